@@ -1,0 +1,77 @@
+"""What the FRF stage hands on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.verdict import Verdict
+
+
+@dataclass(frozen=True)
+class FrfSet:
+    """Frequency response functions of one configuration.
+
+    Where an output was not measured for an input, the entry is NaN at all lines.
+
+    Attributes
+    ----------
+    frequency_hz : ndarray, (n_lines,)
+        From 0 to the Nyquist frequency, equally spaced.
+    frf : complex ndarray, (n_outputs, n_inputs, n_lines)
+        Response over force, SI, in the quantity of `quantities`; signs of the DOFs applied, so that
+        `outputs` and `inputs` all have sign +1. Line 0 (0 Hz) is finite but carries no information.
+    coherence : ndarray, (n_outputs, n_inputs, n_lines)
+        NaN where fewer than two hits were averaged: one hit has no coherence.
+    variance : ndarray, (n_outputs, n_inputs, n_lines)
+        Variance of the complex FRF, E|H - E H|², from the scatter over hits; NaN where fewer than two
+        hits were averaged.
+    outputs, inputs : tuple of Dof
+    quantities : tuple of str
+        Per output: ``"acceleration"``, ``"velocity"`` or ``"displacement"``.
+    hits : ndarray of int, (n_outputs, n_inputs)
+        Number of hits averaged; 0 where not measured.
+    estimator : str
+        ``"H1"``, ``"H2"`` or ``"Hv"``.
+    record_s : float
+        Length of the analysed record, s.
+    response_decay_rad_s : float
+        Decay rate σ of the exponential window on force and responses; it has been added to the decay
+        of every pole and must be taken off again. 0 without such a window.
+    delay_s : ndarray, (n_inputs,)
+        Mean time of the force peak after the start of the analysed record.
+    band_hz : tuple of float
+        Band in which the force carried enough energy, (low, high).
+    force_calibrated : bool
+        False where the force is in volts: the FRF is then unscaled.
+    sensor_mass_kg : ndarray, (n_outputs,)
+    verdicts : tuple of Verdict
+        Checks that need several hits or several points: coherence, driving point, reciprocity.
+    """
+
+    frequency_hz: NDArray[np.float64]
+    frf: NDArray[np.complex128]
+    coherence: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    outputs: tuple[Dof, ...]
+    inputs: tuple[Dof, ...]
+    quantities: tuple[str, ...]
+    hits: NDArray[np.int64]
+    estimator: str
+    record_s: float
+    response_decay_rad_s: float
+    delay_s: NDArray[np.float64]
+    band_hz: tuple[float, float]
+    force_calibrated: bool
+    sensor_mass_kg: NDArray[np.float64]
+    verdicts: tuple[Verdict, ...] = ()
+
+    def accelerance(self) -> NDArray[np.complex128]:
+        """All FRFs as acceleration over force, (m/s²)/N, shape (n_outputs, n_inputs, n_lines)."""
+        power = {"acceleration": 0, "velocity": 1, "displacement": 2}
+        jw = 2j * np.pi * self.frequency_hz
+        factors = np.stack([jw ** power[q] for q in self.quantities])
+        return np.asarray(self.frf * factors[:, None, :])

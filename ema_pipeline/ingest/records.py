@@ -1,0 +1,168 @@
+"""What ingest hands on: records in SI units, the hits found in them, and each hit's verdicts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.verdict import Verdict
+
+
+@dataclass(frozen=True)
+class ResponseChannel:
+    """One response channel of a record.
+
+    Attributes
+    ----------
+    name : str
+        Channel name in the record file.
+    dof : Dof
+        Where the sensor sits and which way it points.
+    quantity : str
+        ``"acceleration"``, ``"velocity"`` or ``"displacement"`` (SI: m/s², m/s, m).
+    sensor_mass_kg : float
+        0 where not stated.
+    full_scale : float
+        Largest value that the input can carry, SI; ``inf`` where not stated.
+    """
+
+    name: str
+    dof: Dof
+    quantity: str
+    sensor_mass_kg: float = 0.0
+    full_scale: float = float("inf")
+
+
+@dataclass(frozen=True)
+class Record:
+    """One record file, scaled to SI.
+
+    Attributes
+    ----------
+    file : str
+        Path relative to the test's folder, as test.toml names it.
+    impact : Dof
+        Where the hammer strikes.
+    sample_rate_hz : float
+    force_name : str
+        Name of the hammer channel.
+    force : ndarray, (n_samples,)
+        Force, N (V where `force_calibrated` is false).
+    responses : ndarray, (n_channels, n_samples)
+        Responses in SI.
+    channels : tuple of ResponseChannel
+        One per row of `responses`.
+    force_full_scale : float
+        Largest force that the input can carry, N; ``inf`` where not stated.
+    force_calibrated : bool
+        False where the hammer signal is deliberately left in volts: FRFs and shapes are then unscaled.
+    """
+
+    file: str
+    impact: Dof
+    sample_rate_hz: float
+    force_name: str
+    force: NDArray[np.float64]
+    responses: NDArray[np.float64]
+    channels: tuple[ResponseChannel, ...]
+    force_full_scale: float = float("inf")
+    force_calibrated: bool = True
+
+
+@dataclass(frozen=True)
+class Hit:
+    """One hit: a stretch of a record, with the verdicts on its quality.
+
+    Attributes
+    ----------
+    file : str
+        Record file.
+    number : int
+        Number of the hit within its record, from 0.
+    impact : Dof
+        Where the hammer strikes.
+    start, stop : int
+        Samples ``start:stop`` of the record belong to this hit.
+    peak : int
+        Sample of the force peak within the record.
+    peak_force : float
+        Force at the peak, N, with its sign.
+    verdicts : tuple of Verdict
+        Outcome of every check that could be made.
+    """
+
+    file: str
+    number: int
+    impact: Dof
+    start: int
+    stop: int
+    peak: int
+    peak_force: float
+    verdicts: tuple[Verdict, ...] = ()
+
+    @property
+    def accepted(self) -> bool:
+        """True unless a check that rejects the whole hit failed."""
+        return not any(v.consequence == "reject_hit" and not v.passes for v in self.verdicts)
+
+    @property
+    def rejected_channels(self) -> frozenset[str]:
+        """Names of channels that must not be used in this hit."""
+        return frozenset(
+            v.channel for v in self.verdicts if v.consequence == "reject_channel" and not v.passes
+        )
+
+    @property
+    def reason(self) -> str:
+        """Why the hit is left out; empty for an accepted hit."""
+        failed = [v for v in self.verdicts if v.consequence == "reject_hit" and not v.passes]
+        return "; ".join(v.message or v.check for v in failed)
+
+
+@dataclass(frozen=True)
+class HitSamples:
+    """One hit with its samples, cut from its record.
+
+    Attributes
+    ----------
+    hit : Hit
+    sample_rate_hz : float
+    force : ndarray, (n_samples,)
+        N, or V for an uncalibrated hammer.
+    responses : ndarray, (n_channels, n_samples)
+        SI.
+    channels : tuple of ResponseChannel
+        One per row of `responses`; channels rejected in this hit are already left out.
+    force_calibrated : bool
+    """
+
+    hit: Hit
+    sample_rate_hz: float
+    force: NDArray[np.float64]
+    responses: NDArray[np.float64]
+    channels: tuple[ResponseChannel, ...]
+    force_calibrated: bool = True
+
+
+def cut_hit(record: Record, hit: Hit) -> HitSamples:
+    """Cut a hit out of its record and leave out the channels that its verdicts reject."""
+    keep = [i for i, c in enumerate(record.channels) if c.name not in hit.rejected_channels]
+    return HitSamples(
+        hit=hit,
+        sample_rate_hz=record.sample_rate_hz,
+        force=record.force[hit.start : hit.stop],
+        responses=record.responses[keep, hit.start : hit.stop],
+        channels=tuple(record.channels[i] for i in keep),
+        force_calibrated=record.force_calibrated,
+    )
+
+
+class HitSource(Protocol):
+    """Anything that can hand out accepted hits one after the other, e.g. the store."""
+
+    def __iter__(self) -> Iterator[HitSamples]: ...

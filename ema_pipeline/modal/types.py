@@ -1,0 +1,158 @@
+"""What the modal stage hands on: modes with uncertainties, and the chart they were picked from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.dof import Dof
+
+
+@dataclass(frozen=True)
+class CircleFit:
+    """Nyquist circle of one mode in one FRF (mobility plane, residual of other modes not removed).
+
+    Attributes
+    ----------
+    output, input : Dof
+    frequency_hz : ndarray, (n_points,)
+        Lines used.
+    points : complex ndarray, (n_points,)
+        The FRF at these lines, mobility, (m/s)/N.
+    centre : complex
+        Centre of the fitted circle.
+    radius : float
+    natural_frequency_hz, natural_frequency_std_hz : float
+        Frequency of maximum sweep rate.
+    damping_ratio, damping_std : float
+        Mean over half-power pairs and its standard deviation.
+    pair_damping : ndarray, (n_pairs,)
+        Damping ratio from each pair of points on either side of resonance.
+    residual : float
+        Root-mean-square distance of the points from the circle over its radius.
+    """
+
+    output: Dof
+    input: Dof
+    frequency_hz: NDArray[np.float64]
+    points: NDArray[np.complex128]
+    centre: complex
+    radius: float
+    natural_frequency_hz: float
+    natural_frequency_std_hz: float
+    damping_ratio: float
+    damping_std: float
+    pair_damping: NDArray[np.float64]
+    residual: float
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One identified mode.
+
+    Attributes
+    ----------
+    frequency_hz : float
+        Undamped natural frequency |s|/2π.
+    frequency_std_hz : float
+    damping_ratio : float
+        -Re(s)/|s|, with the exponential window's share already taken off.
+    damping_std : float
+    pole : complex
+        s, rad/s, window share taken off.
+    shape : complex ndarray, (n_dofs,)
+        At `ModalModel.dofs`. Mass-normalised (residue = shape_out·shape_in, for displacement over force
+        as Σ A/(s - p) + conj., with A = shape·shapeᵀ/(2jω_d)) where `ModalModel.scaled`, else the largest entry is 1.
+        NaN where not measured.
+    shape_std : ndarray, (n_dofs,)
+        Standard deviation of the modulus of each entry's error, per real or imaginary part.
+    mpc : float
+        Modal phase collinearity, 0…1.
+    method : str
+        ``"plscf"``, ``"lscf"``, ``"sdypy"`` or ``"circle"``.
+    stability : float
+        Share of model orders that voted for the mode, 0…1.
+    flags : tuple of str
+        Plain-word remarks, e.g. ``"circle fit differs: close neighbour"``.
+    circles : tuple of CircleFit
+        Best FRFs first.
+    """
+
+    frequency_hz: float
+    frequency_std_hz: float
+    damping_ratio: float
+    damping_std: float
+    pole: complex
+    shape: NDArray[np.complex128]
+    shape_std: NDArray[np.float64]
+    mpc: float
+    method: str
+    stability: float = 1.0
+    flags: tuple[str, ...] = ()
+    circles: tuple[CircleFit, ...] = ()
+
+
+@dataclass(frozen=True)
+class StabilisationChart:
+    """Poles of all model orders.
+
+    Attributes
+    ----------
+    order : ndarray of int, (n_poles,)
+    frequency_hz, damping_ratio : ndarray, (n_poles,)
+    stable : ndarray of bool, (n_poles,)
+        Pole found again at the next lower order in frequency, damping and shape.
+    selected : ndarray of int, (n_poles,)
+        Index of the mode that the pole voted for, or -1.
+    """
+
+    order: NDArray[np.int64]
+    frequency_hz: NDArray[np.float64]
+    damping_ratio: NDArray[np.float64]
+    stable: NDArray[np.bool_]
+    selected: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ModalModel:
+    """Everything identified from one configuration's FRFs.
+
+    Attributes
+    ----------
+    dofs : tuple of Dof
+        DOFs at which shapes are given (outputs; inputs too where reciprocity allows), all with sign +1.
+    modes : tuple of Mode
+        In order of frequency.
+    band_hz : tuple of float
+        Band analysed.
+    scaled : bool
+        True where shapes are mass-normalised (a driving point was measured with a calibrated hammer).
+    scaling_note : str
+        Why the shapes are unscaled; empty where they are scaled.
+    references : tuple of Dof
+        Inputs (or outputs, for a roving hammer) that served as references.
+    frequency_hz : ndarray, (n_lines,)
+        Lines of the band analysed.
+    synthesis : complex ndarray, (n_outputs, n_inputs, n_lines)
+        Accelerance that the modes and residuals give at these lines.
+    outputs, inputs : tuple of Dof
+        DOFs of `synthesis`.
+    chart : StabilisationChart
+    notes : tuple of str
+        Plain sentences, e.g. that a single reference cannot show a multiplicity.
+    """
+
+    dofs: tuple[Dof, ...]
+    modes: tuple[Mode, ...]
+    band_hz: tuple[float, float]
+    scaled: bool
+    scaling_note: str
+    references: tuple[Dof, ...]
+    frequency_hz: NDArray[np.float64]
+    synthesis: NDArray[np.complex128]
+    outputs: tuple[Dof, ...]
+    inputs: tuple[Dof, ...]
+    chart: StabilisationChart
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,85 @@
+"""What a rig is: parameters with tolerances, configurations, and the system that they build."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.mechanics.system import LinearSystem
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of a rig.
+
+    Attributes
+    ----------
+    name : str
+        E.g. ``"sun_planet_mesh_stiffness"``.
+    value : float
+        Nominal value in `unit`.
+    unit : str
+    tolerance : float
+        Relative standard deviation (1 σ) of the nominal value; 0 for exactly known.
+    minimum, maximum : float
+        Bounds.
+    free : bool
+        True where the nominal value is only a start and the data must determine the parameter
+        (no prior but the bounds).
+    """
+
+    name: str
+    value: float
+    unit: str
+    tolerance: float = 0.0
+    minimum: float = 0.0
+    maximum: float = float("inf")
+    free: bool = False
+
+
+@dataclass(frozen=True)
+class ModelMode:
+    """A mode of the analytical model.
+
+    Attributes
+    ----------
+    index : int
+    frequency_hz : float
+    damping_ratio : float
+    family : str
+        ``"rotational"``, ``"translational"``, ``"planet"``, ``"rigid body"``, …
+    shape : ndarray, (n,)
+        Mass-normalised real shape at the system's coordinates.
+    """
+
+    index: int
+    frequency_hz: float
+    damping_ratio: float
+    family: str
+    shape: NDArray[np.float64]
+
+
+class Rig(Protocol):
+    """A rig: builds a system from parameter values for each of its configurations."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def configurations(self) -> tuple[str, ...]: ...
+
+    @property
+    def parameters(self) -> Mapping[str, Parameter]: ...
+
+    def system(self, configuration: str, values: Mapping[str, float] | None = None) -> LinearSystem:
+        """System at `values` (nominal values where left out); EmaError for unknown names."""
+        ...
+
+    def knows(self, configuration: str, dof: Dof) -> bool:
+        """True where a sensor or hammer can sit at `dof` in this configuration."""
+        ...

@@ -1,0 +1,81 @@
+"""Typed settings: every stage has its own class, unknown keys are refused with a hint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from ema_pipeline.errors import EmaError, did_you_mean
+
+
+class Settings(BaseModel):
+    """Base of all settings: immutable, unknown keys forbidden, every field has a documented default."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def parse(model: type[M], data: Any, where: str | Path) -> M:
+    """Build `model` from a plain mapping; errors become one line that names file and key.
+
+    Parameters
+    ----------
+    model : type
+        A pydantic model class.
+    data : Any
+        Usually a dictionary read from TOML.
+    where : str or Path
+        File (and table) that the error message names.
+
+    Raises
+    ------
+    EmaError
+        For unknown keys, wrong types and values out of range.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        first = error.errors()[0]
+        path = ".".join(str(p) for p in first["loc"])
+        if first["type"] == "extra_forbidden":
+            known = _fields_at(model, first["loc"][:-1])
+            raise EmaError(
+                f"{where}: unknown key '{path}'{did_you_mean(str(first['loc'][-1]), known)}"
+            ) from None
+        if first["type"] == "missing":
+            raise EmaError(f"{where}: key '{path}' is missing; add it") from None
+        shown = repr(first.get("input"))
+        shown = shown if len(shown) <= 60 else shown[:57] + "..."
+        message = first["msg"].removeprefix("Value error, ")
+        raise EmaError(f"{where}: {path or 'file'} = {shown}: {message}") from None
+
+
+def _fields_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
+    """Names of the fields of the (nested) model that `loc` leads to."""
+    current: Any = model
+    for step in loc:
+        if isinstance(step, int) or not (isinstance(current, type) and issubclass(current, BaseModel)):
+            continue
+        field = current.model_fields.get(str(step))
+        if field is None:
+            return []
+        current = next(
+            (t for t in _type_leaves(field.annotation) if isinstance(t, type) and issubclass(t, BaseModel)),
+            None,
+        )
+        if current is None:
+            return []
+    if isinstance(current, type) and issubclass(current, BaseModel):
+        return [f.alias or name for name, f in current.model_fields.items()]
+    return []
+
+
+def _type_leaves(annotation: Any) -> list[Any]:
+    args = getattr(annotation, "__args__", None)
+    if not args:
+        return [annotation]
+    return [leaf for a in args for leaf in _type_leaves(a)]
