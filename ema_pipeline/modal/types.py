@@ -63,9 +63,9 @@ class Mode:
     pole : complex
         s, rad/s, window share taken off.
     shape : complex ndarray, (n_dofs,)
-        At `ModalModel.dofs`. Mass-normalised (residue = shape_out·shape_in, for displacement over force
-        as Σ A/(s - p) + conj., with A = shape·shapeᵀ/(2jω_d)) where `ModalModel.scaled`, else the largest entry is 1.
-        NaN where not measured.
+        At `ModalModel.dofs`; NaN where not measured. Where `ModalModel.scaled`, mass-normalised:
+        the receptance is Σ A/(jω - s) + conj. with A = shape·shapeᵀ/(2jω_d), ω_d = Im s. Otherwise the
+        largest entry is 1.
     shape_std : ndarray, (n_dofs,)
         Standard deviation of the modulus of each entry's error, per real or imaginary part.
     mpc : float

@@ -1,0 +1,144 @@
+"""What fitting the model's parameters hands on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class ErrorSweep:
+    """The error function ε over one stiffness (seed's Eq. 10, drawn as its Figs. 5 and 6).
+
+    Attributes
+    ----------
+    parameter, configuration : str
+    mode_count : int
+        Number of modes used, the lowest ones first.
+    values : ndarray, (n,)
+        Stiffness, N/m, logarithmically spaced.
+    error : ndarray, (n,)
+        ε at `values`.
+    minimum : float
+        Stiffness at the minimum of ε.
+    relative_depth : float
+        (median ε - least ε)/least ε: near 0 for a flat curve that determines nothing.
+    identified : bool
+        False where ε is too flat, or its minimum lies on an end of the sweep.
+    note : str
+        Plain words on how well ε determines the stiffness.
+    """
+
+    parameter: str
+    configuration: str
+    mode_count: int
+    values: NDArray[np.float64]
+    error: NDArray[np.float64]
+    minimum: float
+    relative_depth: float
+    identified: bool
+    note: str
+
+
+@dataclass(frozen=True)
+class TwoStep:
+    """The seed's route: sun-planet from ``no_ring``, ring-planet from ``with_ring``, then the average.
+
+    Values are NaN where the step could not be taken (its configuration was not measured).
+    """
+
+    sun_planet_mesh_stiffness: float
+    ring_planet_mesh_stiffness: float
+    average: float
+    note: str
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Profile likelihood of one parameter: the best objective with the parameter held at `values`.
+
+    `objective` is -2 log posterior minus its minimum, so 1 marks one standard deviation.
+    """
+
+    values: NDArray[np.float64]
+    objective: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """A fitted parameter.
+
+    Attributes
+    ----------
+    value, std : float
+        Estimate and its standard deviation (1 σ) from the posterior covariance.
+    low, high : float
+        68 % interval from the profile likelihood (equal to value ∓ std where no profile was made);
+        an open end is at the parameter's bound.
+    unit : str
+    free : bool
+        True for parameters without a prior.
+    nominal, prior_std : float
+        Nominal value and its tolerance as a standard deviation (NaN without prior).
+    identified : bool
+        True where the data determine the parameter; for a parameter with a prior: where the data narrow it.
+    shift_z : float
+        (value - nominal)/prior_std; NaN without prior.
+    note : str
+        Why not identified, at a bound, out of tolerance; empty otherwise.
+    profile : Profile or None
+    """
+
+    name: str
+    value: float
+    std: float
+    low: float
+    high: float
+    unit: str
+    free: bool
+    nominal: float
+    prior_std: float
+    identified: bool
+    shift_z: float
+    note: str
+    profile: Profile | None = None
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A weighted fit of all parameters over all configurations.
+
+    Attributes
+    ----------
+    parameters : dict of str to ParameterEstimate
+    names : tuple of str
+        Order of rows and columns of `correlation`.
+    correlation : ndarray, (n, n)
+        Posterior correlation.
+    error : float
+        Root-mean-square of (measurement - model)/standard uncertainty over all data.
+    chi2_per_dof : float
+    frequency_error : float
+        ε (seed's Eq. 10) over all pairs of all configurations.
+    data_count : int
+        Number of real data.
+    stop_reason : str
+        Why the optimiser stopped, in words.
+    sweeps : tuple of ErrorSweep
+    two_step : TwoStep or None
+    notes : tuple of str
+    """
+
+    parameters: dict[str, ParameterEstimate]
+    names: tuple[str, ...]
+    correlation: NDArray[np.float64]
+    error: float
+    chi2_per_dof: float
+    frequency_error: float
+    data_count: int
+    stop_reason: str
+    sweeps: tuple[ErrorSweep, ...] = ()
+    two_step: TwoStep | None = None
+    notes: tuple[str, ...] = ()
