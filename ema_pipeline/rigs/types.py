@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
+from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.system import LinearSystem
 
 
@@ -55,6 +56,9 @@ class ModelMode:
         ``"rotational"``, ``"translational"``, ``"planet"``, ``"rigid body"``, …
     shape : ndarray, (n,)
         Mass-normalised real shape at the system's coordinates.
+    complex_shape : complex ndarray, (n,), or None
+        Shape of the damped mode, scaled as in `mechanics.modes.ComplexModes`; None where damping does not
+        couple the modes and `shape` says it all.
     """
 
     index: int
@@ -62,6 +66,7 @@ class ModelMode:
     damping_ratio: float
     family: str
     shape: NDArray[np.float64]
+    complex_shape: NDArray[np.complex128] | None = None
 
 
 class Rig(Protocol):
@@ -76,10 +81,24 @@ class Rig(Protocol):
     @property
     def parameters(self) -> Mapping[str, Parameter]: ...
 
+    def used(self, configuration: str) -> tuple[str, ...]:
+        """Names of the parameters that this configuration depends on."""
+        ...
+
+    def assembly(self, configuration: str, values: Mapping[str, float] | None = None) -> Assembly:
+        """Named elements at `values` (nominal values where left out): what effects edit."""
+        ...
+
     def system(self, configuration: str, values: Mapping[str, float] | None = None) -> LinearSystem:
         """System at `values` (nominal values where left out); EmaError for unknown names."""
         ...
 
     def knows(self, configuration: str, dof: Dof) -> bool:
         """True where a sensor or hammer can sit at `dof` in this configuration."""
+        ...
+
+    def classify(
+        self, system: LinearSystem, frequency_hz: NDArray[np.float64], shapes: NDArray[np.float64]
+    ) -> tuple[tuple[str, ...], NDArray[np.float64]]:
+        """Family of every mode, and shapes rotated within equal frequencies to one family each."""
         ...
