@@ -1,0 +1,208 @@
+"""The results file ``ema.h5``: one group per stage and configuration, safe against a kill at any moment.
+
+Every change is made to a copy that replaces the file in one step, so that the file on disk is always
+whole: either before the change or after it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import os
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, TypeVar
+
+import h5py
+
+from ema_pipeline import __version__, codec
+from ema_pipeline.errors import EmaError
+
+T = TypeVar("T")
+
+ALL = "all"
+"""Name that stands for all configurations together."""
+
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """How a stage's result came about.
+
+    Attributes
+    ----------
+    key : str
+        Hash of the stage's inputs and settings; an equal key means that nothing has to be computed.
+    settings : str
+        The stage's settings, JSON.
+    version : str
+        Version of the program.
+    finished : str
+        UTC time, ISO 8601.
+    seconds : float
+        Time that the stage took.
+    """
+
+    key: str
+    settings: str
+    version: str
+    finished: str
+    seconds: float
+
+
+class Store:
+    """Results of one run.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder; the store is ``folder/ema.h5``.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.path = folder / "ema.h5"
+
+    @classmethod
+    def existing(cls, folder: Path) -> Store:
+        """Open the store of a finished or interrupted run.
+
+        Raises
+        ------
+        EmaError
+            If there is none, or if it is not readable.
+        """
+        store = cls(folder)
+        if not store.path.is_file():
+            raise EmaError(f"{folder}: holds no ema.h5; make one with 'ema run RAW --out {folder}'")
+        with store.reading():
+            return store
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Keep a second process from writing to the same results folder."""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            handle = (self.folder / ".lock").open("w")
+        except OSError as error:
+            raise EmaError(
+                f"{self.folder}: cannot write results there ({_reason(error)}); choose another with --out"
+            ) from None
+        with handle:
+            if not _try_lock(handle):
+                raise EmaError(f"{self.folder}: another ema process is writing there; wait for it to end")
+            for left_over in self.folder.glob(".ema.h5.*.tmp"):
+                left_over.unlink(missing_ok=True)
+            yield
+
+    @contextlib.contextmanager
+    def reading(self) -> Iterator[h5py.File]:
+        """The HDF5 file, open for reading."""
+        try:
+            file = h5py.File(self.path, "r")
+        except OSError as error:
+            raise EmaError(
+                f"{self.path}: is not a readable HDF5 file ({_reason(error)}); delete it and run again"
+            ) from None
+        with file:
+            yield file
+
+    @contextlib.contextmanager
+    def changing(self) -> Iterator[h5py.File]:
+        """A copy of the HDF5 file to change; it replaces the file when the block ends without an error."""
+        scratch = self.folder / f".ema.h5.{os.getpid()}.tmp"
+        try:
+            if self.path.exists():
+                shutil.copyfile(self.path, scratch)
+                file = h5py.File(scratch, "r+")
+            else:
+                file = h5py.File(scratch, "w", fs_strategy="fsm", fs_persist=True)
+                file.attrs["format"] = _FORMAT
+            with file:
+                yield file
+            os.replace(scratch, self.path)
+        except OSError as error:
+            raise EmaError(
+                f"{self.path}: cannot be written ({_reason(error)}); free space or use --out"
+            ) from None
+        finally:
+            scratch.unlink(missing_ok=True)
+
+    def key(self, stage: str, configuration: str = ALL) -> str:
+        """Key of the stored result, empty where there is none."""
+        if not self.path.is_file():
+            return ""
+        with self.reading() as file:
+            group = file.get(_group(stage, configuration))
+            return "" if group is None else str(codec.read(group, "provenance", Provenance).key)
+
+    def save(
+        self, stage: str, configuration: str, key: str, settings: str, seconds: float, **results: Any
+    ) -> None:
+        """Replace a stage's results by new ones in one step."""
+        with self.changing() as file:
+            write_stage(file, stage, configuration, key, settings, seconds, **results)
+
+    def load(self, stage: str, configuration: str, name: str, cls: type[T]) -> T:
+        """Load one result of a stage.
+
+        Raises
+        ------
+        EmaError
+            If the stage has not been run.
+        """
+        with self.reading() as file:
+            group = file.get(_group(stage, configuration))
+            if group is None:
+                raise EmaError(
+                    f"{self.path}: holds no result of stage '{stage}' ({configuration}); run it first"
+                )
+            result: T = codec.read(group, name, cls)
+            return result
+
+    def provenance(self) -> dict[tuple[str, str], Provenance]:
+        """Provenance of everything in the store, by stage and configuration."""
+        found: dict[tuple[str, str], Provenance] = {}
+        with self.reading() as file:
+            for stage, configurations in file.get("stages", {}).items():
+                for configuration, group in configurations.items():
+                    found[stage, configuration] = codec.read(group, "provenance", Provenance)
+        return found
+
+
+def write_stage(
+    file: h5py.File, stage: str, configuration: str, key: str, settings: str, seconds: float, **results: Any
+) -> h5py.Group:
+    """Write a stage's results and provenance into an open file; returns the stage's group."""
+    path = _group(stage, configuration)
+    if path in file:
+        del file[path]
+    group = file.create_group(path)
+    finished = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    codec.write(group, "provenance", Provenance(key, settings, __version__, finished, seconds))
+    for name, value in results.items():
+        codec.write(group, name, value)
+    return group
+
+
+def _group(stage: str, configuration: str) -> str:
+    return f"stages/{stage}/{configuration}"
+
+
+def _reason(error: OSError) -> str:
+    return error.strerror or str(error).split("\n")[0]
+
+
+def _try_lock(handle: IO[str]) -> bool:
+    try:
+        import fcntl
+    except ImportError:  # no advisory locks on this platform
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,177 @@
+"""The results file keeps what it is given, and survives being killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import h5py
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from ema_pipeline import codec
+from ema_pipeline.dof import Dof
+from ema_pipeline.errors import EmaError
+from ema_pipeline.store import ALL, Store
+
+
+@dataclass(frozen=True)
+class Row:
+    name: str
+    value: float
+    kind: Literal["a", "b"]
+    dof: Dof
+    good: bool
+
+
+@dataclass(frozen=True)
+class Nested:
+    rows: tuple[Row, ...]
+    note: str
+
+
+@dataclass(frozen=True)
+class Everything:
+    text: str
+    number: int
+    ratio: float
+    pole: complex
+    flag: bool
+    nothing: Nested | None
+    something: Nested | None
+    array: np.ndarray
+    masks: np.ndarray
+    band: tuple[float, float]
+    words: tuple[str, ...]
+    dofs: tuple[Dof, ...]
+    deep: tuple[Nested, ...]
+    empty: tuple[Row, ...]
+    mapping: dict[str, float]
+    nested_mapping: dict[str, Nested]
+    infinite: float = float("inf")
+    defaulted: dict[str, float] = field(default_factory=dict)
+
+
+def example() -> Everything:
+    rows = (Row("ä", 1.5, "a", Dof("sun", "x", -1), True), Row("b", float("nan"), "b", Dof("p1", "zeta"), False))
+    nested = Nested(rows, "two rows")
+    return Everything(
+        text="m/s²",
+        number=7,
+        ratio=0.1,
+        pole=-3 + 4j,
+        flag=False,
+        nothing=None,
+        something=nested,
+        array=np.arange(10_000).reshape(100, 100) * (1 + 2j),
+        masks=np.array([True, False]),
+        band=(1.0, 2.0),
+        words=("", "two words"),
+        dofs=(Dof("sun", "x"), Dof("ring", "u", -1)),
+        deep=(nested, Nested((), "none")),
+        empty=(),
+        mapping={"mesh@sun-planet1/fraction": 0.3},
+        nested_mapping={"with ring": nested},
+    )
+
+
+def test_what_is_written_is_read_back_equal(tmp_path: Path) -> None:
+    before = example()
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        codec.write(file, "it", before)
+        after = codec.read(file, "it", Everything)
+    assert_array_equal(after.array, before.array)
+    assert_array_equal(after.masks, before.masks)
+    assert repr(after.something) == repr(before.something)  # nan is not equal to itself
+    assert repr(after.deep) == repr(before.deep)
+    for name in ("text", "number", "ratio", "pole", "flag", "nothing", "band", "words", "dofs", "empty", "infinite"):
+        assert getattr(after, name) == getattr(before, name), name
+        assert type(getattr(after, name)) is type(getattr(before, name)), name
+    assert after.mapping == before.mapping
+    assert repr(after.nested_mapping) == repr(before.nested_mapping)
+    assert after.defaulted == {}
+
+
+def test_plain_hdf5_tools_can_read_scalars_arrays_and_tables(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        codec.write(file, "it", example())
+        assert file["it"].attrs["ratio"] == 0.1
+        assert file["it/array"].shape == (100, 100)
+        assert file["it/something/rows"]["value"][0] == 1.5
+        assert file["it/dofs"][1] == b"-ring.u"
+
+
+def test_a_stage_that_fails_half_way_leaves_the_store_as_it_was(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key1", "{}", 0.1, result=Nested((), "old"))
+    with pytest.raises(RuntimeError, match="half-way"), store.changing() as file:
+        del file["stages/frf/all/result"]
+        raise RuntimeError("half-way")
+    assert store.load("frf", ALL, "result", Nested).note == "old"
+    assert store.key("frf") == "key1"
+    assert [p.name for p in tmp_path.iterdir()] == ["ema.h5"]
+
+
+def test_replacing_a_result_again_and_again_does_not_make_the_file_grow(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    sizes = []
+    for turn in range(6):
+        store.save("frf", ALL, f"{turn}", "{}", 0.1, result=np.random.default_rng(turn).normal(size=40_000))
+        sizes.append(store.path.stat().st_size)
+    assert sizes[-1] < 2.5 * sizes[0]
+
+
+def test_a_store_that_is_no_hdf5_file_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "ema.h5").write_bytes(b"not HDF5 at all")
+    with pytest.raises(EmaError, match=r"ema\.h5: is not a readable HDF5 file"):
+        Store.existing(tmp_path)
+
+
+def test_a_second_process_is_kept_out_while_one_writes(tmp_path: Path) -> None:
+    code = f"""
+from pathlib import Path
+from ema_pipeline.store import Store
+with Store(Path({str(tmp_path)!r})).lock():
+    print("locked")
+"""
+    with Store(tmp_path).lock():
+        blocked = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    free = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "another ema process" in blocked.stderr
+    assert free.stdout.strip() == "locked"
+
+
+def test_a_process_killed_while_it_writes_leaves_a_readable_store(tmp_path: Path) -> None:
+    Store(tmp_path).save("frf", ALL, "first", "{}", 0.1, result=np.zeros(10))
+    code = f"""
+import numpy as np
+from pathlib import Path
+from ema_pipeline.store import Store
+store = Store(Path({str(tmp_path)!r}))
+print("go", flush=True)
+turn = 0
+while True:
+    turn += 1
+    store.save("frf", "all", f"turn {{turn}}", "{{}}", 0.1, result=np.full(20_000, float(turn)))
+"""
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+        assert process.stdout is not None
+        process.stdout.readline()
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(float(rng.uniform(0.01, 0.15)))
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+        with Store(tmp_path).reading() as file:
+            values = file["stages/frf/all/result"][()]
+        assert np.ptp(values) == 0.0
+    with Store(tmp_path).lock():
+        assert not list(tmp_path.glob(".ema.h5.*.tmp"))
