@@ -1,0 +1,1 @@
+"""One module per subject; each function takes results and returns a matplotlib Figure."""

@@ -1,0 +1,133 @@
+"""Nyquist sheets: one per mode, one panel per FRF with its fitted circle."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from ema_pipeline.modal.types import CircleFit, ModalModel
+from ema_pipeline.report.numbers import format_percent, format_value
+from ema_pipeline.report.style import (
+    GREEN,
+    GREY,
+    MEASURED,
+    MODEL,
+    PURPLE,
+    margins,
+    new_figure,
+    note,
+    styled,
+)
+
+CHANNELS_PER_SHEET = 4
+
+
+@styled
+def nyquist_sheet(modal: ModalModel, index: int, calibrated: bool = True) -> Figure:
+    """Nyquist circles of one mode in its best FRFs.
+
+    Parameters
+    ----------
+    modal : ModalModel
+    index : int
+        Mode.
+    calibrated : bool
+        False where the force is in volts.
+    """
+    mode = modal.modes[index]
+    circles = mode.circles[:CHANNELS_PER_SHEET]
+    columns = min(max(len(circles), 1), 2)
+    rows = -(-max(len(circles), 1) // 2)
+    figure = new_figure(0.75 + 3.0 * rows)
+    grid = figure.add_gridspec(rows, 2, hspace=0.34, wspace=0.3, **margins(figure, top=0.62))
+    frequency = format_value(mode.frequency_hz, mode.frequency_std_hz, "Hz")
+    damping = format_percent(mode.damping_ratio, mode.damping_std)
+    figure.text(
+        0.5, 1 - 0.13 / figure.get_size_inches()[1],
+        f"Mode {index + 1}: {frequency}, ζ = {damping} ({mode.method})",
+        ha="center", va="top", fontsize=9, fontweight="bold",
+    )  # fmt: skip
+    if not circles:
+        ax = figure.add_subplot(grid[0, :])
+        ax.set_axis_off()
+        note(ax, "no circle fit for this mode")
+    for k, circle in enumerate(circles):
+        where = grid[k // 2, :] if columns == 1 else grid[k // 2, k % 2]
+        _panel(figure.add_subplot(where), circle, mode.frequency_hz, calibrated, legend=k == 0)
+    return figure
+
+
+def _panel(ax: Axes, circle: CircleFit, pole_hz: float, calibrated: bool, legend: bool) -> None:
+    largest = float(np.max(np.abs(circle.points), initial=0.0)) or 1.0
+    exponent = int(np.floor(np.log10(largest)))
+    scale = 10.0**-exponent
+    z, centre, radius = circle.points * scale, circle.centre * scale, circle.radius * scale
+    angle = np.linspace(0, 2 * np.pi, 181)
+    ax.axhline(0, color="#bbbbbb", lw=0.6)
+    ax.axvline(0, color="#bbbbbb", lw=0.6)
+    ax.plot(centre.real + radius * np.cos(angle), centre.imag + radius * np.sin(angle), "--", color=MODEL,
+            lw=1.1, label="fitted circle")  # fmt: skip
+    ax.plot(z.real, z.imag, "o-", color=MEASURED, ms=3.2, lw=0.4, label="measured lines")
+    _mark(ax, circle, circle.natural_frequency_hz, scale, "*", PURPLE, 11, "most rapid sweep (circle)")
+    _mark(ax, circle, pole_hz, scale, "D", "#000000", 6, "frequency of the pole", hollow=True)
+    half = np.array([1 - circle.damping_ratio, 1 + circle.damping_ratio]) * circle.natural_frequency_hz
+    for f, label in zip(half, ("half-power points", "_"), strict=True):
+        _mark(ax, circle, float(f), scale, "s", GREEN, 5, label)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.margins(0.12)
+    # room on the right for the pair damping and the words
+    reach = max(float(np.ptp(np.r_[z.real, centre.real - radius, centre.real + radius])), 2 * radius)
+    ax.set_xlim(centre.real - 0.66 * reach, centre.real + 1.5 * reach)
+    ax.set_ylim(centre.imag - 0.72 * reach, centre.imag + 0.9 * reach)
+    ax.xaxis.set_major_locator(MaxNLocator(4))
+    ax.yaxis.set_major_locator(MaxNLocator(5))
+    unit = f"{_power(exponent)}(m/s)/{'N' if calibrated else 'V'}"
+    ax.set_xlabel(f"Re mobility, {unit}")
+    ax.set_ylabel(f"Im mobility, {unit}")
+    ax.set_title(f"{circle.output.point} ← {circle.input.point}")
+    ax.text(
+        0.985, 0.03,
+        f"f = {format_value(circle.natural_frequency_hz, circle.natural_frequency_std_hz, 'Hz')}\n"
+        f"ζ = {format_percent(circle.damping_ratio, circle.damping_std)}\n"
+        f"misfit {100 * circle.residual:.1f} % of radius",
+        transform=ax.transAxes, ha="right", va="bottom", fontsize=6.5, linespacing=1.35,
+        bbox={"boxstyle": "square,pad=0.3", "fc": "white", "ec": "#cccccc", "lw": 0.5},
+    )  # fmt: skip
+    if circle.pair_damping.size >= 3:
+        _damping_inset(ax, circle)
+    if legend:
+        ax.legend(loc="upper right", borderpad=0.3, labelspacing=0.25, handlelength=1.6, fontsize=6)
+
+
+def _damping_inset(ax: Axes, circle: CircleFit) -> None:
+    inset = ax.inset_axes((0.74, 0.33, 0.23, 0.2))
+    percent = 100 * circle.pair_damping[np.isfinite(circle.pair_damping)]
+    low, high = np.percentile(percent, [1, 99])
+    inset.hist(percent, bins=12, range=(low, max(high, low * 1.001 + 1e-9)), color="#9ec7e3", ec=MEASURED, lw=0.4)
+    inset.axvline(100 * circle.damping_ratio, color=MODEL, lw=1)
+    inset.set_yticks([])
+    inset.xaxis.set_major_locator(MaxNLocator(2))
+    inset.tick_params(labelsize=5.5, length=2, pad=1)
+    inset.set_title("ζ of pairs, %", fontsize=5.5, pad=2, fontweight="normal", color=GREY)
+    inset.grid(False)
+
+
+def _mark(
+    ax: Axes, circle: CircleFit, f: float, scale: float, marker: str, color: str, size: float, label: str,
+    hollow: bool = False,
+) -> None:  # fmt: skip
+    """Mark a frequency on the circle, at the angle of the data interpolated there."""
+    lines = circle.frequency_hz
+    if lines.size < 2 or not lines[0] <= f <= lines[-1]:
+        return
+    angle = np.interp(f, lines, np.unwrap(np.angle(circle.points - circle.centre)))
+    at = (circle.centre + circle.radius * np.exp(1j * angle)) * scale
+    ax.plot(at.real, at.imag, marker, color=color, ms=size, mfc="none" if hollow else color, mew=1.0,
+            mec=color if hollow else "white", ls="none", label=label, zorder=5)  # fmt: skip
+
+
+def _power(exponent: int) -> str:
+    digits = str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
+    return "" if exponent == 0 else f"10{digits} "
