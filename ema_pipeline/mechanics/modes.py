@@ -113,7 +113,7 @@ class ComplexModes:
     def damping_ratio(self) -> NDArray[np.float64]:
         """-Re s/|s|, (n_modes,); 0 for rigid-body modes."""
         size = np.abs(self.poles)
-        return np.asarray(-self.poles.real / np.where(size > 0, size, 1.0))
+        return np.asarray(0.0 - self.poles.real / np.where(size > 0, size, 1.0))
 
 
 def complex_modes(system: LinearSystem) -> ComplexModes:

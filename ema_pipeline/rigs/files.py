@@ -8,9 +8,8 @@ import tomllib
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError, did_you_mean
@@ -39,7 +38,15 @@ class DerivedRigFile(Settings):
     base: str = Field(description="name of the shipped rig")
     name: str | None = Field(None, description="name of this rig; that of its base where left out")
     geometry: dict[str, int] = Field({}, description="counts, e.g. planets = 3")
-    parameters: dict[str, ParameterEntry | float] = Field({}, description="values that differ from the base")
+    parameters: dict[str, ParameterEntry] = Field({}, description="values that differ from the base")
+
+    @field_validator("parameters", mode="before")
+    @classmethod
+    def _number_is_a_value(cls, given: object) -> object:
+        """``sun_mass = 2.0`` is short for ``sun_mass = { value = 2.0 }``."""
+        if not isinstance(given, dict):
+            return given
+        return {k: v if isinstance(v, dict) else {"value": v} for k, v in given.items()}
 
 
 class ElementEntry(Settings):
@@ -129,14 +136,13 @@ def _derived(file: DerivedRigFile, kinds: Mapping[str, RigKind], path: Path) -> 
         default = defaults.get(name) or kind.extra(name, geometry)
         if default is None:
             raise EmaError(f"{path}: unknown key 'parameters.{name}'{did_you_mean(name, defaults)}")
-        given = entry if isinstance(entry, ParameterEntry) else ParameterEntry(value=entry)
-        changed[name] = _merge(default, given, path)
+        changed[name] = _merge(default, entry, path)
     try:
         rig = kind.make(geometry, changed)
     except EmaError as error:
         raise EmaError(f"{path}: {error}") from None
     if file.name and dataclasses.is_dataclass(rig) and not isinstance(rig, type):
-        return dataclasses.replace(rig, name=file.name)  # type: ignore[return-value]
+        return dataclasses.replace(rig, name=file.name)
     return rig
 
 
@@ -189,16 +195,14 @@ def _from_elements(file: ElementRigFile, path: Path) -> Rig:
         build=partial(_build, file),
         uses=partial(_uses, file),
     )
-    for entry in (*file.masses, *file.springs, *file.dampers):
-        if isinstance(entry.value, str) and entry.value not in parameters:
-            raise EmaError(
-                f"{path}: value '{entry.value}' is no parameter{did_you_mean(entry.value, parameters)}"
-            )
-        for name in entry.configurations:
+    for element in (*file.masses, *file.springs, *file.dampers):
+        value = element.value
+        if isinstance(value, str) and value not in parameters:
+            raise EmaError(f"{path}: value '{value}' is no parameter{did_you_mean(value, parameters)}")
+        for name in element.configurations:
             if name not in file.configurations:
-                raise EmaError(
-                    f"{path}: unknown configuration '{name}'{did_you_mean(name, file.configurations)}"
-                )
+                hint = did_you_mean(name, file.configurations)
+                raise EmaError(f"{path}: unknown configuration '{name}'{hint}")
     try:
         for configuration in file.configurations:
             rig.system(configuration)

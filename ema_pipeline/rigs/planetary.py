@@ -1,8 +1,8 @@
 """Planetary gear: carrier, ring, sun and N planets in the plane, three coordinates each.
 
 Coordinates: x, y (fixed frame) and u = r·θ (at the base radius) of carrier, ring and sun; ζ (radial), η
-(tangential) and u of planet n, which sits at ψ_n = 2π(n-1)/N. Every mesh and bearing is a spring along the row
-of its stretch.
+(tangential) and u of planet n, which sits at ψ_n = 2π(n-1)/N. Every mesh and bearing is a spring along the
+row of its stretch.
 
 References
 ----------
@@ -86,8 +86,8 @@ def planetary(planets: int = 2, parameters: Mapping[str, Parameter] | None = Non
     planets : int
         Number of planets N ≥ 2, equally spaced.
     parameters : dict of str to Parameter, optional
-        Parameters that replace or join the default ones (see `default_parameters`, `extra_parameter`). Viscous
-        bearing coefficients without a `modal_damping_ratio` take its place.
+        Parameters that replace or join the default ones (see `default_parameters`, `extra_parameter`).
+        Viscous bearing coefficients without a `modal_damping_ratio` take its place.
 
     Raises
     ------
@@ -155,7 +155,11 @@ def planet_bearing_rows(planet: int, psi: float) -> dict[str, Row]:
 
 
 def _build(planets: int, configuration: str, values: Mapping[str, float]) -> Assembly:
-    """Elements are named ``carrier mass x``, ``carrier bearing x``, ``planet1 bearing radial``, ``sun-planet1 mesh`` …"""
+    """Elements of one configuration.
+
+    Names: ``carrier mass x``, ``carrier bearing x``, ``planet1 bearing radial``, ``sun-planet1 mesh`` …; effects
+    find them by these names.
+    """
     central = CENTRAL if configuration == "with_ring" else ("carrier", "sun")
     alpha = np.deg2rad(values["pressure_angle_deg"])
     dofs: list[str] = []
@@ -186,10 +190,10 @@ def _build(planets: int, configuration: str, values: Mapping[str, float]) -> Ass
 
         for axis, quantity in (("zeta", "mass"), ("eta", "mass"), ("u", "inertia")):
             elements.append(Mass(f"{p} mass {axis}", {f"{p}.{axis}": 1.0}, own(quantity)))
-        for axis, row in planet_bearing_rows(n, psi).items():
-            elements.append(Spring(f"{p} bearing {axis}", row, own("bearing_stiffness")))
+        for axis, stretch in planet_bearing_rows(n, psi).items():
+            elements.append(Spring(f"{p} bearing {axis}", stretch, own("bearing_stiffness")))
             if own("bearing_damping"):
-                elements.append(Damper(f"{p} bearing {axis} damper", row, own("bearing_damping")))
+                elements.append(Damper(f"{p} bearing {axis} damper", stretch, own("bearing_damping")))
         for gear, mesh_row in (("sun", sun_mesh_row), ("ring", ring_mesh_row)):
             if gear in central:
                 common = values[f"{gear}_planet_mesh_stiffness"]

@@ -1,0 +1,114 @@
+"""The library of effects: every module of this package that defines ``EFFECT``, and the user's own files."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import pkgutil
+from collections.abc import Iterable, Mapping
+from functools import cache
+from pathlib import Path
+
+import ema_pipeline.effects as package
+from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.rigs.types import Rig
+
+Library = Mapping[str, Effect]
+
+
+@cache
+def shipped_effects() -> dict[str, Effect]:
+    """Effects that ship with the product, by id."""
+    found = {}
+    for module in pkgutil.iter_modules(package.__path__):
+        effect = getattr(importlib.import_module(f"{package.__name__}.{module.name}"), "EFFECT", None)
+        if isinstance(effect, Effect):
+            found[effect.id] = effect
+    return found
+
+
+def load_effect_file(path: str | Path) -> Effect:
+    """The effect of the user's own Python file, which defines ``EFFECT = Effect(...)``.
+
+    Raises
+    ------
+    EmaError
+        If the file is missing, does not run or has no ``EFFECT``.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise EmaError(f"{path}: no such effect file")
+    digest = hashlib.sha1(str(path.resolve()).encode()).hexdigest()[:8]
+    spec = importlib.util.spec_from_file_location(f"ema_user_effect_{path.stem}_{digest}", path)
+    if spec is None or spec.loader is None:
+        raise EmaError(f"{path}: is no Python file; an effect file ends in .py")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:  # whatever a user's file raises is shown as one line
+        raise EmaError(f"{path}: does not run: {type(error).__name__}: {error}") from None
+    effect = getattr(module, "EFFECT", None)
+    if not isinstance(effect, Effect):
+        raise EmaError(f"{path}: defines no EFFECT = Effect(...)")
+    return effect
+
+
+def effect_library(files: Iterable[str | Path] = ()) -> dict[str, Effect]:
+    """Shipped effects and those of the user's files; an id may not be taken twice."""
+    library = dict(shipped_effects())
+    for file in files:
+        effect = load_effect_file(file)
+        if effect.id in library:
+            raise EmaError(f"{file}: effect id '{effect.id}' is already taken; choose another id")
+        library[effect.id] = effect
+    return library
+
+
+def effect_ids(library: Library | None = None) -> tuple[str, ...]:
+    """Ids of all effects, sorted."""
+    return tuple(sorted(shipped_effects() if library is None else library))
+
+
+def get_effect(effect_id: str, library: Library | None = None) -> Effect:
+    """The effect of that id; EmaError with a hint for unknown ones."""
+    known = shipped_effects() if library is None else library
+    if effect_id not in known:
+        raise EmaError(f"no effect '{effect_id}'{did_you_mean(effect_id, known)}")
+    return known[effect_id]
+
+
+def parse_effect(
+    text: str, rig: Rig, configuration: str | None = None, library: Library | None = None
+) -> PlacedEffect:
+    """Read ``id@place`` and check that the rig has the place.
+
+    Parameters
+    ----------
+    text : str
+        E.g. ``"mesh_stiffness_loss@sun-planet1"``.
+    rig : Rig
+    configuration : str, optional
+        Where the place must exist; in any of the rig's configurations where left out.
+    library : dict of str to Effect, optional
+        The shipped effects where left out.
+
+    Raises
+    ------
+    EmaError
+        For a wrong form, an unknown effect or a place that the rig does not have.
+    """
+    effect_id, at, place = text.strip().partition("@")
+    if not at or not effect_id or not place:
+        raise EmaError(f"'{text}' is not of the form effect@place, e.g. 'sensor_mass@all'")
+    effect = get_effect(effect_id.strip(), library)
+    place = place.strip()
+    configurations = rig.configurations if configuration is None else (configuration,)
+    assemblies = [rig.assembly(c) for c in configurations]
+    if not any(effect.fits(a, place) for a in assemblies):
+        known = dict.fromkeys(p for a in assemblies for p in effect.find_places(a))
+        where = f" in configuration '{configuration}'" if configuration is not None else ""
+        hint = did_you_mean(place, known) if known else "; the rig has no place for this effect"
+        raise EmaError(f"effect '{effect.id}' cannot sit at '{place}' of rig '{rig.name}'{where}{hint}")
+    return PlacedEffect(effect, place)

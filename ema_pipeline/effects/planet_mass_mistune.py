@@ -1,0 +1,29 @@
+"""One planet is heavier than the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ema_pipeline.effects.base import Effect, EffectParameter
+from ema_pipeline.effects.places import planets
+from ema_pipeline.mechanics.assembly import Assembly, Mass
+
+
+def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
+    axes = [d for d in assembly.coordinates(place) if not d.endswith(".u")]
+    return assembly.add(*(Mass(f"{d} mistuned mass", {d: 1.0}, values["mass"]) for d in axes))
+
+
+EFFECT = Effect(
+    id="planet_mass_mistune",
+    title="one planet heavier than the others",
+    parameters=(
+        EffectParameter(
+            "mass", "kg", 0.0, 0.04, 0.05, -0.2, 1.0, "mass added at the planet's centre (I/r² stays)"
+        ),
+    ),
+    find_places=planets,
+    edit=_edit,
+    signs="mode pairs split; a mode leans to one planet, more so at high frequency",
+    reference="D. R. Kiracofe, R. G. Parker, J. Vib. Acoust. 129 (2007) 1-16",
+)
