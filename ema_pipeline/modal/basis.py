@@ -1,0 +1,73 @@
+"""Functions of frequency that modes and out-of-band modes add to an accelerance.
+
+A mode with pole s adds Q/(jω − s) + Q*/(jω − s*), with Q = s²A where A is its receptance residue; the
+difference to −ω²(A/(jω − s) + …) is a constant, which the residual terms hold. A record of finite length T
+cuts the response off: the transform of the cut tail is known in closed form, so that the basis
+
+    u(ω; s) = (1 − exp((s − jω)(T − t₀))) / (jω − s)
+
+is exact for records that have not decayed, with t₀ the time of the hit within the record.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Complex = NDArray[np.complex128]
+Real = NDArray[np.float64]
+
+
+def pole_functions(omega: Real, poles: Complex, rest_s: float) -> tuple[Complex, Complex]:
+    """u(ω; s) and its derivative by s.
+
+    Parameters
+    ----------
+    omega : ndarray, (n_lines,)
+        rad/s.
+    poles : complex ndarray, (n_poles,)
+        rad/s.
+    rest_s : float
+        Time from the hit to the end of the record, s; ``inf`` for a decayed record.
+
+    Returns
+    -------
+    u, du : complex ndarray, (n_poles, n_lines)
+    """
+    delta = 1j * omega - poles[:, None]
+    inverse = 1.0 / delta
+    if not np.isfinite(rest_s):
+        return inverse, inverse**2
+    tail = np.exp(np.minimum(poles.real[:, None] * rest_s, 30.0) + 1j * (poles.imag[:, None] - omega) * rest_s)
+    u = (1.0 - tail) * inverse
+    return u, u * inverse - rest_s * tail * inverse
+
+
+def real_columns(omega: Real, poles: Complex, rest_s: float) -> tuple[Complex, Complex]:
+    """Columns that real and imaginary parts of a residue multiply, and the same for du/ds.
+
+    Returns
+    -------
+    columns, derivatives : complex ndarray, (2·n_poles, n_lines)
+        Rows 2r and 2r+1 belong to the real and imaginary part of mode r: Q gives Re Q · row 2r + Im Q · row 2r+1.
+    """
+    u, du = pole_functions(omega, poles, rest_s)
+    uc, duc = pole_functions(omega, poles.conj(), rest_s)
+    shape = (2 * len(poles), len(omega))
+    columns = np.stack([u + uc, 1j * (u - uc)], axis=1).reshape(shape)
+    derivatives = np.stack([du + duc, 1j * (du - duc)], axis=1).reshape(shape)
+    return columns, derivatives
+
+
+def residual_columns(omega: Real) -> Complex:
+    """Terms of modes outside the band: mass line (constant) and stiffness line (ω²), each complex.
+
+    Returns
+    -------
+    ndarray, (4, n_lines)
+        Real and imaginary constants, real and imaginary ω², scaled to order 1 in the band.
+    """
+    one = np.ones_like(omega)
+    square = (omega / omega[-1]) ** 2
+    centred = square - square.mean()
+    return np.stack([one, 1j * one, centred, 1j * centred]).astype(np.complex128)

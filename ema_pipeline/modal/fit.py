@@ -1,0 +1,273 @@
+"""Separable least squares: poles and participations are searched, shapes and residual terms follow linearly.
+
+The model of row o and reference i is
+
+    H_oi(ω) = Σ_r [ψ_ro l_ri u(ω; s_r) + conj. pole] + residual terms of (o, i),
+
+which keeps every residue of rank one (reciprocity, and the only way to part both modes of a repeated pole).
+For given poles s and participations l the rest is linear and independent from row to row. All that the
+Gauss–Newton step needs are weighted Gram matrices of a few functions of frequency, which one matrix product
+gives for all FRFs.
+
+References
+----------
+Golub & Pereyra, "Separable nonlinear least squares: the variable projection method and its applications",
+Inverse Problems 19, 2003.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.modal.basis import real_columns, residual_columns
+from ema_pipeline.modal.data import FitData
+
+Complex = NDArray[np.complex128]
+Real = NDArray[np.float64]
+
+RIDGE = 1e-12
+"""Relative ridge that keeps Gram matrices of coinciding poles solvable."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Nonlinear parameters: poles, and participations with their largest entry 1.
+
+    Attributes
+    ----------
+    poles : complex ndarray, (n_modes,)
+    participation : complex ndarray, (n_modes, n_references)
+    """
+
+    poles: Complex
+    participation: Complex
+
+    def take(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> Estimate:
+        """The modes that `keep` picks."""
+        return Estimate(self.poles[keep], self.participation[keep])
+
+    def joined(self, other: Estimate) -> Estimate:
+        """Modes of both, by frequency."""
+        poles = np.concatenate([self.poles, other.poles])
+        parts = np.concatenate([self.participation, other.participation])
+        order = np.argsort(poles.imag, kind="stable")
+        return Estimate(poles[order], parts[order])
+
+
+@dataclass(frozen=True)
+class LinearSolution:
+    """Shapes and residual terms that fit best for given poles and participations.
+
+    Attributes
+    ----------
+    shapes : complex ndarray, (n_rows, n_modes)
+    gram : ndarray, (n_rows, n_reference, 4·n_modes, 4·n_modes)
+        Gram matrix of mode columns and their derivatives, residual terms projected out.
+    moment : ndarray, (n_rows, n_references, 4·n_modes)
+        The same columns against the data.
+    normal : ndarray, (n_rows, 2·n_modes, 2·n_modes)
+        Normal matrix of the shapes.
+    cost : float
+        Weighted sum of squares of the residual.
+    """
+
+    shapes: Complex
+    gram: Real
+    moment: Real
+    normal: Real
+    cost: float
+
+
+def normalised(participation: Complex) -> Complex:
+    """Scale each row so that its largest entry is 1."""
+    pivot = np.argmax(np.abs(participation), axis=1)
+    return np.asarray(participation / participation[np.arange(len(pivot)), pivot][:, None])
+
+
+def rotation(values: Complex) -> Real:
+    """2 × 2 matrices that multiply (Re, Im) by complex numbers, shape (..., 2, 2)."""
+    re, im = values.real, values.imag
+    return np.stack([np.stack([re, -im], axis=-1), np.stack([im, re], axis=-1)], axis=-2)
+
+
+def mixing(participation: Complex) -> Real:
+    """Block-diagonal matrices that turn shape entries into residues, (n_references, 2M, 2M)."""
+    n_modes, n_ref = participation.shape
+    out = np.zeros((n_ref, n_modes, 2, n_modes, 2))
+    k = np.arange(n_modes)
+    out[:, k, :, k, :] = rotation(participation)
+    return out.reshape(n_ref, 2 * n_modes, 2 * n_modes)
+
+
+def weighted_grams(columns: Complex, weight: Real, data: Complex) -> tuple[Real, Real]:
+    """Re(Eᴴ W E) and Re(Eᴴ W y) for every FRF.
+
+    Parameters
+    ----------
+    columns : complex ndarray, (n_columns, n_lines)
+    weight : ndarray, (n_frfs, n_lines)
+    data : complex ndarray, (n_frfs, n_lines)
+
+    Returns
+    -------
+    gram : ndarray, (n_frfs, n_columns, n_columns)
+    moment : ndarray, (n_frfs, n_columns)
+    """
+    n = len(columns)
+    upper = np.triu_indices(n)
+    re, im = np.ascontiguousarray(columns.real), np.ascontiguousarray(columns.imag)
+    products = re[upper[0]] * re[upper[1]]
+    products += im[upper[0]] * im[upper[1]]
+    packed = weight @ products.T
+    gram = np.empty((len(weight), n, n))
+    gram[:, upper[0], upper[1]] = packed
+    gram[:, upper[1], upper[0]] = packed
+    moment = (weight * data.real) @ re.T + (weight * data.imag) @ im.T
+    return gram, moment
+
+
+def solve_linear(data: FitData, weight: Real, estimate: Estimate) -> LinearSolution:
+    """Best shapes and residual terms for given poles and participations.
+
+    Parameters
+    ----------
+    data : FitData
+    weight : ndarray, (n_rows, n_references, n_lines)
+        One over variance; 0 where not measured.
+    estimate : Estimate
+    """
+    n_rows, n_ref, n_lines = data.frf.shape
+    m = len(estimate.poles)
+    columns, derivatives = real_columns(data.omega, estimate.poles, data.rest_s)
+    residual = residual_columns(data.omega)
+    everything = np.concatenate([columns, derivatives, residual])
+    flat_weight = weight.reshape(-1, n_lines)
+    flat = data.frf.reshape(-1, n_lines)
+    gram, moment = weighted_grams(everything, flat_weight, flat)
+    power = np.einsum("fl,fl->f", flat_weight, flat.real**2 + flat.imag**2)
+    gram, moment, power = _project_out(gram, moment, power, 4 * m)
+    gram = gram.reshape(n_rows, n_ref, 4 * m, 4 * m)
+    moment = moment.reshape(n_rows, n_ref, 4 * m)
+    mix = mixing(estimate.participation)
+    normal = np.einsum("iba,oibc,icd->oad", mix, gram[:, :, : 2 * m, : 2 * m], mix, optimize=True)
+    right = np.einsum("iba,oib->oa", mix, moment[:, :, : 2 * m])
+    solved = _solve_scaled(normal, right[..., None])[..., 0]
+    cost = float(power.sum() - np.einsum("oa,oa->", right, solved))
+    shapes = solved[:, 0::2] + 1j * solved[:, 1::2]
+    return LinearSolution(shapes, gram, moment, normal, cost)
+
+
+def _project_out(gram: Real, moment: Real, power: Real, keep: int) -> tuple[Real, Real, Real]:
+    """Eliminate the columns after `keep` (the residual terms) from the normal equations."""
+    corner = gram[:, keep:, keep:]
+    side = np.concatenate([gram[:, keep:, :keep], moment[:, keep:, None]], axis=-1)
+    solved = _solve_scaled(corner, side)
+    gram_out = gram[:, :keep, :keep] - np.matmul(side[:, :, :-1].transpose(0, 2, 1), solved[:, :, :-1])
+    moment_out = moment[:, :keep] - np.einsum("fka,fk->fa", side[:, :, :-1], solved[:, :, -1])
+    power_out = power - np.einsum("fk,fk->f", moment[:, keep:], solved[:, :, -1])
+    return gram_out, moment_out, power_out
+
+
+def _solve_scaled(matrix: Real, right: Real) -> Real:
+    """Solve symmetric systems, columns scaled to unit diagonal; rows without data give 0."""
+    diagonal = np.einsum("...aa->...a", matrix)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = matrix * scale[..., :, None] * scale[..., None, :]
+    n = matrix.shape[-1]
+    index = np.arange(n)
+    scaled[..., index, index] += RIDGE + (diagonal <= 0)
+    return np.asarray(np.linalg.solve(scaled, right * scale[..., None]) * scale[..., None])
+
+
+@dataclass(frozen=True)
+class Step:
+    """Reduced normal equations of the nonlinear parameters.
+
+    Attributes
+    ----------
+    information : ndarray, (n_parameters, n_parameters)
+        Information matrix, shapes and residual terms eliminated.
+    gradient : ndarray, (n_parameters,)
+    """
+
+    information: Real
+    gradient: Real
+
+
+def parameter_columns(estimate: Estimate, shapes: Complex) -> Real:
+    """How each nonlinear parameter acts on the columns of a row and reference.
+
+    Parameters are (Re s, Im s) of all modes, then (Re l, Im l) of the entries of the participations that are
+    not their mode's pivot.
+
+    Returns
+    -------
+    ndarray, (n_rows, n_references, 4M, n_parameters)
+    """
+    m, n_ref = estimate.participation.shape
+    n_rows = len(shapes)
+    free = free_participations(estimate)
+    out = np.zeros((n_rows, n_ref, 4 * m, 2 * m + 2 * len(free)))
+    residues = shapes[:, None, :] * estimate.participation.T[None]  # (rows, refs, modes)
+    rot = rotation(residues)
+    for r in range(m):
+        out[:, :, 2 * m + 2 * r : 2 * m + 2 * r + 2, 2 * r : 2 * r + 2] = rot[:, :, r]
+    for k, (r, i) in enumerate(free):
+        start = 2 * m + 2 * k
+        out[:, i, 2 * r : 2 * r + 2, start : start + 2] = rotation(shapes[:, r])
+    return out
+
+
+def free_participations(estimate: Estimate) -> list[tuple[int, int]]:
+    """(mode, reference) of the participations that are searched: all but each mode's largest."""
+    pivot = np.argmax(np.abs(estimate.participation), axis=1)
+    m, n_ref = estimate.participation.shape
+    return [(r, i) for r in range(m) for i in range(n_ref) if i != pivot[r]]
+
+
+def newton_step(estimate: Estimate, solution: LinearSolution) -> Step:
+    """Gauss–Newton information matrix and gradient at the best linear solution."""
+    m = len(estimate.poles)
+    mix = mixing(estimate.participation)
+    z = parameter_columns(estimate, solution.shapes)
+    gz = np.matmul(solution.gram, z)
+    jj = np.tensordot(z, gz, axes=([0, 1, 2], [0, 1, 2]))
+    cross = np.einsum("iba,oibp->oap", mix, gz[:, :, : 2 * m], optimize=True)
+    eliminated = _solve_scaled(solution.normal, cross)
+    information = jj - np.tensordot(cross, eliminated, axes=([0, 1], [0, 1]))
+    psi = np.stack([solution.shapes.real, solution.shapes.imag], axis=-1).reshape(len(solution.shapes), 2 * m)
+    coefficients = np.einsum("iab,ob->oia", mix, psi)
+    misfit = solution.moment - np.einsum("oiab,oib->oia", solution.gram[..., : 2 * m], coefficients)
+    gradient = np.einsum("oiap,oia->p", z, misfit, optimize=True)
+    return Step(0.5 * (information + information.T), gradient)
+
+
+def moved(estimate: Estimate, change: Real) -> Estimate:
+    """Estimate after a change of its parameters."""
+    m = len(estimate.poles)
+    poles = estimate.poles + change[0 : 2 * m : 2] + 1j * change[1 : 2 * m : 2]
+    participation = estimate.participation.copy()
+    for k, (r, i) in enumerate(free_participations(estimate)):
+        participation[r, i] += change[2 * m + 2 * k] + 1j * change[2 * m + 2 * k + 1]
+    return Estimate(poles, participation)
+
+
+def synthesis(data: FitData, estimate: Estimate, shapes: Complex) -> Complex:
+    """What the modes alone add to the FRFs, (n_rows, n_references, n_lines)."""
+    columns, _ = real_columns(data.omega, estimate.poles, data.rest_s)
+    residues = shapes[:, None, :] * estimate.participation.T[None]
+    return np.asarray(residues.real @ columns[0::2] + residues.imag @ columns[1::2])
+
+
+def residual_fit(data: FitData, weight: Real, modes: Complex) -> Complex:
+    """Best residual terms for what the modes leave over, (n_rows, n_references, n_lines)."""
+    columns = residual_columns(data.omega)
+    n_lines = data.frf.shape[-1]
+    gram, moment = weighted_grams(
+        columns, weight.reshape(-1, n_lines), (data.frf - modes).reshape(-1, n_lines)
+    )
+    coefficients = _solve_scaled(gram, moment[..., None])[..., 0]
+    return np.asarray((coefficients @ columns).reshape(data.frf.shape))

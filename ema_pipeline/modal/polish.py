@@ -1,0 +1,93 @@
+"""Refine poles and participations on the FRFs, with step control."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.fit import (
+    Estimate,
+    LinearSolution,
+    moved,
+    newton_step,
+    normalised,
+    solve_linear,
+)
+
+Real = NDArray[np.float64]
+
+MAX_ITERATIONS = 25
+LARGEST_STEP = 0.5
+"""A pole moves by at most this share of its decay rate per iteration."""
+
+CONVERGED = 1e-5
+"""Stop when no pole moves by more than this share of its decay rate."""
+
+
+def polish(
+    data: FitData, weight: Real, start: Estimate, iterations: int = MAX_ITERATIONS
+) -> tuple[Estimate, LinearSolution]:
+    """Levenberg–Marquardt on poles and participations, shapes and residual terms eliminated.
+
+    Parameters
+    ----------
+    data : FitData
+    weight : ndarray, (n_rows, n_references, n_lines)
+        One over variance; 0 where not measured.
+    start : Estimate
+    iterations : int
+
+    Returns
+    -------
+    Estimate, LinearSolution
+        The best found; the start where no step improves it.
+    """
+    estimate = Estimate(start.poles, normalised(start.participation))
+    solution = solve_linear(data, weight, estimate)
+    damping = 1e-3
+    for _ in range(iterations):
+        step = newton_step(estimate, solution)
+        diagonal = np.diag(step.information).copy()
+        diagonal = np.where(diagonal > 0, diagonal, 1.0)
+        scale = 1 / np.sqrt(diagonal)
+        accepted = False
+        change = np.zeros(len(diagonal))
+        for _ in range(6):
+            scaled = step.information * scale[:, None] * scale[None]
+            scaled[np.diag_indices_from(scaled)] += damping
+            change = scale * np.linalg.lstsq(scaled, scale * step.gradient, rcond=1e-13)[0]
+            change = _limited(estimate, change)
+            trial = moved(estimate, change)
+            trial_solution = solve_linear(data, weight, trial)
+            if trial_solution.cost < solution.cost:
+                accepted = True
+                break
+            damping = max(10 * damping, 1e-6)
+        if not accepted:
+            break
+        gain = (solution.cost - trial_solution.cost) / max(solution.cost, 1e-300)
+        estimate, solution = trial, trial_solution
+        damping *= 0.1
+        m = len(estimate.poles)
+        moves = np.hypot(change[0 : 2 * m : 2], change[1 : 2 * m : 2]) / np.abs(estimate.poles.real)
+        if moves.max() < CONVERGED or gain < 1e-12:
+            break
+        pivoted = normalised(estimate.participation)
+        if np.max(np.abs(estimate.participation)) > 1.5:
+            estimate = Estimate(estimate.poles, pivoted)
+            solution = solve_linear(data, weight, estimate)
+    return estimate, solution
+
+
+def _limited(estimate: Estimate, change: Real) -> Real:
+    """Shorten the step of every pole to a share of its decay rate; participations to order one."""
+    m = len(estimate.poles)
+    out = change.copy()
+    size = np.hypot(out[0 : 2 * m : 2], out[1 : 2 * m : 2])
+    allowed = LARGEST_STEP * np.abs(estimate.poles.real)
+    factor = np.minimum(1.0, allowed / np.maximum(size, 1e-300))
+    out[0 : 2 * m : 2] *= factor
+    out[1 : 2 * m : 2] *= factor
+    out[2 * m :] = np.clip(out[2 * m :], -1.0, 1.0)
+    return out
