@@ -1,0 +1,124 @@
+"""Measured modes as the comparison with a model needs them, from an identification or from a plain table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.correlate.settings import UncertaintySettings
+from ema_pipeline.dof import Dof
+from ema_pipeline.errors import EmaError
+from ema_pipeline.modal.types import ModalModel
+
+
+@dataclass(frozen=True)
+class MeasuredModes:
+    """The measured modes of one configuration.
+
+    Attributes
+    ----------
+    configuration : str
+    frequency_hz, frequency_std_hz : ndarray, (n_modes,)
+        In ascending order; the standard deviation is NaN where unknown.
+    damping_ratio, damping_std : ndarray, (n_modes,)
+        NaN where not measured.
+    shapes : complex ndarray, (n_modes, n_dofs), or None
+        NaN where not measured; None where only frequencies are known.
+    shape_std : ndarray, (n_modes, n_dofs), or None
+        Standard deviation of each entry, per real or imaginary part.
+    dofs : tuple of Dof
+    scaled : bool
+        True where shapes are mass-normalised.
+    band_hz : tuple of float, or None
+        Band in which modes were looked for; None where unknown.
+    references : tuple of Dof
+        Points at which the rig was struck; empty where unknown.
+    """
+
+    configuration: str
+    frequency_hz: NDArray[np.float64]
+    frequency_std_hz: NDArray[np.float64]
+    damping_ratio: NDArray[np.float64]
+    damping_std: NDArray[np.float64]
+    shapes: NDArray[np.complex128] | None = None
+    shape_std: NDArray[np.float64] | None = None
+    dofs: tuple[Dof, ...] = ()
+    scaled: bool = False
+    band_hz: tuple[float, float] | None = None
+    references: tuple[Dof, ...] = ()
+
+    def __len__(self) -> int:
+        return int(self.frequency_hz.size)
+
+
+def from_modal_model(model: ModalModel, configuration: str) -> MeasuredModes:
+    """Collect an identified modal model into arrays."""
+    modes = model.modes
+    n_dofs = len(model.dofs)
+    return MeasuredModes(
+        configuration=configuration,
+        frequency_hz=np.array([m.frequency_hz for m in modes], dtype=float),
+        frequency_std_hz=np.array([m.frequency_std_hz for m in modes], dtype=float),
+        damping_ratio=np.array([m.damping_ratio for m in modes], dtype=float),
+        damping_std=np.array([m.damping_std for m in modes], dtype=float),
+        shapes=np.array([m.shape for m in modes], dtype=complex).reshape(-1, n_dofs),
+        shape_std=np.array([m.shape_std for m in modes], dtype=float).reshape(-1, n_dofs),
+        dofs=model.dofs,
+        scaled=model.scaled,
+        band_hz=model.band_hz,
+        references=model.references,
+    )
+
+
+def from_frequencies(
+    configuration: str,
+    frequency_hz: Sequence[float] | NDArray[np.float64],
+    frequency_std_hz: Sequence[float] | NDArray[np.float64] | None = None,
+) -> MeasuredModes:
+    """Measured modes from a plain table of frequencies, as a paper prints them.
+
+    Raises
+    ------
+    EmaError
+        If a frequency is not positive, or the two columns differ in length.
+    """
+    frequency = np.asarray(frequency_hz, dtype=float)
+    std = np.full(frequency.shape, np.nan) if frequency_std_hz is None else np.asarray(frequency_std_hz, float)
+    if frequency.ndim != 1 or std.shape != frequency.shape:
+        raise EmaError(f"{configuration}: {std.size} standard deviations for {frequency.size} frequencies")
+    if not np.all(np.isfinite(frequency) & (frequency > 0)):
+        raise EmaError(f"{configuration}: measured frequencies must be positive numbers in Hz; got {frequency}")
+    order = np.argsort(frequency, kind="stable")
+    unknown = np.full(frequency.shape, np.nan)
+    return MeasuredModes(configuration, frequency[order], std[order], unknown, unknown.copy())
+
+
+def with_floors(measured: MeasuredModes, settings: UncertaintySettings) -> MeasuredModes:
+    """Standard uncertainties for comparison with a model: the test's scatter and the floors, root sum of squares.
+
+    Standard deviations that are missing (NaN, zero or negative) are replaced by the assumed ones.
+    """
+    frequency, damping = measured.frequency_hz, measured.damping_ratio
+    frequency_std = _or_assumed(measured.frequency_std_hz, settings.frequency_std_assumed * frequency)
+    damping_std = _or_assumed(measured.damping_std, settings.damping_std_assumed * np.abs(damping))
+    shape_std = None
+    if measured.shapes is not None:
+        size = np.max(np.nan_to_num(np.abs(measured.shapes)), axis=1, keepdims=True, initial=0.0)
+        size = np.broadcast_to(size, measured.shapes.shape)
+        given = np.full(measured.shapes.shape, np.nan) if measured.shape_std is None else measured.shape_std
+        std = _or_assumed(given, settings.shape_std_assumed * size)
+        shape_std = np.hypot(std, settings.shape_floor * size)
+    return replace(
+        measured,
+        frequency_std_hz=np.hypot(frequency_std, settings.frequency_floor * frequency),
+        damping_std=np.hypot(damping_std, settings.damping_floor * np.abs(damping)),
+        shape_std=shape_std,
+    )
+
+
+def _or_assumed(std: NDArray[np.float64], assumed: NDArray[np.float64]) -> NDArray[np.float64]:
+    known = np.isfinite(std) & (std > 0)
+    return np.where(known, np.where(known, std, 1.0), assumed)
