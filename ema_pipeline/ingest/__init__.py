@@ -1,0 +1,27 @@
+"""From a raw folder to records in SI units: test description, readers per format, scaling, drafting."""
+
+from __future__ import annotations
+
+from ema_pipeline.ingest.description import (
+    Campaign,
+    ChannelDescription,
+    RecordDescription,
+    TestDescription,
+    read_campaign,
+    read_description,
+)
+from ema_pipeline.ingest.load import load_channels, load_record, load_records
+from ema_pipeline.ingest.readers import read_raw
+
+__all__ = [
+    "Campaign",
+    "ChannelDescription",
+    "RecordDescription",
+    "TestDescription",
+    "load_channels",
+    "load_record",
+    "load_records",
+    "read_campaign",
+    "read_description",
+    "read_raw",
+]

@@ -1,0 +1,364 @@
+"""The test description: what ``test.toml`` says about channels, records and the rig's configuration."""
+
+from __future__ import annotations
+
+import tomllib
+from collections import Counter
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, Field
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.settings import Settings, parse
+from ema_pipeline.units import SI_SYMBOL, Unit, parse_unit
+
+DESCRIPTION_FILE = "test.toml"
+RIG_FILE = "rig.toml"
+
+Quantity = Literal["force", "acceleration", "velocity", "displacement"]
+
+
+def _parse_dof(value: Any) -> Dof:
+    if isinstance(value, Dof):
+        return value
+    if not isinstance(value, str):
+        raise ValueError("a dof is text of the form body.direction, e.g. 'sun.x'")
+    try:
+        return Dof.parse(value)
+    except EmaError as error:
+        raise ValueError(str(error)) from None
+
+
+DofText = Annotated[Dof, BeforeValidator(_parse_dof)]
+
+
+class ChannelDescription(Settings):
+    """One ``[[channels]]`` table: a column, dataset or channel of the record files."""
+
+    name: str = Field(
+        min_length=1, description="CSV column, HDF5 dataset, MAT variable, TDMS channel, UFF58 id1"
+    )
+    quantity: Quantity = Field(description="What the sensor measures")
+    unit: str = Field(description="Engineering unit of the channel")
+    sensitivity_mv: float | None = Field(
+        default=None, gt=0, description="mV per unit; left out: the file is in `unit` already"
+    )
+    dof: DofText | None = Field(default=None, description="Where and which way; '-' in front for reversed")
+    sensor_mass_kg: float = Field(default=0.0, ge=0, description="Mass of the sensor")
+    full_scale: float | None = Field(
+        default=None, gt=0, description="Largest value that the input can carry, in `unit`"
+    )
+    full_scale_v: float | None = Field(
+        default=None, gt=0, description="Largest voltage that the converter can carry"
+    )
+    uncalibrated: bool = Field(
+        default=False, description="Force channel left in volts on purpose: FRFs and shapes are unscaled"
+    )
+
+    @property
+    def parsed_unit(self) -> Unit:
+        """The channel's unit, looked up."""
+        return parse_unit(self.unit)
+
+
+class RecordDescription(Settings):
+    """One ``[[records]]`` table: a record file, and what was done while it was recorded."""
+
+    file: str = Field(min_length=1, description="Record file, relative to the folder of test.toml")
+    impact: DofText | None = Field(default=None, description="Dof that the hammer strikes")
+    dofs: dict[str, DofText] = Field(
+        default_factory=dict, description="Roving sensors: overrides the channels' dofs for this record"
+    )
+    frequency_hz: float | None = Field(default=None, gt=0, description="Sine frequency (hysteresis tests)")
+    amplitude_m: float | None = Field(
+        default=None, gt=0, description="Displacement amplitude (hysteresis tests)"
+    )
+
+
+class _TestFile(Settings):
+    """The keys of ``test.toml``."""
+
+    version: Literal[1] = Field(default=1, alias="schema", description="Version of this file's layout")
+    title: str = Field(default="", description="Free text")
+    kind: Literal["hammer", "hysteresis"] = Field(default="hammer", description="Kind of test")
+    rig: str | None = Field(default=None, description="Rig name or file; --rig wins")
+    configuration: str | None = Field(default=None, description="One of the rig's configurations")
+    sample_rate_hz: float | None = Field(
+        default=None, gt=0, description="Required unless the record files carry it"
+    )
+    channels: tuple[ChannelDescription, ...] = Field(description="Channels of the record files")
+    records: tuple[RecordDescription, ...] = Field(description="Record files")
+
+
+class TestDescription(_TestFile):
+    """One checked ``test.toml`` and the folder it lies in."""
+
+    __test__: ClassVar[bool] = False  # not a test case, whatever pytest makes of the name
+
+    folder: Path = Field(description="Folder that the record files are relative to")
+
+    @property
+    def file(self) -> Path:
+        """The description file itself."""
+        return self.folder / DESCRIPTION_FILE
+
+    @property
+    def force(self) -> ChannelDescription:
+        """The force channel."""
+        return next(c for c in self.channels if c.quantity == "force")
+
+    @property
+    def responses(self) -> tuple[ChannelDescription, ...]:
+        """All channels but the force, in the order of the file."""
+        return tuple(c for c in self.channels if c.quantity != "force")
+
+    def dof_of(self, channel: ChannelDescription, record: RecordDescription) -> Dof | None:
+        """Where `channel` sat while `record` was taken."""
+        return record.dofs.get(channel.name, channel.dof)
+
+    def path_of(self, record: RecordDescription) -> Path:
+        """Path of a record file."""
+        return self.folder / record.file
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """All tests of a raw folder.
+
+    Attributes
+    ----------
+    root : Path
+        The raw folder.
+    tests : tuple of TestDescription
+        One per ``test.toml``; several tests have distinct configurations.
+    rig_file : Path or None
+        A ``rig.toml`` that lies beside the test descriptions.
+    """
+
+    root: Path
+    tests: tuple[TestDescription, ...]
+    rig_file: Path | None = None
+
+    @property
+    def rig(self) -> str | None:
+        """The rig that the tests name, if any."""
+        return next((t.rig for t in self.tests if t.rig is not None), None)
+
+
+def read_campaign(raw: Path) -> Campaign:
+    """Read a raw folder: one ``test.toml``, or sub-folders that hold one each.
+
+    Parameters
+    ----------
+    raw : Path
+        Folder with ``test.toml``, or with sub-folders that each hold one.
+
+    Raises
+    ------
+    EmaError
+        Where there is no such folder or no description in it, where a description is wrong, or where
+        the descriptions of a campaign contradict each other.
+    """
+    folders = description_folders(raw)
+    if not folders:
+        raise EmaError(f"{raw}: no test.toml here or in its sub-folders; 'ema init {raw}' drafts one")
+    tests = tuple(read_description(folder) for folder in folders)
+    if len(tests) > 1:
+        tests = tuple(
+            t if t.configuration else t.model_copy(update={"configuration": t.folder.name}) for t in tests
+        )
+    _check_campaign(raw, tests)
+    return Campaign(root=raw, tests=tests, rig_file=_find_rig_file(raw, folders))
+
+
+def description_folders(raw: Path) -> list[Path]:
+    """Return the folders of `raw` that hold a ``test.toml``: itself, or its sub-folders.
+
+    Raises
+    ------
+    EmaError
+        Where `raw` is not a folder, or holds a description beside sub-folders with descriptions.
+    """
+    if not raw.exists():
+        raise EmaError(f"{raw}: there is no such folder; give the folder that holds test.toml")
+    if not raw.is_dir():
+        raise EmaError(f"{raw}: is a file, not a folder; give the folder that holds test.toml")
+    below = sorted(p.parent for p in raw.glob(f"*/{DESCRIPTION_FILE}") if not p.parent.name.startswith("."))
+    if not (raw / DESCRIPTION_FILE).exists():
+        return below
+    if below:
+        raise EmaError(
+            f"{raw}: holds test.toml and so does its sub-folder '{below[0].name}'; keep one description per "
+            "folder, and for a campaign only those in the sub-folders"
+        )
+    return [raw]
+
+
+def read_description(folder: Path) -> TestDescription:
+    """Read and check the ``test.toml`` of one folder.
+
+    Raises
+    ------
+    EmaError
+        Where the file is not valid TOML, has unknown, missing or contradicting keys, or names record
+        files that are not there.
+    """
+    path = folder / DESCRIPTION_FILE
+    keys = parse(_TestFile, _read_toml(path), path)
+    test = TestDescription.model_construct(folder=folder, **dict(keys))
+    _check_channels(test)
+    _check_records(test)
+    return test
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise EmaError(f"{path}: cannot be read ({error.strerror})") from None
+    try:
+        return tomllib.loads(data.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise EmaError(f"{path}: line {line} is not UTF-8 text; save the file as UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise EmaError(f"{path}: not valid TOML: {error}") from None
+
+
+def _check_channels(test: TestDescription) -> None:
+    if not test.channels:
+        raise EmaError(f"{test.file}: no channels; add a [[channels]] table for each")
+    name, count = Counter(c.name for c in test.channels).most_common(1)[0]
+    if count > 1:
+        raise EmaError(f"{test.file}: channel '{name}' is described {count} times; keep one")
+    for channel in test.channels:
+        _check_channel(channel, f"{test.file}: channel '{channel.name}'")
+    forces = [c.name for c in test.channels if c.quantity == "force"]
+    if len(forces) != 1:
+        found = "none has" if not forces else f"{', '.join(forces)} have"
+        raise EmaError(f'{test.file}: exactly one channel must have quantity = "force"; {found} it')
+    if not test.responses:
+        raise EmaError(f"{test.file}: no response channel; add a [[channels]] table for each sensor")
+    if test.kind == "hysteresis" and not any(c.quantity == "displacement" for c in test.channels):
+        raise EmaError(f"{test.file}: a hysteresis test needs a channel with quantity 'displacement'")
+
+
+def _check_channel(channel: ChannelDescription, where: str) -> None:
+    try:
+        unit = channel.parsed_unit
+    except EmaError as error:
+        raise EmaError(f"{where}: {error}") from None
+    if channel.uncalibrated:
+        if channel.quantity != "force":
+            raise EmaError(f"{where}: only a force channel can be uncalibrated; give sensitivity_mv and unit")
+        if unit.quantity != "voltage" or channel.sensitivity_mv is not None:
+            raise EmaError(
+                f"{where}: uncalibrated = true means volts as recorded; "
+                f'write unit = "V" without sensitivity_mv, or drop uncalibrated'
+            )
+    elif unit.quantity == "voltage":
+        remedy = f"give sensitivity_mv (mV per {SI_SYMBOL[channel.quantity]}) and the engineering unit"
+        if channel.quantity == "force":
+            remedy += ", or uncalibrated = true to go on with unscaled FRFs and shapes"
+        raise EmaError(f"{where}: unit '{channel.unit}' is not a unit of {channel.quantity}; {remedy}")
+    elif unit.quantity != channel.quantity:
+        raise EmaError(
+            f"{where}: quantity is '{channel.quantity}' but unit '{channel.unit}' is one of {unit.quantity}; "
+            f"a unit of {channel.quantity} is e.g. '{SI_SYMBOL[channel.quantity]}'"
+        )
+    if channel.full_scale is not None and channel.full_scale_v is not None:
+        raise EmaError(f"{where}: give full_scale or full_scale_v, not both")
+
+
+def _check_records(test: TestDescription) -> None:
+    if not test.records:
+        raise EmaError(f"{test.file}: no records; add a [[records]] table for each record file")
+    seen: set[str] = set()
+    for record in test.records:
+        where = f"{test.file}: record '{record.file}'"
+        key = str(PurePosixPath(record.file))
+        if key in seen:
+            raise EmaError(f"{where}: is listed twice; its hits would count twice, keep one")
+        seen.add(key)
+        _check_file(test, record, where)
+        known = [c.name for c in test.channels]
+        for name in record.dofs:
+            if name not in known:
+                raise EmaError(f"{where}: dofs names an unknown channel '{name}'{did_you_mean(name, known)}")
+            if name == test.force.name and test.kind == "hammer":
+                raise EmaError(f"{where}: dofs names the hammer channel '{name}'; its dof is 'impact'")
+        (_check_hammer if test.kind == "hammer" else _check_sine)(test, record, where)
+
+
+def _check_file(test: TestDescription, record: RecordDescription, where: str) -> None:
+    relative = Path(record.file)
+    if relative.is_absolute() or ".." in relative.parts:
+        raise EmaError(f"{where}: lies outside {test.folder}; copy it there and name it without '..'")
+    path = test.path_of(record)
+    if not path.exists():
+        try:
+            others = [p.name for p in path.parent.iterdir() if p.is_file() and p.name != DESCRIPTION_FILE]
+        except OSError:
+            others = []
+        close = get_close_matches(path.name, others, n=1, cutoff=0.6)
+        hint = f" (did you mean '{close[0]}'?)" if close else ""
+        raise EmaError(f"{where}: there is no such file{hint}; correct 'file' or remove the record")
+    if not path.is_file():
+        raise EmaError(f"{where}: is a folder, not a file; name one record file")
+
+
+def _check_hammer(test: TestDescription, record: RecordDescription, where: str) -> None:
+    if record.impact is None:
+        raise EmaError(f'{where}: impact is missing; add the dof that the hammer strikes, impact = "sun.y"')
+    if record.frequency_hz is not None or record.amplitude_m is not None:
+        raise EmaError(f'{where}: frequency_hz and amplitude_m belong to kind = "hysteresis"; remove them')
+    taken: dict[str, str] = {}
+    for channel in test.responses:
+        dof = test.dof_of(channel, record)
+        if dof is None:
+            raise EmaError(
+                f"{where}: response channel '{channel.name}' has no dof; add dof to the channel or "
+                f'dofs = {{ {channel.name} = "body.direction" }} to the record'
+            )
+        if dof.point in taken:
+            raise EmaError(
+                f"{where}: channels '{taken[dof.point]}' and '{channel.name}' both measure {dof.point}; "
+                "correct one dof"
+            )
+        taken[dof.point] = channel.name
+
+
+def _check_sine(test: TestDescription, record: RecordDescription, where: str) -> None:
+    for key in ("frequency_hz", "amplitude_m"):
+        if getattr(record, key) is None:
+            raise EmaError(f"{where}: {key} is missing; a hysteresis record needs it")
+    if record.impact is not None:
+        raise EmaError(f"{where}: a hysteresis record has no impact; remove it or drop kind")
+
+
+def _check_campaign(raw: Path, tests: tuple[TestDescription, ...]) -> None:
+    seen: dict[str | None, TestDescription] = {}
+    for test in tests:
+        other = seen.setdefault(test.configuration, test)
+        if other is not test:
+            raise EmaError(
+                f"{raw}: '{other.folder.name}' and '{test.folder.name}' both describe configuration "
+                f"'{test.configuration}'; name them differently, or put their records under one test.toml"
+            )
+    rigs = sorted({t.rig for t in tests if t.rig is not None})
+    if len(rigs) > 1:
+        raise EmaError(f"{raw}: its tests name different rigs ({', '.join(rigs)}); one campaign has one rig")
+
+
+def _find_rig_file(raw: Path, folders: list[Path]) -> Path | None:
+    if (raw / RIG_FILE).is_file():
+        return raw / RIG_FILE
+    found = [folder / RIG_FILE for folder in folders if (folder / RIG_FILE).is_file()]
+    for other in found[1:]:
+        if other.read_bytes() != found[0].read_bytes():
+            raise EmaError(f"{found[0]} and {other} differ; put one rig.toml into {raw}")
+    return found[0] if found else None

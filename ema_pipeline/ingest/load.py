@@ -1,0 +1,267 @@
+"""Record files to records in SI units; nothing is scaled by a guess, every contradiction is an error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.ingest.description import ChannelDescription, RecordDescription, TestDescription
+from ema_pipeline.ingest.readers import read_raw
+from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord, split_unit
+from ema_pipeline.ingest.records import Record, ResponseChannel
+from ema_pipeline.ingest.swap import find_swap
+from ema_pipeline.units import Unit, find_unit
+
+MINIMUM_SAMPLES = 64
+"""A shorter record holds no hit with a spectrum worth the name."""
+
+RATE_TOLERANCE = 1e-4
+"""Relative difference up to which two statements of a sample rate mean the same."""
+
+
+@dataclass(frozen=True)
+class ScaledChannels:
+    """The described channels of one record file in SI.
+
+    Attributes
+    ----------
+    sample_rate_hz : float
+    samples : dict
+        Channel name to samples (n_samples,) in SI; volts for an uncalibrated force channel.
+    full_scale : dict
+        Channel name to the largest value that the input can carry, in the same units; ``inf`` if unknown.
+    """
+
+    sample_rate_hz: float
+    samples: dict[str, NDArray[np.float64]]
+    full_scale: dict[str, float]
+
+
+def load_records(test: TestDescription) -> Iterator[Record]:
+    """Load the records of a hammer test one after the other.
+
+    Raises
+    ------
+    EmaError
+        As `load_record`, and where sample rates differ between the records.
+    """
+    first: Record | None = None
+    for entry in test.records:
+        record = load_record(test, entry)
+        if first is None:
+            first = record
+        elif abs(record.sample_rate_hz / first.sample_rate_hz - 1) > RATE_TOLERANCE:
+            raise EmaError(
+                f"{test.path_of(entry)}: sample rate {record.sample_rate_hz:.10g} Hz differs from "
+                f"{first.sample_rate_hz:.10g} Hz of '{first.file}'; put it into a test of its own"
+            )
+        yield record
+
+
+def load_record(test: TestDescription, entry: RecordDescription) -> Record:
+    """Load one record of a hammer test and scale it to SI.
+
+    Parameters
+    ----------
+    test : TestDescription
+        The description that `entry` belongs to.
+    entry : RecordDescription
+        Which record.
+
+    Returns
+    -------
+    Record
+        Force in N (V where deliberately uncalibrated), responses in m/s², m/s or m.
+
+    Raises
+    ------
+    EmaError
+        Where the file cannot be read, lacks a channel, is too short, holds values that are no numbers,
+        contradicts the description (unit, sensitivity, sample rate), or where hammer and response are
+        swapped.
+    """
+    if entry.impact is None:
+        raise EmaError(f"{test.file}: record '{entry.file}' has no impact: it is no hammer record")
+    scaled = load_channels(test, entry)
+    force = scaled.samples[test.force.name]
+    responses = {c.name: scaled.samples[c.name] for c in test.responses}
+    swap = find_swap(force, responses)
+    if swap is not None:
+        raise EmaError(
+            f"{test.path_of(entry)}: channels '{test.force.name}' and '{swap.channel}' look swapped: "
+            f"'{swap.channel}' has 90 % of its energy in {swap.response_share:.2%} of its samples and on one "
+            f"side of zero, as a hammer has, while '{test.force.name}' rings ({swap.force_share:.1%}); "
+            "exchange their names in test.toml"
+        )
+    channels = []
+    for channel in test.responses:
+        dof = test.dof_of(channel, entry)
+        assert dof is not None, "checked when the description was read"
+        channels.append(
+            ResponseChannel(
+                name=channel.name,
+                dof=dof,
+                quantity=channel.quantity,
+                sensor_mass_kg=channel.sensor_mass_kg,
+                full_scale=scaled.full_scale[channel.name],
+            )
+        )
+    return Record(
+        file=entry.file,
+        impact=entry.impact,
+        sample_rate_hz=scaled.sample_rate_hz,
+        force_name=test.force.name,
+        force=force,
+        responses=np.vstack(list(responses.values())),
+        channels=tuple(channels),
+        force_full_scale=scaled.full_scale[test.force.name],
+        force_calibrated=not test.force.uncalibrated,
+    )
+
+
+def load_channels(test: TestDescription, entry: RecordDescription) -> ScaledChannels:
+    """Load the described channels of one record of any kind of test and scale them to SI.
+
+    Raises
+    ------
+    EmaError
+        As `load_record`, but for what is special to hammer tests.
+    """
+    path = test.path_of(entry)
+    raw = read_raw(path)
+    rate = _sample_rate(test, raw, str(path))
+    found = {c.name: _find_channel(c.name, raw, str(path)) for c in test.channels}
+    _check_lengths(found, str(path))
+    samples, full_scale = {}, {}
+    for channel in test.channels:
+        where = f"{path}: channel '{channel.name}'"
+        source = found[channel.name]
+        _check_finite(source.samples, rate, where)
+        factor = _factor(channel, source, where)
+        samples[channel.name] = np.asarray(source.samples * factor, dtype=np.float64)
+        full_scale[channel.name] = _full_scale(channel)
+    return ScaledChannels(rate, samples, full_scale)
+
+
+def _sample_rate(test: TestDescription, raw: RawRecord, where: str) -> float:
+    stated, found = test.sample_rate_hz, raw.sample_rate_hz
+    if stated is None and found is None:
+        raise EmaError(f"{where}: states no sample rate; add sample_rate_hz to {test.file}")
+    if stated is not None and found is not None and abs(found / stated - 1) > RATE_TOLERANCE:
+        raise EmaError(
+            f"{where}: sample rate is {found:.10g} Hz in the file but {stated:.10g} Hz in {test.file}; "
+            "correct sample_rate_hz or remove it"
+        )
+    return float(stated if stated is not None else found or 0.0)
+
+
+def _find_channel(name: str, raw: RawRecord, where: str) -> RawChannel:
+    for candidate in (name, split_unit(name)[0], name.strip("/").rsplit("/", 1)[-1]):
+        if candidate in raw.channels:
+            return raw.channels[candidate]
+    same = [known for known in raw.channels if known.casefold() == name.casefold()]
+    close = did_you_mean(name, raw.channels)
+    hint = f"did you mean '{same[0]}'? " if same else f"{close.strip(' ()')}; " if "mean" in close else ""
+    shown = ", ".join(list(raw.channels)[:30])
+    more = f" and {len(raw.channels) - 30} more" if len(raw.channels) > 30 else ""
+    raise EmaError(
+        f"{where}: has no channel '{name}' ({hint}the file holds: {shown}{more}); "
+        "correct the name in test.toml"
+    )
+
+
+def _check_lengths(found: dict[str, RawChannel], where: str) -> None:
+    sizes = {name: channel.samples.size for name, channel in found.items()}
+    short, long = min(sizes, key=lambda n: sizes[n]), max(sizes, key=lambda n: sizes[n])
+    if sizes[short] != sizes[long]:
+        raise EmaError(
+            f"{where}: channels differ in length ('{short}' {sizes[short]} samples, '{long}' {sizes[long]}); "
+            "export them together"
+        )
+    if sizes[short] < MINIMUM_SAMPLES:
+        raise EmaError(
+            f"{where}: channel '{short}' has {sizes[short]} samples, at least {MINIMUM_SAMPLES} are needed; "
+            "record longer or leave the file out"
+        )
+
+
+def _check_finite(samples: NDArray[np.float64], rate: float, where: str) -> None:
+    finite = np.isfinite(samples)
+    if not finite.all():
+        at = int(np.argmin(finite))
+        count = int(finite.size - finite.sum())
+        raise EmaError(
+            f"{where}: {samples[at]} at sample {at} ({at / rate:.4g} s), {count} such in all; "
+            "export the record again or leave it out"
+        )
+
+
+def _factor(channel: ChannelDescription, source: RawChannel, where: str) -> float:
+    """What one number of the file is in SI (volts for an uncalibrated force)."""
+    unit = channel.parsed_unit
+    if source.unit == FULL_SCALE:
+        return _fraction_factor(channel, unit, where)
+    label = source.unit
+    # A label that spells no unit we know says nothing that could contradict the description.
+    stated = find_unit(label) if label is not None else None
+    if channel.sensitivity_mv is not None:
+        if stated is not None and stated.quantity != "voltage":
+            raise EmaError(
+                f"{where}: the file is in '{label}' already, but test.toml gives sensitivity_mv = "
+                f"{channel.sensitivity_mv:g} for volts; remove sensitivity_mv, or export volts"
+            )
+        volts = stated.scale if stated is not None else 1.0
+        return volts * 1000.0 / channel.sensitivity_mv * unit.scale
+    if channel.uncalibrated:
+        if stated is not None and stated.quantity != "voltage":
+            raise EmaError(
+                f"{where}: is marked uncalibrated, but the file is in '{label}'; "
+                f'write unit = "{label}" and remove uncalibrated'
+            )
+        return stated.scale if stated is not None else unit.scale
+    if stated is None:
+        return unit.scale
+    if stated.quantity == "voltage":
+        raise EmaError(
+            f"{where}: the file is in '{label}', but test.toml has no sensitivity_mv; "
+            f"add the sensor's mV per {channel.unit}"
+        )
+    if not stated.same_as(unit):
+        raise EmaError(
+            f"{where}: the file is in '{label}' but test.toml says '{channel.unit}'; "
+            "correct unit in test.toml"
+        )
+    return unit.scale
+
+
+def _fraction_factor(channel: ChannelDescription, unit: Unit, where: str) -> float:
+    """Scale of integer WAV, whose numbers are fractions of the converter's full scale."""
+    if channel.sensitivity_mv is not None and channel.full_scale_v is not None:
+        return channel.full_scale_v * 1000.0 / channel.sensitivity_mv * unit.scale
+    if channel.sensitivity_mv is None and channel.full_scale is not None:
+        return channel.full_scale * unit.scale
+    if channel.uncalibrated and channel.full_scale_v is not None:
+        return channel.full_scale_v
+    remedy = (
+        "add full_scale_v, the volts at full scale"
+        if channel.sensitivity_mv is not None or channel.uncalibrated
+        else f"add full_scale_v (volts at full scale) and sensitivity_mv, or full_scale (in {channel.unit})"
+    )
+    raise EmaError(f"{where}: this WAV holds fractions of full scale; {remedy}")
+
+
+def _full_scale(channel: ChannelDescription) -> float:
+    unit = channel.parsed_unit
+    if channel.full_scale is not None:
+        return channel.full_scale * unit.scale
+    if channel.full_scale_v is None:
+        return float("inf")
+    if channel.uncalibrated:
+        return channel.full_scale_v
+    if channel.sensitivity_mv is None:
+        return float("inf")
+    return channel.full_scale_v * 1000.0 / channel.sensitivity_mv * unit.scale

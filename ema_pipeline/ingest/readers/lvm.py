@@ -1,0 +1,69 @@
+"""LabVIEW measurement files (LVM), by lvm_read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, clean_unit, split_unit
+from ema_pipeline.ingest.readers.text import decode
+from ema_pipeline.ingest.readers.timebase import rate_from_times, whole_rate
+
+NAME = "LVM"
+
+
+def recognise(path: Path, head: bytes) -> bool:
+    """True for the file's own first words."""
+    return head.removeprefix(b"\xef\xbb\xbf").startswith(b"LabVIEW Measurement")
+
+
+def read(path: Path) -> RawRecord:
+    """Read the one segment of the file."""
+    import lvm_read
+
+    # Decoded here: lvm_read drops what is not UTF-8, which turns m/s² into m/s.
+    content = lvm_read.read_str(decode(path.read_bytes()))
+    if content["Segments"] != 1:
+        raise EmaError(f"holds {content['Segments']} segments; export each as its own file")
+    segment = content[0]
+    if "data" not in segment or len(segment["data"]) == 0:
+        raise EmaError("holds no samples; export it again")
+    table = np.atleast_2d(segment["data"])
+    names = [str(n).strip() for n in segment["Channel names"]]
+    units = _per_column(segment.get("Y_Unit_Label"), names)
+    steps = [s for s in segment.get("Delta_X", []) if isinstance(s, int | float) and s > 0]
+    stated = [s for s in segment.get("Samples", []) if isinstance(s, int | float) and s > 0]
+    if stated and table.shape[0] < max(stated):
+        raise EmaError(
+            f"holds {table.shape[0]} of the {int(max(stated))} samples that its header states; "
+            "the file is cut short, copy or export it again"
+        )
+    channels: dict[str, RawChannel] = {}
+    times = None
+    for i, name in enumerate(names):
+        if name == "X_Value":
+            times = table[:, i] if times is None else times
+        elif name and name != "Comment" and i < table.shape[1]:
+            plain, unit = split_unit(name)
+            if plain in channels:
+                raise EmaError(f"two channels have the name '{plain}'; rename one in the file")
+            channels[plain] = RawChannel(np.ascontiguousarray(table[:, i]), unit or clean_unit(units[i]))
+    if len(set(steps)) > 1:
+        raise EmaError(f"its channels differ in Delta_X ({min(steps):g} and {max(steps):g} s); use one rate")
+    rate = whole_rate(steps[0], 1e-6) if steps else None if times is None else rate_from_times(times)
+    return RawRecord(channels, rate)
+
+
+def _per_column(labels: Any, names: list[str]) -> list[Any]:
+    """Align labels, of which there is one per channel, with the columns."""
+    given = [str(v) for v in labels] if labels is not None else []
+    given += [""] * len(names)
+    if names and names[0] == "X_Value" and names.count("X_Value") == 1:
+        return ["", *given]
+    if names.count("X_Value") > 1:
+        spread = iter([label for label in given if label] + [""] * len(names))
+        return ["" if name == "X_Value" else next(spread) for name in names]
+    return given

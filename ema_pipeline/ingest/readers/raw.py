@@ -1,0 +1,72 @@
+"""What a reader hands back: channels as the file holds them, unscaled."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.units import find_unit
+
+FULL_SCALE = "fraction of full scale"
+"""Stands in place of a unit where samples are fractions of the converter's range (integer WAV)."""
+
+
+@dataclass(frozen=True)
+class RawChannel:
+    """One channel as its file holds it.
+
+    Attributes
+    ----------
+    samples : ndarray, (n_samples,)
+        In `unit`; NaN where the file says so.
+    unit : str or None
+        As the file spells it, None where it is silent, `FULL_SCALE` for integer WAV.
+    dof : str or None
+        Hint such as ``"12.z"``, for drafting a description only.
+    """
+
+    samples: NDArray[np.float64]
+    unit: str | None = None
+    dof: str | None = None
+
+
+@dataclass(frozen=True)
+class RawRecord:
+    """One record file as a reader understands it.
+
+    Attributes
+    ----------
+    channels : dict
+        Channel name to `RawChannel`, in the order of the file.
+    sample_rate_hz : float or None
+        None where the file is silent.
+    notes : tuple of str
+        What the reader had to decide, one plain sentence each.
+    """
+
+    channels: dict[str, RawChannel]
+    sample_rate_hz: float | None = None
+    notes: tuple[str, ...] = field(default=())
+
+
+def split_unit(label: str) -> tuple[str, str | None]:
+    """Split a label such as ``"hammer [N]"`` into name and unit; only bracketed known units count.
+
+    >>> split_unit("hammer (N)")
+    ('hammer', 'N')
+    """
+    match = re.fullmatch(r"\s*(.*?\S)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*", label)
+    if match and find_unit(match[2]) is not None:
+        return match[1], match[2]
+    return label.strip(), None
+
+
+def clean_unit(text: object) -> str | None:
+    """Return a unit label as text, or None where it only fills a field (``NONE``, ``-``, ``EU``)."""
+    if isinstance(text, bytes):
+        text = text.decode("utf-8", errors="replace")
+    label = str(text).strip() if text is not None else ""
+    return None if label.casefold() in {"", "none", "-", "eu", "n/a", "unknown", "arb", "a.u."} else label

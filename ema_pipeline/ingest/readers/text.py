@@ -1,0 +1,286 @@
+"""CSV and text tables: a header row, numbers below it, and whatever a vendor writes above."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.readers.preamble import Preamble, read_preamble
+from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord
+from ema_pipeline.ingest.readers.timebase import (
+    is_index_name,
+    is_time_name,
+    is_uniform_ramp,
+    rate_from_times,
+    time_unit_scale,
+)
+from ema_pipeline.units import find_unit
+
+NAME = "CSV/TXT"
+
+_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][+-]?\d+)?")
+_NOT_A_NUMBER = {
+    "nan",
+    "-nan",
+    "inf",
+    "-inf",
+    "+inf",
+    "infinity",
+    "-infinity",
+    "#n/a",
+    "#num!",
+    "1.#qnan",
+    "-1.#ind",
+}
+_CLOCK = re.compile(r"\d{1,4}[-/.:]\d{1,2}[-/.:]\d{1,4}.*")
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """How a table is written.
+
+    Attributes
+    ----------
+    delimiter : str
+        ``","``, ``";"``, tab, or ``" "`` for any run of blanks.
+    decimal : str
+        ``"."`` or ``","``.
+    """
+
+    delimiter: str
+    decimal: str
+
+    def split(self, line: str) -> list[str]:
+        """Cells of a line, without quotes and outer blanks."""
+        if self.delimiter == " ":
+            return line.split()
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=self.delimiter), [])]
+
+    def is_number(self, cell: str) -> bool:
+        """True for a number in this dialect."""
+        return _NUMBER.fullmatch(cell) is not None and (
+            "," not in cell if self.decimal == "." else "." not in cell
+        )
+
+
+def recognise(path: Path, head: bytes) -> bool:
+    """True for decodable text with a row of numbers somewhere."""
+    if not head.startswith((b"\xff\xfe", b"\xfe\xff")) and b"\x00" in head:
+        return False
+    lines = [line for line in decode(head[: len(head) // 2 * 2]).splitlines() if line.strip()]
+    printable = sum(c.isprintable() or c in "\t\r\n\ufeff" for line in lines for c in line)
+    if not lines or printable < 0.99 * sum(len(line) for line in lines):
+        return False
+    return any(_dialect_of(line) is not None for line in lines)
+
+
+def decode(data: bytes) -> str:
+    """Text of a file in UTF-8, UTF-16 (with byte order mark) or Latin-1."""
+    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return data.decode("utf-16", errors="replace")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        # The first bytes of a file may end within a character; Latin-1 has no such characters.
+        if error.reason == "unexpected end of data":
+            return data[: error.start].decode("utf-8-sig")
+        return data.decode("cp1252", errors="replace")
+
+
+def read(path: Path) -> RawRecord:
+    """Read the table; a time column or the preamble gives the sample rate."""
+    lines = re.split(r"\r\n|\n|\r", decode(path.read_bytes()))
+    rows = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
+    dialect, first = _find_table(rows)
+    preamble = read_preamble([line for _, line in rows[:first]], dialect.split, _width(rows, first, dialect))
+    table = _numbers(rows[first:], dialect, preamble.names)
+    if preamble.samples is not None and table.shape[0] < preamble.samples:
+        raise EmaError(
+            f"holds {table.shape[0]} of the {preamble.samples} samples that its header states; "
+            "the file is cut short, copy or export it again"
+        )
+    return _channels(table, preamble)
+
+
+def _find_table(rows: list[tuple[int, str]]) -> tuple[Dialect, int]:
+    """Dialect of the table and the index of its first row."""
+    # The middle of the file lies in the table unless the preamble is longer than it.
+    for probe in (len(rows) // 2, 3 * len(rows) // 4, len(rows) - 2, len(rows) - 1):
+        dialect = _dialect_of(rows[probe][1]) if 0 <= probe < len(rows) else None
+        if dialect is None:
+            continue
+        width = len(_drop_trailing_blank(dialect.split(rows[probe][1])))
+        first = next(i for i, (_, line) in enumerate(rows) if _is_table_row(line, dialect, width))
+        # Rows above that start with a number are table rows with a bad cell: they are reported, not skipped.
+        while first > 0 and _starts_like_table(rows[first - 1][1], dialect, width):
+            first -= 1
+        return dialect, first
+    raise EmaError("no table of numbers found; export a header row and one column per channel")
+
+
+def _dialect_of(line: str) -> Dialect | None:
+    """Dialect in which every cell of `line` is a number, None where there is none."""
+    for delimiter in (";", "\t", ",", " "):
+        if delimiter not in line.strip() and delimiter != " ":
+            continue
+        for decimal in (".", ","):
+            if delimiter == decimal and '"' not in line:
+                continue
+            dialect = Dialect(delimiter, decimal)
+            cells = _drop_trailing_blank(dialect.split(line))
+            if cells and all(dialect.is_number(c) for c in _values(cells)) and len(_values(cells)) > 0:
+                return dialect
+    return None
+
+
+def _drop_trailing_blank(cells: list[str]) -> list[str]:
+    return cells[:-1] if len(cells) > 1 and cells[-1] == "" else cells
+
+
+def _values(cells: list[str]) -> list[str]:
+    """Cells but for a date or clock time in front."""
+    return cells[1:] if _CLOCK.fullmatch(cells[0]) else cells
+
+
+def _is_table_row(line: str, dialect: Dialect, width: int) -> bool:
+    cells = _drop_trailing_blank(dialect.split(line))
+    return len(cells) == width and all(dialect.is_number(c) for c in _values(cells))
+
+
+def _starts_like_table(line: str, dialect: Dialect, width: int) -> bool:
+    cells = dialect.split(line)
+    cells = cells if len(cells) == width else _drop_trailing_blank(cells)
+    if len(cells) != width or width == 1:
+        return False
+    bad = [c for c in cells if not dialect.is_number(c)]
+    front = dialect.is_number(cells[0]) or _CLOCK.fullmatch(cells[0]) is not None
+    return front and all(c == "" or c.casefold() in _NOT_A_NUMBER or _CLOCK.fullmatch(c) for c in bad)
+
+
+def _width(rows: list[tuple[int, str]], first: int, dialect: Dialect) -> int:
+    """Number of columns: what most of the first rows have."""
+    widths = Counter(len(_drop_trailing_blank(dialect.split(line))) for _, line in rows[first : first + 20])
+    return widths.most_common(1)[0][0]
+
+
+def _numbers(rows: list[tuple[int, str]], dialect: Dialect, names: tuple[str, ...]) -> NDArray[np.float64]:
+    """The table (n_samples, n_columns); a column of dates or clock times becomes NaN."""
+    width = len(names)
+    clock = _CLOCK.fullmatch(dialect.split(rows[0][1])[0]) is not None
+    if not clock and dialect.delimiter != " ":
+        table = _fast_numbers(rows, dialect, width)
+        if table is not None:
+            return table
+    return _careful_numbers(rows, dialect, names, clock)
+
+
+def _fast_numbers(rows: list[tuple[int, str]], dialect: Dialect, width: int) -> NDArray[np.float64] | None:
+    """Parse in one go; None where anything is odd, so that the careful way can say what."""
+    import pandas
+
+    separators = {line.count(dialect.delimiter) for _, line in rows}
+    if len(separators) != 1 or next(iter(separators)) not in (width - 1, width):
+        return None
+    try:
+        frame = pandas.read_csv(
+            io.StringIO("\n".join(line for _, line in rows)),
+            sep=dialect.delimiter,
+            decimal=dialect.decimal,
+            header=None,
+            usecols=range(width),
+            dtype=np.float64,
+            skipinitialspace=True,
+        )
+    except (ValueError, OverflowError):
+        return None
+    table = frame.to_numpy(dtype=np.float64)
+    return table if table.shape == (len(rows), width) and np.all(np.isfinite(table)) else None
+
+
+def _careful_numbers(
+    rows: list[tuple[int, str]], dialect: Dialect, names: tuple[str, ...], clock: bool
+) -> NDArray[np.float64]:
+    """Parse cell by cell and name the first cell that is no number."""
+    width = len(names)
+    while rows and not any(c.isdigit() for c in rows[-1][1]) and dialect.split(rows[-1][1])[0] != "":
+        if any(cell.casefold() in _NOT_A_NUMBER for cell in dialect.split(rows[-1][1])):
+            break
+        rows = rows[:-1]  # a footer such as "End of data"
+    convert = _converter(dialect)
+    table = np.empty((len(rows), width))
+    for i, (number, line) in enumerate(rows):
+        cells = dialect.split(line)
+        cells = cells if len(cells) == width else _drop_trailing_blank(cells)
+        if len(cells) != width:
+            raise EmaError(
+                f"line {number} has {len(cells)} cells where the table has {width}; "
+                "the file is damaged or cut short, export it again"
+            )
+        for j, cell in enumerate(cells):
+            if j == 0 and clock:
+                table[i, j] = np.nan
+            elif dialect.is_number(cell):
+                table[i, j] = convert(cell)
+            else:
+                shown = "is blank" if cell == "" else f"'{cell}' is not a number"
+                raise EmaError(
+                    f"line {number}, channel '{names[j]}': {shown}; export the record again or leave it out"
+                )
+    return table
+
+
+def _converter(dialect: Dialect) -> Callable[[str], float]:
+    if dialect.decimal == ",":
+        return lambda cell: float(cell.replace(",", ".").replace("d", "e").replace("D", "e"))
+    return lambda cell: float(cell.replace("d", "e").replace("D", "e"))
+
+
+def _channels(table: NDArray[np.float64], preamble: Preamble) -> RawRecord:
+    notes = list(preamble.notes)
+    rate = preamble.sample_rate_hz
+    times: NDArray[np.float64] | None = None
+    channels: dict[str, RawChannel] = {}
+    for i, (name, unit) in enumerate(zip(preamble.names, preamble.units, strict=True)):
+        samples = np.ascontiguousarray(table[:, i])
+        ramp = i == 0 and is_uniform_ramp(samples)
+        if i == 0 and np.all(np.isnan(samples)):
+            notes.append(f"column '{name}' holds dates or clock times and is left out")
+        elif ramp and (is_index_name(name) or (_could_be_time(unit) and _counts(samples))):
+            notes.append(f"column '{name}' is a running number and is left out")
+        elif times is None and (is_time_name(name) or (ramp and _could_be_time(unit))):
+            times = samples * time_unit_scale(name, unit)
+        elif name in channels:
+            raise EmaError(f"two columns have the name '{name}'; rename one in the file")
+        else:
+            channels[name] = RawChannel(samples, unit)
+    if times is not None:
+        measured = rate_from_times(times)
+        if rate is None:
+            rate = measured
+        elif measured is not None and abs(measured / rate - 1) > 1e-3:
+            raise EmaError(
+                f"contradicts itself: its header states {rate:.10g} Hz and its time column "
+                f"{measured:.10g} Hz; correct the file"
+            )
+    if not channels:
+        raise EmaError("holds no channel beside time; export one column per channel")
+    return RawRecord(channels, rate, tuple(notes))
+
+
+def _counts(samples: NDArray[np.float64]) -> bool:
+    return bool(abs(samples[1] - samples[0] - 1.0) < 1e-9)
+
+
+def _could_be_time(unit: str | None) -> bool:
+    """A ramp in the first column is time unless the file gives it another unit."""
+    found = find_unit(unit) if unit else None
+    return found is None or found.quantity == "time"
