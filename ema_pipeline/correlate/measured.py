@@ -86,11 +86,15 @@ def from_frequencies(
         If a frequency is not positive, or the two columns differ in length.
     """
     frequency = np.asarray(frequency_hz, dtype=float)
-    std = np.full(frequency.shape, np.nan) if frequency_std_hz is None else np.asarray(frequency_std_hz, float)
+    std = (
+        np.full(frequency.shape, np.nan) if frequency_std_hz is None else np.asarray(frequency_std_hz, float)
+    )
     if frequency.ndim != 1 or std.shape != frequency.shape:
         raise EmaError(f"{configuration}: {std.size} standard deviations for {frequency.size} frequencies")
     if not np.all(np.isfinite(frequency) & (frequency > 0)):
-        raise EmaError(f"{configuration}: measured frequencies must be positive numbers in Hz; got {frequency}")
+        raise EmaError(
+            f"{configuration}: measured frequencies must be positive numbers in Hz; got {frequency}"
+        )
     order = np.argsort(frequency, kind="stable")
     unknown = np.full(frequency.shape, np.nan)
     return MeasuredModes(configuration, frequency[order], std[order], unknown, unknown.copy())

@@ -87,7 +87,9 @@ def pair(
         if r not in chosen
     )
     unpaired_model = tuple(
-        Unpaired(k, float(f), _why_model(k, measured, modes, shapes, system, distance, grouped, taken, settings))
+        Unpaired(
+            k, float(f), _why_model(k, measured, modes, shapes, system, distance, grouped, taken, settings)
+        )
         for k, f in enumerate(model_f)
         if k not in taken
     )

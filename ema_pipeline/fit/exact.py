@@ -1,11 +1,4 @@
-"""Residuals of paired modes: frequencies, damping ratios and shapes of the model's own modes.
-
-Unlike the latent-shape objective this one leaves no freedom to coordinates that carry no sensor: the model's mode
-must have the measured frequency, damping and shape. Shapes of modes that nearly coincide are compared by the
-space that they span, with a smooth transition: mode j may mix into mode k with an amplitude of the order
-mixing·λ_k/|λ_j - λ_k|, which is what an unmodelled relative perturbation `mixing` of the matrices does (first-order
-perturbation theory). Equal eigenvalues mix freely, distant ones not at all.
-"""
+"""Gauss-Newton terms of the residuals of paired modes; see `ema_pipeline.correlate.residuals`."""
 
 from __future__ import annotations
 
@@ -14,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.fit.evidence import Evidence, Modes, observable_modes
+from ema_pipeline.correlate.residuals import mode_residuals, observable_modes
+from ema_pipeline.fit.evidence import Dataset
 
 _STEP = 1e-4
 
@@ -24,14 +18,16 @@ class ExactObjective:
 
     Parameters
     ----------
-    evidence : sequence of Evidence
+    evidence : sequence of Dataset
     pairs : sequence of ndarray, (R,)
         Per configuration the model mode of each measured mode, -1 where it has none.
     mixing : float
-        See the module's description.
+        See `ema_pipeline.correlate.residuals`.
     """
 
-    def __init__(self, evidence: Sequence[Evidence], pairs: Sequence[NDArray[np.int64]], mixing: float) -> None:
+    def __init__(
+        self, evidence: Sequence[Dataset], pairs: Sequence[NDArray[np.int64]], mixing: float
+    ) -> None:
         self.evidence = evidence
         self.pairs = pairs
         self.mixing = mixing
@@ -43,7 +39,7 @@ class ExactObjective:
         Columns: frequency, damping ratio, shape (real and imaginary parts), mixing; 0 for modes without partner.
         """
         return [
-            _residuals(e, p, observable_modes(e.family.at(x)), self.mixing)
+            mode_residuals(e, p, observable_modes(e.family.at(x)), self.mixing)
             for e, p in zip(self.evidence, self.pairs, strict=True)
         ]
 
@@ -68,41 +64,3 @@ class ExactObjective:
             normal += jacobian @ jacobian.T
             gradient += jacobian @ weighted[0]
         return normal, gradient
-
-
-def _residuals(
-    e: Evidence, pairs: NDArray[np.int64], modes: Modes, mixing: float
-) -> NDArray[np.float64]:
-    batch, n = modes.omega.shape
-    has = np.flatnonzero(pairs >= 0)
-    k = pairs[has]
-    frequency = (modes.omega[:, k] / e.omega[has] - 1) / e.relative_std[has]
-    damping = (modes.damping_ratio[:, k] - e.damping[has]) * e.damping_weight[has]
-    columns = [frequency[..., None], damping[..., None]]
-    if e.has_shapes and has.size:
-        at_sensors = e.rows @ modes.shapes
-        weight = e.shape_weight[has]
-        b = weight[None, :, :, None] * at_sensors[:, None]
-        rhs = e.shapes[has] * weight
-        eigenvalues = modes.omega**2
-        own = np.maximum(eigenvalues[:, k], 1e-12)
-        d = np.abs(eigenvalues[:, None, :] - own[:, :, None]) / (mixing * own[:, :, None])
-        seen = np.maximum(np.sum(np.abs(at_sensors[:, :, k]) ** 2, axis=1), 1e-30)
-        size = np.sqrt(np.sum(np.abs(e.shapes[has]) ** 2, axis=1) / seen)
-        d = d / np.maximum(size, 1e-150)[:, :, None]
-        normal = b.conj().swapaxes(-1, -2) @ b
-        diagonal = np.einsum("brii->bri", normal)
-        diagonal += d**2 + 1e-9 * diagonal.mean(axis=2, keepdims=True) + 1e-30
-        right = np.einsum("brsn,rs->brn", b.conj(), rhs, optimize=True)
-        if np.iscomplexobj(normal):
-            q = np.linalg.solve(normal, right[..., None])[..., 0]
-        else:
-            both = np.linalg.solve(normal, np.stack([right.real, right.imag], axis=-1))
-            q = both[..., 0] + 1j * both[..., 1]
-        misfit = np.einsum("brsn,brn->brs", b, q, optimize=True) - rhs
-        mixed = np.einsum("bmn,brn->brm", modes.directions, d * q, optimize=True)
-        columns += [misfit.real, misfit.imag, mixed.real, mixed.imag]
-    part = np.concatenate(columns, axis=2)
-    out = np.zeros((batch, pairs.size, part.shape[2]))
-    out[:, has] = part
-    return out

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from ema_pipeline.fit.evidence import Basis, Evidence, modal_basis
+from ema_pipeline.correlate.residuals import Basis, modal_basis
+from ema_pipeline.fit.evidence import Dataset
 
 
 class LatentObjective:
@@ -28,12 +29,12 @@ class LatentObjective:
 
     Parameters
     ----------
-    evidence : sequence of Evidence
+    evidence : sequence of Dataset
     tau_least : float
         Eigenvalue error (relative) that each mode is allowed at least: high at the start of the annealing.
     """
 
-    def __init__(self, evidence: Sequence[Evidence], tau_least: float) -> None:
+    def __init__(self, evidence: Sequence[Dataset], tau_least: float) -> None:
         self.evidence = evidence
         self.tau = [np.maximum(2 * e.relative_std, tau_least) for e in evidence]
 
@@ -71,7 +72,7 @@ class LatentObjective:
 
 
 def _ridge(
-    e: Evidence, tau: NDArray[np.float64], basis: Basis
+    e: Dataset, tau: NDArray[np.float64], basis: Basis
 ) -> tuple[NDArray[np.complex128], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Modal coordinates (R, n), costs (R,), weighted sensor matrix (R, n_dofs, n), penalties (R, n)."""
     at_sensors = e.rows @ basis.shapes[0]
@@ -95,7 +96,7 @@ def _ridge(
 
 
 def _ridge_jacobian(
-    e: Evidence,
+    e: Dataset,
     tau: NDArray[np.float64],
     basis: Basis,
     d_mass: NDArray[np.float64],
@@ -108,7 +109,9 @@ def _ridge_jacobian(
     by_stiffness = np.einsum("ia,pij,jb->pab", phi, d_stiffness, phi, optimize=True)
     by_mass = np.einsum("ia,pij,jb->pab", phi, d_mass, phi, optimize=True)
     scale = 1 / (tau * e.omega**2 * np.maximum(np.linalg.norm(q, axis=1), 1e-150))
-    moved = (by_stiffness @ (q * scale[:, None]).T - by_mass @ (q * (scale * e.omega**2)[:, None]).T).swapaxes(1, 2)
+    moved = (
+        by_stiffness @ (q * scale[:, None]).T - by_mass @ (q * (scale * e.omega**2)[:, None]).T
+    ).swapaxes(1, 2)
     full = np.concatenate([np.zeros((len(moved), len(q), n_dofs)), moved], axis=2)
     diagonal = np.zeros((len(q), n, n))
     diagonal[:, np.arange(n), np.arange(n)] = d
@@ -121,7 +124,7 @@ def _ridge_jacobian(
 
 
 def _nearest(
-    e: Evidence, tau: NDArray[np.float64], basis: Basis
+    e: Dataset, tau: NDArray[np.float64], basis: Basis
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """For frequencies without shapes: the assigned model mode and the residual of each, (R,)."""
     values = basis.eigenvalues[0]
@@ -134,7 +137,7 @@ def _nearest(
 
 
 def _nearest_jacobian(
-    e: Evidence,
+    e: Dataset,
     tau: NDArray[np.float64],
     basis: Basis,
     d_mass: NDArray[np.float64],

@@ -7,28 +7,15 @@ builds every system itself.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.correlate.residuals import Matrices
 from ema_pipeline.fit.space import Space
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.rigs.types import Rig
 
 _EXACT = 1e-9
-
-
-@dataclass(frozen=True)
-class Matrices:
-    """Matrices of a batch of systems: mass, stiffness, damping, structural (B, n, n); damping ratio (B,)."""
-
-    mass: NDArray[np.float64]
-    stiffness: NDArray[np.float64]
-    damping: NDArray[np.float64]
-    structural: NDArray[np.float64]
-    modal_damping_ratio: NDArray[np.float64]
-    damped: bool
 
 
 class MatrixFamily:
@@ -60,7 +47,9 @@ class MatrixFamily:
     def _fit_polynomial(self, steps: NDArray[np.float64]) -> None:
         count = len(steps)
         base = self._build(self.origin)
-        slopes = np.array([(self._build(_moved(self.origin, i, steps)) - base) / steps[i] for i in range(count)])
+        slopes = np.array(
+            [(self._build(_moved(self.origin, i, steps)) - base) / steps[i] for i in range(count)]
+        )
         slopes = slopes.reshape(count, base.size)
         other = self.origin + 0.37 * steps
         other_base = self._build(other)
@@ -82,7 +71,8 @@ class MatrixFamily:
         self.coefficients = np.vstack([base[None], slopes, np.reshape(products, (-1, base.size))])
         checks = [self.origin + 0.61 * steps * np.cos(np.arange(count) + s) ** 2 for s in (0.0, 1.0)]
         self.polynomial = all(
-            np.max(np.abs(self._polynomial(v[None])[0] - self._build(v))) <= 1e3 * _EXACT * scale for v in checks
+            np.max(np.abs(self._polynomial(v[None])[0] - self._build(v))) <= 1e3 * _EXACT * scale
+            for v in checks
         )
 
     def _relevant(self, steps: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -145,5 +135,3 @@ def _moved(values: NDArray[np.float64], index: int, steps: NDArray[np.float64]) 
     out = values.copy()
     out[index] += steps[index]
     return out
-
-

@@ -20,7 +20,9 @@ class FitSettings(UncertaintySettings):
         description="Starting values per decade for every free parameter that may span decades.",
     )
     starts_refined: int = Field(
-        default=3, ge=1, description="Number of starts that go through the whole annealing; the rest only compete."
+        default=3,
+        ge=1,
+        description="Number of starts that go through the whole annealing; the rest only compete.",
     )
     annealing_start: float = Field(
         default=0.3,
@@ -28,7 +30,9 @@ class FitSettings(UncertaintySettings):
         description="Relative error of eigenvalues that the first rung of the annealing allows; the default "
         "covers a nominal model whose stiffnesses are off by 30 %.",
     )
-    annealing_rungs: int = Field(default=7, ge=2, description="Rungs from the start down to the data's own accuracy.")
+    annealing_rungs: int = Field(
+        default=7, ge=2, description="Rungs from the start down to the data's own accuracy."
+    )
     outlier_prior: float = Field(
         default=0.05,
         gt=0,
@@ -49,9 +53,13 @@ class FitSettings(UncertaintySettings):
         "in the last gram). Modes closer than this exchange their shapes freely; see the method's description.",
     )
     damping: bool = Field(default=True, description="Use measured damping ratios.")
-    iterations: int = Field(default=60, ge=1, description="Largest number of Gauss-Newton steps of one refinement.")
+    iterations: int = Field(
+        default=60, ge=1, description="Largest number of Gauss-Newton steps of one refinement."
+    )
     profile_points: int = Field(
-        default=5, ge=2, description="Points of the profile likelihood on each side, within three standard deviations."
+        default=5,
+        ge=2,
+        description="Points of the profile likelihood on each side, within three standard deviations.",
     )
     profile_rise: float = Field(
         default=4.0,
@@ -60,10 +68,10 @@ class FitSettings(UncertaintySettings):
         "identified: 4 is the 95 % interval of one parameter.",
     )
     relative_std_limit: float = Field(
-        default=0.3,
+        default=0.5,
         gt=0,
-        description="Relative standard deviation above which a free parameter does not count as identified: beyond "
-        "30 % the estimate says little more than its order of magnitude.",
+        description="Relative standard deviation above which a free parameter does not count as identified: "
+        "beyond 50 % not even its factor of two is known.",
     )
     narrowed: float = Field(
         default=0.8,

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.pairing import assign, close_groups, shape_agreement
+from ema_pipeline.correlate.residuals import observable_modes
 from ema_pipeline.errors import EmaError, did_you_mean
-from ema_pipeline.fit.evidence import Evidence, gather, observable_modes
+from ema_pipeline.fit.evidence import Dataset, dataset
 from ema_pipeline.fit.exact import ExactObjective
 from ema_pipeline.fit.latent import LatentObjective
 from ema_pipeline.fit.matrices import MatrixFamily
@@ -129,8 +130,8 @@ class FitProblem:
         self.irrelevant = tuple(
             c.parameter for c, r in zip(everything.coordinates, relevant, strict=True) if not r
         )
-        self.evidence: list[Evidence] = [
-            gather(m, MatrixFamily(rig, c, self.space), settings) for c, m in used.items()
+        self.evidence: list[Dataset] = [
+            dataset(m, MatrixFamily(rig, c, self.space), settings) for c, m in used.items()
         ]
         self.counts = np.concatenate([e.counts for e in self.evidence])
 
@@ -142,6 +143,10 @@ class FitProblem:
     def assignments(self, x: NDArray[np.float64]) -> list[NDArray[np.int64]]:
         """Model mode of each measured mode at a point, -1 where none, per configuration."""
         return [_assignment(e, x, self.settings) for e in self.evidence]
+
+    def model_omega(self, e: Dataset, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Frequencies of the model of one configuration at a point, rad/s, (n,)."""
+        return np.asarray(observable_modes(e.family.at(x[None])).omega[0])
 
     def exact(self, pairs: Sequence[NDArray[np.int64]]) -> ExactObjective:
         """Eigen-residual objective with fixed pairs."""
@@ -240,7 +245,9 @@ def refine(problem: FitProblem, start: NDArray[np.float64], scale: float = 1.0) 
     return best
 
 
-def search(problem: FitProblem, start: Mapping[str, float] | None, progress: Progress | None = None) -> Optimum:
+def search(
+    problem: FitProblem, start: Mapping[str, float] | None, progress: Progress | None = None
+) -> Optimum:
     """Most probable parameters over a grid of starts of the free parameters.
 
     Every start takes one rung of annealing; the best go all the way. With `start` given (the fit of a poorer
@@ -278,7 +285,7 @@ def _distinct(points: list[NDArray[np.float64]], count: int) -> list[NDArray[np.
     return out
 
 
-def _assignment(e: Evidence, x: NDArray[np.float64], settings: FitSettings) -> NDArray[np.int64]:
+def _assignment(e: Dataset, x: NDArray[np.float64], settings: FitSettings) -> NDArray[np.int64]:
     modes = observable_modes(e.family.at(x[None]))
     omega, shapes = modes.omega[0], (e.rows @ modes.shapes[0]).T
     model_hz = omega / (2 * np.pi)

@@ -98,7 +98,9 @@ class Space:
     def point(self, values: Mapping[str, float] | None = None) -> NDArray[np.float64]:
         """Coordinates at named values; nominal where left out."""
         given = values or {}
-        return np.array([c.coordinate(given.get(c.parameter.name, c.parameter.value)) for c in self.coordinates])
+        return np.array(
+            [c.coordinate(given.get(c.parameter.name, c.parameter.value)) for c in self.coordinates]
+        )
 
     def named(self, x: NDArray[np.float64]) -> dict[str, float]:
         """Named values at a point."""

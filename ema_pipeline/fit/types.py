@@ -129,6 +129,13 @@ class FitResult:
     sweeps : tuple of ErrorSweep
     two_step : TwoStep or None
     notes : tuple of str
+    objective : float
+        -2 log posterior at the data's own uncertainties, up to a constant that is the same for all models of
+        the same data: the smaller, the better.
+    outlier_share : float
+        Share of the measured modes that the model does not explain.
+    misfit_scale : float
+        Factor by which all uncertainties were multiplied because the model does not reach them; 1 where it does.
     """
 
     parameters: dict[str, ParameterEstimate]
@@ -142,3 +149,10 @@ class FitResult:
     sweeps: tuple[ErrorSweep, ...] = ()
     two_step: TwoStep | None = None
     notes: tuple[str, ...] = ()
+    objective: float = float("nan")
+    outlier_share: float = 0.0
+    misfit_scale: float = 1.0
+
+    def values(self) -> dict[str, float]:
+        """Parameter values at the optimum, as `Rig.system` takes them."""
+        return {name: p.value for name, p in self.parameters.items()}
