@@ -1,0 +1,372 @@
+"""FRFs in, modes out: the whole of modal identification in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.modal.assurance import mpc
+from ema_pipeline.modal.bands import SubBand, find_peaks, indicator, split
+from ema_pipeline.modal.data import FitData, analysis_band, arrange
+from ema_pipeline.modal.engines import poles_of_all_orders
+from ema_pipeline.modal.fit import Estimate, normalised, residual_fit, solve_linear, synthesis
+from ema_pipeline.modal.noise import Noise, fit_noise, second_difference_power
+from ema_pipeline.modal.plscf import MAX_DAMPING_RATIO
+from ema_pipeline.modal.poles import PoleSet
+from ema_pipeline.modal.polish import polish
+from ema_pipeline.modal.scaling import scale_shapes, scaling_note
+from ema_pipeline.modal.segment import SegmentFit, fit_segment, measured_noise
+from ema_pipeline.modal.selection import BANDWIDTH_TOLERANCE, DAMPING_TOLERANCE, FREQUENCY_TOLERANCE, link
+from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
+from ema_pipeline.modal.uncertainty import covariance
+from ema_pipeline.threads import single_blas_thread
+
+Progress = Callable[[float, str], None]
+Complex = NDArray[np.complex128]
+Real = NDArray[np.float64]
+
+POLISH_ITERATIONS = 25
+
+
+@dataclass(frozen=True)
+class _Modes:
+    """Final modes before they are scaled: one entry per mode."""
+
+    poles: Complex
+    pole_cov: Real
+    shapes: Complex
+    shape_stds: Real
+    participation: Complex
+    participation_stds: Real
+
+
+def identify(frfs: FrfSet, settings: ModalSettings, progress: Progress | None = None) -> ModalModel:
+    """Identify the modes that the FRFs show, with uncertainties.
+
+    Parameters
+    ----------
+    frfs : FrfSet
+    settings : ModalSettings
+    progress : callable, optional
+        Called with the share done, 0…1, and a few words.
+
+    Returns
+    -------
+    ModalModel
+        Without circle fits, which are attached later.
+
+    Raises
+    ------
+    EmaError
+        Where the band is too narrow or nothing was measured.
+    """
+    tell = progress or (lambda share, text: None)
+    with single_blas_thread():
+        return _identify(frfs, settings, tell)
+
+
+def _identify(frfs: FrfSet, settings: ModalSettings, tell: Progress) -> ModalModel:
+    band = analysis_band(frfs, settings)
+    data = arrange(frfs, band)
+    hits, start, level = _first_noise(data)
+    bands = split(data.omega, indicator(data, level))
+    scale = np.sqrt(level)
+    iterations = POLISH_ITERATIONS if settings.polish else 0
+
+    charts: list[PoleSet] = []
+    found = Estimate(np.zeros(0, complex), np.zeros((0, data.measured.shape[1]), complex))
+    for k, part in enumerate(bands):
+        tell(0.1 + 0.5 * k / len(bands), f"poles and modes of sub-band {k + 1} of {len(bands)}")
+        poles, estimate = _modes_of_band(data, hits, start, scale, part, settings, iterations)
+        charts.append(_inside(poles, part))
+        inside = (estimate.poles.imag >= part.low) & (estimate.poles.imag < part.high)
+        found = _stitched(found, estimate.take(inside))
+    tell(0.7, f"refining {len(found.poles)} modes")
+    modes = _refined(data, hits, start, bands, found, iterations)
+    tell(0.9, "shapes and synthesis")
+    return _model(frfs, settings, band, data, start, modes, charts)
+
+
+def _first_noise(data: FitData) -> tuple[Noise | None, Noise, Real]:
+    """Noise from hits, first guess of the noise, and noise level of every FRF."""
+    known = np.isfinite(data.variance).any()
+    second = np.maximum(second_difference_power(data.frf), 1e-300)
+    floor = 1e-12 * np.mean(np.abs(data.frf) ** 2, axis=-1)
+    level = np.where(data.measured, np.maximum(second, np.maximum(floor, 1e-300)), 1.0)
+    if known:
+        hits = fit_noise(data.variance, data.frf, data.measured, inputs_are_rows=data.transposed)
+        level = np.where(data.measured, np.median(hits.own, axis=-1), 1.0)
+        return hits, hits, level
+    own = np.broadcast_to(level[..., None], data.frf.shape).copy()
+    return None, Noise(1e-4 * np.abs(data.frf) ** 2, own), level
+
+
+def _cut(noise: Noise | None, part: SubBand) -> Noise | None:
+    if noise is None:
+        return None
+    lines = slice(part.first, part.stop)
+    return Noise(noise.common[..., lines], noise.own[..., lines])
+
+
+def _modes_of_band(
+    data: FitData,
+    hits: Noise | None,
+    start: Noise,
+    scale: Real,
+    part: SubBand,
+    settings: ModalSettings,
+    iterations: int,
+) -> tuple[PoleSet, Estimate]:
+    """Chart and accepted modes of one sub-band."""
+    lines = data.lines(part.first, part.stop)
+    poles = poles_of_all_orders(lines, scale, part.n_peaks, settings)
+    tracks = link(poles)
+    candidates = _candidates(poles, tracks.representative)
+    sub_start = _cut(start, part)
+    assert sub_start is not None
+
+    def search(left: FitData, weight: Real) -> Estimate:
+        level = 1.0 / np.maximum(np.median(weight, axis=-1), 1e-300)
+        level = np.where(left.measured, level, 1.0)
+        peaks = len(find_peaks(indicator(left, level)))
+        more = poles_of_all_orders(left, np.sqrt(level), min(peaks, part.n_peaks), settings)
+        return _candidates(more, link(more).representative)
+
+    fit = fit_segment(lines, _cut(hits, part), sub_start, candidates, search, iterations=iterations)
+    return poles, fit.estimate
+
+
+def _candidates(poles: PoleSet, index: NDArray[np.int64]) -> Estimate:
+    return Estimate(poles.pole[index], normalised(poles.participation[index]))
+
+
+def _inside(poles: PoleSet, part: SubBand) -> PoleSet:
+    return poles.take((poles.pole.imag >= part.low) & (poles.pole.imag < part.high))
+
+
+def _stitched(known: Estimate, fresh: Estimate) -> Estimate:
+    """Join the modes of the next sub-band; one that was found on both sides of the seam counts once."""
+    if not len(known.poles) or not len(fresh.poles):
+        return known.joined(fresh)
+    last, first = known.poles[-1], fresh.poles[0]
+    same = abs(last - first) < 0.3 * min(-last.real, -first.real)
+    a, b = known.participation[-1], fresh.participation[0]
+    alike = abs(np.vdot(a, b)) ** 2 > 0.8 * np.vdot(a, a).real * np.vdot(b, b).real
+    return known.joined(fresh.take(np.arange(1, len(fresh.poles)))) if same and alike else known.joined(fresh)
+
+
+def _refined(
+    data: FitData,
+    hits: Noise | None,
+    start: Noise,
+    bands: tuple[SubBand, ...],
+    found: Estimate,
+    iterations: int,
+) -> _Modes:
+    """Final fit, sub-band by sub-band, with the modes of the other sub-bands taken off the data."""
+    m, (n_rows, n_ref) = len(found.poles), data.measured.shape
+    out = _Modes(
+        poles=found.poles.copy(),
+        pole_cov=np.zeros((m, 2, 2)),
+        shapes=np.zeros((m, n_rows), complex),
+        shape_stds=np.zeros((m, n_rows)),
+        participation=found.participation.copy(),
+        participation_stds=np.zeros((m, n_ref)),
+    )
+    if not m:
+        return out
+    everywhere = solve_linear(data, start.weight(data.measured), found)
+    for part in bands:
+        near = (found.poles.imag >= data.omega[part.first]) & (found.poles.imag <= data.omega[part.stop - 1])
+        core = (found.poles.imag >= part.low) & (found.poles.imag < part.high)
+        near |= core
+        if not core.any():
+            continue
+        lines = data.lines(part.first, part.stop)
+        far = synthesis(lines, found.take(~near), everywhere.shapes[:, ~near])
+        lines = FitData(
+            lines.omega, lines.frf - far, lines.variance, lines.measured, lines.rest_s, lines.transposed
+        )
+        lines.frf[~lines.measured] = 0.0
+        fit = _final_fit(lines, _cut(hits, part), _cut(start, part), found.take(near), iterations)
+        cov = covariance(lines, fit.noise.weight(lines.measured), fit.estimate, fit.solution, fit.noise)
+        where = np.flatnonzero(near)
+        stds = _participation_stds(fit.estimate, cov.parameters)
+        for local, mode in enumerate(where):
+            if not core[mode]:
+                continue
+            out.poles[mode] = fit.estimate.poles[local]
+            out.pole_cov[mode] = cov.poles(local)
+            out.shapes[mode] = fit.solution.shapes[:, local]
+            two = slice(2 * local, 2 * local + 2)
+            out.shape_stds[mode] = np.sqrt(0.5 * np.einsum("oaa->o", cov.shapes[:, two, two]))
+            out.participation[mode] = fit.estimate.participation[local]
+            out.participation_stds[mode] = stds[local]
+    return out
+
+
+def _final_fit(
+    data: FitData, hits: Noise | None, start: Noise | None, estimate: Estimate, iterations: int
+) -> SegmentFit:
+    assert start is not None
+    noise = start
+    for _ in range(2):
+        weight = noise.weight(data.measured)
+        estimate, solution = polish(data, weight, estimate, iterations)
+        noise = measured_noise(data, hits, estimate, solution, weight)
+    solution = solve_linear(data, noise.weight(data.measured), estimate)
+    return SegmentFit(estimate, solution, noise, np.zeros(0), np.zeros(0))
+
+
+def _participation_stds(estimate: Estimate, parameters: Real) -> Real:
+    from ema_pipeline.modal.fit import free_participations
+
+    m = len(estimate.poles)
+    out = np.zeros(estimate.participation.shape)
+    for k, (r, i) in enumerate(free_participations(estimate)):
+        j = 2 * m + 2 * k
+        out[r, i] = np.sqrt(max(0.5 * (parameters[j, j] + parameters[j + 1, j + 1]), 0.0))
+    return out
+
+
+def _model(
+    frfs: FrfSet,
+    settings: ModalSettings,
+    band: tuple[float, float],
+    data: FitData,
+    start: Noise,
+    modes: _Modes,
+    charts: list[PoleSet],
+) -> ModalModel:
+    order = np.argsort(np.abs(modes.poles))
+    rows, references = frfs.outputs, frfs.inputs
+    if data.transposed:
+        rows, references = references, rows
+    shapes = np.where(data.measured.any(axis=1), modes.shapes, np.nan)
+    physical = modes.poles + frfs.response_decay_rad_s
+    scaled = scale_shapes(
+        rows,
+        references,
+        physical[order],
+        shapes[order],
+        modes.shape_stds[order],
+        modes.participation[order],
+        modes.participation_stds[order],
+        calibrated=frfs.force_calibrated,
+    )
+    note = scaling_note(any(d in rows for d in references), frfs.force_calibrated)
+    chart, stability = _chart(charts, modes.poles[order], frfs.response_decay_rad_s)
+    result = tuple(
+        _mode(
+            complex(physical[j]),
+            modes.pole_cov[j],
+            scaled.shapes[k],
+            scaled.stds[k],
+            settings.engine,
+            float(stability[k]),
+            float(scaled.scale_std[k]),
+        )
+        for k, j in enumerate(order)
+    )
+    return ModalModel(
+        dofs=scaled.dofs,
+        modes=result,
+        band_hz=(float(band[0]), float(band[1])),
+        scaled=not note,
+        scaling_note=note,
+        references=references,
+        frequency_hz=data.omega / (2 * np.pi),
+        synthesis=_synthesis(data, start, modes),
+        outputs=frfs.outputs,
+        inputs=frfs.inputs,
+        chart=chart,
+        notes=_notes(data, note),
+    )
+
+
+def _mode(
+    pole: complex,
+    cov: Real,
+    shape: Complex,
+    std: Real,
+    method: str,
+    stability: float,
+    scale_std: float,
+) -> Mode:
+    size = abs(pole)
+    along = np.array([pole.real, pole.imag]) / size
+    zeta = -pole.real / size
+    across = np.array([-1.0 / size + pole.real**2 / size**3, pole.real * pole.imag / size**3])
+    flags = []
+    if np.isfinite(scale_std) and scale_std > 0.1:
+        flags.append(f"scale uncertain by {100 * scale_std:.0f} %: the driving point lies near a node")
+    if zeta <= 0:
+        flags.append("damping not above zero after the window's share was taken off")
+    return Mode(
+        frequency_hz=float(size / (2 * np.pi)),
+        frequency_std_hz=float(np.sqrt(along @ cov @ along) / (2 * np.pi)),
+        damping_ratio=float(zeta),
+        damping_std=float(np.sqrt(across @ cov @ across)),
+        pole=pole,
+        shape=shape,
+        shape_std=std,
+        mpc=float(mpc(shape)),
+        method=method,
+        stability=stability,
+        flags=tuple(flags),
+    )
+
+
+def _chart(charts: list[PoleSet], poles: Complex, decay: float) -> tuple[StabilisationChart, Real]:
+    """Chart of all sub-bands, and each mode's share of the orders in the upper half of its sub-band's chart."""
+    selected, stable = [], []
+    votes = np.zeros(len(poles))
+    for chart in charts:
+        linked = link(chart)
+        stable.append(linked.stable)
+        choice = np.full(len(chart.pole), -1)
+        if len(poles) and len(chart.pole):
+            shift = np.abs(chart.pole.imag[:, None] - poles.imag[None])
+            loss = np.abs(chart.pole.real[:, None] - poles.real[None])
+            limit = FREQUENCY_TOLERANCE * np.abs(poles) + BANDWIDTH_TOLERANCE * -poles.real
+            score = np.maximum(shift / limit, loss / (2 * DAMPING_TOLERANCE * -poles.real))
+            best = np.argmin(score, axis=1)
+            hit = score[np.arange(len(best)), best] < 1
+            choice = np.where(hit, best, -1)
+            upper = chart.orders[len(chart.orders) // 2 :]
+            for r in np.unique(choice[hit]):
+                orders = np.unique(chart.order[choice == r])
+                votes[r] = max(votes[r], np.isin(orders, upper).sum() / max(len(upper), 1))
+        selected.append(choice)
+    physical = [chart.pole + decay for chart in charts]
+    pole = np.concatenate(physical)
+    return StabilisationChart(
+        order=np.concatenate([c.order for c in charts]).astype(np.int64),
+        frequency_hz=np.abs(pole) / (2 * np.pi),
+        damping_ratio=-pole.real / np.abs(pole),
+        stable=np.concatenate(stable),
+        selected=np.concatenate(selected).astype(np.int64),
+    ), np.minimum(votes, 1.0)
+
+
+def _synthesis(data: FitData, noise: Noise, modes: _Modes) -> Complex:
+    """Accelerance of the modes and residual terms, in the order (outputs, inputs)."""
+    fitted = synthesis(data, Estimate(modes.poles, modes.participation), modes.shapes.T)
+    total = fitted + residual_fit(data, noise.weight(data.measured), fitted)
+    total = np.where(data.measured[..., None], total, np.nan)
+    return np.asarray(total.swapaxes(0, 1) if data.transposed else total)
+
+
+def _notes(data: FitData, scaling: str) -> tuple[str, ...]:
+    notes = [scaling] if scaling else []
+    if data.measured.shape[1] == 1:
+        notes.append(
+            "one reference cannot show a multiplicity: modes of equal frequency appear as one; hit or measure "
+            "at a second point to tell them apart"
+        )
+    return tuple(notes)
