@@ -79,6 +79,25 @@ def get_effect(effect_id: str, library: Library | None = None) -> Effect:
     return known[effect_id]
 
 
+def parse_sized(text: str) -> tuple[str, dict[str, float]]:
+    """Read ``id@place:name=value,name=value``; without values the effect's start values apply later.
+
+    >>> parse_sized("flexible_support@ring:mass=3,stiffness=2e7")
+    ('flexible_support@ring', {'mass': 3.0, 'stiffness': 20000000.0})
+    """
+    label, _, sizes = text.strip().partition(":")
+    values: dict[str, float] = {}
+    for part in filter(None, (p.strip() for p in sizes.split(","))):
+        name, equals, number = part.partition("=")
+        try:
+            values[name.strip()] = float(number)
+        except ValueError:
+            equals = ""
+        if not equals:
+            raise EmaError(f"'{text}': '{part}' is not of the form name=number") from None
+    return label.strip(), values
+
+
 def parse_effect(
     text: str, rig: Rig, configuration: str | None = None, library: Library | None = None
 ) -> PlacedEffect:

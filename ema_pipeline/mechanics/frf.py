@@ -34,7 +34,7 @@ def receptance(
     Raises
     ------
     EmaError
-        If a line falls on a pole of the system (0 Hz with a rigid-body mode): the receptance is infinite there.
+        If a line falls on a pole of the system (0 Hz with a rigid-body mode).
     """
     frequency_hz = np.asarray(frequency_hz, dtype=float)
     if not np.any(system.damping) and not np.any(system.structural):

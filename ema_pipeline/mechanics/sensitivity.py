@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,8 +63,8 @@ def eigen_sensitivity(
 
     Notes
     -----
-    dλ_r = φ_rᵀ(K' - λM')φ_r; for a repeated eigenvalue the eigenvalues of that form on its subspace. Shapes by
-    modal expansion, complete here because all modes are at hand.
+    dλ_r = φ_rᵀ(K' - λM')φ_r; for a repeated eigenvalue the eigenvalues of that form on its subspace. Shapes
+    by modal expansion, complete here because all modes are at hand.
 
     References
     ----------
@@ -98,4 +99,4 @@ def equal_groups(values: NDArray[np.float64]) -> tuple[tuple[int, int], ...]:
     """Ranges of ascending eigenvalues that are equal to `EQUAL`."""
     limit = EQUAL * max(float(np.max(np.abs(values), initial=0.0)), 1e-300)
     starts = [0, *(np.flatnonzero(np.diff(values) > limit) + 1).tolist(), len(values)]
-    return tuple((a, b) for a, b in zip(starts[:-1], starts[1:], strict=True) if b > a)
+    return tuple((a, b) for a, b in pairwise(starts) if b > a)

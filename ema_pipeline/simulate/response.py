@@ -1,0 +1,86 @@
+"""What ideal sensors of a linear rig read: exact, band-limited samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.errors import EmaError
+from ema_pipeline.mechanics.assembly import Assembly
+from ema_pipeline.mechanics.frf import accelerance
+from ema_pipeline.mechanics.modes import complex_modes
+from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
+from ema_pipeline.simulate.hammer import ForceHistory, anti_alias
+
+Respond = Callable[
+    [Assembly, tuple[ForceHistory, ...], Dof, tuple[Dof, ...]],
+    tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...],
+]
+"""``respond(assembly, histories, impact, sensors)``: force (n,), accelerations (n_sensors, n) per history."""
+
+REST = 1e-7
+"""The periodic record is so long that responses decay to this share before it starts anew."""
+
+LONGEST = 2**22
+
+
+def linear_response(
+    assembly: Assembly, histories: tuple[ForceHistory, ...], impact: Dof, sensors: tuple[Dof, ...]
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...]:
+    """Force and accelerations of each record.
+
+    The force's spectrum is known in closed form and the accelerance exactly, so their product is sampled
+    without an error of time stepping or interpolation; the anti-alias filter acts on force and responses
+    alike. The transform's period is long enough for every mode to die out.
+
+    Parameters
+    ----------
+    assembly : Assembly
+    histories : tuple of ForceHistory
+        Of equal rate and length.
+    impact : Dof
+    sensors : tuple of Dof
+
+    Returns
+    -------
+    tuple of (force, accelerations)
+        N, (n_samples,), and m/s², (n_sensors, n_samples).
+
+    Raises
+    ------
+    EmaError
+        If a mode is damped too little to die out in any reasonable time.
+    """
+    system = assembly.system()
+    rate, n = histories[0].sample_rate_hz, histories[0].n_samples
+    period = scipy.fft.next_fast_len(n + int(np.ceil(rate * _decay_time(system))), real=True)
+    if period > LONGEST:
+        raise EmaError(
+            f"simulated responses ring for {period / rate:.0f} s: give every mode some damping, "
+            "e.g. modal_damping_ratio = 0.01"
+        )
+    frequency_hz = np.asarray(np.fft.rfftfreq(period, 1 / rate), dtype=np.float64)
+    transfer = accelerance(
+        system, frequency_hz, sensor_rows(system, sensors), sensor_rows(system, (impact,))
+    )[:, 0]
+    gain = rate * anti_alias(frequency_hz, rate)
+    results = []
+    for history in histories:
+        spectrum = gain * history.spectrum(frequency_hz)
+        force = scipy.fft.irfft(spectrum, period)[:n]
+        results.append((force, scipy.fft.irfft(transfer * spectrum, period, axis=-1)[:, :n]))
+    return tuple(results)
+
+
+def _decay_time(system: LinearSystem) -> float:
+    """Time in which the slowest mode decays to `REST`, s."""
+    poles = complex_modes(system).poles
+    decay = -poles.real[np.abs(poles) > 0]
+    slowest = float(decay.min(initial=np.inf))
+    if slowest <= 0:
+        return float(LONGEST)
+    return float(-np.log(REST) / slowest)

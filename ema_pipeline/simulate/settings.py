@@ -1,0 +1,38 @@
+"""Settings of a simulated test: what is recorded, how, and how well."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from ema_pipeline.settings import Settings
+
+RecordFormat = Literal["uff", "csv", "hdf5", "mat", "wav", "tdms"]
+
+
+class SimulationSettings(Settings):
+    """How the simulated test is made and recorded."""
+
+    hits: int = Field(2, ge=1, description="hits per impact point and force level")
+    hits_per_record: int = Field(1, ge=1, description="hits in one continuous record file")
+    peak_force_n: tuple[float, ...] = Field((150.0,), min_length=1, description="force levels, N")
+    force_spread: float = Field(0.1, ge=0, lt=0.5, description="relative spread (1 σ) of the peak force")
+    contact_s: float = Field(6e-4, gt=0, description="duration of the hammer's contact, s")
+    sample_rate_hz: float = Field(5120.0, gt=0, description="sample rate, Hz")
+    duration_s: float = Field(2.0, gt=0, description="length of the record per hit, s")
+    pretrigger_s: float = Field(0.1, gt=0, description="time before the blow, s")
+    force_noise_n: float = Field(0.009, ge=0, description="noise of the hammer channel, N rms")
+    acceleration_noise: float = Field(0.002, ge=0, description="noise of the accelerometers, m/s² rms")
+    offset_v: float = Field(1e-3, ge=0, description="standard deviation of the channels' DC offsets, V")
+    converter_bits: int = Field(24, ge=8, le=32, description="resolution of the converter")
+    converter_range_v: float = Field(10.0, gt=0, description="the converter carries ± this voltage")
+    hammer_sensitivity_mv: float = Field(2.25, gt=0, description="mV/N")
+    accelerometer_sensitivity_mv: float = Field(1.00, gt=0, description="mV/(m/s²)")
+    scatter: float = Field(
+        0.0, ge=0, description="true parameters deviate by this many tolerances (1 σ), at random"
+    )
+    double_hits: tuple[str, ...] = Field((), description="hits that bounce: '[configuration:]dof#number'")
+    overloads: tuple[str, ...] = Field((), description="hits that clip the hammer channel, written alike")
+    format: RecordFormat = Field("uff", description="format of the record files")
+    seed: int = Field(0, ge=0, description="seed of all random numbers")
