@@ -100,14 +100,14 @@ def frf_sheet(frfs: FrfSet, modal: ModalModel | None, picks: Sequence[tuple[int,
         hits = int(frfs.hits[o, i])
         label = f"measured, mean of {hits} hits" if hits > 1 else "measured, one hit"
         _curve(top, f[shown], np.abs(h[shown]), MEASURED, "-", label)
-        _curve(middle, f[shown], np.rad2deg(np.angle(h[shown])), MEASURED, "-")
+        _curve(middle, f[shown], phase_deg(h[shown]), MEASURED, "-")
         if modal is not None:
             model = _synthesis_of(modal, frfs, o, i)
             if model is not None:
                 keep = (modal.frequency_hz >= low) & (modal.frequency_hz <= high)
                 g = modal.frequency_hz[keep]
                 _curve(top, g, np.abs(model[keep]), MODEL, "--", "modal model")
-                _curve(middle, g, np.rad2deg(np.angle(model[keep])), MODEL, "--")
+                _curve(middle, g, phase_deg(model[keep]), MODEL, "--")
         log_y(top)
         _limit_decades(top, np.abs(h[shown]))
         top.legend(loc="lower right", ncols=1, handlelength=2.4, borderpad=0.3)
@@ -180,6 +180,14 @@ def frf_overview(frfs: FrfSet, modal: ModalModel | None) -> Figure:
     mark_modes(bottom, modes, numbers=False)
     figure.align_ylabels([top, bottom])
     return figure
+
+
+def phase_deg(frf: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Phase in degrees, NaN after each wrap so that no vertical line is drawn there."""
+    phase = np.rad2deg(np.angle(frf))
+    wraps = np.flatnonzero(np.abs(np.diff(phase)) > 180) + 1
+    phase[wraps] = np.nan
+    return np.asarray(phase)
 
 
 def cmif(frf: NDArray[np.complex128], count: int = 4) -> NDArray[np.float64]:

@@ -82,7 +82,7 @@ def stabilisation_chart(modal: ModalModel, frfs: FrfSet | None) -> Figure:
 def modes_overview(modal: ModalModel) -> Figure:
     """Damping ratio against frequency, and what the circle fits say of the frequency, with error bars."""
     figure = new_figure(4.0)
-    grid = figure.add_gridspec(2, 1, hspace=0.16, height_ratios=(1.3, 1), **margins(figure, top=0.62))
+    grid = figure.add_gridspec(2, 1, hspace=0.16, height_ratios=(1.3, 1), **margins(figure, left=0.8, top=0.62))
     top, bottom = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
     f = np.array([m.frequency_hz for m in modal.modes])
     std = np.array([m.frequency_std_hz for m in modal.modes])

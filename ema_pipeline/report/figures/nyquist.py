@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from ema_pipeline.modal.types import CircleFit, ModalModel
 from ema_pipeline.report.numbers import format_percent, format_value
@@ -40,8 +41,8 @@ def nyquist_sheet(modal: ModalModel, index: int, calibrated: bool = True) -> Fig
     circles = mode.circles[:CHANNELS_PER_SHEET]
     columns = min(max(len(circles), 1), 2)
     rows = -(-max(len(circles), 1) // 2)
-    figure = new_figure(0.75 + 3.0 * rows)
-    grid = figure.add_gridspec(rows, 2, hspace=0.34, wspace=0.3, **margins(figure, top=0.62))
+    figure = new_figure(0.95 + 2.7 * rows)
+    grid = figure.add_gridspec(rows, 2, hspace=0.34, wspace=0.3, **margins(figure, top=0.76))
     frequency = format_value(mode.frequency_hz, mode.frequency_std_hz, "Hz")
     damping = format_percent(mode.damping_ratio, mode.damping_std)
     figure.text(
@@ -55,11 +56,15 @@ def nyquist_sheet(modal: ModalModel, index: int, calibrated: bool = True) -> Fig
         note(ax, "no circle fit for this mode")
     for k, circle in enumerate(circles):
         where = grid[k // 2, :] if columns == 1 else grid[k // 2, k % 2]
-        _panel(figure.add_subplot(where), circle, mode.frequency_hz, calibrated, legend=k == 0)
+        _panel(figure.add_subplot(where), circle, mode.frequency_hz, calibrated)
+    if circles:
+        entries = {label: h for ax in figure.axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+        figure.legend(entries.values(), entries.keys(), loc="upper center", ncols=5, frameon=False, handlelength=1.6,
+                      bbox_to_anchor=(0.5, 1 - 0.26 / figure.get_size_inches()[1]), columnspacing=1.4, fontsize=6.5)  # fmt: skip
     return figure
 
 
-def _panel(ax: Axes, circle: CircleFit, pole_hz: float, calibrated: bool, legend: bool) -> None:
+def _panel(ax: Axes, circle: CircleFit, pole_hz: float, calibrated: bool) -> None:
     largest = float(np.max(np.abs(circle.points), initial=0.0)) or 1.0
     exponent = int(np.floor(np.log10(largest)))
     scale = 10.0**-exponent
@@ -75,12 +80,7 @@ def _panel(ax: Axes, circle: CircleFit, pole_hz: float, calibrated: bool, legend
     half = np.array([1 - circle.damping_ratio, 1 + circle.damping_ratio]) * circle.natural_frequency_hz
     for f, label in zip(half, ("half-power points", "_"), strict=True):
         _mark(ax, circle, float(f), scale, "s", GREEN, 5, label)
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.margins(0.12)
-    # room on the right for the pair damping and the words
-    reach = max(float(np.ptp(np.r_[z.real, centre.real - radius, centre.real + radius])), 2 * radius)
-    ax.set_xlim(centre.real - 0.66 * reach, centre.real + 1.5 * reach)
-    ax.set_ylim(centre.imag - 0.72 * reach, centre.imag + 0.9 * reach)
+    _equal_limits(ax, z, centre, radius)
     ax.xaxis.set_major_locator(MaxNLocator(4))
     ax.yaxis.set_major_locator(MaxNLocator(5))
     unit = f"{_power(exponent)}(m/s)/{'N' if calibrated else 'V'}"
@@ -97,8 +97,22 @@ def _panel(ax: Axes, circle: CircleFit, pole_hz: float, calibrated: bool, legend
     )  # fmt: skip
     if circle.pair_damping.size >= 3:
         _damping_inset(ax, circle)
-    if legend:
-        ax.legend(loc="upper right", borderpad=0.3, labelspacing=0.25, handlelength=1.6, fontsize=6)
+
+
+def _equal_limits(ax: Axes, z: NDArray[np.complex128], centre: complex, radius: float) -> None:
+    """Equal scales, with room on the right for the pair damping and the words."""
+    figure = ax.get_figure()
+    assert figure is not None
+    box, (width, height) = ax.get_position(), figure.get_size_inches()
+    left = min(float(z.real.min(initial=np.inf)), centre.real - radius)
+    right = max(float(z.real.max(initial=-np.inf)), centre.real + radius)
+    low = min(float(z.imag.min(initial=np.inf)), centre.imag - radius)
+    high = max(float(z.imag.max(initial=-np.inf)), centre.imag + radius)
+    per_inch = max((right - left) / (0.64 * box.width * width), (high - low) / (0.78 * box.height * height))
+    half = 0.5 * per_inch * box.height * height
+    start = left - 0.03 * per_inch * box.width * width
+    ax.set_xlim(start, start + per_inch * box.width * width)
+    ax.set_ylim(0.5 * (low + high) - half, 0.5 * (low + high) + half)
 
 
 def _damping_inset(ax: Axes, circle: CircleFit) -> None:

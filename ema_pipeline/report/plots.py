@@ -1,0 +1,228 @@
+"""Which figures a run has, drawn once and kept as PNG and SVG."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from matplotlib.figure import Figure
+
+from ema_pipeline.report import style
+from ema_pipeline.report.figures import comparison, fit, frf, mac, modes, nyquist, shapes
+from ema_pipeline.report.numbers import slug
+from ema_pipeline.report.planetary import layout_of
+from ema_pipeline.report.results import ConfigurationResults, RunResults
+
+Format = Literal["png", "svg"]
+Progress = Callable[[int, int, str], None]
+"""Called with the number of figures done, their total, and the name of the one just drawn."""
+
+
+@dataclass(frozen=True)
+class FigureSpec:
+    """A figure before it is drawn.
+
+    Attributes
+    ----------
+    name : str
+        Stem of its file names; stays the same from run to run.
+    section : str
+        Part of the report, e.g. ``"frf"``, ``"nyquist"``.
+    configuration : str
+        Empty for figures over all configurations.
+    caption : str
+        What it shows, in words; the text for readers who cannot see it.
+    draw : callable
+        Returns the figure.
+    report_format : {"png", "svg"}
+        The smaller of the two for this kind of figure.
+    """
+
+    name: str
+    section: str
+    configuration: str
+    caption: str
+    draw: Callable[[], Figure]
+    report_format: Format = "svg"
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A drawn figure: the bytes of its files by format, and its size in inches."""
+
+    spec: FigureSpec
+    files: dict[Format, bytes]
+    width_in: float
+
+
+def figure_specs(results: RunResults) -> tuple[FigureSpec, ...]:
+    """All figures that these results allow, in the order of the report."""
+    specs: list[FigureSpec] = []
+    for configuration in results.configurations:
+        specs += _measured(configuration)
+    specs += _fitted(results)
+    return tuple(specs)
+
+
+def render(
+    results: RunResults, formats: Collection[Format] | None = None, progress: Progress | None = None
+) -> tuple[Plot, ...]:
+    """Draw all figures.
+
+    Parameters
+    ----------
+    results : RunResults
+    formats : collection of {"png", "svg"} or None
+        None keeps for each figure the one format that the report embeds.
+    progress : callable or None
+    """
+    specs = figure_specs(results)
+    plots = []
+    for number, spec in enumerate(specs, start=1):
+        plots.append(_render(spec, formats or (spec.report_format,)))
+        if progress is not None:
+            progress(number, len(specs), spec.name)
+    return tuple(plots)
+
+
+def write_plots(
+    results: RunResults, folder: str | Path, progress: Progress | None = None
+) -> tuple[Plot, ...]:
+    """Draw all figures and write each as ``<name>.png`` and ``<name>.svg`` into `folder`.
+
+    Figures of an earlier run that this one no longer has are removed (those that ``figures.txt`` names).
+
+    Returns
+    -------
+    tuple of Plot
+        Hand it to `write_report`, which then need not draw again.
+    """
+    target = Path(folder)
+    target.mkdir(parents=True, exist_ok=True)
+    index = target / "figures.txt"
+    before = set(index.read_text(encoding="utf-8").split()) if index.is_file() else set()
+    plots = render(results, ("png", "svg"), progress)
+    names = []
+    for plot in plots:
+        for suffix, content in plot.files.items():
+            names.append(f"{plot.spec.name}.{suffix}")
+            (target / names[-1]).write_bytes(content)
+    for stale in before - set(names):
+        # names come from a file that a user can edit: never leave the folder
+        if Path(stale).name == stale and stale.endswith((".png", ".svg")):
+            (target / stale).unlink(missing_ok=True)
+    index.write_text("\n".join(names) + "\n", encoding="utf-8")
+    return plots
+
+
+def _render(spec: FigureSpec, formats: Collection[Format]) -> Plot:
+    figure = spec.draw()
+    files: dict[Format, bytes] = {}
+    if "png" in formats:
+        files["png"] = style.png(figure)
+    if "svg" in formats:
+        files["svg"] = style.svg(figure)
+    return Plot(spec, files, float(figure.get_size_inches()[0]))
+
+
+def _chunks(count: int, size: int) -> Iterator[list[int]]:
+    for start in range(0, count, size):
+        yield list(range(start, min(start + size, count)))
+
+
+def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:
+    frfs, modal, pairing = configuration.frfs, configuration.modal, configuration.pairing
+    name = configuration.name
+    stem = slug(name)
+    if frfs is not None:
+        picks = frf.representative_frfs(frfs)
+        for n, chunk in enumerate(_chunks(len(picks), frf.FRFS_PER_SHEET), start=1):
+            chosen = [picks[k] for k in chunk]
+            which = " and ".join(f"{frfs.outputs[o].point} ← {frfs.inputs[i].point}" for o, i in chosen)
+            yield FigureSpec(
+                f"{stem}_frf_{n}", "frf", name, f"FRFs {which}: magnitude, phase and coherence, with the modal model",
+                partial(frf.frf_sheet, frfs, modal, chosen), "png",
+            )  # fmt: skip
+        yield FigureSpec(
+            f"{stem}_frf_all", "frf", name, "All FRFs over one another, and the complex mode indicator function",
+            partial(frf.frf_overview, frfs, modal), "png",
+        )  # fmt: skip
+    if modal is None:
+        return
+    calibrated = frfs.force_calibrated if frfs is not None else True
+    for i, mode in enumerate(modal.modes):
+        if mode.circles:
+            caption = f"Nyquist circles of mode {i + 1} at {mode.frequency_hz:.5g} Hz in its best FRFs"
+            draw = partial(nyquist.nyquist_sheet, modal, i, calibrated)
+            yield FigureSpec(f"{stem}_nyquist_{i + 1:02d}", "nyquist", name, caption, draw)
+    yield FigureSpec(
+        f"{stem}_stabilisation", "stabilisation", name, "Stabilisation chart: poles of all model orders over the CMIF",
+        partial(modes.stabilisation_chart, modal, frfs), "png",
+    )  # fmt: skip
+    if modal.modes:
+        yield FigureSpec(
+            f"{stem}_modes", "modes", name, "Natural frequencies and damping ratios with their uncertainty",
+            partial(modes.modes_overview, modal),
+        )  # fmt: skip
+        yield FigureSpec(
+            f"{stem}_mac_measured", "pairing", name, "MAC of the measured modes with each other",
+            partial(mac.auto_mac_matrix, modal),
+        )  # fmt: skip
+    if pairing is not None:
+        yield FigureSpec(
+            f"{stem}_pairing", "pairing", name, "Measured against model frequencies of the pairs, and their deviation",
+            partial(mac.pairing_plot, pairing, modal),
+        )  # fmt: skip
+        yield FigureSpec(
+            f"{stem}_mac_model", "pairing", name, "MAC of measured with model modes; pairs are framed",
+            partial(mac.pairing_mac_matrix, pairing, modal),
+        )  # fmt: skip
+    yield from _shapes(configuration, stem)
+
+
+def _shapes(configuration: ConfigurationResults, stem: str) -> Iterator[FigureSpec]:
+    modal = configuration.modal
+    assert modal is not None
+    layout = layout_of(configuration)
+    size = shapes.GEAR_MODES_PER_SHEET if layout else shapes.STEM_MODES_PER_SHEET
+    for n, chunk in enumerate(_chunks(len(modal.modes), size), start=1):
+        caption = f"Shapes of modes {chunk[0] + 1} to {chunk[-1] + 1}"
+        if layout is not None:
+            yield FigureSpec(f"{stem}_shapes_{n}", "shapes", configuration.name, caption + " as a moved gear set",
+                             partial(shapes.gear_shapes, configuration, layout, chunk), "png")  # fmt: skip
+        else:
+            yield FigureSpec(f"{stem}_shapes_{n}", "shapes", configuration.name, caption + " over the DOFs",
+                             partial(shapes.stem_shapes, configuration, chunk))  # fmt: skip
+
+
+def _fitted(results: RunResults) -> Iterator[FigureSpec]:
+    found, compared = results.fit, results.comparison
+    if found is not None:
+        if found.sweeps:
+            yield FigureSpec("error_function", "error_function", "", "Error function ε over the mesh stiffnesses",
+                             partial(fit.error_sweeps, found.sweeps))  # fmt: skip
+        yield FigureSpec("fit_parameters", "fit", "", "Fitted parameters against their nominal values and tolerances",
+                         partial(fit.parameter_forest, found))  # fmt: skip
+        profiled = [p for p in found.parameters.values() if p.profile is not None]
+        for n, chunk in enumerate(_chunks(len(profiled), fit.PROFILES_PER_SHEET), start=1):
+            yield FigureSpec(f"fit_profiles_{n}", "fit", "", "Profile likelihood of fitted parameters",
+                             partial(fit.profiles, [profiled[k] for k in chunk]))  # fmt: skip
+        if len(found.names) > 1:
+            yield FigureSpec("fit_correlation", "fit", "", "Correlation of the fitted parameters",
+                             partial(fit.correlation_matrix, found))  # fmt: skip
+    if compared is None:
+        return
+    if compared.modes:
+        yield FigureSpec("comparison_modes", "comparison", "", "Frequency, damping and shape differences per mode, in σ",
+                         partial(comparison.mode_differences, compared.modes))  # fmt: skip
+    layouts = {c.name: layout_of(c) for c in results.configurations}
+    for name in dict.fromkeys(d.configuration for d in compared.dofs):
+        mine = [d for d in compared.dofs if d.configuration == name]
+        yield FigureSpec(f"comparison_{slug(name)}_dofs", "comparison", name, f"{name}: shape difference per DOF, in σ",
+                         partial(comparison.dof_differences, mine, layouts.get(name)))  # fmt: skip
+    for name in dict.fromkeys(b.configuration for b in compared.bands):
+        yield FigureSpec(f"comparison_{slug(name)}_frfs", "comparison", name, f"{name}: FRF difference per band, in σ",
+                         partial(comparison.band_differences, compared.bands, name))  # fmt: skip

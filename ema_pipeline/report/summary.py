@@ -1,0 +1,152 @@
+"""The run in plain words: what was found, what was fitted, and what to be careful about."""
+
+from __future__ import annotations
+
+import math
+
+from ema_pipeline.fit.types import FitResult, ParameterEstimate
+from ema_pipeline.report.numbers import format_value, plain, words
+from ema_pipeline.report.results import ConfigurationResults, RunResults
+
+LOW_MAC = 0.8
+"""Below this a pair is named as doubtful (common practice: 0.9 good, under 0.8 to be looked at)."""
+
+FAR_SIGMA = 3.0
+"""A difference beyond this many standard uncertainties is named."""
+
+
+def findings(results: RunResults) -> tuple[str, ...]:
+    """What was measured and how well the model follows it, one sentence each."""
+    lines = [_measured(c) for c in results.configurations]
+    if not lines:
+        lines = ["Nothing has been analysed yet."]
+    compared, fit = results.comparison, results.fit
+    if fit is not None:
+        lines.append(
+            f"The fit uses {fit.data_count} data; χ² per degree of freedom is {plain(fit.chi2_per_dof, 3)}, "
+            f"the error function ε is {plain(fit.frequency_error, 3)}."
+        )
+    if compared is not None and math.isfinite(compared.error):
+        size = plain(compared.error, 3)
+        if compared.error <= 1.5:
+            lines.append(
+                f"Model and measurement differ by {size} standard uncertainties (root mean square): the model explains "
+                "the data about as well as the data can tell."
+            )
+        else:
+            lines.append(
+                f"Model and measurement differ by {size} standard uncertainties (root mean square): "
+                "more than the measurement's uncertainty explains."
+            )
+            lines += _worst(results)
+    return tuple(lines)
+
+
+def stiffnesses(fit: FitResult) -> tuple[ParameterEstimate, ...]:
+    """The parameters that a reader wants first: the free ones, or else the mesh stiffnesses."""
+    free = tuple(p for p in fit.parameters.values() if p.free)
+    return free or tuple(p for p in fit.parameters.values() if "mesh_stiffness" in p.name)
+
+
+def identified_words(p: ParameterEstimate) -> str:
+    """``"identified by the data"`` or why not."""
+    if p.identified:
+        return "identified by the data"
+    if p.free:
+        return "not identified by the data" + (f": {p.note}" if p.note else "")
+    return "not narrowed by the data: its tolerance decides"
+
+
+def cautions(results: RunResults) -> tuple[str, ...]:
+    """What to be careful about, one sentence each, the gravest first."""
+    lines: list[str] = []
+    fit = results.fit
+    if fit is not None:
+        for p in fit.parameters.values():
+            value = format_value(p.value, p.std, p.unit)
+            if p.free and not p.identified:
+                lines.append(f"{words(p.name)} ({value}) is {identified_words(p)}. Do not quote it as a result.")
+            elif math.isfinite(p.shift_z) and abs(p.shift_z) > FAR_SIGMA:
+                lines.append(
+                    f"{words(p.name)} was fitted to {value}, {abs(p.shift_z):.1f} tolerances from its nominal "
+                    f"{format_value(p.nominal, p.prior_std, p.unit)}: check the nominal value."
+                )
+        lines += [
+            f"Error function of {words(s.parameter)}, {s.configuration}, {s.mode_count} modes: {s.note}"
+            for s in fit.sweeps
+            if not s.identified
+        ]
+    for c in results.configurations:
+        lines += [f"{c.name}: {text}" for text in _cautions_of(c)]
+    lines += results.warnings
+    return tuple(dict.fromkeys(_sentence(line) for line in lines))
+
+
+def _measured(c: ConfigurationResults) -> str:
+    used = sum(h.accepted for h in c.hits)
+    text = f"{c.name}: {used} of {len(c.hits)} hits used" if c.hits else f"{c.name}:"
+    if c.frfs is not None:
+        text += f"{',' if c.hits else ''} {len(c.frfs.outputs)} responses × {len(c.frfs.inputs)} impact points"
+    if c.modal is None:
+        return text + "; no modes identified yet."
+    low, high = c.modal.band_hz
+    text += f"; {_count(len(c.modal.modes), 'mode')} between {low:.4g} and {high:.5g} Hz"
+    if c.pairing is not None:
+        text += f", {len(c.pairing.pairs)} of them paired with the model"
+    return text + "."
+
+
+def _cautions_of(c: ConfigurationResults) -> list[str]:
+    lines = []
+    rejected = [h for h in c.hits if not h.accepted]
+    if rejected:
+        lines.append(f"{_count(len(rejected), 'hit')} rejected; the reasons are under Hits")
+    if c.frfs is not None:
+        singles = int(((c.frfs.hits == 1)).sum())
+        if singles:
+            lines.append(f"{_count(singles, 'FRF')} rest on one hit: no coherence and no scatter to judge them by")
+        if not c.frfs.force_calibrated:
+            lines.append("the hammer is not calibrated: FRFs and shapes have no absolute scale")
+        lines += [v.message or f"{v.check} fails" for v in c.frfs.verdicts if not v.passes][:5]
+    if c.modal is not None:
+        if not c.modal.scaled:
+            lines.append(f"shapes are not mass-normalised: {c.modal.scaling_note or 'no driving point'}")
+        lines += c.modal.notes
+    if c.pairing is not None:
+        lines += [f"measured mode {u.index + 1} at {u.frequency_hz:.5g} Hz has no model partner: {u.reason}"
+                  for u in c.pairing.unpaired_measured]  # fmt: skip
+        weak = [p for p in c.pairing.pairs if p.mac < LOW_MAC]
+        if weak:
+            named = ", ".join(f"{p.measured_frequency_hz:.5g} Hz ({p.mac:.2f})" for p in weak[:6])
+            more = f" and {len(weak) - 6} more" if len(weak) > 6 else ""
+            lines.append(f"doubtful pairs with MAC under {LOW_MAC}: {named}{more}")
+    return lines
+
+
+def _worst(results: RunResults) -> list[str]:
+    compared = results.comparison
+    assert compared is not None
+    lines = []
+    modes = [
+        (abs(z), what, m)
+        for m in compared.modes
+        for what, z in (("frequency", m.frequency_z), ("damping", m.damping_z), ("shape", m.shape_z))
+        if math.isfinite(z) and abs(z) > FAR_SIGMA
+    ]
+    if modes:
+        z, what, m = max(modes, key=lambda t: t[0])
+        lines.append(f"Largest difference in a mode: {what} of {m.measured_frequency_hz:.5g} Hz, {m.configuration}, {plain(z, 2)}σ.")
+    dofs = [d for d in compared.dofs if math.isfinite(d.z) and d.z > FAR_SIGMA]
+    if dofs:
+        d = max(dofs, key=lambda d: d.z)
+        lines.append(f"Largest difference in shape: at {d.dof}, {d.configuration}, {plain(d.z, 2)}σ.")
+    return lines
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}{'' if n == 1 else 's'}"
+
+
+def _sentence(text: str) -> str:
+    text = text.strip()
+    return text if text.endswith((".", "!", "?")) else text + "."
