@@ -10,6 +10,7 @@ from ema_pipeline.ingest.description import (
     read_campaign,
     read_description,
 )
+from ema_pipeline.ingest.draft import draft_description, write_drafts
 from ema_pipeline.ingest.load import load_channels, load_record, load_records
 from ema_pipeline.ingest.readers import read_raw
 
@@ -18,10 +19,12 @@ __all__ = [
     "ChannelDescription",
     "RecordDescription",
     "TestDescription",
+    "draft_description",
     "load_channels",
     "load_record",
     "load_records",
     "read_campaign",
     "read_description",
     "read_raw",
+    "write_drafts",
 ]

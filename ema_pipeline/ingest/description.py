@@ -248,6 +248,11 @@ def _check_channels(test: TestDescription) -> None:
 
 
 def _check_channel(channel: ChannelDescription, where: str) -> None:
+    if channel.unit.strip() in ("", "?"):
+        raise EmaError(
+            f"{where}: unit is not filled in; write the engineering unit, e.g. "
+            f"'{SI_SYMBOL[channel.quantity]}', and sensitivity_mv if the file holds volts"
+        )
     try:
         unit = channel.parsed_unit
     except EmaError as error:
