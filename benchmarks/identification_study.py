@@ -1,0 +1,292 @@
+"""Study of modal identification on random systems simulated as hammer tests.
+
+    python benchmarks/identification_study.py random --cases 200
+    python benchmarks/identification_study.py pairs --cases 50
+    python benchmarks/identification_study.py coverage --cases 500
+    python benchmarks/identification_study.py noise --cases 30
+
+Records are simulated (blow, response, noise on all channels) and turned into H1 estimates by the simulator of the
+tests. A true mode counts as found when an identified mode lies within 0.5 half-power bandwidths + 0.05 % of it.
+
+A true mode is called invisible, and left out of recall, by a criterion on the truth alone: with the true noise,
+the Cramér–Rao bound of its decay rate, all other modes known, exceeds 20 % (`visible`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from simulate_modal import FrfSet, Hits, TrueSystem, frf_set, h1, random_system, simulate_hits  # noqa: E402
+
+from ema_pipeline.modal.identify import identify  # noqa: E402
+from ema_pipeline.modal.settings import ModalSettings  # noqa: E402
+from ema_pipeline.modal.types import ModalModel  # noqa: E402
+
+INVISIBLE_STD = 0.2
+
+
+def crlb_decay(system: TrueSystem, hits: Hits, frfs: FrfSet, dofs_out: list[int], dofs_in: list[int]) -> np.ndarray:
+    """Cramér–Rao bound of each mode's relative decay rate, other modes known, this mode's residues unknown.
+
+    Per FRF with residue Q and white noise density, a single mode's damping has information
+    Σ 2|Q|²·σ²/v·Σ|P⊥ (jω − s)⁻²|², P⊥ taking out the residue.
+    """
+    omega = 2 * np.pi * frfs.frequency_hz[1:]
+    n = hits.force.shape[-1]
+    force2 = np.mean(np.abs(np.fft.rfft(hits.force)) ** 2, axis=1)[:, 1:]  # (in, f)
+    n_hits = hits.force.shape[1]
+    truth = system.accelerance(frfs.frequency_hz[1:], dofs_out, dofs_in)
+    v = (hits.response_noise[:, None, None] ** 2 * n + np.abs(truth) ** 2 * hits.force_noise**2 * n) / (
+        n_hits * force2[None]
+    )
+    out = np.empty(len(system.frequency_hz))
+    for r, s in enumerate(system.poles):
+        q = s**2 * np.outer(system.shapes[r, dofs_out], system.shapes[r, dofs_in]) / (2j * s.imag)
+        u = 1 / (1j * omega - s)
+        w = 1 / v
+        uu = np.einsum("oif,f->oi", w, np.abs(u) ** 2)
+        ud = np.einsum("oif,f->oi", w, u.conj() * u**2)
+        dd = np.einsum("oif,f->oi", w, np.abs(u) ** 4)
+        info = 2 * np.sum(np.abs(q) ** 2 * (dd - np.abs(ud) ** 2 / uu))
+        out[r] = 1 / np.sqrt(info) / abs(s.real)
+    return out
+
+
+def match(system: TrueSystem, model: ModalModel) -> tuple[dict[int, int], list[int]]:
+    """True mode → identified mode, one to one, nearest first; and the identified modes without a partner."""
+    f = np.array([m.frequency_hz for m in model.modes])
+    pairs = sorted(
+        (abs(fj - ft), t, j) for t, ft in enumerate(system.frequency_hz) for j, fj in enumerate(f)
+    )
+    found: dict[int, int] = {}
+    used: set[int] = set()
+    for distance, t, j in pairs:
+        limit = (system.damping_ratio[t] + 5e-4) * system.frequency_hz[t]
+        if t not in found and j not in used and distance <= limit:
+            found[t] = j
+            used.add(j)
+    return found, [j for j in range(len(f)) if j not in used]
+
+
+def random_case(seed: int) -> tuple[TrueSystem, Hits, FrfSet, list[int], list[int]]:
+    rng = np.random.default_rng(seed)
+    n_modes = int(rng.integers(4, 16))
+    n_ref = int(rng.integers(1, 5))
+    n_out = int(rng.integers(max(6, n_ref), 25))
+    f_max = float(rng.choice([400.0, 800.0, 1600.0, 3200.0]))
+    low = f_max * rng.uniform(0.02, 0.15)
+    system = random_system(rng, n_modes=n_modes, n_dofs=n_out, low_hz=low, high_hz=0.95 * f_max)
+    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
+    record = float(np.clip(4.5 / slowest, 1024 / f_max, 16384 / f_max))
+    dofs_out, dofs_in = list(range(n_out)), sorted(rng.choice(n_out, n_ref, replace=False).tolist())
+    hits = simulate_hits(
+        system,
+        dofs_out,
+        dofs_in,
+        f_max=f_max,
+        record_s=record,
+        n_hits=int(rng.integers(2, 6)),
+        force_noise=rng.uniform(0.01, 0.05),
+        response_noise=rng.uniform(0.01, 0.05),
+        rng=rng,
+    )
+    return system, hits, h1(hits, dofs_out, dofs_in, f_max), dofs_out, dofs_in
+
+
+def random_study(cases: int, first: int, settings: ModalSettings, peer: bool, verbose: bool) -> None:
+    truth = found = spurious = invisible = 0
+    ef, ez, zf, zz, ep = [], [], [], [], []
+    clock = 0.0
+    for seed in range(first, first + cases):
+        system, hits, frfs, dofs_out, dofs_in = random_case(seed)
+        bound = crlb_decay(system, hits, frfs, dofs_out, dofs_in)
+        t = time.perf_counter()
+        model = identify(frfs, settings)
+        clock += time.perf_counter() - t
+        pairs, extra = match(system, model)
+        seen = bound < INVISIBLE_STD
+        missed = [t for t in range(len(bound)) if seen[t] and t not in pairs]
+        truth += int(seen.sum())
+        invisible += int((~seen).sum())
+        found += int(seen.sum()) - len(missed)
+        spurious += len(extra)
+        for t_, j in pairs.items():
+            mode = model.modes[j]
+            ef.append(abs(mode.frequency_hz / system.frequency_hz[t_] - 1))
+            ez.append(abs(mode.damping_ratio / system.damping_ratio[t_] - 1))
+            zf.append((mode.frequency_hz - system.frequency_hz[t_]) / mode.frequency_std_hz)
+            zz.append((mode.damping_ratio - system.damping_ratio[t_]) / mode.damping_std)
+        if peer:
+            ep += peer_errors(system, frfs)
+        if verbose and (missed or extra):
+            print(
+                f"  seed {seed}: refs {len(dofs_in)} missed",
+                [(round(float(system.frequency_hz[t]), 2), round(float(bound[t]), 3)) for t in missed],
+                "extra",
+                [(round(model.modes[j].frequency_hz, 2), round(model.modes[j].damping_ratio, 4)) for j in extra],
+                flush=True,
+            )
+    print(f"modes {truth} (+ {invisible} invisible)  time per case {clock / cases:.2f} s")
+    print(f"recall {found / truth:.4f}  precision {len(ef) / (len(ef) + spurious):.4f} ({spurious} spurious)")
+    print(f"frequency error median {100 * np.median(ef):.5f} %  p95 {100 * np.quantile(ef, 0.95):.4f} %")
+    print(f"damping error   median {100 * np.median(ez):.3f} %  p95 {100 * np.quantile(ez, 0.95):.2f} %")
+    for name, z in (("frequency", zf), ("damping", zz)):
+        z = np.array(z)
+        print(f"95 % interval of {name} covers {np.mean(np.abs(z) < 1.96):.3f}, rms of z {np.sqrt(np.mean(np.minimum(z**2, 25))):.2f}")
+    if peer and ep:
+        print(f"sdypy-EMA damping error median {100 * np.median(ep):.3f} % ({len(ep)} modes)")
+
+
+def peer_errors(system: TrueSystem, frfs: FrfSet) -> list[float]:
+    """Damping errors of sdypy-EMA (first reference), given the true frequencies to pick its poles by."""
+    import contextlib
+    import io
+    import warnings
+
+    from sdypy import EMA  # progress bars go to stderr
+
+    errors = []
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        warnings.simplefilter("ignore")
+        acc = frfs.accelerance()[:, 0]
+        low, high = 0.7 * system.frequency_hz[0], frfs.band_hz[1]
+        peer = EMA.Model(acc, frfs.frequency_hz, lower=low, upper=high, pol_order_high=60)
+        peer.get_poles(show_progress=False)
+        try:
+            peer.select_closest_poles(list(system.frequency_hz))
+        except Exception:
+            return []
+        f, z = np.array(peer.nat_freq), np.array(peer.nat_xi)
+    for t, ft in enumerate(system.frequency_hz):
+        if len(f) and np.min(np.abs(f - ft)) < (system.damping_ratio[t] + 5e-4) * ft:
+            errors.append(abs(z[np.argmin(np.abs(f - ft))] / system.damping_ratio[t] - 1))
+    return errors
+
+
+def pair_case(seed: int) -> tuple[TrueSystem, Hits, FrfSet, list[int], list[int], list[tuple[int, int]]]:
+    """A system in which two modes are 0.5 % apart or equal, and at least two references."""
+    rng = np.random.default_rng(10_000 + seed)
+    f_max, n_out, n_ref = 800.0, int(rng.integers(8, 20)), int(rng.integers(2, 5))
+    base = random_system(rng, n_modes=int(rng.integers(4, 9)), n_dofs=n_out, low_hz=60, high_hz=740, min_spacing=0.05)
+    k = int(rng.integers(0, len(base.frequency_hz)))
+    gap = 0.0 if seed % 2 else 0.005
+    zeta = base.damping_ratio[k] * (1.0 if seed % 2 else rng.uniform(0.8, 1.25))
+    system = TrueSystem(
+        np.insert(base.frequency_hz, k + 1, base.frequency_hz[k] * (1 + gap)),
+        np.insert(base.damping_ratio, k + 1, zeta),
+        np.insert(base.shapes, k + 1, rng.standard_normal(n_out), axis=0),
+    )
+    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
+    record = float(np.clip(4.5 / slowest, 1.28, 20.0))
+    dofs_out, dofs_in = list(range(n_out)), sorted(rng.choice(n_out, n_ref, replace=False).tolist())
+    hits = simulate_hits(
+        system, dofs_out, dofs_in, f_max=f_max, record_s=record, n_hits=int(rng.integers(2, 6)),
+        force_noise=rng.uniform(0.005, 0.02), response_noise=rng.uniform(0.005, 0.02), rng=rng,
+    )  # fmt: skip
+    return system, hits, h1(hits, dofs_out, dofs_in, f_max), dofs_out, dofs_in, [(k, k + 1)]
+
+
+def subspace_mac(a: np.ndarray, b: np.ndarray) -> float:
+    """Smallest squared cosine of the angles between two sets of shapes, rows."""
+    qa = np.linalg.qr(np.asarray(a).T)[0]
+    qb = np.linalg.qr(np.asarray(b).T)[0]
+    return float(np.min(np.linalg.svd(qa.conj().T @ qb, compute_uv=False)) ** 2)
+
+
+def pair_study(cases: int, first: int, settings: ModalSettings, verbose: bool) -> None:
+    both = 0
+    macs = []
+    spurious = 0
+    for seed in range(first, first + cases):
+        system, _, frfs, _, _, ((a, b),) = pair_case(seed)
+        model = identify(frfs, settings)
+        pairs, extra = match(system, model)
+        spurious += len(extra)
+        ok = a in pairs and b in pairs
+        both += ok
+        value = np.nan
+        if ok:
+            value = subspace_mac(
+                np.array([model.modes[pairs[a]].shape, model.modes[pairs[b]].shape]), system.shapes[[a, b]]
+            )
+            macs.append(value)
+        if verbose and (not ok or value < 0.98 or extra):
+            print(f"  seed {seed}: f {system.frequency_hz[a]:.2f} ζ {system.damping_ratio[a]:.4f} both {ok} subspace {value:.4f} extra",
+                  [(round(model.modes[j].frequency_hz, 2), round(model.modes[j].damping_ratio, 4)) for j in extra], flush=True)  # fmt: skip
+    print(f"both members in {both} of {cases}; subspace MAC min {min(macs):.4f}, median {np.median(macs):.5f}; spurious {spurious}")
+
+
+def noise_study(cases: int, first: int, settings: ModalSettings) -> None:
+    invented = 0
+    for seed in range(first, first + cases):
+        rng = np.random.default_rng(seed)
+        n_out, n_in, n_lines = int(rng.integers(1, 20)), int(rng.integers(1, 4)), int(rng.integers(400, 4000))
+        n_hits = int(rng.integers(1, 5))
+        each = rng.standard_normal((n_hits, n_out, n_in, n_lines, 2)) @ np.array([1, 1j])
+        frf = each.mean(axis=0)
+        variance = None if n_hits == 1 else np.mean(np.abs(each - frf) ** 2, axis=0) / (n_hits - 1)
+        f = np.arange(n_lines) * 0.5
+        frfs = frf_set(f, frf, list(range(n_out)), list(range(n_in)), variance=variance, n_hits=n_hits)
+        n = len(identify(frfs, settings).modes)
+        invented += n
+        if n:
+            print(f"  seed {seed}: {n} invented ({n_out} × {n_in}, {n_lines} lines, {n_hits} hits)")
+    print(f"{invented} modes invented in {cases} sets of pure noise")
+
+
+def coverage_study(cases: int, first: int, settings: ModalSettings) -> None:
+    inside = {"frequency": [], "damping": [], "shape": []}
+    for seed in range(first, first + cases):
+        rng = np.random.default_rng(50_000 + seed)
+        n_out, n_ref = int(rng.integers(2, 13)), int(rng.integers(1, 3))
+        system = random_system(rng, n_modes=int(rng.integers(2, 6)), n_dofs=n_out, low_hz=60, high_hz=360, min_spacing=0.05, damping=(0.003, 0.02))  # fmt: skip
+        slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
+        dofs_out, dofs_in = list(range(n_out)), list(range(n_ref))
+        hits = simulate_hits(
+            system, dofs_out, dofs_in, f_max=400.0, record_s=max(6.0 / slowest, 1.28), n_hits=int(rng.integers(1, 6)),
+            force_noise=rng.uniform(0.002, 0.05), response_noise=rng.uniform(0.002, 0.05), rng=rng,
+        )  # fmt: skip
+        model = identify(h1(hits, dofs_out, dofs_in, 400.0), settings)
+        pairs, _ = match(system, model)
+        for t, j in pairs.items():
+            mode = model.modes[j]
+            inside["frequency"].append((mode.frequency_hz - system.frequency_hz[t]) / mode.frequency_std_hz)
+            inside["damping"].append((mode.damping_ratio - system.damping_ratio[t]) / mode.damping_std)
+            phi = system.shapes[t]
+            phi = phi * np.sign(np.real(np.vdot(phi, mode.shape)))
+            inside["shape"] += list(np.real(mode.shape - phi) / mode.shape_std)
+    for name, z in inside.items():
+        z = np.array(z)
+        print(f"95 % interval of {name}: covers {np.mean(np.abs(z) < 1.96):.4f} of {len(z)}; std of z {np.std(np.clip(z, -6, 6)):.3f}, mean {np.mean(np.clip(z, -6, 6)):.3f}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("study", choices=["random", "pairs", "noise", "coverage"])
+    parser.add_argument("--cases", type=int, default=50)
+    parser.add_argument("--first", type=int, default=0, help="seed of the first case")
+    parser.add_argument("--engine", default="plscf", choices=["plscf", "lscf", "sdypy"])
+    parser.add_argument("--no-polish", action="store_true")
+    parser.add_argument("--peer", action="store_true", help="run sdypy-EMA beside")
+    parser.add_argument("--verbose", action="store_true")
+    args = parser.parse_args()
+    settings = ModalSettings(engine=args.engine, polish=not args.no_polish)
+    if args.study == "random":
+        random_study(args.cases, args.first, settings, args.peer, args.verbose)
+    elif args.study == "pairs":
+        pair_study(args.cases, args.first, settings, args.verbose)
+    elif args.study == "noise":
+        noise_study(args.cases, args.first, settings)
+    else:
+        coverage_study(args.cases, args.first, settings)
+
+
+if __name__ == "__main__":
+    main()
