@@ -49,6 +49,12 @@ class UncertaintySettings(Settings):
         gt=0,
         description="Standard deviation of a shape entry that comes without one, in units of the largest entry.",
     )
+    mode_mixing: float = Field(
+        default=1e-3,
+        gt=0,
+        description="Relative scatter of eigenvalues from small asymmetries that no model holds (planets that "
+        "differ in the last gram). Modes closer than this exchange their shapes freely.",
+    )
 
 
 class PairingSettings(Settings):

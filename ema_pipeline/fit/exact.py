@@ -64,3 +64,20 @@ class ExactObjective:
             normal += jacobian @ jacobian.T
             gradient += jacobian @ weighted[0]
         return normal, gradient
+
+
+class PairedOnly:
+    """The same residuals where modes without partner cost nothing: for a plain least-squares step."""
+
+    def __init__(self, inner: ExactObjective) -> None:
+        self.inner = inner
+
+    def costs(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Cost of every measured mode at one point, (R,)."""
+        return np.where(self.inner.paired, self.inner.costs(x), 0.0)
+
+    def normal_equations(
+        self, x: NDArray[np.float64], weight: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """See `ExactObjective.normal_equations`."""
+        return self.inner.normal_equations(x, weight)

@@ -22,7 +22,7 @@ class FitSettings(UncertaintySettings):
     starts_refined: int = Field(
         default=3,
         ge=1,
-        description="Number of starts that go through the whole annealing; the rest only compete.",
+        description="Number of starts that are followed to the end; the rest only compete.",
     )
     annealing_start: float = Field(
         default=0.3,
@@ -32,6 +32,12 @@ class FitSettings(UncertaintySettings):
     )
     annealing_rungs: int = Field(
         default=7, ge=2, description="Rungs from the start down to the data's own accuracy."
+    )
+    screening_error: float = Field(
+        default=0.03,
+        gt=0,
+        description="Relative error of eigenvalues at which the starts of the grid compete: tight enough to tell "
+        "their basins apart, loose enough that few modes are lost as outliers.",
     )
     outlier_prior: float = Field(
         default=0.05,
@@ -45,12 +51,6 @@ class FitSettings(UncertaintySettings):
         le=1,
         description="Share of outliers above which not the modes but the model is taken to be wrong: all "
         "uncertainties are then widened together until at most this share is left out.",
-    )
-    mode_mixing: float = Field(
-        default=1e-3,
-        gt=0,
-        description="Relative scatter of eigenvalues from small asymmetries that no model holds (planets that differ "
-        "in the last gram). Modes closer than this exchange their shapes freely; see the method's description.",
     )
     damping: bool = Field(default=True, description="Use measured damping ratios.")
     iterations: int = Field(

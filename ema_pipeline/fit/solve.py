@@ -7,7 +7,7 @@ priors that the tolerances state; free parameters have no prior but their bounds
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -18,7 +18,7 @@ from ema_pipeline.correlate.pairing import assign, close_groups, shape_agreement
 from ema_pipeline.correlate.residuals import observable_modes
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.fit.evidence import Dataset, dataset
-from ema_pipeline.fit.exact import ExactObjective
+from ema_pipeline.fit.exact import ExactObjective, PairedOnly
 from ema_pipeline.fit.latent import LatentObjective
 from ema_pipeline.fit.matrices import MatrixFamily
 from ema_pipeline.fit.settings import FitSettings
@@ -133,6 +133,8 @@ class FitProblem:
         self.evidence: list[Dataset] = [
             dataset(m, MatrixFamily(rig, c, self.space), settings) for c, m in used.items()
         ]
+        undamped = np.any([_undamped_relevance(e.family) for e in self.evidence], axis=0)
+        self.damping_only = ~np.asarray(undamped, dtype=bool)
         self.counts = np.concatenate([e.counts for e in self.evidence])
 
     def mixture(self, scale: float = 1.0) -> Mixture:
@@ -235,6 +237,12 @@ def refine(problem: FitProblem, start: NDArray[np.float64], scale: float = 1.0) 
     mixture = problem.mixture(scale)
     for _ in range(4):
         pairs = problem.assignments(x)
+        if best is None and np.any(problem.damping_only):
+            # The latent shapes said nothing of damping: far from its value every mode would look like an outlier.
+            held = ~problem.damping_only
+            trusting = replace(mixture, outlier_cost=np.full_like(mixture.outlier_cost, np.inf))
+            matched = PairedOnly(problem.exact(pairs))
+            x = descend(matched, problem.space, x, trusting, 6, held).x
         found = descend(problem.exact(pairs), problem.space, x, mixture, problem.settings.iterations)
         if best is not None and found.objective >= best.objective - 1e-9:
             break
@@ -250,25 +258,29 @@ def search(
 ) -> Optimum:
     """Most probable parameters over a grid of starts of the free parameters.
 
-    Every start takes one rung of annealing; the best go all the way. With `start` given (the fit of a poorer
-    model, say) that point is refined as well, so that a richer model never fits worse than the poorer one.
+    The whole annealing from the nominal values finds the optimum nearly always. It leans towards soft free springs
+    (a loose dynamic residual prefers them), so every point of the grid also competes further down the ladder, and
+    the best of these are followed to its end. With `start` given (the fit of a poorer model, say) that point is
+    refined as well, so that a richer model never fits worse than the poorer one.
     """
     tell = progress or (lambda share, text: None)
     settings, space = problem.settings, problem.space
-    mixture = problem.mixture()
-    first = LatentObjective(problem.evidence, float(ladder(problem)[0]))
-    screened = []
-    grid = space.starts(settings.starts_per_decade)
-    for i, x in enumerate(grid):
-        found = descend(first, space, x, mixture, 4)
-        screened.append((found.objective, i, found.x))
-        tell(0.3 * (i + 1) / len(grid), "screening starting values")
-    screened.sort(key=lambda s: (s[0], s[1]))
-    chosen = _distinct([s[2] for s in screened], settings.starts_refined)
-    candidates = []
-    for i, x in enumerate(chosen):
-        candidates.append(refine(problem, anneal(problem, x, skip=1)))
-        tell(0.3 + 0.5 * (i + 1) / len(chosen), "annealing")
+    rungs = ladder(problem)
+    candidates = [refine(problem, anneal(problem, space.point()))]
+    if np.any(~space.has_prior):
+        middle = int(np.argmin(np.abs(np.log(rungs / settings.screening_error))))
+        lower, mixture = LatentObjective(problem.evidence, float(rungs[middle])), problem.mixture()
+        grid = space.starts(settings.starts_per_decade)
+        screened = []
+        for i, x in enumerate(grid):
+            found = descend(lower, space, x, mixture, 6)
+            screened.append((found.objective, i, found.x))
+            tell(0.05 + 0.4 * (i + 1) / len(grid), "screening starting values")
+        screened.sort(key=lambda s: (s[0], s[1]))
+        chosen = _distinct([s[2] for s in screened], settings.starts_refined)
+        for i, x in enumerate(chosen):
+            candidates.append(refine(problem, anneal(problem, x, skip=middle + 1)))
+            tell(0.45 + 0.35 * (i + 1) / len(chosen), "annealing")
     if start is not None:
         candidates.append(refine(problem, space.point(start)))
     return min(candidates, key=lambda c: c.objective)
