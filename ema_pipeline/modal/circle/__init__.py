@@ -2,6 +2,7 @@
 
 from ema_pipeline.modal.circle.compare import CircleAverage, attach_circles, average
 from ema_pipeline.modal.circle.fit import SdofCircle, fit_circle
+from ema_pipeline.modal.circle.identify import identify_by_circle
 from ema_pipeline.modal.circle.modes import circle_fits
 from ema_pipeline.modal.circle.settings import CircleSettings
 
@@ -13,4 +14,5 @@ __all__ = [
     "average",
     "circle_fits",
     "fit_circle",
+    "identify_by_circle",
 ]

@@ -20,7 +20,9 @@ FEW_LINES = 2.0
 start for one line in the half-power band, 0.2 % for two."""
 
 _DISTORTED = 0.015  # systematic misfit over the radius
-_SYSTEMATIC = 0.4  # correlation of the misfit from line to line; white noise gives slightly less than 0
+_SYSTEMATIC = 0.3  # correlation of the misfit from line to line; white noise gives slightly less than 0
+_STRONGLY_DISTORTED = 0.05  # flagged even where frequency and damping agree
+_OVER_NOISE = 3.0  # misfit over what the scatter from hit to hit explains
 
 
 @dataclass(frozen=True)
@@ -71,15 +73,15 @@ def attach_circles(frfs: FrfSet, modal: ModalModel, settings: CircleSettings | N
     for index, circles in enumerate(fitted):
         mode = replace(modal.modes[index], circles=circles)
         difference = disagreement(mode, settings)
-        if difference:
-            reason = _reason(frfs, modal, index, circles)
-            mode = replace(mode, flags=(*mode.flags, f"circle fit differs ({difference}): {reason}"))
+        if circles:
+            flag = _flag(frfs, modal, index, circles, difference)
+            mode = replace(mode, flags=(*mode.flags, flag) if flag else mode.flags)
         modes.append(mode)
     return replace(modal, modes=tuple(modes))
 
 
 def disagreement(mode: Mode, settings: CircleSettings) -> str:
-    """How a mode differs from its own circles, e.g. ``"damping 1.2 % against 1.0 %"``; empty if it does not."""
+    """How a mode differs from its own circles, e.g. ``"damping 1.2 % against 1 %"``; empty if it does not."""
     if not mode.circles:
         return ""
     circle = average(mode.circles)
@@ -96,7 +98,23 @@ def disagreement(mode: Mode, settings: CircleSettings) -> str:
     return ", ".join(words)
 
 
-def _reason(frfs: FrfSet, modal: ModalModel, index: int, circles: Sequence[CircleFit]) -> str:
+def _flag(frfs: FrfSet, modal: ModalModel, index: int, circles: Sequence[CircleFit], difference: str) -> str:
+    """The flag of one mode, with the first reason that applies; empty where there is nothing to say."""
+    known = _known_reason(frfs, modal, index)
+    systematic, size = distortion(circles)
+    noise = _noise(frfs, circles)
+    beyond_noise = size > _OVER_NOISE * noise if np.isfinite(noise) else systematic > _SYSTEMATIC
+    distorted = f"nonlinearity suspected: circle distorted by {100 * size:.2g} % of its radius"
+    if difference:
+        reason = known or (distorted if beyond_noise and size > _DISTORTED else "unexplained")
+        return f"circle fit differs ({difference}): {reason}"
+    if not known and np.isfinite(noise) and beyond_noise and size > _STRONGLY_DISTORTED:
+        return distorted
+    return ""
+
+
+def _known_reason(frfs: FrfSet, modal: ModalModel, index: int) -> str:
+    """What a circle fit cannot be expected to cope with: a close neighbour, or too few lines."""
     seen = [seen_in_frfs(m.pole, frfs.response_decay_rad_s) for m in modal.modes]
     own = seen[index]
     near = [
@@ -115,10 +133,7 @@ def _reason(frfs: FrfSet, modal: ModalModel, index: int, circles: Sequence[Circl
             f"leakage: response not decayed within the record, {lines:.2g} lines in the half-power band; "
             "use a longer record"
         )
-    systematic, size = distortion(circles)
-    if systematic > _SYSTEMATIC and size > _DISTORTED:
-        return f"nonlinearity suspected: circle distorted by {100 * size:.2g} % of its radius"
-    return "unexplained"
+    return ""
 
 
 def distortion(circles: Sequence[CircleFit]) -> tuple[float, float]:
@@ -142,6 +157,18 @@ def distortion(circles: Sequence[CircleFit]) -> tuple[float, float]:
     if not sizes:
         return 0.0, 0.0
     return float(np.median(correlations)), float(np.median(sizes))
+
+
+def _noise(frfs: FrfSet, circles: Sequence[CircleFit]) -> float:
+    """Median radial noise over the radius, from the scatter over hits; NaN where that is not known."""
+    power = {"acceleration": 1, "velocity": 0, "displacement": -1}
+    sizes = []
+    for circle in circles:
+        o, i = frfs.outputs.index(circle.output), frfs.inputs.index(circle.input)
+        lines = np.searchsorted(frfs.frequency_hz, circle.frequency_hz)
+        scale = (2 * np.pi * circle.frequency_hz) ** (-2 * power[frfs.quantities[o]])
+        sizes.append(float(np.sqrt(np.mean(frfs.variance[o, i, lines] * scale) / 2)) / circle.radius)
+    return float(np.median(sizes))
 
 
 def _median(values: Sequence[float], stds: Sequence[float]) -> tuple[float, float]:

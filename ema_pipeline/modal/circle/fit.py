@@ -71,7 +71,7 @@ class SdofCircle:
     def contribution(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Mobility of this mode alone, D/(1 + j x), at any lines, (n,)."""
         x = sweep(frequency_hz, self.natural_frequency_hz, self.damping_ratio)
-        return self.diameter / (1 + 1j * x)
+        return np.asarray(self.diameter / (1 + 1j * x), dtype=np.complex128)
 
 
 def sweep(
@@ -138,7 +138,8 @@ def fit_circle(
         zeta = float(np.sum(pair_weights * pairs) / np.sum(pair_weights))
     diameter = 2 * radius * complex(np.exp(1j * phase))
     x = sweep(f, f_n, zeta)
-    misfit = points - centre - diameter * (1 / (1 + 1j * x) - 0.5)
+    on_circle = centre + diameter * (1 / (1 + 1j * x) - 0.5)
+    misfit = np.asarray(points - on_circle, dtype=np.complex128)
     f_std, zeta_std = _standard_deviations(f, f_n, zeta, diameter, misfit, weights)
     return SdofCircle(
         frequency_hz=f,

@@ -110,7 +110,7 @@ def fit_targets(
     data: Mobilities, targets: Sequence[Target], settings: CircleSettings
 ) -> list[list[tuple[int, SdofCircle]]]:
     """Circles of every target as (row of `data`, circle), best rows first."""
-    found = []
+    found: list[list[tuple[int, SdofCircle]]] = []
     for i in range(len(targets)):
         lines = line_range(data.frequency_hz, targets, i, settings)
         if lines.stop - lines.start < MINIMUM_POINTS:
@@ -219,7 +219,10 @@ def _fit_refined(
         for k in [k for k in group if k != index] + [index]:
             f = data.frequency_hz[ranges[k]]
             others = (circles[m] for m in group if m != k)
-            taken = sum((c.contribution(f) for c in others if c and c.residual < _CREDIBLE), np.zeros(f.size))
+            taken = np.zeros(f.size, dtype=np.complex128)
+            for other in others:
+                if other is not None and other.residual < _CREDIBLE:
+                    taken += other.contribution(f)
             refit = _fit_once(data, row, ranges[k], taken, circles[k])
             circles[k] = refit if refit is not None else circles[k]
     refined = circles[index]
