@@ -130,6 +130,10 @@ def _derived(file: DerivedRigFile, kinds: Mapping[str, RigKind], path: Path) -> 
         if key not in kind.geometry:
             raise EmaError(f"{path}: unknown key 'geometry.{key}'{did_you_mean(key, kind.geometry)}")
     geometry = {**kind.geometry, **file.geometry}
+    try:
+        kind.make(geometry, {})
+    except EmaError as error:
+        raise EmaError(f"{path}: {error}") from None
     defaults = kind.parameters(geometry)
     changed: dict[str, Parameter] = {}
     for name, entry in file.parameters.items():
@@ -137,10 +141,7 @@ def _derived(file: DerivedRigFile, kinds: Mapping[str, RigKind], path: Path) -> 
         if default is None:
             raise EmaError(f"{path}: unknown key 'parameters.{name}'{did_you_mean(name, defaults)}")
         changed[name] = _merge(default, entry, path)
-    try:
-        rig = kind.make(geometry, changed)
-    except EmaError as error:
-        raise EmaError(f"{path}: {error}") from None
+    rig = kind.make(geometry, changed)
     if file.name and dataclasses.is_dataclass(rig) and not isinstance(rig, type):
         return dataclasses.replace(rig, name=file.name)
     return rig

@@ -157,8 +157,8 @@ def planet_bearing_rows(planet: int, psi: float) -> dict[str, Row]:
 def _build(planets: int, configuration: str, values: Mapping[str, float]) -> Assembly:
     """Elements of one configuration.
 
-    Names: ``carrier mass x``, ``carrier bearing x``, ``planet1 bearing radial``, ``sun-planet1 mesh`` …; effects
-    find them by these names.
+    Names: ``carrier mass x``, ``carrier bearing x``, ``planet1 bearing radial``, ``sun-planet1 mesh`` …;
+    effects find them by these names.
     """
     central = CENTRAL if configuration == "with_ring" else ("carrier", "sun")
     alpha = np.deg2rad(values["pressure_angle_deg"])

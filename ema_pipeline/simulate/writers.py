@@ -40,8 +40,8 @@ def write_uff(path: Path, channels: Channels, sample_rate_hz: float) -> None:
         )
         for i, (name, volts) in enumerate(channels.items(), 1)
     ]
-    path.unlink(missing_ok=True)  # the library appends
-    pyuff.UFF(str(path)).write_sets(sets, mode="overwrite")
+    path.unlink(missing_ok=True)  # appending is the one mode in which the library keeps every set
+    pyuff.UFF(str(path)).write_sets(sets, mode="add")
 
 
 def write_csv(path: Path, channels: Channels, sample_rate_hz: float) -> None:

@@ -1,0 +1,284 @@
+"""Effects: absent at null, present as their physics says, and open to the user's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ema_pipeline.effects.library import (
+    effect_ids,
+    effect_library,
+    get_effect,
+    load_effect_file,
+    parse_effect,
+    parse_sized,
+)
+from ema_pipeline.effects.rig import rig_with_effects
+from ema_pipeline.errors import EmaError
+from ema_pipeline.mechanics.modes import complex_modes, normal_modes
+from ema_pipeline.rigs import load_rig, model_modes
+from ema_pipeline.rigs.frame import frame
+from ema_pipeline.rigs.planetary import planetary
+
+RIG = load_rig("planetary")
+LINEAR = [i for i in effect_ids() if get_effect(i).linear]
+
+CONTRACT_PLACES = {
+    "mesh_stiffness_loss": {"sun-planet1", "sun-planet2", "ring-planet1", "ring-planet2"},
+    "planet_bearing_mistune": {"planet1", "planet2"},
+    "planet_mass_mistune": {"planet1", "planet2"},
+    "bearing_anisotropy": {"carrier", "ring", "sun"},
+    "shaft_torsion": {"carrier", "sun"},
+    "shaft_coupling": {"carrier-ring", "carrier-sun", "ring-sun"},
+    "sensor_mass": {"carrier", "ring", "sun", "planet1", "planet2", "all"},
+    "flexible_support": {"carrier", "ring", "sun"},
+    "local_damper": {"carrier", "ring", "sun", "planet1", "planet2"},
+    "hysteretic_damping": {"sun-planet", "ring-planet", "carrier", "ring", "sun", "planet"},
+    "gyroscopic": {"carrier", "sun", "planet1", "planet2"},
+}
+
+
+def matrices(system) -> list[np.ndarray]:
+    return [system.mass, system.stiffness, system.damping, system.structural]
+
+
+def system_with(label: str, configuration: str = "with_ring", rig=RIG, **values: float):
+    return rig_with_effects(rig, [(label, values)]).system(configuration)
+
+
+@pytest.mark.parametrize("effect_id", LINEAR)
+def test_effect_at_its_null_leaves_every_matrix_as_it_was(effect_id: str) -> None:
+    effect = get_effect(effect_id)
+    for configuration in RIG.configurations:
+        base = RIG.assembly(configuration)
+        for place in effect.places(RIG, configuration):
+            edited = effect.apply(base, place).system()
+            for before, after in zip(matrices(base.system()), matrices(edited), strict=True):
+                np.testing.assert_array_equal(before, after)
+
+
+@pytest.mark.parametrize("effect_id", LINEAR)
+def test_effect_at_its_start_value_changes_the_modes_visibly(effect_id: str) -> None:
+    effect = get_effect(effect_id)
+    start = {p.name: p.start for p in effect.parameters}
+    base = RIG.assembly("with_ring")
+    poles = complex_modes(base.system()).poles
+    for place in effect.places(RIG, "with_ring"):
+        edited = complex_modes(effect.apply(base, place, start).system()).poles
+        moved = (
+            len(edited) != len(poles) or np.max(np.abs(edited - poles) / np.maximum(np.abs(poles), 1)) > 1e-4
+        )
+        assert moved, place
+
+
+@pytest.mark.parametrize(("effect_id", "places"), CONTRACT_PLACES.items())
+def test_effect_sits_at_the_places_that_are_documented(effect_id: str, places: set[str]) -> None:
+    assert set(get_effect(effect_id).places(RIG, "with_ring")) == places
+    assert not any("ring" in p for p in get_effect(effect_id).places(RIG, "no_ring"))
+
+
+def test_every_effect_says_how_it_shows_and_starts_within_its_range() -> None:
+    for effect_id in effect_ids():
+        effect = get_effect(effect_id)
+        assert effect.id == effect_id
+        assert len(effect.signs) > 10
+        assert len(effect.title) > 10
+        for p in effect.parameters:
+            assert p.minimum <= p.start <= p.maximum
+            assert p.scale > 0
+            assert p.unit
+
+
+def test_lost_mesh_stiffness_is_taken_from_one_mesh_only() -> None:
+    before, after = (
+        RIG.system("no_ring"),
+        system_with("mesh_stiffness_loss@sun-planet2", "no_ring", fraction=0.4),
+    )
+    lost = before.stiffness - after.stiffness
+    assert np.linalg.matrix_rank(lost, tol=1.0) == 1
+    assert lost[before.dofs.index("sun.u"), before.dofs.index("sun.u")] == pytest.approx(0.4e7)
+    assert lost[before.dofs.index("planet1.u"), before.dofs.index("planet1.u")] == pytest.approx(
+        0.0, abs=1e-3
+    )
+
+
+def test_anisotropic_bearing_splits_a_body_along_its_axis() -> None:
+    system = system_with("bearing_anisotropy@sun", relative_stiffness=0.2, angle_deg=90.0)
+    i, j = system.dofs.index("sun.x"), system.dofs.index("sun.y")
+    difference = system.stiffness[j, j] - system.stiffness[i, i]
+    base = RIG.system("with_ring")
+    own = base.stiffness[j, j] - base.stiffness[i, i]
+    assert difference - own == pytest.approx(0.2 * 1.025e6)
+
+
+def test_shaft_torsion_lifts_the_rigid_body_mode_of_the_free_carrier() -> None:
+    before = [m.frequency_hz for m in model_modes(RIG, "no_ring")]
+    rig = rig_with_effects(RIG, [("shaft_torsion@carrier", {"stiffness": 4e5})])
+    after = [m.frequency_hz for m in model_modes(rig, "no_ring")]
+    assert before.count(0.0) - after.count(0.0) == 1
+
+
+def test_sensor_mass_lowers_every_elastic_frequency_as_one_over_the_root_of_mass() -> None:
+    tip = system_with("sensor_mass@storey1", "default", rig=frame(1), mass=0.5)
+    plain = frame(1).system("default")
+    ratio = normal_modes(tip)[0][0] / normal_modes(plain)[0][0]
+    assert ratio == pytest.approx(np.sqrt(5.0 / 5.5), rel=1e-12)
+    before, after = (
+        normal_modes(RIG.system("with_ring"))[0],
+        normal_modes(system_with("sensor_mass@all", mass=0.03))[0],
+    )
+    assert np.all(after[before > 0] < before[before > 0])
+
+
+def test_flexible_support_adds_two_modes_and_tends_to_none_when_stiff() -> None:
+    soft = system_with("flexible_support@ring", mass=3.0, stiffness=2e7)
+    assert len(soft.dofs) == len(RIG.system("with_ring").dofs) + 2
+    stiff = normal_modes(system_with("flexible_support@ring", mass=1e-3, stiffness=1e12))[0]
+    base = normal_modes(RIG.system("with_ring"))[0]
+    np.testing.assert_allclose(stiff[: len(base)], base, rtol=2e-5)
+
+
+def test_flexible_support_is_two_masses_in_a_row_for_a_single_body() -> None:
+    # Sun alone (no mesh to speak of) on its bearing on a support: closed form of a two-mass chain.
+    k, m, ks, ms = 1.025e6, 2.0, 3e6, 5.0
+    values = {"sun_planet_mesh_stiffness": 1e-3, "ring_planet_mesh_stiffness": 1e-3}
+    rig = rig_with_effects(RIG, [("flexible_support@sun", {"mass": ms, "stiffness": ks})])
+    found = normal_modes(rig.system("no_ring", values))[0]
+    a, b, c = m * ms, -(m * (k + ks) + ms * k), k * ks
+    for expected in np.sqrt(np.roots([a, b, c]).real) / (2 * np.pi):
+        assert np.sum(np.abs(found - expected) < 1e-3) == 2
+
+
+def test_local_damper_adds_its_power_and_nothing_else() -> None:
+    system = system_with("local_damper@planet2", coefficient=30.0)
+    velocity = np.zeros(len(system.dofs))
+    velocity[[system.dofs.index("planet2.zeta"), system.dofs.index("planet2.eta")]] = 1.0, 2.0
+    assert velocity @ system.damping @ velocity == pytest.approx(30.0 * 5.0)
+    assert np.linalg.matrix_rank(system.damping) == 2
+
+
+def test_loss_factor_of_all_springs_gives_half_of_it_in_every_mode() -> None:
+    places = get_effect("hysteretic_damping").places(RIG, "with_ring")
+    rig = rig_with_effects(RIG, [(f"hysteretic_damping@{p}", {"loss_factor": 0.04}) for p in places])
+    modes = complex_modes(rig.system("with_ring", {"modal_damping_ratio": 0.0}))
+    np.testing.assert_allclose(modes.damping_ratio[modes.frequency_hz > 0], 0.02, rtol=1e-3)
+
+
+def test_loss_factor_replaces_the_viscous_damper_of_its_bearing(tmp_path: Path) -> None:
+    file = tmp_path / "rig.toml"
+    file.write_text('base = "planetary"\n[parameters]\nsun_bearing_damping = 28.57\n', encoding="utf-8")
+    rig = load_rig(file)
+    assert np.any(rig.system("no_ring").damping)
+    system = system_with("hysteretic_damping@sun", "no_ring", rig=rig, loss_factor=0.02)
+    assert not np.any(system.damping)
+    assert np.any(system.structural)
+
+
+def test_gyroscopic_coupling_is_skew_and_turns_with_the_planet() -> None:
+    system = system_with("gyroscopic@planet2", coefficient=12.0, rig=planetary(3))
+    np.testing.assert_array_equal(system.damping, -system.damping.T)
+    i, j = system.dofs.index("planet2.zeta"), system.dofs.index("planet2.eta")
+    assert system.damping[i, j] == pytest.approx(12.0)  # a rotation leaves skew coupling as it is
+
+
+def test_generic_spring_works_at_one_dof_and_between_two() -> None:
+    base = RIG.system("with_ring").stiffness
+    dofs = RIG.system("with_ring").dofs
+    one = system_with("spring@sun.u", stiffness=1e4).stiffness - base
+    assert one[dofs.index("sun.u"), dofs.index("sun.u")] == pytest.approx(1e4)
+    two = system_with("spring@carrier.x-sun.x", stiffness=1e4).stiffness - base
+    assert two[dofs.index("carrier.x"), dofs.index("sun.x")] == pytest.approx(-1e4)
+    derived = system_with("mass@planet2.x", mass=0.1).mass - RIG.system("with_ring").mass
+    assert derived[dofs.index("planet2.zeta"), dofs.index("planet2.zeta")] == pytest.approx(0.1)
+
+
+def test_effects_add_up_and_their_parameters_join_the_rigs() -> None:
+    rig = rig_with_effects(
+        RIG, [("flexible_support@ring", {"mass": 3.0, "stiffness": 2e7}), "local_damper@ring_support"]
+    )
+    name = "flexible_support@ring.stiffness"
+    assert rig.parameters[name].value == 2e7
+    assert rig.parameters[name].free
+    assert name in rig.used("with_ring")
+    assert name not in rig.used("no_ring")
+    assert np.any(rig.system("with_ring").damping)
+    np.testing.assert_array_equal(rig.system("no_ring").stiffness, RIG.system("no_ring").stiffness)
+    families = {m.family for m in model_modes(rig, "with_ring")}
+    assert families <= {"rotational", "translational", "rigid body"}
+
+
+def test_mistakes_in_effects_come_with_a_hint() -> None:
+    with pytest.raises(EmaError, match="did you mean 'mesh_stiffness_loss'"):
+        parse_effect("mesh_stifness_loss@sun-planet1", RIG)
+    with pytest.raises(EmaError, match="did you mean 'sun-planet2'"):
+        parse_effect("mesh_stiffness_loss@sun-planet3", RIG, "no_ring")
+    with pytest.raises(EmaError, match="form effect@place"):
+        parse_effect("sensor_mass", RIG)
+    with pytest.raises(EmaError, match="no place for this effect"):
+        parse_effect("gyroscopic@storey1", frame(2))
+    with pytest.raises(EmaError, match="did you mean 'fraction'"):
+        rig_with_effects(RIG, [("mesh_stiffness_loss@sun-planet1", {"fracton": 0.3})])
+    with pytest.raises(EmaError, match=r"fraction = 1\.3"):
+        rig_with_effects(RIG, [("mesh_stiffness_loss@sun-planet1", {"fraction": 1.3})])
+    with pytest.raises(EmaError, match="named twice"):
+        rig_with_effects(RIG, ["sensor_mass@all", "sensor_mass@all"])
+    with pytest.raises(EmaError, match="name=number"):
+        parse_sized("sensor_mass@all:mass=heavy")
+
+
+def test_effect_with_sizes_is_read_from_one_word() -> None:
+    assert parse_sized("flexible_support@ring:mass=3,stiffness=2e7") == (
+        "flexible_support@ring",
+        {"mass": 3.0, "stiffness": 2e7},
+    )
+    assert parse_sized("sensor_mass@all") == ("sensor_mass@all", {})
+
+
+OWN = """
+from ema_pipeline.effects.base import Effect, EffectParameter
+from ema_pipeline.mechanics.assembly import Spring
+
+EFFECT = Effect(
+    id="oil_film",
+    title="an oil film holds the sun sideways",
+    parameters=(EffectParameter("stiffness", "N/m", 0.0, 1e5, 1e5, 0.0, 1e9),),
+    find_places=lambda assembly: ("sun",) if assembly.has_dof("sun.x") else (),
+    edit=lambda assembly, place, values: assembly.add(
+        Spring("oil film", {"sun.x": 1.0}, values["stiffness"])
+    ),
+    signs="sun translation stiffer in x",
+)
+"""
+
+
+def test_effect_of_the_user_is_one_file(tmp_path: Path) -> None:
+    file = tmp_path / "oil_film.py"
+    file.write_text(OWN, encoding="utf-8")
+    library = effect_library([file])
+    assert "oil_film" in effect_ids(library)
+    rig = rig_with_effects(RIG, [("oil_film@sun", {"stiffness": 5e5})], library)
+    i = rig.system("no_ring").dofs.index("sun.x")
+    gained = rig.system("no_ring").stiffness[i, i] - RIG.system("no_ring").stiffness[i, i]
+    assert gained == pytest.approx(5e5)
+    assert "oil_film" not in effect_ids()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("EFFECT = 3", "defines no EFFECT"),
+        ("import nonsense_module_xyz", "does not run: ModuleNotFoundError"),
+        ("def broken(:", "does not run: SyntaxError"),
+        (OWN.replace("oil_film", "sensor_mass"), "already taken"),
+    ],
+)
+def test_broken_effect_file_is_one_clear_line(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(EmaError, match=message) as caught:
+        effect_library([file])
+    assert str(file) in str(caught.value)
+    with pytest.raises(EmaError, match="no such effect file"):
+        load_effect_file(tmp_path / "none.py")

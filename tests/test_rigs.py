@@ -1,0 +1,326 @@
+"""Rigs against published frequencies, and rig files."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.errors import EmaError
+from ema_pipeline.mechanics.modes import complex_modes, normal_modes
+from ema_pipeline.mechanics.system import sensor_row
+from ema_pipeline.rigs import load_rig, model_modes, rig_names
+from ema_pipeline.rigs.frame import frame
+from ema_pipeline.rigs.planetary import planetary
+
+# J. Lin, R. G. Parker, J. Vib. Acoust. 121 (1999), the example gear and its table for N = 3.
+LIN_PARKER = {
+    "carrier_mass": 5.43,
+    "ring_mass": 2.35,
+    "sun_mass": 0.4,
+    "planet_mass": 0.66,
+    "carrier_inertia": 6.29,
+    "ring_inertia": 3.00,
+    "sun_inertia": 0.39,
+    "planet_inertia": 0.61,
+    "sun_planet_mesh_stiffness": 5e8,
+    "ring_planet_mesh_stiffness": 5e8,
+    "planet_bearing_stiffness": 1e8,
+    "sun_bearing_stiffness": 1e8,
+    "ring_bearing_stiffness": 1e8,
+    "carrier_bearing_stiffness": 1e8,
+    "ring_torsional_stiffness": 1e9,
+    "carrier_torsional_stiffness": 0.0,
+    "sun_torsional_stiffness": 0.0,
+    "pressure_angle_deg": 24.6,
+}
+ROTATIONAL = [1475.7, 1930.3, 2658.3, 7462.8, 11775.3]
+TRANSLATIONAL = [743.2, 1102.4, 1896.0, 2276.4, 6986.3, 9647.9]
+
+
+def frequencies(rig, configuration, values=None, family=None) -> list[float]:
+    modes = model_modes(rig, configuration, values)
+    return [m.frequency_hz for m in modes if family is None or m.family == family]
+
+
+def test_lin_and_parker_frequencies_come_out_with_their_multiplicities() -> None:
+    rig = planetary(3)
+    np.testing.assert_allclose(frequencies(rig, "with_ring", LIN_PARKER, "rotational"), ROTATIONAL, atol=0.05)
+    pairs = np.repeat(TRANSLATIONAL, 2)
+    np.testing.assert_allclose(frequencies(rig, "with_ring", LIN_PARKER, "translational"), pairs, atol=0.05)
+    assert frequencies(rig, "with_ring", LIN_PARKER, "rigid body") == [0.0]
+    assert len(model_modes(rig, "with_ring", LIN_PARKER)) == 18
+
+
+@pytest.mark.parametrize("planets", [3, 4, 5, 6])
+def test_families_have_the_sizes_of_the_theory(planets: int) -> None:
+    modes = model_modes(planetary(planets), "with_ring", LIN_PARKER)
+    families = [m.family for m in modes]
+    assert families.count("rotational") + families.count("rigid body") == 6
+    assert families.count("translational") == 12
+    assert families.count("planet") == 3 * (planets - 3)
+
+
+@pytest.mark.parametrize("planets", [4, 6])
+def test_planet_modes_repeat_and_do_not_depend_on_the_number_of_planets(planets: int) -> None:
+    planet = frequencies(planetary(planets), "with_ring", LIN_PARKER, "planet")
+    np.testing.assert_allclose(planet, np.repeat([1808.2, 5963.8, 6981.7], planets - 3), atol=0.1)
+
+
+def test_shapes_of_each_family_move_what_the_theory_says() -> None:
+    rig = planetary(4)
+    system = rig.system("with_ring", LIN_PARKER)
+    central_turn = [system.dofs.index(f"{b}.u") for b in ("carrier", "ring", "sun")]
+    central_shift = [system.dofs.index(f"{b}.{d}") for b in ("carrier", "ring", "sun") for d in "xy"]
+    for mode in model_modes(rig, "with_ring", LIN_PARKER):
+        if mode.family in ("translational", "planet"):
+            np.testing.assert_allclose(mode.shape[central_turn], 0, atol=1e-6)
+        if mode.family in ("rotational", "planet", "rigid body"):
+            np.testing.assert_allclose(mode.shape[central_shift], 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("planets", [2, 3, 5])
+def test_modes_that_coincide_by_accident_are_still_sorted_into_families(planets: int) -> None:
+    rig = planetary(planets)
+    system = rig.system("with_ring", LIN_PARKER)
+    _, shapes = normal_modes(system)
+    rng = np.random.default_rng(0)
+    turn, _ = np.linalg.qr(rng.standard_normal((shapes.shape[1],) * 2))
+    families, rotated = rig.classify(system, np.full(shapes.shape[1], 100.0), shapes @ turn)
+    assert families.count("rotational") == 6
+    assert families.count("planet") == 3 * max(planets - 3, 0)
+    np.testing.assert_allclose(rotated.T @ system.mass @ rotated, np.eye(len(families)), atol=1e-9)
+
+
+def test_default_rig_gives_the_seeds_predictions() -> None:
+    rig = load_rig("planetary")
+    case1 = frequencies(rig, "no_ring")
+    for expected in (51.1, 106.7, 113.9, 1395.0):
+        assert min(abs(f - expected) for f in case1) < 0.06
+    case2 = frequencies(rig, "with_ring", {"ring_planet_mesh_stiffness": 1.5e7})
+    for expected in (46.2, 106.0, 310.8, 965.2):
+        assert min(abs(f - expected) for f in case2) < 0.06
+
+
+def test_bare_ring_on_ten_times_softer_bearing_gives_the_printed_98_hz() -> None:
+    # f = √(k/m)/2π of the ring alone; Table I's 1.64e7 N/m would give 311 Hz.
+    rig = load_rig("planetary")
+    soft = frequencies(
+        rig,
+        "with_ring",
+        {
+            "ring_bearing_stiffness": 1.64e6,
+            "sun_planet_mesh_stiffness": 1e6,
+            "ring_planet_mesh_stiffness": 1e6,
+        },
+    )
+    assert min(abs(f - 98.3) for f in soft) < 3.0
+
+
+def test_modal_damping_is_one_percent_in_every_elastic_mode() -> None:
+    for mode in model_modes(load_rig("planetary"), "with_ring"):
+        assert mode.damping_ratio == pytest.approx(0.0 if mode.frequency_hz == 0 else 0.01)
+        assert mode.complex_shape is None
+
+
+def test_planet_sensors_in_x_and_y_follow_the_planets_position() -> None:
+    system = planetary(4).system("no_ring")
+    # Planet 2 of 4 sits at 90°: its x is -η, its y is ζ.
+    x, y = sensor_row(system, Dof("planet2", "x")), sensor_row(system, Dof("planet2", "y"))
+    assert x[system.dofs.index("planet2.eta")] == pytest.approx(-1.0)
+    assert y[system.dofs.index("planet2.zeta")] == pytest.approx(1.0)
+    assert abs(x[system.dofs.index("planet2.zeta")]) < 1e-12
+    rig = planetary(4)
+    assert rig.knows("no_ring", Dof("planet4", "y"))
+    assert not rig.knows("no_ring", Dof("ring", "x"))
+    assert rig.knows("with_ring", Dof("ring", "x"))
+
+
+def test_rigid_rotation_of_all_gears_in_mesh_strains_no_spring() -> None:
+    # Kinematics by hand: carrier turns by 1 at the planets' circle, ring held, sun and planets roll.
+    system = planetary(3).system("with_ring", {"pressure_angle_deg": 20.0})
+    u = dict.fromkeys(system.dofs, 0.0)
+    alpha = np.deg2rad(20.0)
+    u["carrier.u"] = 1.0
+    for n in (1, 2, 3):
+        u[f"planet{n}.eta"] = 1.0
+        u[f"planet{n}.u"] = -np.cos(alpha)  # ring mesh: -η cos α - u_p = 0
+    u["sun.u"] = 2 * np.cos(alpha)  # sun mesh: u_s - η cos α + u_p = 0
+    x = np.array([u[d] for d in system.dofs])
+    assert abs(x @ system.stiffness @ x) < 1e-6 * 1e7
+
+
+def test_used_parameters_leave_the_ring_out_where_there_is_none() -> None:
+    rig = load_rig("planetary")
+    assert "ring_planet_mesh_stiffness" not in rig.used("no_ring")
+    assert "ring_planet_mesh_stiffness" in rig.used("with_ring")
+    for name in set(rig.parameters) - set(rig.used("no_ring")):
+        moved = rig.system("no_ring", {name: 2 * rig.parameters[name].value})
+        np.testing.assert_array_equal(moved.stiffness, rig.system("no_ring").stiffness)
+
+
+def test_free_parameters_are_the_two_mesh_stiffnesses() -> None:
+    free = {n: (p.minimum, p.maximum) for n, p in load_rig("planetary").parameters.items() if p.free}
+    assert free == {
+        "sun_planet_mesh_stiffness": (1e6, 1e9),
+        "ring_planet_mesh_stiffness": (1e6, 1e9),
+    }
+
+
+def test_frame_has_the_closed_form_frequencies_of_a_uniform_shear_building() -> None:
+    n, m, k = 4, 5.0, 2e5
+    expected = np.sqrt(k / m) / np.pi * np.sin((2 * np.arange(1, n + 1) - 1) * np.pi / (2 * (2 * n + 1)))
+    np.testing.assert_allclose(frequencies(frame(n), "default"), expected, rtol=1e-10)
+
+
+def test_rigs_can_be_sent_to_another_process() -> None:
+    for name in rig_names():
+        rig = load_rig(name)
+        again = pickle.loads(pickle.dumps(rig))
+        configuration = rig.configurations[0]
+        np.testing.assert_array_equal(
+            again.system(configuration).stiffness, rig.system(configuration).stiffness
+        )
+
+
+def test_unknown_names_come_with_a_hint() -> None:
+    rig = load_rig("planetary")
+    with pytest.raises(EmaError, match="did you mean 'with_ring'"):
+        rig.system("with_rign")
+    with pytest.raises(EmaError, match="did you mean 'sun_mass'"):
+        rig.system("with_ring", {"sun_mas": 2.0})
+    with pytest.raises(EmaError, match="did you mean 'planetary'"):
+        load_rig("planetry")
+
+
+RIG_FILE = """\
+base = "planetary"
+[geometry]
+planets = 3
+[parameters]
+carrier_mass = { value = 1.50, unit = "kg", tolerance = 0.02 }
+sun_planet_mesh_stiffness = { value = 2e7, unit = "N/m", min = 1e6, max = 1e9, free = true }
+planet2_mass = 0.5
+sun_mass = 2.2
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "rig.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_rig_file_specialises_a_shipped_rig(tmp_path: Path) -> None:
+    rig = load_rig(write(tmp_path, RIG_FILE))
+    assert rig.name == "planetary"
+    assert rig.parameters["carrier_mass"].value == 1.5
+    assert rig.parameters["carrier_mass"].tolerance == 0.02
+    assert rig.parameters["sun_mass"].value == 2.2
+    assert rig.parameters["sun_mass"].tolerance == 0.01
+    system = rig.system("no_ring")
+    mass = dict(zip(system.dofs, np.diag(system.mass), strict=True))
+    assert mass["planet1.zeta"] == 0.43
+    assert mass["planet2.zeta"] == 0.5
+    assert "planet3.u" in mass
+
+
+def test_tolerance_on_a_free_parameter_makes_it_a_known_one(tmp_path: Path) -> None:
+    text = 'base = "planetary"\n[parameters]\nsun_planet_mesh_stiffness = { value = 2e7, tolerance = 0.1 }\n'
+    assert not load_rig(write(tmp_path, text)).parameters["sun_planet_mesh_stiffness"].free
+
+
+def test_viscous_coefficients_take_the_place_of_modal_damping(tmp_path: Path) -> None:
+    # Table I prints c = 2·0.01·√(k·m) for the sun bearing as 28.57: one percent of the bare sun.
+    text = (
+        'base = "planetary"\n[parameters]\nsun_bearing_damping = { value = 28.57, unit = "Ns/m" }\n'
+        "planet_bearing_damping = 2.56\n"
+    )
+    rig = load_rig(write(tmp_path, text))
+    assert rig.parameters["modal_damping_ratio"].value == 0.0
+    ratios = complex_modes(rig.system("no_ring")).damping_ratio
+    assert 0.003 < ratios.max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("carrier_mass", "carier_mass", "line 5.*carier_mass.*did you mean 'carrier_mass'"),
+        ('"kg"', '"g"', "line 5.*carrier_mass.*unit 'g'.*convert the value to kg"),
+        ("planets", "planet", "line 3.*did you mean 'planets'"),
+        ("tolerance", "tolerence", "line 5.*tolerence"),
+        ('"planetary"', '"planetery"', "line 1.*did you mean 'planetary'"),
+        ("= 3", "= 1", "at least 2 planets"),
+        ("value = 1.50", 'value = "heavy"', "line 5.*carrier_mass.*'heavy'"),
+        ("planet2_mass", "planet9_mass", "line 7.*planet9_mass"),
+        ("2e7", "2e3", "line 6.*outside its bounds"),
+        ("1.50", "nan", "line 5.*finite"),
+        ("= 3", "= [", "not valid TOML.*line"),
+    ],
+)
+def test_mistakes_in_a_rig_file_name_file_line_and_key(
+    tmp_path: Path, old: str, new: str, message: str
+) -> None:
+    path = write(tmp_path, RIG_FILE.replace(old, new, 1))
+    with pytest.raises(EmaError, match=message) as caught:
+        load_rig(path)
+    assert str(path) in str(caught.value)
+
+
+ELEMENTS = """\
+name = "two blocks"
+configurations = ["free", "clamped"]
+[parameters]
+link = { value = 1e5, unit = "N/m", tolerance = 0.1 }
+[[masses]]
+at = "top.x"
+value = 1.0
+[[masses]]
+at = "base.x"
+value = 3.0
+[[springs]]
+name = "link"
+between = ["top.x", "base.x"]
+value = "link"
+[[springs]]
+at = "base.x"
+value = 1e6
+configurations = ["clamped"]
+[[dampers]]
+row = { "top.x" = 1.0, "base.x" = -1.0 }
+value = 5.0
+[[sensors]]
+dof = "middle.x"
+row = { "top.x" = 0.5, "base.x" = 0.5 }
+"""
+
+
+def test_rig_from_scratch_is_made_of_elements(tmp_path: Path) -> None:
+    rig = load_rig(write(tmp_path, ELEMENTS))
+    free = frequencies(rig, "free")
+    assert free[0] == 0.0
+    assert free[1] == pytest.approx(np.sqrt(1e5 * (1 / 1.0 + 1 / 3.0)) / (2 * np.pi), rel=1e-9)
+    assert frequencies(rig, "clamped")[0] > 10.0
+    assert rig.knows("free", Dof("middle", "x"))
+    assert set(rig.used("free")) == {"link", "modal_damping_ratio"}
+    soft = rig.system("free", {"link": 5e4}).stiffness
+    np.testing.assert_allclose(soft, rig.system("free").stiffness / 2)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('value = "link"', 'value = "lnk"', "did you mean 'link'"),
+        ('"top.x", "base.x"]', '"top.x", "bas.x"]', "did you mean 'base.x'"),
+        ('at = "base.x"\nvalue = 3', 'att = "base.x"\nvalue = 3', "did you mean 'at'"),
+        ('["clamped"]', '["clampd"]', "did you mean 'clamped'"),
+        ("value = 3.0", "", "value.*missing"),
+    ],
+)
+def test_mistakes_in_a_rig_from_scratch_are_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in ELEMENTS
+    with pytest.raises(EmaError, match=message):
+        load_rig(write(tmp_path, ELEMENTS.replace(old, new)))
