@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from ema_pipeline.settings import Settings
 
@@ -36,3 +36,11 @@ class SimulationSettings(Settings):
     overloads: tuple[str, ...] = Field((), description="hits that clip the hammer channel, written alike")
     format: RecordFormat = Field("uff", description="format of the record files")
     seed: int = Field(0, ge=0, description="seed of all random numbers")
+
+    @field_validator("peak_force_n", "double_hits", "overloads", mode="before")
+    @classmethod
+    def _one_or_several(cls, given: object) -> object:
+        """One item may be given bare, several as text with commas: ``30,100,300``."""
+        if isinstance(given, str):
+            return [part.strip() for part in given.split(",") if part.strip()]
+        return given if isinstance(given, list | tuple) else [given]
