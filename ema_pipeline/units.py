@@ -113,8 +113,8 @@ _ALIASES = {
     "hertz": "Hz",
 }
 _PLAIN = str.maketrans("²µμ·⋅*", "2uu  ^")
-# Symbols whose meaning hangs on the case of the first letter (mN and MN): these are never folded.
-_CASE_MATTERS = {"mn", "mv", "mg"}
+# Symbols whose meaning hangs on letter case (mN and MN, nm and Nm): these are never folded.
+_CASE_MATTERS = {"mn", "mv", "mg", "nm"}
 
 
 def find_unit(text: str) -> Unit | None:

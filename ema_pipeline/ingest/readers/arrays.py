@@ -102,7 +102,7 @@ def assemble(arrays: Sequence[NamedArray], file_attributes: Mapping[str, Any] | 
         rates.read(label, array.attributes)
         numbers = values.astype(np.float64)
         if values.ndim == 1 and is_time_name(array.name):
-            scale = time_unit_scale(array.name, _lookup(array.attributes, _UNIT_KEYS))
+            scale = time_unit_scale(array.name, _text(array.attributes, _UNIT_KEYS))
             rates.add(label, rate_from_times(numbers * scale))
         elif values.ndim == 1:
             columns.append(_Column(array.path, numbers, array.attributes))
@@ -119,10 +119,8 @@ def assemble(arrays: Sequence[NamedArray], file_attributes: Mapping[str, Any] | 
     channels = {
         name: RawChannel(
             samples=column.samples,
-            unit=clean_unit(
-                _lookup(column.attributes, _UNIT_KEYS) or (unit_names[i] if unit_names else None)
-            ),
-            dof=clean_unit(_lookup(column.attributes, _DOF_KEYS)),
+            unit=clean_unit(_text(column.attributes, _UNIT_KEYS) or (unit_names[i] if unit_names else None)),
+            dof=clean_unit(_text(column.attributes, _DOF_KEYS)),
         )
         for i, (name, column) in enumerate(zip(names, columns, strict=True))
     }
@@ -168,7 +166,7 @@ def _split_matrix(array: NamedArray, numbers: NDArray[np.float64]) -> list[_Colu
         axis_rate = rate_from_times(table[:, 0])
         table = table[:, 1:]
     count = table.shape[1]
-    given = _texts(np.asarray(_lookup(array.attributes, _NAME_KEYS) or ()))
+    given = _texts(_lookup(array.attributes, _NAME_KEYS))
     if len(given) == count + 1 and axis_rate is not None:
         given = given[1:]
     if len(given) == count:
@@ -177,7 +175,7 @@ def _split_matrix(array: NamedArray, numbers: NDArray[np.float64]) -> list[_Colu
         names = (array.name,)
     else:
         names = tuple(f"{array.name}_{i + 1}" for i in range(count))
-    units = _texts(np.asarray(_lookup(array.attributes, _UNIT_KEYS) or ()))
+    units = _texts(_lookup(array.attributes, _UNIT_KEYS))
     units = units if len(units) == count else units * count if len(units) == 1 else ()
     return [
         _Column(
@@ -230,16 +228,23 @@ def _key(name: str) -> str:
 
 
 def _lookup(attributes: Mapping[str, Any], keys: set[str]) -> Any:
-    for name, value in attributes.items():
-        if _key(name) in keys and np.size(value) > 0:
-            return value if np.size(value) > 1 or isinstance(value, str | bytes) else np.ravel(value)[0]
-    return None
+    return next((v for name, v in attributes.items() if _key(name) in keys and np.size(v) > 0), None)
 
 
-def _texts(values: NDArray[Any]) -> tuple[str, ...]:
+def _text(attributes: Mapping[str, Any], keys: set[str]) -> str | None:
+    """The one text under any of the keys."""
+    found = _texts(_lookup(attributes, keys))
+    return found[0] if len(found) == 1 else None
+
+
+def _texts(values: Any) -> tuple[str, ...]:
+    """Texts of an array, a list or one text; none of None."""
+    if values is None:
+        return ()
+
     def text(item: Any) -> str:
         while isinstance(item, np.ndarray) and item.size == 1:
             item = item.ravel()[0]
         return item.decode("utf-8", errors="replace") if isinstance(item, bytes) else str(item).strip()
 
-    return tuple(text(item) for item in np.ravel(values))
+    return tuple(text(item) for item in np.ravel(np.asarray(values)))
