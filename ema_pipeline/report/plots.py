@@ -39,6 +39,8 @@ class FigureSpec:
         Returns the figure.
     report_format : {"png", "svg"}
         The smaller of the two for this kind of figure.
+    in_report : bool
+        False for figures that the report replaces by a moving drawing.
     """
 
     name: str
@@ -47,6 +49,7 @@ class FigureSpec:
     caption: str
     draw: Callable[[], Figure]
     report_format: Format = "svg"
+    in_report: bool = True
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ def render(
         None keeps for each figure the one format that the report embeds.
     progress : callable or None
     """
-    specs = figure_specs(results)
+    specs = tuple(s for s in figure_specs(results) if formats is not None or s.in_report)
     plots = []
     for number, spec in enumerate(specs, start=1):
         plots.append(_render(spec, formats or (spec.report_format,)))
@@ -192,7 +195,7 @@ def _shapes(configuration: ConfigurationResults, stem: str) -> Iterator[FigureSp
         caption = f"Shapes of modes {chunk[0] + 1} to {chunk[-1] + 1}"
         if layout is not None:
             yield FigureSpec(f"{stem}_shapes_{n}", "shapes", configuration.name, caption + " as a moved gear set",
-                             partial(shapes.gear_shapes, configuration, layout, chunk), "png")  # fmt: skip
+                             partial(shapes.gear_shapes, configuration, layout, chunk), "png", in_report=False)  # fmt: skip
         else:
             yield FigureSpec(f"{stem}_shapes_{n}", "shapes", configuration.name, caption + " over the DOFs",
                              partial(shapes.stem_shapes, configuration, chunk))  # fmt: skip

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import io
+import re
 from collections.abc import Callable, Sequence
-from typing import ParamSpec
+from typing import Any, ParamSpec
 
 import matplotlib
 import numpy as np
@@ -14,6 +15,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import ArrayLike
+from PIL import Image
 
 # Okabe & Ito (2008), "Color universal design": told apart with every common colour vision deficiency.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -26,7 +28,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 2)))
 
 WIDTH_IN = 7.2  # text width of an A4 page with 14 mm margins
-_RC = {
+_RC: dict[str, Any] = {
     "font.family": ["DejaVu Sans"],
     "font.size": 8.0,
     "axes.titlesize": 8.5,
@@ -97,10 +99,14 @@ def margins(
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as PNG; the same bytes for the same figure."""
-    buffer = io.BytesIO()
+    """The figure as PNG with a palette of 200 colours (a third of the size); the same bytes for the same figure."""
     with matplotlib.rc_context(_RC):
-        figure.savefig(buffer, format="png", metadata={"Software": None})
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    buffer = io.BytesIO()
+    palette = image.quantize(200, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    palette.save(buffer, format="png", dpi=(_RC["figure.dpi"],) * 2)
     return buffer.getvalue()
 
 
@@ -109,7 +115,15 @@ def svg(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     with matplotlib.rc_context(_RC):
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return buffer.getvalue()
+    return _slim(buffer.getvalue())
+
+
+def _slim(content: bytes) -> bytes:
+    """Coordinates to 1/100 pt, no turns by zero, and fonts for readers who lack ours (none of which base64 holds)."""
+    content = re.sub(rb"(\d\.\d\d)\d+", rb"\1", content)
+    content = re.sub(rb' transform="rotate\(-?0 [^"]*"', b"", content)
+    content = content.replace(b"font-family: 'DejaVu Sans'", b"font-family: 'DejaVu Sans', Verdana, sans-serif")
+    return re.sub(rb"\s*\n\s*", b"\n", content)
 
 
 def frequency_axis(ax: Axes, low_hz: float, high_hz: float, log: bool, label: bool = True) -> None:

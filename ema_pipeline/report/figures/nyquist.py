@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from ema_pipeline.modal.types import CircleFit, ModalModel
-from ema_pipeline.report.numbers import format_percent, format_value
+from ema_pipeline.report.numbers import format_percent, format_value, plain
 from ema_pipeline.report.style import (
     GREEN,
     GREY,
@@ -96,7 +98,7 @@ def _panel(ax: Axes, circle: CircleFit, pole_hz: float, calibrated: bool) -> Non
         bbox={"boxstyle": "square,pad=0.3", "fc": "white", "ec": "#cccccc", "lw": 0.5},
     )  # fmt: skip
     if circle.pair_damping.size >= 3:
-        _damping_inset(ax, circle)
+        _damping_spread(ax, circle)
 
 
 def _equal_limits(ax: Axes, z: NDArray[np.complex128], centre: complex, radius: float) -> None:
@@ -115,17 +117,24 @@ def _equal_limits(ax: Axes, z: NDArray[np.complex128], centre: complex, radius: 
     ax.set_ylim(0.5 * (low + high) - half, 0.5 * (low + high) + half)
 
 
-def _damping_inset(ax: Axes, circle: CircleFit) -> None:
-    inset = ax.inset_axes((0.74, 0.33, 0.23, 0.2))
+def _damping_spread(ax: Axes, circle: CircleFit) -> None:
+    """Small histogram of the damping of all half-power pairs, drawn without axes of its own (they are slow)."""
     percent = 100 * circle.pair_damping[np.isfinite(circle.pair_damping)]
-    low, high = np.percentile(percent, [1, 99])
-    inset.hist(percent, bins=12, range=(low, max(high, low * 1.001 + 1e-9)), color="#9ec7e3", ec=MEASURED, lw=0.4)
-    inset.axvline(100 * circle.damping_ratio, color=MODEL, lw=1)
-    inset.set_yticks([])
-    inset.xaxis.set_major_locator(MaxNLocator(2))
-    inset.tick_params(labelsize=5.5, length=2, pad=1)
-    inset.set_title("ζ of pairs, %", fontsize=5.5, pad=2, fontweight="normal", color=GREY)
-    inset.grid(False)
+    low, high = (float(v) for v in np.percentile(percent, [1, 99]))
+    if not high > low:
+        return
+    counts, edges = np.histogram(percent, bins=12, range=(low, high))
+    left, bottom, width, height = 0.735, 0.38, 0.24, 0.16
+    x = left + width * (edges - low) / (high - low)
+    y = bottom + height * counts / counts.max()
+    bars = [[(x[k], bottom), (x[k], y[k]), (x[k + 1], y[k]), (x[k + 1], bottom)] for k in range(12)]
+    ax.add_artist(PolyCollection(bars, transform=ax.transAxes, fc="#9ec7e3", ec=MEASURED, lw=0.4, zorder=4))
+    mean = left + width * (100 * circle.damping_ratio - low) / (high - low)
+    if left <= mean <= left + width:
+        ax.add_artist(Line2D([mean, mean], [bottom, bottom + 1.05 * height], transform=ax.transAxes, color=MODEL, lw=1, zorder=5))
+    words = {"transform": ax.transAxes, "ha": "center", "fontsize": 5.8, "color": GREY}
+    ax.text(left + width / 2, bottom + 1.1 * height, "ζ of all pairs", va="bottom", **words)  # type: ignore[arg-type]
+    ax.text(left + width / 2, bottom - 0.015, f"{plain(low, 3)} … {plain(high, 3)} %", va="top", **words)  # type: ignore[arg-type]
 
 
 def _mark(

@@ -87,27 +87,27 @@ def draw_gear(
         unknown = len(moved[body.name].missing) == 3 and fills is None
         if kind == "carrier":
             circle = outline(body)
-            ax.add_patch(Polygon(circle, fill=False, ec="#a0a0a0", lw=0.5, ls=(0, (3, 2)), transform=rest))
-            ax.add_patch(Polygon(circle, fill=False, ec="#d9a878" if fills is None else fill, lw=3.2, transform=place))
+            ax.add_artist(Polygon(circle, fill=False, ec="#a0a0a0", lw=0.5, ls=(0, (3, 2)), transform=rest))
+            ax.add_artist(Polygon(circle, fill=False, ec="#d9a878" if fills is None else fill, lw=3.2, transform=place))
             for planet in planets:
-                ax.add_line(Line2D([0, planet.x], [0, planet.y], color="#d9a878" if fills is None else fill, lw=3.2, transform=place))
+                ax.add_artist(Line2D([0, planet.x], [0, planet.y], color="#d9a878" if fills is None else fill, lw=3.2, transform=place))
             continue
         teeth = outline(body)
-        ax.add_patch(Polygon(teeth, fill=False, ec="#8a8a8a", lw=0.5, ls=(0, (3, 2)), transform=rest, zorder=1.5))
+        ax.add_artist(Polygon(teeth, fill=False, ec="#8a8a8a", lw=0.5, ls=(0, (3, 2)), transform=rest, zorder=1.5))
         if kind == "ring":
             angle = np.linspace(0, 2 * np.pi, 121)
             outer = (body.radius + 0.35) * np.column_stack([np.cos(angle), np.sin(angle)])
-            ax.add_patch(Polygon(outer, fc=fill, ec="#333333", lw=0.7, transform=place, zorder=-2, alpha=0.9))
-            ax.add_patch(Polygon(teeth, fc="white", ec="#333333", lw=0.7, transform=place, zorder=-1))
+            ax.add_artist(Polygon(outer, fc=fill, ec="#333333", lw=0.7, transform=place, zorder=-2, alpha=0.9))
+            ax.add_artist(Polygon(teeth, fc="white", ec="#333333", lw=0.7, transform=place, zorder=-1))
         else:
-            ax.add_patch(Polygon(teeth, fc="none" if unknown else fill, ec="#333333", lw=0.7, alpha=0.9, transform=place, zorder=2))
+            ax.add_artist(Polygon(teeth, fc="none" if unknown else fill, ec="#333333", lw=0.7, alpha=0.9, transform=place, zorder=2))
             ax.plot(x, y, "o", color="#333333", ms=1.8, zorder=4)
         if "u" in moved[body.name].missing:
             continue  # a spoke would claim that the body does not turn
         inner = 0.0 if kind != "ring" else body.radius + 0.05
         end = body.radius * 0.9 if kind != "ring" else body.radius + 0.33
-        ax.add_line(Line2D([inner, end], [0, 0], color=MODEL, lw=1.4, transform=place, zorder=4))
-        ax.add_line(Line2D([inner, end], [0, 0], color="#8a8a8a", lw=0.6, ls=(0, (3, 2)), transform=rest, zorder=3))
+        ax.add_artist(Line2D([inner, end], [0, 0], color=MODEL, lw=1.4, transform=place, zorder=4))
+        ax.add_artist(Line2D([inner, end], [0, 0], color="#8a8a8a", lw=0.6, ls=(0, (3, 2)), transform=rest, zorder=3))
 
 
 @styled
