@@ -1,4 +1,4 @@
-"""Where model and measurement part: by mode, by DOF and by band, in units of the measurement's uncertainty."""
+"""Where model and measurement part: by mode, DOF and band, in units of the uncertainty."""
 
 from __future__ import annotations
 
@@ -66,7 +66,8 @@ def compare(
         modes += _mode_differences(evidence, pairing, model, residual)
         dofs += _dof_differences(evidence, pairs, residual)
         epsilon += sum(
-            ((p.measured_frequency_hz - p.model_frequency_hz) / p.model_frequency_hz) ** 2 for p in pairing.pairs
+            ((p.measured_frequency_hz - p.model_frequency_hz) / p.model_frequency_hz) ** 2
+            for p in pairing.pairs
         )
         if frfs is not None and configuration in frfs:
             bands += band_differences(configuration, system, frfs[configuration], settings)
@@ -82,7 +83,7 @@ def compare(
 def band_differences(
     configuration: str, system: LinearSystem, frfs: FrfSet, settings: CompareSettings
 ) -> list[BandDifference]:
-    """Root-mean-square difference of every measured FRF from the model's, in bands of equal logarithmic width.
+    """Root-mean-square difference of every FRF from the model's, in bands of equal logarithmic width.
 
     An FRF in volts has no scale of its own: one common factor is fitted to each input first.
     """
@@ -117,9 +118,9 @@ def band_differences(
         h, difference = measured[..., inside], measured[..., inside] - model[..., inside]
         size = np.abs(h) ** 2
         level = np.mean(size, axis=2, keepdims=True)
-        sigma2 = (
-            variance[..., inside] + settings.frf_floor**2 * size + settings.frf_background**2 * level
-        )
+        # the scatter of two or three hits is itself too uncertain to be used line by line
+        scatter = np.mean(variance[..., inside], axis=2, keepdims=True)
+        sigma2 = scatter + settings.frf_floor**2 * size + settings.frf_background**2 * level
         z = np.sqrt(np.mean(np.abs(difference) ** 2 / np.maximum(sigma2, 1e-300), axis=2))
         for o, i in zip(*np.nonzero(np.isfinite(z)), strict=True):
             out.append(
@@ -157,7 +158,9 @@ def _lines(
     """Evenly picked lines of every band, and the number of the band of each."""
     lines, number = [], []
     for b in range(edges.size - 1):
-        inside = np.flatnonzero((frequency_hz >= edges[b]) & (frequency_hz < edges[b + 1]) & (frequency_hz > 0))
+        inside = np.flatnonzero(
+            (frequency_hz >= edges[b]) & (frequency_hz < edges[b + 1]) & (frequency_hz > 0)
+        )
         if inside.size > most:
             inside = inside[np.linspace(0, inside.size - 1, most).round().astype(int)]
         lines.append(inside)

@@ -101,7 +101,7 @@ def from_frequencies(
 
 
 def with_floors(measured: MeasuredModes, settings: UncertaintySettings) -> MeasuredModes:
-    """Standard uncertainties for comparison with a model: the test's scatter and the floors, root sum of squares.
+    """Standard uncertainties for comparison with a model: root sum of squares of scatter and floors.
 
     Standard deviations that are missing (NaN, zero or negative) are replaced by the assumed ones.
     """

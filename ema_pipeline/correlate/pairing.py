@@ -1,4 +1,4 @@
-"""Which measured mode is which model mode: one globally optimal assignment, with reasons for every refusal."""
+"""Which measured mode is which model mode: one optimal assignment, and a reason for every refusal."""
 
 from __future__ import annotations
 
@@ -44,7 +44,8 @@ def pair(
     The cost of a pair is (|ln f/f_model| / tolerance)² + (1 - MAC)/(1 - least MAC); the assignment of least
     total cost over all modes is taken (Hungarian method), in which a mode may also stay alone at the price
     of `settings.refusal`. Inside a group of close model modes the MAC is that of the measured shape with the
-    span of the group's shapes, because single shapes are arbitrary there. The order of modes only breaks ties.
+    span of the group's shapes, because single shapes are arbitrary there. The order of modes only breaks
+    ties.
 
     Parameters
     ----------
@@ -62,7 +63,8 @@ def pair(
     """
     model_f = np.array([m.frequency_hz for m in modes])
     rows = sensor_rows(system, measured)
-    shapes = np.array([_shape(m) for m in modes], dtype=complex).reshape(len(modes), -1) @ rows.T
+    full = np.array([_shape(m) for m in modes], dtype=complex).reshape(len(modes), -1)
+    shapes = np.asarray(full @ rows.T, dtype=complex)
     groups = close_groups(model_f, settings.group_width)
     single, grouped = shape_agreement(measured, shapes, groups)
     distance = _log_distance(measured.frequency_hz, model_f)

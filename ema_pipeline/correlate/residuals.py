@@ -1,9 +1,11 @@
 """Residuals of paired modes: frequencies, damping ratios and shapes of the model's own modes.
 
-Unlike the latent-shape objective this one leaves no freedom to coordinates that carry no sensor: the model's mode
+Unlike the latent-shape objective this one leaves no freedom to coordinates that carry no sensor: the model's
+mode
 must have the measured frequency, damping and shape. Shapes of modes that nearly coincide are compared by the
 space that they span, with a smooth transition: mode j may mix into mode k with an amplitude of the order
-mixing·λ_k/|λ_j - λ_k|, which is what an unmodelled relative perturbation `mixing` of the matrices does (first-order
+mixing·λ_k/|λ_j - λ_k|, which is what an unmodelled relative perturbation `mixing` of the matrices does
+(first-order
 perturbation theory). Equal eigenvalues mix freely, distant ones not at all.
 """
 
@@ -138,7 +140,7 @@ def mode_residuals(e: Evidence, pairs: NDArray[np.int64], modes: Modes, mixing: 
         Columns: frequency, damping ratio, shape (n_dofs real parts, n_dofs imaginary parts), mixing. Zero for
         modes without partner.
     """
-    batch, n = modes.omega.shape
+    batch = len(modes.omega)
     has = np.flatnonzero(pairs >= 0)
     k = pairs[has]
     frequency = (modes.omega[:, k] / e.omega[has] - 1) / e.relative_std[has]

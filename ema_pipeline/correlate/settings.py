@@ -31,7 +31,8 @@ class UncertaintySettings(Settings):
     shape_floor: float = Field(
         default=0.01,
         ge=0,
-        description="Standard uncertainty of a shape entry, in units of the shape's largest entry: accelerometer "
+        description="Standard uncertainty of a shape entry, in units of the shape's largest entry: "
+        "accelerometer "
         "sensitivity is known to 1-2 % (ISO 16063-21), and a mounting angle off by 1 degree gives 1.7 %.",
     )
     frequency_std_assumed: float = Field(
@@ -47,12 +48,14 @@ class UncertaintySettings(Settings):
     shape_std_assumed: float = Field(
         default=0.05,
         gt=0,
-        description="Standard deviation of a shape entry that comes without one, in units of the largest entry.",
+        description="Standard deviation of a shape entry that comes without one, in units of the largest "
+        "entry.",
     )
     mode_mixing: float = Field(
         default=1e-3,
         gt=0,
-        description="Relative scatter of eigenvalues from small asymmetries that no model holds (planets that "
+        description="Relative scatter of eigenvalues from small asymmetries that no model holds (planets "
+        "that "
         "differ in the last gram). Modes closer than this exchange their shapes freely.",
     )
 
@@ -82,7 +85,8 @@ class PairingSettings(Settings):
     node_level: float = Field(
         default=0.02,
         ge=0,
-        description="A model mode whose share of motion at the sensors (or at the points struck) is below this, "
+        description="A model mode whose share of motion at the sensors (or at the points struck) is below "
+        "this, "
         "relative to the best seen mode, counts as not seen (not excited).",
     )
 
@@ -97,7 +101,8 @@ class CompareSettings(UncertaintySettings):
     frf_floor: float = Field(
         default=0.03,
         ge=0,
-        description="Standard uncertainty of an FRF, relative to its modulus: calibration of hammer and sensor.",
+        description="Standard uncertainty of an FRF, relative to its modulus: calibration of hammer and "
+        "sensor.",
     )
     frf_background: float = Field(
         default=0.01,

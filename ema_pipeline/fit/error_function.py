@@ -4,7 +4,8 @@
 
 References
 ----------
-K. A. Olanipekun, "Estimation of a planetary gear mesh stiffness: an approach based on minimising error function",
+K. A. Olanipekun, "Estimation of a planetary gear mesh stiffness: an approach based on minimising error
+function",
 Eq. 10 and Figs. 5 and 6.
 """
 
@@ -138,7 +139,8 @@ def two_step(
     """Sun-planet stiffness from ``no_ring``, with it ring-planet from ``with_ring``, then their average.
 
     All measured modes are used, or the lowest `mode_count`. Values are NaN where the configuration was not
-    measured; the average is NaN unless both steps determine their stiffness, and the note says why they do not.
+    measured; the average is NaN unless both steps determine their stiffness, and the note says why they do
+    not.
     """
     sun = ring = float("nan")
     sound = True

@@ -36,7 +36,8 @@ class ExactObjective:
     def residuals(self, x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Residuals in units of the standard uncertainty, per configuration (B, R, m), at points (B, P).
 
-        Columns: frequency, damping ratio, shape (real and imaginary parts), mixing; 0 for modes without partner.
+        Columns: frequency, damping ratio, shape (real and imaginary parts), mixing; 0 for modes without
+        partner.
         """
         return [
             mode_residuals(e, p, observable_modes(e.family.at(x)), self.mixing)

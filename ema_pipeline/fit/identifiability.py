@@ -19,7 +19,9 @@ class Judgement:
     note: str
 
 
-def judge_free(coordinate: Coordinate, p: Profile, value: float, std: float, settings: FitSettings) -> Judgement:
+def judge_free(
+    coordinate: Coordinate, p: Profile, value: float, std: float, settings: FitSettings
+) -> Judgement:
     """A free parameter: its profile must close inside the bounds, and its standard deviation be small.
 
     Parameters
@@ -40,17 +42,13 @@ def judge_free(coordinate: Coordinate, p: Profile, value: float, std: float, set
         return Judgement(True, f"at its lower bound, {p.values[0]:.3g} {unit}")
     if at_high and below >= settings.profile_rise and coordinate.kind == "linear":
         return Judgement(True, f"at its upper bound, {p.values[-1]:.3g} {unit}")
-    open_sides = [
-        side
-        for side, rise in (("below", below), ("above", above))
-        if rise < settings.profile_rise
-    ]
+    open_sides = [side for side, rise in (("below", below), ("above", above)) if rise < settings.profile_rise]
     if open_sides:
         where = " and ".join(open_sides)
         return Judgement(
             False,
-            f"not identified: -2 log posterior rises by {below:.2g} below and {above:.2g} above the estimate inside "
-            f"the bounds, {settings.profile_rise:g} is needed on both sides (open {where})",
+            f"not identified: -2 log posterior rises by {below:.2g} below and {above:.2g} above the "
+            f"estimate inside the bounds, {settings.profile_rise:g} is needed on both sides (open {where})",
         )
     reference = abs(value)
     if coordinate.kind == "linear" and np.isfinite(coordinate.high - coordinate.low):
@@ -68,11 +66,14 @@ def judge_free(coordinate: Coordinate, p: Profile, value: float, std: float, set
 def judge_prior(
     std: float, prior_std: float, shift_z: float, at_bound: bool, settings: FitSettings
 ) -> Judgement:
-    """A parameter with a tolerance: identified where the data narrow it; remarked where they contradict it."""
+    """A parameter with a tolerance: identified where the data narrow it; remarked where they contradict "
+    "it."""
     identified = std < settings.narrowed * prior_std
     notes = []
     if abs(shift_z) > 3:
-        notes.append(f"out of tolerance: the data put it {shift_z:+.1f} standard deviations from its nominal value")
+        notes.append(
+            f"out of tolerance: the data put it {shift_z:+.1f} standard deviations from its nominal value"
+        )
     if at_bound:
         notes.append("at its bound")
     if not identified:

@@ -1,15 +1,21 @@
 """The latent-shape objective: how nearly does the model's equation hold for each measured mode, unpaired.
 
-For measured mode r with frequency ω_r and shape y_r at the sensors S the full shape u is unknown. Its best guess
-minimises ‖(S u - y_r)/σ‖² + ‖W Z_r u‖²/(τ² ω_r⁴ a_r), with Z_r = K - ω_r² M, W the inverse Cholesky factor of M
+For measured mode r with frequency ω_r and shape y_r at the sensors S the full shape u is unknown. Its best
+guess
+minimises ‖(S u - y_r)/σ‖² + ‖W Z_r u‖²/(τ² ω_r⁴ a_r), with Z_r = K - ω_r² M, W the inverse Cholesky factor of
+M
 and a_r = uᵀMu; the minimum is the mode's cost. No pairing is needed, and degenerate shapes may rotate. In the
-model's own modal coordinates q the second term is Σ ((λ_k - ω_r²)/(τ ω_r²))² |q_k|²/a_r: one small ridge regression.
+model's own modal coordinates q the second term is Σ ((λ_k - ω_r²)/(τ ω_r²))² |q_k|²/a_r: one small ridge
+regression.
 
 References
 ----------
-J. L. Beck, L. S. Katafygiotis, "Updating models and their uncertainties", J. Eng. Mech. 124, 1998 (system modes as
-latent variables). G. H. Golub, V. Pereyra, "The differentiation of pseudo-inverses and nonlinear least squares
-problems whose variables separate", SIAM J. Numer. Anal. 10, 1973; L. Kaufman, BIT 15, 1975 (the Jacobian used).
+J. L. Beck, L. S. Katafygiotis, "Updating models and their uncertainties", J. Eng. Mech. 124, 1998 (system
+modes as
+latent variables). G. H. Golub, V. Pereyra, "The differentiation of pseudo-inverses and nonlinear least
+squares
+problems whose variables separate", SIAM J. Numer. Anal. 10, 1973; L. Kaufman, BIT 15, 1975 (the Jacobian
+used).
 """
 
 from __future__ import annotations

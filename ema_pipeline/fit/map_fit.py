@@ -71,7 +71,7 @@ def fit_rig(
 
 
 def chi2_per_dof(problem: FitProblem, found: Optimum) -> float:
-    """Sum of squares of data and priors over their number, less the parameters without prior."""
+    """Sum of squares of inliers and priors over their number, less the parameters without prior."""
     finite = np.isfinite(found.costs)
     weight = np.where(finite, found.inlier, 0.0)
     prior = problem.space.has_prior
@@ -80,11 +80,20 @@ def chi2_per_dof(problem: FitProblem, found: Optimum) -> float:
     return chi2 / max(dof, 1.0)
 
 
+def _full_chi2_per_dof(problem: FitProblem, found: Optimum) -> float:
+    """The same over every mode that has a partner, outliers included: they must not make a wrong model "
+    "look good."""
+    paired = np.where(np.isfinite(found.costs), 1.0, 0.0)
+    return chi2_per_dof(problem, replace(found, inlier=paired))
+
+
 def misfit_scale(problem: FitProblem, found: Optimum) -> tuple[Optimum, float]:
     """Widen all standard uncertainties where the model does not reach them, and fit again.
 
-    With the data's own uncertainties a wrong model first turns modes into outliers. Where these become too many it is
-    the model that is wrong: the uncertainties are multiplied by 2, 4, … until at most `outlier_limit` is left out,
+    With the data's own uncertainties a wrong model first turns modes into outliers. Where these become too
+    many it is
+    the model that is wrong: the uncertainties are multiplied by 2, 4, … until at most `outlier_limit` is left
+    out,
     and then by √(χ²/dof) if that is still above 1.
 
     Returns
@@ -109,7 +118,8 @@ def misfit_scale(problem: FitProblem, found: Optimum) -> tuple[Optimum, float]:
 def posterior_covariance(problem: FitProblem, found: Optimum, scale: float) -> NDArray[np.float64]:
     """Inverse Gauss-Newton Hessian of the coordinates at the optimum, priors included, (P, P).
 
-    A free logarithm gets the variance of a uniform distribution between its bounds as its prior, so that a direction
+    A free logarithm gets the variance of a uniform distribution between its bounds as its prior, so that a
+    direction
     that the data say nothing about has a large, not an infinite variance.
     """
     space = problem.space
@@ -164,20 +174,16 @@ def _report(problem: FitProblem, plain: Optimum, best: Optimum, scale: float) ->
         estimates[p.name] = _not_measured(p)
 
     deviation = np.sqrt(np.diag(covariance))
-    plain_residual = plain.costs[np.isfinite(plain.costs)]
-    paired = np.isfinite(best.costs)
-    chi2 = chi2_per_dof(problem, best)
+    chi2 = _full_chi2_per_dof(problem, best)
     outliers = float(1 - np.mean(best.inlier))
     return FitResult(
         parameters=estimates,
         names=space.names,
         correlation=covariance / np.outer(deviation, deviation),
-        error=float(np.sqrt(np.sum(best.costs[paired]) / max(float(np.sum(problem.counts[paired])), 1.0)))
-        if plain_residual.size
-        else float("nan"),
+        error=_error(problem, best),
         chi2_per_dof=chi2,
         frequency_error=_paired_frequency_error(problem, best.x),
-        data_count=int(round(float(np.sum(problem.counts)))),
+        data_count=round(float(np.sum(problem.counts))),
         stop_reason=best.stop_reason,
         notes=_notes(problem, best, scale, chi2, outliers),
         objective=plain.objective,
@@ -186,14 +192,21 @@ def _report(problem: FitProblem, plain: Optimum, best: Optimum, scale: float) ->
     )
 
 
-def _notes(
-    problem: FitProblem, best: Optimum, scale: float, chi2: float, outliers: float
-) -> tuple[str, ...]:
+def _error(problem: FitProblem, found: Optimum) -> float:
+    """Root-mean-square residual over all data of the paired modes; NaN without pairs."""
+    paired = np.isfinite(found.costs)
+    if not np.any(paired):
+        return float("nan")
+    return float(np.sqrt(np.sum(found.costs[paired]) / np.sum(problem.counts[paired])))
+
+
+def _notes(problem: FitProblem, best: Optimum, scale: float, chi2: float, outliers: float) -> tuple[str, ...]:
     notes = []
     if scale > 1:
         notes.append(
-            f"the model does not reach the data's accuracy (χ²/dof {chi2:.3g}): all uncertainties were multiplied by "
-            f"{scale:.3g}, and the standard deviations hold only as far as the misfit acts like random scatter"
+            f"the model does not reach the data's accuracy (χ²/dof {chi2:.3g}): all uncertainties were "
+            f"multiplied by {scale:.3g}, and the standard deviations hold only as far as the misfit acts like "
+            "random scatter"
         )
     start = 0
     for e in problem.evidence:
@@ -203,7 +216,10 @@ def _notes(
             which = ", ".join(f"{f:.1f}" for f in e.measured.frequency_hz[out])
             notes.append(f"{e.measured.configuration}: left out as outliers: {which} Hz")
     if outliers > 0.2:
-        notes.append(f"{100 * outliers:.0f} % of the measured modes fit no mode of the model")
+        notes.append(
+            f"{100 * outliers:.0f} % of the measured modes fit no mode of the model: "
+            "something is missing in it"
+        )
     if not any(e.has_shapes for e in problem.evidence):
         notes.append("frequencies only: which measured mode is which model mode rests on nearness alone")
     return tuple(notes)

@@ -1,7 +1,9 @@
 """System matrices as polynomials of the parameters, so that thousands of systems are one matrix product.
 
-Masses, springs and dampers enter the matrices linearly, a stiffness loss as a product of two parameters. Where
-that is so (it is checked, not assumed) the matrices are a + Σ b_i v_i + Σ c_ij v_i v_j; where it is not, the rig
+Masses, springs and dampers enter the matrices linearly, a stiffness loss as a product of two parameters.
+Where
+that is so (it is checked, not assumed) the matrices are a + Σ b_i v_i + Σ c_ij v_i v_j; where it is not, the
+rig
 builds every system itself.
 """
 
@@ -34,15 +36,17 @@ class MatrixFamily:
         self.system = rig.system(configuration, space.named(space.point()))
         self.size = len(self.system.dofs)
         self.origin = space.values(space.point())
-        steps = np.array([_probe(c.kind, c.scale, c.low, c.high, v) for c, v in self._coordinates()])
+        steps = np.array(
+            [
+                _probe(c.kind, c.scale, c.low, c.high, v)
+                for c, v in zip(space.coordinates, self.origin, strict=True)
+            ]
+        )
         self._fit_polynomial(steps)
         self.relevant = self._relevant(steps)
         point = self.origin + 0.3 * steps
         n2 = self.size**2
         self.damped = bool(np.any(self._build(point)[2 * n2 : 4 * n2]))
-
-    def _coordinates(self) -> list[tuple]:  # type: ignore[type-arg]
-        return list(zip(self.space.coordinates, self.origin, strict=True))
 
     def _fit_polynomial(self, steps: NDArray[np.float64]) -> None:
         count = len(steps)

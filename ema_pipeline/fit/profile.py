@@ -20,8 +20,10 @@ def profile(
 ) -> tuple[Profile, Optimum]:
     """Profile of one coordinate around an optimum.
 
-    The coordinate is stepped outwards on both sides, the others refitted from the last point (first shifted along
-    the posterior's ridge). It goes on, with growing steps, until the objective has risen by `profile_rise` or a
+    The coordinate is stepped outwards on both sides, the others refitted from the last point (first shifted
+    along
+    the posterior's ridge). It goes on, with growing steps, until the objective has risen by `profile_rise` or
+    a
     bound is reached.
 
     Parameters
@@ -97,7 +99,9 @@ def interval(p: Profile, low: float, high: float, logarithmic: bool) -> tuple[fl
     return ends[0], ends[1]
 
 
-def _held(problem: FitProblem, start: NDArray[np.float64], index: int, target: float, scale: float) -> Optimum:
+def _held(
+    problem: FitProblem, start: NDArray[np.float64], index: int, target: float, scale: float
+) -> Optimum:
     """Best fit with one coordinate held; with the pairs of the start, and with new ones if they differ."""
     space = problem.space
     x = np.clip(start, space.low, space.high)

@@ -36,14 +36,16 @@ class FitSettings(UncertaintySettings):
     screening_error: float = Field(
         default=0.03,
         gt=0,
-        description="Relative error of eigenvalues at which the starts of the grid compete: tight enough to tell "
+        description="Relative error of eigenvalues at which the starts of the grid compete: tight enough to"
+        " tell "
         "their basins apart, loose enough that few modes are lost as outliers.",
     )
     outlier_prior: float = Field(
         default=0.05,
         gt=0,
         lt=0.5,
-        description="Prior probability that a measured mode is no mode of the rig (spurious, or of the foundation).",
+        description="Prior probability that a measured mode is no mode of the rig (spurious, or of the "
+        "foundation).",
     )
     outlier_limit: float = Field(
         default=0.35,
@@ -64,7 +66,8 @@ class FitSettings(UncertaintySettings):
     profile_rise: float = Field(
         default=4.0,
         gt=0,
-        description="Rise of -2 log posterior on both sides, inside the bounds, by which a free parameter counts as "
+        description="Rise of -2 log posterior on both sides, inside the bounds, by which a free parameter "
+        "counts as "
         "identified: 4 is the 95 % interval of one parameter.",
     )
     relative_std_limit: float = Field(
@@ -77,7 +80,8 @@ class FitSettings(UncertaintySettings):
         default=0.8,
         gt=0,
         lt=1,
-        description="A parameter with a tolerance counts as identified where its posterior is narrower than this "
+        description="A parameter with a tolerance counts as identified where its posterior is narrower than"
+        " this "
         "share of the tolerance.",
     )
     sweep_points: int = Field(default=601, ge=50, description="Stiffnesses in a sweep of the error function.")

@@ -1,6 +1,7 @@
 """The search for the most probable parameters: annealed latent shapes first, paired eigen-residuals last.
 
-The posterior is a product over measured modes of a mixture (a mode of the rig, or an outlier) and of the Gaussian
+The posterior is a product over measured modes of a mixture (a mode of the rig, or an outlier) and of the
+Gaussian
 priors that the tolerances state; free parameters have no prior but their bounds.
 """
 
@@ -238,7 +239,7 @@ def refine(problem: FitProblem, start: NDArray[np.float64], scale: float = 1.0) 
     for _ in range(4):
         pairs = problem.assignments(x)
         if best is None and np.any(problem.damping_only):
-            # The latent shapes said nothing of damping: far from its value every mode would look like an outlier.
+            # The latent shapes say nothing of damping: far from it every mode would look like an outlier.
             held = ~problem.damping_only
             trusting = replace(mixture, outlier_cost=np.full_like(mixture.outlier_cost, np.inf))
             matched = PairedOnly(problem.exact(pairs))
@@ -258,9 +259,12 @@ def search(
 ) -> Optimum:
     """Most probable parameters over a grid of starts of the free parameters.
 
-    The whole annealing from the nominal values finds the optimum nearly always. It leans towards soft free springs
-    (a loose dynamic residual prefers them), so every point of the grid also competes further down the ladder, and
-    the best of these are followed to its end. With `start` given (the fit of a poorer model, say) that point is
+    The whole annealing from the nominal values finds the optimum nearly always. It leans towards soft free
+    springs
+    (a loose dynamic residual prefers them), so every point of the grid also competes further down the ladder,
+    and
+    the best of these are followed to its end. With `start` given (the fit of a poorer model, say) that point
+    is
     refined as well, so that a richer model never fits worse than the poorer one.
     """
     tell = progress or (lambda share, text: None)

@@ -120,6 +120,7 @@ class FitResult:
     error : float
         Root-mean-square of (measurement - model)/standard uncertainty over all data.
     chi2_per_dof : float
+        Over all paired modes, those left out as outliers included, and the priors.
     frequency_error : float
         ε (seed's Eq. 10) over all pairs of all configurations.
     data_count : int
@@ -135,7 +136,8 @@ class FitResult:
     outlier_share : float
         Share of the measured modes that the model does not explain.
     misfit_scale : float
-        Factor by which all uncertainties were multiplied because the model does not reach them; 1 where it does.
+        Factor by which all uncertainties were multiplied because the model does not reach them; 1 where it
+        does.
     """
 
     parameters: dict[str, ParameterEstimate]
