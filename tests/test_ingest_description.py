@@ -60,7 +60,10 @@ WRONG = {
         DESCRIPTION.replace('"m/s^2"', '"?"'),
         "channel 'tip': unit is not filled in",
     ),
-    "hammer in volts": (DESCRIPTION.replace('"N"', '"V"'), "or uncalibrated = true to go on with unscaled FRFs"),
+    "hammer in volts": (
+        DESCRIPTION.replace('"N"', '"V"'),
+        "or uncalibrated = true to go on with unscaled FRFs",
+    ),
     "response in volts": (DESCRIPTION.replace('"m/s^2"', '"V"'), "channel 'tip': unit 'V' is not a unit of"),
     "uncalibrated response": (
         DESCRIPTION.replace('dof = "tip.z"', 'dof = "tip.z"\nuncalibrated = true'),

@@ -151,7 +151,8 @@ def _sample_rate(test: TestDescription, raw: RawRecord, where: str) -> float:
     stated, found = test.sample_rate_hz, raw.sample_rate_hz
     if stated is None and found is None:
         raise EmaError(f"{where}: states no sample rate; add sample_rate_hz to {test.file}")
-    if stated is not None and found is not None and abs(found / stated - 1) > RATE_TOLERANCE:
+    tolerance = max(RATE_TOLERANCE, raw.rate_tolerance)
+    if stated is not None and found is not None and abs(found / stated - 1) > tolerance:
         raise EmaError(
             f"{where}: sample rate is {found:.10g} Hz in the file but {stated:.10g} Hz in {test.file}; "
             "correct sample_rate_hz or remove it"

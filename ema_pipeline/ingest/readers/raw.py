@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,11 +45,14 @@ class RawRecord:
         None where the file is silent.
     notes : tuple of str
         What the reader had to decide, one plain sentence each.
+    rate_tolerance : float
+        Relative uncertainty of the sample rate where it comes from rounded times.
     """
 
     channels: dict[str, RawChannel]
     sample_rate_hz: float | None = None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
+    rate_tolerance: float = 0.0
 
 
 def split_unit(label: str) -> tuple[str, str | None]:

@@ -21,6 +21,7 @@ from ema_pipeline.ingest.readers.timebase import (
     is_time_name,
     is_uniform_ramp,
     rate_from_times,
+    time_rounding,
     time_unit_scale,
 )
 from ema_pipeline.units import find_unit
@@ -262,18 +263,20 @@ def _channels(table: NDArray[np.float64], preamble: Preamble) -> RawRecord:
             raise EmaError(f"two columns have the name '{name}'; rename one in the file")
         else:
             channels[name] = RawChannel(samples, unit)
+    tolerance = 0.0
     if times is not None:
         measured = rate_from_times(times)
+        rounding = time_rounding(times)
         if rate is None:
-            rate = measured
-        elif measured is not None and abs(measured / rate - 1) > 1e-3:
+            rate, tolerance = measured, rounding
+        elif measured is not None and abs(measured / rate - 1) > max(1e-3, rounding):
             raise EmaError(
                 f"contradicts itself: its header states {rate:.10g} Hz and its time column "
                 f"{measured:.10g} Hz; correct the file"
             )
     if not channels:
         raise EmaError("holds no channel beside time; export one column per channel")
-    return RawRecord(channels, rate, tuple(notes))
+    return RawRecord(channels, rate, tuple(notes), tolerance)
 
 
 def _counts(samples: NDArray[np.float64]) -> bool:

@@ -78,8 +78,18 @@ def rate_from_times(times: NDArray[np.float64]) -> float | None:
             f"time jumps by {steps[worst]:.6g} s at sample {worst + 1} where {step:.6g} s is the step: "
             "samples are missing; export the record again without gaps"
         )
-    # Rounded times scatter each step; over the whole span that rounding all but vanishes.
-    return whole_rate(mean, max(1e-9, float(np.max(np.abs(steps - step))) / span))
+    return whole_rate(mean, max(1e-9, time_rounding(times)))
+
+
+def time_rounding(times: NDArray[np.float64]) -> float:
+    """Relative uncertainty of the rate of a time axis (n,) whose values were rounded when written.
+
+    Rounding scatters each step; over the whole span it all but vanishes, unless the record is short.
+    """
+    if times.size < 3 or times[-1] <= times[0]:
+        return 0.0
+    steps = np.diff(times)
+    return float(np.max(np.abs(steps - np.median(steps))) / (times[-1] - times[0]))
 
 
 def whole_rate(step: float, relative_rounding: float) -> float:
