@@ -231,7 +231,7 @@ def test_geometry_comes_back_with_local_nodes_at_their_bodies(tmp_path: Path) ->
     assert peer[0]["units_code"] == 1
     assert dict(zip(peer[1]["node_nums"], peer[1]["x"], strict=True))[
         table.nodes["planet1"]
-    ] == pytest.approx(0.1234567, rel=1e-6)
+    ] == pytest.approx(0.123456, rel=1e-6)
     assert list(peer[2]["nodes"]) == [table.nodes[b] for b in GEOMETRY.lines[0]]
 
 
