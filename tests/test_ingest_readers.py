@@ -6,6 +6,7 @@ import contextlib
 import gzip
 import struct
 from pathlib import Path
+from types import ModuleType
 
 import h5py
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.io import wavfile
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest import readers
 from ema_pipeline.ingest.readers import READERS, read_raw, reader_of
 from ema_pipeline.ingest.readers.raw import FULL_SCALE
 
@@ -562,3 +564,19 @@ def _write_h5(path: Path) -> None:
 
 def test_every_reader_has_its_own_name() -> None:
     assert len({r.NAME for r in READERS}) == len(READERS) == 7
+
+
+def test_the_reader_of_the_documentation_works_as_printed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "adding_a_reader.md").read_text(encoding="utf-8")
+    module = ModuleType("nlog")
+    exec(page.split("```python\n")[1].split("```")[0], module.__dict__)
+    monkeypatch.setattr(readers, "READERS", (*READERS[:-1], module, READERS[-1]))
+    path = tmp_path / "hit.dat"
+    head = b"NLOG" + struct.pack("<di", RATE, 2) + b"hammer".ljust(16, b"\0") + b"tip".ljust(16)
+    path.write_bytes(head + b"".join(x.astype("<f4").tobytes() for x in DATA.values()))
+    check(path, rtol=1e-5, format_name="NLOG")
+    path.write_bytes(path.read_bytes()[:-6])
+    with pytest.raises(EmaError, match=r"hit\.dat: is cut short"):
+        read_raw(path)
