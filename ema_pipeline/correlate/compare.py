@@ -117,7 +117,10 @@ def band_differences(
             continue
         h, difference = measured[..., inside], measured[..., inside] - model[..., inside]
         size = np.abs(h) ** 2
-        level = np.mean(size, axis=2, keepdims=True)
+        known = np.isfinite(size)
+        level = np.sum(np.where(known, size, 0.0), axis=(0, 2), keepdims=True) / np.maximum(
+            np.sum(known, axis=(0, 2), keepdims=True), 1
+        )
         # the scatter of two or three hits is itself too uncertain to be used line by line
         scatter = np.mean(variance[..., inside], axis=2, keepdims=True)
         sigma2 = scatter + settings.frf_floor**2 * size + settings.frf_background**2 * level
