@@ -580,3 +580,39 @@ def test_the_reader_of_the_documentation_works_as_printed(
     path.write_bytes(path.read_bytes()[:-6])
     with pytest.raises(EmaError, match=r"hit\.dat: is cut short"):
         read_raw(path)
+
+
+@pytest.mark.parametrize(
+    ("header", "delimiter", "unit"),
+    [
+        ("time, hammer, tip", ",", None),
+        ('"Time, s","hammer, N","tip, g"', ",", "N"),
+        ("Time (s)   hammer (N)   tip (g)", "  ", "N"),
+        ("time\thammer [N]\ttip [g]", "\t", "N"),
+        ("File: x\nSample rate: 2048\n\ntime;hammer (N);tip (g)", ";", "N"),
+        ("sep=;\ntime;hammer;tip", ";", None),
+    ],
+)
+def test_headers_of_many_programs_give_names_and_units(
+    tmp_path: Path, header: str, delimiter: str, unit: str | None
+) -> None:
+    path = tmp_path / "hit.csv"
+    body = table_text(delimiter).split("\n", 1)[1]
+    path.write_text(header + "\n" + body)
+    check(path)
+    assert read_raw(path).channels["hammer"].unit == unit
+
+
+def test_a_blank_comment_column_is_no_channel(tmp_path: Path) -> None:
+    path = tmp_path / "hit.csv"
+    lines = table_text(",").splitlines()
+    path.write_text("\n".join([lines[0] + ",Comment", *(line + "," for line in lines[1:])]))
+    check(path)
+
+
+def test_a_table_with_texts_among_its_numbers_says_what_to_export(tmp_path: Path) -> None:
+    path = tmp_path / "hit.csv"
+    lines = table_text(",").splitlines()
+    path.write_text("\n".join([lines[0] + ",Event", *(line + ",ok" for line in lines[1:])]))
+    with pytest.raises(EmaError, match=r"hit\.csv: no table of numbers found; export"):
+        read_raw(path)

@@ -46,13 +46,17 @@ class Preamble:
     notes: tuple[str, ...] = ()
 
 
-def read_preamble(lines: list[str], split: Callable[[str], list[str]], width: int) -> Preamble:
-    """Read the lines above a table of `width` columns.
+def read_preamble(
+    lines: list[str], split: Callable[[str], list[str]], width: int, blank_columns: int = 0
+) -> Preamble:
+    """Read the lines above a table of `width` columns, behind which `blank_columns` hold nothing.
 
     Labelled rows count first (``Unit,…``, ``CH No.,…`` as Kyowa writes them), else the row right above the
     table, with a row of units in between.
     """
-    rows = [cells for cells in (_cells(line, split, width) for line in lines) if cells is not None]
+    rows = [
+        cells for cells in (_cells(line, split, width, blank_columns) for line in lines) if cells is not None
+    ]
     notes: tuple[str, ...] = ()
     units = _labelled(rows, _UNIT_LABELS)
     names = _labelled(rows, _NAME_LABELS)
@@ -80,18 +84,21 @@ def read_preamble(lines: list[str], split: Callable[[str], list[str]], width: in
     )
 
 
-def _cells(line: str, split: Callable[[str], list[str]], width: int) -> list[str] | None:
+def _cells(line: str, split: Callable[[str], list[str]], width: int, blank_columns: int) -> list[str] | None:
     """Cells of a header row without a leading comment sign; None where it does not fit the table."""
-    plain = re.sub(r"^\s*[#%]+\s*", "", line)
+    plain = re.sub(r"^\s*[#%]+\s*", "", line).strip(" ")
     cells = split(plain)
-    if len(cells) == width + 1 and cells[-1] == "":
+    if len(cells) == width + 1 and (cells[-1] == "" or blank_columns):
         cells = cells[:-1]
-    if len(cells) != width:
-        # Blank-separated headers carry units with a blank in front: Time (s)  Hammer (N)
-        cells = re.findall(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?", plain)
-        if len(cells) != width or split("a b") != ["a", "b"]:
-            return None
-    return cells
+    if len(cells) == width:
+        return cells
+    if split("a b") != ["a", "b"]:
+        return None
+    # Names in blank-separated headers may hold blanks: two or more then part them, or brackets do.
+    parted = re.split(r"\s{2,}|\t", plain)
+    if len(parted) != width:
+        parted = re.findall(r"[^\s\[(]+(?:\s*[\[(][^\])]*[\])])?", plain)
+    return parted if len(parted) == width else None
 
 
 def _labelled(rows: list[list[str]], labels: set[str]) -> list[str] | None:

@@ -56,14 +56,15 @@ class RawRecord:
 
 
 def split_unit(label: str) -> tuple[str, str | None]:
-    """Split a label such as ``"hammer [N]"`` into name and unit; only bracketed known units count.
+    """Split a label such as ``"hammer [N]"`` or ``"hammer, N"`` into name and unit; only known units count.
 
     >>> split_unit("hammer (N)")
     ('hammer', 'N')
     """
-    match = re.fullmatch(r"\s*(.*?\S)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*", label)
-    if match and find_unit(match[2]) is not None:
-        return match[1], match[2]
+    for pattern in (r"\s*(.*?\S)\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*", r"\s*(.*?\S)\s*,\s*(\S+)\s*"):
+        match = re.fullmatch(pattern, label)
+        if match and find_unit(match[2]) is not None:
+            return match[1], match[2]
     return label.strip(), None
 
 

@@ -81,7 +81,13 @@ def recognise(path: Path, head: bytes) -> bool:
     printable = sum(c.isprintable() or c in "\t\r\n\ufeff" for line in lines for c in line)
     if not lines or printable < 0.99 * sum(len(line) for line in lines):
         return False
-    return any(_dialect_of(line) is not None for line in lines)
+    return any(_dialect_of(line) is not None or _starts_with_numbers(line) for line in lines)
+
+
+def _starts_with_numbers(line: str) -> bool:
+    """True for a row with texts among its numbers: no table we read, but one worth a better message."""
+    cells = re.split(r"[;\t,]", line)
+    return len(cells) > 2 and all(_NUMBER.fullmatch(cell.strip()) for cell in cells[:2])
 
 
 def decode(data: bytes) -> str:
@@ -102,7 +108,9 @@ def read(path: Path) -> RawRecord:
     lines = re.split(r"\r\n|\n|\r", decode(path.read_bytes()))
     rows = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
     dialect, first = _find_table(rows)
-    preamble = read_preamble([line for _, line in rows[:first]], dialect.split, _width(rows, first, dialect))
+    width = _width(rows, first, dialect)
+    blank = len(dialect.split(rows[first][1])) - width
+    preamble = read_preamble([line for _, line in rows[:first]], dialect.split, width, blank)
     table = _numbers(rows[first:], dialect, preamble.names)
     if preamble.samples is not None and table.shape[0] < preamble.samples:
         raise EmaError(
@@ -125,7 +133,7 @@ def _find_table(rows: list[tuple[int, str]]) -> tuple[Dialect, int]:
         while first > 0 and _starts_like_table(rows[first - 1][1], dialect, width):
             first -= 1
         return dialect, first
-    raise EmaError("no table of numbers found; export a header row and one column per channel")
+    raise EmaError("no table of numbers found; export a header row and one column of numbers per channel")
 
 
 def _dialect_of(line: str) -> Dialect | None:
@@ -255,7 +263,7 @@ def _channels(table: NDArray[np.float64], preamble: Preamble) -> RawRecord:
         ramp = i == 0 and is_uniform_ramp(samples)
         if i == 0 and np.all(np.isnan(samples)):
             notes.append(f"column '{name}' holds dates or clock times and is left out")
-        elif ramp and (is_index_name(name) or (_could_be_time(unit) and _counts(samples))):
+        elif ramp and (is_index_name(name) or (unit is None and _counts(samples))):
             notes.append(f"column '{name}' is a running number and is left out")
         elif times is None and (is_time_name(name) or (ramp and _could_be_time(unit))):
             times = samples * time_unit_scale(name, unit)
