@@ -1,0 +1,50 @@
+"""Settings of hit finding and of the checks on single hits."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from ema_pipeline.settings import Settings
+
+
+class HitSettings(Settings):
+    """How hits are found in records and what a good hit is."""
+
+    trigger_level: float = Field(
+        default=0.1,
+        gt=0,
+        lt=1,
+        description="A blow counts as a hit of its own from this share of the record's largest blow on",
+    )
+    trigger_noise: float = Field(
+        default=8.0, ge=5, description="A blow must exceed the noise of the hammer channel this many times"
+    )
+    minimum_spacing_s: float = Field(
+        default=0.1,
+        gt=0,
+        description="Blows closer together are one hit (a double hit), s; also a quarter of the usual spacing",
+    )
+    pre_trigger_s: float = Field(
+        default=0.01, ge=0, description="Time before the peak that is kept when a recording is cut, s"
+    )
+    trim: Literal["none", "auto"] = Field(
+        default="auto",
+        description="auto: records of tests whose responses have not decayed start at the force pulse",
+    )
+    double_hit: float = Field(
+        default=0.025, gt=0, lt=1, description="Second impact over first from which on a hit is rejected"
+    )
+    overload: float = Field(
+        default=0.99,
+        gt=0,
+        le=1,
+        description="Share of full scale from which on a channel counts as overloaded",
+    )
+    residual_response: float = Field(
+        default=0.01, gt=0, description="Response at the end of the record over its largest, rms"
+    )
+    force_drop_db: float = Field(
+        default=20.0, gt=0, description="Drop of the force spectrum that ends the usable band, dB"
+    )

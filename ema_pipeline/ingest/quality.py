@@ -1,0 +1,354 @@
+"""Checks on single hits, after ISO 7626-5: each gives a verdict with its value, limit and topic."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import next_fast_len, rfft
+
+from ema_pipeline.ingest.clipping import flat_top_share
+from ema_pipeline.ingest.hit_settings import HitSettings
+from ema_pipeline.ingest.hits import align_hits, find_hits, trim_hits
+from ema_pipeline.ingest.pulse import Pulse, find_pulse, find_second_impact, noise_of, step_of
+from ema_pipeline.ingest.records import Hit, Record, ResponseChannel
+from ema_pipeline.verdict import Consequence, Verdict
+
+DOUBLE_HIT = "ISO 7626-5, avoidance of double impacts"
+OVERLOAD = "ISO 7626-5, overload of the measuring channels"
+SPECTRUM = "ISO 7626-5, frequency range of the impact force"
+DECAY = "ISO 7626-5, record length and decay of the response"
+
+FLAT_TOP_LIMIT = 0.7
+"""Smooth peaks have 0.5: the time within ε of the top grows with √ε."""
+
+BAND_OVER_RATE = 1 / 2.56
+"""Converters' anti-alias filters are flat up to the sample rate over 2.56."""
+
+HUM_HZ = (50.0, 60.0)
+
+
+def hits_of_test(records: Sequence[Record], settings: HitSettings | None = None) -> tuple[Hit, ...]:
+    """Find, align, check and if need be trim the hits of one configuration.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        All records of the configuration; gone through three times, so a lazy sequence may load anew.
+    settings : HitSettings, optional
+
+    Returns
+    -------
+    tuple of Hit
+        With verdicts, in the order of the records.
+
+    Raises
+    ------
+    EmaError
+        Where a record holds no hit.
+    """
+    settings = settings or HitSettings()
+    found: list[Hit] = []
+    owner: list[int] = []
+    for index, record in enumerate(records):
+        hits = find_hits(record, settings)
+        found += hits
+        owner += [index] * len(hits)
+    if not found:
+        return ()
+    aligned = align_hits(found, records[0].sample_rate_hz, settings)
+    checked = [check_hit(records[i], hit, settings) for i, hit in zip(owner, aligned, strict=True)]
+    return trim_hits(checked, (records[i].force for i in owner), settings)
+
+
+def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> Hit:
+    """Check a hit: double hit, overload, dead channels, decay of the responses, force spectrum.
+
+    Parameters
+    ----------
+    record : Record
+        The record that the hit was found in.
+    hit : Hit
+    settings : HitSettings, optional
+
+    Returns
+    -------
+    Hit
+        The same hit with its verdicts.
+    """
+    settings = settings or HitSettings()
+    force = record.force[hit.start : hit.stop]
+    pulse = find_pulse(force, hit.peak - hit.start)
+    rate = record.sample_rate_hz
+    verdicts = [
+        *hit.verdicts,
+        _double_hit(force, pulse, rate, settings),
+        _overload(
+            force, record.force_full_scale, record.force_name, "reject_hit", pulse.peak, rate, settings
+        ),
+        _flat_top(force, record.force_name, "reject_hit"),
+        _force_level(force, pulse, record.force_name, settings),
+        _force_spectrum(force, pulse, rate, record.force_name, settings),
+    ]
+    # Before the first hit of a record the structure is at rest: what is there is noise and hum.
+    rest = pulse.start if hit.start == 0 and hit.number == 0 else 0
+    for channel, samples in zip(record.channels, record.responses, strict=True):
+        verdicts += _check_response(channel, samples[hit.start : hit.stop], pulse, rest, rate, settings)
+    return replace(hit, verdicts=tuple(verdicts))
+
+
+def usable_band_hz(
+    force: NDArray[np.float64], pulse: Pulse, sample_rate_hz: float, drop_db: float
+) -> tuple[float, float]:
+    """Frequency up to which the spectrum of the pulse stays within `drop_db` of its largest, and its level.
+
+    Only the pulse itself is transformed, so that noise after it does not fill the dips.
+
+    Returns
+    -------
+    band_hz : float
+        At most the Nyquist frequency.
+    top_db : float
+        Level at the sample rate over 2.56, relative to the largest, dB.
+    """
+    margin = int(2 * pulse.width) + 4
+    cut = force[max(0, pulse.start - margin) : pulse.stop + margin] - pulse.baseline
+    n = next_fast_len(max(8 * cut.size, 4096), real=True)
+    level = np.abs(np.asarray(rfft(cut, n)))
+    frequency = np.fft.rfftfreq(n, 1 / sample_rate_hz)
+    top = int(np.argmax(level))
+    relative = 20 * np.log10(np.maximum(level / max(float(level[top]), 1e-300), 1e-15))
+    low = np.flatnonzero(relative[top:] < -drop_db)
+    band = float(frequency[top + low[0] - 1]) if low.size else float(frequency[-1])
+    return band, float(np.interp(sample_rate_hz * BAND_OVER_RATE, frequency, relative))
+
+
+def _double_hit(force: NDArray[np.float64], pulse: Pulse, rate: float, settings: HitSettings) -> Verdict:
+    second = find_second_impact(force, pulse, rate, settings.double_hit)
+    passes = second.ratio < settings.double_hit
+    when = "after" if second.delay_s > 0 else "before"
+    return Verdict(
+        check="double hit",
+        value=float(second.ratio),
+        limit=settings.double_hit,
+        unit="1",
+        passes=passes,
+        clause=DOUBLE_HIT,
+        consequence="reject_hit",
+        message=""
+        if passes
+        else f"second impact of {second.ratio:.0%} {abs(second.delay_s) * 1e3:.1f} ms {when} the peak",
+    )
+
+
+def _overload(
+    samples: NDArray[np.float64],
+    full_scale: float,
+    name: str,
+    consequence: Consequence,
+    peak: int,
+    rate: float,
+    settings: HitSettings,
+) -> Verdict:
+    largest = float(max(samples.max(), -samples.min()))
+    share = largest / full_scale if np.isfinite(full_scale) else 0.0
+    passes = share < settings.overload
+    at = int(np.argmax(np.abs(samples)))
+    return Verdict(
+        check="overload",
+        value=float(share),
+        limit=settings.overload,
+        unit="1",
+        passes=passes,
+        clause=OVERLOAD,
+        consequence=consequence,
+        channel=name,
+        message=""
+        if passes
+        else f"overload on {name}: {share:.1%} of full scale {(at - peak) / rate:+.4g} s from the blow",
+    )
+
+
+def _flat_top(samples: NDArray[np.float64], name: str, consequence: Consequence) -> Verdict:
+    share = flat_top_share(samples)
+    passes = share < FLAT_TOP_LIMIT
+    return Verdict(
+        check="clipping",
+        value=float(share),
+        limit=FLAT_TOP_LIMIT,
+        unit="1",
+        passes=passes,
+        clause=OVERLOAD,
+        consequence=consequence,
+        channel=name,
+        message="" if passes else f"{name} is clipped: its tops are flat; use a lower gain or hit softer",
+    )
+
+
+def _force_level(force: NDArray[np.float64], pulse: Pulse, name: str, settings: HitSettings) -> Verdict:
+    noise = noise_of(force)
+    ratio = min(pulse.height / noise, 1e12) if noise > 0 else 1e12
+    passes = ratio >= settings.trigger_noise
+    return Verdict(
+        check="force level",
+        value=float(ratio),
+        limit=settings.trigger_noise,
+        unit="1",
+        passes=passes,
+        clause="",
+        consequence="reject_hit",
+        channel=name,
+        message="" if passes else f"{name} does not stand out of its noise: {ratio:.1f} times",
+    )
+
+
+def _force_spectrum(
+    force: NDArray[np.float64], pulse: Pulse, rate: float, name: str, settings: HitSettings
+) -> Verdict:
+    band, top_db = usable_band_hz(force, pulse, rate, settings.force_drop_db)
+    wanted = rate * BAND_OVER_RATE
+    passes = band >= wanted
+    return Verdict(
+        check="force spectrum",
+        value=float(band),
+        limit=float(wanted),
+        unit="Hz",
+        passes=passes,
+        clause=SPECTRUM,
+        consequence="warn",
+        channel=name,
+        message=""
+        if passes
+        else f"force within {settings.force_drop_db:.0f} dB up to {band:.4g} Hz; {top_db:.0f} dB at {wanted:.4g} Hz",
+    )
+
+
+def _check_response(
+    channel: ResponseChannel,
+    samples: NDArray[np.float64],
+    pulse: Pulse,
+    rest: int,
+    rate: float,
+    settings: HitSettings,
+) -> list[Verdict]:
+    dead = _dead_channel(channel.name, samples, pulse, rest, rate)
+    if not dead.passes:
+        return [dead]
+    return [
+        dead,
+        _overload(samples, channel.full_scale, channel.name, "reject_channel", pulse.peak, rate, settings),
+        _flat_top(samples, channel.name, "reject_channel"),
+        _decay(channel.name, samples, pulse, rest, settings),
+    ]
+
+
+def _dead_channel(name: str, samples: NDArray[np.float64], pulse: Pulse, rest: int, rate: float) -> Verdict:
+    """A channel that carries a constant, a flickering last bit, or nothing but mains hum.
+
+    A working sensor at a node shows its own broadband noise instead, many steps of the converter high; it is
+    not dead, however silent. The value is the number of converter steps that the channel spans, which
+    for a dead one is at most one.
+    """
+    step = step_of(samples)
+    spans = float(np.ptp(samples) / step) if step > 0 else 0.0
+    hum = _hum_share(samples, rate) if spans > 1.5 else 0.0
+    only_hum = hum > HUM_ONLY and not _answers(samples, pulse, rest)
+    passes = spans > 1.5 and not only_hum
+    if passes:
+        message = ""
+    elif only_hum:
+        message = (
+            f"{name} carries mains hum only ({hum:.1%} of its power) and no answer to the blow: cable open?"
+        )
+    elif spans == 0:
+        message = f"{name} is constant at {samples[0]:.3g}: sensor or cable dead"
+    else:
+        message = f"{name} flickers by one converter step only: sensor or cable dead"
+    return Verdict(
+        check="dead channel",
+        value=0.0 if only_hum else min(spans, 1e12),
+        limit=1.5,
+        unit="1",
+        passes=passes,
+        clause="",
+        consequence="reject_channel",
+        channel=name,
+        message=message,
+    )
+
+
+HUM_ONLY = 0.98
+"""Share of a channel's power in mains lines from which on it carries nothing else."""
+
+
+def _hum_share(samples: NDArray[np.float64], rate: float) -> float:
+    """Share of the power, offset taken off, in 50 or 60 Hz and harmonics: a least-squares fit of sines.
+
+    A fit does not leak, whatever the record's length; the mains' own drift of ±0.1 Hz is searched.
+    """
+    centred = samples - samples.mean()
+    total = float(centred @ centred)
+    if total <= 0:
+        return 0.0
+    # The first second shows it as well as all of it and bears the mains' drift better.
+    n = min(centred.size, int(rate))
+    part, time = centred[:n], np.arange(n) / rate
+    power = float(part @ part)
+    best = 0.0
+    for mains in HUM_HZ:
+        # Fewer than two periods, or no room below Nyquist: not to be told from vibration.
+        if n < 2 * rate / mains or mains > 0.45 * rate or power <= 0:
+            continue
+        for frequency in mains + np.array([-0.1, 0.0, 0.1]):
+            harmonics = frequency * np.arange(1, 8)
+            phase = 2 * np.pi * np.outer(time, harmonics[harmonics < 0.45 * rate])
+            basis = np.hstack([np.ones((n, 1)), np.cos(phase), np.sin(phase)])
+            weights, *_ = np.linalg.lstsq(basis, part, rcond=None)
+            rest = part - basis @ weights
+            best = max(best, 1 - float(rest @ rest) / power)
+            if best < 0.5:
+                break
+    return best
+
+
+def _answers(samples: NDArray[np.float64], pulse: Pulse, rest: int) -> bool:
+    """True where the channel swings more after the blow than before it, or than late in the record."""
+    span = min(max(int(16 * pulse.width), 64), samples.size // 4)
+    after = samples[pulse.start : pulse.start + span]
+    quiet = samples[:rest] if rest >= span else samples[-span:]
+    return bool(np.std(after) > 1.5 * np.std(quiet))
+
+
+def _decay(
+    name: str, samples: NDArray[np.float64], pulse: Pulse, rest: int, settings: HitSettings
+) -> Verdict:
+    """Response at the end of the record over its largest, noise and hum taken off.
+
+    Both are rms over a twentieth of the record. What the channel shows before the blow (or, in the middle of a
+    recording, its broadband noise) is no response. A channel that shows nothing but noise has decayed.
+    """
+    length = max(samples.size // 20, 8)
+    quiet = float(np.std(samples[:rest])) if rest >= 32 else noise_of(samples)
+    blocks = samples[samples.size % length :].reshape(-1, length)
+    blocks = blocks[max(0, (pulse.start - samples.size % length) // length) :]
+    # Offset from the end: an AC-coupled or drifting channel is centred where it matters.
+    rms = np.sqrt(np.mean((blocks - np.mean(blocks[-1])) ** 2, axis=1))
+    largest = float(rms.max())
+    left = float(np.sqrt(max(rms[-1] ** 2 - quiet**2, 0.0)))
+    # Scatter of an rms over n samples is rms/√(2n): less than three times that is no response.
+    silent = left < quiet * np.sqrt(3 / np.sqrt(2 * length)) * 1.5 or largest < 3 * quiet
+    ratio = 0.0 if silent or largest == 0 else left / largest
+    passes = ratio <= settings.residual_response
+    return Verdict(
+        check="response decay",
+        value=float(ratio),
+        limit=settings.residual_response,
+        unit="1",
+        passes=passes,
+        clause=DECAY,
+        consequence="warn",
+        channel=name,
+        message="" if passes else f"{name} still at {ratio:.1%} of its largest at the end: record longer",
+    )
