@@ -60,6 +60,15 @@ def test_numbered_points_are_not_averaged_with_each_other(tmp_path: Path) -> Non
     assert len({r.impact for r in read_description(tmp_path).records}) == 3
 
 
+def test_counted_sets_of_one_name_are_repetitions_of_one_blow(tmp_path: Path) -> None:
+    for name in ("ham_set1_nomass.csv", "ham_set2_no_mass.csv", "ham_set1_mass.csv"):
+        write_csv(tmp_path / name, SI)
+    write_drafts(tmp_path)
+    impacts = {r.file: r.impact for r in read_description(tmp_path).records}
+    assert impacts["ham_set1_nomass.csv"] == impacts["ham_set2_no_mass.csv"]
+    assert impacts["ham_set1_mass.csv"] != impacts["ham_set1_nomass.csv"]
+
+
 def test_a_unit_that_no_file_tells_stops_the_run(tmp_path: Path) -> None:
     write_csv(tmp_path / "hit1.csv", DATA)
     write_drafts(tmp_path)

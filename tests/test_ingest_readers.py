@@ -457,7 +457,8 @@ def damaged(kind: str, folder: Path) -> Path:
         path.write_bytes(whole.read_bytes()[:20000])
     elif kind == "half.wav":
         wavfile.write(path, int(RATE), np.column_stack(list(DATA.values())).astype(np.float32))
-        path.write_bytes(path.read_bytes()[:5001])
+        header = path.stat().st_size - 8 * SAMPLES
+        path.write_bytes(path.read_bytes()[: header + 8 * 500])  # whole frames, just too few
     elif kind == "half.tdms":
         from nptdms import ChannelObject, TdmsWriter
 
