@@ -2,7 +2,8 @@
 
 The layout is meant to be read with any HDF5 viewer: scalars are attributes, arrays are datasets, nested
 dataclasses and dictionaries are groups, a tuple of plain records is a table (compound dataset), a tuple of
-anything else is a group with members ``0``, ``1``, … DOFs are written as text (``"sun.x"``).
+anything else is a group with members ``0``, ``1``, … An iterator is written like a tuple, one item at a
+time, so that it need not fit into memory. DOFs are written as text (``"sun.x"``).
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -48,6 +49,10 @@ def write(parent: h5py.Group, name: str, value: Any) -> None:
             write(group, _escape(str(key)), item)
     elif isinstance(value, tuple | list):
         _write_tuple(parent, name, tuple(value))
+    elif isinstance(value, Iterator):
+        group = parent.create_group(name)
+        for index, item in enumerate(value):
+            write(group, str(index), item)
     else:
         raise TypeError(f"cannot store {type(value).__name__} as '{name}'")
 

@@ -96,6 +96,17 @@ def read_rig_file(path: Path, kinds: Mapping[str, RigKind]) -> Rig:
         raise EmaError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise EmaError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
+    return rig_from_text(text, path, kinds)
+
+
+def rig_from_text(text: str, path: Path, kinds: Mapping[str, RigKind]) -> Rig:
+    """The rig that the text of a rig file describes; `path` is named in error messages.
+
+    Raises
+    ------
+    EmaError
+        Names file, line and key of whatever is wrong.
+    """
     try:
         data = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

@@ -1,0 +1,295 @@
+"""Starting a run: raw folder, rig, pipeline and results folder are brought together and checked."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.effects.library import shipped_effects
+from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.ingest.description import Campaign, TestDescription, read_campaign
+from ema_pipeline.ingest.records import Hit
+from ema_pipeline.pipeline import (
+    PipelineSettings,
+    ShowStage,
+    describe_run,
+    existing_run,
+    load_pipeline,
+    new_run,
+    override,
+    run_stages,
+    shipped_pipelines,
+    toml_value,
+)
+from ema_pipeline.rigs import Rig, load_rig, model_modes, rig_names
+from ema_pipeline.simulate.campaign import SimulatedCampaign, simulate_campaign
+from ema_pipeline.stages.base import Run, RunInfo, save_info, silent
+from ema_pipeline.stages.hits import judge_hits
+from ema_pipeline.stages.ingest import read_records
+from ema_pipeline.store import Store
+
+DEFAULT_PIPELINE = "default"
+
+
+def run_raw(
+    raw: Path,
+    rig: str | None,
+    out: Path,
+    pipeline: str | None = None,
+    overrides: Iterable[str] = (),
+    show: ShowStage | None = None,
+) -> tuple[Run, list[str]]:
+    """Run a whole pipeline on a raw folder.
+
+    Parameters
+    ----------
+    raw : Path
+        Raw folder.
+    rig : str or None
+        Name of a rig or path of a rig file. Left out: the ``rig.toml`` beside test.toml, then the rig that
+        test.toml names, then none.
+    out : Path
+        Results folder; made where it does not exist.
+    pipeline : str or None
+        Name or path of a pipeline; left out, the one made for the rig.
+    overrides : iterable of str
+        ``stage.key=value``.
+    show : ShowStage or None
+        Display of progress.
+
+    Returns
+    -------
+    run : Run
+    computed : list of str
+        What was computed; empty where everything was up to date.
+
+    Raises
+    ------
+    EmaError
+        Whatever is wrong with data or settings, in one line.
+    """
+    info = describe(raw, rig, pipeline, overrides)
+    store = Store(out)
+    with _tidy(out), store.lock():
+        save_info(store, info)
+        run = new_run(store, info)
+        stages = PipelineSettings.model_validate_json(info.pipeline).stages
+        return run, run_stages(run, stages, show)
+
+
+def run_on(
+    folder: Path, stages: Iterable[str], overrides: Iterable[str] = (), show: ShowStage | None = None
+) -> tuple[Run, list[str]]:
+    """Run single stages on a results folder; settings changed by `overrides` stay changed there.
+
+    Raises
+    ------
+    EmaError
+        Whatever is wrong with the folder or the settings, in one line.
+    """
+    info = existing_run(folder).info
+    settings = override(PipelineSettings.model_validate_json(info.pipeline), overrides, folder)
+    store = Store(folder)
+    with store.lock():
+        info = dataclasses.replace(info, pipeline=settings.model_dump_json())
+        save_info(store, info)
+        run = new_run(store, info)
+        return run, run_stages(run, stages, show)
+
+
+def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterable[str]) -> RunInfo:
+    """Check raw folder, rig and settings against each other, before anything is written."""
+    campaign = read_campaign(raw)
+    for test in campaign.tests:
+        if test.kind != "hammer":
+            raise EmaError(f"{test.file}: kind = '{test.kind}': only hammer tests can be run yet")
+    source = rig or _rig_of(campaign)
+    model = None if source is None else load_rig(source)
+    names = tuple(_configuration(test, model) for test in campaign.tests)
+    if model is not None:
+        for test, name in zip(campaign.tests, names, strict=True):
+            check_dofs(test, name, model)
+    settings = load_pipeline(pipeline or _pipeline_for(model), overrides)
+    title = (
+        next((t.title for t in campaign.tests if t.title), raw.name)
+        if len(names) == 1
+        else raw.resolve().name
+    )
+    return describe_run(raw, title, _rig_text(source), source or "", names, settings)
+
+
+def check_dofs(test: TestDescription, configuration: str, rig: Rig) -> None:
+    """Make sure that the rig knows every DOF that was struck or measured.
+
+    Raises
+    ------
+    EmaError
+        Names the channel or record whose DOF is unknown.
+    """
+    sensors = rig.system(configuration)
+    known = [*sensors.dofs, *sensors.sensors]
+
+    def check(dof: Dof, what: str) -> None:
+        if not rig.knows(configuration, dof):
+            raise EmaError(
+                f"{test.file}: {what}: rig '{rig.name}' ({configuration}) has no dof "
+                f"'{dof.point}'{did_you_mean(dof.point, known)}"
+            )
+
+    for record in test.records:
+        if record.impact is not None:
+            check(record.impact, f"record '{record.file}'")
+        for channel in test.responses:
+            dof = test.dof_of(channel, record)
+            if dof is not None:
+                check(dof, f"channel '{channel.name}'")
+
+
+def _rig_of(campaign: Campaign) -> str | None:
+    """The rig that the raw folder itself names; a file is looked for beside test.toml."""
+    if campaign.rig_file is not None:
+        return str(campaign.rig_file)
+    name = campaign.rig
+    if name is not None and name.endswith(".toml"):
+        return str(next((t.folder / name for t in campaign.tests if (t.folder / name).is_file()), Path(name)))
+    return name
+
+
+def _rig_text(source: str | None) -> str:
+    """Name of a shipped rig, or the text of the user's file, which then lives on in the store."""
+    if source is None or source in rig_names():
+        return source or ""
+    return Path(source).read_text(encoding="utf-8-sig").rstrip() + "\n"
+
+
+def _configuration(test: TestDescription, rig: Rig | None) -> str:
+    """Name of the test's configuration, checked against the rig's."""
+    if rig is None:
+        return test.configuration or "default"
+    if test.configuration is None:
+        if len(rig.configurations) == 1:
+            return rig.configurations[0]
+        raise EmaError(
+            f"{test.file}: configuration is missing; rig '{rig.name}' has {', '.join(rig.configurations)}"
+        )
+    if test.configuration not in rig.configurations:
+        raise EmaError(
+            f"{test.file}: rig '{rig.name}' has no configuration "
+            f"'{test.configuration}'{did_you_mean(test.configuration, rig.configurations)}"
+        )
+    return test.configuration
+
+
+def _pipeline_for(rig: Rig | None) -> str:
+    name = DEFAULT_PIPELINE if rig is None else rig.name
+    return name if name in shipped_pipelines() else DEFAULT_PIPELINE
+
+
+def check_raw(raw: Path) -> dict[str, tuple[Hit, ...]]:
+    """Hits of every configuration of a raw folder with their verdicts; nothing is written."""
+    settings = load_pipeline(DEFAULT_PIPELINE).hits
+    judged = {}
+    for test in read_campaign(raw).tests:
+        judged[test.configuration or "default"] = judge_hits(list(read_records(test, silent)), settings)
+    return judged
+
+
+def report_path(out: Path) -> Path:
+    """The report of a results folder.
+
+    Raises
+    ------
+    EmaError
+        If there is none.
+    """
+    path = Store.existing(out).folder / "report.html"
+    if not path.is_file():
+        raise EmaError(f"{path}: there is no report yet; write it with 'ema report {out}'")
+    return path.resolve()
+
+
+def list_model_modes(rig: str, configuration: str | None) -> dict[str, list[dict[str, Any]]]:
+    """The model's own modes for one configuration, or for all of them."""
+    loaded = load_rig(rig)
+    return {
+        name: [
+            {"frequency_hz": m.frequency_hz, "damping_ratio": m.damping_ratio, "family": m.family}
+            for m in model_modes(loaded, name)
+        ]
+        for name in ((configuration,) if configuration else loaded.configurations)
+    }
+
+
+def list_effects(rig: str) -> list[dict[str, Any]]:
+    """Effects that can sit on a rig, with places, parameters and tell-tale signs."""
+    loaded = load_rig(rig)
+    listed = []
+    for effect in shipped_effects().values():
+        places = dict.fromkeys(p for c in loaded.configurations for p in effect.places(loaded, c))
+        if places:
+            parameters = [
+                {"name": p.name, "unit": p.unit, "null": p.null, "description": p.description}
+                for p in effect.parameters
+            ]
+            listed.append(
+                {
+                    "id": effect.id,
+                    "title": effect.title,
+                    "places": list(places),
+                    "parameters": parameters,
+                    "signs": effect.signs,
+                    "reference": effect.reference,
+                }
+            )
+    return listed
+
+
+def simulate_raw(
+    out: Path,
+    rig: str,
+    *,
+    configurations: list[str],
+    effects: list[str],
+    values: list[str],
+    sensors: list[str],
+    impacts: list[str],
+    settings: list[str],
+) -> SimulatedCampaign:
+    """Simulate a campaign; values and settings are given as ``"name=value"``."""
+    return simulate_campaign(
+        out,
+        rig,
+        configurations=configurations,
+        effects=effects,
+        values=_named_values(values, "--value"),
+        sensors=sensors,
+        impacts=impacts,
+        **_named_values(settings, "--set"),
+    )
+
+
+def _named_values(texts: list[str], option: str) -> dict[str, Any]:
+    named = {}
+    for text in texts:
+        name, sign, value = text.partition("=")
+        if not sign or not name.strip():
+            raise EmaError(f"{option} {text}: is not of the form name=value")
+        named[name.strip()] = toml_value(value.strip())
+    return named
+
+
+@contextlib.contextmanager
+def _tidy(out: Path) -> Iterator[None]:
+    """Remove a results folder that this run made, if the run fails before it holds a result."""
+    existed = out.exists()
+    try:
+        yield
+    except BaseException:
+        (out / ".lock").unlink(missing_ok=True)
+        if not existed and out.is_dir() and not any(out.iterdir()):
+            out.rmdir()
+        raise

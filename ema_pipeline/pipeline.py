@@ -1,0 +1,296 @@
+"""Runs the stages of a pipeline over one store; what is unchanged is skipped."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import time
+import tomllib
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any, cast
+
+from pydantic import Field
+
+from ema_pipeline.correlate.settings import CompareSettings, PairingSettings
+from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.fit.settings import FitSettings
+from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.ingest.hit_settings import HitSettings
+from ema_pipeline.modal.circle.settings import CircleSettings
+from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.report.settings import ReportSettings
+from ema_pipeline.settings import Settings, parse
+from ema_pipeline.stages.base import (
+    Progress,
+    Run,
+    RunInfo,
+    Stage,
+    code_fingerprint,
+    configurations_of,
+    load_info,
+    silent,
+    versions,
+)
+from ema_pipeline.store import ALL, Store
+
+STAGES = ("ingest", "hits", "frf", "modal", "fit", "correlate", "report")
+"""All stages, in the order in which the data flow."""
+
+
+class IngestSettings(Settings):
+    """Reading raw folders has nothing to set: everything is said in test.toml."""
+
+
+class CorrelateSettings(Settings):
+    """Pairing and comparison."""
+
+    pairing: PairingSettings = Field(PairingSettings(), description="when two modes may be the same")
+    compare: CompareSettings = Field(CompareSettings(), description="how differences are counted")
+
+
+class ModalStageSettings(Settings):
+    """Identification, and the circle fits beside it."""
+
+    identify: ModalSettings = Field(ModalSettings(), description="poles, selection, shapes")
+    circle: CircleSettings = Field(CircleSettings(), description="Nyquist circles")
+
+
+class PipelineSettings(Settings):
+    """All settings of a pipeline; ``pipelines/*.toml`` are files of this kind."""
+
+    rig: str | None = Field(None, description="rig that this pipeline is made for")
+    stages: tuple[str, ...] = Field(STAGES, description="stages to run, in order")
+    ingest: IngestSettings = Field(IngestSettings(), description="reading raw folders")
+    hits: HitSettings = Field(HitSettings(), description="hit finding and quality limits")
+    frf: FrfSettings = Field(FrfSettings(), description="windows and estimator")
+    modal: ModalStageSettings = Field(ModalStageSettings(), description="modal identification")
+    fit: FitSettings = Field(FitSettings(), description="fitting the model's parameters")
+    correlate: CorrelateSettings = Field(CorrelateSettings(), description="pairing and comparison")
+    report: ReportSettings = Field(ReportSettings(), description="tables, plots and the report")
+
+    def of(self, stage: str) -> Settings:
+        """Settings of one stage."""
+        return cast(Settings, getattr(self, stage))
+
+
+def shipped_pipelines() -> dict[str, Path]:
+    """Pipelines that come with the program, by name."""
+    package = Path(__file__).resolve().parent
+    for folder in (package / "pipelines", package.parent / "pipelines"):
+        if folder.is_dir():
+            return {p.stem: p for p in sorted(folder.glob("*.toml"))}
+    return {}
+
+
+def load_pipeline(name_or_path: str, overrides: Iterable[str] = ()) -> PipelineSettings:
+    """Read a pipeline and apply overrides such as ``"modal.identify.engine=lscf"``.
+
+    Parameters
+    ----------
+    name_or_path : str
+        Name of a shipped pipeline, or path of a TOML file.
+    overrides : iterable of str
+        ``stage.key=value`` with a TOML value; a value that is no TOML is taken as text.
+
+    Raises
+    ------
+    EmaError
+        For an unknown pipeline, broken TOML, unknown keys and values of the wrong type.
+    """
+    shipped = shipped_pipelines()
+    path = shipped.get(name_or_path, Path(name_or_path))
+    if not path.is_file():
+        raise EmaError(
+            f"no pipeline '{name_or_path}'{did_you_mean(name_or_path, shipped)}; or give a TOML file"
+        )
+    try:
+        data: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise EmaError(f"{path}: is not valid TOML: {error}") from None
+    return _settings(data, overrides, str(path))
+
+
+def override(settings: PipelineSettings, overrides: Iterable[str], where: str | Path) -> PipelineSettings:
+    """The settings with ``stage.key=value`` changed; `where` is named in error messages."""
+    return _settings(settings.model_dump(mode="json"), overrides, str(where))
+
+
+def _settings(data: dict[str, Any], overrides: Iterable[str], where: str) -> PipelineSettings:
+    for change in overrides:
+        key, sign, value = change.partition("=")
+        if not sign or not key.strip():
+            raise EmaError(f"--set {change}: is not of the form stage.key=value")
+        *parents, last = key.strip().split(".")
+        table = data
+        for parent in parents:
+            table = table.setdefault(parent, {})
+            if not isinstance(table, dict):
+                raise EmaError(f"--set {change}: '{parent}' is no table of settings")
+        table[last] = toml_value(value.strip())
+        where = f"{where} with --set {change}"
+    settings = parse(PipelineSettings, data, where)
+    for stage in settings.stages:
+        if stage not in STAGES:
+            raise EmaError(f"{where}: unknown stage '{stage}'{did_you_mean(stage, STAGES)}")
+    return settings
+
+
+def toml_value(text: str) -> Any:
+    """A value as TOML would read it; text that is no TOML is taken as it stands."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def new_run(store: Store, info: RunInfo) -> Run:
+    """A run with the settings that its description holds."""
+    settings = PipelineSettings.model_validate_json(info.pipeline)
+    return Run(store, info, {name: settings.of(name) for name in STAGES})
+
+
+def existing_run(folder: Path) -> Run:
+    """The run that a results folder belongs to.
+
+    Raises
+    ------
+    EmaError
+        If the folder holds no results, or results that cannot be read.
+    """
+    store = Store.existing(folder)
+    info = load_info(store)
+    if info is None:
+        raise EmaError(f"{store.path}: holds no run; make one with 'ema run RAW --out {folder}'")
+    return new_run(store, info)
+
+
+def describe_run(
+    raw: Path,
+    title: str,
+    rig: str,
+    rig_source: str,
+    configurations: tuple[str, ...],
+    settings: PipelineSettings,
+) -> RunInfo:
+    """Description of a run, for the store."""
+    return RunInfo(
+        raw=str(raw),
+        title=title,
+        rig=rig,
+        rig_source=rig_source,
+        configurations=configurations,
+        pipeline=settings.model_dump_json(),
+        versions=versions(),
+    )
+
+
+def stage_module(name: str) -> Stage:
+    """The module of a stage."""
+    return cast(Stage, importlib.import_module(f"ema_pipeline.stages.{name}"))
+
+
+class Keys:
+    """Keys of all stages of a run: equal keys mean equal inputs, settings and program.
+
+    Stages that are not to be run are taken as they are in the store.
+    """
+
+    def __init__(self, run: Run, names: Iterable[str]) -> None:
+        self._run = run
+        self._names = frozenset(names)
+        self._known: dict[tuple[str, str], str] = {}
+
+    def __call__(self, name: str, configuration: str) -> str:
+        """Key that the result of a stage should have."""
+        if (name, configuration) not in self._known:
+            make = self._compute if name in self._names else self._stored
+            self._known[name, configuration] = make(name, configuration)
+        return self._known[name, configuration]
+
+    def _stored(self, name: str, configuration: str) -> str:
+        key = self._run.store.key(name, configuration)
+        if not key:
+            where = "" if configuration == ALL else f" for configuration '{configuration}'"
+            raise EmaError(
+                f"{self._run.store.path}: holds no result of stage '{name}'{where}; "
+                f"run 'ema {name} {self._run.store.folder}' first"
+            )
+        return key
+
+    def _compute(self, name: str, configuration: str) -> str:
+        stage, run = stage_module(name), self._run
+        needed = [
+            self(other, c)
+            for other in stage.NEEDS
+            if run.rig is not None or not stage_module(other).NEEDS_RIG
+            for c in (
+                (configuration,) if configuration != ALL else configurations_of(stage_module(other), run)
+            )
+        ]
+        parts = {
+            "stage": name,
+            "code": code_fingerprint(),
+            "settings": run.settings[name].model_dump_json(),
+            "rig": run.info.rig if stage.NEEDS_RIG else "",
+            "inputs": stage.inputs(run, configuration),
+            "needed": needed,
+        }
+        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+
+
+ShowStage = Callable[[str], AbstractContextManager[Progress]]
+"""Opens the display of one stage's progress and hands out the function to report it with."""
+
+
+def run_stages(run: Run, names: Iterable[str], show: ShowStage | None = None) -> list[str]:
+    """Run the stages that are out of date, in order.
+
+    Returns
+    -------
+    list of str
+        What was computed, as ``stage`` or ``stage (configuration)``; empty where all was up to date.
+
+    Raises
+    ------
+    EmaError
+        With the name of the stage that failed.
+    """
+    computed = []
+    names = tuple(names)
+    keys = Keys(run, names)
+    for name in names:
+        stage = stage_module(name)
+        if stage.NEEDS_RIG and run.rig is None:
+            continue
+        for configuration in configurations_of(stage, run):
+            key = keys(name, configuration)
+            if run.store.key(name, configuration) == key and _outputs_present(stage, run):
+                continue
+            label = name if configuration == ALL else f"{name} ({configuration})"
+            _run_one(stage, run, configuration, key, label, show)
+            computed.append(label)
+    return computed
+
+
+def _run_one(
+    stage: Stage, run: Run, configuration: str, key: str, label: str, show: ShowStage | None
+) -> None:
+    start = time.perf_counter()
+    settings = run.settings[stage.NAME].model_dump_json()
+    if show is None:
+        results = stage.work(run, configuration, silent)
+        run.store.save(stage.NAME, configuration, key, settings, time.perf_counter() - start, **results)
+        return
+    with show(label) as progress:
+        results = stage.work(run, configuration, progress)
+        run.store.save(stage.NAME, configuration, key, settings, time.perf_counter() - start, **results)
+        progress(1.0, "")
+
+
+def _outputs_present(stage: Stage, run: Run) -> bool:
+    """True unless files that a stage writes beside the store are gone."""
+    outputs = getattr(stage, "OUTPUTS", ())
+    return all((run.store.folder / name).exists() for name in outputs)

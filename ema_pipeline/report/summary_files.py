@@ -1,0 +1,152 @@
+"""summary.json and modes.csv: the numbers, for other programs."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from ema_pipeline.fit.types import FitResult
+from ema_pipeline.report.results import ConfigurationResults, RunResults
+
+SCHEMA = 1
+
+MODE_COLUMNS = (
+    "configuration",
+    "mode",
+    "frequency_hz",
+    "frequency_std_hz",
+    "damping_ratio",
+    "damping_std",
+    "mpc",
+    "method",
+    "model_mode",
+    "model_frequency_hz",
+    "mac",
+    "family",
+    "flags",
+)
+
+
+def write_summary(results: RunResults, path: Path) -> None:
+    """Write ``summary.json``; numbers that are not finite become null."""
+    replace_file(path, json.dumps(_finite(summary(results)), indent=2, ensure_ascii=False) + "\n")
+
+
+def write_modes_csv(results: RunResults, path: Path) -> None:
+    """Write ``modes.csv``: one row per measured mode."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(MODE_COLUMNS)
+    for c in results.configurations:
+        for number, mode in enumerate(_modes(c), 1):
+            row = {**mode, "configuration": c.name, "mode": number, "flags": "; ".join(mode["flags"])}
+            writer.writerow(["" if row[k] is None else row[k] for k in MODE_COLUMNS])
+    replace_file(path, text.getvalue())
+
+
+def summary(results: RunResults) -> dict[str, Any]:
+    """Contents of ``summary.json`` (schema 1)."""
+    content: dict[str, Any] = {
+        "schema": SCHEMA,
+        "title": results.title,
+        "rig": results.rig,
+        "configurations": {c.name: _configuration(c) for c in results.configurations},
+    }
+    if results.fit is not None:
+        content["fit"] = _fit(results.fit)
+    if results.comparison is not None:
+        content["comparison"] = {
+            "error": results.comparison.error,
+            "frequency_error": results.comparison.frequency_error,
+        }
+    content["warnings"] = list(results.warnings)
+    return content
+
+
+def _fit(fit: FitResult) -> dict[str, Any]:
+    """The fit; a free parameter that the data do not determine has no value."""
+    return {
+        "parameters": {
+            name: {
+                "value": p.value if p.identified or not p.free else None,
+                "std": p.std if p.identified or not p.free else None,
+                "unit": p.unit,
+                "identified": p.identified,
+                "free": p.free,
+                "note": p.note,
+            }
+            for name, p in fit.parameters.items()
+        },
+        "frequency_error": fit.frequency_error,
+        "chi2_per_dof": fit.chi2_per_dof,
+        "error": fit.error,
+        "data_count": fit.data_count,
+        "stop_reason": fit.stop_reason,
+        "sweeps": [{k: v for k, v in vars(s).items() if k not in ("values", "error")} for s in fit.sweeps],
+        "two_step": None if fit.two_step is None else asdict(fit.two_step),
+        "notes": list(fit.notes),
+    }
+
+
+def _configuration(c: ConfigurationResults) -> dict[str, Any]:
+    content: dict[str, Any] = {"modes": _modes(c)}
+    if c.pairing is not None:
+        content["unpaired_model_modes"] = [asdict(u) for u in c.pairing.unpaired_model]
+        content["unpaired_measured_modes"] = [asdict(u) for u in c.pairing.unpaired_measured]
+    content["records"] = {
+        "used": len({h.file for h in c.hits if h.accepted}),
+        "found": len({h.file for h in c.hits}),
+        "hits_used": sum(h.accepted for h in c.hits),
+        "rejected": [{"file": h.file, "hit": h.number, "reason": h.reason} for h in c.hits if not h.accepted],
+    }
+    return content
+
+
+def _modes(c: ConfigurationResults) -> list[dict[str, Any]]:
+    pairs = {} if c.pairing is None else {p.measured: p for p in c.pairing.pairs}
+    modes = []
+    for index, mode in enumerate(() if c.modal is None else c.modal.modes):
+        pair = pairs.get(index)
+        modes.append(
+            {
+                "frequency_hz": mode.frequency_hz,
+                "frequency_std_hz": mode.frequency_std_hz,
+                "damping_ratio": mode.damping_ratio,
+                "damping_std": mode.damping_std,
+                "method": mode.method,
+                "mpc": mode.mpc,
+                "flags": list(mode.flags),
+                "model_mode": None if pair is None else pair.model,
+                "model_frequency_hz": None if pair is None else pair.model_frequency_hz,
+                "mac": None if pair is None else pair.mac,
+                "family": None if pair is None else pair.family,
+            }
+        )
+    return modes
+
+
+def replace_file(path: Path, text: str) -> None:
+    """Write a text file in one step: a reader sees the old one or the new one, never half of one."""
+    scratch = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        scratch.write_text(text, encoding="utf-8")
+        os.replace(scratch, path)
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def _finite(value: Any) -> Any:
+    """The value with NaN and infinity replaced by None, which JSON can hold."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

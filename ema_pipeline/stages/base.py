@@ -1,0 +1,168 @@
+"""What a stage of the pipeline is, and the run that it works on."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import platform
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Protocol
+
+from ema_pipeline import __version__, codec
+from ema_pipeline.errors import EmaError
+from ema_pipeline.rigs import Rig, load_rig, rig_kinds
+from ema_pipeline.rigs.files import rig_from_text
+from ema_pipeline.settings import Settings
+from ema_pipeline.store import ALL, Store
+
+Progress = Callable[[float, str], None]
+"""Called with the share that is done, 0…1, and a few words on what is going on."""
+
+
+def silent(done: float, text: str = "") -> None:
+    """Show no progress."""
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """What a results folder has to know of its run, kept in the store.
+
+    Attributes
+    ----------
+    raw : str
+        Folder that the records came from.
+    title : str
+    rig : str
+        Name of a shipped rig, or the whole text of the user's rig file; empty without a rig.
+    rig_source : str
+        Name or path under which the rig was given; empty without a rig.
+    configurations : tuple of str
+    pipeline : str
+        Settings of the pipeline, JSON.
+    versions : dict of str to str
+        Versions of the program, Python and the libraries that compute.
+    """
+
+    raw: str
+    title: str
+    rig: str
+    rig_source: str
+    configurations: tuple[str, ...]
+    pipeline: str
+    versions: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: its store, its settings by stage, and its rig.
+
+    Attributes
+    ----------
+    store : Store
+    info : RunInfo
+    settings : mapping of str to Settings
+        The settings of each stage.
+    """
+
+    store: Store
+    info: RunInfo
+    settings: Mapping[str, Settings]
+
+    @cached_property
+    def rig(self) -> Rig | None:
+        """The rig, None for a modal analysis without a model."""
+        if not self.info.rig:
+            return None
+        if "\n" in self.info.rig:
+            return rig_from_text(self.info.rig, Path(self.info.rig_source), rig_kinds())
+        return load_rig(self.info.rig)
+
+    def require_rig(self, stage: str) -> Rig:
+        """The rig.
+
+        Raises
+        ------
+        EmaError
+            If the run has none.
+        """
+        if self.rig is None:
+            raise EmaError(f"{self.store.folder}: stage '{stage}' needs a model; run again with --rig")
+        return self.rig
+
+
+class Stage(Protocol):
+    """One step of the pipeline; a module of this package is a stage.
+
+    Attributes
+    ----------
+    NAME : str
+    NEEDS : tuple of str
+        Stages whose results it reads.
+    PER_CONFIGURATION : bool
+        True where it works on one configuration at a time.
+    NEEDS_RIG : bool
+        True where there is nothing to do without a model.
+    """
+
+    NAME: str
+    NEEDS: tuple[str, ...]
+    PER_CONFIGURATION: bool
+    NEEDS_RIG: bool
+
+    def inputs(self, run: Run, configuration: str) -> str:
+        """Fingerprint of inputs other than settings and the needed stages' results, e.g. of raw files."""
+        ...
+
+    def work(self, run: Run, configuration: str, progress: Progress) -> dict[str, object]:
+        """Do the work; the results go into the store under their names."""
+        ...
+
+
+def configurations_of(stage: Stage, run: Run) -> tuple[str, ...]:
+    """Configurations that a stage is run for, or `ALL`."""
+    return run.info.configurations if stage.PER_CONFIGURATION else (ALL,)
+
+
+@cache
+def code_fingerprint() -> str:
+    """Hash of the package's source, so that a changed program does not trust old results."""
+    root = Path(__file__).resolve().parents[1]
+    digest = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def versions() -> dict[str, str]:
+    """Versions of the program, of Python and of the libraries that compute."""
+    libraries = ("numpy", "scipy", "h5py", "sdypy-EMA", "matplotlib", "pandas")
+    found = {"ema-pipeline": __version__, "python": platform.python_version()}
+    return found | {name: importlib.metadata.version(name) for name in libraries}
+
+
+def save_info(store: Store, info: RunInfo) -> None:
+    """Write the run's description into the store, unless it is there already.
+
+    Results of configurations that are no longer part of the run are dropped.
+    """
+    if store.path.is_file() and load_info(store) == info:
+        return
+    with store.changing() as file:
+        if "run" in file:
+            del file["run"]
+        for stage in file.get("stages", {}).values():
+            for stale in set(stage) - {*info.configurations, ALL}:
+                del stage[stale]
+        codec.write(file, "run", info)
+
+
+def load_info(store: Store) -> RunInfo | None:
+    """The run's description, None where the store has none yet."""
+    with store.reading() as file:
+        if "run" not in file:
+            return None
+        info: RunInfo = codec.read(file, "run", RunInfo)
+        return info

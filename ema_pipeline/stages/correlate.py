@@ -1,0 +1,40 @@
+"""Modes and fitted model → pairs, and where the two part."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, cast
+
+from ema_pipeline.correlate.compare import compare
+from ema_pipeline.correlate.pairing import pair_rig
+from ema_pipeline.fit.types import FitResult
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.stages.base import Progress, Run
+from ema_pipeline.stages.fit import measured_modes
+from ema_pipeline.stages.results import fitted_values
+from ema_pipeline.store import ALL
+
+if TYPE_CHECKING:
+    from ema_pipeline.pipeline import CorrelateSettings
+
+NAME = "correlate"
+NEEDS = ("frf", "modal", "fit")
+PER_CONFIGURATION = False
+NEEDS_RIG = True
+
+
+def inputs(run: Run, configuration: str) -> str:
+    """Nothing but earlier results."""
+    return ""
+
+
+def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
+    """Pair the modes at the fitted parameters, then compare modes, shapes and FRFs."""
+    settings = cast("CorrelateSettings", run.settings[NAME])
+    rig = run.require_rig(NAME)
+    values = fitted_values(run.store.load("fit", ALL, "fit", FitResult))
+    measured = measured_modes(run)
+    pairings = {name: pair_rig(rig, name, values, measured[name], settings.pairing) for name in measured}
+    progress(0.3, "comparing")
+    frfs = {name: run.store.load("frf", name, "frfs", FrfSet) for name in measured}
+    comparison = compare(rig, values, measured, frfs, pairings, settings.compare)
+    return {f"pairing {name}": p for name, p in pairings.items()} | {"comparison": comparison}

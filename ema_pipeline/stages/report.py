@@ -1,0 +1,39 @@
+"""Everything found → summary.json, modes.csv, plots and report.html."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from ema_pipeline.report.html import write_report
+from ema_pipeline.report.plots import write_plots
+from ema_pipeline.report.settings import ReportSettings
+from ema_pipeline.report.summary_files import write_modes_csv, write_summary
+from ema_pipeline.stages.base import Progress, Run
+from ema_pipeline.stages.results import load_results
+
+NAME = "report"
+NEEDS = ("hits", "frf", "modal", "fit", "correlate")
+PER_CONFIGURATION = False
+NEEDS_RIG = False
+OUTPUTS = ("summary.json", "modes.csv", "report.html")
+
+
+def inputs(run: Run, configuration: str) -> str:
+    """The title and the configurations' names stand in the report too."""
+    return f"{run.info.title} {run.info.configurations} {run.info.rig}"
+
+
+def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
+    """Write every file of the results folder but the store."""
+    settings = cast(ReportSettings, run.settings[NAME])
+    results = load_results(run)
+    folder = run.store.folder
+    write_summary(results, folder / "summary.json")
+    write_modes_csv(results, folder / "modes.csv")
+
+    def drawn(number: int, count: int, name: str) -> None:
+        progress(0.95 * number / count, name)
+
+    plots = write_plots(results, folder / "plots", drawn) if settings.plots else None
+    write_report(results, folder / "report.html", plots, drawn)
+    return {"files": OUTPUTS}

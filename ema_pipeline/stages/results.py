@@ -1,0 +1,97 @@
+"""Collects what the store holds of a run, for reports and screens."""
+
+from __future__ import annotations
+
+import json
+from typing import TypeVar
+
+from ema_pipeline.correlate.types import Comparison, Pairing
+from ema_pipeline.fit.types import FitResult
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.ingest.records import Hit
+from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.stages.base import Run
+from ema_pipeline.store import ALL
+
+T = TypeVar("T")
+
+
+def load_results(run: Run) -> RunResults:
+    """Everything that has been computed so far; what is missing is None or empty."""
+    fit = _load(run, "fit", ALL, "fit", FitResult)
+    values = fitted_values(fit)
+    configurations = []
+    for name in run.info.configurations:
+        modal = _load(run, "modal", name, "modal", ModalModel)
+        configurations.append(
+            ConfigurationResults(
+                name=name,
+                hits=_load(run, "hits", name, "hits", tuple[Hit, ...]) or (),
+                frfs=_load(run, "frf", name, "frfs", FrfSet),
+                modal=modal,
+                pairing=_load(run, "correlate", ALL, f"pairing {name}", Pairing),
+                system=None if run.rig is None else run.rig.system(name, values),
+            )
+        )
+    return RunResults(
+        title=run.info.title,
+        rig=None if run.rig is None else run.rig.name,
+        configurations=tuple(configurations),
+        fit=fit,
+        comparison=_load(run, "correlate", ALL, "comparison", Comparison),
+        warnings=warnings(tuple(configurations)),
+        provenance=_provenance(run),
+        settings={name: _flat(json.loads(s.model_dump_json())) for name, s in run.settings.items()},
+    )
+
+
+def fitted_values(fit: FitResult | None) -> dict[str, float]:
+    """Parameter values that the fit found; empty before the fit, so that nominal values are taken."""
+    if fit is None:
+        return {}
+    return {name: p.value for name, p in fit.parameters.items()}
+
+
+def warnings(configurations: tuple[ConfigurationResults, ...]) -> tuple[str, ...]:
+    """Plain sentences on what a reader should be careful about."""
+    found = []
+    for c in configurations:
+        rejected = [h for h in c.hits if not h.accepted]
+        if rejected:
+            found.append(f"{c.name}: {len(rejected)} of {len(c.hits)} hits were left out.")
+        if c.frfs is not None:
+            found += [f"{c.name}: {v.message}" for v in c.frfs.verdicts if not v.passes and v.message]
+        if c.modal is not None:
+            found += [f"{c.name}: {note}" for note in c.modal.notes]
+    return tuple(found)
+
+
+def _load(run: Run, stage: str, configuration: str, name: str, cls: type[T]) -> T | None:
+    if not run.store.key(stage, configuration):
+        return None
+    return run.store.load(stage, configuration, name, cls)
+
+
+def _provenance(run: Run) -> dict[str, str]:
+    facts = {"raw folder": run.info.raw, "rig": run.info.rig_source or "none"}
+    facts |= {f"version of {name}": version for name, version in run.info.versions.items()}
+    for (stage, configuration), p in run.store.provenance().items():
+        label = stage if configuration == ALL else f"{stage} ({configuration})"
+        facts[f"stage {label}"] = f"{p.finished}, {p.seconds:.2f} s, key {p.key[:12]}"
+    for configuration in run.info.configurations:
+        if not run.store.key("ingest", configuration):
+            continue
+        for file, digest in run.store.load("ingest", configuration, "sources", dict[str, str]).items():
+            facts[f"SHA-256 of {configuration}/{file}"] = digest
+    return facts
+
+
+def _flat(settings: dict[str, object], prefix: str = "") -> dict[str, str]:
+    flat: dict[str, str] = {}
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = json.dumps(value)
+    return flat
