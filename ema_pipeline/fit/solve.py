@@ -277,7 +277,7 @@ def search(
         grid = space.starts(settings.starts_per_decade)
         screened = []
         for i, x in enumerate(grid):
-            found = descend(lower, space, x, mixture, 6)
+            found = descend(lower, space, x, mixture, 4)
             screened.append((found.objective, i, found.x))
             tell(0.05 + 0.4 * (i + 1) / len(grid), "screening starting values")
         screened.sort(key=lambda s: (s[0], s[1]))

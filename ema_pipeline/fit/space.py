@@ -118,8 +118,8 @@ class Space:
                 out[i] = x[i] + np.log(np.clip(1 + step[i], 0.02, 50.0))
         return np.clip(out, self.low, self.high)
 
-    def starts(self, per_decade: int, most: int = 150) -> NDArray[np.float64]:
-        """Grid of starting points over the free parameters, the others nominal, (n_starts, n)."""
+    def starts(self, per_decade: int, most: int = 64) -> NDArray[np.float64]:
+        """Grid of starting points over the logarithms, the others at their values, (n_starts, n)."""
         axes = [_axis(c, per_decade) for c in self.coordinates]
         while np.prod([float(len(a)) for a in axes]) > most and per_decade > 1:
             per_decade -= 1
@@ -168,6 +168,4 @@ def _axis(c: Coordinate, per_decade: int) -> NDArray[np.float64]:
         count = max(2, round((c.high - c.low) / np.log(10) * per_decade))
         edges = np.linspace(c.low, c.high, count + 1)
         return np.asarray(0.5 * (edges[1:] + edges[:-1]))
-    if c.kind == "linear" and np.isfinite(c.low) and np.isfinite(c.high):
-        return np.unique([start, 0.75 * start + 0.25 * c.low, 0.75 * start + 0.25 * c.high])
     return np.array([start])
