@@ -105,6 +105,35 @@ def test_default_rig_gives_the_seeds_predictions() -> None:
         assert min(abs(f - expected) for f in case2) < 0.06
 
 
+def error_over_stiffness(configuration: str, measured: list[float], stiffness, values) -> np.ndarray:
+    """The seed's error function (its Eq. 10) with nearest-frequency pairing."""
+    rig = load_rig("planetary")
+    errors = []
+    for k in stiffness:
+        model = normal_modes(rig.system(configuration, values(k)))[0]
+        model = model[model > 0]
+        nearest = [model[np.argmin(np.abs(model - f))] for f in measured]
+        errors.append(np.sum(((np.array(measured) - nearest) / nearest) ** 2))
+    return np.array(errors)
+
+
+def test_three_low_modes_of_the_first_case_do_not_determine_the_mesh_stiffness() -> None:
+    k = np.logspace(6, 9, 121)
+    measured = [62.5, 85.7, 134.0, 1097.0]
+    four = error_over_stiffness("no_ring", measured, k, lambda x: {"sun_planet_mesh_stiffness": x})
+    assert k[np.argmin(four)] == pytest.approx(5.5e6, rel=0.06)
+    three = error_over_stiffness("no_ring", measured[:3], k, lambda x: {"sun_planet_mesh_stiffness": x})
+    assert three.max() / three.min() - 1 < 0.01
+
+
+def test_second_case_has_its_minimum_far_below_the_printed_stiffness() -> None:
+    k = np.logspace(6, 7.5, 121)
+    error = error_over_stiffness(
+        "with_ring", [47.5, 90.66, 515.0, 1117.0], k, lambda x: {"ring_planet_mesh_stiffness": x}
+    )
+    assert 1.6e6 < k[np.argmin(error)] < 1.9e6
+
+
 def test_bare_ring_on_ten_times_softer_bearing_gives_the_printed_98_hz() -> None:
     # f = √(k/m)/2π of the ring alone; Table I's 1.64e7 N/m would give 311 Hz.
     rig = load_rig("planetary")
