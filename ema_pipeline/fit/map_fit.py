@@ -205,8 +205,8 @@ def _notes(problem: FitProblem, best: Optimum, scale: float, chi2: float, outlie
     if scale > 1:
         notes.append(
             f"the model does not reach the data's accuracy (χ²/dof {chi2:.3g}): all uncertainties were "
-            f"multiplied by {scale:.3g}, and the standard deviations hold only as far as the misfit acts like "
-            "random scatter"
+            f"multiplied by {scale:.3g}, and the standard deviations hold only as far as the misfit acts "
+            "like random scatter"
         )
     start = 0
     for e in problem.evidence:
