@@ -74,7 +74,9 @@ def model_modes(system: LinearSystem) -> tuple[ModelMode, ...]:
     root = np.sqrt(np.diag(system.mass))
     w2, v = np.linalg.eigh(system.stiffness / np.outer(root, root))
     return tuple(
-        ModelMode(i, float(np.sqrt(max(w, 0)) / 2 / np.pi), 0.01, "translational" if i % 3 else "rotational", s)
+        ModelMode(
+            i, float(np.sqrt(max(w, 0)) / 2 / np.pi), 0.01, "translational" if i % 3 else "rotational", s
+        )
         for i, (w, s) in enumerate(zip(w2, (v / root[:, None]).T, strict=True))
     )
 
@@ -112,12 +114,16 @@ def circle(modes: list[Mode], mode: Mode, out: int, inp: int, dofs: tuple[Dof, .
     )  # fmt: skip
 
 
-def configuration(name: str, ring: bool, seed: int = 1, one_hit: bool = False, lines: int = 4097) -> ConfigurationResults:
+def configuration(
+    name: str, ring: bool, seed: int = 1, one_hit: bool = False, lines: int = 4097
+) -> ConfigurationResults:
     rng = np.random.default_rng(seed)
     system = planetary(ring, 1.05e7)
     truth = model_modes(planetary(ring))
     bodies = ["carrier", "ring", "sun"] if ring else ["carrier", "sun"]
-    names = [f"{b}.{d}" for b in bodies for d in "xy"] + [f"planet{n}.{d}" for n in range(1, PLANETS + 1) for d in "xy"]
+    names = [f"{b}.{d}" for b in bodies for d in "xy"] + [
+        f"planet{n}.{d}" for n in range(1, PLANETS + 1) for d in "xy"
+    ]
     names.remove("planet3.y")
     dofs = tuple(Dof.parse(n) for n in names)
     rows = sensor_rows(planetary(ring), dofs)
@@ -145,7 +151,12 @@ def configuration(name: str, ring: bool, seed: int = 1, one_hit: bool = False, l
     if one_hit:
         coherence, noise = np.full(h.shape, np.nan), np.full(h.shape, np.nan)
     modes = [
-        replace(m, circles=tuple(circle(modes, m, o, i, dofs, rng) for o, i in ((0, 0), (1, 1), (4, 4), (6, 6), (7, 0))))
+        replace(
+            m,
+            circles=tuple(
+                circle(modes, m, o, i, dofs, rng) for o, i in ((0, 0), (1, 1), (4, 4), (6, 6), (7, 0))
+            ),
+        )
         for m in modes
     ]
     band = (f > 20) & (f < 1800)
@@ -161,7 +172,11 @@ def configuration(name: str, ring: bool, seed: int = 1, one_hit: bool = False, l
     for order in orders:
         for i, m in enumerate(modes):
             if order > 10 + 2 * i:
-                o.append(order), p.append(m.frequency_hz * (1 + 1e-3 * rng.normal())), z.append(m.damping_ratio)
+                (
+                    o.append(order),
+                    p.append(m.frequency_hz * (1 + 1e-3 * rng.normal())),
+                    z.append(m.damping_ratio),
+                )
                 s.append(True), sel.append(i if order > 14 + 2 * i else -1)
         for x in rng.uniform(20, 1800, order // 6):
             o.append(order), p.append(x), z.append(0.03), s.append(rng.random() < 0.1), sel.append(-1)
@@ -182,7 +197,15 @@ def pairing(modal: ModalModel, system: LinearSystem) -> Pairing:
     mac = cross / np.outer(np.sum(np.abs(measured) ** 2, 1), np.maximum(np.sum(shapes**2, 1), 1e-12))
     in_band = [m.index for m in model if 20 < m.frequency_hz < 1850]
     pairs = tuple(
-        Pair(i, j, m.frequency_hz, model[j].frequency_hz, float(mac[i, j]), model[j].family, 0 if i in (0, 1) else -1)
+        Pair(
+            i,
+            j,
+            m.frequency_hz,
+            model[j].frequency_hz,
+            float(mac[i, j]),
+            model[j].family,
+            0 if i in (0, 1) else -1,
+        )
         for i, (m, j) in enumerate(zip(modal.modes, in_band, strict=False))
         if i != 3
     )
@@ -207,7 +230,18 @@ def hits(rng: np.random.Generator) -> tuple[Hit, ...]:
                 Verdict("overload", 1.0 if n == 5 else 0.6, 0.98, "1", n != 5, "", "reject_channel", "planet2_y",
                         "planet2_y at full scale at 0.051 s" if n == 5 else ""),
             )  # fmt: skip
-            out.append(Hit(f"{dof.strip('-')}_1.uff", n, Dof.parse(dof), 0, 1000, 50, float(rng.uniform(80, 200)), verdicts))
+            out.append(
+                Hit(
+                    f"{dof.strip('-')}_1.uff",
+                    n,
+                    Dof.parse(dof),
+                    0,
+                    1000,
+                    50,
+                    float(rng.uniform(80, 200)),
+                    verdicts,
+                )
+            )
     return tuple(out)
 
 
@@ -238,10 +272,25 @@ def fit_result() -> FitResult:
     d = np.sqrt(np.diag(cov))
     x = np.geomspace(1e6, 1e9, 200)
     sweeps = []
-    for parameter, conf, least in (("sun_planet_mesh_stiffness", "no_ring", 5.5e6), ("ring_planet_mesh_stiffness", "with_ring", 1.7e7)):
+    for parameter, conf, least in (
+        ("sun_planet_mesh_stiffness", "no_ring", 5.5e6),
+        ("ring_planet_mesh_stiffness", "with_ring", 1.7e7),
+    ):
         sweeps.append(ErrorSweep(parameter, conf, 3, x, 0.071 + 2e-4 * np.log10(x / least) ** 2, least, 0.004, False,
                                  "ε changes by 0.4 % over three decades: three modes do not identify it"))  # fmt: skip
-        sweeps.append(ErrorSweep(parameter, conf, 4, x, 0.02 + 0.3 * np.log10(x / least) ** 2, least, 5.0, True, "a clear minimum"))
+        sweeps.append(
+            ErrorSweep(
+                parameter,
+                conf,
+                4,
+                x,
+                0.02 + 0.3 * np.log10(x / least) ** 2,
+                least,
+                5.0,
+                True,
+                "a clear minimum",
+            )
+        )
     return FitResult(
         parameters, tuple(parameters), cov / np.outer(d, d), 1.04, 1.08, 0.0123, 96,
         "the step fell below the tolerance after 9 iterations", tuple(sweeps),
@@ -261,7 +310,10 @@ def comparison(configurations: tuple[ConfigurationResults, ...]) -> Comparison:
             dz = (m.damping_ratio - 0.01) / m.damping_std
             modes.append(ModeDifference(c.name, p.measured, p.family, m.frequency_hz, m.frequency_std_hz, p.model_frequency_hz,
                                         fz, m.damping_ratio, m.damping_std, 0.01, dz, p.mac, abs(float(rng.normal())) + 0.5))  # fmt: skip
-        dofs += [DofDifference(c.name, d.point, float(6.1 if d.body == "planet2" else rng.uniform(0.6, 1.6))) for d in c.modal.dofs]
+        dofs += [
+            DofDifference(c.name, d.point, float(6.1 if d.body == "planet2" else rng.uniform(0.6, 1.6)))
+            for d in c.modal.dofs
+        ]
         edges = np.geomspace(20, 1800, 9)
         for o in c.frfs.outputs:
             for i in c.frfs.inputs:
@@ -271,7 +323,10 @@ def comparison(configurations: tuple[ConfigurationResults, ...]) -> Comparison:
 
 
 def planetary_run(lines: int = 4097) -> RunResults:
-    configurations = (configuration("no_ring", False, 1, lines=lines), configuration("with_ring", True, 2, lines=lines))
+    configurations = (
+        configuration("no_ring", False, 1, lines=lines),
+        configuration("with_ring", True, 2, lines=lines),
+    )
     return RunResults(
         "Planetary rig, two configurations", "planetary", configurations, fit_result(), comparison(configurations),
         ("with_ring: planet3.y was not measured.",),
@@ -280,7 +335,9 @@ def planetary_run(lines: int = 4097) -> RunResults:
     )  # fmt: skip
 
 
-def beam_run(points: int = 25, directions: str = "xyz", mode_count: int = 12, one_hit: bool = True) -> RunResults:
+def beam_run(
+    points: int = 25, directions: str = "xyz", mode_count: int = 12, one_hit: bool = True
+) -> RunResults:
     """A structure without a rig: many points, few references."""
     rng = np.random.default_rng(9)
     dofs = tuple(Dof(f"point{n:02d}", d) for n in range(1, points + 1) for d in directions)
@@ -288,10 +345,17 @@ def beam_run(points: int = 25, directions: str = "xyz", mode_count: int = 12, on
     modes: list[Mode] = []
     for k in range(mode_count):
         f, z = 6.0 + 5.3 * k**1.2, 0.008
-        shape = np.where(np.array([d.direction == "z" for d in dofs]), np.sin((k + 1) * np.pi * s), 0.1 * np.cos(k * s)) + 0j
+        shape = (
+            np.where(
+                np.array([d.direction == "z" for d in dofs]), np.sin((k + 1) * np.pi * s), 0.1 * np.cos(k * s)
+            )
+            + 0j
+        )
         w = 2 * np.pi * f
-        modes.append(Mode(f, 0.002 * f, z, 5e-4, complex(-z * w, w), shape, np.full(len(dofs), 0.03), 0.95, "plscf"))
-    inputs = list(range(2, 9, 3))
+        modes.append(
+            Mode(f, 0.002 * f, z, 5e-4, complex(-z * w, w), shape, np.full(len(dofs), 0.03), 0.95, "plscf")
+        )
+    inputs = [2, 0, 1]
     f = np.linspace(0, 128, 1025)
     h = synthesise(modes, f, list(range(len(dofs))), inputs)
     h += 0.002 * np.abs(h).max() * (rng.normal(size=h.shape) + 1j * rng.normal(size=h.shape))
@@ -300,7 +364,9 @@ def beam_run(points: int = 25, directions: str = "xyz", mode_count: int = 12, on
     frfs = FrfSet(f, h, nan, nan, dofs, picks, ("acceleration",) * len(dofs), np.ones(h.shape[:2], int), "H1", 8.0, 0.3,
                   np.zeros(3), (4.0, 120.0), False, np.zeros(len(dofs)))  # fmt: skip
     modes = [replace(m, circles=(circle(modes, m, 2, 2, dofs, rng),)) for m in modes]
-    chart = StabilisationChart(np.array([2]), np.array([6.0]), np.array([0.01]), np.array([True]), np.array([0]))
+    chart = StabilisationChart(
+        np.array([2]), np.array([6.0]), np.array([0.01]), np.array([True]), np.array([0])
+    )
     modal = ModalModel(dofs, tuple(modes), (4.0, 120.0), False, "the hammer is not calibrated", picks, f[f > 4],
                        synthesise(modes, f[f > 4], list(range(len(dofs))), inputs), dofs, picks, chart)  # fmt: skip
     return RunResults("Aircraft <test>", None, (ConfigurationResults("default", hits(rng), frfs, modal),))

@@ -118,6 +118,7 @@ def _configuration(c: ConfigurationResults) -> dict[str, Any]:
         "name": c.name,
         "modal": c.modal,
         "frfs": c.frfs,
+        "averages": _averages(c),
         "pairing": c.pairing,
         "modes": tables.modes_table(c.modal) if c.modal else None,
         "pairs": tables.pairs_table(c.pairing, c.modal) if c.pairing and c.modal else None,
@@ -130,6 +131,16 @@ def _configuration(c: ConfigurationResults) -> dict[str, Any]:
         "listed": len(listed),
         "checks": tables.failed_checks_table(c.frfs.verdicts) if c.frfs else None,
     }
+
+
+def _averages(c: ConfigurationResults) -> str:
+    if c.frfs is None or not (c.frfs.hits > 0).any():
+        return "no hits"
+    counts = c.frfs.hits[c.frfs.hits > 0]
+    low, high = int(counts.min()), int(counts.max())
+    if low == high:
+        return "one hit" if low == 1 else f"{low} hits"
+    return f"{low} to {high} hits"
 
 
 def _two_step(results: RunResults) -> dict[str, str] | None:

@@ -88,7 +88,9 @@ def moving_gears(configuration: ConfigurationResults) -> MovingGears | None:
         if pair.model is not None:
             theirs = motions(layout, pair.model)
             drawings.append(_drawing(stem, layout, theirs, scale, f"Model shape beside mode {index + 1}"))
-            remark = f"model {pair.model_frequency_hz:.5g} Hz" + (", mixture of its close group" if pair.combined else "")
+            remark = f"model {pair.model_frequency_hz:.5g} Hz" + (
+                ", mixture of its close group" if pair.combined else ""
+            )
         modes.append(MovingMode(
             f"Mode {index + 1}: {format_value(mode.frequency_hz, mode.frequency_std_hz, 'Hz')}",
             format_percent(mode.damping_ratio, mode.damping_std), tuple(drawings), remark,

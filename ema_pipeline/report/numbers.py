@@ -49,7 +49,9 @@ def format_value(value: float, std: float, unit: str = "") -> str:
         return f"{_minus(f'{round(value, decimals):.0f}')} ± {round(std, decimals):.0f}{tail}"
     power = math.floor(math.log10(max(abs(value), std)))
     decimals += power
-    mantissa = f"{_minus(f'{value / 10**power:.{max(decimals, 0)}f}')} ± {std / 10**power:.{max(decimals, 0)}f}"
+    mantissa = (
+        f"{_minus(f'{value / 10**power:.{max(decimals, 0)}f}')} ± {std / 10**power:.{max(decimals, 0)}f}"
+    )
     return f"({mantissa}) × 10^{power}{tail}"
 
 
@@ -88,7 +90,8 @@ def signed(value: float, decimals: int = 1) -> str:
     """
     if math.isnan(value):
         return "–"
-    return _minus(f"{value:+.{decimals}f}")
+    text = f"{value:+.{decimals}f}"
+    return text[1:] if float(text) == 0 else _minus(text)
 
 
 def words(name: str) -> str:

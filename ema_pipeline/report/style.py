@@ -106,6 +106,11 @@ def png(figure: Figure) -> bytes:
         image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     buffer = io.BytesIO()
     palette = image.quantize(200, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    colours = palette.getpalette() or []
+    for k in range(0, len(colours), 3):
+        if min(colours[k : k + 3]) >= 250:
+            colours[k : k + 3] = 255, 255, 255  # the paper stays white
+    palette.putpalette(colours)
     palette.save(buffer, format="png", dpi=(_RC["figure.dpi"],) * 2)
     return buffer.getvalue()
 
@@ -119,11 +124,18 @@ def svg(figure: Figure) -> bytes:
 
 
 def _slim(content: bytes) -> bytes:
-    """Coordinates to 1/100 pt, no turns by zero, and fonts for readers who lack ours (none of which base64 holds)."""
-    content = re.sub(rb"(\d\.\d\d)\d+", rb"\1", content)
-    content = re.sub(rb' transform="rotate\(-?0 [^"]*"', b"", content)
-    content = content.replace(b"font-family: 'DejaVu Sans'", b"font-family: 'DejaVu Sans', Verdana, sans-serif")
-    return re.sub(rb"\s*\n\s*", b"\n", content)
+    """Coordinates to 1/100 pt, no turns by zero, and fonts for readers who lack ours.
+
+    Only inside tags: the numbers that people read are text between them.
+    """
+    return re.sub(rb"<[^<>]*>", lambda tag: _slim_tag(tag[0]), content)
+
+
+def _slim_tag(tag: bytes) -> bytes:
+    tag = re.sub(rb"(\d\.\d\d)\d+", rb"\1", tag)
+    tag = re.sub(rb' transform="rotate\(-?0 [^"]*"', b"", tag)
+    tag = tag.replace(b"font-family: 'DejaVu Sans'", b"font-family: 'DejaVu Sans', Verdana, sans-serif")
+    return re.sub(rb"\s*\n\s*", b" ", tag)
 
 
 def frequency_axis(ax: Axes, low_hz: float, high_hz: float, log: bool, label: bool = True) -> None:

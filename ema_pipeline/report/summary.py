@@ -65,7 +65,9 @@ def cautions(results: RunResults) -> tuple[str, ...]:
         for p in fit.parameters.values():
             value = format_value(p.value, p.std, p.unit)
             if p.free and not p.identified:
-                lines.append(f"{words(p.name)} ({value}) is {identified_words(p)}. Do not quote it as a result.")
+                lines.append(
+                    f"{words(p.name)} ({value}) is {identified_words(p)}. Do not quote it as a result."
+                )
             elif math.isfinite(p.shift_z) and abs(p.shift_z) > FAR_SIGMA:
                 lines.append(
                     f"{words(p.name)} was fitted to {value}, {abs(p.shift_z):.1f} tolerances from its nominal "
@@ -86,7 +88,9 @@ def _measured(c: ConfigurationResults) -> str:
     used = sum(h.accepted for h in c.hits)
     text = f"{c.name}: {used} of {len(c.hits)} hits used" if c.hits else f"{c.name}:"
     if c.frfs is not None:
-        text += f"{',' if c.hits else ''} {len(c.frfs.outputs)} responses × {len(c.frfs.inputs)} impact points"
+        text += (
+            f"{',' if c.hits else ''} {len(c.frfs.outputs)} responses × {len(c.frfs.inputs)} impact points"
+        )
     if c.modal is None:
         return text + "; no modes identified yet."
     low, high = c.modal.band_hz
@@ -102,9 +106,11 @@ def _cautions_of(c: ConfigurationResults) -> list[str]:
     if rejected:
         lines.append(f"{_count(len(rejected), 'hit')} rejected; the reasons are under Hits")
     if c.frfs is not None:
-        singles = int(((c.frfs.hits == 1)).sum())
+        singles = int((c.frfs.hits == 1).sum())
         if singles:
-            lines.append(f"{_count(singles, 'FRF')} rest on one hit: no coherence and no scatter to judge them by")
+            lines.append(
+                f"{_count(singles, 'FRF')} rest on one hit: no coherence and no scatter to judge them by"
+            )
         if not c.frfs.force_calibrated:
             lines.append("the hammer is not calibrated: FRFs and shapes have no absolute scale")
         lines += [v.message or f"{v.check} fails" for v in c.frfs.verdicts if not v.passes][:5]
@@ -135,7 +141,9 @@ def _worst(results: RunResults) -> list[str]:
     ]
     if modes:
         z, what, m = max(modes, key=lambda t: t[0])
-        lines.append(f"Largest difference in a mode: {what} of {m.measured_frequency_hz:.5g} Hz, {m.configuration}, {plain(z, 2)}σ.")
+        lines.append(
+            f"Largest difference in a mode: {what} of {m.measured_frequency_hz:.5g} Hz, {m.configuration}, {plain(z, 2)}σ."
+        )
     dofs = [d for d in compared.dofs if math.isfinite(d.z) and d.z > FAR_SIGMA]
     if dofs:
         d = max(dofs, key=lambda d: d.z)

@@ -35,7 +35,17 @@ class Table:
 def modes_table(modal: ModalModel) -> Table:
     """One row per mode: frequency and damping of the pole and of the best circle, collinearity, votes, remarks."""
     rows = tuple(_mode_row(i, m) for i, m in enumerate(modal.modes))
-    head = ("mode", "frequency, Hz", "damping ratio, %", "circle: f, Hz", "circle: ζ, %", "MPC", "stable orders", "method", "remarks")
+    head = (
+        "mode",
+        "frequency, Hz",
+        "damping ratio, %",
+        "circle: f, Hz",
+        "circle: ζ, %",
+        "MPC",
+        "stable orders",
+        "method",
+        "remarks",
+    )
     return Table(head, rows, frozenset({0, 1, 2, 3, 4, 5, 6}))
 
 
@@ -44,8 +54,12 @@ def pairs_table(pairing: Pairing, modal: ModalModel) -> Table:
     rows = []
     for p in pairing.pairs:
         std = modal.modes[p.measured].frequency_std_hz
-        percent = 100 * (p.measured_frequency_hz / p.model_frequency_hz - 1) if p.model_frequency_hz > 0 else math.nan
-        remark = f"close group {p.group + 1}" if p.group >= 0 else ""
+        percent = (
+            100 * (p.measured_frequency_hz / p.model_frequency_hz - 1)
+            if p.model_frequency_hz > 0
+            else math.nan
+        )
+        remark = f"group {p.group + 1}" if p.group >= 0 else ""
         weak = p.mac < LOW_MAC
         remark = "; ".join(t for t in (remark, "low MAC" if weak else "") if t)
         rows.append(Row((str(p.measured + 1), _bare(p.measured_frequency_hz, std), str(p.model + 1),
@@ -58,7 +72,9 @@ def unpaired_table(pairing: Pairing) -> Table:
     """Modes of either side that have no partner, and why."""
     sides = (("measured", pairing.unpaired_measured), ("model", pairing.unpaired_model))
     rows = tuple(
-        Row((side, str(u.index + 1), plain(u.frequency_hz, 5), u.reason), side == "measured") for side, us in sides for u in us
+        Row((side, str(u.index + 1), plain(u.frequency_hz, 5), u.reason), side == "measured")
+        for side, us in sides
+        for u in us
     )
     return Table(("side", "mode", "frequency, Hz", "reason"), rows, frozenset({1, 2}))
 
@@ -75,7 +91,15 @@ def parameters_table(fit: FitResult) -> Table:
         rows.append(Row((words(p.name), format_value(p.value, p.std, p.unit), f"{low} … {high}{tail}",
                          "free" if p.free else format_value(p.nominal, p.prior_std, p.unit), signed(p.shift_z),
                          status, p.note), far or (p.free and not p.identified)))  # fmt: skip
-    head = ("parameter", "fitted (±1σ)", "68 % interval", "nominal (±1σ)", "shift, tolerances", "data say", "remarks")
+    head = (
+        "parameter",
+        "fitted (±1σ)",
+        "68 % interval",
+        "nominal (±1σ)",
+        "shift, tolerances",
+        "data say",
+        "remarks",
+    )
     return Table(head, tuple(rows), frozenset({4}))
 
 
@@ -87,19 +111,34 @@ def sweeps_table(fit: FitResult) -> Table:
              plain(min(s.error), 3), s.note), not s.identified)
         for s in fit.sweeps
     )  # fmt: skip
-    return Table(("parameter", "configuration", "modes", "minimum at", "least ε", "remarks"), rows, frozenset({2, 4}))
+    return Table(
+        ("parameter", "configuration", "modes", "minimum at", "least ε", "remarks"), rows, frozenset({2, 4})
+    )
 
 
 def differences_table(compared: Comparison) -> Table:
     """One row per pair: differences of frequency, damping and shape in units of their uncertainty."""
     rows = []
     for m in compared.modes:
-        worst = max((abs(z) for z in (m.frequency_z, m.damping_z, m.shape_z) if math.isfinite(z)), default=0.0)
+        worst = max(
+            (abs(z) for z in (m.frequency_z, m.damping_z, m.shape_z) if math.isfinite(z)), default=0.0
+        )
         rows.append(Row((m.configuration, str(m.measured + 1), _bare(m.measured_frequency_hz, m.frequency_std_hz),
                          plain(m.model_frequency_hz, 5), signed(m.frequency_z),
                          _bare(100 * m.measured_damping_ratio, 100 * m.damping_std), plain(100 * m.model_damping_ratio, 3),
                          signed(m.damping_z), f"{m.mac:.2f}", signed(m.shape_z)), worst > FAR_SIGMA))  # fmt: skip
-    head = ("configuration", "mode", "measured, Hz", "model, Hz", "f: z, σ", "measured ζ, %", "model ζ, %", "ζ: z, σ", "MAC", "shape: z, σ")
+    head = (
+        "configuration",
+        "mode",
+        "measured, Hz",
+        "model, Hz",
+        "f: z, σ",
+        "measured ζ, %",
+        "model ζ, %",
+        "ζ: z, σ",
+        "MAC",
+        "shape: z, σ",
+    )
     return Table(head, tuple(rows), frozenset(range(1, 10)))
 
 
@@ -114,7 +153,15 @@ def worst_bands_table(compared: Comparison, count: int = 8) -> Table:
     """The FRF bands with the largest difference."""
     bands = sorted((b for b in compared.bands if math.isfinite(b.z)), key=lambda b: -b.z)[:count]
     rows = tuple(
-        Row((b.configuration, f"{b.output} ← {b.input}", f"{plain(b.low_hz)} … {plain(b.high_hz)}", f"{b.z:.1f}"), b.z > FAR_SIGMA)
+        Row(
+            (
+                b.configuration,
+                f"{b.output} ← {b.input}",
+                f"{plain(b.low_hz)} … {plain(b.high_hz)}",
+                f"{b.z:.1f}",
+            ),
+            b.z > FAR_SIGMA,
+        )
         for b in bands
     )
     return Table(("configuration", "FRF", "band, Hz", "difference, σ"), rows, frozenset({3}))
@@ -129,7 +176,17 @@ def rejected_hits_table(hits: Sequence[Hit]) -> Table:
         elif h.rejected_channels:
             why = "; ".join(v.message or f"{v.channel}: {v.check}" for v in h.verdicts
                             if v.consequence == "reject_channel" and not v.passes)  # fmt: skip
-            rows.append(Row((h.file, str(h.number + 1), str(h.impact), f"left out: {', '.join(sorted(h.rejected_channels))}", why)))
+            rows.append(
+                Row(
+                    (
+                        h.file,
+                        str(h.number + 1),
+                        str(h.impact),
+                        f"left out: {', '.join(sorted(h.rejected_channels))}",
+                        why,
+                    )
+                )
+            )
     return Table(("file", "hit", "impact", "consequence", "reason"), tuple(rows), frozenset({1}))
 
 

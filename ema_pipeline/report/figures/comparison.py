@@ -43,25 +43,45 @@ def mode_differences(modes: Sequence[ModeDifference]) -> Figure:
         groups += [(configuration, mine[k : k + size]) for k in range(0, len(mine), size)]
     figure = new_figure(0.55 + 2.45 * len(groups))
     grid = figure.add_gridspec(len(groups), 1, hspace=0.75, **margins(figure, top=0.55, bottom=0.75))
-    series = (("frequency", "frequency_z", BLUE, ""), ("damping ratio", "damping_z", GREEN, "///"), ("shape", "shape_z", VERMILLION, "..."))
-    limit = 1.15 * max([5.0, *(abs(v) for m in modes for v in (m.frequency_z, m.damping_z, m.shape_z) if np.isfinite(v))])
+    series = (
+        ("frequency", "frequency_z", BLUE, ""),
+        ("damping ratio", "damping_z", GREEN, "///"),
+        ("shape", "shape_z", VERMILLION, "..."),
+    )
+    limit = 1.15 * max(
+        [5.0, *(abs(v) for m in modes for v in (m.frequency_z, m.damping_z, m.shape_z) if np.isfinite(v))]
+    )
     for k, (configuration, mine) in enumerate(groups):
         ax = figure.add_subplot(grid[k])
         at = np.arange(len(mine))
         ax.axhspan(-2, 2, color="#efefef", lw=0, zorder=0)
         for i, (label, field, color, hatch) in enumerate(series):
             z = np.array([getattr(m, field) for m in mine], dtype=float)
-            ax.bar(at + 0.27 * (i - 1), np.nan_to_num(z), 0.25, color=color, hatch=hatch, ec="white", lw=0.3, label=label, zorder=2)
+            ax.bar(
+                at + 0.27 * (i - 1),
+                np.nan_to_num(z),
+                0.25,
+                color=color,
+                hatch=hatch,
+                ec="white",
+                lw=0.3,
+                label=label,
+                zorder=2,
+            )
         ax.axhline(0, color="black", lw=0.7)
         sigma_axis(ax, limit)
         ax.set_xlim(-0.7, len(mine) - 0.3)
-        ax.set_xticks(at, [f"{m.measured + 1}: {m.measured_frequency_hz:.4g}" for m in mine], rotation=90, fontsize=6.2)
+        ax.set_xticks(
+            at, [f"{m.measured + 1}: {m.measured_frequency_hz:.4g}" for m in mine], rotation=90, fontsize=6.2
+        )
         ax.grid(False, axis="x")
         ax.set_title(configuration, loc="left")
         ax.set_ylabel("(measured − model)/σ, 1")
         ax.set_xlabel("measured mode, Hz")
     handles = [Patch(fc=c, hatch=h, ec="white", label=label) for label, _, c, h in series]
-    figure.legend(handles=[*handles, Patch(fc="#efefef", label="within ±2σ")], loc="upper right", ncols=4, frameon=False)
+    figure.legend(
+        handles=[*handles, Patch(fc="#efefef", label="within ±2σ")], loc="upper right", ncols=4, frameon=False
+    )
     return figure
 
 
@@ -75,7 +95,9 @@ def dof_differences(dofs: Sequence[DofDifference], layout: GearLayout | None = N
     width, height = figure.get_size_inches()
     left = 1.35
     several = len({d.configuration for d in dofs}) > 1
-    ax = figure.add_axes((left / width, 0.5 / height, (share * width - left - 0.2) / width, (height - 0.85) / height))
+    ax = figure.add_axes(
+        (left / width, 0.5 / height, (share * width - left - 0.2) / width, (height - 0.85) / height)
+    )
     at = np.arange(len(keep))
     z = np.array([d.z for d in keep], dtype=float)
     ax.axvspan(0, 2, color="#efefef", lw=0)
@@ -95,18 +117,25 @@ def dof_differences(dofs: Sequence[DofDifference], layout: GearLayout | None = N
             body = body_of(d.dof)
             worst[body] = max(worst.get(body, 0.0), float(np.nan_to_num(d.z)))
         norm, colours = _levels()
-        fills = {b.name: to_hex(colours(norm(worst[b.name]))) if b.name in worst else "#ffffff" for b in layout.bodies}
+        fills = {
+            b.name: to_hex(colours(norm(worst[b.name]))) if b.name in worst else "#ffffff"
+            for b in layout.bodies
+        }
         still = {b.name: Motion(0, 0, 0, ("x", "y", "u")) for b in layout.bodies}
         draw_gear(gear, layout, still, 0.0, fills)
         gear.set_title("Largest per body (white: not measured)")
         for b in layout.bodies:
             if b.name not in worst:
                 continue
-            x, y = {"carrier": (0.71 * b.radius, 0.71 * b.radius), "ring": (0.0, b.radius + 0.18)}.get(b.name, (b.x, b.y))
+            x, y = {"carrier": (0.71 * b.radius, 0.71 * b.radius), "ring": (0.0, b.radius + 0.18)}.get(
+                b.name, (b.x, b.y)
+            )
             gear.text(x, y, f"{worst[b.name]:.1f}", ha="center", va="center", fontsize=7, zorder=6,
                       bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85})  # fmt: skip
         bar = figure.add_axes((share + 0.06, 0.14, 0.87 - share, 0.12 / height))
-        figure.colorbar(ScalarMappable(norm, colours), cax=bar, orientation="horizontal").set_label("shape difference / σ, 1")
+        figure.colorbar(ScalarMappable(norm, colours), cax=bar, orientation="horizontal").set_label(
+            "shape difference / σ, 1"
+        )
     return figure
 
 
@@ -164,5 +193,3 @@ def sigma_axis(ax: Axes, limit: float) -> None:
 def _levels() -> tuple[BoundaryNorm, matplotlib.colors.Colormap]:
     colours = matplotlib.colormaps["OrRd"].with_extremes(bad=LIGHT)
     return BoundaryNorm(LEVELS, colours.N, extend="max"), colours
-
-

@@ -45,7 +45,13 @@ def error_sweeps(sweeps: Sequence[ErrorSweep]) -> Figure:
             factor, unit = prefixed(sweep.minimum, "N/m")
             least = f"{plain(sweep.minimum * factor, 3)} {unit}"
             verdict = f"minimum at {least}" if sweep.identified else "not identified"
-            ax.plot(sweep.values, sweep.error, color=SERIES[i], ls=LINES[i], label=f"{sweep.mode_count} modes: {verdict}")
+            ax.plot(
+                sweep.values,
+                sweep.error,
+                color=SERIES[i],
+                ls=LINES[i],
+                label=f"{sweep.mode_count} modes: {verdict}",
+            )
             at = int(np.nanargmin(sweep.error))
             ax.plot(sweep.values[at], sweep.error[at], MARKERS[i], color=SERIES[i], ms=6,
                     mfc=SERIES[i] if sweep.identified else "white", zorder=4)  # fmt: skip
@@ -69,10 +75,16 @@ def parameter_forest(fit: FitResult) -> Figure:
 
     A hollow marker stands for a parameter that the data do not narrow.
     """
-    held = [p for p in (fit.parameters[n] for n in fit.parameters) if not p.free and np.isfinite(p.prior_std) and p.prior_std > 0]
+    held = [
+        p
+        for p in (fit.parameters[n] for n in fit.parameters)
+        if not p.free and np.isfinite(p.prior_std) and p.prior_std > 0
+    ]
     free = [p for p in fit.parameters.values() if p.free]
     figure = new_figure(1.15 + 0.21 * max(len(held), 2) + 0.17 * len(free))
-    grid = figure.add_gridspec(1, 1, **margins(figure, left=1.85, right=1.75, top=0.35, bottom=0.62 + 0.17 * len(free)))
+    grid = figure.add_gridspec(
+        1, 1, **margins(figure, left=1.85, right=1.75, top=0.35, bottom=0.62 + 0.17 * len(free))
+    )
     ax = figure.add_subplot(grid[0])
     ax.set_title("Fitted parameters against their tolerances")
     ax.axvspan(-2, 2, color="#f0f0f0", lw=0)
@@ -93,7 +105,9 @@ def parameter_forest(fit: FitResult) -> Figure:
     ax.set_ylim(len(held) - 0.4, -0.6)
     ax.set_xlim(-reach, reach)
     ax.grid(False, axis="y")
-    ax.set_xlabel("(value − nominal)/tolerance, 1    bands: ±1 and ±2 tolerances; hollow: not narrowed by the data")
+    ax.set_xlabel(
+        "(value − nominal)/tolerance, 1    bands: ±1 and ±2 tolerances; hollow: not narrowed by the data"
+    )
     ax.xaxis.label.set_fontsize(7)
     height = figure.get_size_inches()[1]
     for k, p in enumerate(free):
@@ -128,7 +142,14 @@ def _profile(ax: Axes, p: ParameterEstimate, first: bool) -> None:
     ax.axvspan(low, high, color="#dfe9f2", lw=0, label="68 % interval")
     if np.isfinite(p.std) and p.std > 0:
         fine = np.linspace(x.min(), x.max(), 120)
-        ax.plot(fine, ((fine / scale - p.value) / p.std) ** 2, "--", color=VERMILLION, lw=0.9, label="normal with this σ")
+        ax.plot(
+            fine,
+            ((fine / scale - p.value) / p.std) ** 2,
+            "--",
+            color=VERMILLION,
+            lw=0.9,
+            label="normal with this σ",
+        )
     ax.plot(x, y, "o-", color=MEASURED, ms=2.4, label="profile")
     ax.axvline(p.value * scale, color=BLACK, lw=0.8, label="estimate")
     ax.set_ylim(0, max(5.0, min(9.0, 1.1 * float(np.nanmax(y)))))
@@ -159,7 +180,15 @@ def correlation_matrix(fit: FitResult) -> Figure:
             for j in range(n):
                 v = float(fit.correlation[i, j])
                 text = "1" if v > 0.995 else f"{v:.2f}".replace("0.", ".").replace("-", "−")
-                ax.text(j, i, text, ha="center", va="center", fontsize=5.6, color="white" if abs(v) > 0.65 else "black")
+                ax.text(
+                    j,
+                    i,
+                    text,
+                    ha="center",
+                    va="center",
+                    fontsize=5.6,
+                    color="white" if abs(v) > 0.65 else "black",
+                )
     bar = figure.add_axes(((left + side + 0.15) / width, bottom / height, 0.14 / width, side / height))
     figure.colorbar(image, cax=bar).set_label("correlation, 1")
     return figure

@@ -34,7 +34,14 @@ def auto_mac_matrix(modal: ModalModel) -> Figure:
     """MAC of the measured modes with each other: large off-diagonal terms mean too few sensors."""
     shapes = np.array([m.shape for m in modal.modes]) if modal.modes else np.empty((0, len(modal.dofs)))
     names = [f"{i + 1}: {m.frequency_hz:.4g}" for i, m in enumerate(modal.modes)]
-    return _matrix(auto_mac(shapes), names, names, "measured mode, Hz", "measured mode, Hz", "Measured modes with each other")
+    return _matrix(
+        auto_mac(shapes),
+        names,
+        names,
+        "measured mode, Hz",
+        "measured mode, Hz",
+        "Measured modes with each other",
+    )
 
 
 @styled
@@ -68,7 +75,9 @@ def _matrix(
         note(ax, "no modes")
         ax.set_axis_off()
         return figure
-    image = ax.imshow(values, cmap="Blues", vmin=0, vmax=1, aspect="auto", origin="lower", interpolation="nearest")
+    image = ax.imshow(
+        values, cmap="Blues", vmin=0, vmax=1, aspect="auto", origin="lower", interpolation="nearest"
+    )
     ax.grid(False)
     for axis, names in ((ax.xaxis, columns), (ax.yaxis, rows)):
         step = -(-len(names) // _LABELS_UP_TO)
@@ -82,7 +91,9 @@ def _matrix(
             for j in range(m):
                 v = values[i, j]
                 text = "–" if not np.isfinite(v) else f"{v:.2f}"[1:] if v < 0.995 else "1"
-                ax.text(j, i, text, ha="center", va="center", fontsize=5.4, color="white" if v > 0.55 else "black")
+                ax.text(
+                    j, i, text, ha="center", va="center", fontsize=5.4, color="white" if v > 0.55 else "black"
+                )
     for i, j in frames:
         ax.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, fill=False, ec=MODEL, lw=1.3))
     bar = figure.add_axes(((left + side_x + 0.15) / width, bottom / height, 0.14 / width, side_y / height))
@@ -151,5 +162,3 @@ def pairing_plot(pairing: Pairing, modal: ModalModel, band_percent: float = 5.0)
     mark_modes(below, [m.frequency_hz for m in modal.modes])
     figure.align_ylabels([ax, below])
     return figure
-
-

@@ -71,7 +71,9 @@ def stabilisation_chart(modal: ModalModel, frfs: FrfSet | None) -> Figure:
     if frfs is not None:
         handles.append(Line2D([], [], color="#8a8a8a", lw=0.8))
         labels.append("CMIF")
-    figure.legend(handles, labels, loc="lower center", ncols=4, frameon=False, handletextpad=0.4, columnspacing=1.4)
+    figure.legend(
+        handles, labels, loc="lower center", ncols=4, frameon=False, handletextpad=0.4, columnspacing=1.4
+    )
     ax.set_ylabel("model order, 1")
     ax.set_title(f"Stabilisation chart: {len(modes)} modes chosen", pad=27)
     mark_modes(ax, modes)
@@ -82,11 +84,15 @@ def stabilisation_chart(modal: ModalModel, frfs: FrfSet | None) -> Figure:
 def modes_overview(modal: ModalModel) -> Figure:
     """Damping ratio against frequency, and what the circle fits say of the frequency, with error bars."""
     figure = new_figure(4.0)
-    grid = figure.add_gridspec(2, 1, hspace=0.16, height_ratios=(1.3, 1), **margins(figure, left=0.8, top=0.62))
+    grid = figure.add_gridspec(
+        2, 1, hspace=0.16, height_ratios=(1.3, 1), **margins(figure, left=0.9, top=0.62)
+    )
     top, bottom = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
     f = np.array([m.frequency_hz for m in modal.modes])
     std = np.array([m.frequency_std_hz for m in modal.modes])
-    z, z_std = (100 * np.array([getattr(m, a) for m in modal.modes]) for a in ("damping_ratio", "damping_std"))
+    z, z_std = (
+        100 * np.array([getattr(m, a) for m in modal.modes]) for a in ("damping_ratio", "damping_std")
+    )
     low, high, log = frequency_range(modal.band_hz, f, modal.frequency_hz)
     top.errorbar(f, z, yerr=_bars(z_std), xerr=_bars(std), fmt=MARKERS[0], color=SERIES[0], capsize=2,
                  label="pole, ±1σ", zorder=3)  # fmt: skip
@@ -99,7 +105,14 @@ def modes_overview(modal: ModalModel) -> Figure:
         deviation_std = np.array([100 * c.natural_frequency_std_hz / m.frequency_hz for m, c in circles])
         damping = np.array([100 * c.damping_ratio for _, c in circles])
         damping_std = np.array([100 * c.damping_std for _, c in circles])
-        style = {"fmt": MARKERS[1], "color": SERIES[1], "ms": 3, "mfc": "none", "elinewidth": 0.5, "zorder": 2}
+        style = {
+            "fmt": MARKERS[1],
+            "color": SERIES[1],
+            "ms": 3,
+            "mfc": "none",
+            "elinewidth": 0.5,
+            "zorder": 2,
+        }
         # beside the pole's marker rather than under it
         beside = at * 1.012 if log else at + 0.006 * (high - low)
         top.errorbar(beside, damping, yerr=_bars(damping_std), label="circle fits of this mode, ±1σ", **style)

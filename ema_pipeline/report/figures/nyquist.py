@@ -60,7 +60,9 @@ def nyquist_sheet(modal: ModalModel, index: int, calibrated: bool = True) -> Fig
         where = grid[k // 2, :] if columns == 1 else grid[k // 2, k % 2]
         _panel(figure.add_subplot(where), circle, mode.frequency_hz, calibrated)
     if circles:
-        entries = {label: h for ax in figure.axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+        entries = {
+            label: h for ax in figure.axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)
+        }
         figure.legend(entries.values(), entries.keys(), loc="upper center", ncols=5, frameon=False, handlelength=1.6,
                       bbox_to_anchor=(0.5, 1 - 0.26 / figure.get_size_inches()[1]), columnspacing=1.4, fontsize=6.5)  # fmt: skip
     return figure
@@ -131,7 +133,16 @@ def _damping_spread(ax: Axes, circle: CircleFit) -> None:
     ax.add_artist(PolyCollection(bars, transform=ax.transAxes, fc="#9ec7e3", ec=MEASURED, lw=0.4, zorder=4))
     mean = left + width * (100 * circle.damping_ratio - low) / (high - low)
     if left <= mean <= left + width:
-        ax.add_artist(Line2D([mean, mean], [bottom, bottom + 1.05 * height], transform=ax.transAxes, color=MODEL, lw=1, zorder=5))
+        ax.add_artist(
+            Line2D(
+                [mean, mean],
+                [bottom, bottom + 1.05 * height],
+                transform=ax.transAxes,
+                color=MODEL,
+                lw=1,
+                zorder=5,
+            )
+        )
     words = {"transform": ax.transAxes, "ha": "center", "fontsize": 5.8, "color": GREY}
     ax.text(left + width / 2, bottom + 1.1 * height, "ζ of all pairs", va="bottom", **words)  # type: ignore[arg-type]
     ax.text(left + width / 2, bottom - 0.015, f"{plain(low, 3)} … {plain(high, 3)} %", va="top", **words)  # type: ignore[arg-type]

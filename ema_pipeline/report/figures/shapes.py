@@ -57,9 +57,19 @@ def gear_shapes(configuration: ConfigurationResults, layout: GearLayout, indices
             continue
         draw_gear(right, layout, motions(layout, pair.model), scale)
         mix = " (mixture of its group)" if pair.combined else ""
-        right.set_title(f"model: {pair.model_frequency_hz:.5g} Hz\n{mix.strip() or 'same scale'}", fontsize=7.2)
+        right.set_title(
+            f"model: {pair.model_frequency_hz:.5g} Hz\n{mix.strip() or 'same scale'}", fontsize=7.2
+        )
     words = "dashed: at rest; solid: moved, exaggerated; spoke: turning, where known"
-    figure.text(0.5, 0.08 / figure.get_size_inches()[1], f"{words}. {lacks}", ha="center", va="bottom", fontsize=6.3, color=GREY)
+    figure.text(
+        0.5,
+        0.08 / figure.get_size_inches()[1],
+        f"{words}. {lacks}",
+        ha="center",
+        va="bottom",
+        fontsize=6.3,
+        color=GREY,
+    )
     return figure
 
 
@@ -88,26 +98,52 @@ def draw_gear(
         if kind == "carrier":
             circle = outline(body)
             ax.add_artist(Polygon(circle, fill=False, ec="#a0a0a0", lw=0.5, ls=(0, (3, 2)), transform=rest))
-            ax.add_artist(Polygon(circle, fill=False, ec="#d9a878" if fills is None else fill, lw=3.2, transform=place))
+            ax.add_artist(
+                Polygon(circle, fill=False, ec="#d9a878" if fills is None else fill, lw=3.2, transform=place)
+            )
             for planet in planets:
-                ax.add_artist(Line2D([0, planet.x], [0, planet.y], color="#d9a878" if fills is None else fill, lw=3.2, transform=place))
+                ax.add_artist(
+                    Line2D(
+                        [0, planet.x],
+                        [0, planet.y],
+                        color="#d9a878" if fills is None else fill,
+                        lw=3.2,
+                        transform=place,
+                    )
+                )
             continue
         teeth = outline(body)
-        ax.add_artist(Polygon(teeth, fill=False, ec="#8a8a8a", lw=0.5, ls=(0, (3, 2)), transform=rest, zorder=1.5))
+        ax.add_artist(
+            Polygon(teeth, fill=False, ec="#8a8a8a", lw=0.5, ls=(0, (3, 2)), transform=rest, zorder=1.5)
+        )
         if kind == "ring":
             angle = np.linspace(0, 2 * np.pi, 121)
             outer = (body.radius + 0.35) * np.column_stack([np.cos(angle), np.sin(angle)])
-            ax.add_artist(Polygon(outer, fc=fill, ec="#333333", lw=0.7, transform=place, zorder=-2, alpha=0.9))
+            ax.add_artist(
+                Polygon(outer, fc=fill, ec="#333333", lw=0.7, transform=place, zorder=-2, alpha=0.9)
+            )
             ax.add_artist(Polygon(teeth, fc="white", ec="#333333", lw=0.7, transform=place, zorder=-1))
         else:
-            ax.add_artist(Polygon(teeth, fc="none" if unknown else fill, ec="#333333", lw=0.7, alpha=0.9, transform=place, zorder=2))
+            ax.add_artist(
+                Polygon(
+                    teeth,
+                    fc="none" if unknown else fill,
+                    ec="#333333",
+                    lw=0.7,
+                    alpha=0.9,
+                    transform=place,
+                    zorder=2,
+                )
+            )
             ax.plot(x, y, "o", color="#333333", ms=1.8, zorder=4)
         if "u" in moved[body.name].missing:
             continue  # a spoke would claim that the body does not turn
         inner = 0.0 if kind != "ring" else body.radius + 0.05
         end = body.radius * 0.9 if kind != "ring" else body.radius + 0.33
         ax.add_artist(Line2D([inner, end], [0, 0], color=MODEL, lw=1.4, transform=place, zorder=4))
-        ax.add_artist(Line2D([inner, end], [0, 0], color="#8a8a8a", lw=0.6, ls=(0, (3, 2)), transform=rest, zorder=3))
+        ax.add_artist(
+            Line2D([inner, end], [0, 0], color="#8a8a8a", lw=0.6, ls=(0, (3, 2)), transform=rest, zorder=3)
+        )
 
 
 @styled
@@ -115,12 +151,16 @@ def stem_shapes(configuration: ConfigurationResults, indices: Sequence[int]) -> 
     """Shapes over the DOFs, grouped by body: real part after the best rotation, with error bars of ±1σ."""
     modal = configuration.modal
     assert modal is not None
-    order = sorted(range(len(modal.dofs)), key=lambda i: (_natural(modal.dofs[i].body), modal.dofs[i].direction))
+    order = sorted(
+        range(len(modal.dofs)), key=lambda i: (_natural(modal.dofs[i].body), modal.dofs[i].direction)
+    )
     names = [modal.dofs[i].point for i in order]
     bodies = [modal.dofs[i].body for i in order]
     at = np.arange(len(names))
     figure = new_figure(0.95 + 1.45 * len(indices))
-    grid = figure.add_gridspec(len(indices), 1, hspace=0.42, **margins(figure, left=0.55, bottom=0.75, top=0.5))
+    grid = figure.add_gridspec(
+        len(indices), 1, hspace=0.42, **margins(figure, left=0.55, bottom=0.75, top=0.5)
+    )
     firsts = [k for k in range(len(bodies)) if k == 0 or bodies[k] != bodies[k - 1]]
     for row, index in enumerate(indices):
         ax = figure.add_subplot(grid[row])
@@ -128,7 +168,9 @@ def stem_shapes(configuration: ConfigurationResults, indices: Sequence[int]) -> 
         value = np.array([pair.measured[n].real for n in names])
         std = np.nan_to_num(np.array([pair.std[n] for n in names]))
         ax.vlines(at, 0, value, color=MEASURED, lw=0.9)
-        ax.errorbar(at, value, yerr=std, fmt="o", ms=2.6, color=MEASURED, elinewidth=0.5, label="measured, ±1σ")
+        ax.errorbar(
+            at, value, yerr=std, fmt="o", ms=2.6, color=MEASURED, elinewidth=0.5, label="measured, ±1σ"
+        )
         if pair.model is not None:
             other = np.array([pair.model.get(n, complex(np.nan)).real for n in names])
             ax.plot(at + 0.2, other, "x", color=MODEL, ms=4, label=f"model, {pair.model_frequency_hz:.5g} Hz")

@@ -1,0 +1,200 @@
+"""Tables for the terminal: they read well at 80 columns, without colour, and where only ASCII can be shown.
+
+Every function returns something for ``rich.console.Console.print``. Colour is never the only cue: rows that
+deserve a look start with ``!``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.table import Table as RichTable
+from rich.text import Text
+
+from ema_pipeline.correlate.types import Comparison, Pairing
+from ema_pipeline.fit.types import FitResult
+from ema_pipeline.ingest.records import Hit
+from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.report import summary, tables
+from ema_pipeline.report.numbers import format_value, plain, words
+from ema_pipeline.report.results import RunResults
+
+_SHORT = 15
+_ASCII = str.maketrans({
+    "±": "+/-", "−": "-", "–": "-", "…": "..", "×": "x", "·": "*", "²": "^2", "³": "^3", "ζ": "zeta", "σ": " sigma",
+    "ε": "epsilon", "χ": "chi", "µ": "u", "←": "<-", "↔": "<->", "≥": ">=", "≤": "<=", "Δ": "D", "θ": "theta", "η": "eta",
+    "“": '"', "”": '"', "’": "'", "°": " deg", "ω": "omega", "Σ": "sum ",
+})  # fmt: skip
+
+
+def modes_table(modal: ModalModel, title: str = "Modes") -> RenderableType:
+    """Frequency, damping, collinearity, votes and remarks of all modes."""
+    source = _pick(tables.modes_table(modal), (0, 1, 2, 5, 6, 7))
+    source = _renamed(source, ("mode", "frequency, Hz", "damping, %", "MPC", "stable", "method"))
+    remarks = [
+        _line(f"mode {i}: {'; '.join(m.flags)}") for i, m in enumerate(modal.modes, start=1) if m.flags
+    ]
+    return Group(_rich(source, title), *remarks)
+
+
+def pairing_table(pairing: Pairing, modal: ModalModel, title: str = "Pairs") -> RenderableType:
+    """Pairs with deviation and MAC, and below them the modes without a partner."""
+    pairs = _pick(tables.pairs_table(pairing, modal), (0, 1, 3, 4, 5, 6, 7))
+    pairs = _renamed(pairs, ("mode", "measured, Hz", "model, Hz", "diff, %", "MAC", "family", "remarks"))
+    parts: list[RenderableType] = [_rich(pairs, title)]
+    lone = tables.unpaired_table(pairing)
+    if lone.rows:
+        parts.append(_rich(lone, "Without a partner"))
+    return Group(*parts)
+
+
+def fit_summary(fit: FitResult) -> RenderableType:
+    """Fitted parameters with their uncertainty and what the data say of each, and the fit's quality."""
+    source = tables.parameters_table(fit)
+    heads = ("parameter", "fitted", "nominal", "shift", "data say")
+    parts: list[RenderableType] = [
+        _rich(_renamed(_pick(source, (0, 1, 3, 4, 5)), heads), "Fitted parameters (±1σ)")
+    ]
+    parts += [_line(f"{words(p.name)}: {p.note}") for p in fit.parameters.values() if p.note]
+    parts += [
+        _line(
+            f"{words(s.parameter)}, {s.configuration}, {s.mode_count} modes: {_sweep_words(s.identified, s.minimum, s.note)}"
+        )
+        for s in fit.sweeps
+    ]
+    parts.append(
+        _line(
+            f"{fit.data_count} data, chi²/dof {plain(fit.chi2_per_dof, 3)}, rms difference {plain(fit.error, 3)} σ, "
+            f"ε {plain(fit.frequency_error, 3)}; {fit.stop_reason}"
+        )
+    )
+    return Group(*parts)
+
+
+def hits_table(hits: Sequence[Hit], title: str = "Hits") -> RenderableType:
+    """How many hits were used, and every rejected hit or channel with its reason."""
+    used = sum(h.accepted for h in hits)
+    head = _line(f"{title}: {used} of {len(hits)} used")
+    source = tables.rejected_hits_table(hits)
+    if not source.rows:
+        return head
+    return Group(head, _rich(source, ""))
+
+
+def verdict_table(hits: Sequence[Hit], title: str = "Verdicts") -> RenderableType:
+    """Every check of every hit, worst value over the channels; a block of columns for each three checks."""
+    source = tables.verdicts_table(hits)
+    fixed, checks = (0, 1, 2, 3), list(range(4, len(source.head)))
+    if len(checks) <= 3:
+        return _rich(source, title)
+    blocks = [_pick(source, (*fixed[:2], *checks[k : k + 3])) for k in range(0, len(checks), 3)]
+    return Group(*(_rich(b, f"{title}, {n} of {len(blocks)}") for n, b in enumerate(blocks, start=1)))
+
+
+def comparison_tables(compared: Comparison) -> RenderableType:
+    """Differences per mode in units of σ, and the worst DOFs and FRF bands."""
+    several = len({m.configuration for m in compared.modes}) > 1
+    columns = ((0,) if several else ()) + (1, 2, 3, 4, 7, 8, 9)
+    heads = (("config",) if several else ()) + (
+        "mode",
+        "measured, Hz",
+        "model, Hz",
+        "freq.",
+        "damping",
+        "MAC",
+        "shape",
+    )
+    parts: list[RenderableType] = [
+        _line(
+            f"Model against measurement: {plain(compared.error, 3)} σ root mean square, ε {plain(compared.frequency_error, 3)}"
+        ),
+        _rich(
+            _renamed(_pick(tables.differences_table(compared), columns), heads),
+            "Per mode, (measured − model)/σ",
+        ),
+    ]
+    if compared.dofs:
+        parts.append(_rich(tables.worst_dofs_table(compared), "DOFs that differ most"))
+    if compared.bands:
+        parts.append(_rich(tables.worst_bands_table(compared), "FRF bands that differ most"))
+    return Group(*parts)
+
+
+def run_summary(results: RunResults) -> RenderableType:
+    """The run in a few sentences: findings, stiffnesses, and what to be careful about."""
+    parts: list[RenderableType] = [_line(line) for line in summary.findings(results)]
+    if results.fit is not None:
+        parts += [
+            _line(f"{words(p.name)} = {format_value(p.value, p.std, p.unit)}, {summary.identified_words(p)}")
+            for p in summary.stiffnesses(results.fit)
+        ]
+    cautions = summary.cautions(results)
+    if cautions:
+        parts += [_line(""), _line("Be careful about:"), *(_line(f"! {c}") for c in cautions)]
+    return Group(*parts)
+
+
+class Safe:
+    """A renderable that shows ± as +/- and so on where the console cannot encode them."""
+
+    def __init__(self, build: RichTable | Text, plain_build: RichTable | Text) -> None:
+        self._unicode, self._ascii = build, plain_build
+
+    def __rich_console__(self, console: Console, options: object) -> Collection[RenderableType]:
+        ascii_only = not (console.encoding or "").lower().replace("-", "").startswith("utf")
+        return [self._ascii if ascii_only else self._unicode]
+
+
+def _sweep_words(identified: bool, minimum: float, note: str) -> str:
+    if identified:
+        return f"minimum of ε at {format_value(minimum, float('nan'), 'N/m')}"
+    return f"not identified ({note})" if note else "not identified"
+
+
+def _line(text: str) -> Safe:
+    return Safe(Text(text), Text(text.translate(_ASCII)))
+
+
+def _pick(source: tables.Table, columns: Sequence[int]) -> tables.Table:
+    """Some columns of a table."""
+    return tables.Table(
+        tuple(source.head[c] for c in columns),
+        tuple(tables.Row(tuple(r.cells[c] for c in columns), r.alert) for r in source.rows),
+        frozenset(k for k, c in enumerate(columns) if c in source.numeric),
+    )
+
+
+def _renamed(source: tables.Table, head: tuple[str, ...]) -> tables.Table:
+    """The same table with heads short enough for 80 columns."""
+    return tables.Table(head, source.rows, source.numeric)
+
+
+def _rich(source: tables.Table, title: str) -> Safe:
+    return Safe(_build(source, title, str), _build(source, title, lambda s: s.translate(_ASCII)))
+
+
+def _build(source: tables.Table, title: str, clean: object) -> RichTable:
+    assert callable(clean)
+    # a column of remarks that nobody made is only noise
+    kept = [k for k in range(len(source.head)) if not source.rows or any(r.cells[k] for r in source.rows)]
+    table = RichTable(
+        title=Text(clean(title), style="bold") if title else None, title_justify="left", box=box.SIMPLE_HEAD, safe_box=True,
+        show_edge=False, pad_edge=False, padding=(0, 1, 0, 0),
+    )  # fmt: skip
+    table.add_column("", width=1, no_wrap=True)
+    for k in kept:
+        numeric = k in source.numeric
+        # numbers and short words are never broken over lines
+        short = max((len(r.cells[k]) for r in source.rows), default=0) <= _SHORT
+        value = any(r.cells[k][:1].isdigit() and "±" in r.cells[k] for r in source.rows)
+        table.add_column(
+            Text(clean(source.head[k])),
+            justify="right" if numeric else "left",
+            no_wrap=numeric or value or short,
+        )
+    for row in source.rows:
+        cells = [Text(clean(row.cells[k])) for k in kept]
+        table.add_row(Text("!" if row.alert else " "), *cells, style="bold yellow" if row.alert else None)
+    return table
