@@ -212,15 +212,13 @@ def _fit_sweep(
         trial[0] = np.clip(trial[0], *bounds)
         trial[1] = np.clip(trial[1], np.log(_SMALLEST_DAMPING), 0.0)
         x_trial, error_trial, cost_trial = misfit(trial)
+        done = np.max(np.abs(trial - p)) < 1e-9
         if cost_trial <= cost:
-            done = np.max(np.abs(trial - p)) < 1e-12
             p, x, error, cost, damping = trial, x_trial, error_trial, cost_trial, damping * 0.1
-            if done:
-                break
         else:
             damping *= 10
-            if damping > 1e8:
-                break
+        if done:
+            break
     return float(np.exp(p[0])), float(np.exp(p[1])), float(p[2])
 
 

@@ -70,15 +70,13 @@ def geometric_circle(points: NDArray[np.complex128], weights: NDArray[np.float64
         step = np.linalg.solve(normal + damping * np.eye(2) * np.trace(normal), gradient)
         trial = centre + complex(step[0], step[1])
         trial_cost = _cost(points, weights, trial)
+        done = abs(trial - centre) < 1e-10 * radius
         if trial_cost <= cost:
-            done = abs(trial - centre) < 1e-12 * radius
             centre, cost, damping = trial, trial_cost, damping * 0.1
-            if done:
-                break
         else:
             damping *= 10
-            if damping > 1e6:
-                break
+        if done:
+            break
     return centre, float(np.sum(weights * np.abs(points - centre)))
 
 

@@ -29,6 +29,9 @@ from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.types import CircleFit, ModalModel, Mode, StabilisationChart
 
 _ALTERNATIONS = 50
+_NOISE_LINES = 51  # over which the noise of the indicator is taken
+_VAGUE = 0.25  # a damping ratio less certain than this does not make a mode
+_OVER_NOISE = 10.0  # a peak stands so much over it, in power
 
 
 def identify_by_circle(frfs: FrfSet, settings: CircleSettings | None = None) -> ModalModel:
@@ -56,14 +59,16 @@ def identify_by_circle(frfs: FrfSet, settings: CircleSettings | None = None) -> 
         raise EmaError("circle fit: no measured FRF; check impacts and channels in test.toml")
     targets = find_peak_targets(data, frfs.band_hz, settings)
     kept: list[tuple[Target, list[CircleFit]]] = []
-    for _ in range(2):  # the second time with widths from circles in place of widths of peaks
+    # first by themselves, to find their widths; then with those, and the neighbours taken off if so set
+    for pass_ in (settings.model_copy(update={"remove_neighbours": False}), settings):
         kept = []
-        for target, found in zip(targets, fit_targets(data, targets, settings), strict=True):
+        for target, found in zip(targets, fit_targets(data, targets, pass_), strict=True):
             circles = [
                 (row, c)
                 for row, c in found
                 if c.residual < settings.maximum_residual
                 and c.damping_ratio < settings.maximum_damping_ratio
+                and c.damping_std < _VAGUE * c.damping_ratio
                 and c.frequency_hz[0] < c.natural_frequency_hz < c.frequency_hz[-1]
             ]
             if 2 * len(circles) <= len(found):
@@ -93,16 +98,20 @@ def find_peak_targets(
     """Peaks of the sum of |mobility|² over all FRFs, each over its own mean in the band."""
     inside = (data.frequency_hz >= band_hz[0]) & (data.frequency_hz <= band_hz[1])
     f = data.frequency_hz[inside]
-    power = np.abs(data.mobility[:, inside]) ** 2
-    power = power[np.mean(power, axis=1) > 0]
+    mobility = data.mobility[:, inside]
+    mobility = mobility[np.median(np.abs(mobility), axis=1) > 0]
+    power = np.abs(mobility) ** 2
     if f.size < 2 * settings.minimum_points or power.size == 0:
         return []
     # by the median, not the mean: else one strong mode would hide the others of its FRF
-    indicator = np.sum(power / np.median(power, axis=1, keepdims=True), axis=0)
+    usual = np.median(power, axis=1, keepdims=True)
+    indicator = np.sum(power / usual, axis=0)
+    # what changes from line to line is noise: the resonances are smooth over most lines
+    rough = np.abs(np.diff(mobility, n=2, axis=1)) ** 2 / 6
+    floor = median_filter(np.pad(np.sum(rough / usual, axis=0), 1, mode="edge"), size=_NOISE_LINES)
     level = 10 * np.log10(np.maximum(indicator, indicator.max() * 1e-30))
-    # the ripple of noise sets how much a peak must rise
-    ripple = 1.4826 * np.median(np.abs(level - median_filter(level, size=5)))
-    peaks, _ = find_peaks(level, prominence=max(settings.peak_prominence_db, 6 * ripple))
+    peaks, _ = find_peaks(level, prominence=settings.peak_prominence_db)
+    peaks = peaks[indicator[peaks] > _OVER_NOISE * floor[peaks]]
     spacing = f[1] - f[0]
     widths = peak_widths(indicator, peaks, rel_height=0.5)[0] * spacing if peaks.size else []
     return [
@@ -245,9 +254,9 @@ def _shape(
     if dofs is not inputs:
         errors |= dict(zip(outputs, by_output, strict=True))
     shape_std = np.array([errors[d] for d in dofs])
-    if scaled:
-        return shape, shape_std
     largest = shape[np.nanargmax(np.abs(shape))]
+    if scaled:
+        return (shape if largest.real >= 0 else -shape), shape_std
     return shape / largest, shape_std / abs(largest)
 
 

@@ -39,7 +39,7 @@ class CircleSettings(Settings):
         default=0.04, ge=0, description="relative disagreement in damping always allowed"
     )
     peak_prominence_db: float = Field(
-        default=6.0, gt=0, description="engine 'circle': a peak of the mode indicator rises by so much, dB"
+        default=2.0, gt=0, description="engine 'circle': a peak of the mode indicator rises by so much, dB"
     )
     maximum_damping_ratio: float = Field(
         default=0.2, gt=0, lt=1, description="engine 'circle': modes damped more than this are left out"
