@@ -24,7 +24,7 @@ class HitSettings(Settings):
     minimum_spacing_s: float = Field(
         default=0.1,
         gt=0,
-        description="Blows closer together are one hit (a double hit), s; also a quarter of the usual spacing",
+        description="Blows closer than this (s), or than a quarter of their spacing, are one hit",
     )
     pre_trigger_s: float = Field(
         default=0.01, ge=0, description="Time before the peak that is kept when a recording is cut, s"

@@ -27,10 +27,10 @@ MINIMUM_GUARD = 8
 def find_hits(record: Record, settings: HitSettings | None = None) -> tuple[Hit, ...]:
     """Find the hits of a record.
 
-    The threshold is the larger of `trigger_level` of the largest blow and `trigger_noise` times the noise,
-    both taken from the record itself, so that offset, unit and polarity of the hammer channel do not matter.
-    Blows that follow each other within `minimum_spacing_s`, or within a quarter of the median spacing, are one
-    hit (`check_hit` then finds the second impact).
+    The threshold is the larger of `trigger_level` of the largest blow and `trigger_noise` times the
+    noise, both taken from the record itself, so that offset, unit and polarity of the hammer channel do not
+    matter. Blows that follow each other within `minimum_spacing_s`, or within a quarter of the median
+    spacing, are one hit (`check_hit` then finds the second impact).
 
     Parameters
     ----------
@@ -59,12 +59,13 @@ def find_hits(record: Record, settings: HitSettings | None = None) -> tuple[Hit,
     if height == 0 or height < settings.trigger_noise * noise:
         raise EmaError(
             f"{record.file}: no hit found on hammer channel '{record.force_name}': its largest deviation is "
-            f"{height:.3g}, its noise {noise:.3g}; check the hammer's cable and sensitivity, or leave the file out"
+            f"{height:.3g}, its noise {noise:.3g}; "
+            "check the hammer's cable and sensitivity, or leave the file out"
         )
     threshold = max(settings.trigger_level * height, settings.trigger_noise * noise)
     spacing = max(int(settings.minimum_spacing_s * rate), 10)
     # Drift of the amplifier can exceed the threshold without any blow: only what is short counts.
-    short = white_tophat(sign * deviation, size=max(int(LONGEST_PULSE_S * rate), 9))
+    short = white_tophat(sign * deviation, size=(max(int(LONGEST_PULSE_S * rate), 9),))
     peaks = _group(_blows(short, threshold), short, spacing)
     if len(peaks) > 2:
         peaks = _group(peaks, short, max(spacing, int(0.25 * float(np.median(np.diff(peaks))))))
@@ -89,12 +90,12 @@ def find_hits(record: Record, settings: HitSettings | None = None) -> tuple[Hit,
 
 
 def align_hits(
-    hits: Sequence[Hit], sample_rate_hz: float, settings: HitSettings | None = None
+    hits: Sequence[Hit], records: Sequence[Record], settings: HitSettings | None = None
 ) -> tuple[Hit, ...]:
     """Give all hits of a test one length, so that their FRFs share a frequency axis.
 
-    Hits that are equally long already stay as they are. Otherwise the common length is the one that keeps most
-    time in all, number of hits × length, while every impact point keeps a hit; it is rounded down to a
+    Hits that are equally long already stay as they are. Otherwise the common length is the one that keeps
+    most time in all, number of hits × length, while every impact point keeps a hit; it is rounded down to a
     length that is fast to transform. A hit with less room than that is rejected, with a verdict. Check hits
     (`check_hit`) after this, since a cut may leave responses that have not decayed.
 
@@ -102,7 +103,8 @@ def align_hits(
     ----------
     hits : sequence of Hit
         All hits of one configuration, as `find_hits` returned them.
-    sample_rate_hz : float
+    records : sequence of Record
+        The records of that configuration; only the first one's sample rate is used.
     settings : HitSettings, optional
 
     Returns
@@ -113,7 +115,8 @@ def align_hits(
     settings = settings or HitSettings()
     if len({h.stop - h.start for h in hits}) <= 1:
         return tuple(hits)
-    guard = _guard(sample_rate_hz, settings)
+    rate = records[0].sample_rate_hz
+    guard = _guard(rate, settings)
     starts = [max(h.start, h.peak - guard) for h in hits]
     room = np.array([h.stop - start for h, start in zip(hits, starts, strict=True)])
     longest: dict[str, int] = defaultdict(int)
@@ -123,13 +126,13 @@ def align_hits(
     best = max(allowed, key=lambda length: int(length) * int(np.sum(room >= length)))
     length = _fast_length_below(int(best))
     return tuple(
-        _with_length(hit, start, int(space), length, sample_rate_hz)
+        _with_length(hit, start, int(space), length, rate)
         for hit, start, space in zip(hits, starts, room, strict=True)
     )
 
 
 def trim_hits(
-    hits: Sequence[Hit], forces: Iterable[NDArray[np.float64]], settings: HitSettings | None = None
+    hits: Sequence[Hit], records: Iterable[Record], settings: HitSettings | None = None
 ) -> tuple[Hit, ...]:
     """Let the hits of a test start at their force pulse where responses have not decayed at the end.
 
@@ -144,8 +147,8 @@ def trim_hits(
     ----------
     hits : sequence of Hit
         All hits of one configuration, checked.
-    forces : iterable of ndarray (n_samples,)
-        Force of each hit's record, in the order of `hits`.
+    records : iterable of Record
+        Their records.
     settings : HitSettings, optional
 
     Returns
@@ -159,10 +162,13 @@ def trim_hits(
     )
     if settings.trim == "none" or not undecayed:
         return tuple(hits)
-    starts = [
-        hit.start + _onset(force[hit.start : hit.stop], hit.peak - hit.start)
-        for hit, force in zip(hits, forces, strict=True)
-    ]
+    onset = {
+        (hit.file, hit.number): hit.start + _onset(record.force[hit.start : hit.stop], hit.peak - hit.start)
+        for record in records
+        for hit in hits
+        if hit.file == record.file
+    }
+    starts = [onset[h.file, h.number] for h in hits]
     kept = [h.stop - s for h, s in zip(hits, starts, strict=True) if h.accepted]
     length = _fast_length_below(min(kept))
     return tuple(

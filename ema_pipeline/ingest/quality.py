@@ -58,9 +58,9 @@ def hits_of_test(records: Sequence[Record], settings: HitSettings | None = None)
         owner += [index] * len(hits)
     if not found:
         return ()
-    aligned = align_hits(found, records[0].sample_rate_hz, settings)
+    aligned = align_hits(found, records, settings)
     checked = [check_hit(records[i], hit, settings) for i, hit in zip(owner, aligned, strict=True)]
-    return trim_hits(checked, (records[i].force for i in owner), settings)
+    return trim_hits(checked, records, settings)
 
 
 def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> Hit:
@@ -81,16 +81,14 @@ def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> 
     settings = settings or HitSettings()
     force = record.force[hit.start : hit.stop]
     pulse = find_pulse(force, hit.peak - hit.start)
-    rate = record.sample_rate_hz
+    rate, name = record.sample_rate_hz, record.force_name
     verdicts = [
         *hit.verdicts,
         _double_hit(force, pulse, rate, settings),
-        _overload(
-            force, record.force_full_scale, record.force_name, "reject_hit", pulse.peak, rate, settings
-        ),
-        _flat_top(force, record.force_name, "reject_hit"),
-        _force_level(force, pulse, record.force_name, settings),
-        _force_spectrum(force, pulse, rate, record.force_name, settings),
+        _overload(force, record.force_full_scale, name, "reject_hit", pulse.peak, rate, settings),
+        _flat_top(force, name, "reject_hit"),
+        _force_level(force, pulse, name, settings),
+        _force_spectrum(force, pulse, rate, name, settings),
     ]
     # Before the first hit of a record the structure is at rest: what is there is noise and hum.
     rest = pulse.start if hit.start == 0 and hit.number == 0 else 0
@@ -221,7 +219,8 @@ def _force_spectrum(
         channel=name,
         message=""
         if passes
-        else f"force within {settings.force_drop_db:.0f} dB up to {band:.4g} Hz; {top_db:.0f} dB at {wanted:.4g} Hz",
+        else f"force within {settings.force_drop_db:.0f} dB up to {band:.4g} Hz; "
+        f"{top_db:.0f} dB at {wanted:.4g} Hz",
     )
 
 
@@ -326,8 +325,8 @@ def _decay(
 ) -> Verdict:
     """Response at the end of the record over its largest, noise and hum taken off.
 
-    Both are rms over a twentieth of the record. What the channel shows before the blow (or, in the middle of a
-    recording, its broadband noise) is no response. A channel that shows nothing but noise has decayed.
+    Both are rms over a twentieth of the record. What the channel shows before the blow (or, in the middle
+    of a recording, its broadband noise) is no response. A channel that shows nothing but noise has decayed.
     """
     length = max(samples.size // 20, 8)
     quiet = float(np.std(samples[:rest])) if rest >= 32 else noise_of(samples)

@@ -1,0 +1,309 @@
+"""Hits to FRFs in one pass: spectra are accumulated, no hit is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import rfft
+from scipy.ndimage import uniform_filter1d
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.errors import EmaError
+from ema_pipeline.frf.checks import check_frfs
+from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.frf.windows import Windows, decay_rate
+from ema_pipeline.ingest.records import HitSamples
+
+BLOCK = 4
+"""Channels transformed at a time: their spectra stay in the processor's cache."""
+
+BAND_OVER_RATE = 1 / 2.56
+"""Converters' anti-alias filters are flat up to the sample rate over 2.56."""
+
+
+def estimate_frfs(hits: Iterable[HitSamples], settings: FrfSettings | None = None) -> FrfSet:
+    """Estimate FRFs, coherence and variance from hits.
+
+    With F the force and Y the response spectra (rectangular window unless set otherwise) and sums over hits,
+    H1 = ΣYF*/Σ|F|², H2 = Σ|Y|²/ΣFY*, Hv their geometric mean with the phase of H1; coherence
+    γ² = |ΣYF*|²/(Σ|F|² Σ|Y|²) [1]_.
+
+    Variance of H1: given the forces, H1 is the least-squares slope of Y on F. The residual
+    R = Σ|Y - H1·F|² = Σ|Y|²(1 - γ²) of n hits has n - 1 complex degrees of freedom, so that R/(n - 1) is
+    unbiased for the noise power and E|H - E H|² = R/((n - 1) Σ|F|²), that is |H|²(1 - γ²)/((n - 1) γ²); [1]_ has n in
+    place of n - 1. A single line gives it but 2(n - 1) real degrees of freedom; the noise power R is
+    therefore averaged over neighbouring lines, as few as give `variance_dof` complex degrees of freedom.
+    For H2 and Hv the relative variance of H1 is taken.
+
+    The band runs from the first line up to where the force autospectrum (median over 1/256 of the lines)
+    first falls `band_drop_db` below its largest, for the weakest of all inputs, and at most to the sample
+    rate over 2.56.
+
+    Parameters
+    ----------
+    hits : iterable of HitSamples
+        Accepted hits of one configuration, gone through once, one at a time.
+    settings : FrfSettings, optional
+
+    Returns
+    -------
+    FrfSet
+        Outputs and inputs in order of appearance, pairs that were not measured NaN.
+
+    Raises
+    ------
+    EmaError
+        Where there is no hit; where hits differ in length, sample rate, calibration or in the quantity of
+        one output; where two channels of a hit measure one DOF; where a force is zero throughout.
+
+    References
+    ----------
+    .. [1] J. S. Bendat and A. G. Piersol, Random Data: Analysis and Measurement Procedures, 4th ed.,
+       Wiley, 2010, sections 6.1, 9.2.
+    """
+    settings = settings or FrfSettings()
+    total = _Total()
+    with ThreadPoolExecutor(settings.threads) as pool:
+        for hit in hits:
+            _accumulate(total.sheet_of(hit), hit, Windows(hit, settings), pool)
+        first = total.first
+        if first is None:
+            raise EmaError("no accepted hit: there is nothing to estimate FRFs from; see the hits' verdicts")
+        frfs = _finish(total, first, settings, pool)
+    return replace(frfs, verdicts=check_frfs(frfs, settings))
+
+
+@dataclass
+class _Sheet:
+    """Sums over all hits on one point in which the same channels were used."""
+
+    impact: str
+    outputs: tuple[str, ...]
+    cross: NDArray[np.complex128]
+    auto: NDArray[np.float64]
+    force: NDArray[np.float64]
+    hits: int = 0
+
+
+@dataclass
+class _Total:
+    """All sheets, and what must be equal in all hits."""
+
+    sheets: dict[tuple[str, tuple[str, ...]], _Sheet] = field(default_factory=dict)
+    outputs: dict[str, Dof] = field(default_factory=dict)
+    inputs: dict[str, Dof] = field(default_factory=dict)
+    quantities: dict[str, str] = field(default_factory=dict)
+    masses: dict[str, float] = field(default_factory=dict)
+    delays: dict[str, list[float]] = field(default_factory=dict)
+    first: HitSamples | None = None
+
+    def sheet_of(self, hit: HitSamples) -> _Sheet:
+        """The sheet that a hit goes to, new where needed."""
+        where = f"{hit.hit.file}, hit {hit.hit.number}"
+        self._check(hit, where)
+        if self.first is None:
+            # Only its length, rate and calibration are needed: the samples must not be held.
+            self.first = replace(hit, responses=np.empty((0, 0)), channels=())
+        points = tuple(c.dof.point for c in hit.channels)
+        if len(set(points)) < len(points):
+            twice = next(p for p in points if points.count(p) > 1)
+            names = [c.name for c in hit.channels if c.dof.point == twice]
+            raise EmaError(
+                f"{where}: channels '{names[0]}' and '{names[1]}' both measure {twice}; correct a dof"
+            )
+        for channel in hit.channels:
+            point = channel.dof.point
+            known = self.quantities.setdefault(point, channel.quantity)
+            if known != channel.quantity:
+                raise EmaError(
+                    f"{where}: channel '{channel.name}' measures {channel.quantity} at {point}, other hits "
+                    f"{known}; put them into separate tests"
+                )
+            self.outputs.setdefault(point, replace(channel.dof, sign=1))
+            self.masses[point] = max(self.masses.get(point, 0.0), channel.sensor_mass_kg)
+        impact = hit.hit.impact
+        self.inputs.setdefault(impact.point, replace(impact, sign=1))
+        self.delays.setdefault(impact.point, []).append((hit.hit.peak - hit.hit.start) / hit.sample_rate_hz)
+        key = (impact.point, points)
+        if key not in self.sheets:
+            lines = hit.force.size // 2 + 1
+            self.sheets[key] = _Sheet(
+                impact.point,
+                points,
+                np.zeros((len(points), lines), dtype=np.complex128),
+                np.zeros((len(points), lines)),
+                np.zeros(lines),
+            )
+        return self.sheets[key]
+
+    def _check(self, hit: HitSamples, where: str) -> None:
+        first = self.first
+        if first is None:
+            return
+        if hit.force.size != first.force.size:
+            raise EmaError(
+                f"{where}: {hit.force.size} samples, but {first.force.size} in '{first.hit.file}'; "
+                "hits of one configuration must be equally long"
+            )
+        if hit.sample_rate_hz != first.sample_rate_hz:
+            raise EmaError(
+                f"{where}: sample rate {hit.sample_rate_hz:.10g} Hz, but {first.sample_rate_hz:.10g} Hz in "
+                f"'{first.hit.file}'; put them into separate tests"
+            )
+        if hit.force_calibrated != first.force_calibrated:
+            raise EmaError(
+                f"{where}: the hammer is calibrated in only one of this and '{first.hit.file}'; "
+                "state its sensitivity"
+            )
+
+
+def _accumulate(sheet: _Sheet, hit: HitSamples, windows: Windows, pool: ThreadPoolExecutor) -> None:
+    """Add one hit to the sums; blocks of channels go to the threads."""
+    spectrum = np.asarray(rfft(windows.force(hit.force)))
+    power = spectrum.real**2 + spectrum.imag**2
+    if not power[1:].any():
+        raise EmaError(f"{hit.hit.file}, hit {hit.hit.number}: the force is constant; leave the hit out")
+    sheet.force += power
+    sheet.hits += 1
+    conjugate = np.conj(spectrum) * hit.hit.impact.sign
+    signs = np.array([float(c.dof.sign) for c in hit.channels])
+
+    def add(start: int) -> None:
+        rows = slice(start, min(start + BLOCK, signs.size))
+        response = np.asarray(rfft(windows.responses(hit.responses[rows]), axis=-1))
+        product = response * conjugate
+        if (signs[rows] < 0).any():
+            product *= signs[rows, None]
+        sheet.cross[rows] += product
+        parts = response.view(np.float64)
+        np.multiply(parts, parts, out=parts)
+        sheet.auto[rows] += parts[:, 0::2]
+        sheet.auto[rows] += parts[:, 1::2]
+
+    list(pool.map(add, range(0, signs.size, BLOCK)))
+
+
+def _finish(total: _Total, first: HitSamples, settings: FrfSettings, pool: ThreadPoolExecutor) -> FrfSet:
+    """Sums to FRFs, in the sums' own memory where all hits share one sheet."""
+    outputs, inputs = list(total.outputs), list(total.inputs)
+    n_samples, rate = first.force.size, first.sample_rate_hz
+    frequency = np.asarray(np.fft.rfftfreq(n_samples, 1 / rate), dtype=np.float64)
+    shape = (len(outputs), len(inputs), frequency.size)
+    hits = np.zeros(shape[:2], dtype=np.int64)
+    forces = _forces(total, inputs)
+    if len(total.sheets) == 1:
+        _, sheet = total.sheets.popitem()
+        cross, auto = sheet.cross[:, None, :], sheet.auto[:, None, :]
+        hits[:] = sheet.hits
+        force = {(0, 0): sheet.force}
+        shared = True
+    else:
+        cross, auto = np.zeros(shape, dtype=np.complex128), np.zeros(shape)
+        force = {}
+        shared = False
+        while total.sheets:
+            _, sheet = total.sheets.popitem()
+            i = inputs.index(sheet.impact)
+            for row, point in enumerate(sheet.outputs):
+                o = outputs.index(point)
+                cross[o, i] += sheet.cross[row]
+                auto[o, i] += sheet.auto[row]
+                hits[o, i] += sheet.hits
+                # Outputs share the force sum of their sheet until a second sheet adds its own.
+                force[o, i] = force[o, i] + sheet.force if (o, i) in force else sheet.force
+    variance = np.empty(shape)
+
+    def finish(output: int) -> None:
+        for i in range(len(inputs)):
+            key = (0, 0) if shared else (output, i)
+            _finish_one(
+                cross[output, i],
+                auto[output, i],
+                variance[output, i],
+                force.get(key),
+                int(hits[output, i]),
+                settings,
+            )
+
+    list(pool.map(finish, range(len(outputs))))
+    return FrfSet(
+        frequency_hz=frequency,
+        frf=cross,
+        coherence=auto,
+        variance=variance,
+        outputs=tuple(total.outputs.values()),
+        inputs=tuple(total.inputs.values()),
+        quantities=tuple(total.quantities[p] for p in outputs),
+        hits=hits,
+        estimator=settings.estimator,
+        record_s=float(n_samples / rate),
+        response_decay_rad_s=decay_rate(settings, n_samples / rate),
+        delay_s=np.array([float(np.mean(total.delays[p])) for p in inputs]),
+        band_hz=_band(forces, frequency, rate, settings.band_drop_db),
+        force_calibrated=first.force_calibrated,
+        sensor_mass_kg=np.array([total.masses[p] for p in outputs]),
+    )
+
+
+def _finish_one(
+    cross: NDArray[np.complex128],
+    auto: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    force: NDArray[np.float64] | None,
+    n: int,
+    settings: FrfSettings,
+) -> None:
+    """Turn, in place, the cross sum into the FRF and the auto sum into the coherence; fill the variance."""
+    if force is None or n == 0:
+        cross[:] = complex(np.nan, np.nan)
+        auto[:] = variance[:] = np.nan
+        return
+    # A line without force carries nothing; its FRF comes out as 0, not as NaN.
+    inverse = 1.0 / np.maximum(force, np.finfo(float).tiny / np.finfo(float).eps)
+    explained = (cross.real**2 + cross.imag**2) * inverse
+    coherence = np.divide(explained, auto, out=np.zeros_like(auto), where=auto > 0).clip(max=1.0)
+    if n > 1:
+        noise = (auto - explained).clip(min=0.0)
+        noise *= 1.0 / (n - 1)
+        lines = min(2 * (-(-settings.variance_dof // (n - 1)) // 2) + 1, noise.size)
+        # Line 0 carries the sensors' offsets, which are no noise of its neighbours.
+        noise[0] = noise[1]
+        uniform_filter1d(noise, lines, output=noise, mode="nearest")
+        np.multiply(noise, inverse, out=variance)
+    else:
+        variance[:] = np.nan
+    cross *= inverse
+    if settings.estimator != "H1":
+        power = 1.0 if settings.estimator == "H2" else 0.5
+        # H2 = H1/γ², Hv = H1/γ; a line without coherence has no H2: 0 there, as its H1 is.
+        gain = np.divide(1.0, coherence**power, out=np.zeros_like(coherence), where=coherence > 1e-12)
+        cross *= gain
+        variance *= gain**2
+    auto[:] = coherence if n > 1 else np.nan
+
+
+def _forces(total: _Total, inputs: list[str]) -> list[NDArray[np.float64]]:
+    """Force autospectrum of each input, summed over its sheets."""
+    return [np.sum([s.force for s in total.sheets.values() if s.impact == point], axis=0) for point in inputs]
+
+
+def _band(
+    forces: list[NDArray[np.float64]], frequency: NDArray[np.float64], rate: float, drop_db: float
+) -> tuple[float, float]:
+    """Band in which the force of every input carried enough energy."""
+    width = max(frequency.size // 256, 1)
+    high = rate * BAND_OVER_RATE
+    for force in forces:
+        # Line 0 is the offset. Medians over blocks are deaf to hum and drift lines.
+        count = (force.size - 1) // width
+        level = np.median(force[1 : 1 + count * width].reshape(count, width), axis=1)
+        top = int(np.argmax(level))
+        low = np.flatnonzero(level[top:] < level[top] * 10 ** (-drop_db / 10))
+        if low.size:
+            high = min(high, float(frequency[max(1 + (top + int(low[0])) * width, 2)]))
+    return float(frequency[1]), float(high)

@@ -1,0 +1,45 @@
+"""Settings of FRF estimation and of the checks on FRFs."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from ema_pipeline.settings import Settings
+
+
+class FrfSettings(Settings):
+    """How FRFs are estimated from hits, and when they are called good."""
+
+    estimator: Literal["H1", "H2", "Hv"] = Field(
+        default="H1", description="H1: noise on the responses; H2: on the force; Hv: on both"
+    )
+    force_window: Literal["none", "auto"] = Field(
+        default="none", description="auto: cosine-tapered window about the force pulse"
+    )
+    exponential_window: Literal["none", "auto"] | Annotated[float, Field(ge=0)] = Field(
+        default="none",
+        description="Decay rate of the window on force and responses, rad/s; auto: down to 1 % at the end",
+    )
+    variance_dof: int = Field(
+        default=16,
+        ge=1,
+        description="Degrees of freedom that the variance is smoothed to, (hits - 1) × neighbouring lines",
+    )
+    band_drop_db: float = Field(
+        default=20.0, gt=0, description="Drop of the force autospectrum that ends the band, dB"
+    )
+    threads: int = Field(default=2, ge=1, description="Threads over blocks of channels")
+    minimum_coherence: float = Field(
+        default=0.9, gt=0, lt=1, description="Coherence, weighted with the FRF's power, from 3 hits on"
+    )
+    negative_driving_point: float = Field(
+        default=0.1, gt=0, lt=1, description="Share of a driving point's imaginary part with the wrong sign"
+    )
+    reciprocity: float = Field(
+        default=0.15, gt=0, description="Difference of two reciprocal FRFs over their size"
+    )
+    repeatability: float = Field(
+        default=0.1, gt=0, description="Scatter of single hits' FRFs over their size, from 2 hits on"
+    )

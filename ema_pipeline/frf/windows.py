@@ -1,0 +1,94 @@
+"""Windows for hammer tests: about the force pulse, and an exponential one on force and responses alike."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.ingest.pulse import find_pulse
+from ema_pipeline.ingest.records import HitSamples
+
+AUTO_END = 0.01
+"""Value of the automatic exponential window at the end of the record."""
+
+MINIMUM_REST = 8
+"""Samples before the pulse that a baseline is taken from."""
+
+
+def decay_rate(settings: FrfSettings, record_s: float) -> float:
+    """Decay rate σ of the exponential window, rad/s; 0 for none."""
+    if settings.exponential_window == "none":
+        return 0.0
+    if settings.exponential_window == "auto":
+        return float(-np.log(AUTO_END) / record_s)
+    return float(settings.exponential_window)
+
+
+def force_window(force: NDArray[np.float64], peak: int) -> NDArray[np.float64]:
+    """Window of 1 over the pulse, with cosine tapers outside it, 0 beyond.
+
+    Parameters
+    ----------
+    force : ndarray, (n_samples,)
+    peak : int
+        Sample of the peak.
+
+    Returns
+    -------
+    ndarray, (n_samples,)
+    """
+    pulse = find_pulse(force, peak)
+    # The anti-alias filter's ringing belongs to the pulse: it shapes force and response alike.
+    margin = int(2 * pulse.width) + 8
+    taper = 2 * margin
+    place = np.arange(force.size)
+    outside = np.maximum(pulse.start - margin - place, place - (pulse.stop - 1 + margin)).clip(0, taper)
+    return np.asarray(0.5 * (1 + np.cos(np.pi * outside / taper)))
+
+
+class Windows:
+    """The windows of one hit.
+
+    The exponential window exp(-σt) starts at the start of the record, on force and responses alike. Then the
+    windowed response is the convolution of the windowed force with exp(-σt) times the impulse response:
+    the FRF is exactly that of the structure with σ added to the decay of every pole. Since only the
+    ratio counts, the window's value at the blow does not matter.
+
+    Offsets, which a window would smear over the lowest lines, are taken off first: the mean before the pulse
+    where at least eight samples lie there, otherwise the median of the record.
+
+    Parameters
+    ----------
+    hit : HitSamples
+    settings : FrfSettings
+    """
+
+    def __init__(self, hit: HitSamples, settings: FrfSettings) -> None:
+        n = hit.force.size
+        decay = decay_rate(settings, n / hit.sample_rate_hz)
+        self._decay = np.exp(-decay * np.arange(n) / hit.sample_rate_hz) if decay > 0 else None
+        peak = hit.hit.peak - hit.hit.start
+        self._shape = force_window(hit.force, peak) if settings.force_window == "auto" else None
+        self.active = self._decay is not None or self._shape is not None
+        self._rest = find_pulse(hit.force, peak).start if self.active else 0
+
+    def force(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The windowed force; the samples themselves without windows."""
+        if not self.active:
+            return samples
+        windowed = samples - self._offset(samples)
+        if self._shape is not None:
+            windowed *= self._shape
+        return windowed if self._decay is None else windowed * self._decay
+
+    def responses(self, block: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The windowed responses (n_channels, n_samples); the block itself without an exponential window."""
+        if self._decay is None:
+            return block
+        return np.asarray((block - self._offset(block)) * self._decay)
+
+    def _offset(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self._rest >= MINIMUM_REST:
+            return np.asarray(samples[..., : self._rest].mean(axis=-1, keepdims=True))
+        return np.asarray(np.median(samples, axis=-1, keepdims=True))
