@@ -1,7 +1,8 @@
-"""A small made-up run for the report's tests: a planetary gear assembled here, FRFs and modes with seeded noise."""
+"""A small made-up run for the report's tests: a planetary gear, FRFs and modes with seeded noise."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -52,11 +53,21 @@ def planetary(ring: bool, mesh: float = 1e7) -> LinearSystem:
     for n in range(1, PLANETS + 1):
         psi, p = 2 * np.pi * (n - 1) / PLANETS, f"planet{n}__"
         s, r = psi - alpha, psi + alpha
-        spring(mesh, sun__x=-np.sin(s), sun__y=np.cos(s), sun__u=1.0,
-               **{p + "zeta": -np.sin(alpha), p + "eta": -np.cos(alpha), p + "u": 1.0})  # fmt: skip
+        spring(
+            mesh,
+            sun__x=-np.sin(s),
+            sun__y=np.cos(s),
+            sun__u=1.0,
+            **{p + "zeta": -np.sin(alpha), p + "eta": -np.cos(alpha), p + "u": 1.0},
+        )
         if ring:
-            spring(1.5 * mesh, ring__x=-np.sin(r), ring__y=np.cos(r), ring__u=1.0,
-                   **{p + "zeta": np.sin(alpha), p + "eta": -np.cos(alpha), p + "u": -1.0})  # fmt: skip
+            spring(
+                1.5 * mesh,
+                ring__x=-np.sin(r),
+                ring__y=np.cos(r),
+                ring__u=1.0,
+                **{p + "zeta": np.sin(alpha), p + "eta": -np.cos(alpha), p + "u": -1.0},
+            )
         spring(8e6, carrier__x=np.cos(psi), carrier__y=np.sin(psi), **{p + "zeta": -1.0})
         spring(8e6, carrier__x=-np.sin(psi), carrier__y=np.cos(psi), carrier__u=1.0, **{p + "eta": -1.0})
     sensors = {}
@@ -108,10 +119,19 @@ def circle(modes: list[Mode], mode: Mode, out: int, inp: int, dofs: tuple[Dof, .
     radius = np.sqrt(c + (x / 2) ** 2 + (y / 2) ** 2)
     pairs = mode.damping_ratio * (1 + 0.05 * rng.normal(size=60))
     return CircleFit(
-        dofs[out], dofs[inp], f, h, complex(x / 2, y / 2), float(radius),
-        mode.frequency_hz * (1 + 2e-4 * float(rng.normal())), 0.03, float(pairs.mean()), float(pairs.std()), pairs,
+        dofs[out],
+        dofs[inp],
+        f,
+        h,
+        complex(x / 2, y / 2),
+        float(radius),
+        mode.frequency_hz * (1 + 2e-4 * float(rng.normal())),
+        0.03,
+        float(pairs.mean()),
+        float(pairs.std()),
+        pairs,
         float(np.std(np.abs(h - complex(x / 2, y / 2)) - radius) / radius),
-    )  # fmt: skip
+    )
 
 
 def configuration(
@@ -137,10 +157,21 @@ def configuration(
         shape = shape + std * (rng.normal(size=len(dofs)) + 1j * rng.normal(size=len(dofs)))
         w, z = 2 * np.pi * t.frequency_hz, 0.01 * (1 + 0.1 * float(rng.normal()))
         pole = complex(-z * w, w * np.sqrt(1 - z * z))
-        modes.append(Mode(
-            t.frequency_hz, 3e-4 * t.frequency_hz, z, 0.03 * z, pole, shape, std, 0.98, "plscf", 0.8,
-            ("circle fit differs: close neighbour",) if t.index == 4 else (),
-        ))  # fmt: skip
+        modes.append(
+            Mode(
+                t.frequency_hz,
+                3e-4 * t.frequency_hz,
+                z,
+                0.03 * z,
+                pole,
+                shape,
+                std,
+                0.98,
+                "plscf",
+                0.8,
+                ("circle fit differs: close neighbour",) if t.index == 4 else (),
+            )
+        )
     inputs = [0, 1, 4, 6]
     h = synthesise(modes, f, list(range(len(dofs))), inputs)
     level = 0.003 * np.abs(h).max(axis=2, keepdims=True)
@@ -162,11 +193,35 @@ def configuration(
     band = (f > 20) & (f < 1800)
     picks = tuple(dofs[i] for i in inputs)
     frfs = FrfSet(
-        f, h, coherence, np.array(noise), dofs, picks, ("acceleration",) * len(dofs),
-        np.where(np.isnan(h[..., 0]), 0, 1 if one_hit else 5), "H1", 0.5, 0.0, np.zeros(4), (20.0, 1800.0), True,
+        f,
+        h,
+        coherence,
+        np.array(noise),
+        dofs,
+        picks,
+        ("acceleration",) * len(dofs),
+        np.where(np.isnan(h[..., 0]), 0, 1 if one_hit else 5),
+        "H1",
+        0.5,
+        0.0,
+        np.zeros(4),
+        (20.0, 1800.0),
+        True,
         np.zeros(len(dofs)),
-        (Verdict("reciprocity", 0.11, 0.05, "1", False, "ISO 7626-5:2019, 8.3", "warn", "sun.x", "sun.x ↔ carrier.x differ by 11 %"),),
-    )  # fmt: skip
+        (
+            Verdict(
+                "reciprocity",
+                0.11,
+                0.05,
+                "1",
+                False,
+                "ISO 7626-5:2019, 8.3",
+                "warn",
+                "sun.x",
+                "sun.x ↔ carrier.x differ by 11 %",
+            ),
+        ),
+    )
     orders = np.arange(6, 61, 2)
     o, p, z, s, sel = [], [], [], [], []
     for order in orders:
@@ -182,10 +237,19 @@ def configuration(
             o.append(order), p.append(x), z.append(0.03), s.append(rng.random() < 0.1), sel.append(-1)
     chart = StabilisationChart(*(np.array(c) for c in (o, p, z, s, sel)))
     modal = ModalModel(
-        dofs, tuple(modes), (20.0, 1800.0), True, "", picks, f[band],
-        synthesise(modes, f[band], list(range(len(dofs))), inputs), dofs, picks, chart,
+        dofs,
+        tuple(modes),
+        (20.0, 1800.0),
+        True,
+        "",
+        picks,
+        f[band],
+        synthesise(modes, f[band], list(range(len(dofs))), inputs),
+        dofs,
+        picks,
+        chart,
         ("ring.y was struck too close to a node to scale mode 3.",) if ring else (),
-    )  # fmt: skip
+    )
     return ConfigurationResults(name, hits(rng), frfs, modal, pairing(modal, system), system)
 
 
@@ -225,11 +289,29 @@ def hits(rng: np.random.Generator) -> tuple[Hit, ...]:
         for n in range(6):
             bad = dof == "sun.x" and n == 3
             verdicts = (
-                Verdict("double hit", 0.12 if bad else 0.02, 0.1, "1", not bad, "ISO 7626-5:2019, 7.4", "reject_hit",
-                        "", "second impact of 12 % after 8.1 ms" if bad else ""),
-                Verdict("overload", 1.0 if n == 5 else 0.6, 0.98, "1", n != 5, "", "reject_channel", "planet2_y",
-                        "planet2_y at full scale at 0.051 s" if n == 5 else ""),
-            )  # fmt: skip
+                Verdict(
+                    "double hit",
+                    0.12 if bad else 0.02,
+                    0.1,
+                    "1",
+                    not bad,
+                    "ISO 7626-5:2019, 7.4",
+                    "reject_hit",
+                    "",
+                    "second impact of 12 % after 8.1 ms" if bad else "",
+                ),
+                Verdict(
+                    "overload",
+                    1.0 if n == 5 else 0.6,
+                    0.98,
+                    "1",
+                    n != 5,
+                    "",
+                    "reject_channel",
+                    "planet2_y",
+                    "planet2_y at full scale at 0.051 s" if n == 5 else "",
+                ),
+            )
             out.append(
                 Hit(
                     f"{dof.strip('-')}_1.uff",
@@ -249,13 +331,41 @@ def fit_result() -> FitResult:
     rng = np.random.default_rng(3)
     table = [
         ("sun_planet_mesh_stiffness", 9.98e6, 3.06e5, "N/m", True, 1e7, np.nan, True, ""),
-        ("ring_planet_mesh_stiffness", 4.1e7, 3.0e7, "N/m", True, 1e7, np.nan, False, "the interval is open towards the upper bound"),
-        *[(f"{b}_mass", v * 1.004, 0.007 * v, "kg", False, v, 0.01 * v, i % 2 == 0, "")
-          for i, (b, v) in enumerate((("carrier", 5.4), ("ring", 2.35), ("sun", 0.4), ("planet", 0.66)))],
-        *[(f"{b}_bearing_stiffness", v * (1 + s), 0.04 * v, "N/m", False, v, 0.1 * v, True,
-           "3.4 tolerances above nominal" if s > 0.3 else "")
-          for b, v, s in (("carrier", 2e6, 0.05), ("ring", 1.64e6, 0.34), ("sun", 2e6, -0.08), ("planet", 8e6, 0.01))],
-    ]  # fmt: skip
+        (
+            "ring_planet_mesh_stiffness",
+            4.1e7,
+            3.0e7,
+            "N/m",
+            True,
+            1e7,
+            np.nan,
+            False,
+            "the interval is open towards the upper bound",
+        ),
+        *[
+            (f"{b}_mass", v * 1.004, 0.007 * v, "kg", False, v, 0.01 * v, i % 2 == 0, "")
+            for i, (b, v) in enumerate((("carrier", 5.4), ("ring", 2.35), ("sun", 0.4), ("planet", 0.66)))
+        ],
+        *[
+            (
+                f"{b}_bearing_stiffness",
+                v * (1 + s),
+                0.04 * v,
+                "N/m",
+                False,
+                v,
+                0.1 * v,
+                True,
+                "3.4 tolerances above nominal" if s > 0.3 else "",
+            )
+            for b, v, s in (
+                ("carrier", 2e6, 0.05),
+                ("ring", 1.64e6, 0.34),
+                ("sun", 2e6, -0.08),
+                ("planet", 8e6, 0.01),
+            )
+        ],
+    ]
     parameters = {}
     for name, value, std, unit, free, nominal, prior, identified, remark in table:
         grid = np.linspace(max(value - 3 * std, 0.05 * value), value + 3 * std, 25)
@@ -264,9 +374,20 @@ def fit_result() -> FitResult:
             bend = np.minimum(bend, 0.6)
         profile = Profile(grid, bend) if free or "sun" in name else None
         parameters[name] = ParameterEstimate(
-            name, value, std, value - std, value + (np.inf if not identified and free else std), unit, free,
-            nominal, prior, identified, (value - nominal) / prior, remark, profile,
-        )  # fmt: skip
+            name,
+            value,
+            std,
+            value - std,
+            value + (np.inf if not identified and free else std),
+            unit,
+            free,
+            nominal,
+            prior,
+            identified,
+            (value - nominal) / prior,
+            remark,
+            profile,
+        )
     a = rng.normal(size=(len(table), len(table))) + 2 * np.eye(len(table))
     cov = a @ a.T
     d = np.sqrt(np.diag(cov))
@@ -276,8 +397,19 @@ def fit_result() -> FitResult:
         ("sun_planet_mesh_stiffness", "no_ring", 5.5e6),
         ("ring_planet_mesh_stiffness", "with_ring", 1.7e7),
     ):
-        sweeps.append(ErrorSweep(parameter, conf, 3, x, 0.071 + 2e-4 * np.log10(x / least) ** 2, least, 0.004, False,
-                                 "ε changes by 0.4 % over three decades: three modes do not identify it"))  # fmt: skip
+        sweeps.append(
+            ErrorSweep(
+                parameter,
+                conf,
+                3,
+                x,
+                0.071 + 2e-4 * np.log10(x / least) ** 2,
+                least,
+                0.004,
+                False,
+                "ε changes by 0.4 % over three decades: three modes do not identify it",
+            )
+        )
         sweeps.append(
             ErrorSweep(
                 parameter,
@@ -292,24 +424,48 @@ def fit_result() -> FitResult:
             )
         )
     return FitResult(
-        parameters, tuple(parameters), cov / np.outer(d, d), 1.04, 1.08, 0.0123, 96,
-        "the step fell below the tolerance after 9 iterations", tuple(sweeps),
+        parameters,
+        tuple(parameters),
+        cov / np.outer(d, d),
+        1.04,
+        1.08,
+        0.0123,
+        96,
+        "the step fell below the tolerance after 9 iterations",
+        tuple(sweeps),
         TwoStep(9.7e6, 1.6e7, 1.285e7, "Three modes leave the sun-planet value open."),
         ("The posterior is well approximated by a normal distribution.",),
-    )  # fmt: skip
+    )
 
 
 def comparison(configurations: tuple[ConfigurationResults, ...]) -> Comparison:
     rng = np.random.default_rng(5)
     modes, dofs, bands = [], [], []
     for c in configurations:
-        assert c.pairing is not None and c.modal is not None and c.frfs is not None
+        assert c.pairing is not None
+        assert c.modal is not None
+        assert c.frfs is not None
         for p in c.pairing.pairs:
             m = c.modal.modes[p.measured]
             fz = (m.frequency_hz - p.model_frequency_hz) / m.frequency_std_hz
             dz = (m.damping_ratio - 0.01) / m.damping_std
-            modes.append(ModeDifference(c.name, p.measured, p.family, m.frequency_hz, m.frequency_std_hz, p.model_frequency_hz,
-                                        fz, m.damping_ratio, m.damping_std, 0.01, dz, p.mac, abs(float(rng.normal())) + 0.5))  # fmt: skip
+            modes.append(
+                ModeDifference(
+                    c.name,
+                    p.measured,
+                    p.family,
+                    m.frequency_hz,
+                    m.frequency_std_hz,
+                    p.model_frequency_hz,
+                    fz,
+                    m.damping_ratio,
+                    m.damping_std,
+                    0.01,
+                    dz,
+                    p.mac,
+                    abs(float(rng.normal())) + 0.5,
+                )
+            )
         dofs += [
             DofDifference(c.name, d.point, float(6.1 if d.body == "planet2" else rng.uniform(0.6, 1.6)))
             for d in c.modal.dofs
@@ -317,8 +473,12 @@ def comparison(configurations: tuple[ConfigurationResults, ...]) -> Comparison:
         edges = np.geomspace(20, 1800, 9)
         for o in c.frfs.outputs:
             for i in c.frfs.inputs:
-                bands += [BandDifference(c.name, o.point, i.point, float(a), float(b), float(np.exp(rng.normal(0.3, 0.7))))
-                          for a, b in zip(edges[:-1], edges[1:], strict=True)]  # fmt: skip
+                bands += [
+                    BandDifference(
+                        c.name, o.point, i.point, float(a), float(b), float(np.exp(rng.normal(0.3, 0.7)))
+                    )
+                    for a, b in itertools.pairwise(edges)
+                ]
     return Comparison(2.7, 0.0123, tuple(modes), tuple(dofs), tuple(bands))
 
 
@@ -328,11 +488,15 @@ def planetary_run(lines: int = 4097) -> RunResults:
         configuration("with_ring", True, 2, lines=lines),
     )
     return RunResults(
-        "Planetary rig, two configurations", "planetary", configurations, fit_result(), comparison(configurations),
+        "Planetary rig, two configurations",
+        "planetary",
+        configurations,
+        fit_result(),
+        comparison(configurations),
         ("with_ring: planet3.y was not measured.",),
         {"ema": "0.1.0", "python": "3.11", "raw folder": "campaign <a & b>", "input hash": "3f2a…"},
         {"frf": {"estimator": "H1", "window": "force + exponential"}, "modal": {"max_order": "60"}},
-    )  # fmt: skip
+    )
 
 
 def beam_run(
@@ -361,12 +525,38 @@ def beam_run(
     h += 0.002 * np.abs(h).max() * (rng.normal(size=h.shape) + 1j * rng.normal(size=h.shape))
     nan = np.full(h.shape, np.nan)
     picks = tuple(dofs[i] for i in inputs)
-    frfs = FrfSet(f, h, nan, nan, dofs, picks, ("acceleration",) * len(dofs), np.ones(h.shape[:2], int), "H1", 8.0, 0.3,
-                  np.zeros(3), (4.0, 120.0), False, np.zeros(len(dofs)))  # fmt: skip
+    frfs = FrfSet(
+        f,
+        h,
+        nan,
+        nan,
+        dofs,
+        picks,
+        ("acceleration",) * len(dofs),
+        np.ones(h.shape[:2], int),
+        "H1",
+        8.0,
+        0.3,
+        np.zeros(3),
+        (4.0, 120.0),
+        False,
+        np.zeros(len(dofs)),
+    )
     modes = [replace(m, circles=(circle(modes, m, 2, 2, dofs, rng),)) for m in modes]
     chart = StabilisationChart(
         np.array([2]), np.array([6.0]), np.array([0.01]), np.array([True]), np.array([0])
     )
-    modal = ModalModel(dofs, tuple(modes), (4.0, 120.0), False, "the hammer is not calibrated", picks, f[f > 4],
-                       synthesise(modes, f[f > 4], list(range(len(dofs))), inputs), dofs, picks, chart)  # fmt: skip
+    modal = ModalModel(
+        dofs,
+        tuple(modes),
+        (4.0, 120.0),
+        False,
+        "the hammer is not calibrated",
+        picks,
+        f[f > 4],
+        synthesise(modes, f[f > 4], list(range(len(dofs))), inputs),
+        dofs,
+        picks,
+        chart,
+    )
     return RunResults("Aircraft <test>", None, (ConfigurationResults("default", hits(rng), frfs, modal),))

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from html.parser import HTMLParser
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,8 @@ def run() -> RunResults:
 
 
 def few_modes(c: ConfigurationResults, count: int) -> ConfigurationResults:
-    assert c.modal is not None and c.pairing is not None
+    assert c.modal is not None
+    assert c.pairing is not None
     modal = replace(c.modal, modes=c.modal.modes[:count])
     pairing = replace(
         c.pairing, pairs=tuple(p for p in c.pairing.pairs if p.measured < count), mac=c.pairing.mac[:count]
@@ -90,7 +92,7 @@ def test_percentages_and_signs_read_as_people_write_them() -> None:
 
 def test_package_never_imports_pyplot() -> None:
     code = (
-        "import sys; import ema_pipeline.report.html, ema_pipeline.report.plots, ema_pipeline.report.terminal;"
+        "import sys; from ema_pipeline.report import html, plots, terminal;"
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
@@ -124,7 +126,7 @@ def test_no_tick_labels_overlap_in_any_figure(figures: dict[str, Figure]) -> Non
                 ]
                 if not axis.get_visible() or not ax.axison:
                     continue
-                for a, b in zip(boxes[:-1], boxes[1:], strict=True):
+                for a, b in pairwise(boxes):
                     clash = a.shrunk(0.9, 0.9).overlaps(b.shrunk(0.9, 0.9))
                     assert not clash or not _inside(figure, a, b), f"{name}: tick labels at {a} and {b}"
 
@@ -372,8 +374,14 @@ def test_report_is_whole_where_stages_are_missing(results: RunResults, tmp_path:
 def test_mode_without_shape_circles_or_uncertainty_is_shown_all_the_same() -> None:
     c = few_modes(example.configuration("a", False, lines=257), 2)
     assert c.modal is not None
-    blind = replace(c.modal.modes[0], circles=(), frequency_std_hz=math.nan, damping_std=math.nan,
-                    shape=np.full(len(c.modal.dofs), np.nan + 0j), shape_std=np.full(len(c.modal.dofs), np.nan))  # fmt: skip
+    blind = replace(
+        c.modal.modes[0],
+        circles=(),
+        frequency_std_hz=math.nan,
+        damping_std=math.nan,
+        shape=np.full(len(c.modal.dofs), np.nan + 0j),
+        shape_std=np.full(len(c.modal.dofs), np.nan),
+    )
     run = RunResults("x", "planetary", (replace(c, modal=replace(c.modal, modes=(blind, c.modal.modes[1]))),))
     assert "Mode 1:" in report_html(run, render(run))
 
@@ -398,14 +406,19 @@ def _printed(renderable: object, width: int, encoding: str = "utf-8") -> str:
 
 def _tables(run: RunResults) -> list[object]:
     c = run.configurations[0]
-    assert (
-        c.modal is not None and c.pairing is not None and run.fit is not None and run.comparison is not None
-    )
+    assert c.modal is not None
+    assert c.pairing is not None
+    assert run.fit is not None
+    assert run.comparison is not None
     return [
-        terminal.run_summary(run), terminal.modes_table(c.modal), terminal.pairing_table(c.pairing, c.modal),
-        terminal.fit_summary(run.fit), terminal.hits_table(c.hits), terminal.verdict_table(c.hits),
+        terminal.run_summary(run),
+        terminal.modes_table(c.modal),
+        terminal.pairing_table(c.pairing, c.modal),
+        terminal.fit_summary(run.fit),
+        terminal.hits_table(c.hits),
+        terminal.verdict_table(c.hits),
         terminal.comparison_tables(run.comparison),
-    ]  # fmt: skip
+    ]
 
 
 @pytest.mark.parametrize("width", [80, 100])

@@ -29,7 +29,7 @@ _SCALE_SHARE = 0.14
 
 @dataclass(frozen=True)
 class MovingBody:
-    """One body: which outline, its place at phase 0, its place at rest, and whether a spoke shows its turn."""
+    """One body: which outline, its place at phase 0, its place at rest, and whether its turn is known."""
 
     kind: str
     outline_id: str
@@ -91,10 +91,14 @@ def moving_gears(configuration: ConfigurationResults) -> MovingGears | None:
             remark = f"model {pair.model_frequency_hz:.5g} Hz" + (
                 ", mixture of its close group" if pair.combined else ""
             )
-        modes.append(MovingMode(
-            f"Mode {index + 1}: {format_value(mode.frequency_hz, mode.frequency_std_hz, 'Hz')}",
-            format_percent(mode.damping_ratio, mode.damping_std), tuple(drawings), remark,
-        ))  # fmt: skip
+        modes.append(
+            MovingMode(
+                f"Mode {index + 1}: {format_value(mode.frequency_hz, mode.frequency_std_hz, 'Hz')}",
+                format_percent(mode.damping_ratio, mode.damping_std),
+                tuple(drawings),
+                remark,
+            )
+        )
     reach = 1.12 * layout.reach * _UNITS
     ring = next((b.radius for b in layout.bodies if b.name == "ring"), 0.0)
     planets = tuple((_n(b.x), _n(b.y)) for b in layout.bodies if b.name.startswith("planet"))
@@ -121,8 +125,15 @@ def _drawing(stem: str, layout: GearLayout, moved: dict[str, Motion], scale: flo
         motion = moved[body.name]
         x, y, turn = displaced(body, motion, scale)
         place = f"translate({_n(x):g} {_n(y):g}) rotate({np.rad2deg(turn):.2f})"
-        bodies.append(MovingBody(_kind(body), f"{stem}-{_kind(body)}", place, f"translate({_n(body.x):g} {_n(body.y):g})",
-                                 "u" not in motion.missing))  # fmt: skip
+        bodies.append(
+            MovingBody(
+                _kind(body),
+                f"{stem}-{_kind(body)}",
+                place,
+                f"translate({_n(body.x):g} {_n(body.y):g})",
+                "u" not in motion.missing,
+            )
+        )
         u = complex(motion.u) * scale / body.radius * 180 / np.pi
         mx, my = complex(motion.x) * scale * _UNITS, complex(motion.y) * scale * _UNITS
         row = (body.x * _UNITS, body.y * _UNITS, mx.real, mx.imag, my.real, my.imag, u.real, u.imag)

@@ -95,7 +95,7 @@ def signed(value: float, decimals: int = 1) -> str:
 
 
 def words(name: str) -> str:
-    """Parameter and check names for reading: ``sun_planet_mesh_stiffness`` → ``sun planet mesh stiffness``."""
+    """Names for reading: ``sun_planet_mesh_stiffness`` → ``sun planet mesh stiffness``."""
     return name.replace("_", " ")
 
 

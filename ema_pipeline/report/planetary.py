@@ -77,9 +77,15 @@ def gear_layout(points: Iterable[str]) -> GearLayout | None:
     for n in range(1, max(numbers) + 1):
         psi = 2 * np.pi * (n - 1) / max(numbers)
         layout.append(
-            GearBody(f"planet{n}", centre * float(np.cos(psi)), centre * float(np.sin(psi)), planet,
-                     max(round(teeth * planet), 6), psi)
-        )  # fmt: skip
+            GearBody(
+                f"planet{n}",
+                centre * float(np.cos(psi)),
+                centre * float(np.sin(psi)),
+                planet,
+                max(round(teeth * planet), 6),
+                psi,
+            )
+        )
     return GearLayout(tuple(layout), 1 + 2 * planet + (0.75 if "ring" in bodies else 0.45))
 
 

@@ -146,13 +146,21 @@ def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:
             chosen = [picks[k] for k in chunk]
             which = " and ".join(f"{frfs.outputs[o].point} ← {frfs.inputs[i].point}" for o, i in chosen)
             yield FigureSpec(
-                f"{stem}_frf_{n}", "frf", name, f"FRFs {which}: magnitude, phase and coherence, with the modal model",
-                partial(frf.frf_sheet, frfs, modal, chosen), "png",
-            )  # fmt: skip
+                f"{stem}_frf_{n}",
+                "frf",
+                name,
+                f"FRFs {which}: magnitude, phase and coherence, with the modal model",
+                partial(frf.frf_sheet, frfs, modal, chosen),
+                "png",
+            )
         yield FigureSpec(
-            f"{stem}_frf_all", "frf", name, "All FRFs over one another, and the complex mode indicator function",
-            partial(frf.frf_overview, frfs, modal), "png",
-        )  # fmt: skip
+            f"{stem}_frf_all",
+            "frf",
+            name,
+            "All FRFs over one another, and the complex mode indicator function",
+            partial(frf.frf_overview, frfs, modal),
+            "png",
+        )
     if modal is None:
         return
     calibrated = frfs.force_calibrated if frfs is not None else True
@@ -162,27 +170,43 @@ def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:
             draw = partial(nyquist.nyquist_sheet, modal, i, calibrated)
             yield FigureSpec(f"{stem}_nyquist_{i + 1:02d}", "nyquist", name, caption, draw)
     yield FigureSpec(
-        f"{stem}_stabilisation", "stabilisation", name, "Stabilisation chart: poles of all model orders over the CMIF",
-        partial(modes.stabilisation_chart, modal, frfs), "png",
-    )  # fmt: skip
+        f"{stem}_stabilisation",
+        "stabilisation",
+        name,
+        "Stabilisation chart: poles of all model orders over the CMIF",
+        partial(modes.stabilisation_chart, modal, frfs),
+        "png",
+    )
     if modal.modes:
         yield FigureSpec(
-            f"{stem}_modes", "modes", name, "Natural frequencies and damping ratios with their uncertainty",
+            f"{stem}_modes",
+            "modes",
+            name,
+            "Natural frequencies and damping ratios with their uncertainty",
             partial(modes.modes_overview, modal),
-        )  # fmt: skip
+        )
         yield FigureSpec(
-            f"{stem}_mac_measured", "pairing", name, "MAC of the measured modes with each other",
+            f"{stem}_mac_measured",
+            "pairing",
+            name,
+            "MAC of the measured modes with each other",
             partial(mac.auto_mac_matrix, modal),
-        )  # fmt: skip
+        )
     if pairing is not None:
         yield FigureSpec(
-            f"{stem}_pairing", "pairing", name, "Measured against model frequencies of the pairs, and their deviation",
+            f"{stem}_pairing",
+            "pairing",
+            name,
+            "Measured against model frequencies of the pairs, and their deviation",
             partial(mac.pairing_plot, pairing, modal),
-        )  # fmt: skip
+        )
         yield FigureSpec(
-            f"{stem}_mac_model", "pairing", name, "MAC of measured with model modes; pairs are framed",
+            f"{stem}_mac_model",
+            "pairing",
+            name,
+            "MAC of measured with model modes; pairs are framed",
             partial(mac.pairing_mac_matrix, pairing, modal),
-        )  # fmt: skip
+        )
     yield from _shapes(configuration, stem)
 
 
@@ -194,38 +218,85 @@ def _shapes(configuration: ConfigurationResults, stem: str) -> Iterator[FigureSp
     for n, chunk in enumerate(_chunks(len(modal.modes), size), start=1):
         caption = f"Shapes of modes {chunk[0] + 1} to {chunk[-1] + 1}"
         if layout is not None:
-            yield FigureSpec(f"{stem}_shapes_{n}", "shapes", configuration.name, caption + " as a moved gear set",
-                             partial(shapes.gear_shapes, configuration, layout, chunk), "png", in_report=False)  # fmt: skip
+            yield FigureSpec(
+                f"{stem}_shapes_{n}",
+                "shapes",
+                configuration.name,
+                caption + " as a moved gear set",
+                partial(shapes.gear_shapes, configuration, layout, chunk),
+                "png",
+                in_report=False,
+            )
         else:
-            yield FigureSpec(f"{stem}_shapes_{n}", "shapes", configuration.name, caption + " over the DOFs",
-                             partial(shapes.stem_shapes, configuration, chunk))  # fmt: skip
+            yield FigureSpec(
+                f"{stem}_shapes_{n}",
+                "shapes",
+                configuration.name,
+                caption + " over the DOFs",
+                partial(shapes.stem_shapes, configuration, chunk),
+            )
 
 
 def _fitted(results: RunResults) -> Iterator[FigureSpec]:
     found, compared = results.fit, results.comparison
     if found is not None:
         if found.sweeps:
-            yield FigureSpec("error_function", "error_function", "", "Error function ε over the mesh stiffnesses",
-                             partial(fit.error_sweeps, found.sweeps))  # fmt: skip
-        yield FigureSpec("fit_parameters", "fit", "", "Fitted parameters against their nominal values and tolerances",
-                         partial(fit.parameter_forest, found))  # fmt: skip
+            yield FigureSpec(
+                "error_function",
+                "error_function",
+                "",
+                "Error function ε over the mesh stiffnesses",
+                partial(fit.error_sweeps, found.sweeps),
+            )
+        yield FigureSpec(
+            "fit_parameters",
+            "fit",
+            "",
+            "Fitted parameters against their nominal values and tolerances",
+            partial(fit.parameter_forest, found),
+        )
         profiled = [p for p in found.parameters.values() if p.profile is not None]
         for n, chunk in enumerate(_chunks(len(profiled), fit.PROFILES_PER_SHEET), start=1):
-            yield FigureSpec(f"fit_profiles_{n}", "fit", "", "Profile likelihood of fitted parameters",
-                             partial(fit.profiles, [profiled[k] for k in chunk]))  # fmt: skip
+            yield FigureSpec(
+                f"fit_profiles_{n}",
+                "fit",
+                "",
+                "Profile likelihood of fitted parameters",
+                partial(fit.profiles, [profiled[k] for k in chunk]),
+            )
         if len(found.names) > 1:
-            yield FigureSpec("fit_correlation", "fit", "", "Correlation of the fitted parameters",
-                             partial(fit.correlation_matrix, found))  # fmt: skip
+            yield FigureSpec(
+                "fit_correlation",
+                "fit",
+                "",
+                "Correlation of the fitted parameters",
+                partial(fit.correlation_matrix, found),
+            )
     if compared is None:
         return
     if compared.modes:
-        yield FigureSpec("comparison_modes", "comparison", "", "Frequency, damping and shape differences per mode, in σ",
-                         partial(comparison.mode_differences, compared.modes))  # fmt: skip
+        yield FigureSpec(
+            "comparison_modes",
+            "comparison",
+            "",
+            "Frequency, damping and shape differences per mode, in σ",
+            partial(comparison.mode_differences, compared.modes),
+        )
     layouts = {c.name: layout_of(c) for c in results.configurations}
     for name in dict.fromkeys(d.configuration for d in compared.dofs):
         mine = [d for d in compared.dofs if d.configuration == name]
-        yield FigureSpec(f"comparison_{slug(name)}_dofs", "comparison", name, f"{name}: shape difference per DOF, in σ",
-                         partial(comparison.dof_differences, mine, layouts.get(name)))  # fmt: skip
+        yield FigureSpec(
+            f"comparison_{slug(name)}_dofs",
+            "comparison",
+            name,
+            f"{name}: shape difference per DOF, in σ",
+            partial(comparison.dof_differences, mine, layouts.get(name)),
+        )
     for name in dict.fromkeys(b.configuration for b in compared.bands):
-        yield FigureSpec(f"comparison_{slug(name)}_frfs", "comparison", name, f"{name}: FRF difference per band, in σ",
-                         partial(comparison.band_differences, compared.bands, name))  # fmt: skip
+        yield FigureSpec(
+            f"comparison_{slug(name)}_frfs",
+            "comparison",
+            name,
+            f"{name}: FRF difference per band, in σ",
+            partial(comparison.band_differences, compared.bands, name),
+        )

@@ -1,4 +1,4 @@
-"""Everything that a report can show, put together by the pipeline. Whatever was not done yet is None or empty."""
+"""Everything that a report can show; what was not done yet is None or empty."""
 
 from __future__ import annotations
 

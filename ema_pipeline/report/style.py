@@ -28,7 +28,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 2)))
 
 WIDTH_IN = 7.2  # text width of an A4 page with 14 mm margins
-_RC: dict[str, Any] = {
+_RC: Any = {
     "font.family": ["DejaVu Sans"],
     "font.size": 8.0,
     "axes.titlesize": 8.5,
@@ -99,7 +99,7 @@ def margins(
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as PNG with a palette of 200 colours (a third of the size); the same bytes for the same figure."""
+    """The figure as PNG with 200 colours (a third of the size); the same bytes for the same figure."""
     with matplotlib.rc_context(_RC):
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
@@ -143,7 +143,7 @@ def frequency_axis(ax: Axes, low_hz: float, high_hz: float, log: bool, label: bo
     if log:
         ax.set_xscale("log")
         decades = np.log10(high_hz / low_hz)
-        steps = (1, 2, 5) if decades < 3 else (1,)
+        steps: Sequence[float] = (1, 2, 5) if decades < 3 else (1,)
         if decades < 0.5:
             steps = (1, 1.5, 2, 3, 4, 5, 6, 7, 8, 9)
         ticks = [s * 10.0**p for p in range(-3, 7) for s in steps]
@@ -188,7 +188,7 @@ def mark_modes(ax: Axes, frequencies_hz: Sequence[float], numbers: bool = True, 
     Call it after the limits of the x axis are set.
     """
     figure = ax.get_figure()
-    assert figure is not None
+    assert isinstance(figure, Figure)
     width_pt = ax.get_position().width * figure.get_size_inches()[0] * 72
     low, high = ax.get_xlim()
     log = ax.get_xscale() == "log"

@@ -30,8 +30,8 @@ def findings(results: RunResults) -> tuple[str, ...]:
         size = plain(compared.error, 3)
         if compared.error <= 1.5:
             lines.append(
-                f"Model and measurement differ by {size} standard uncertainties (root mean square): the model explains "
-                "the data about as well as the data can tell."
+                f"Model and measurement differ by {size} standard uncertainties (root mean square): "
+                "the model explains the data about as well as the data can tell."
             )
         else:
             lines.append(
@@ -70,8 +70,8 @@ def cautions(results: RunResults) -> tuple[str, ...]:
                 )
             elif math.isfinite(p.shift_z) and abs(p.shift_z) > FAR_SIGMA:
                 lines.append(
-                    f"{words(p.name)} was fitted to {value}, {abs(p.shift_z):.1f} tolerances from its nominal "
-                    f"{format_value(p.nominal, p.prior_std, p.unit)}: check the nominal value."
+                    f"{words(p.name)} was fitted to {value}, {abs(p.shift_z):.1f} tolerances from "
+                    f"its nominal {format_value(p.nominal, p.prior_std, p.unit)}: check the nominal value."
                 )
         lines += [
             f"Error function of {words(s.parameter)}, {s.configuration}, {s.mode_count} modes: {s.note}"
@@ -119,8 +119,10 @@ def _cautions_of(c: ConfigurationResults) -> list[str]:
             lines.append(f"shapes are not mass-normalised: {c.modal.scaling_note or 'no driving point'}")
         lines += c.modal.notes
     if c.pairing is not None:
-        lines += [f"measured mode {u.index + 1} at {u.frequency_hz:.5g} Hz has no model partner: {u.reason}"
-                  for u in c.pairing.unpaired_measured]  # fmt: skip
+        lines += [
+            f"measured mode {u.index + 1} at {u.frequency_hz:.5g} Hz has no model partner: {u.reason}"
+            for u in c.pairing.unpaired_measured
+        ]
         weak = [p for p in c.pairing.pairs if p.mac < LOW_MAC]
         if weak:
             named = ", ".join(f"{p.measured_frequency_hz:.5g} Hz ({p.mac:.2f})" for p in weak[:6])
@@ -142,7 +144,8 @@ def _worst(results: RunResults) -> list[str]:
     if modes:
         z, what, m = max(modes, key=lambda t: t[0])
         lines.append(
-            f"Largest difference in a mode: {what} of {m.measured_frequency_hz:.5g} Hz, {m.configuration}, {plain(z, 2)}σ."
+            f"Largest difference in a mode: {what} of {m.measured_frequency_hz:.5g} Hz, "
+            f"{m.configuration}, {plain(z, 2)}σ."
         )
     dofs = [d for d in compared.dofs if math.isfinite(d.z) and d.z > FAR_SIGMA]
     if dofs:

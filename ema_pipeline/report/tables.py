@@ -33,7 +33,7 @@ class Table:
 
 
 def modes_table(modal: ModalModel) -> Table:
-    """One row per mode: frequency and damping of the pole and of the best circle, collinearity, votes, remarks."""
+    """One row per mode: frequency and damping of the pole and the best circle, MPC, votes, remarks."""
     rows = tuple(_mode_row(i, m) for i, m in enumerate(modal.modes))
     head = (
         "mode",
@@ -62,8 +62,21 @@ def pairs_table(pairing: Pairing, modal: ModalModel) -> Table:
         remark = f"group {p.group + 1}" if p.group >= 0 else ""
         weak = p.mac < LOW_MAC
         remark = "; ".join(t for t in (remark, "low MAC" if weak else "") if t)
-        rows.append(Row((str(p.measured + 1), _bare(p.measured_frequency_hz, std), str(p.model + 1),
-                         plain(p.model_frequency_hz, 5), signed(percent, 2), f"{p.mac:.2f}", p.family, remark), weak))  # fmt: skip
+        rows.append(
+            Row(
+                (
+                    str(p.measured + 1),
+                    _bare(p.measured_frequency_hz, std),
+                    str(p.model + 1),
+                    plain(p.model_frequency_hz, 5),
+                    signed(percent, 2),
+                    f"{p.mac:.2f}",
+                    p.family,
+                    remark,
+                ),
+                weak,
+            )
+        )
     head = ("mode", "measured, Hz", "model mode", "model, Hz", "difference, %", "MAC", "family", "remarks")
     return Table(head, tuple(rows), frozenset({0, 1, 2, 3, 4, 5}))
 
@@ -88,9 +101,20 @@ def parameters_table(fit: FitResult) -> Table:
         tail = f" {unit}" if unit not in ("", "1") else ""
         far = math.isfinite(p.shift_z) and abs(p.shift_z) > FAR_SIGMA
         status = "identified" if p.identified else ("NOT identified" if p.free else "not narrowed")
-        rows.append(Row((words(p.name), format_value(p.value, p.std, p.unit), f"{low} … {high}{tail}",
-                         "free" if p.free else format_value(p.nominal, p.prior_std, p.unit), signed(p.shift_z),
-                         status, p.note), far or (p.free and not p.identified)))  # fmt: skip
+        rows.append(
+            Row(
+                (
+                    words(p.name),
+                    format_value(p.value, p.std, p.unit),
+                    f"{low} … {high}{tail}",
+                    "free" if p.free else format_value(p.nominal, p.prior_std, p.unit),
+                    signed(p.shift_z),
+                    status,
+                    p.note,
+                ),
+                far or (p.free and not p.identified),
+            )
+        )
     head = (
         "parameter",
         "fitted (±1σ)",
@@ -106,11 +130,19 @@ def parameters_table(fit: FitResult) -> Table:
 def sweeps_table(fit: FitResult) -> Table:
     """One row per sweep of the error function."""
     rows = tuple(
-        Row((words(s.parameter), s.configuration, str(s.mode_count),
-             format_value(s.minimum, math.nan, "N/m") if s.identified else "not identified",
-             plain(min(s.error), 3), s.note), not s.identified)
+        Row(
+            (
+                words(s.parameter),
+                s.configuration,
+                str(s.mode_count),
+                format_value(s.minimum, math.nan, "N/m") if s.identified else "not identified",
+                plain(min(s.error), 3),
+                s.note,
+            ),
+            not s.identified,
+        )
         for s in fit.sweeps
-    )  # fmt: skip
+    )
     return Table(
         ("parameter", "configuration", "modes", "minimum at", "least ε", "remarks"), rows, frozenset({2, 4})
     )
@@ -123,10 +155,23 @@ def differences_table(compared: Comparison) -> Table:
         worst = max(
             (abs(z) for z in (m.frequency_z, m.damping_z, m.shape_z) if math.isfinite(z)), default=0.0
         )
-        rows.append(Row((m.configuration, str(m.measured + 1), _bare(m.measured_frequency_hz, m.frequency_std_hz),
-                         plain(m.model_frequency_hz, 5), signed(m.frequency_z),
-                         _bare(100 * m.measured_damping_ratio, 100 * m.damping_std), plain(100 * m.model_damping_ratio, 3),
-                         signed(m.damping_z), f"{m.mac:.2f}", signed(m.shape_z)), worst > FAR_SIGMA))  # fmt: skip
+        rows.append(
+            Row(
+                (
+                    m.configuration,
+                    str(m.measured + 1),
+                    _bare(m.measured_frequency_hz, m.frequency_std_hz),
+                    plain(m.model_frequency_hz, 5),
+                    signed(m.frequency_z),
+                    _bare(100 * m.measured_damping_ratio, 100 * m.damping_std),
+                    plain(100 * m.model_damping_ratio, 3),
+                    signed(m.damping_z),
+                    f"{m.mac:.2f}",
+                    signed(m.shape_z),
+                ),
+                worst > FAR_SIGMA,
+            )
+        )
     head = (
         "configuration",
         "mode",
@@ -174,8 +219,11 @@ def rejected_hits_table(hits: Sequence[Hit]) -> Table:
         if not h.accepted:
             rows.append(Row((h.file, str(h.number + 1), str(h.impact), "hit rejected", h.reason), True))
         elif h.rejected_channels:
-            why = "; ".join(v.message or f"{v.channel}: {v.check}" for v in h.verdicts
-                            if v.consequence == "reject_channel" and not v.passes)  # fmt: skip
+            why = "; ".join(
+                v.message or f"{v.channel}: {v.check}"
+                for v in h.verdicts
+                if v.consequence == "reject_channel" and not v.passes
+            )
             rows.append(
                 Row(
                     (
@@ -198,8 +246,7 @@ def verdicts_table(hits: Sequence[Hit]) -> Table:
             checks.setdefault(v.check, v)
     head = ["file", "hit", "impact", "peak, N"]
     for v in checks.values():
-        unit = f" {v.unit}" if v.unit not in ("", "1") else ""
-        head.append(f"{words(v.check)} (limit {plain(v.limit, 3)}{unit})")
+        head.append(f"{words(v.check)} (limit {plain(v.limit, 3)}{_unit(v)})")
     rows = []
     for h in hits:
         cells = [h.file, str(h.number + 1), str(h.impact), plain(h.peak_force, 3)]
@@ -213,11 +260,24 @@ def verdicts_table(hits: Sequence[Hit]) -> Table:
 def failed_checks_table(verdicts: Sequence[Verdict]) -> Table:
     """Checks over several hits or points that failed."""
     rows = tuple(
-        Row((words(v.check), v.channel, f"{plain(v.value, 3)} (limit {plain(v.limit, 3)}{'' if v.unit in ('', '1') else ' ' + v.unit})",
-             v.clause, v.message), True)
-        for v in verdicts if not v.passes
-    )  # fmt: skip
+        Row(
+            (
+                words(v.check),
+                v.channel,
+                f"{plain(v.value, 3)} (limit {plain(v.limit, 3)}{_unit(v)})",
+                v.clause,
+                v.message,
+            ),
+            True,
+        )
+        for v in verdicts
+        if not v.passes
+    )
     return Table(("check", "where", "value", "clause", "finding"), rows)
+
+
+def _unit(v: Verdict) -> str:
+    return "" if v.unit in ("", "1") else f" {v.unit}"
 
 
 def _verdict_cell(verdicts: Sequence[Verdict]) -> str:
@@ -234,12 +294,16 @@ def _verdict_cell(verdicts: Sequence[Verdict]) -> str:
 def _mode_row(index: int, mode: Mode) -> Row:
     best = mode.circles[0] if mode.circles else None
     cells = (
-        str(index + 1), _bare(mode.frequency_hz, mode.frequency_std_hz),
+        str(index + 1),
+        _bare(mode.frequency_hz, mode.frequency_std_hz),
         format_percent(mode.damping_ratio, mode.damping_std).removesuffix(" %"),
         _bare(best.natural_frequency_hz, best.natural_frequency_std_hz) if best else "–",
         _bare(100 * best.damping_ratio, 100 * best.damping_std) if best else "–",
-        f"{mode.mpc:.2f}", f"{100 * mode.stability:.0f} %", mode.method, "; ".join(mode.flags),
-    )  # fmt: skip
+        f"{mode.mpc:.2f}",
+        f"{100 * mode.stability:.0f} %",
+        mode.method,
+        "; ".join(mode.flags),
+    )
     return Row(cells, bool(mode.flags))
 
 

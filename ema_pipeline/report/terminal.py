@@ -6,10 +6,11 @@ deserve a look start with ``!``.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from rich import box
-from rich.console import Console, Group, RenderableType
+from rich.console import Console, ConsoleOptions, Group, RenderableType
+from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -21,12 +22,38 @@ from ema_pipeline.report import summary, tables
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.results import RunResults
 
+Clean = Callable[[str], str]
 _SHORT = 15
-_ASCII = str.maketrans({
-    "±": "+/-", "−": "-", "–": "-", "…": "..", "×": "x", "·": "*", "²": "^2", "³": "^3", "ζ": "zeta", "σ": " sigma",
-    "ε": "epsilon", "χ": "chi", "µ": "u", "←": "<-", "↔": "<->", "≥": ">=", "≤": "<=", "Δ": "D", "θ": "theta", "η": "eta",
-    "“": '"', "”": '"', "’": "'", "°": " deg", "ω": "omega", "Σ": "sum ",
-})  # fmt: skip
+_ASCII = str.maketrans(
+    {
+        "±": "+/-",
+        "−": "-",
+        "–": "-",
+        "…": "..",
+        "×": "x",
+        "·": "*",
+        "²": "^2",
+        "³": "^3",
+        "ζ": "zeta",
+        "σ": " sigma",
+        "ε": "epsilon",
+        "χ": "chi",
+        "µ": "u",
+        "←": "<-",
+        "↔": "<->",
+        "≥": ">=",
+        "≤": "<=",
+        "Δ": "D",
+        "θ": "theta",
+        "η": "eta",
+        "“": '"',
+        "”": '"',
+        "’": "'",
+        "°": " deg",
+        "ω": "omega",
+        "Σ": "sum ",
+    }
+)
 
 
 def modes_table(modal: ModalModel, title: str = "Modes") -> RenderableType:
@@ -60,14 +87,15 @@ def fit_summary(fit: FitResult) -> RenderableType:
     parts += [_line(f"{words(p.name)}: {p.note}") for p in fit.parameters.values() if p.note]
     parts += [
         _line(
-            f"{words(s.parameter)}, {s.configuration}, {s.mode_count} modes: {_sweep_words(s.identified, s.minimum, s.note)}"
+            f"{words(s.parameter)}, {s.configuration}, {s.mode_count} modes: "
+            f"{_sweep_words(s.identified, s.minimum, s.note)}"
         )
         for s in fit.sweeps
     ]
     parts.append(
         _line(
-            f"{fit.data_count} data, chi²/dof {plain(fit.chi2_per_dof, 3)}, rms difference {plain(fit.error, 3)} σ, "
-            f"ε {plain(fit.frequency_error, 3)}; {fit.stop_reason}"
+            f"{fit.data_count} data, chi²/dof {plain(fit.chi2_per_dof, 3)}, "
+            f"rms difference {plain(fit.error, 3)} σ, ε {plain(fit.frequency_error, 3)}; {fit.stop_reason}"
         )
     )
     return Group(*parts)
@@ -108,7 +136,8 @@ def comparison_tables(compared: Comparison) -> RenderableType:
     )
     parts: list[RenderableType] = [
         _line(
-            f"Model against measurement: {plain(compared.error, 3)} σ root mean square, ε {plain(compared.frequency_error, 3)}"
+            f"Model against measurement: {plain(compared.error, 3)} σ root mean square, "
+            f"ε {plain(compared.frequency_error, 3)}"
         ),
         _rich(
             _renamed(_pick(tables.differences_table(compared), columns), heads),
@@ -137,14 +166,25 @@ def run_summary(results: RunResults) -> RenderableType:
 
 
 class Safe:
-    """A renderable that shows ± as +/- and so on where the console cannot encode them."""
+    """A table or line that suits the console: +/- where it has no ±, loose where it is narrow.
 
-    def __init__(self, build: RichTable | Text, plain_build: RichTable | Text) -> None:
-        self._unicode, self._ascii = build, plain_build
+    In a rigid table numbers are never broken over lines; where that does not fit the width, a loose one
+    breaks them at their blanks rather than lose a digit.
+    """
 
-    def __rich_console__(self, console: Console, options: object) -> Collection[RenderableType]:
-        ascii_only = not (console.encoding or "").lower().replace("-", "").startswith("utf")
-        return [self._ascii if ascii_only else self._unicode]
+    def __init__(self, build: Callable[[Clean, bool], RenderableType]) -> None:
+        self._build = build
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
+        unicode_console = (console.encoding or "").lower().replace("-", "").startswith("utf")
+        clean = str if unicode_console else _to_ascii
+        rigid = self._build(clean, True)
+        needed = Measurement.get(console, options.update(max_width=10_000), rigid).minimum
+        yield rigid if needed <= options.max_width else self._build(clean, False)
+
+
+def _to_ascii(text: str) -> str:
+    return text.translate(_ASCII).encode("ascii", "replace").decode("ascii")
 
 
 def _sweep_words(identified: bool, minimum: float, note: str) -> str:
@@ -154,7 +194,7 @@ def _sweep_words(identified: bool, minimum: float, note: str) -> str:
 
 
 def _line(text: str) -> Safe:
-    return Safe(Text(text), Text(text.translate(_ASCII)))
+    return Safe(lambda clean, rigid: Text(clean(text)))
 
 
 def _pick(source: tables.Table, columns: Sequence[int]) -> tables.Table:
@@ -172,27 +212,31 @@ def _renamed(source: tables.Table, head: tuple[str, ...]) -> tables.Table:
 
 
 def _rich(source: tables.Table, title: str) -> Safe:
-    return Safe(_build(source, title, str), _build(source, title, lambda s: s.translate(_ASCII)))
+    return Safe(lambda clean, rigid: _build(source, title, clean, rigid))
 
 
-def _build(source: tables.Table, title: str, clean: object) -> RichTable:
-    assert callable(clean)
+def _build(source: tables.Table, title: str, clean: Clean, rigid: bool) -> RichTable:
     # a column of remarks that nobody made is only noise
     kept = [k for k in range(len(source.head)) if not source.rows or any(r.cells[k] for r in source.rows)]
     table = RichTable(
-        title=Text(clean(title), style="bold") if title else None, title_justify="left", box=box.SIMPLE_HEAD, safe_box=True,
-        show_edge=False, pad_edge=False, padding=(0, 1, 0, 0),
-    )  # fmt: skip
+        title=Text(clean(title), style="bold") if title else None,
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        safe_box=True,
+        show_edge=False,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
     table.add_column("", width=1, no_wrap=True)
     for k in kept:
         numeric = k in source.numeric
-        # numbers and short words are never broken over lines
         short = max((len(r.cells[k]) for r in source.rows), default=0) <= _SHORT
         value = any(r.cells[k][:1].isdigit() and "±" in r.cells[k] for r in source.rows)
         table.add_column(
             Text(clean(source.head[k])),
             justify="right" if numeric else "left",
-            no_wrap=numeric or value or short,
+            no_wrap=rigid and (numeric or value or short),
+            overflow="fold",
         )
     for row in source.rows:
         cells = [Text(clean(row.cells[k])) for k in kept]

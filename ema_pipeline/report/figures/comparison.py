@@ -1,4 +1,4 @@
-"""Where model and measurement part: per mode, per DOF and per band of each FRF, in units of the uncertainty."""
+"""Where model and measurement part: per mode, per DOF and per FRF band, in units of the uncertainty."""
 
 from __future__ import annotations
 
@@ -130,8 +130,16 @@ def dof_differences(dofs: Sequence[DofDifference], layout: GearLayout | None = N
             x, y = {"carrier": (0.71 * b.radius, 0.71 * b.radius), "ring": (0.0, b.radius + 0.18)}.get(
                 b.name, (b.x, b.y)
             )
-            gear.text(x, y, f"{worst[b.name]:.1f}", ha="center", va="center", fontsize=7, zorder=6,
-                      bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85})  # fmt: skip
+            gear.text(
+                x,
+                y,
+                f"{worst[b.name]:.1f}",
+                ha="center",
+                va="center",
+                fontsize=7,
+                zorder=6,
+                bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85},
+            )
         bar = figure.add_axes((share + 0.06, 0.14, 0.87 - share, 0.12 / height))
         figure.colorbar(ScalarMappable(norm, colours), cax=bar, orientation="horizontal").set_label(
             "shape difference / σ, 1"
@@ -141,7 +149,7 @@ def dof_differences(dofs: Sequence[DofDifference], layout: GearLayout | None = N
 
 @styled
 def band_differences(bands: Sequence[BandDifference], configuration: str) -> Figure:
-    """FRF difference per band in units of its uncertainty, as a map; with many FRFs only the worst are drawn."""
+    """FRF difference per band in units of its uncertainty, as a map; of many FRFs only the worst."""
     mine = [b for b in bands if b.configuration == configuration]
     pairs = list(dict.fromkeys((b.output, b.input) for b in mine))
     edges = sorted({b.low_hz for b in mine} | {b.high_hz for b in mine})

@@ -31,7 +31,7 @@ _NUMBERS_UP_TO = 14
 
 @styled
 def error_sweeps(sweeps: Sequence[ErrorSweep]) -> Figure:
-    """Error function ε over stiffness, one panel per parameter and configuration, one curve per number of modes."""
+    """Error function ε over stiffness, one panel per parameter, one curve per number of modes."""
     groups: dict[tuple[str, str], list[ErrorSweep]] = {}
     for sweep in sweeps:
         groups.setdefault((sweep.parameter, sweep.configuration), []).append(sweep)
@@ -53,8 +53,15 @@ def error_sweeps(sweeps: Sequence[ErrorSweep]) -> Figure:
                 label=f"{sweep.mode_count} modes: {verdict}",
             )
             at = int(np.nanargmin(sweep.error))
-            ax.plot(sweep.values[at], sweep.error[at], MARKERS[i], color=SERIES[i], ms=6,
-                    mfc=SERIES[i] if sweep.identified else "white", zorder=4)  # fmt: skip
+            ax.plot(
+                sweep.values[at],
+                sweep.error[at],
+                MARKERS[i],
+                color=SERIES[i],
+                ms=6,
+                mfc=SERIES[i] if sweep.identified else "white",
+                zorder=4,
+            )
         every = np.concatenate([s.error for s in curves])
         every = every[np.isfinite(every) & (every > 0)]
         if every.size and every.max() > 12 * every.min():
@@ -94,11 +101,25 @@ def parameter_forest(fit: FitResult) -> Figure:
     for k, p in enumerate(held):
         z, bar = (p.value - p.nominal) / p.prior_std, p.std / p.prior_std
         color = VERMILLION if abs(z) > 2 else MEASURED
-        ax.errorbar(z, k, xerr=bar if np.isfinite(bar) else 0, fmt="D" if abs(z) > 2 else "o", color=color, capsize=2,
-                    mfc=color if p.identified else "white", ms=4.5)  # fmt: skip
+        ax.errorbar(
+            z,
+            k,
+            xerr=bar if np.isfinite(bar) else 0,
+            fmt="D" if abs(z) > 2 else "o",
+            color=color,
+            capsize=2,
+            mfc=color if p.identified else "white",
+            ms=4.5,
+        )
         reach = max(reach, 1.1 * (abs(z) + (bar if np.isfinite(bar) else 0)))
-        ax.annotate(format_value(p.value, p.std, p.unit), (1.02, k), xycoords=("axes fraction", "data"), fontsize=7,
-                    va="center", color=color if abs(z) > 2 else BLACK)  # fmt: skip
+        ax.annotate(
+            format_value(p.value, p.std, p.unit),
+            (1.02, k),
+            xycoords=("axes fraction", "data"),
+            fontsize=7,
+            va="center",
+            color=color if abs(z) > 2 else BLACK,
+        )
     if not held:
         note(ax, "no parameter with a tolerance")
     ax.set_yticks(range(len(held)), [words(p.name) for p in held])
@@ -112,9 +133,14 @@ def parameter_forest(fit: FitResult) -> Figure:
     height = figure.get_size_inches()[1]
     for k, p in enumerate(free):
         verdict = "" if p.identified else " (not identified)"
-        figure.text(0.02, (0.1 + 0.17 * (len(free) - 1 - k)) / height,
-                    f"free: {words(p.name)} = {format_value(p.value, p.std, p.unit)}{verdict}", fontsize=7.5,
-                    va="bottom", fontweight="bold" if p.identified else "normal")  # fmt: skip
+        figure.text(
+            0.02,
+            (0.1 + 0.17 * (len(free) - 1 - k)) / height,
+            f"free: {words(p.name)} = {format_value(p.value, p.std, p.unit)}{verdict}",
+            fontsize=7.5,
+            va="bottom",
+            fontweight="bold" if p.identified else "normal",
+        )
     return figure
 
 

@@ -1,4 +1,4 @@
-"""FRF sheets: magnitude, phase and coherence of chosen FRFs, and an overlay with the CMIF over all of them."""
+"""FRF sheets: magnitude, phase and coherence of chosen FRFs, and an overlay of all with the CMIF."""
 
 from __future__ import annotations
 
@@ -86,9 +86,13 @@ def frf_sheet(frfs: FrfSet, modal: ModalModel | None, picks: Sequence[tuple[int,
     columns = len(picks)
     figure = new_figure(4.5)
     grid = figure.add_gridspec(
-        3, max(columns, FRFS_PER_SHEET), height_ratios=(2.2, 1, 1), hspace=0.12, wspace=0.24,
+        3,
+        max(columns, FRFS_PER_SHEET),
+        height_ratios=(2.2, 1, 1),
+        hspace=0.12,
+        wspace=0.24,
         **margins(figure, top=0.62),
-    )  # fmt: skip
+    )
     modes = [m.frequency_hz for m in modal.modes] if modal else []
     low, high, log = frequency_range(modal.band_hz if modal else frfs.band_hz, modes, frfs.frequency_hz)
     f = frfs.frequency_hz
@@ -153,16 +157,21 @@ def frf_overview(frfs: FrfSet, modal: ModalModel | None) -> Figure:
     step = max(1, int(np.ceil(len(rows) / _OVERLAY_LINES)))
     curves = LineCollection(
         [np.column_stack([f[shown], row]) for row in rows[::step]],
-        colors=MEASURED, linewidths=0.4, alpha=max(0.12, min(0.6, 12 / max(len(rows), 1))), rasterized=True,
-    )  # fmt: skip
+        colors=MEASURED,
+        linewidths=0.4,
+        alpha=max(0.12, min(0.6, 12 / max(len(rows), 1))),
+        rasterized=True,
+    )
     top.add_collection(curves)
     mean = np.sqrt(np.nanmean(rows**2, axis=0))
     _curve(top, f[shown], mean, "#000000", "-")
     some = f", every {step}th drawn" if step > 1 else ""
     top.legend(
         [Line2D([], [], color=MEASURED, lw=0.7), Line2D([], [], color="#000000")],
-        [f"{len(rows)} FRFs{some}", "root mean square"], loc="lower right", borderpad=0.3,
-    )  # fmt: skip
+        [f"{len(rows)} FRFs{some}", "root mean square"],
+        loc="lower right",
+        borderpad=0.3,
+    )
     log_y(top)
     _limit_decades(top, rows)
     top.set_title("All FRFs and their mode indicator", pad=27)
@@ -233,7 +242,7 @@ def _curve(
 ) -> None:
     # dense curves become pixels inside the SVG, which would be megabytes otherwise
     width = 0.8 if len(x) > 1500 else 1.1
-    ax.plot(x, y, color=color, ls=line, lw=width, label=label or "_", rasterized=len(x) > 1500)  # type: ignore[arg-type]
+    ax.plot(x, y, color=color, ls=line, lw=width, label=label or "_", rasterized=len(x) > 1500)
 
 
 def _limit_decades(ax: Axes, values: NDArray[np.float64], decades: float = 6.0) -> None:

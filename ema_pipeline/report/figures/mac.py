@@ -54,15 +54,25 @@ def pairing_mac_matrix(pairing: Pairing, modal: ModalModel) -> Figure:
     names = [f"{j + 1}: {pairing.model_modes[j].frequency_hz:.4g}" for j in columns]
     frames = [(p.measured, columns.index(p.model)) for p in pairing.pairs]
     return _matrix(
-        pairing.mac[:, columns], rows, names, "measured mode, Hz", "model mode, Hz",
-        "Measured with model modes (frames: pairs)", frames,
-    )  # fmt: skip
+        pairing.mac[:, columns],
+        rows,
+        names,
+        "measured mode, Hz",
+        "model mode, Hz",
+        "Measured with model modes (frames: pairs)",
+        frames,
+    )
 
 
 def _matrix(
-    values: NDArray[np.float64], rows: Sequence[str], columns: Sequence[str], row_label: str, column_label: str,
-    title: str, frames: Sequence[tuple[int, int]] = (),
-) -> Figure:  # fmt: skip
+    values: NDArray[np.float64],
+    rows: Sequence[str],
+    columns: Sequence[str],
+    row_label: str,
+    column_label: str,
+    title: str,
+    frames: Sequence[tuple[int, int]] = (),
+) -> Figure:
     n, m = max(len(rows), 1), max(len(columns), 1)
     cell = min(0.3, 5.0 / m, 5.4 / n)
     left, bottom, right, top = 1.0, 0.95, 1.2, 0.45
@@ -124,11 +134,26 @@ def pairing_plot(pairing: Pairing, modal: ModalModel, band_percent: float = 5.0)
     log = bool(high > 12 * low)
     ends = np.geomspace(low, high, 200)
     ax.plot(ends, ends, color="black", lw=0.8, label="measured = model")
-    ax.fill_between(ends, ends * (1 - band_percent / 100), ends * (1 + band_percent / 100), color="#e8e2c8", lw=0,
-                    label=f"±{band_percent:g} %")  # fmt: skip
+    ax.fill_between(
+        ends,
+        ends * (1 - band_percent / 100),
+        ends * (1 + band_percent / 100),
+        color="#e8e2c8",
+        lw=0,
+        label=f"±{band_percent:g} %",
+    )
     if x.size:
-        ax.errorbar(x, y, yerr=np.where(np.isfinite(std), std, 0), fmt="o", color=MEASURED, ms=4.5, mfc="white",
-                    label="pair", zorder=4)  # fmt: skip
+        ax.errorbar(
+            x,
+            y,
+            yerr=np.where(np.isfinite(std), std, 0),
+            fmt="o",
+            color=MEASURED,
+            ms=4.5,
+            mfc="white",
+            label="pair",
+            zorder=4,
+        )
     frequency_axis(ax, low, high, log)
     if log:
         log_y(ax)
@@ -137,11 +162,27 @@ def pairing_plot(pairing: Pairing, modal: ModalModel, band_percent: float = 5.0)
         ax.yaxis.set_minor_locator(ax.xaxis.get_minor_locator())
     ax.set_ylim(low, high)
     if lone_measured:
-        ax.plot([0.008] * len(lone_measured), lone_measured, ">", color=PURPLE, ms=6, clip_on=False,
-                transform=ax.get_yaxis_transform(), label=f"measured, no partner ({len(lone_measured)})")  # fmt: skip
+        ax.plot(
+            [0.008] * len(lone_measured),
+            lone_measured,
+            ">",
+            color=PURPLE,
+            ms=6,
+            clip_on=False,
+            transform=ax.get_yaxis_transform(),
+            label=f"measured, no partner ({len(lone_measured)})",
+        )
     if lone_model:
-        ax.plot(lone_model, [0.012] * len(lone_model), "^", color=MODEL, ms=6, clip_on=False,
-                transform=ax.get_xaxis_transform(), label=f"model, no partner ({len(lone_model)})")  # fmt: skip
+        ax.plot(
+            lone_model,
+            [0.012] * len(lone_model),
+            "^",
+            color=MODEL,
+            ms=6,
+            clip_on=False,
+            transform=ax.get_xaxis_transform(),
+            label=f"model, no partner ({len(lone_model)})",
+        )
     ax.set_xlabel("model frequency, Hz")
     ax.set_ylabel("measured frequency, Hz")
     ax.set_title("Pairs of measured and model modes")

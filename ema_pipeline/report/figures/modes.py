@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -56,15 +58,24 @@ def stabilisation_chart(modal: ModalModel, frfs: FrfSet | None) -> Figure:
     stable = chart.stable & ~chosen
     other = ~chart.stable & ~chosen
     inside = (chart.frequency_hz >= low) & (chart.frequency_hz <= high)
-    draw = {"ls": "none", "rasterized": True}
+    draw: dict[str, Any] = {"ls": "none", "rasterized": True}
     for keep, marker, color, size, face, label in (
         (other, "x", "#b0b0b0", 2.6, "#b0b0b0", "not stable"),
         (stable, "o", BLUE, 3.2, "none", "stable in frequency, damping and shape"),
         (chosen, "^", VERMILLION, 3.8, VERMILLION, "votes for a mode"),
     ):
         keep = keep & inside
-        ax.plot(chart.frequency_hz[keep], chart.order[keep], marker, color=color, ms=size, mfc=face, mew=0.7,
-                label=f"{label} ({int(keep.sum())})", **draw)  # type: ignore[arg-type]  # fmt: skip
+        ax.plot(
+            chart.frequency_hz[keep],
+            chart.order[keep],
+            marker,
+            color=color,
+            ms=size,
+            mfc=face,
+            mew=0.7,
+            label=f"{label} ({int(keep.sum())})",
+            **draw,
+        )
     if not chart.order.size:
         note(ax, "no poles")
     handles, labels = ax.get_legend_handles_labels()
@@ -94,10 +105,26 @@ def modes_overview(modal: ModalModel) -> Figure:
         100 * np.array([getattr(m, a) for m in modal.modes]) for a in ("damping_ratio", "damping_std")
     )
     low, high, log = frequency_range(modal.band_hz, f, modal.frequency_hz)
-    top.errorbar(f, z, yerr=_bars(z_std), xerr=_bars(std), fmt=MARKERS[0], color=SERIES[0], capsize=2,
-                 label="pole, ±1σ", zorder=3)  # fmt: skip
-    bottom.errorbar(f, np.zeros_like(f), yerr=_bars(100 * std / np.maximum(f, 1e-12)), fmt=MARKERS[0],
-                    color=SERIES[0], capsize=2, zorder=3)  # fmt: skip
+    top.errorbar(
+        f,
+        z,
+        yerr=_bars(z_std),
+        xerr=_bars(std),
+        fmt=MARKERS[0],
+        color=SERIES[0],
+        capsize=2,
+        label="pole, ±1σ",
+        zorder=3,
+    )
+    bottom.errorbar(
+        f,
+        np.zeros_like(f),
+        yerr=_bars(100 * std / np.maximum(f, 1e-12)),
+        fmt=MARKERS[0],
+        color=SERIES[0],
+        capsize=2,
+        zorder=3,
+    )
     circles = [(m, c) for m in modal.modes for c in m.circles]
     if circles:
         at = np.array([m.frequency_hz for m, _ in circles])
@@ -105,7 +132,7 @@ def modes_overview(modal: ModalModel) -> Figure:
         deviation_std = np.array([100 * c.natural_frequency_std_hz / m.frequency_hz for m, c in circles])
         damping = np.array([100 * c.damping_ratio for _, c in circles])
         damping_std = np.array([100 * c.damping_std for _, c in circles])
-        style = {
+        style: dict[str, Any] = {
             "fmt": MARKERS[1],
             "color": SERIES[1],
             "ms": 3,

@@ -48,10 +48,14 @@ def nyquist_sheet(modal: ModalModel, index: int, calibrated: bool = True) -> Fig
     frequency = format_value(mode.frequency_hz, mode.frequency_std_hz, "Hz")
     damping = format_percent(mode.damping_ratio, mode.damping_std)
     figure.text(
-        0.5, 1 - 0.13 / figure.get_size_inches()[1],
+        0.5,
+        1 - 0.13 / figure.get_size_inches()[1],
         f"Mode {index + 1}: {frequency}, ζ = {damping} ({mode.method})",
-        ha="center", va="top", fontsize=9, fontweight="bold",
-    )  # fmt: skip
+        ha="center",
+        va="top",
+        fontsize=9,
+        fontweight="bold",
+    )
     if not circles:
         ax = figure.add_subplot(grid[0, :])
         ax.set_axis_off()
@@ -63,8 +67,17 @@ def nyquist_sheet(modal: ModalModel, index: int, calibrated: bool = True) -> Fig
         entries = {
             label: h for ax in figure.axes for h, label in zip(*ax.get_legend_handles_labels(), strict=True)
         }
-        figure.legend(entries.values(), entries.keys(), loc="upper center", ncols=5, frameon=False, handlelength=1.6,
-                      bbox_to_anchor=(0.5, 1 - 0.26 / figure.get_size_inches()[1]), columnspacing=1.4, fontsize=6.5)  # fmt: skip
+        figure.legend(
+            entries.values(),
+            entries.keys(),
+            loc="upper center",
+            ncols=5,
+            frameon=False,
+            handlelength=1.6,
+            bbox_to_anchor=(0.5, 1 - 0.26 / figure.get_size_inches()[1]),
+            columnspacing=1.4,
+            fontsize=6.5,
+        )
     return figure
 
 
@@ -76,8 +89,14 @@ def _panel(ax: Axes, circle: CircleFit, pole_hz: float, calibrated: bool) -> Non
     angle = np.linspace(0, 2 * np.pi, 181)
     ax.axhline(0, color="#bbbbbb", lw=0.6)
     ax.axvline(0, color="#bbbbbb", lw=0.6)
-    ax.plot(centre.real + radius * np.cos(angle), centre.imag + radius * np.sin(angle), "--", color=MODEL,
-            lw=1.1, label="fitted circle")  # fmt: skip
+    ax.plot(
+        centre.real + radius * np.cos(angle),
+        centre.imag + radius * np.sin(angle),
+        "--",
+        color=MODEL,
+        lw=1.1,
+        label="fitted circle",
+    )
     ax.plot(z.real, z.imag, "o-", color=MEASURED, ms=3.2, lw=0.4, label="measured lines")
     _mark(ax, circle, circle.natural_frequency_hz, scale, "*", PURPLE, 11, "most rapid sweep (circle)")
     _mark(ax, circle, pole_hz, scale, "D", "#000000", 6, "frequency of the pole", hollow=True)
@@ -92,13 +111,18 @@ def _panel(ax: Axes, circle: CircleFit, pole_hz: float, calibrated: bool) -> Non
     ax.set_ylabel(f"Im mobility, {unit}")
     ax.set_title(f"{circle.output.point} ← {circle.input.point}")
     ax.text(
-        0.985, 0.03,
+        0.985,
+        0.03,
         f"f = {format_value(circle.natural_frequency_hz, circle.natural_frequency_std_hz, 'Hz')}\n"
         f"ζ = {format_percent(circle.damping_ratio, circle.damping_std)}\n"
         f"misfit {100 * circle.residual:.1f} % of radius",
-        transform=ax.transAxes, ha="right", va="bottom", fontsize=6.5, linespacing=1.35,
+        transform=ax.transAxes,
+        ha="right",
+        va="bottom",
+        fontsize=6.5,
+        linespacing=1.35,
         bbox={"boxstyle": "square,pad=0.3", "fc": "white", "ec": "#cccccc", "lw": 0.5},
-    )  # fmt: skip
+    )
     if circle.pair_damping.size >= 3:
         _damping_spread(ax, circle)
 
@@ -106,7 +130,7 @@ def _panel(ax: Axes, circle: CircleFit, pole_hz: float, calibrated: bool) -> Non
 def _equal_limits(ax: Axes, z: NDArray[np.complex128], centre: complex, radius: float) -> None:
     """Equal scales, with room on the right for the pair damping and the words."""
     figure = ax.get_figure()
-    assert figure is not None
+    assert isinstance(figure, Figure)
     box, (width, height) = ax.get_position(), figure.get_size_inches()
     left = min(float(z.real.min(initial=np.inf)), centre.real - radius)
     right = max(float(z.real.max(initial=-np.inf)), centre.real + radius)
@@ -120,7 +144,7 @@ def _equal_limits(ax: Axes, z: NDArray[np.complex128], centre: complex, radius: 
 
 
 def _damping_spread(ax: Axes, circle: CircleFit) -> None:
-    """Small histogram of the damping of all half-power pairs, drawn without axes of its own (they are slow)."""
+    """Small histogram of the damping of all half-power pairs, without axes of its own (they are slow)."""
     percent = 100 * circle.pair_damping[np.isfinite(circle.pair_damping)]
     low, high = (float(v) for v in np.percentile(percent, [1, 99]))
     if not high > low:
@@ -149,17 +173,35 @@ def _damping_spread(ax: Axes, circle: CircleFit) -> None:
 
 
 def _mark(
-    ax: Axes, circle: CircleFit, f: float, scale: float, marker: str, color: str, size: float, label: str,
+    ax: Axes,
+    circle: CircleFit,
+    f: float,
+    scale: float,
+    marker: str,
+    color: str,
+    size: float,
+    label: str,
     hollow: bool = False,
-) -> None:  # fmt: skip
+) -> None:
     """Mark a frequency on the circle, at the angle of the data interpolated there."""
     lines = circle.frequency_hz
     if lines.size < 2 or not lines[0] <= f <= lines[-1]:
         return
     angle = np.interp(f, lines, np.unwrap(np.angle(circle.points - circle.centre)))
     at = (circle.centre + circle.radius * np.exp(1j * angle)) * scale
-    ax.plot(at.real, at.imag, marker, color=color, ms=size, mfc="none" if hollow else color, mew=1.0,
-            mec=color if hollow else "white", ls="none", label=label, zorder=5)  # fmt: skip
+    ax.plot(
+        at.real,
+        at.imag,
+        marker,
+        color=color,
+        ms=size,
+        mfc="none" if hollow else color,
+        mew=1.0,
+        mec=color if hollow else "white",
+        ls="none",
+        label=label,
+        zorder=5,
+    )
 
 
 def _power(exponent: int) -> str:

@@ -192,8 +192,12 @@ def stem_shapes(configuration: ConfigurationResults, indices: Sequence[int]) -> 
             ax.set_xticks(at, names, rotation=90, fontsize=6)
         else:
             step = -(-len(firsts) // _DOF_LABELS_UP_TO)
-            ax.set_xticks([firsts[k] for k in range(0, len(firsts), step)], [bodies[firsts[k]] for k in range(0, len(firsts), step)],
-                          rotation=90, fontsize=6)  # fmt: skip
+            ax.set_xticks(
+                [firsts[k] for k in range(0, len(firsts), step)],
+                [bodies[firsts[k]] for k in range(0, len(firsts), step)],
+                rotation=90,
+                fontsize=6,
+            )
     return figure
 
 
