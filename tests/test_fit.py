@@ -333,3 +333,15 @@ def test_nothing_to_fit_is_said_in_one_line() -> None:
         fit_rig(RIG, {"no_ring": from_frequencies("no_ring", [])}, FAST)
     with pytest.raises(EmaError, match="no configuration 'noring'"):
         fit_rig(RIG, {"noring": from_frequencies("noring", CASE_1)}, FAST)
+
+
+def test_standard_deviations_agree_with_the_profile_also_for_an_effect_with_bounds_decades_away() -> None:
+    rng = np.random.default_rng(14)
+    stiffened = rig_with_effects(RIG, ["shaft_torsion@carrier"])
+    torsion = "shaft_torsion@carrier.stiffness"
+    values = draw(rng, (7, 7)) | {torsion: 4e5}
+    fitted = fit_rig(stiffened, {"no_ring": simulate(stiffened, "no_ring", values, rng)}, FAST)
+    for name in (torsion, SUN_PLANET):
+        p = fitted.parameters[name]
+        assert (p.high - p.low) / 2 == pytest.approx(p.std, rel=0.15)
+        assert abs(p.value - values[name]) < 3.5 * p.std

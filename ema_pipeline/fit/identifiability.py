@@ -51,9 +51,9 @@ def judge_free(
             f"estimate inside the bounds, {settings.profile_rise:g} is needed on both sides (open {where})",
         )
     reference = abs(value)
-    if coordinate.kind == "linear" and np.isfinite(coordinate.high - coordinate.low):
-        # an effect's size may well be zero: what counts is its range
-        reference = max(reference, coordinate.scale * (coordinate.high - coordinate.low))
+    if coordinate.kind == "linear":
+        # an effect's size may well be zero: what counts is the size that would be clearly visible
+        reference = max(reference, coordinate.scale)
     if std > settings.relative_std_limit * reference:
         return Judgement(
             False,

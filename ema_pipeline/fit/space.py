@@ -155,7 +155,8 @@ def _coordinate(p: Parameter) -> Coordinate | None:
     if p.value > 0 and p.minimum == 0 and p.maximum == np.inf:
         # Free without bounds: three decades to either side of the start.
         return Coordinate(p, "log", 1.0, float(np.log(p.value * 1e-3)), float(np.log(p.value * 1e3)))
-    finite = [abs(v) for v in (p.minimum, p.maximum, p.value) if np.isfinite(v) and v != 0]
+    # The value is a size that would be clearly visible; bounds may lie decades further out.
+    finite = [abs(p.value)] if p.value else [abs(v) for v in (p.minimum, p.maximum) if np.isfinite(v) and v]
     if not finite:
         raise EmaError(f"free parameter '{p.name}' has neither a value nor bounds: give it 'min' and 'max'")
     scale = max(finite)
