@@ -107,7 +107,7 @@ class CompareSettings(UncertaintySettings):
     frf_background: float = Field(
         default=0.01,
         ge=0,
-        description="Standard uncertainty of an FRF relative to the root-mean-square of all outputs in the band: "
-        "cross-axis sensitivity (1-3 % of the main axis) and modes beyond the band fill antiresonances and "
-        "whatever symmetry makes zero.",
+        description="Standard uncertainty of an FRF relative to the root-mean-square of all outputs in the "
+        "band: cross-axis sensitivity (1-3 % of the main axis) and modes beyond the band fill antiresonances "
+        "and whatever symmetry makes zero.",
     )
