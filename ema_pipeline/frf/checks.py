@@ -105,11 +105,10 @@ def _scatter(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings) -> 
 def _driving_points(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings) -> list[Verdict]:
     """Sign of driving points: a passive structure takes power in, so that Im(accelerance) ≥ 0."""
     verdicts = []
-    acceleration = frfs.accelerance() if any(d in frfs.inputs for d in frfs.outputs) else frfs.frf
     for o, output in enumerate(frfs.outputs):
         if output not in frfs.inputs or frfs.hits[o, frfs.inputs.index(output)] == 0:
             continue
-        loss = acceleration[o, frfs.inputs.index(output), inside].imag
+        loss = _accelerance(frfs, o, frfs.inputs.index(output), inside).imag
         # Squares: resonances decide, not the noise between them.
         total = float(np.sum(loss**2))
         wrong = float(np.sum(loss[loss < 0] ** 2)) / total if total > 0 else 0.0
@@ -143,12 +142,11 @@ def _reciprocity(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings)
     verdicts = []
     place = {d: o for o, d in enumerate(frfs.outputs)}
     both = [(place[d], i) for i, d in enumerate(frfs.inputs) if d in place]
-    acceleration = frfs.accelerance() if len(both) > 1 else frfs.frf
     for first, (o1, i1) in enumerate(both):
         for o2, i2 in both[first + 1 :]:
             if frfs.hits[o1, i2] == 0 or frfs.hits[o2, i1] == 0:
                 continue
-            one, other = acceleration[o1, i2, inside], acceleration[o2, i1, inside]
+            one, other = _accelerance(frfs, o1, i2, inside), _accelerance(frfs, o2, i1, inside)
             size = 0.5 * (np.linalg.norm(one) + np.linalg.norm(other))
             difference = float(np.linalg.norm(one - other) / size) if size > 0 else 0.0
             passes = difference <= settings.reciprocity
@@ -170,3 +168,9 @@ def _reciprocity(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings)
                 )
             )
     return verdicts
+
+
+def _accelerance(frfs: FrfSet, output: int, source: int, inside: NDArray[np.bool_]) -> NDArray[np.complex128]:
+    """One FRF in the band as acceleration over force; the whole set at once would double the memory."""
+    power = {"acceleration": 0, "velocity": 1, "displacement": 2}[frfs.quantities[output]]
+    return np.asarray(frfs.frf[output, source, inside] * (2j * np.pi * frfs.frequency_hz[inside]) ** power)

@@ -35,8 +35,8 @@ def estimate_frfs(hits: Iterable[HitSamples], settings: FrfSettings | None = Non
 
     Variance of H1: given the forces, H1 is the least-squares slope of Y on F. The residual
     R = Σ|Y - H1·F|² = Σ|Y|²(1 - γ²) of n hits has n - 1 complex degrees of freedom, so that R/(n - 1) is
-    unbiased for the noise power and E|H - E H|² = R/((n - 1) Σ|F|²), that is |H|²(1 - γ²)/((n - 1) γ²); [1]_ has n in
-    place of n - 1. A single line gives it but 2(n - 1) real degrees of freedom; the noise power R is
+    unbiased for the noise power and E|H - E H|² = R/((n - 1) Σ|F|²), that is |H|²(1 - γ²)/((n - 1) γ²);
+    [1]_ has n in place of n - 1. A single line gives it but 2(n - 1) real degrees of freedom; the noise power R is
     therefore averaged over neighbouring lines, as few as give `variance_dof` complex degrees of freedom.
     For H2 and Hv the relative variance of H1 is taken.
 

@@ -20,7 +20,8 @@ def flat_top_share(samples: NDArray[np.float64]) -> float:
     Near any smooth peak the signal is a parabola, so that it stays within ε of its top for a time that
     grows with √ε: half as long within ε as within 4ε. The same ratio of 1/2 holds for the number of samples
     that many periods of a steady vibration spend there, and for a decaying one it is lower. Of a clipped
-    top all samples lie within the noise that the converter adds after clipping; so ε is 6 deviations of that noise.
+    top all samples lie within the noise that the converter adds after clipping; so ε is 6 deviations of
+    that noise.
 
     Parameters
     ----------
