@@ -27,6 +27,7 @@ from ema_pipeline.modal.circle.modes import (
 )
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.types import CircleFit, ModalModel, Mode, StabilisationChart
+from ema_pipeline.threads import single_blas_thread
 
 _ALTERNATIONS = 50
 _NOISE_LINES = 51  # over which the noise of the indicator is taken
@@ -53,7 +54,11 @@ def identify_by_circle(frfs: FrfSet, settings: CircleSettings | None = None) -> 
     EmaError
         If no FRF was measured, or none shows a resonance within the band.
     """
-    settings = settings or CircleSettings()
+    with single_blas_thread():
+        return _identify(frfs, settings or CircleSettings())
+
+
+def _identify(frfs: FrfSet, settings: CircleSettings) -> ModalModel:
     data = mobilities(frfs)
     if data.mobility.shape[0] == 0:
         raise EmaError("circle fit: no measured FRF; check impacts and channels in test.toml")

@@ -17,6 +17,7 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.circle.fit import MINIMUM_POINTS, SdofCircle, fit_circle, sweep
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.types import CircleFit, ModalModel
+from ema_pipeline.threads import single_blas_thread
 
 _PASSES = 2  # of refinement; a third changes damping by less than its uncertainty
 _CREDIBLE = 0.3  # residual over radius up to which a neighbour's circle may be taken off
@@ -94,10 +95,9 @@ def circle_fits(
     settings = settings or CircleSettings()
     data = mobilities(frfs)
     targets = [seen_in_frfs(mode.pole, frfs.response_decay_rad_s) for mode in modal.modes]
-    return tuple(
-        tuple(to_circle_fit(circle, frfs, data, row) for row, circle in found)
-        for found in fit_targets(data, targets, settings)
-    )
+    with single_blas_thread():
+        fitted = fit_targets(data, targets, settings)
+    return tuple(tuple(to_circle_fit(circle, frfs, data, row) for row, circle in found) for found in fitted)
 
 
 def seen_in_frfs(pole: complex, decay_rad_s: float) -> Target:
