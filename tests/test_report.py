@@ -396,6 +396,22 @@ def test_summary_speaks_of_agreement_only_where_the_error_is_about_one(run: RunR
     assert "as well as the data can tell" in " ".join(summary.findings(good))
 
 
+def test_misfit_is_the_first_caution_even_where_values_are_identified(run: RunResults) -> None:
+    assert run.fit is not None
+    assert "does not fit" not in " ".join(summary.cautions(run))
+    poor = replace(run, fit=replace(run.fit, chi2_per_dof=3091.0))
+    assert summary.cautions(poor)[0].startswith("The model does not fit (χ² per degree of freedom 3091)")
+
+
+def test_cautions_of_one_kind_are_counted_rather_than_all_written_out() -> None:
+    many = tuple(f"single hits of {b}.x over sun.u scatter by {n}.5%" for n, b in enumerate("abcdefgh"))
+    lines = summary.cautions(RunResults("x", warnings=(*many, "another matter")))
+    assert len(lines) == 3
+    assert lines[0] == "single hits of a.x over sun.u scatter by 0.5%."
+    assert lines[1].endswith("(6 more of this kind.)")
+    assert lines[2] == "another matter."
+
+
 def _printed(renderable: object, width: int, encoding: str = "utf-8") -> str:
     file = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
     Console(file=file, width=width, no_color=True, force_terminal=False).print(renderable)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 from ema_pipeline.fit.types import FitResult, ParameterEstimate
 from ema_pipeline.report.numbers import format_value, plain, words
@@ -13,6 +14,14 @@ LOW_MAC = 0.8
 
 FAR_SIGMA = 3.0
 """A difference beyond this many standard uncertainties is named."""
+
+POOR_CHI2 = 4.0
+"""χ² per degree of freedom beyond which the misfit exceeds twice the uncertainty: fitted values are doubtful."""
+
+SAME_KIND = 2
+"""Cautions of one kind that are written out; the rest is counted."""
+
+_DOF_OR_NUMBER = re.compile(r"-?\b[A-Za-z]\w*\.[a-z]\w*|[\d.]*\d")
 
 
 def findings(results: RunResults) -> tuple[str, ...]:
@@ -62,6 +71,11 @@ def cautions(results: RunResults) -> tuple[str, ...]:
     lines: list[str] = []
     fit = results.fit
     if fit is not None:
+        if fit.chi2_per_dof > POOR_CHI2:
+            lines.append(
+                f"The model does not fit (χ² per degree of freedom {plain(fit.chi2_per_dof, 3)}): the fitted values "
+                "and their uncertainties hold only for a model that lacks nothing"
+            )
         for p in fit.parameters.values():
             value = format_value(p.value, p.std, p.unit)
             if p.free and not p.identified:
@@ -81,7 +95,7 @@ def cautions(results: RunResults) -> tuple[str, ...]:
     for c in results.configurations:
         lines += [f"{c.name}: {text}" for text in _cautions_of(c)]
     lines += results.warnings
-    return tuple(dict.fromkeys(_sentence(line) for line in lines))
+    return _without_repeats([_sentence(line) for line in lines])
 
 
 def _measured(c: ConfigurationResults) -> str:
@@ -152,6 +166,20 @@ def _worst(results: RunResults) -> list[str]:
         d = max(dofs, key=lambda d: d.z)
         lines.append(f"Largest difference in shape: at {d.dof}, {d.configuration}, {plain(d.z, 2)}σ.")
     return lines
+
+
+def _without_repeats(lines: list[str]) -> tuple[str, ...]:
+    """Lines that differ only in DOFs and numbers are a kind: its first `SAME_KIND` lines stand for all."""
+    kinds: dict[str, list[str]] = {}
+    for line in dict.fromkeys(lines):
+        kinds.setdefault(_DOF_OR_NUMBER.sub("#", line), []).append(line)
+    shown = []
+    for mine in kinds.values():
+        rest = len(mine) - SAME_KIND
+        shown += mine[:SAME_KIND] if rest > 1 else mine
+        if rest > 1:
+            shown[-1] += f" ({rest} more of this kind.)"
+    return tuple(shown)
 
 
 def _count(n: int, noun: str) -> str:

@@ -1,0 +1,73 @@
+"""Screens that show no run: the library of effects, a model's own modes, progress."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any
+
+from rich import box
+from rich.console import Console, Group, RenderableType
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+Tell = Callable[[float, str], None]
+
+
+def effects_list(effects: Sequence[dict[str, Any]]) -> RenderableType:
+    """Every effect with what it is, where it can sit, its parameters and its tell-tale signs."""
+    parts: list[RenderableType] = []
+    for effect in effects:
+        parameters = "; ".join(
+            f"{p['name']} ({p['unit']}): {p['description']}"
+            if p["description"]
+            else f"{p['name']} ({p['unit']})"
+            for p in effect["parameters"]
+        )
+        table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 1))
+        table.add_column(width=10, no_wrap=True)
+        table.add_column(overflow="fold")
+        table.add_row("  what", Text(effect["title"]))
+        table.add_row("  places", Text(", ".join(effect["places"])))
+        table.add_row("  size", Text(parameters))
+        table.add_row("  signs", Text(effect["signs"]))
+        parts += [Text(effect["id"], style="bold"), table]
+    return Group(*parts)
+
+
+def model_table(configuration: str, modes: Sequence[dict[str, Any]]) -> RenderableType:
+    """The model's own modes."""
+    table = Table(title=f"Model, {configuration}", box=box.SIMPLE, title_justify="left")
+    table.add_column("mode", justify="right")
+    table.add_column("frequency, Hz", justify="right")
+    table.add_column("damping, %", justify="right")
+    table.add_column("family")
+    for number, mode in enumerate(modes, 1):
+        damping = 100 * mode["damping_ratio"]
+        table.add_row(str(number), f"{mode['frequency_hz']:.2f}", f"{damping:.3f}", mode["family"])
+    return table
+
+
+@contextmanager
+def progress_bars() -> Iterator[Callable[[str], AbstractContextManager[Tell]]]:
+    """Progress bars on stderr; the function handed out opens one bar."""
+    columns = (
+        TextColumn("{task.description:20s}"),
+        BarColumn(bar_width=30),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[now]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+
+        @contextmanager
+        def show(label: str) -> Iterator[Tell]:
+            task = bars.add_task(label, total=1.0, now="")
+
+            def tell(done: float, text: str = "") -> None:
+                bars.update(task, completed=done, now=text[:30])
+
+            yield tell
+
+        yield show
