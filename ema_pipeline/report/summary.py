@@ -16,7 +16,7 @@ FAR_SIGMA = 3.0
 """A difference beyond this many standard uncertainties is named."""
 
 POOR_CHI2 = 4.0
-"""χ² per degree of freedom beyond which the misfit exceeds twice the uncertainty: fitted values are doubtful."""
+"""χ² per degree of freedom beyond which fitted values are doubtful (misfit twice the uncertainty)."""
 
 SAME_KIND = 2
 """Cautions of one kind that are written out; the rest is counted."""
@@ -73,8 +73,8 @@ def cautions(results: RunResults) -> tuple[str, ...]:
     if fit is not None:
         if fit.chi2_per_dof > POOR_CHI2:
             lines.append(
-                f"The model does not fit (χ² per degree of freedom {plain(fit.chi2_per_dof, 3)}): the fitted values "
-                "and their uncertainties hold only for a model that lacks nothing"
+                f"The model does not fit (χ² per degree of freedom {plain(fit.chi2_per_dof, 3)}): "
+                "the fitted values and their uncertainties hold only for a model that lacks nothing"
             )
         for p in fit.parameters.values():
             value = format_value(p.value, p.std, p.unit)

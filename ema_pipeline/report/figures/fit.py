@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
 from ema_pipeline.report.numbers import format_value, plain, prefixed, words
@@ -167,7 +168,7 @@ def _profile(ax: Axes, p: ParameterEstimate, first: bool) -> None:
     low, high = (np.clip(v * scale, x.min(), x.max()) for v in (p.low, p.high))
     ax.axvspan(low, high, color="#dfe9f2", lw=0, label="68 % interval")
     if np.isfinite(p.std) and p.std > 0:
-        fine = np.linspace(x.min(), x.max(), 120)
+        fine = np.linspace(x.min(), x.max(), 2000)
         ax.plot(
             fine,
             ((fine / scale - p.value) / p.std) ** 2,
@@ -178,6 +179,12 @@ def _profile(ax: Axes, p: ParameterEstimate, first: bool) -> None:
         )
     ax.plot(x, y, "o-", color=MEASURED, ms=2.4, label="profile")
     ax.axvline(p.value * scale, color=BLACK, lw=0.8, label="estimate")
+    if x.min() > 0 and x.max() > 20 * x.min():
+        # profiles that reach out to a bound
+        ax.set_xscale("log")
+        ax.xaxis.set_major_locator(LogLocator(base=10, subs=(1.0,), numticks=5))
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+        ax.xaxis.set_minor_formatter(NullFormatter())
     ax.set_ylim(0, max(5.0, min(9.0, 1.1 * float(np.nanmax(y)))))
     ax.set_title(words(p.name) + ("" if p.identified else "\nnot identified"), fontsize=7, pad=4)
     ax.set_xlabel(f"value, {unit or 1}")

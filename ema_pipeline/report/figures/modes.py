@@ -144,9 +144,9 @@ def modes_overview(modal: ModalModel) -> Figure:
         beside = at * 1.012 if log else at + 0.006 * (high - low)
         top.errorbar(beside, damping, yerr=_bars(damping_std), label="circle fits of this mode, ±1σ", **style)
         bottom.errorbar(beside, deviation, yerr=_bars(deviation_std), **style)
-        limit = 1.6 * float(np.nanpercentile(np.abs(np.r_[deviation, 100 * std / f]), 97))
+        limit = 1.6 * float(np.nanpercentile(np.abs(np.r_[deviation, 100 * std / f]), 90))
         bottom.set_ylim(-limit, limit)
-        top.set_ylim(0, 1.35 * float(np.nanpercentile(np.r_[z + np.nan_to_num(z_std), damping], 98)))
+        top.set_ylim(0, 1.35 * float(np.nanpercentile(np.r_[z + np.nan_to_num(z_std), damping], 92)))
     else:
         top.set_ylim(bottom=0)
     top.set_ylabel("damping ratio, %")

@@ -136,7 +136,7 @@ def _equal_limits(ax: Axes, z: NDArray[np.complex128], centre: complex, radius: 
     right = max(float(z.real.max(initial=-np.inf)), centre.real + radius)
     low = min(float(z.imag.min(initial=np.inf)), centre.imag - radius)
     high = max(float(z.imag.max(initial=-np.inf)), centre.imag + radius)
-    per_inch = max((right - left) / (0.64 * box.width * width), (high - low) / (0.78 * box.height * height))
+    per_inch = max((right - left) / (0.58 * box.width * width), (high - low) / (0.78 * box.height * height))
     half = 0.5 * per_inch * box.height * height
     start = left - 0.03 * per_inch * box.width * width
     ax.set_xlim(start, start + per_inch * box.width * width)
@@ -169,7 +169,7 @@ def _damping_spread(ax: Axes, circle: CircleFit) -> None:
         )
     words = {"transform": ax.transAxes, "ha": "center", "fontsize": 5.8, "color": GREY}
     ax.text(left + width / 2, bottom + 1.1 * height, "ζ of all pairs", va="bottom", **words)  # type: ignore[arg-type]
-    ax.text(left + width / 2, bottom - 0.015, f"{plain(low, 3)} … {plain(high, 3)} %", va="top", **words)  # type: ignore[arg-type]
+    ax.text(left + width / 2, bottom - 0.015, f"{plain(low)} … {plain(high)} %", va="top", **words)  # type: ignore[arg-type]
 
 
 def _mark(
