@@ -141,13 +141,14 @@ _stage_command("report", "Write the tables, plots and report of OUT.")
 
 
 @app.command()
-def check(raw: Raw, verbose: Verbose = False) -> None:
+def check(raw: Raw) -> None:
     """Judge every hit of a raw folder: value, limit and clause of each check."""
     from ema_pipeline.job import check_raw
     from ema_pipeline.report import terminal
 
     for name, hits in check_raw(raw).items():
-        _print(terminal.hit_table(hits, name, all_checks=verbose))
+        _print(terminal.verdict_table(hits, name))
+        _print(terminal.hits_table(hits, name))
 
 
 @app.command()
@@ -169,7 +170,9 @@ def compare(out: Out) -> None:
     with _progress(False) as show:
         run, _ = run_on(out, ["correlate"], show=show)
     run.require_rig("correlate")
-    _print(terminal.comparison_tables(load_results(run)))
+    comparison = load_results(run).comparison
+    assert comparison is not None  # the stage has just run
+    _print(terminal.comparison_tables(comparison))
 
 
 @app.command()
@@ -198,13 +201,13 @@ def rigs() -> None:
 def effects(rig: RigOption = None, json: Json = False) -> None:
     """List the physical effects that a model may be missing, with places, parameters and signs."""
     from ema_pipeline.job import list_effects
-    from ema_pipeline.report import terminal
+    from ema_pipeline.report.listings import effects_list
 
     listed = list_effects(rig or "planetary")
     if json:
         _print_json({"effects": listed})
     else:
-        _print(terminal.effects_table(listed))
+        _print(effects_list(listed))
 
 
 @app.command()
@@ -217,7 +220,7 @@ def model(
 ) -> None:
     """Show the modes of the model itself."""
     from ema_pipeline.job import list_model_modes
-    from ema_pipeline.report import terminal
+    from ema_pipeline.report.listings import model_table
 
     listed = list_model_modes(rig, configuration)
     if json:
@@ -225,7 +228,7 @@ def model(
         _print_json({"modes": first, "configurations": listed} if len(listed) > 1 else {"modes": first})
     else:
         for name, modes in listed.items():
-            _print(terminal.model_table(name, modes))
+            _print(model_table(name, modes))
 
 
 @app.command()
@@ -299,7 +302,7 @@ def _progress(quiet: bool) -> Iterator[ShowStage | None]:
     elif not sys.stderr.isatty():
         yield _stage_lines
     else:
-        from ema_pipeline.report.terminal import progress_bars
+        from ema_pipeline.report.listings import progress_bars
 
         with progress_bars() as show:
             yield show
@@ -308,7 +311,11 @@ def _progress(quiet: bool) -> Iterator[ShowStage | None]:
 @contextmanager
 def _stage_lines(label: str) -> Iterator[Progress]:
     start = time.perf_counter()
-    yield lambda done, text="": None
+
+    def tell(done: float, text: str = "") -> None:
+        """Show nothing until the stage is done."""
+
+    yield tell
     typer.echo(f"{label}: {time.perf_counter() - start:.1f} s", err=True)
 
 

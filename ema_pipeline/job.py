@@ -12,6 +12,8 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.ingest.description import Campaign, TestDescription, read_campaign
+from ema_pipeline.ingest.load import load_records
+from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.pipeline import (
     PipelineSettings,
@@ -27,9 +29,7 @@ from ema_pipeline.pipeline import (
 )
 from ema_pipeline.rigs import Rig, load_rig, model_modes, rig_names
 from ema_pipeline.simulate.campaign import SimulatedCampaign, simulate_campaign
-from ema_pipeline.stages.base import Run, RunInfo, save_info, silent
-from ema_pipeline.stages.hits import judge_hits
-from ema_pipeline.stages.ingest import read_records
+from ema_pipeline.stages.base import Run, RunInfo, save_info
 from ema_pipeline.store import Store
 
 DEFAULT_PIPELINE = "default"
@@ -194,7 +194,7 @@ def check_raw(raw: Path) -> dict[str, tuple[Hit, ...]]:
     settings = load_pipeline(DEFAULT_PIPELINE).hits
     judged = {}
     for test in read_campaign(raw).tests:
-        judged[test.configuration or "default"] = judge_hits(list(read_records(test, silent)), settings)
+        judged[test.configuration or "default"] = hits_of_test(list(load_records(test)), settings)
     return judged
 
 
@@ -289,7 +289,7 @@ def _tidy(out: Path) -> Iterator[None]:
     try:
         yield
     except BaseException:
-        (out / ".lock").unlink(missing_ok=True)
-        if not existed and out.is_dir() and not any(out.iterdir()):
+        if not existed and out.is_dir() and {p.name for p in out.iterdir()} <= {".lock"}:
+            (out / ".lock").unlink(missing_ok=True)
             out.rmdir()
         raise

@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from pydantic import Field
 
@@ -54,6 +54,10 @@ class CorrelateSettings(Settings):
 class ModalStageSettings(Settings):
     """Identification, and the circle fits beside it."""
 
+    method: Literal["lscf", "circle"] = Field(
+        "lscf",
+        description="'lscf': poles of all FRFs at once, circle fits as a check; 'circle': circle fits alone",
+    )
     identify: ModalSettings = Field(ModalSettings(), description="poles, selection, shapes")
     circle: CircleSettings = Field(CircleSettings(), description="Nyquist circles")
 

@@ -8,8 +8,7 @@ from typing import Any, cast
 from ema_pipeline import codec
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.hit_settings import HitSettings
-from ema_pipeline.ingest.hits import align_hits, find_hits
-from ema_pipeline.ingest.quality import check_hit
+from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import Hit, HitSamples, Record, cut_hit
 from ema_pipeline.stages.base import Progress, Run, silent
 from ema_pipeline.store import Store
@@ -28,25 +27,9 @@ def inputs(run: Run, configuration: str) -> str:
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Find the hits of every record and judge them; every impact point needs one that is good."""
     settings = cast(HitSettings, run.settings[NAME])
-    hits = judge_hits(StoredRecords(run.store, configuration), settings, progress)
+    hits = hits_of_test(StoredRecords(run.store, configuration), settings)
     require_good_hits(hits, configuration)
     return {"hits": hits}
-
-
-def judge_hits(
-    records: Sequence[Record], settings: HitSettings, progress: Progress = silent
-) -> tuple[Hit, ...]:
-    """All hits of a test, of one common length, with their verdicts."""
-    found: list[tuple[Hit, ...]] = []
-    for i, record in enumerate(records):
-        progress(0.5 * i / len(records), record.file)
-        found.append(find_hits(record, settings))
-    hits = align_hits(tuple(h for hits in found for h in hits), records, settings)
-    judged: list[Hit] = []
-    for i, record in enumerate(records):
-        progress(0.5 + 0.5 * i / len(records), record.file)
-        judged += [check_hit(record, hit, settings) for hit in hits if hit.file == record.file]
-    return tuple(judged)
 
 
 def require_good_hits(hits: tuple[Hit, ...], configuration: str) -> None:

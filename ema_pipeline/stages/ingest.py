@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.description import TestDescription, read_campaign
-from ema_pipeline.ingest.load import load_record
+from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Record
 from ema_pipeline.stages.base import Progress, Run
 
@@ -30,22 +30,13 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     return {
         "sources": file_hashes(test),
         "title": test.title,
-        "records": read_records(test, progress),
+        "records": _with_progress(load_records(test), len(test.records), progress),
     }
 
 
-def read_records(test: TestDescription, progress: Progress) -> Iterator[Record]:
-    """Records of one test, one after the other; all must have one sample rate."""
-    rate = None
-    for index, entry in enumerate(test.records):
-        progress(index / len(test.records), entry.file)
-        record = load_record(test, entry)
-        if rate is not None and abs(record.sample_rate_hz / rate - 1) > 1e-4:
-            raise EmaError(
-                f"{test.path_of(entry)}: is sampled at {record.sample_rate_hz:g} Hz but "
-                f"{test.records[0].file} at {rate:g} Hz; put them into folders of their own"
-            )
-        rate = rate or record.sample_rate_hz
+def _with_progress(records: Iterator[Record], count: int, progress: Progress) -> Iterator[Record]:
+    for index, record in enumerate(records):
+        progress(index / count, record.file)
         yield record
 
 

@@ -1,0 +1,450 @@
+"""The command line: what users type, what they get, and what they are told when something is wrong."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from ema_pipeline import cli
+from ema_pipeline.simulate import simulate_campaign
+
+RUN = [sys.executable, "-m", "ema_pipeline.cli", "run"]
+
+
+def ema(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
+    """Run the command in this process; returns exit code, stdout and stderr."""
+    before = sys.argv
+    sys.argv = ["ema", *map(str, arguments)]
+    try:
+        cli.main()
+        code = 0
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    finally:
+        sys.argv = before
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+@pytest.fixture(scope="module")
+def small_raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small healthy test without the ring: three sensors, two points, one hit each, CSV."""
+    raw = tmp_path_factory.mktemp("raw") / "small"
+    simulate_campaign(
+        raw,
+        "planetary",
+        configurations=["no_ring"],
+        sensors=["carrier.x", "sun.y", "planet1.x", "planet1.u"],
+        impacts=["carrier.x", "planet1.u"],
+        hits=1,
+        duration_s=1.0,
+        format="csv",
+        seed=3,
+    )
+    return raw
+
+
+@pytest.fixture(scope="module")
+def results(small_raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of a run on the small test."""
+    out = tmp_path_factory.mktemp("out") / "small"
+    command = [*RUN, str(small_raw), "--rig", "planetary", "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "report.html" in done.stdout
+    return out
+
+
+def test_a_run_writes_every_file_of_the_results_folder(results: Path) -> None:
+    names = {p.name for p in results.iterdir()}
+    assert {"ema.h5", "report.html", "plots", "modes.csv", "summary.json"} <= names
+    plots = {p.suffix for p in (results / "plots").iterdir()}
+    assert {".png", ".svg"} <= plots
+
+
+def test_the_summary_holds_modes_near_those_of_the_model_that_made_the_data(
+    results: Path, small_raw: Path
+) -> None:
+    summary = json.loads((results / "summary.json").read_text(encoding="utf-8"))
+    truth = json.loads((small_raw / "truth.json").read_text(encoding="utf-8"))
+    true_hz = np.array([m["frequency_hz"] for m in truth["configurations"]["no_ring"]["modes"]])
+    modes = summary["configurations"]["no_ring"]["modes"]
+    assert len(modes) >= 8
+    for mode in modes:
+        nearest = true_hz[np.argmin(np.abs(true_hz - mode["frequency_hz"]))]
+        assert mode["frequency_hz"] == pytest.approx(nearest, rel=2e-3)
+        assert mode["model_frequency_hz"] == pytest.approx(nearest, rel=2e-3)
+        assert mode["frequency_std_hz"] > 0
+        assert mode["damping_ratio"] == pytest.approx(0.01, rel=0.1)
+    mesh = summary["fit"]["parameters"]["sun_planet_mesh_stiffness"]
+    assert mesh["identified"]
+    assert abs(mesh["value"] - truth["values"]["sun_planet_mesh_stiffness"]) < 3 * mesh["std"]
+    assert summary["fit"]["parameters"]["ring_planet_mesh_stiffness"]["value"] is None
+    assert summary["configurations"]["no_ring"]["records"]["used"] == 2
+
+
+def test_an_unchanged_second_run_computes_nothing(
+    results: Path, small_raw: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (results / "ema.h5").stat().st_mtime_ns
+    code, out, err = ema(capsys, "run", small_raw, "--rig", "planetary", "--out", results)
+    assert code == 0
+    assert "Nothing had changed" in out
+    assert err == ""
+    assert (results / "ema.h5").stat().st_mtime_ns == before
+
+
+def test_a_changed_setting_recomputes_only_what_depends_on_it(
+    results: Path, small_raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(results, out)
+    code, text, _ = ema(
+        capsys,
+        "run",
+        small_raw,
+        "--rig",
+        "planetary",
+        "--out",
+        out,
+        "--verbose",
+        "--set",
+        "report.plots=false",
+    )
+    assert code == 0
+    assert "Computed: report\n" in text
+
+
+def test_stages_run_alone_on_a_results_folder_without_the_raw_data(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(results, out)
+    code, text, _ = ema(capsys, "frf", out, "--set", "frf.estimator=H2")
+    assert code == 0
+    assert text == "Computed: frf (no_ring)\n"
+    with h5py.File(out / "ema.h5") as file:
+        assert file["stages/frf/no_ring/frfs"].attrs["estimator"] == "H2"
+
+
+def test_compare_shows_each_mode_with_its_difference(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, _ = ema(capsys, "compare", results)
+    assert code == 0
+    summary = json.loads((results / "summary.json").read_text(encoding="utf-8"))
+    for mode in summary["configurations"]["no_ring"]["modes"]:
+        assert f"{int(mode['frequency_hz'])}." in out
+
+
+def test_check_shows_a_verdict_table_and_writes_nothing(
+    small_raw: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = sorted(p.name for p in small_raw.iterdir())
+    code, out, _ = ema(capsys, "check", small_raw)
+    assert code == 0
+    assert "carrier" in out
+    assert sorted(p.name for p in small_raw.iterdir()) == before
+
+
+def test_the_model_command_gives_the_seeds_frequencies_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = ema(capsys, "model", "--rig", "planetary", "--configuration", "no_ring", "--json")
+    assert code == 0
+    modes = json.loads(out)["modes"]
+    frequencies = [m["frequency_hz"] for m in modes]
+    for seed_hz in (51.1, 106.7, 113.9, 1395.0):
+        assert min(abs(f - seed_hz) for f in frequencies) < 0.06
+    assert {m["family"] for m in modes} >= {"rotational", "translational"}
+
+
+def test_rigs_and_effects_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "planetary" in ema(capsys, "rigs")[1]
+    code, out, _ = ema(capsys, "effects", "--rig", "planetary", "--json")
+    assert code == 0
+    listed = {e["id"]: e for e in json.loads(out)["effects"]}
+    assert listed["mesh_stiffness_loss"]["places"] == [
+        "sun-planet1",
+        "sun-planet2",
+        "ring-planet1",
+        "ring-planet2",
+    ]
+
+
+def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = ema(capsys, "--version")
+    assert code == 0
+    assert out.startswith("ema 0.")
+
+
+def test_a_wrong_option_is_a_usage_error_with_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+    assert ema(capsys, "run")[0] == 2
+    assert ema(capsys, "run", "x", "--no-such-option")[0] == 2
+
+
+def test_importing_the_package_loads_no_figure_window_and_little_else() -> None:
+    code = (
+        "import sys, ema_pipeline, ema_pipeline.cli\n"
+        "heavy = {'matplotlib', 'tkinter', 'PyQt5', 'PyQt6', 'PySide6', 'pandas', 'scipy'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_run_loads_no_pyplot_and_no_window_toolkit(small_raw: Path) -> None:
+    code = (
+        "import sys, importlib, pkgutil, ema_pipeline\n"
+        "for m in pkgutil.walk_packages(ema_pipeline.__path__, 'ema_pipeline.'):\n"
+        "    importlib.import_module(m.name)\n"
+        "windows = ('matplotlib.pyplot', 'tkinter', 'PyQt5', 'PyQt6', 'PySide6')\n"
+        "print([n for n in windows if n in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_run_killed_again_and_again_ends_with_the_same_tables(
+    small_raw: Path, results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "killed"
+    rng = np.random.default_rng(5)
+    kills = 0
+    for _ in range(10):
+        process = subprocess.Popen([*RUN, str(small_raw), "--rig", "planetary", "--out", str(out), "--quiet"])
+        try:
+            process.wait(float(rng.uniform(0.6, 3.5)))
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            kills += 1
+        if (out / "ema.h5").exists():
+            with h5py.File(out / "ema.h5") as file:
+                assert "run" in file
+    assert kills >= 3
+    code, _, err = ema(capsys, "run", small_raw, "--rig", "planetary", "--out", out, "--quiet")
+    assert (code, err) == (0, "")
+    for name in ("summary.json", "modes.csv"):
+        assert (out / name).read_bytes() == (results / name).read_bytes()
+    assert not list(out.glob(".ema.h5*"))
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    """Replace text that must be there."""
+    text = path.read_text(encoding="utf-8")
+    assert old in text, f"{old!r} is not in {path}"
+    path.write_text(text.replace(old, new), encoding="utf-8")
+
+
+def toml(old: str, new: str) -> Callable[[Path], None]:
+    return lambda raw: edit(raw / "test.toml", old, new)
+
+
+def record(raw: Path) -> Path:
+    return sorted(raw.glob("carrier*.csv"))[0]
+
+
+def replace_record(write: Callable[[Path], None]) -> Callable[[Path], None]:
+    """Put another file in the place of the first record, under its name."""
+    return lambda raw: write(record(raw))
+
+
+def half_an_hdf5_file(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file["hammer"] = np.zeros(100_000)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+
+
+def half_a_uff_file(path: Path) -> None:
+    lines = [
+        "    -1",
+        "    58",
+        *["hammer"] * 5,
+        "    1         0    0         0       NONE         1   1       NONE         1   1",
+        "         2      1000         1  0.00000e+00  1.95313e-04  0.00000e+00",
+        *["        17    0    0    0 NONE                 NONE"] * 4,
+        "  1.0000E+00  2.0000E+00",
+    ]
+    path.write_text("\n".join(lines), encoding="ascii")
+
+
+def zip_named_mat(path: Path) -> None:
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("a.txt", "nothing of use")
+
+
+def put_nan(path: Path) -> None:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    cells = lines[500].split(",")
+    cells[-1] = "nan"
+    lines[500] = ",".join(cells)
+    path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def drop_column(path: Path) -> None:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join(line.rpartition(",")[0] for line in lines), encoding="utf-8")
+
+
+def swap_hammer(raw: Path) -> None:
+    path = raw / "test.toml"
+    text = path.read_text(encoding="utf-8")
+    text = text.replace('name = "hammer"', 'name = "@"').replace('name = "carrier_x"', 'name = "hammer"')
+    path.write_text(text.replace('name = "@"', 'name = "carrier_x"'), encoding="utf-8")
+
+
+def second_rate(raw: Path) -> None:
+    edit(raw / "test.toml", "sample_rate_hz = 5120.0", "")
+    path = record(raw)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    fast = [lines[0]]
+    for line in lines[1:]:
+        time, _, rest = line.partition(",")
+        fast.append(f"{float(time) / 2:.10g},{rest}")
+    path.write_text("\n".join(fast), encoding="utf-8")
+
+
+def silent_hammer(path: Path) -> None:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    column = lines[0].split(",").index("hammer")
+    rows = [line.split(",") for line in lines[1:]]
+    for row in rows:
+        row[column] = "0.0"
+    path.write_text("\n".join([lines[0], *(",".join(r) for r in rows)]), encoding="utf-8")
+
+
+# name → (what is done to the raw folder, what the one line must name)
+BAD: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
+    "empty record": (replace_record(lambda p: p.write_bytes(b"")), ("carrier",)),
+    "binary junk": (replace_record(lambda p: p.write_bytes(bytes(range(256)) * 40)), ("carrier",)),
+    "text without numbers": (replace_record(lambda p: p.write_text("hello\nworld\n")), ("carrier",)),
+    "NaN in a record": (replace_record(put_nan), ("carrier",)),
+    "missing column": (replace_record(drop_column), ("carrier",)),
+    "truncated UFF": (replace_record(half_a_uff_file), ("carrier",)),
+    "half an HDF5 file": (replace_record(half_an_hdf5_file), ("carrier",)),
+    "zip renamed": (replace_record(zip_named_mat), ("carrier",)),
+    "missing record": (lambda raw: record(raw).unlink(), ("carrier",)),
+    "silent hammer": (replace_record(silent_hammer), ("hammer",)),
+    "hammer and accelerometer swapped": (swap_hammer, ("hammer",)),
+    "two sample rates": (second_rate, ("Hz",)),
+    "wrong channel name": (toml('name = "sun_y"', 'name = "sun_z"'), ("sun_z",)),
+    "unknown unit": (toml('unit = "N"', 'unit = "newtonish"'), ("newtonish", "hammer")),
+    "unit of another quantity": (toml('unit = "N"', 'unit = "m"'), ("hammer",)),
+    "volts without sensitivity": (
+        toml('unit = "N"\nsensitivity_mv = 2.25', 'unit = "V"'),
+        ("hammer", "sensitivity_mv"),
+    ),
+    "no unit": (toml('unit = "N"\n', ""), ("unit",)),
+    "negative sensitivity": (toml("sensitivity_mv = 2.25", "sensitivity_mv = -2.25"), ("sensitivity_mv",)),
+    "unknown quantity": (toml('quantity = "force"', 'quantity = "farce"'), ("farce",)),
+    "no hammer": (
+        toml('quantity = "force"\nunit = "N"', 'quantity = "acceleration"\nunit = "m/s^2"'),
+        ("force",),
+    ),
+    "misspelt key": (toml("sample_rate_hz", "sample_rate"), ("sample_rate", "did you mean")),
+    "sample rate against the file's": (toml("sample_rate_hz = 5120.0", "sample_rate_hz = 25600"), ("25600",)),
+    "unknown dof": (toml('dof = "sun.y"', 'dof = "moon.y"'), ("moon.y",)),
+    "dof of another form": (toml('dof = "sun.y"', 'dof = "sun"'), ("sun",)),
+    "impact on an unknown dof": (toml('impact = "carrier.x"', 'impact = "carrier.q"'), ("carrier.q",)),
+    "two sensors at one dof": (toml('dof = "sun.y"', 'dof = "carrier.x"'), ("carrier.x",)),
+    "unknown configuration": (toml('configuration = "no_ring"', 'configuration = "noring"'), ("no_ring",)),
+    "broken TOML": (toml("[[channels]]", "[[channels]"), ("TOML",)),
+    "no records": (lambda raw: _cut(raw, "[[records]]"), ("records",)),
+    "no test.toml": (lambda raw: (raw / "test.toml").unlink(), ("ema init",)),
+    "later schema": (toml("schema = 1", "schema = 2"), ("schema",)),
+    "record outside the folder": (toml('file = "', 'file = "../'), ("outside",)),
+}
+
+
+def _cut(raw: Path, marker: str) -> None:
+    path = raw / "test.toml"
+    path.write_text(path.read_text(encoding="utf-8").partition(marker)[0], encoding="utf-8")
+
+
+def assert_one_clear_line(code: int, out: str, err: str) -> None:
+    assert code == 1
+    assert out == ""
+    lines = err.strip().splitlines()
+    messages = [line for line in lines if line.startswith("ema: ")]
+    assert len(messages) == 1
+    assert lines[-1] == messages[0]
+    assert "Traceback" not in err
+    assert "unexpected" not in err
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_one_clear_line_and_leaves_nothing_behind(
+    case: str, small_raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raw = tmp_path / "raw"
+    shutil.copytree(small_raw, raw)
+    spoil, named = BAD[case]
+    spoil(raw)
+    code, out, err = ema(capsys, "run", raw, "--rig", "planetary", "--out", tmp_path / "out")
+    assert_one_clear_line(code, out, err)
+    for word in named:
+        assert word in err, err
+    assert not (tmp_path / "out" / "summary.json").exists()
+    assert not (tmp_path / "out" / "report.html").exists()
+    assert not list(tmp_path.glob("out/.*.tmp"))
+
+
+def bad_settings(small_raw: Path, results: Path, tmp_path: Path) -> dict[str, list[object]]:
+    (tmp_path / "file").write_text("x", encoding="utf-8")
+    (tmp_path / "rig.toml").write_text('base = "planetary"\n[parameters]\nsun_maas = 2.0\n', encoding="utf-8")
+    (tmp_path / "pipeline.toml").write_text("[frf]\nestimater = 'H1'\n", encoding="utf-8")
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "ema.h5").write_bytes((results / "ema.h5").read_bytes()[:5000])
+    run: list[object] = ["run", small_raw, "--out", tmp_path / "out"]
+    return {
+        "unknown rig": [*run, "--rig", "planetry"],
+        "misspelt parameter in a rig file": [*run, "--rig", tmp_path / "rig.toml"],
+        "missing rig file": [*run, "--rig", "nowhere.toml"],
+        "unknown pipeline": [*run, "--pipeline", "nowhere"],
+        "misspelt key in a pipeline": [*run, "--pipeline", tmp_path / "pipeline.toml"],
+        "unknown setting": [*run, "--set", "frf.estimater=H1"],
+        "setting out of its choices": [*run, "--set", "frf.estimator=H7"],
+        "setting without a value": [*run, "--set", "frf.estimator"],
+        "raw folder that is not there": ["run", tmp_path / "nowhere"],
+        "raw folder that is a file": ["run", tmp_path / "file"],
+        "results folder that is a file": ["run", small_raw, "--out", tmp_path / "file"],
+        "results folder under a file": ["run", small_raw, "--out", tmp_path / "file" / "out"],
+        "results folder of nothing": ["compare", tmp_path],
+        "half a results file": ["compare", broken],
+        "init over a description": ["init", small_raw],
+        "simulate over a test": ["simulate", small_raw],
+        "simulate an unknown effect": [
+            "simulate",
+            tmp_path / "s",
+            "--effect",
+            "mesh_loss@sun-planet1:fraction=0.1",
+        ],
+    }
+
+
+BAD_SETTINGS = 17
+
+
+@pytest.mark.parametrize("number", range(BAD_SETTINGS))
+def test_bad_settings_are_one_clear_line(
+    number: int, small_raw: Path, results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cases = bad_settings(small_raw, results, tmp_path)
+    assert len(cases) == BAD_SETTINGS
+    arguments = list(cases.values())[number]
+    assert_one_clear_line(*ema(capsys, *arguments))
+    assert not (tmp_path / "out").exists()
