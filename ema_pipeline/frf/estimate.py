@@ -36,12 +36,12 @@ def estimate_frfs(hits: Iterable[HitSamples], settings: FrfSettings | None = Non
     Variance of H1: given the forces, H1 is the least-squares slope of Y on F. The residual
     R = Σ|Y - H1·F|² = Σ|Y|²(1 - γ²) of n hits has n - 1 complex degrees of freedom, so that R/(n - 1) is
     unbiased for the noise power and E|H - E H|² = R/((n - 1) Σ|F|²), that is |H|²(1 - γ²)/((n - 1) γ²);
-    [1]_ has n in place of n - 1. A single line gives it but 2(n - 1) real degrees of freedom; the noise power R is
-    therefore averaged over neighbouring lines, as few as give `variance_dof` complex degrees of freedom.
+    [1]_ has n in place of n - 1. A single line gives it but 2(n - 1) real degrees of freedom; the noise
+    power R is therefore averaged over neighbouring lines, as few as give `variance_dof` complex degrees of freedom.
     For H2 and Hv the relative variance of H1 is taken.
 
     The band runs from the first line up to where the force autospectrum (median over 1/256 of the lines)
-    first falls `band_drop_db` below its largest, for the weakest of all inputs, and at most to the sample
+    first falls `band_drop_db` below its largest, for nine tenths of all inputs, and at most to the sample
     rate over 2.56.
 
     Parameters
@@ -295,15 +295,18 @@ def _forces(total: _Total, inputs: list[str]) -> list[NDArray[np.float64]]:
 def _band(
     forces: list[NDArray[np.float64]], frequency: NDArray[np.float64], rate: float, drop_db: float
 ) -> tuple[float, float]:
-    """Band in which the force of every input carried enough energy."""
+    """Band in which the force of all but a tenth of the inputs carried enough energy.
+
+    One weak blow among many must not narrow the band of all.
+    """
     width = max(frequency.size // 256, 1)
-    high = rate * BAND_OVER_RATE
+    highest = rate * BAND_OVER_RATE
+    tops = []
     for force in forces:
         # Line 0 is the offset. Medians over blocks are deaf to hum and drift lines.
         count = (force.size - 1) // width
         level = np.median(force[1 : 1 + count * width].reshape(count, width), axis=1)
         top = int(np.argmax(level))
         low = np.flatnonzero(level[top:] < level[top] * 10 ** (-drop_db / 10))
-        if low.size:
-            high = min(high, float(frequency[max(1 + (top + int(low[0])) * width, 2)]))
-    return float(frequency[1]), float(high)
+        tops.append(float(frequency[max(1 + (top + int(low[0])) * width, 2)]) if low.size else highest)
+    return float(frequency[1]), min(highest, float(np.quantile(tops, 0.1, method="lower")))
