@@ -59,15 +59,28 @@ def real_columns(omega: Real, poles: Complex, rest_s: float) -> tuple[Complex, C
     return columns, derivatives
 
 
+EDGE = 0.12
+"""Distance of the two stand-in poles from the edges of the band, as a share of its width."""
+
+EDGE_DECAY = 0.06
+"""Their decay, as a share of the width of the band."""
+
+
 def residual_columns(omega: Real) -> Complex:
-    """Terms of modes outside the band: mass line (constant) and stiffness line (ω²), each complex.
+    """Terms of modes outside the band, each with a complex coefficient per FRF.
+
+    A mass line (constant) and a stiffness line (ω²) stand for what is far away; one pole beyond either edge
+    for modes that lie close to the band, whose tails no polynomial of low order follows.
 
     Returns
     -------
-    ndarray, (4, n_lines)
-        Real and imaginary constants, real and imaginary ω², scaled to order 1 in the band.
+    ndarray, (8, n_lines)
+        Each term times 1 and j, scaled to order 1 in the band.
     """
+    width = omega[-1] - omega[0]
     one = np.ones_like(omega)
     square = (omega / omega[-1]) ** 2
-    centred = square - square.mean()
-    return np.stack([one, 1j * one, centred, 1j * centred]).astype(np.complex128)
+    below = 1.0 / (1j * (omega - omega[0] + EDGE * width) / width + EDGE_DECAY)
+    above = 1.0 / (1j * (omega - omega[-1] - EDGE * width) / width + EDGE_DECAY)
+    terms = np.stack([one, square - square.mean(), below, above])
+    return np.concatenate([terms, 1j * terms])

@@ -17,8 +17,15 @@ SPARE_MODES = 12
 """Modes that a model can hold beyond three times the peaks seen."""
 
 
+MIN_TOP_ORDER = 24
+"""The highest order is at least this, so that the numerators can follow what lies outside the band."""
+
+MAX_ORDERS = 30
+"""Orders computed per sub-band, about."""
+
+
 def poles_of_all_orders(
-    data: FitData, scale: NDArray[np.float64], n_peaks: int, settings: ModalSettings
+    data: FitData, variance: NDArray[np.float64], n_peaks: int, settings: ModalSettings
 ) -> PoleSet:
     """Poles of all orders in one sub-band with the engine of the settings.
 
@@ -26,8 +33,8 @@ def poles_of_all_orders(
     ----------
     data : FitData
         Lines of the sub-band.
-    scale : ndarray, (n_rows, n_references)
-        Noise amplitude of each FRF.
+    variance : ndarray, (n_rows, n_references, n_lines)
+        Of the FRFs: rows are scaled to equal noise.
     n_peaks : int
         Peaks seen, which sets the highest order unless the settings do.
     settings : ModalSettings
@@ -41,7 +48,7 @@ def poles_of_all_orders(
     modes = 3 * n_peaks + SPARE_MODES
     rows, refs = complete_block(data.measured)
     frf = data.frf[np.ix_(rows, refs)]
-    row_scale = scale[np.ix_(rows, refs)].mean(axis=1)
+    row_scale = np.exp(0.5 * np.log(np.maximum(variance[np.ix_(rows, refs)], 1e-300)).mean(axis=(1, 2)))
     scaled = frf / row_scale[:, None, None]
     back = np.eye(len(refs), dtype=np.complex128)
     if settings.engine == "plscf" and len(refs) > MAX_REFERENCES:
@@ -50,10 +57,10 @@ def poles_of_all_orders(
         back = vectors[:, -MAX_REFERENCES:].astype(np.complex128)
         scaled = np.einsum("oil,ik->okl", scaled, back.real)
     n_ref = scaled.shape[1]
-    highest = settings.max_order or int(np.ceil(2 * modes / n_ref))
+    highest = settings.max_order or max(MIN_TOP_ORDER, int(np.ceil(2 * modes / np.sqrt(n_ref))))
     highest = int(np.clip(highest, 4, max(4, n_lines // 3)))
     lowest = max(2, int(np.ceil(4 / n_ref)))
-    step = max(1, (highest - lowest) // 40)
+    step = max(1, (highest - lowest) // MAX_ORDERS)
     orders = list(range(lowest, highest + 1, step))
     found = polyreference_poles(data.omega, scaled, np.ones(n_lines), orders)
     shape = np.zeros((len(found.pole), len(data.measured)), dtype=np.complex128)

@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.assurance import mpc
-from ema_pipeline.modal.bands import SubBand, find_peaks, indicator, split
+from ema_pipeline.modal.bands import SubBand, indicator, split
 from ema_pipeline.modal.data import FitData, analysis_band, arrange
 from ema_pipeline.modal.engines import poles_of_all_orders
-from ema_pipeline.modal.fit import Estimate, normalised, residual_fit, solve_linear, synthesis
+from ema_pipeline.modal.fit import (
+    Estimate,
+    free_participations,
+    normalised,
+    residual_fit,
+    solve_linear,
+    synthesis,
+)
 from ema_pipeline.modal.noise import Noise, fit_noise, second_difference_power
-from ema_pipeline.modal.plscf import MAX_DAMPING_RATIO
 from ema_pipeline.modal.poles import PoleSet
-from ema_pipeline.modal.polish import polish
 from ema_pipeline.modal.scaling import scale_shapes, scaling_note
-from ema_pipeline.modal.segment import SegmentFit, fit_segment, measured_noise
-from ema_pipeline.modal.selection import BANDWIDTH_TOLERANCE, DAMPING_TOLERANCE, FREQUENCY_TOLERANCE, link
+from ema_pipeline.modal.segment import SegmentFit, fit_segment
+from ema_pipeline.modal.selection import link, votes
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
 from ema_pipeline.modal.uncertainty import covariance
@@ -75,19 +80,24 @@ def _identify(frfs: FrfSet, settings: ModalSettings, tell: Progress) -> ModalMod
     data = arrange(frfs, band)
     hits, start, level = _first_noise(data)
     bands = split(data.omega, indicator(data, level))
-    scale = np.sqrt(level)
     iterations = POLISH_ITERATIONS if settings.polish else 0
 
     charts: list[PoleSet] = []
     found = Estimate(np.zeros(0, complex), np.zeros((0, data.measured.shape[1]), complex))
     for k, part in enumerate(bands):
         tell(0.1 + 0.5 * k / len(bands), f"poles and modes of sub-band {k + 1} of {len(bands)}")
-        poles, estimate = _modes_of_band(data, hits, start, scale, part, settings, iterations)
-        charts.append(_inside(poles, part))
+        lines, noise = data.lines(part.first, part.stop), _cut(start, part)
+        poles = poles_of_all_orders(lines, noise.variance, part.n_peaks, settings)
+        charts.append(poles)
+        estimate = _candidates(poles, link(poles).representative)
+        if len(bands) > 1:  # a first guess of all modes, so that far ones can be taken off the data
+            fit = fit_segment(lines, _known(hits, part), noise, estimate, _voters(poles), min(iterations, 6))
+            estimate = fit.estimate
         inside = (estimate.poles.imag >= part.low) & (estimate.poles.imag < part.high)
         found = _stitched(found, estimate.take(inside))
     tell(0.7, f"refining {len(found.poles)} modes")
-    modes = _refined(data, hits, start, bands, found, iterations)
+    modes = _refined(data, hits, start, bands, charts, found, iterations)
+    charts = [_inside(poles, part) for poles, part in zip(charts, bands, strict=True)]
     tell(0.9, "shapes and synthesis")
     return _model(frfs, settings, band, data, start, modes, charts)
 
@@ -106,39 +116,18 @@ def _first_noise(data: FitData) -> tuple[Noise | None, Noise, Real]:
     return None, Noise(1e-4 * np.abs(data.frf) ** 2, own), level
 
 
-def _cut(noise: Noise | None, part: SubBand) -> Noise | None:
-    if noise is None:
-        return None
+def _cut(noise: Noise, part: SubBand) -> Noise:
     lines = slice(part.first, part.stop)
     return Noise(noise.common[..., lines], noise.own[..., lines])
 
 
-def _modes_of_band(
-    data: FitData,
-    hits: Noise | None,
-    start: Noise,
-    scale: Real,
-    part: SubBand,
-    settings: ModalSettings,
-    iterations: int,
-) -> tuple[PoleSet, Estimate]:
-    """Chart and accepted modes of one sub-band."""
-    lines = data.lines(part.first, part.stop)
-    poles = poles_of_all_orders(lines, scale, part.n_peaks, settings)
-    tracks = link(poles)
-    candidates = _candidates(poles, tracks.representative)
-    sub_start = _cut(start, part)
-    assert sub_start is not None
+def _known(noise: Noise | None, part: SubBand) -> Noise | None:
+    return None if noise is None else _cut(noise, part)
 
-    def search(left: FitData, weight: Real) -> Estimate:
-        level = 1.0 / np.maximum(np.median(weight, axis=-1), 1e-300)
-        level = np.where(left.measured, level, 1.0)
-        peaks = len(find_peaks(indicator(left, level)))
-        more = poles_of_all_orders(left, np.sqrt(level), min(peaks, part.n_peaks), settings)
-        return _candidates(more, link(more).representative)
 
-    fit = fit_segment(lines, _cut(hits, part), sub_start, candidates, search, iterations=iterations)
-    return poles, fit.estimate
+def _voters(poles: PoleSet) -> Callable[[Estimate], Real]:
+    """Share of the orders of a chart that show each mode of an estimate."""
+    return lambda estimate: votes(poles, estimate.poles)[0]
 
 
 def _candidates(poles: PoleSet, index: NDArray[np.int64]) -> Estimate:
@@ -165,67 +154,61 @@ def _refined(
     hits: Noise | None,
     start: Noise,
     bands: tuple[SubBand, ...],
+    charts: list[PoleSet],
     found: Estimate,
     iterations: int,
 ) -> _Modes:
     """Final fit, sub-band by sub-band, with the modes of the other sub-bands taken off the data."""
-    m, (n_rows, n_ref) = len(found.poles), data.measured.shape
-    out = _Modes(
-        poles=found.poles.copy(),
-        pole_cov=np.zeros((m, 2, 2)),
-        shapes=np.zeros((m, n_rows), complex),
-        shape_stds=np.zeros((m, n_rows)),
-        participation=found.participation.copy(),
-        participation_stds=np.zeros((m, n_ref)),
-    )
-    if not m:
-        return out
-    everywhere = solve_linear(data, start.weight(data.measured), found)
-    for part in bands:
-        near = (found.poles.imag >= data.omega[part.first]) & (found.poles.imag <= data.omega[part.stop - 1])
-        core = (found.poles.imag >= part.low) & (found.poles.imag < part.high)
-        near |= core
-        if not core.any():
-            continue
-        lines = data.lines(part.first, part.stop)
-        far = synthesis(lines, found.take(~near), everywhere.shapes[:, ~near])
-        lines = FitData(
-            lines.omega, lines.frf - far, lines.variance, lines.measured, lines.rest_s, lines.transposed
-        )
-        lines.frf[~lines.measured] = 0.0
-        fit = _final_fit(lines, _cut(hits, part), _cut(start, part), found.take(near), iterations)
-        cov = covariance(lines, fit.noise.weight(lines.measured), fit.estimate, fit.solution, fit.noise)
-        where = np.flatnonzero(near)
-        stds = _participation_stds(fit.estimate, cov.parameters)
-        for local, mode in enumerate(where):
-            if not core[mode]:
+    parts: list[_Modes] = []
+    if len(found.poles):
+        everywhere = solve_linear(data, start.weight(data.measured), found)
+        for part, chart in zip(bands, charts, strict=True):
+            near = (found.poles.imag >= data.omega[part.first]) & (found.poles.imag <= data.omega[part.stop - 1])
+            if not (near & (found.poles.imag >= part.low) & (found.poles.imag < part.high)).any():
                 continue
-            out.poles[mode] = fit.estimate.poles[local]
-            out.pole_cov[mode] = cov.poles(local)
-            out.shapes[mode] = fit.solution.shapes[:, local]
-            two = slice(2 * local, 2 * local + 2)
-            out.shape_stds[mode] = np.sqrt(0.5 * np.einsum("oaa->o", cov.shapes[:, two, two]))
-            out.participation[mode] = fit.estimate.participation[local]
-            out.participation_stds[mode] = stds[local]
-    return out
+            lines = data.lines(part.first, part.stop)
+            far = synthesis(lines, found.take(~near), everywhere.shapes[:, ~near])
+            lines = replace(lines, frf=np.where(lines.measured[..., None], lines.frf - far, 0.0))
+            fit = fit_segment(
+                lines, _known(hits, part), _cut(start, part), found.take(near), _voters(chart), iterations
+            )
+            parts.append(_final(lines, fit, part))
+    n_rows, n_ref = data.measured.shape
+    empty = _Modes(
+        np.zeros(0, complex),
+        np.zeros((0, 2, 2)),
+        np.zeros((0, n_rows), complex),
+        np.zeros((0, n_rows)),
+        np.zeros((0, n_ref), complex),
+        np.zeros((0, n_ref)),
+    )
+    return _Modes(
+        *(np.concatenate([getattr(p, f.name) for p in [empty, *parts]]) for f in fields(_Modes))
+    )
 
 
-def _final_fit(
-    data: FitData, hits: Noise | None, start: Noise | None, estimate: Estimate, iterations: int
-) -> SegmentFit:
-    assert start is not None
-    noise = start
-    for _ in range(2):
-        weight = noise.weight(data.measured)
-        estimate, solution = polish(data, weight, estimate, iterations)
-        noise = measured_noise(data, hits, estimate, solution, weight)
-    solution = solve_linear(data, noise.weight(data.measured), estimate)
-    return SegmentFit(estimate, solution, noise, np.zeros(0), np.zeros(0))
+def _final(lines: FitData, fit: SegmentFit, part: SubBand) -> _Modes:
+    """Modes of a sub-band's core with their uncertainties."""
+    estimate = fit.estimate
+    cov = covariance(lines, fit.noise.weight(lines.measured), estimate, fit.solution, fit.noise)
+    core = np.flatnonzero((estimate.poles.imag >= part.low) & (estimate.poles.imag < part.high))
+    stds = np.array(
+        [
+            np.sqrt(0.5 * (cov.shapes[:, 2 * r, 2 * r] + cov.shapes[:, 2 * r + 1, 2 * r + 1]))
+            for r in core
+        ]
+    )
+    return _Modes(
+        poles=estimate.poles[core],
+        pole_cov=np.array([cov.poles(int(r)) for r in core]).reshape(len(core), 2, 2),
+        shapes=fit.solution.shapes.T[core],
+        shape_stds=stds.reshape(len(core), len(lines.frf)),
+        participation=estimate.participation[core],
+        participation_stds=_participation_stds(estimate, cov.parameters)[core],
+    )
 
 
 def _participation_stds(estimate: Estimate, parameters: Real) -> Real:
-    from ema_pipeline.modal.fit import free_participations
-
     m = len(estimate.poles)
     out = np.zeros(estimate.participation.shape)
     for k, (r, i) in enumerate(free_participations(estimate)):
@@ -325,23 +308,11 @@ def _mode(
 def _chart(charts: list[PoleSet], poles: Complex, decay: float) -> tuple[StabilisationChart, Real]:
     """Chart of all sub-bands, and each mode's share of the orders in the upper half of its sub-band's chart."""
     selected, stable = [], []
-    votes = np.zeros(len(poles))
+    share = np.zeros(len(poles))
     for chart in charts:
-        linked = link(chart)
-        stable.append(linked.stable)
-        choice = np.full(len(chart.pole), -1)
-        if len(poles) and len(chart.pole):
-            shift = np.abs(chart.pole.imag[:, None] - poles.imag[None])
-            loss = np.abs(chart.pole.real[:, None] - poles.real[None])
-            limit = FREQUENCY_TOLERANCE * np.abs(poles) + BANDWIDTH_TOLERANCE * -poles.real
-            score = np.maximum(shift / limit, loss / (2 * DAMPING_TOLERANCE * -poles.real))
-            best = np.argmin(score, axis=1)
-            hit = score[np.arange(len(best)), best] < 1
-            choice = np.where(hit, best, -1)
-            upper = chart.orders[len(chart.orders) // 2 :]
-            for r in np.unique(choice[hit]):
-                orders = np.unique(chart.order[choice == r])
-                votes[r] = max(votes[r], np.isin(orders, upper).sum() / max(len(upper), 1))
+        stable.append(link(chart).stable)
+        found, choice = votes(chart, poles)
+        share = np.maximum(share, found)
         selected.append(choice)
     physical = [chart.pole + decay for chart in charts]
     pole = np.concatenate(physical)
@@ -351,7 +322,7 @@ def _chart(charts: list[PoleSet], poles: Complex, decay: float) -> tuple[Stabili
         damping_ratio=-pole.real / np.abs(pole),
         stable=np.concatenate(stable),
         selected=np.concatenate(selected).astype(np.int64),
-    ), np.minimum(votes, 1.0)
+    ), share
 
 
 def _synthesis(data: FitData, noise: Noise, modes: _Modes) -> Complex:

@@ -11,7 +11,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.normal_equations import Fraction, NormalEquations, fractions, normal_equations, numerator
+from ema_pipeline.modal.normal_equations import (
+    Fraction,
+    NormalEquations,
+    fractions,
+    normal_equations,
+    numerator,
+)
 from ema_pipeline.modal.poles import PoleSet
 
 MAX_DAMPING_RATIO = 0.3

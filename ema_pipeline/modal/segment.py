@@ -1,4 +1,4 @@
-"""Modes of one sub-band: candidates are polished, tested against the noise, and searched for in what is left."""
+"""Modes of one sub-band: candidates are polished and tested."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
+from ema_pipeline.modal.assurance import mac
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import (
     Estimate,
@@ -24,8 +25,8 @@ from ema_pipeline.modal.polish import polish
 from ema_pipeline.modal.uncertainty import evidence
 
 Real = NDArray[np.float64]
-Search = Callable[[FitData, Real], Estimate]
-"""Finds candidates in FRFs with given weights."""
+Votes = Callable[[Estimate], Real]
+"""Share of model orders that show each mode."""
 
 FALSE_ALARM = 1e-6
 """Probability that noise at one line passes for a mode."""
@@ -33,9 +34,32 @@ FALSE_ALARM = 1e-6
 MAX_DAMPING_STD = 0.35
 """A pole whose damping is not known to this share is not told from noise."""
 
-MAX_DAMPING_RATIO = 0.25
-ROUNDS = 3
-"""How often what the fit leaves over is searched for missed modes."""
+MAX_DAMPING_RATIO = 0.2
+
+MIN_VOTES = 0.3
+"""Share of model orders that must show a mode, unless the FRFs show it plainly or the noise is known."""
+
+HOPELESS = 0.3
+"""Candidates that reach less than this share of a limit are dropped together, others one at a time."""
+
+PLAIN = 2.0
+"""A mode is plain where, at its frequency, its own response has this many times the power of all the rest."""
+
+PLAIN_DAMPING = 0.05
+"""Poles with more damping shape a background rather than a peak: they are only taken on votes."""
+
+EXPLAINED = 1.5
+"""Misfit around a mode over the scatter between hits, up to which nothing but noise is left over."""
+
+COINCIDENT = 0.3
+"""Poles closer than this, in decay rates, coincide."""
+
+SAME_SHAPE = 0.99
+"""MAC above which two coinciding poles are one mode."""
+
+SAME_RESPONSE = 0.9
+"""The same for shapes at three or more sensors that measured together: between hits the frequency may drift,
+which splits a mode in two with one shape at the sensors."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +71,11 @@ class SegmentFit:
     estimate : Estimate
     solution : LinearSolution
     noise : Noise
-    gain, threshold : ndarray, (n_modes,)
-        Growth of χ² without the mode, and what noise would make of it at most.
     """
 
     estimate: Estimate
     solution: LinearSolution
     noise: Noise
-    gain: Real
-    threshold: Real
 
 
 def fit_segment(
@@ -63,11 +83,10 @@ def fit_segment(
     hits: Noise | None,
     start: Noise,
     candidates: Estimate,
-    search: Search,
-    *,
+    votes: Votes,
     iterations: int,
 ) -> SegmentFit:
-    """Fit, test and complete the modes of one sub-band.
+    """Polish the candidates of a sub-band and drop those that are no modes, the least likely first.
 
     Parameters
     ----------
@@ -77,82 +96,117 @@ def fit_segment(
     start : Noise
         First guess of the noise.
     candidates : Estimate
-    search : callable
-        Finds candidates in FRFs (used on the residual).
+    votes : callable
+        Share of model orders that show each mode of an estimate.
     iterations : int
         Of the polish; 0 keeps the engine's poles.
     """
-    fit = _fit_and_prune(data, hits, start, candidates, iterations)
-    for _ in range(ROUNDS):
-        modes = synthesis(data, fit.estimate, fit.solution.shapes)
-        weight = fit.noise.weight(data.measured)
-        left = data.frf - modes - residual_fit(data, weight, modes)
-        found = search(_with_frf(data, left), weight)
-        found = found.take(_is_new(found, fit.estimate))
-        if not len(found.poles):
-            break
-        trial = _fit_and_prune(data, hits, fit.noise, fit.estimate.joined(found), iterations)
-        if len(trial.estimate.poles) <= len(fit.estimate.poles):
-            break
-        fit = trial
-    return fit
-
-
-def _is_new(found: Estimate, known: Estimate) -> NDArray[np.bool_]:
-    """Candidates that are not on top of a known mode (whose misfit they would only mend)."""
-    if not len(known.poles):
-        return np.ones(len(found.poles), dtype=bool)
-    distance = np.abs(found.poles[:, None] - known.poles[None])
-    return np.asarray((distance > 0.5 * np.abs(known.poles.real)[None]).all(axis=1))
-
-
-def _with_frf(data: FitData, frf: NDArray[np.complex128]) -> FitData:
-    return FitData(data.omega, frf, data.variance, data.measured, data.rest_s, data.transposed)
-
-
-def _fit_and_prune(
-    data: FitData, hits: Noise | None, start: Noise, candidates: Estimate, iterations: int
-) -> SegmentFit:
-    """Polish and drop modes that the FRFs do not need, the least needed first."""
     estimate = Estimate(candidates.poles, normalised(candidates.participation))
     noise = start
     while True:
         weight = noise.weight(data.measured)
-        estimate, solution = polish(data, weight, estimate, min(iterations, 6))
-        noise = measured_noise(data, hits, estimate, solution, weight)
-        weight = noise.weight(data.measured)
         estimate, solution = polish(data, weight, estimate, iterations)
         noise = measured_noise(data, hits, estimate, solution, weight)
         solution = solve_linear(data, noise.weight(data.measured), estimate)
-        gain, threshold = significance(data, noise, estimate, solution)
-        worst = _worst(data, estimate, solution, gain, threshold)
-        if worst is None:
-            return SegmentFit(estimate, solution, noise, gain, threshold)
-        keep = np.ones(len(estimate.poles), dtype=bool)
-        keep[worst] = False
-        estimate = estimate.take(keep)
+        doubtful = _doubtful(data, hits, noise, estimate, solution, votes)
+        if not doubtful.any():
+            return SegmentFit(estimate, solution, noise)
+        estimate = estimate.take(~doubtful)
 
 
-def _worst(
-    data: FitData, estimate: Estimate, solution: LinearSolution, gain: Real, threshold: Real
-) -> int | None:
-    """Index of the mode that is least a mode, or None where all stand."""
-    if not len(estimate.poles):
-        return None
+def _doubtful(
+    data: FitData,
+    hits: Noise | None,
+    noise: Noise,
+    estimate: Estimate,
+    solution: LinearSolution,
+    votes: Votes,
+) -> NDArray[np.bool_]:
+    """Candidates to drop now: all impossible ones, else the hopeless or the worst one."""
     poles = estimate.poles
-    score = gain / threshold
+    if not len(poles):
+        return np.zeros(0, dtype=bool)
     zeta = -poles.real / np.abs(poles)
     outside = (poles.imag < data.omega[0]) | (poles.imag > data.omega[-1])
     impossible = (poles.real >= 0) | (zeta > MAX_DAMPING_RATIO) | outside
-    score = np.where(impossible, -1.0, score)
+    if impossible.any():
+        return np.asarray(impossible)
+    gain, threshold = significance(data, noise, estimate, solution)
+    score = np.minimum(gain / threshold, MAX_DAMPING_STD / np.maximum(decay_std(estimate, solution), 1e-9))
+    plain = visibility(data, estimate, solution) / PLAIN
+    plain = np.where(zeta > PLAIN_DAMPING, 0.0, plain)
+    support = np.maximum(votes(estimate) / MIN_VOTES, plain)
+    if hits is not None:
+        support = np.maximum(support, EXPLAINED / misfit(data, hits, estimate, solution))
+    score = np.minimum(score, support)
+    doubles = np.flatnonzero(_doubles(data, estimate, solution))
+    if len(doubles):  # one at a time: three poles on two modes mix their shapes
+        strength = np.linalg.norm(solution.shapes, axis=0) * np.linalg.norm(estimate.participation, axis=1)
+        out = np.zeros(len(poles), dtype=bool)
+        out[doubles[np.argmin(strength[doubles])]] = True
+        return out
+    import os
+    if os.environ.get('DBG'):
+        for r in range(len(poles)): print(f'{poles[r].imag/6.2832:.3f} z {zeta[r]:.4f} sc {score[r]:.2f} gain {gain[r]:.0f} thr {threshold[r]:.0f} ds {decay_std(estimate,solution)[r]:.3f} plain {plain[r]:.2f} votes {votes(estimate)[r]:.2f} misfit {misfit(data,hits,estimate,solution)[r] if hits else 0:.2f}')
+        print()
+    failed = score < 1
+    return np.asarray(failed & (score <= max(HOPELESS, score.min())))
+
+
+def decay_std(estimate: Estimate, solution: LinearSolution) -> Real:
+    """Relative standard deviation of each pole's decay rate, from the fit alone."""
     information = newton_step(estimate, solution).information
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information * scale[:, None] * scale[None], rcond=1e-12)
     std = np.sqrt(0.5 * np.maximum(np.diag(inverse), 0)) * scale
-    vague = std[0 : 2 * len(poles) : 2] / np.abs(poles.real)
-    score = np.where(vague > MAX_DAMPING_STD, np.minimum(score, 0.9 * MAX_DAMPING_STD / vague), score)
-    worst = int(np.argmin(score))
-    return worst if score[worst] < 1 else None
+    return np.asarray(std[0 : 2 * len(estimate.poles) : 2] / np.abs(estimate.poles.real))
+
+
+def visibility(data: FitData, estimate: Estimate, solution: LinearSolution) -> Real:
+    """Power of each mode at its frequency (three lines, all FRFs) over the power of all the rest."""
+    out = np.empty(len(estimate.poles))
+    for r, pole in enumerate(estimate.poles):
+        line = int(np.argmin(np.abs(data.omega - pole.imag)))
+        near = data.lines(max(0, line - 1), line + 2)
+        own = synthesis(near, estimate.take(np.array([r])), solution.shapes[:, [r]])
+        rest = np.where(data.measured[..., None], near.frf - own, 0.0)
+        own = np.where(data.measured[..., None], own, 0.0)
+        out[r] = np.sum(np.abs(own) ** 2) / max(float(np.sum(np.abs(rest) ** 2)), 1e-300)
+    return out
+
+
+def misfit(data: FitData, hits: Noise, estimate: Estimate, solution: LinearSolution) -> Real:
+    """What the fit leaves over around each mode, over what the scatter between hits explains."""
+    weight = hits.weight(data.measured)
+    modes = synthesis(data, estimate, solution.shapes)
+    left = np.abs(data.frf - modes - residual_fit(data, weight, modes)) ** 2 * weight
+    ratio = left.sum(axis=(0, 1)) / max(np.count_nonzero(data.measured), 1)
+    out = np.empty(len(estimate.poles))
+    for r, pole in enumerate(estimate.poles):
+        line = int(np.argmin(np.abs(data.omega - pole.imag)))
+        reach = int(np.clip(-3 * pole.real / (data.omega[1] - data.omega[0]), 6, 200))
+        out[r] = ratio[max(0, line - reach) : line + reach + 1].mean()
+    return np.maximum(out, 1e-9)
+
+
+def _doubles(data: FitData, estimate: Estimate, solution: LinearSolution) -> NDArray[np.bool_]:
+    """The weaker of two coinciding poles that have one shape, at the rows or at the references."""
+    m = len(estimate.poles)
+    rows, references = mac(solution.shapes.T, solution.shapes.T), mac(estimate.participation, estimate.participation)
+    sensors, hit = (references, rows) if data.transposed else (rows, references)
+    n_sensors, n_hit = data.measured.shape[::-1] if data.transposed else data.measured.shape
+    alike = np.zeros((m, m), dtype=bool)
+    if n_sensors > 1:
+        alike |= sensors > (SAME_RESPONSE if n_sensors > 2 else SAME_SHAPE)
+    if n_hit > 2:
+        alike |= hit > SAME_SHAPE
+    decay = -estimate.poles.real
+    close = np.abs(estimate.poles[:, None] - estimate.poles[None]) < COINCIDENT * np.maximum(decay[:, None], decay)
+    if data.measured.size == 1:
+        alike[:] = True
+    strength = np.linalg.norm(solution.shapes, axis=0) * np.linalg.norm(estimate.participation, axis=1)
+    weaker = strength[:, None] < strength[None]
+    return np.asarray((alike & close & weaker).any(axis=1))
 
 
 def measured_noise(
@@ -164,7 +218,7 @@ def measured_noise(
     n_lines = len(data.omega)
     n_rows, n_ref = data.measured.shape
     # the fit follows the noise a little: one shape entry per row and mode, and the residual terms
-    linear = 2.0 * len(estimate.poles) / max(n_ref, 1) + 4.0
+    linear = 2.0 * len(estimate.poles) / max(n_ref, 1) + 8.0
     share = max(1.0 - linear / (2.0 * n_lines), 0.3)
     left = np.abs(data.frf - model) ** 2 / share
     found = fit_noise(left, model, data.measured, inputs_are_rows=data.transposed)

@@ -100,6 +100,39 @@ def link(poles: PoleSet) -> Tracks:
     return _candidates(poles, track, stable, level, n_tracks)
 
 
+def votes(poles: PoleSet, modes: NDArray[np.complex128]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Share of the orders in the upper half of the chart that show each mode, and what each pole voted for.
+
+    Parameters
+    ----------
+    poles : PoleSet
+    modes : complex ndarray, (n_modes,)
+        Poles of the modes, rad/s.
+
+    Returns
+    -------
+    share : ndarray, (n_modes,)
+    choice : ndarray of int, (n_poles,)
+        Nearest mode within the tolerances, or -1. Modes that coincide share their votes.
+    """
+    if not len(modes) or not len(poles.pole):
+        return np.zeros(len(modes)), np.full(len(poles.pole), -1, dtype=np.int64)
+    shift = np.abs(poles.pole.imag[:, None] - modes.imag[None])
+    loss = np.abs(poles.pole.real[:, None] - modes.real[None])
+    decay = -modes.real
+    limit = FREQUENCY_TOLERANCE * np.abs(modes) + BANDWIDTH_TOLERANCE * decay
+    score = np.maximum(shift / limit, loss / (2 * DAMPING_TOLERANCE * decay))
+    nearest = np.argmin(score, axis=1)
+    choice = np.where(score[np.arange(len(nearest)), nearest] < 1, nearest, -1)
+    upper = poles.orders[len(poles.orders) // 2 :]
+    share = np.zeros(len(modes))
+    for r in range(len(modes)):
+        twins = np.flatnonzero(np.abs(modes - modes[r]) < 0.1 * decay[r])
+        mine = np.isin(choice, twins) & np.isin(poles.order, upper)
+        share[r] = min(1.0, np.count_nonzero(mine) / (len(twins) * max(len(upper), 1)))
+    return share, choice
+
+
 def _unit(vectors: NDArray[np.complex128]) -> NDArray[np.complex128]:
     norm = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors / np.where(norm > 0, norm, 1.0))
