@@ -17,9 +17,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.mechanics.laws import Nonlinear, Row, Spring
 from ema_pipeline.mechanics.system import LinearSystem
 
-Row = Mapping[str, float]
+__all__ = [
+    "Assembly",
+    "Damper",
+    "Element",
+    "Gyroscopic",
+    "Mass",
+    "Nonlinear",
+    "Row",
+    "Spring",
+    "combination",
+    "difference",
+]
 
 
 @dataclass(frozen=True)
@@ -29,16 +41,6 @@ class Mass:
     name: str
     row: Row
     value: float
-
-
-@dataclass(frozen=True)
-class Spring:
-    """Elastic energy ½·stiffness·(row·x)²; N/m. `loss_factor` makes it stiffness·(1 + j·loss_factor)."""
-
-    name: str
-    row: Row
-    stiffness: float
-    loss_factor: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class Gyroscopic:
     coefficient: float
 
 
-Element = Mass | Spring | Damper | Gyroscopic
+Element = Mass | Spring | Damper | Gyroscopic | Nonlinear
 
 
 @dataclass(frozen=True)
@@ -135,8 +137,13 @@ class Assembly:
         edited = (change(e) if e.name in wanted else e for e in self.elements)
         return dataclasses.replace(self, elements=tuple(e for e in edited if e is not None))
 
+    @property
+    def nonlinear(self) -> tuple[Nonlinear, ...]:
+        """Elements whose force is not proportional to the motion."""
+        return tuple(e for e in self.elements if isinstance(e, Nonlinear))
+
     def system(self) -> LinearSystem:
-        """Matrices of all elements.
+        """Matrices of all elements; nonlinear ones with their tangents.
 
         Raises
         ------
@@ -147,6 +154,10 @@ class Assembly:
         masses = [e for e in self.elements if isinstance(e, Mass)]
         springs = [e for e in self.elements if isinstance(e, Spring)]
         dampers = [e for e in self.elements if isinstance(e, Damper)]
+        for n in self.nonlinear:
+            if not isinstance(n, Spring):
+                springs.append(Spring(n.name, n.row, n.tangent_stiffness))
+                dampers.append(Damper(n.name, n.row, n.tangent_damping))
         mass = _sum_of_squares([e.row for e in masses], [e.value for e in masses], index)
         stiffness = _sum_of_squares([e.row for e in springs], [e.stiffness for e in springs], index)
         lossy = [e for e in springs if e.loss_factor != 0.0]

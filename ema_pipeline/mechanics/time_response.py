@@ -58,17 +58,9 @@ def time_response(
         raise EmaError(
             "a loss factor holds at steady state only and has no time response; use the frequency domain"
         )
-    n, inputs = len(system.dofs), len(in_rows)
-    a, b = _state_space(system, in_rows)
-    size = 2 * n + 2 * inputs
-    block = np.zeros((size, size))
-    block[: 2 * n, : 2 * n] = a / sample_rate_hz
-    block[: 2 * n, 2 * n : 2 * n + inputs] = b / sample_rate_hz
-    block[2 * n : 2 * n + inputs, 2 * n + inputs :] = np.eye(inputs)
-    exponential = scipy.linalg.expm(block)[: 2 * n]
-    transition = exponential[:, : 2 * n]
-    ramp = exponential[:, 2 * n + inputs :]
-    step = exponential[:, 2 * n : 2 * n + inputs] - ramp
+    n = len(system.dofs)
+    a, b = state_space(system, in_rows)
+    transition, step, ramp = recursion(a, b, sample_rate_hz)
 
     forces = np.atleast_2d(np.asarray(forces, dtype=float))
     states = np.zeros((forces.shape[1], 2 * n))
@@ -83,7 +75,21 @@ def time_response(
     )
 
 
-def _state_space(
+def recursion(
+    a: NDArray[np.float64], b: NDArray[np.float64], sample_rate_hz: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Φ (s, s), Γ₀ and Γ₁ (s, n_inputs) of the ramp-invariant recursion of ẋ = a·x + b·f."""
+    size, inputs = b.shape
+    block = np.zeros((size + 2 * inputs, size + 2 * inputs))
+    block[:size, :size] = a / sample_rate_hz
+    block[:size, size : size + inputs] = b / sample_rate_hz
+    block[size : size + inputs, size + inputs :] = np.eye(inputs)
+    exponential = scipy.linalg.expm(block)[:size]
+    ramp = exponential[:, size + inputs :]
+    return exponential[:, :size], exponential[:, size : size + inputs] - ramp, ramp
+
+
+def state_space(
     system: LinearSystem, in_rows: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """A (2n, 2n) and B (2n, n_inputs) of the state (x, ẋ)."""

@@ -1,0 +1,249 @@
+"""Nonlinear elements: a linear tangent, which the matrices hold, and the force's deviation from it.
+
+Each acts along a row like the linear elements do. Its state after a step follows from its stretch, so that an
+integrator only has to find the stretches. Deviations are evaluated one number at a time: an integrator asks
+for a few of them per step, where plain floats are faster than arrays.
+
+References
+----------
+F. Ikhouane, J. Rodellar, *Systems with Hysteresis: Analysis, Identification and Control using the Bouc-Wen
+Model*, 2007, chapter 2 (normalised form). For the describing functions: A. Gelb, W. E. Vander Velde,
+*Multiple-Input Describing Functions and Nonlinear System Design*, 1968.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import cosh, exp, expm1, inf, log1p, tanh
+
+from ema_pipeline.errors import EmaError
+
+Row = Mapping[str, float]
+Step = tuple[float, float, float, float]
+"""Deviation of the force, N; its derivatives by stretch and by rate; the state after the step."""
+
+
+@dataclass(frozen=True)
+class Spring:
+    """Elastic energy ½·stiffness·(row·x)²; N/m. `loss_factor` makes it stiffness·(1 + j·loss_factor)."""
+
+    name: str
+    row: Row
+    stiffness: float
+    loss_factor: float = 0.0
+
+
+class Nonlinear:
+    """What every nonlinear element offers.
+
+    `tangent_stiffness` and `tangent_damping` are the slopes of its force that the linear system holds;
+    `has_memory` tells whether the force depends on the past; `start` is the state at rest.
+    """
+
+    has_memory = False
+    start = 0.0
+    name: str
+    row: Row
+
+    @property
+    def tangent_stiffness(self) -> float:
+        """N/m."""
+        return 0.0
+
+    @property
+    def tangent_damping(self) -> float:
+        """N·s/m."""
+        return 0.0
+
+    def step(self, before: float, stretch: float, rate: float, state: float, time_step: float) -> Step:
+        """Deviation of the force from its tangent after a straight path from `before` to `stretch`, m."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class PolynomialSpring(Nonlinear):
+    """Force quadratic·δ² + cubic·δ³; N/m², N/m³. The linear term is a `Spring` beside it."""
+
+    name: str
+    row: Row
+    quadratic: float = 0.0
+    cubic: float = 0.0
+
+    def step(self, before: float, stretch: float, rate: float, state: float, time_step: float) -> Step:
+        """See `Nonlinear.step`."""
+        force = (self.quadratic + self.cubic * stretch) * stretch * stretch
+        return force, (2 * self.quadratic + 3 * self.cubic * stretch) * stretch, 0.0, 0.0
+
+
+@dataclass(frozen=True)
+class DryFriction(Nonlinear):
+    """Coulomb force limit·tanh(δ̇/velocity).
+
+    The sign function is regularised: below `velocity`, m/s, the element acts like a viscous damper of
+    limit/velocity, so it creeps where true friction sticks. It gives nothing to the linear system: its
+    equivalent damper 4·limit/(π·ω·amplitude) vanishes for large motions, and that limit is the base model.
+    """
+
+    name: str
+    row: Row
+    limit: float
+    velocity: float = 1e-3
+
+    def step(self, before: float, stretch: float, rate: float, state: float, time_step: float) -> Step:
+        """See `Nonlinear.step`."""
+        x = rate / self.velocity
+        slope = 0.0 if abs(x) > 300 else self.limit / (self.velocity * cosh(x) ** 2)
+        return self.limit * tanh(x), 0.0, slope, 0.0
+
+
+@dataclass(frozen=True)
+class PartingSpring(Spring, Nonlinear):
+    """A gear mesh or any contact that can part.
+
+    `preload` is the deflection of the contact at the working point, from which the stretch δ is counted:
+    the teeth part where δ falls below -preload, and meet again with their backs after a further `gap`, m.
+    The force counts from its value at the working point: k·max(δ + preload, 0) + k·min(δ + preload + gap, 0)
+    - k·max(preload, 0). A negative preload is a working point inside the gap: -gap/2 is its middle, and the
+    element is then the symmetric backlash function.
+    """
+
+    preload: float = inf
+    gap: float = inf
+
+    @property
+    def tangent_stiffness(self) -> float:
+        """Stiffness in contact, N/m."""
+        return self.stiffness
+
+    def step(self, before: float, stretch: float, rate: float, state: float, time_step: float) -> Step:
+        """See `Nonlinear.step`."""
+        if self.preload == inf:
+            return 0.0, 0.0, 0.0, 0.0
+        k = self.stiffness
+        contact = stretch + self.preload
+        rest = 0.0 if self.preload > 0 else -k * self.preload  # the tangent's force is counted from contact
+        if contact >= 0:
+            return -rest, 0.0, 0.0, 0.0
+        if contact >= -self.gap:
+            return -k * contact - rest, -k, 0.0, 0.0
+        return k * self.gap - rest, 0.0, 0.0, 0.0
+
+
+@dataclass(frozen=True)
+class BoucWen(Nonlinear):
+    """Normalised Bouc-Wen hysteresis: force limit·w, ẇ = ρ(δ̇ - σ|δ̇||w|ⁿ⁻¹w + (σ - 1)δ̇|w|ⁿ).
+
+    Attributes
+    ----------
+    limit : float
+        k_w, the force that it tends to, N.
+    rho : float
+        1/m; limit·rho is the stiffness at small motions, which the linear system holds.
+    sigma : float
+        Shape of the unloading branch; the loop takes energy for sigma > 0 and is passive for any motion
+        from 0.5 on.
+    exponent : float
+        n ≥ 1: the larger, the sharper the yield.
+
+    Notes
+    -----
+    The force depends on the path only, not on its speed. For n = 1 each stretch of the path is solved in
+    closed form; other exponents take a fourth-order step.
+    """
+
+    has_memory = True
+    name: str
+    row: Row
+    limit: float
+    rho: float
+    sigma: float
+    exponent: float = 1.0
+
+    @property
+    def tangent_stiffness(self) -> float:
+        """Stiffness at small motions, N/m."""
+        return self.limit * self.rho
+
+    def slope(self, w: float, direction: float) -> float:
+        """dw/dδ for motion in `direction` (±1), 1/m."""
+        size = abs(w) ** self.exponent
+        towards = direction if w >= 0 else -direction
+        return self.rho * (1.0 - (self.sigma * towards + 1.0 - self.sigma) * size)
+
+    def step(self, before: float, stretch: float, rate: float, state: float, time_step: float) -> Step:
+        """See `Nonlinear.step`."""
+        path = stretch - before
+        direction = 1.0 if path >= 0 else -1.0
+        w = self._closed(state, path) if self.exponent == 1.0 else self._runge_kutta(state, path)
+        slope = self.limit * self.slope(w, direction) - self.tangent_stiffness
+        return self.limit * w - self.tangent_stiffness * stretch, slope, 0.0, w
+
+    def _closed(self, w: float, path: float) -> float:
+        """dw/dδ = ρ(1 - a·w) with a constant between changes of sign of w."""
+        direction = 1.0 if path >= 0 else -1.0
+        while True:
+            away = w * direction >= 0
+            # a carries the sign of w, so that a·w = (…)|w|.
+            size = 1.0 if away else 1.0 - 2 * self.sigma
+            a = size * (direction if away else -direction)
+            if not away:
+                crossing = (log1p(-a * w) / a if abs(a) > 1e-12 else -w) / self.rho
+                if abs(crossing) < abs(path):
+                    w, path = 0.0, path - crossing
+                    continue
+            x = self.rho * path
+            if abs(a) <= 1e-12:
+                return w + x
+            return w * exp(-a * x) - expm1(-a * x) / a
+
+    def _runge_kutta(self, w: float, path: float) -> float:
+        direction = 1.0 if path >= 0 else -1.0
+        count = 1 + int(4 * self.rho * abs(path))
+        h = path / count
+        for _ in range(count):
+            a = self.slope(w, direction)
+            b = self.slope(w + 0.5 * h * a, direction)
+            c = self.slope(w + 0.5 * h * b, direction)
+            w += h / 6 * (a + 2 * b + 2 * c + self.slope(w + h * c, direction))
+        return w
+
+
+@dataclass(frozen=True)
+class Maxwell(Nonlinear):
+    """Relaxation: a spring `stiffness` in series with a damper, which follows with `time` (c/k), s.
+
+    Its loss per cycle π·k·X²·ωτ/(1 + ω²τ²) falls with frequency above 1/(2πτ). The linear system holds the
+    spring alone, i.e. motions faster than `time`; time and harmonic responses are exact.
+    """
+
+    has_memory = True
+    name: str
+    row: Row
+    stiffness: float
+    time: float
+
+    @property
+    def tangent_stiffness(self) -> float:
+        """Stiffness to motions faster than `time`, N/m."""
+        return self.stiffness
+
+    def step(self, before: float, stretch: float, rate: float, state: float, time_step: float) -> Step:
+        """See `Nonlinear.step`; the state is the stretch of the damper."""
+        x = time_step / self.time
+        decay = exp(-x)
+        late = -expm1(-x) / x  # mean of e^{-s} over the step
+        after = decay * state + (late - decay) * before + (1.0 - late) * stretch
+        return -self.stiffness * after, -self.stiffness * (1.0 - late), 0.0, after
+
+
+def check_element(element: Nonlinear) -> None:
+    """EmaError for values that make no physical sense."""
+    if isinstance(element, BoucWen) and (element.rho <= 0 or element.exponent < 1):
+        raise EmaError(f"'{element.name}': a Bouc-Wen element needs rho > 0 and exponent ≥ 1")
+    if isinstance(element, Maxwell) and element.time <= 0:
+        raise EmaError(f"'{element.name}': a relaxation needs a time above 0 s")
+    if isinstance(element, DryFriction) and element.velocity <= 0:
+        raise EmaError(f"'{element.name}': dry friction needs a regularisation velocity above 0 m/s")
+    if isinstance(element, PartingSpring) and element.gap < 0:
+        raise EmaError(f"'{element.name}': the gap behind the teeth cannot be negative")
