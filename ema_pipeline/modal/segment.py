@@ -62,6 +62,14 @@ SAME_RESPONSE = 0.9
 which splits a mode in two with one shape at the sensors."""
 
 
+ECHO_REACH = 10.0
+"""Distance from a stronger mode, in its decay rates, within which a pole may be its echo: a mode whose
+frequency drifts between hits, or with the level, leaves a misfit that a second pole beside it mends."""
+
+ECHO_MAC = 0.6
+"""Product of the MACs at rows and references above which a nearby pole is an echo."""
+
+
 @dataclass(frozen=True)
 class SegmentFit:
     """Result on the lines of one sub-band.
@@ -135,20 +143,18 @@ def _doubtful(
     score = np.minimum(gain / threshold, MAX_DAMPING_STD / np.maximum(decay_std(estimate, solution), 1e-9))
     plain = visibility(data, estimate, solution) / PLAIN
     plain = np.where(zeta > PLAIN_DAMPING, 0.0, plain)
-    support = np.maximum(votes(estimate) / MIN_VOTES, plain)
+    explained = np.zeros(len(poles), dtype=bool)
     if hits is not None:
-        support = np.maximum(support, EXPLAINED / misfit(data, hits, estimate, solution))
+        explained = misfit(data, hits, estimate, solution) < EXPLAINED
+    support = np.maximum(votes(estimate) / MIN_VOTES, plain)
+    support = np.where(explained, np.maximum(support, 1.0), support)
     score = np.minimum(score, support)
-    doubles = np.flatnonzero(_doubles(data, estimate, solution))
+    doubles = np.flatnonzero(_doubles(data, estimate, solution, explained))
     if len(doubles):  # one at a time: three poles on two modes mix their shapes
         strength = np.linalg.norm(solution.shapes, axis=0) * np.linalg.norm(estimate.participation, axis=1)
         out = np.zeros(len(poles), dtype=bool)
         out[doubles[np.argmin(strength[doubles])]] = True
         return out
-    import os
-    if os.environ.get('DBG'):
-        for r in range(len(poles)): print(f'{poles[r].imag/6.2832:.3f} z {zeta[r]:.4f} sc {score[r]:.2f} gain {gain[r]:.0f} thr {threshold[r]:.0f} ds {decay_std(estimate,solution)[r]:.3f} plain {plain[r]:.2f} votes {votes(estimate)[r]:.2f} misfit {misfit(data,hits,estimate,solution)[r] if hits else 0:.2f}')
-        print()
     failed = score < 1
     return np.asarray(failed & (score <= max(HOPELESS, score.min())))
 
@@ -189,24 +195,27 @@ def misfit(data: FitData, hits: Noise, estimate: Estimate, solution: LinearSolut
     return np.maximum(out, 1e-9)
 
 
-def _doubles(data: FitData, estimate: Estimate, solution: LinearSolution) -> NDArray[np.bool_]:
-    """The weaker of two coinciding poles that have one shape, at the rows or at the references."""
+def _doubles(
+    data: FitData, estimate: Estimate, solution: LinearSolution, explained: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """The weaker of two poles that are one mode: coinciding with one shape, or an echo of a stronger mode."""
     m = len(estimate.poles)
     rows, references = mac(solution.shapes.T, solution.shapes.T), mac(estimate.participation, estimate.participation)
     sensors, hit = (references, rows) if data.transposed else (rows, references)
-    n_sensors, n_hit = data.measured.shape[::-1] if data.transposed else data.measured.shape
-    alike = np.zeros((m, m), dtype=bool)
-    if n_sensors > 1:
-        alike |= sensors > (SAME_RESPONSE if n_sensors > 2 else SAME_SHAPE)
-    if n_hit > 2:
-        alike |= hit > SAME_SHAPE
+    n_sensors = data.measured.shape[1] if data.transposed else data.measured.shape[0]
+    if n_sensors == 1:  # nothing measured together: the points hit must tell
+        alike = hit > SAME_RESPONSE
+    else:
+        alike = sensors > (SAME_RESPONSE if n_sensors > 2 else SAME_SHAPE)
     decay = -estimate.poles.real
     close = np.abs(estimate.poles[:, None] - estimate.poles[None]) < COINCIDENT * np.maximum(decay[:, None], decay)
-    if data.measured.size == 1:
-        alike[:] = True
     strength = np.linalg.norm(solution.shapes, axis=0) * np.linalg.norm(estimate.participation, axis=1)
     weaker = strength[:, None] < strength[None]
-    return np.asarray((alike & close & weaker).any(axis=1))
+    double = alike & close
+    if min(data.measured.shape) > 2:
+        near = np.abs(estimate.poles[:, None] - estimate.poles[None]) < ECHO_REACH * decay[None]
+        double |= near & (rows * references > ECHO_MAC) & ~explained[:, None]
+    return np.asarray((double & weaker).any(axis=1))
 
 
 def measured_noise(
