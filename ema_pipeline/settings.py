@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -55,23 +55,28 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
 
 
 def _fields_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
-    """Names of the fields of the (nested) model that `loc` leads to."""
+    """Names of the fields of the (nested) model that `loc` leads to; keys of dictionaries are passed over."""
     current: Any = model
+    in_dictionary = False
     for step in loc:
-        if isinstance(step, int) or not (isinstance(current, type) and issubclass(current, BaseModel)):
+        if isinstance(step, int) or in_dictionary:
+            in_dictionary = False
             continue
-        field = current.model_fields.get(str(step))
+        field = next((f for n, f in current.model_fields.items() if str(step) in (n, f.alias)), None)
         if field is None:
             return []
-        current = next(
-            (t for t in _type_leaves(field.annotation) if isinstance(t, type) and issubclass(t, BaseModel)),
-            None,
-        )
+        in_dictionary = _is_dictionary(field.annotation)
+        leaves = [t for t in _type_leaves(field.annotation) if isinstance(t, type)]
+        current = next((t for t in leaves if issubclass(t, BaseModel)), None)
         if current is None:
             return []
-    if isinstance(current, type) and issubclass(current, BaseModel):
-        return [f.alias or name for name, f in current.model_fields.items()]
-    return []
+    return [f.alias or name for name, f in current.model_fields.items()]
+
+
+def _is_dictionary(annotation: Any) -> bool:
+    if get_origin(annotation) is dict:
+        return True
+    return get_origin(annotation) is not None and any(_is_dictionary(a) for a in get_args(annotation))
 
 
 def _type_leaves(annotation: Any) -> list[Any]:

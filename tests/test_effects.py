@@ -37,6 +37,9 @@ CONTRACT_PLACES = {
     "local_damper": {"carrier", "ring", "sun", "planet1", "planet2"},
     "hysteretic_damping": {"sun-planet", "ring-planet", "carrier", "ring", "sun", "planet"},
     "gyroscopic": {"carrier", "sun", "planet1", "planet2"},
+    "bearing_cubic": {"carrier", "ring", "sun"},
+    "dry_friction": {"carrier", "ring", "sun"},
+    "mesh_backlash": {"sun-planet1", "sun-planet2", "ring-planet1", "ring-planet2"},
 }
 
 
@@ -71,6 +74,22 @@ def test_effect_at_its_start_value_changes_the_modes_visibly(effect_id: str) -> 
             len(edited) != len(poles) or np.max(np.abs(edited - poles) / np.maximum(np.abs(poles), 1)) > 1e-4
         )
         assert moved, place
+
+
+NONLINEAR = [i for i in effect_ids() if not get_effect(i).linear]
+
+
+@pytest.mark.parametrize("effect_id", NONLINEAR)
+def test_nonlinear_effect_is_absent_at_its_null_and_acts_at_its_start_value(effect_id: str) -> None:
+    effect = get_effect(effect_id)
+    rig = load_rig("isolator") if effect.find_places(load_rig("isolator").assembly("default")) else RIG
+    base = rig.assembly(rig.configurations[-1])
+    places = effect.find_places(base)
+    assert places
+    for place in places:
+        assert effect.apply(base, place).nonlinear == ()
+        start = {p.name: p.start for p in effect.parameters}
+        assert effect.apply(base, place, start).nonlinear
 
 
 @pytest.mark.parametrize(("effect_id", "places"), CONTRACT_PLACES.items())

@@ -280,7 +280,7 @@ def test_viscous_coefficients_take_the_place_of_modal_damping(tmp_path: Path) ->
         ("carrier_mass", "carier_mass", "line 5.*carier_mass.*did you mean 'carrier_mass'"),
         ('"kg"', '"g"', "line 5.*carrier_mass.*unit 'g'.*convert the value to kg"),
         ("planets", "planet", "line 3.*did you mean 'planets'"),
-        ("tolerance", "tolerence", "line 5.*tolerence"),
+        ("tolerance", "tolerence", "line 5.*tolerence.*did you mean 'tolerance'"),
         ('"planetary"', '"planetery"', "line 1.*did you mean 'planetary'"),
         ("= 3", "= 1", "at least 2 planets"),
         ("value = 1.50", 'value = "heavy"', "line 5.*carrier_mass.*'heavy'"),

@@ -25,7 +25,7 @@ from ema_pipeline.simulate import simulate_campaign
 from ema_pipeline.simulate.campaign import default_impacts, default_sensors, true_values
 from ema_pipeline.simulate.hammer import ForceHistory, Pulse
 from ema_pipeline.simulate.recorder import quantise
-from ema_pipeline.simulate.response import linear_response
+from ema_pipeline.simulate.response import integrated_response, linear_response
 
 RIG = load_rig("planetary")
 
@@ -335,3 +335,31 @@ def test_sample_data_are_what_their_documented_commands_make(tmp_path: Path, nam
             stored, fresh = read_h5(SAMPLES / name / file), read_h5(tmp_path / "raw" / file)
             for channel, volts in stored.items():  # another FFT may round one sample to the next code
                 np.testing.assert_allclose(fresh[channel], volts, atol=1.5 * step, err_msg=channel)
+
+
+def test_a_rig_with_hardly_any_nonlinearity_answers_like_the_linear_one() -> None:
+    from ema_pipeline.effects.rig import rig_with_effects
+
+    history = ForceHistory((Pulse(0.05, 150.0, 6e-4),), 5120.0, 5120)
+    sensors, impact = default_sensors(RIG.assembly("no_ring")), Dof("sun", "y")
+    slight = rig_with_effects(RIG, [("bearing_cubic@sun", {"stiffness": 1.0})]).assembly("no_ring")
+    ((f1, linear),) = linear_response(RIG.assembly("no_ring"), (history,), impact, sensors)
+    ((f2, stepped),) = integrated_response(slight, (history,), impact, sensors)
+    np.testing.assert_allclose(f2, f1, atol=2e-3 * f1.max())
+    assert np.max(np.abs(stepped - linear)) < 5e-3 * np.max(np.abs(linear))
+
+
+def test_cubic_bearing_shifts_the_simulated_resonance_with_the_force(tmp_path: Path) -> None:
+    simulate_campaign(
+        tmp_path, "planetary", configurations=["no_ring"], effects=["bearing_cubic@sun:stiffness=2e13"],
+        sensors=["sun.x"], impacts=["sun.x"], peak_force_n=(10.0, 400.0), hits=1, duration_s=1.0,
+        force_spread=0.0, format="hdf5",
+    )  # fmt: skip
+    peaks = []
+    for level in ("10N", "400N"):
+        record = read_h5(next(tmp_path.glob(f"*{level}*.h5")))
+        gain = np.abs(np.fft.rfft(record["sun_x"])) / np.abs(np.fft.rfft(record["hammer"]))
+        f = np.fft.rfftfreq(len(record["sun_x"]), 1 / 5120.0)
+        band = (f > 95) & (f < 140)
+        peaks.append(f[band][np.argmax(gain[band])])
+    assert peaks[1] > peaks[0] + 0.5

@@ -31,3 +31,8 @@ def bodies_in_plane(assembly: Assembly) -> tuple[str, ...]:
 def plane_rows(assembly: Assembly, body: str) -> tuple[Row, Row]:
     """Rows of a body's x and y, also where these are no coordinates (planets)."""
     return assembly.row(f"{body}.x"), assembly.row(f"{body}.y")
+
+
+def bodies_that_only_turn(assembly: Assembly) -> tuple[str, ...]:
+    """Bodies whose only coordinate is u = r·θ."""
+    return tuple(b for b in assembly.bodies if assembly.coordinates(b) == (f"{b}.u",))

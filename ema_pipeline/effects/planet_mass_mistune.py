@@ -9,8 +9,16 @@ from ema_pipeline.effects.places import planets
 from ema_pipeline.mechanics.assembly import Assembly, Mass
 
 
+def _axes(assembly: Assembly, planet: str) -> list[str]:
+    return [d for d in assembly.coordinates(planet) if not d.endswith(".u")]
+
+
+def _places(assembly: Assembly) -> tuple[str, ...]:
+    return tuple(p for p in planets(assembly) if _axes(assembly, p))
+
+
 def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
-    axes = [d for d in assembly.coordinates(place) if not d.endswith(".u")]
+    axes = _axes(assembly, place)
     return assembly.add(*(Mass(f"{d} mistuned mass", {d: 1.0}, values["mass"]) for d in axes))
 
 
@@ -22,7 +30,7 @@ EFFECT = Effect(
             "mass", "kg", 0.0, 0.04, 0.05, -0.2, 1.0, "mass added at the planet's centre (I/r² stays)"
         ),
     ),
-    find_places=planets,
+    find_places=_places,
     edit=_edit,
     signs="mode pairs split; a mode leans to one planet, more so at high frequency",
     reference="D. R. Kiracofe, R. G. Parker, J. Vib. Acoust. 129 (2007) 1-16",

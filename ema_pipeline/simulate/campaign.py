@@ -23,7 +23,7 @@ from ema_pipeline.rigs.types import Rig
 from ema_pipeline.settings import parse
 from ema_pipeline.simulate.hammer import ForceHistory, Pulse
 from ema_pipeline.simulate.recorder import clip_peak, record_channel
-from ema_pipeline.simulate.response import Respond, linear_response
+from ema_pipeline.simulate.response import Respond, response
 from ema_pipeline.simulate.settings import SimulationSettings
 from ema_pipeline.simulate.writers import SUFFIX, WRITERS
 from ema_pipeline.threads import single_blas_thread
@@ -64,7 +64,7 @@ def simulate_campaign(
     sensors: Sequence[str] = (),
     impacts: Sequence[str] = (),
     library: Library | None = None,
-    respond: Respond = linear_response,
+    respond: Respond = response,
     **settings: Any,
 ) -> SimulatedCampaign:
     """Simulate hammer tests of a rig and write them as raw folders.

@@ -1,4 +1,4 @@
-"""What ideal sensors of a linear rig read: exact, band-limited samples."""
+"""What ideal sensors read: band-limited samples, exact for a linear rig."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.frf import accelerance
 from ema_pipeline.mechanics.modes import complex_modes
+from ema_pipeline.mechanics.nonlinear import nonlinear_response
 from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
 from ema_pipeline.simulate.hammer import ForceHistory, anti_alias
 
@@ -26,6 +27,48 @@ REST = 1e-7
 """The periodic record is so long that responses decay to this share before it starts anew."""
 
 LONGEST = 2**22
+
+FINE_RATE_HZ = 51200.0
+"""A nonlinear rig is integrated at this rate or a little above."""
+
+TAIL = 0.05
+"""A nonlinear record runs on by this share of its length, so that the filter meets no edge."""
+
+
+def response(
+    assembly: Assembly, histories: tuple[ForceHistory, ...], impact: Dof, sensors: tuple[Dof, ...]
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...]:
+    """Force and accelerations of each record; see `linear_response` and `integrated_response`."""
+    respond = integrated_response if assembly.nonlinear else linear_response
+    return respond(assembly, histories, impact, sensors)
+
+
+def integrated_response(
+    assembly: Assembly, histories: tuple[ForceHistory, ...], impact: Dof, sensors: tuple[Dof, ...]
+) -> tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...]:
+    """Force and accelerations of each record of a rig with nonlinear elements, by stepping in time.
+
+    Parameters and result are those of `linear_response`. The steps are `FINE_RATE_HZ` apart; the samples are
+    taken behind the same anti-alias filter.
+    """
+    system = assembly.system()
+    rate, n = histories[0].sample_rate_hz, histories[0].n_samples
+    factor = int(np.ceil(FINE_RATE_HZ / rate))
+    length = scipy.fft.next_fast_len(n + int(np.ceil(TAIL * n)) + 64, real=True)
+    time_s = np.arange(length * factor) / (rate * factor)
+    fade = np.ones(length * factor)
+    fade[n * factor :] = np.cos(0.5 * np.pi * np.linspace(0, 1, (length - n) * factor)) ** 2
+    gain = anti_alias(np.asarray(np.fft.rfftfreq(length, 1 / rate), dtype=np.float64), rate) / factor
+    out, into = sensor_rows(system, sensors), sensor_rows(system, (impact,))
+    results = []
+    for history in histories:
+        force = np.sum([p.force(time_s) for p in history.pulses], axis=0)
+        motion = nonlinear_response(assembly, rate * factor, force[None], out, into).acceleration
+        signals = np.vstack([force, motion]) * fade
+        spectrum = scipy.fft.rfft(signals, axis=-1)[:, : len(gain)] * gain
+        sampled = scipy.fft.irfft(spectrum, length, axis=-1)[:, :n]
+        results.append((sampled[0], sampled[1:]))
+    return tuple(results)
 
 
 def linear_response(
