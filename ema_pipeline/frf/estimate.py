@@ -25,6 +25,15 @@ BLOCK = 4
 BAND_OVER_RATE = 1 / 2.56
 """Converters' anti-alias filters are flat up to the sample rate over 2.56."""
 
+SAFE_DROP_DB = 20.0
+"""A force spectrum within this of its largest is strong enough, whatever its noise (as ISO 7626-5 asks)."""
+
+FLOOR_DB = 10.0
+"""Distance from the hammer's noise at which a force spectrum still serves."""
+
+STRONG_SHARE = 0.8
+"""Least share of lines with enough force up to the band's end; the rest lies in zeros of the spectrum."""
+
 
 def estimate_frfs(hits: Iterable[HitSamples], settings: FrfSettings | None = None) -> FrfSet:
     """Estimate FRFs, coherence and variance from hits.
@@ -37,12 +46,12 @@ def estimate_frfs(hits: Iterable[HitSamples], settings: FrfSettings | None = Non
     R = Σ|Y - H1·F|² = Σ|Y|²(1 - γ²) of n hits has n - 1 complex degrees of freedom, so that R/(n - 1) is
     unbiased for the noise power and E|H - E H|² = R/((n - 1) Σ|F|²), that is |H|²(1 - γ²)/((n - 1) γ²);
     [1]_ has n in place of n - 1. A single line gives it but 2(n - 1) real degrees of freedom; the noise
-    power R is therefore averaged over neighbouring lines, as few as give `variance_dof` complex degrees of freedom.
-    For H2 and Hv the relative variance of H1 is taken.
+    power R is therefore averaged over neighbouring lines, as few as give `variance_dof` complex degrees of
+    freedom. For H2 and Hv the relative variance of H1 is taken.
 
-    The band runs from the first line up to where the force autospectrum (median over 1/256 of the lines)
-    first falls `band_drop_db` below its largest, for nine tenths of all inputs, and at most to the sample
-    rate over 2.56.
+    The band runs from the first line to the last at which the force autospectrum (median over 1/256 of the
+    lines) stands above the hammer's noise and is not `band_drop_db` below its largest, narrow zeros of the
+    spectrum aside, for nine tenths of all inputs, and at most to the sample rate over 2.56.
 
     Parameters
     ----------
@@ -297,16 +306,23 @@ def _band(
 ) -> tuple[float, float]:
     """Band in which the force of all but a tenth of the inputs carried enough energy.
 
-    One weak blow among many must not narrow the band of all.
+    Enough is what stands `FLOOR_DB` above the hammer's own noise, for which the weakest part of all spectra
+    is taken, but a drop of `SAFE_DROP_DB` is always enough and one of `drop_db` never. One weak blow among
+    many must not narrow the band of all.
     """
     width = max(frequency.size // 256, 1)
     highest = rate * BAND_OVER_RATE
+    # Line 0 is the offset. Medians over blocks are deaf to hum and drift lines.
+    count = (frequency.size - 1) // width
+    levels = [np.median(f[1 : 1 + count * width].reshape(count, width), axis=1) for f in forces]
+    floor = min(float(np.min(level)) for level in levels) * 10 ** (FLOOR_DB / 10)
     tops = []
-    for force in forces:
-        # Line 0 is the offset. Medians over blocks are deaf to hum and drift lines.
-        count = (force.size - 1) // width
-        level = np.median(force[1 : 1 + count * width].reshape(count, width), axis=1)
+    for level in levels:
         top = int(np.argmax(level))
-        low = np.flatnonzero(level[top:] < level[top] * 10 ** (-drop_db / 10))
-        tops.append(float(frequency[max(1 + (top + int(low[0])) * width, 2)]) if low.size else highest)
+        least = np.clip(floor, level[top] * 10 ** (-drop_db / 10), level[top] * 10 ** (-SAFE_DROP_DB / 10))
+        strong = level[top:] >= least
+        share = np.cumsum(strong) / np.arange(1, strong.size + 1)
+        # The zeros of a pulse's spectrum are narrow; beyond them the force is strong again.
+        last = top + int(np.flatnonzero(strong & (share >= STRONG_SHARE))[-1])
+        tops.append(float(frequency[min((last + 1) * width, frequency.size - 1)]))
     return float(frequency[1]), min(highest, float(np.quantile(tops, 0.1, method="lower")))

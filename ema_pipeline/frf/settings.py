@@ -28,7 +28,9 @@ class FrfSettings(Settings):
         description="Degrees of freedom that the variance is smoothed to, (hits - 1) × neighbouring lines",
     )
     band_drop_db: float = Field(
-        default=20.0, gt=0, description="Drop of the force autospectrum that ends the band, dB"
+        default=40.0,
+        ge=20.0,
+        description="Drop of the force autospectrum that ends the band, dB, unless noise ends it before",
     )
     threads: int = Field(default=2, ge=1, description="Threads over blocks of channels")
     minimum_coherence: float = Field(
