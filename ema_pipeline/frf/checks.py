@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
@@ -16,6 +17,15 @@ REPEATABILITY = "ISO 7626-5, repeatability"
 
 HITS_FOR_COHERENCE = 3
 """Fewer hits fit almost any line: their coherence says little."""
+
+PEAK_SHARE = 0.01
+"""Lines with at least this share of the largest |FRF|² are judged: zeros of the force blow up the rest."""
+
+NODE_LEVEL = 0.1
+"""An FRF below this share of the strongest one at its sensor is near a node: its noise says little on the test."""
+
+NOISE_MARGIN = 2.0
+"""Reciprocal FRFs may differ by their noise: this many times its power is taken off their difference."""
 
 
 def check_frfs(frfs: FrfSet, settings: FrfSettings | None = None) -> tuple[Verdict, ...]:
@@ -59,15 +69,20 @@ def _scatter(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings) -> 
             )
         ]
     verdicts = []
+    peak = _peak_power(frfs, inside)
     for o, i in np.argwhere(frfs.hits > 1):
         n = int(frfs.hits[o, i])
-        power = np.abs(frfs.frf[o, i, inside]) ** 2
-        total = float(power.sum())
-        if total == 0:
+        if peak[o, i] <= NODE_LEVEL**2 * np.nanmax(peak[o]):
             continue
+        power = np.abs(frfs.frf[o, i, inside]) ** 2
+        power[power < PEAK_SHARE * peak[o, i]] = 0.0
+        total = float(power.sum())
         coherence = float(frfs.coherence[o, i, inside] @ power / total)
-        # Variance of one hit's FRF, not of the mean over n.
-        scatter = float(np.sqrt(n * frfs.variance[o, i, inside].sum() / total))
+        # Variance of one hit's FRF, not of the mean over n. Noise is there at all lines, scatter of the blows
+        # only where the structure answers.
+        variance = frfs.variance[o, i, inside]
+        excess = (variance - median_filter(variance, variance.size // 16 + 1)).clip(min=0.0)
+        scatter = float(np.sqrt(n * excess[power > 0].sum() / total))
         name = f"{frfs.outputs[o]} over {frfs.inputs[i]}"
         enough = n >= HITS_FOR_COHERENCE
         good = not enough or coherence >= settings.minimum_coherence
@@ -100,6 +115,17 @@ def _scatter(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings) -> 
             ),
         ]
     return verdicts
+
+
+def _peak_power(frfs: FrfSet, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Largest |FRF|² in the band, (n_outputs, n_inputs); NaN where not measured.
+
+    A high quantile: a few lines in a zero of the force may hold noise as large as a resonance.
+    """
+    peak = np.full(frfs.hits.shape, np.nan)
+    for o, i in np.argwhere(frfs.hits > 0):
+        peak[o, i] = np.quantile(np.abs(frfs.frf[o, i, inside]), 0.998) ** 2
+    return peak
 
 
 def _driving_points(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings) -> list[Verdict]:
@@ -140,15 +166,23 @@ def _driving_points(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettin
 def _reciprocity(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings) -> list[Verdict]:
     """H_ij against H_ji, in accelerance."""
     verdicts = []
+    peak = _peak_power(frfs, inside)
     place = {d: o for o, d in enumerate(frfs.outputs)}
     both = [(place[d], i) for i, d in enumerate(frfs.inputs) if d in place]
     for first, (o1, i1) in enumerate(both):
         for o2, i2 in both[first + 1 :]:
             if frfs.hits[o1, i2] == 0 or frfs.hits[o2, i1] == 0:
                 continue
+            if peak[o1, i2] * peak[o2, i1] <= NODE_LEVEL**4 * peak[o1, i1] * peak[o2, i2]:
+                continue
             one, other = _accelerance(frfs, o1, i2, inside), _accelerance(frfs, o2, i1, inside)
+            power = np.maximum(np.abs(one), np.abs(other)) ** 2
+            seen = power >= PEAK_SHARE * power.max()
+            one, other = one[seen], other[seen]
             size = 0.5 * (np.linalg.norm(one) + np.linalg.norm(other))
-            difference = float(np.linalg.norm(one - other) / size) if size > 0 else 0.0
+            noise = np.nan_to_num(frfs.variance[o1, i2, inside] + frfs.variance[o2, i1, inside])[seen]
+            beyond = max(float(np.sum(np.abs(one - other) ** 2) - NOISE_MARGIN * np.sum(noise)), 0.0)
+            difference = float(np.sqrt(beyond) / size) if size > 0 else 0.0
             passes = difference <= settings.reciprocity
             name = f"{frfs.outputs[o1]} and {frfs.outputs[o2]}"
             verdicts.append(
