@@ -71,7 +71,5 @@ def _span(lobe: NDArray[np.float64], level: float) -> float:
 def _all_lobes(x: NDArray[np.float64], top: float, epsilon: float) -> float:
     near = int(np.count_nonzero(x >= top - epsilon))
     wide = int(np.count_nonzero(x >= top - 4 * epsilon))
-    # By chance (one half each) that many of `wide` lie in the upper quarter: 5 deviations of the binomial.
-    if near < 8 or near - 0.5 * wide < 2.5 * np.sqrt(wide):
-        return 0.0
-    return near / wide
+    # By chance half of `wide` lie in the upper quarter: 5 deviations of the binomial above that.
+    return near / wide if near >= 8 and near - 0.5 * wide >= 2.5 * np.sqrt(wide) else 0.0

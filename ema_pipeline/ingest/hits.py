@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len
-from scipy.ndimage import white_tophat
+from scipy.ndimage import uniform_filter1d, white_tophat
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.hit_settings import HitSettings
@@ -51,21 +51,22 @@ def find_hits(record: Record, settings: HitSettings | None = None) -> tuple[Hit,
     settings = settings or HitSettings()
     rate, force = record.sample_rate_hz, record.force
     deviation = force - np.median(force)
-    largest = int(np.argmax(np.abs(deviation)))
-    sign = 1.0 if deviation[largest] >= 0 else -1.0
-    height = float(abs(deviation[largest]))
-    # Slow disturbance (hum) is no broadband noise, yet no blow either: hence also the median deviation.
-    noise = max(noise_of(force), 1.4826 * float(np.median(np.abs(deviation))))
-    if height == 0 or height < settings.trigger_noise * noise:
+    # Drift of the amplifier can exceed the threshold without any blow: only what is short counts.
+    longest = max(int(LONGEST_PULSE_S * rate), 9)
+    quick = force - uniform_filter1d(force, 10 * longest, mode="nearest")
+    sign = 1.0 if quick[np.argmax(np.abs(quick))] >= 0 else -1.0
+    short = white_tophat(sign * deviation, size=(longest,))
+    height = float(short.max())
+    # The median sees hum, which is no broadband noise, and yet no blow either.
+    noise = max(noise_of(force), float(np.median(short)))
+    threshold = max(settings.trigger_level * height, settings.trigger_noise * noise)
+    if height == 0 or height < threshold:
         raise EmaError(
-            f"{record.file}: no hit found on hammer channel '{record.force_name}': its largest deviation is "
+            f"{record.file}: no hit found on hammer channel '{record.force_name}': its largest pulse is "
             f"{height:.3g}, its noise {noise:.3g}; "
             "check the hammer's cable and sensitivity, or leave the file out"
         )
-    threshold = max(settings.trigger_level * height, settings.trigger_noise * noise)
     spacing = max(int(settings.minimum_spacing_s * rate), 10)
-    # Drift of the amplifier can exceed the threshold without any blow: only what is short counts.
-    short = white_tophat(sign * deviation, size=(max(int(LONGEST_PULSE_S * rate), 9),))
     peaks = _group(_blows(short, threshold), short, spacing)
     if len(peaks) > 2:
         peaks = _group(peaks, short, max(spacing, int(0.25 * float(np.median(np.diff(peaks))))))

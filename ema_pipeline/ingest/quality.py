@@ -252,8 +252,9 @@ def _dead_channel(name: str, samples: NDArray[np.float64], pulse: Pulse, rest: i
     """
     step = step_of(samples)
     spans = float(np.ptp(samples) / step) if step > 0 else 0.0
-    hum = _hum_share(samples, rate) if spans > 1.5 else 0.0
-    only_hum = hum > HUM_ONLY and not _answers(samples, pulse, rest)
+    silent = spans > 1.5 and not _answers(samples, pulse, rest)
+    hum = _hum_share(samples, rate) if silent else 0.0
+    only_hum = hum > HUM_ONLY
     passes = spans > 1.5 and not only_hum
     if passes:
         message = ""

@@ -1,0 +1,215 @@
+"""Checks on single hits: what they must find, and what they must leave in peace."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulate_hits import Blow, force_of, modal_response, random_record, record_of
+
+from ema_pipeline.ingest.hits import find_hits
+from ema_pipeline.ingest.pulse import find_pulse, find_second_impact, noise_of
+from ema_pipeline.ingest.quality import check_hit, hits_of_test, usable_band_hz
+from ema_pipeline.ingest.records import Hit, Record
+from ema_pipeline.verdict import Verdict
+
+RATE = 12800.0
+
+
+def checked(record: Record) -> Hit:
+    """The first hit of a record, checked."""
+    return check_hit(record, find_hits(record)[0])
+
+
+def verdict(hit: Hit, check: str, channel: str | None = None) -> Verdict:
+    """The verdict of one check."""
+    return next(v for v in hit.verdicts if v.check == check and channel in (None, v.channel))
+
+
+def clean(seed: int = 0, length_s: float = 0.5) -> Record:
+    """A clean hit of 1 ms at 12.8 kHz on two modes."""
+    rng = np.random.default_rng(seed)
+    force = force_of(Blow(RATE, "half-sine", 1e-3, length_s=length_s), rng)
+    poles = np.array([-60 + 1j * 2 * np.pi * 300, -90 + 1j * 2 * np.pi * 900])
+    answers = [
+        modal_response(force - np.median(force), RATE, poles, 1j * rng.normal(size=2)) for _ in range(2)
+    ]
+    answers = [a + 2e-4 * np.abs(a).max() * rng.standard_normal(a.size) for a in answers]
+    return record_of(force, np.array(answers), RATE)
+
+
+def test_clean_single_hits_pass_the_whole_gate_in_99_of_100_cases() -> None:
+    rng = np.random.default_rng(11)
+    bad = 0
+    for _ in range(200):
+        hit = checked(random_record(rng))
+        bad += not hit.accepted or bool(hit.rejected_channels)
+    assert bad <= 2
+
+
+def test_second_hits_from_5_percent_and_2_to_50_ms_on_are_found_in_99_of_100_cases() -> None:
+    rng = np.random.default_rng(12)
+    missed = sum(checked(random_record(rng, double=True, channels=1)).accepted for _ in range(200))
+    assert missed <= 2
+
+
+@pytest.mark.parametrize("delay_s", [0.003, 0.0081, 0.02, 0.049])
+def test_ratio_and_delay_of_a_second_impact_are_told(delay_s: float) -> None:
+    force = force_of(Blow(RATE, "haversine", 1e-3, second=(0.12, delay_s, 1e-3)), np.random.default_rng(1))
+    second = find_second_impact(force, find_pulse(force, int(np.argmax(force))), RATE, 0.025)
+    assert second.ratio == pytest.approx(0.12, abs=0.015)
+    assert second.delay_s == pytest.approx(delay_s, abs=2.5 / RATE)
+
+
+def test_shoulder_of_a_second_blow_is_seen_inside_the_first_pulse() -> None:
+    """4 ms pulses 2 ms apart: the force falls all the way, there is no second maximum."""
+    force = force_of(
+        Blow(RATE, "half-sine", 4e-3, second=(0.08, 2e-3, 4e-3), noise=2e-4), np.random.default_rng(2)
+    )
+    hit = checked(record_of(force, clean(length_s=0.4).responses, RATE))
+    assert not hit.accepted
+
+
+def test_tap_before_the_blow_is_a_double_hit_too() -> None:
+    force = force_of(Blow(RATE, "half-sine", 1e-3, second=(8.0, 0.01, 1e-3)), np.random.default_rng(2))
+    hit = checked(record_of(force, clean(length_s=0.4).responses, RATE))
+    assert not hit.accepted
+    assert "before" in hit.reason
+
+
+def test_ringing_of_the_anti_alias_filter_is_no_second_hit() -> None:
+    for seed in range(20):
+        force = force_of(Blow(4000.0, "half-sine", 0.3e-3, high_pass_hz=1.0), np.random.default_rng(seed))
+        second = find_second_impact(force, find_pulse(force, int(np.argmax(force))), 4000.0, 0.025)
+        assert second.ratio < 0.025
+
+
+def test_overload_of_the_hammer_rejects_the_hit_and_of_a_response_only_its_channel() -> None:
+    record = clean()
+    peak = float(record.force.max())
+    hit = checked(replace(record, force_full_scale=peak))
+    assert not hit.accepted
+    assert "overload on hammer" in hit.reason
+    full = replace(record.channels[1], full_scale=float(np.abs(record.responses[1]).max()))
+    hit = checked(replace(record, channels=(record.channels[0], full)))
+    assert hit.accepted
+    assert hit.rejected_channels == {"a1"}
+    assert checked(replace(record, force_full_scale=1.1 * peak)).accepted
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 5e-3])
+def test_clipped_hammer_is_found_from_its_flat_top_with_and_without_noise(noise: float) -> None:
+    for seed in range(10):
+        record = clean(seed)
+        rng = np.random.default_rng(seed)
+        peak = float(record.force.max())
+        force = np.minimum(record.force, 0.75 * peak) + noise * peak * rng.standard_normal(record.force.size)
+        hit = checked(replace(record, force=force))
+        assert "clipped" in hit.reason
+        assert verdict(hit, "clipping", "hammer").value > 0.7
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_clipped_response_loses_its_channel_only(noise: float) -> None:
+    for seed in range(10):
+        record = clean(seed)
+        rng = np.random.default_rng(seed)
+        responses = record.responses.copy()
+        level = 0.5 * float(np.abs(responses[0]).max())
+        responses[0] = np.clip(responses[0], -level, level) + noise * level * rng.standard_normal(
+            responses.shape[1]
+        )
+        hit = checked(replace(record, responses=responses))
+        assert hit.accepted
+        assert hit.rejected_channels == {"a0"}
+
+
+def test_dead_channels_are_found_and_a_silent_working_sensor_is_not_dead() -> None:
+    record = clean()
+    rng = np.random.default_rng(3)
+    n = record.force.size
+    t = np.arange(n) / RATE
+    cases = {
+        "constant": np.zeros(n),
+        "offset": np.full(n, 3.7),
+        "one step": 1e-4 * rng.integers(0, 2, n),
+        "hum": 0.2 * np.sin(2 * np.pi * 50.03 * t + 1)
+        + 0.02 * np.sin(2 * np.pi * 150.09 * t)
+        + 1e-4 * rng.standard_normal(n),
+        "silent": 2e-3 * rng.standard_normal(n) + 1.2,
+        "silent with hum": 2e-3 * rng.standard_normal(n) + 2e-3 * np.sin(2 * np.pi * 50 * t),
+        "answer on hum": 0.1 * np.sin(2 * np.pi * 50 * t)
+        + record.responses[1] / np.abs(record.responses[1]).max(),
+    }
+    dead = set()
+    for name, samples in cases.items():
+        hit = checked(replace(record, responses=np.stack([samples, record.responses[1]])))
+        assert hit.accepted
+        if hit.rejected_channels:
+            assert not verdict(hit, "dead channel", "a0").passes, name
+            dead.add(name)
+    assert dead == {"constant", "offset", "one step", "hum"}
+
+
+def test_response_that_has_not_decayed_is_reported_with_its_ratio() -> None:
+    assert verdict(checked(clean()), "response decay", "a0").passes
+    rng = np.random.default_rng(0)
+    force = force_of(Blow(RATE, "half-sine", 1e-3, length_s=0.4), rng)
+    slow = modal_response(force - np.median(force), RATE, np.array([-5 + 2000j]), np.array([1j]))
+    hit = checked(record_of(force, slow[None, :], RATE))
+    ring = verdict(hit, "response decay", "a0")
+    # exp(-5·0.36 s) between blocks of a twentieth of the record.
+    assert ring.value == pytest.approx(np.exp(-5 * 0.36), rel=0.05)
+    assert not ring.passes
+    assert ring.consequence == "warn"
+    assert hit.accepted
+
+
+def test_usable_band_of_a_half_sine_is_where_its_known_spectrum_has_dropped_20_db() -> None:
+    width = 1e-3
+    rate = 102400.0
+    x = np.arange(4096) / rate / width - 2
+    force = np.where((x > 0) & (x < 1), np.sin(np.pi * np.clip(x, 0, 1)), 0.0)
+    band, _ = usable_band_hz(force, find_pulse(force, int(np.argmax(force))), rate, 20.0)
+    u = np.linspace(0.6, 1.4, 100001)
+    spectrum = np.abs(np.cos(np.pi * u) / (1 - 4 * u**2))
+    assert band == pytest.approx(u[np.argmax(spectrum < 0.1)] / width, rel=0.01)
+
+
+def test_soft_tip_is_warned_about_but_not_rejected() -> None:
+    hit = checked(clean())
+    soft = verdict(hit, "force spectrum")
+    assert not soft.passes
+    assert soft.consequence == "warn"
+    assert soft.limit == pytest.approx(RATE / 2.56)
+    assert 1000 < soft.value < 1500
+    assert hit.accepted
+
+
+def test_noise_is_measured_beside_a_hit_an_offset_and_hum() -> None:
+    rng = np.random.default_rng(5)
+    record = clean()
+    t = np.arange(record.force.size) / RATE
+    quiet = record.force * 0 + 0.03 * rng.standard_normal(record.force.size) + 4 + np.sin(2 * np.pi * 50 * t)
+    assert noise_of(quiet) == pytest.approx(0.03, rel=0.2)
+
+
+def test_real_hits_raise_no_false_alarm(test_data: Path) -> None:
+    from ema_pipeline.ingest.description import read_campaign
+    from ema_pipeline.ingest.load import load_records
+
+    folders = [
+        test_data / "realdata" / "five_hits_25600hz",
+        test_data / "realdata" / "aircraft_roving_hammer",
+    ]
+    folders += sorted(p for p in (test_data / "blind").iterdir() if p.is_dir())
+    count = 0
+    for folder in folders:
+        for test in read_campaign(folder).tests:
+            for hit in hits_of_test(list(load_records(test))):
+                assert hit.accepted, (hit.file, hit.reason)
+                assert not hit.rejected_channels, hit.file
+                count += 1
+    assert count >= 190
