@@ -22,7 +22,7 @@ PEAK_SHARE = 0.01
 """Lines with at least this share of the largest |FRF|² are judged: zeros of the force blow up the rest."""
 
 NODE_LEVEL = 0.1
-"""An FRF below this share of the strongest one at its sensor is near a node: its noise says little on the test."""
+"""An FRF below this share of the strongest at its sensor is near a node: its noise says little on the test."""
 
 NOISE_MARGIN = 2.0
 """Reciprocal FRFs may differ by their noise: this many times its power is taken off their difference."""

@@ -257,6 +257,38 @@ def verdicts_table(hits: Sequence[Hit]) -> Table:
     return Table(tuple(head), tuple(rows), frozenset({1, 3}))
 
 
+_CONSEQUENCES = {
+    "reject_hit": "hit left out",
+    "reject_channel": "channel left out",
+    "warn": "warning",
+}
+
+
+def checks_table(hits: Sequence[Hit]) -> Table:
+    """One row per check: its limit, where the limit comes from, and how many hits fail it."""
+    found: dict[str, list[Verdict]] = {}
+    failing: dict[str, set[tuple[str, int]]] = {}
+    for h in hits:
+        for v in h.verdicts:
+            found.setdefault(v.check, []).append(v)
+            if not v.passes:
+                failing.setdefault(v.check, set()).add((h.file, h.number))
+    rows = tuple(
+        Row(
+            (
+                words(check),
+                f"{plain(verdicts[0].limit, 3)}{_unit(verdicts[0])}",
+                _CONSEQUENCES[verdicts[0].consequence],
+                verdicts[0].clause or "own limit",
+                f"{len(failing.get(check, ()))} of {len(hits)}",
+            ),
+            check in failing,
+        )
+        for check, verdicts in found.items()
+    )
+    return Table(("check", "limit", "if it fails", "clause", "hits failing"), rows)
+
+
 def failed_checks_table(verdicts: Sequence[Verdict]) -> Table:
     """Checks over several hits or points that failed."""
     rows = tuple(

@@ -112,13 +112,15 @@ def hits_table(hits: Sequence[Hit], title: str = "Hits") -> RenderableType:
 
 
 def verdict_table(hits: Sequence[Hit], title: str = "Verdicts") -> RenderableType:
-    """Every check of every hit, worst value over the channels; a block of columns for each three checks."""
+    """The checks with limit and clause, then every hit's values, worst over its channels."""
     source = tables.verdicts_table(hits)
-    fixed, checks = (0, 1, 2, 3), list(range(4, len(source.head)))
-    if len(checks) <= 3:
-        return _rich(source, title)
-    blocks = [_pick(source, (*fixed[:2], *checks[k : k + 3])) for k in range(0, len(checks), 3)]
-    return Group(*(_rich(b, f"{title}, {n} of {len(blocks)}") for n, b in enumerate(blocks, start=1)))
+    checks = list(range(4, len(source.head)))
+    short = _renamed(source, tuple(h.partition(" (limit")[0] for h in source.head))
+    blocks = [_pick(short, (0, 1, *checks[k : k + 4])) for k in range(0, len(checks), 4)]
+    return Group(
+        _rich(tables.checks_table(hits), f"{title}: checks"),
+        *(_rich(b, f"{title}: hits") for b in blocks),
+    )
 
 
 def comparison_tables(compared: Comparison) -> RenderableType:
