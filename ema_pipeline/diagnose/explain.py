@@ -1,0 +1,50 @@
+"""The diagnosis in plain sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.diagnose.fitting import Fitted
+from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE, EffectSize
+
+
+def why(base: Fitted, fitted: Fitted, measured: Mapping[str, MeasuredModes], signs: str) -> str:
+    """Two sentences: the effect's tell-tale signs, and the modes whose misfit fell most."""
+    names = [(c, float(f)) for c, m in measured.items() if len(m) for f in m.frequency_hz]
+    cap = 1e4
+    before = np.where(np.isfinite(base.costs), np.minimum(base.costs, cap), cap)
+    after = np.where(np.isfinite(fitted.costs), np.minimum(fitted.costs, cap), cap)
+    fall = before - after
+    order = np.argsort(-fall)[:3]
+    parts = [f"{names[i][1]:.1f} Hz ({names[i][0]})" for i in order if fall[i] > 0.5]
+    gain = base.objective - fitted.objective
+    eased = base.prior_cost - fitted.prior_cost
+    if gain > 0 and eased > 0.5 * gain:
+        second = (
+            "Without it the measured modes push the rig's parameters out of their tolerances "
+            f"(their squared shifts add up to {base.prior_cost:.1f}, with it to {fitted.prior_cost:.1f})."
+        )
+    elif parts:
+        second = f"The misfit falls most at {', '.join(parts)}."
+    else:
+        second = "No mode is fitted better with it."
+    return f"Its signs: {signs}. {second}"
+
+
+def size_text(sizes: Mapping[str, EffectSize]) -> str:
+    """``fraction 0.350 ± 0.002, …``."""
+    return ", ".join(
+        f"{n.rpartition('.')[2]} {s.value:.4g} ± {s.std:.2g}{'' if s.unit in ('', '1') else ' ' + s.unit}"
+        for n, s in sizes.items()
+    )
+
+
+def label_text(label: str) -> str:
+    """A label as a phrase."""
+    effect, _, place = label.partition("@")
+    if effect == OUT_OF_TOLERANCE:
+        return f"parameter {place} out of tolerance"
+    return f"{effect.replace('_', ' ')} at {place}"

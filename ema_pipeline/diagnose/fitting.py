@@ -1,0 +1,250 @@
+"""Fit of one hypothesis: all parameters again, from several starts, never worse than the model without it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.correlate.residuals import observable_modes
+from ema_pipeline.diagnose.hypotheses import Extra, Hypothesis, extras, make_rig, starting_points
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.effects.library import Library
+from ema_pipeline.fit.latent import LatentObjective
+from ema_pipeline.fit.map_fit import posterior_covariance
+from ema_pipeline.fit.settings import FitSettings
+from ema_pipeline.fit.solve import FitProblem, Optimum, descend, refine, search
+from ema_pipeline.fit.space import Coordinate
+from ema_pipeline.rigs.types import Rig
+
+_TAU_RUNGS = (0.1, 0.02, 0.004)
+_VISIBLE = 0.02
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a diagnosis works on.
+
+    Attributes
+    ----------
+    rig : Rig
+    measured : mapping of configuration to MeasuredModes
+    settings : DiagnoseSettings
+    library : mapping of id to Effect, or None for the shipped one
+    """
+
+    rig: Rig
+    measured: Mapping[str, MeasuredModes]
+    settings: DiagnoseSettings
+    library: Library | None = None
+
+    def problem(self, hypothesis: Hypothesis, fit: FitSettings) -> FitProblem:
+        """The fit of a hypothesis, prepared."""
+        rig = make_rig(self.rig, hypothesis, self.library, self.settings.parameter_range)
+        return FitProblem(rig, self.measured, fit)
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A hypothesis at its optimum.
+
+    Attributes
+    ----------
+    hypothesis : Hypothesis
+    values : dict of str to float
+        All fitted parameters.
+    std : dict of str to float
+    objective : float
+        -2 log posterior, up to a constant common to all hypotheses of the same data.
+    evidence : float
+        -2 log evidence (Laplace), up to the same constant.
+    costs, inlier : ndarray, (R,)
+        Sum of squares and inlier probability of each measured mode; infinite where it has no partner.
+    counts : ndarray, (R,)
+    prior_cost : float
+        Sum of squares of the shifts of all parameters with a tolerance.
+    missed : int
+        Model modes that the test should have shown and did not.
+    """
+
+    hypothesis: Hypothesis
+    values: dict[str, float]
+    std: dict[str, float]
+    objective: float
+    evidence: float
+    costs: NDArray[np.float64]
+    inlier: NDArray[np.float64]
+    counts: NDArray[np.float64]
+    prior_cost: float
+    prior_count: int
+    missed: int
+
+    @property
+    def explained(self) -> NDArray[np.bool_]:
+        """Which measured modes the model explains."""
+        return np.isfinite(self.costs) & (self.inlier > 0.5)
+
+
+def fit_null(
+    case: Case, hypothesis: Hypothesis, fit: FitSettings, start: Mapping[str, float] | None
+) -> Fitted:
+    """Fit of a base model, over the whole grid of starts."""
+    problem = case.problem(hypothesis, fit)
+    return judge(case, problem, hypothesis, search(problem, start))
+
+
+def refit(case: Case, hypothesis: Hypothesis, fit: FitSettings, start: Mapping[str, float]) -> Fitted:
+    """Fit from one starting point."""
+    problem = case.problem(hypothesis, fit)
+    return judge(case, problem, hypothesis, refine(problem, problem.space.point(start)))
+
+
+def fit_hypothesis(
+    case: Case, hypothesis: Hypothesis, fit: FitSettings, base: Mapping[str, float], thorough: bool = True
+) -> Fitted:
+    """Fit of a hypothesis from the base model's optimum and from visible sizes of what it adds.
+
+    Parameters
+    ----------
+    case : Case
+    hypothesis : Hypothesis
+    fit : FitSettings
+    base : mapping of parameter to value
+        Optimum of the poorer model (or, with the added parameters in it, of this one at another noise level).
+    thorough : bool
+        Also anneal from every start.
+    """
+    problem = case.problem(hypothesis, fit)
+    space = problem.space
+    added = [e for e in extras(case.rig, hypothesis, case.library) if e.name in space.names]
+    new = [e for e in added if e.name not in base]
+    candidates: list[Optimum] = []
+    if not new:
+        candidates.append(refine(problem, space.point(base)))
+    # What a parameter out of tolerance widens is in the base already; its starts still compete.
+    freed = [e for e in added if e.name in base and e.name in case.rig.parameters]
+    if thorough:
+        dynamic = not all(problem.damping_only[space.names.index(e.name)] for e in added)
+        points = starting_points(new or freed)
+        screened = []
+        for number, point in enumerate(points):
+            given = {**base, **point}
+            from_base = space.point(given)
+            if not dynamic:
+                screened.append((0.0, number, from_base))
+                continue
+            nominal = from_base.copy()
+            nominal[space.has_prior] = 0.0
+            for order, x in enumerate((from_base, nominal)):
+                found = _descend_rungs(problem, x)
+                screened.append((found.objective, 2 * number + order, found.x))
+        screened.sort(key=lambda s: (s[0], s[1]))
+        kept: list[NDArray[np.float64]] = []
+        for _, _, x in screened:
+            if all(np.max(np.abs(x - k)) > 0.05 for k in kept):
+                kept.append(x)
+            if len(kept) == 3:
+                break
+        candidates += [refine(problem, x) for x in kept]
+        if dynamic and new:
+            small = {e.name: _near_null(e, space.coordinates[space.names.index(e.name)]) for e in new}
+            candidates.append(refine(problem, space.point({**base, **small})))
+    best = min(candidates, key=lambda o: o.objective)
+    return judge(case, problem, hypothesis, best)
+
+
+def _near_null(e: Extra, c: Coordinate) -> float:
+    if not np.isfinite(e.null):
+        return float(c.value(c.high))
+    if c.kind == "log":
+        return float(c.value(c.low)) if e.null <= c.value(c.low) else e.null
+    return e.null + 0.02 * (e.starts[0] - e.null)
+
+
+def _descend_rungs(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
+    mixture = problem.mixture()
+    found = None
+    for tau in _TAU_RUNGS:
+        found = descend(LatentObjective(problem.evidence, tau), problem.space, x, mixture, 6)
+        x = found.x
+    assert found is not None
+    return found
+
+
+def judge(case: Case, problem: FitProblem, hypothesis: Hypothesis, found: Optimum) -> Fitted:
+    """Evidence and standard deviations at an optimum."""
+    space = problem.space
+    covariance = posterior_covariance(problem, found, 1.0)
+    std = np.sqrt(np.diag(covariance)) * np.abs(space.slopes(found.x))
+    missed = missed_modes(problem, found.x)
+    added = extras(case.rig, hypothesis, case.library)
+    evidence = found.objective + _occam(problem, found, covariance, added)
+    evidence += -2 * np.log(case.settings.missed_mode) * missed
+    prior = space.has_prior
+    return Fitted(
+        hypothesis=hypothesis,
+        values=space.named(found.x),
+        std={n: float(s) for n, s in zip(space.names, std, strict=True)},
+        objective=found.objective,
+        evidence=float(evidence),
+        costs=found.costs,
+        inlier=found.inlier,
+        counts=problem.counts,
+        prior_cost=float(np.sum(found.x[prior] ** 2)),
+        prior_count=int(np.sum(prior)),
+        missed=missed,
+    )
+
+
+def _occam(
+    problem: FitProblem, found: Optimum, covariance: NDArray[np.float64], added: Sequence[Extra]
+) -> float:
+    """Laplace's factor: how much of the prior's volume the posterior fills, as -2 log.
+
+    Parameters with a tolerance have a standard normal prior in their coordinate; logarithms are spread evenly
+    between their bounds; sizes of effects follow a Cauchy distribution about null (half of one where they have
+    one sign), which leaves room for effects larger than expected.
+    """
+    space = problem.space
+    total = 0.0
+    by_name = {e.name: e for e in added}
+    hessian = np.linalg.inv(covariance)
+    for i, c in enumerate(space.coordinates):
+        if c.kind == "prior":
+            total += np.log(2 * np.pi)
+            continue
+        e = by_name.get(c.parameter.name)
+        if c.kind == "log" or e is None or e.scale == 0:
+            width = space.high[i] - space.low[i]
+            total += 2 * np.log(width) if np.isfinite(width) else 0.0
+            continue
+        scale = e.scale / c.scale
+        z = (c.value(float(found.x[i])) - e.null) / e.scale
+        total += 2 * np.log(np.pi * scale * (1 + z**2)) - (2 * np.log(2) if e.one_sided else 0.0)
+        hessian[i, i] += 2 / scale**2
+    sign, logdet = np.linalg.slogdet(hessian)
+    return float(total + logdet - len(space.names) * np.log(2 * np.pi))
+
+
+def missed_modes(problem: FitProblem, x: NDArray[np.float64]) -> int:
+    """Model modes inside the band, moving sensors and struck points, that no measured mode is paired with."""
+    count = 0
+    for e, pairs in zip(problem.evidence, problem.assignments(x), strict=True):
+        m = e.measured
+        if m.band_hz is None or not m.dofs:
+            continue
+        modes = observable_modes(e.family.at(x[None]))
+        f = modes.omega[0] / (2 * np.pi)
+        at = np.abs(e.rows @ modes.shapes[0])
+        seen = np.sqrt(np.sum(at**2, axis=0))
+        points = [i for i, d in enumerate(m.dofs) if any(d.point == r.point for r in m.references)]
+        struck = np.max(at[points], axis=0) if points else seen
+        inside = (f > 1.1 * max(m.band_hz[0], 1.0)) & (f < m.band_hz[1] / 1.05)
+        shows = (seen > _VISIBLE * np.max(seen)) & (struck > _VISIBLE * np.max(struck))
+        free = np.ones(f.size, dtype=bool)
+        free[pairs[pairs >= 0]] = False
+        count += int(np.sum(inside & shows & free))
+    return count

@@ -1,0 +1,255 @@
+"""Hypotheses: one effect at one place, or one parameter outside its tolerance, on top of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE
+from ema_pipeline.effects.base import Effect, EffectParameter
+from ema_pipeline.effects.library import Library, shipped_effects
+from ema_pipeline.effects.rig import rig_with_effects
+from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.rigs.base import ParametricRig
+from ema_pipeline.rigs.types import Parameter, Rig
+
+GENERIC = ("spring", "mass", "damper")
+"""Effects that only say where and how: used to localise, not to compete with named physics."""
+
+NOTHING = "nothing"
+_SMALL = 1e-3
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A set of effects and parameters out of tolerance on top of the base model.
+
+    Attributes
+    ----------
+    labels : tuple of str
+        ``id@place`` each; ``out_of_tolerance@parameter`` for a parameter. Empty for the base model.
+    """
+
+    labels: tuple[str, ...] = ()
+
+    @property
+    def label(self) -> str:
+        return " + ".join(self.labels) or NOTHING
+
+    @property
+    def family(self) -> str:
+        """Id of the effect added last."""
+        return self.labels[-1].partition("@")[0] if self.labels else NOTHING
+
+    @property
+    def place(self) -> str:
+        return self.labels[-1].partition("@")[2] if self.labels else ""
+
+    def plus(self, label: str) -> Hypothesis:
+        """With one more effect."""
+        return Hypothesis((*self.labels, label))
+
+    def without(self, label: str) -> Hypothesis:
+        """With one effect less."""
+        if label not in self.labels:
+            raise EmaError(f"effect '{label}' is not in the model{did_you_mean(label, self.labels)}")
+        return Hypothesis(tuple(x for x in self.labels if x != label))
+
+
+@dataclass(frozen=True)
+class Extra:
+    """A coordinate that a hypothesis has and the base model has not.
+
+    Attributes
+    ----------
+    name : str
+        Among the rig's parameters.
+    starts : tuple of float
+        Values to start a fit from.
+    null : float
+        Value at which it is absent.
+    scale : float
+        Size to expect; 0 for a quantity spread evenly over its range.
+    one_sided : bool
+    """
+
+    name: str
+    starts: tuple[float, ...]
+    null: float
+    scale: float
+    one_sided: bool
+
+
+def make_rig(rig: Rig, hypothesis: Hypothesis, library: Library | None, span: float) -> ParametricRig:
+    """The rig of a hypothesis; a parameter out of tolerance is free within a factor `span`."""
+    effects = [x for x in hypothesis.labels if not x.startswith(f"{OUT_OF_TOLERANCE}@")]
+    made = rig_with_effects(rig, effects, library)
+    changed = dict(made.parameters)
+    for label in hypothesis.labels:
+        family, _, name = label.partition("@")
+        if family == OUT_OF_TOLERANCE:
+            if name not in rig.parameters:
+                raise EmaError(
+                    f"rig '{rig.name}' has no parameter '{name}'{did_you_mean(name, rig.parameters)}"
+                )
+            changed[name] = _freed(rig.parameters[name], span)
+    return replace(made, parameters=changed)
+
+
+def _freed(p: Parameter, span: float) -> Parameter:
+    low, high = max(p.minimum, p.value / span), min(p.maximum, p.value * span)
+    return replace(p, tolerance=0.0, minimum=low, maximum=high, free=True)
+
+
+def extras(rig: Rig, hypothesis: Hypothesis, library: Library | None) -> tuple[Extra, ...]:
+    """Coordinates that the hypothesis adds, with starts and scales."""
+    known = shipped_effects() if library is None else library
+    found: list[Extra] = []
+    for label in hypothesis.labels:
+        family, _, place = label.partition("@")
+        if family == OUT_OF_TOLERANCE:
+            v = rig.parameters[place].value
+            found.append(Extra(place, (0.6 * v, 1.6 * v, 0.1 * v, 10 * v), v, 0.0, False))
+            continue
+        for p in known[family].parameters:
+            found.append(Extra(f"{label}.{p.name}", _starts(p), p.null, _scale(p), p.minimum >= p.null))
+    return tuple(found)
+
+
+def _scale(p: EffectParameter) -> float:
+    spread = p.minimum > 0 and np.isfinite(p.maximum) and p.maximum / p.minimum > 5
+    return 0.0 if spread or p.unit == "deg" else p.scale
+
+
+def _starts(p: EffectParameter) -> tuple[float, ...]:
+    if p.unit == "deg":
+        return tuple(float(v) for v in np.linspace(p.minimum, p.maximum, 5)[:-1])
+    if p.minimum > 0:
+        grid = (p.start, 0.2 * p.start, 5 * p.start)
+        return tuple(v for v in grid if p.minimum <= v <= p.maximum)
+    if p.minimum < p.null:
+        return (p.start, max(-p.start, 0.9 * p.minimum))
+    return (p.start,)
+
+
+def starting_points(found: Sequence[Extra], most: int = 9) -> list[dict[str, float]]:
+    """Combinations of starting values of the added coordinates."""
+    grid = product(*(e.starts for e in found))
+    points = [dict(zip((e.name for e in found), v, strict=True)) for v in grid]
+    return points[:most]
+
+
+def single_hypotheses(
+    rig: Rig,
+    configurations: Sequence[str],
+    library: Library | None,
+    base: Hypothesis | None = None,
+    parameters: bool = True,
+) -> list[Hypothesis]:
+    """All hypotheses that add one effect at one place (or one parameter out of tolerance) to `base`.
+
+    Effects that change the matrices alike, to a factor, are one hypothesis: the first by id is kept, a named
+    effect before a generic one. Effects that do not act in any measured configuration, or not on linear
+    data, are left out.
+    """
+    base = base or Hypothesis()
+    known = shipped_effects() if library is None else library
+    made = rig_with_effects(
+        rig, [x for x in base.labels if not x.startswith(f"{OUT_OF_TOLERANCE}@")], library
+    )
+    directions: list[NDArray[np.float64]] = []
+    chosen: list[Hypothesis] = []
+    for effect_id in sorted(known):
+        effect = known[effect_id]
+        if effect_id in GENERIC or not effect.linear:
+            continue
+        places = dict.fromkeys(p for c in configurations for p in effect.find_places(made.assembly(c)))
+        for place in places:
+            label = f"{effect_id}@{place}"
+            if label in base.labels:
+                continue
+            direction = _direction(made, configurations, effect, place)
+            if direction is None:
+                continue
+            if direction.size and any(_alike(direction, d) for d in directions):
+                continue
+            directions.append(direction)
+            chosen.append(base.plus(label))
+    if parameters:
+        used = {n for c in configurations for n in rig.used(c)}
+        for name, p in rig.parameters.items():
+            label = f"{OUT_OF_TOLERANCE}@{name}"
+            if name in used and not p.free and p.tolerance > 0 and p.value > 0 and label not in base.labels:
+                chosen.append(base.plus(label))
+    return chosen
+
+
+def _direction(
+    rig: Rig, configurations: Sequence[str], effect: Effect, place: str
+) -> NDArray[np.float64] | None:
+    """Change of all matrices by a small effect, scaled to length 1; empty for an effect that adds DOFs or has
+    several parameters, None for one that changes nothing."""
+    if len(effect.parameters) > 1:
+        return np.zeros(0)
+    p = effect.parameters[0]
+    parts = []
+    for c in configurations:
+        plain = rig.assembly(c)
+        if not effect.fits(plain, place):
+            parts.append(np.zeros(4 * len(plain.dofs) ** 2))
+            continue
+        # A small size could be lost in rounding of the stiffnesses, so the start's own is taken.
+        edited = effect.apply(plain, place, {p.name: p.start}).system()
+        base = plain.system()
+        if edited.mass.shape != base.mass.shape:
+            return np.zeros(0)
+        parts.append(
+            np.concatenate(
+                [
+                    (edited.mass - base.mass).ravel() * 1e6,
+                    (edited.stiffness - base.stiffness).ravel(),
+                    (edited.damping - base.damping).ravel() * 1e3,
+                    (edited.structural - base.structural).ravel(),
+                ]
+            )
+        )
+    whole = np.concatenate(parts)
+    size = float(np.linalg.norm(whole))
+    return whole / size if size > 0 else None
+
+
+def _alike(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
+    return a.size == b.size and min(np.linalg.norm(a - b), np.linalg.norm(a + b)) < _SMALL
+
+
+def prior_probabilities(
+    hypotheses: Sequence[Hypothesis], null_prior: float, parameter_prior: float
+) -> dict[str, float]:
+    """Prior probability of each hypothesis by label: families share alike, places within a family alike."""
+    families: dict[str, int] = {}
+    for h in hypotheses:
+        families[h.family] = families.get(h.family, 0) + 1
+    effects = [f for f in families if f != OUT_OF_TOLERANCE]
+    share = parameter_prior if OUT_OF_TOLERANCE in families and effects else 0.0
+    if OUT_OF_TOLERANCE in families and not effects:
+        share = 1.0
+    weights = {NOTHING: null_prior if hypotheses else 1.0}
+    for h in hypotheses:
+        of_family = share if h.family == OUT_OF_TOLERANCE else (1 - share) / max(len(effects), 1)
+        weights[h.label] = (1 - null_prior) * of_family / families[h.family]
+    return weights
+
+
+def describe(hypothesis: Hypothesis, library: Library | None) -> tuple[str, str]:
+    """Title and tell-tale signs of the effect added last."""
+    if hypothesis.family == OUT_OF_TOLERANCE:
+        return (
+            f"{hypothesis.place} lies outside its tolerance",
+            "all modes that depend on this one parameter off together",
+        )
+    known: Mapping[str, Effect] = shipped_effects() if library is None else library
+    return known[hypothesis.family].title, known[hypothesis.family].signs

@@ -1,0 +1,128 @@
+"""Fits of all hypotheses of one base model, and their probabilities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, refit
+from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, prior_probabilities
+from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.fit.settings import FitSettings
+
+Progress = Callable[[float, str], None]
+
+_NULL_FROM = 8
+_NULL_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """A base model and everything that was tried on top of it.
+
+    Attributes
+    ----------
+    base : Fitted
+    fitted : tuple of Fitted
+        In the order of the hypotheses.
+    probabilities : dict of str to float
+        By label, ``"nothing"`` for the base model; adds up to 1.
+    """
+
+    base: Fitted
+    fitted: tuple[Fitted, ...]
+    probabilities: dict[str, float]
+
+    def ordered(self) -> list[Fitted]:
+        """The most probable first."""
+        return sorted(self.fitted, key=lambda f: -self.probabilities[f.hypothesis.label])
+
+    def gain(self, f: Fitted) -> float:
+        """Fall of -2 log posterior."""
+        return self.base.objective - f.objective
+
+    def log_evidence(self, f: Fitted) -> float:
+        """Natural logarithm of the Bayes factor against the base model."""
+        return -0.5 * (f.evidence - self.base.evidence)
+
+
+def rank(
+    case: Case,
+    base: Fitted,
+    hypotheses: Sequence[Hypothesis],
+    fit: FitSettings,
+    tell: Progress,
+    thorough: bool = True,
+    from_fits: Sequence[Fitted] = (),
+) -> Ranking:
+    """Fit all hypotheses and the base model from all of their optima.
+
+    Parameters
+    ----------
+    case : Case
+    base : Fitted
+    hypotheses : sequence of Hypothesis
+    fit : FitSettings
+    tell : callable
+    thorough : bool
+        Anneal every hypothesis from visible sizes.
+    from_fits : sequence of Fitted
+        Fits of the same hypotheses at another noise level, to start from.
+    """
+    starts = {f.hypothesis.label: f.values for f in from_fits}
+
+    def one(h: Hypothesis) -> Fitted:
+        return fit_hypothesis(case, h, fit, starts.get(h.label, base.values), thorough)
+
+    fitted = []
+    for f in spread(one, hypotheses, case.settings.processes):
+        fitted.append(f)
+        tell(len(fitted) / len(hypotheses), f.hypothesis.label)
+    base = settle_base(case, base, fitted, fit)
+    fitted = [_never_worse(f, base) for f in fitted]
+    return Ranking(base, tuple(fitted), probabilities(case, base, fitted))
+
+
+def settle_base(case: Case, base: Fitted, fitted: Sequence[Fitted], fit: FitSettings) -> Fitted:
+    """The base model refitted from the parameters of the best hypotheses, until it gets no better.
+
+    Otherwise the gain of a hypothesis may only be that its start led to a better optimum.
+    """
+    for _ in range(_NULL_ROUNDS):
+        best = base
+        for f in sorted(fitted, key=lambda f: f.objective)[:_NULL_FROM]:
+            other = refit(case, base.hypothesis, fit, f.values)
+            if other.objective < best.objective - 1e-6:
+                best = other
+        if best.objective > base.objective - 0.01:
+            return best
+        base = best
+    return base
+
+
+def _never_worse(f: Fitted, base: Fitted) -> Fitted:
+    """A richer model holds the poorer one: where its fit ended higher, the poorer one's costs stand."""
+    if f.objective <= base.objective:
+        return f
+    return replace(
+        f,
+        objective=base.objective,
+        evidence=f.evidence - (f.objective - base.objective),
+        costs=base.costs,
+        inlier=base.inlier,
+        prior_cost=base.prior_cost,
+    )
+
+
+def probabilities(case: Case, base: Fitted, fitted: Sequence[Fitted]) -> dict[str, float]:
+    """Posterior probabilities of the hypotheses and of ``"nothing"`` (more)."""
+    settings = case.settings
+    prior = prior_probabilities([f.hypothesis for f in fitted], settings.null_prior, settings.parameter_prior)
+    evidence = {NOTHING: base.evidence} | {f.hypothesis.label: f.evidence for f in fitted}
+    logs = {label: np.log(max(prior[label], 1e-300)) - 0.5 * e for label, e in evidence.items()}
+    top = max(logs.values())
+    weights = {label: float(np.exp(v - top)) for label, v in logs.items()}
+    total = sum(weights.values())
+    return {label: w / total for label, w in weights.items()}

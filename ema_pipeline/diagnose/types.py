@@ -1,0 +1,188 @@
+"""What the diagnosis hands on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+VerdictWord = Literal["adequate", "effect", "ambiguous", "unknown_effect", "not_enough_data"]
+
+OUT_OF_TOLERANCE = "out_of_tolerance"
+"""Stands where an effect's id stands for a parameter that the data put outside its tolerance."""
+
+
+@dataclass(frozen=True)
+class EffectSize:
+    """A fitted size; `std` is 1 σ."""
+
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that may be missing.
+
+    Attributes
+    ----------
+    effect, at : str
+        Id and place; ``out_of_tolerance`` and the parameter's name for a parameter.
+    title : str
+        What it is, in a few words.
+    probability : float
+        Over all hypotheses and "nothing is missing" it adds up to 1.
+    parameters : dict of str to EffectSize
+    error_before, error_after : float
+        Root-mean-square of (measurement - model)/standard uncertainty without and with it.
+    heldout_before, heldout_error_after : float
+        The same on data that the fit has not seen; NaN where it was not computed.
+    gain : float
+        Fall of -2 log posterior.
+    threshold : float
+        Gain that its family reaches by chance in at most one of a hundred tests with nothing missing.
+    log_evidence : float
+        Natural logarithm of the evidence against "nothing is missing" (its Bayes factor).
+    claimed : bool
+        True where probability, gain and held-out data all support it.
+    why : str
+        Two plain sentences.
+    """
+
+    effect: str
+    at: str
+    title: str
+    probability: float
+    parameters: dict[str, EffectSize]
+    error_before: float
+    error_after: float
+    heldout_before: float
+    heldout_error_after: float
+    gain: float
+    threshold: float
+    log_evidence: float
+    claimed: bool
+    why: str
+
+    @property
+    def label(self) -> str:
+        """``id@place``."""
+        return f"{self.effect}@{self.at}"
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One model of the ladder.
+
+    Attributes
+    ----------
+    effects : tuple of str
+        Labels ``id@place``; empty for the base model.
+    error, heldout_error : float
+    chi2 : float
+        Sum of squares of everything compared, priors included.
+    objective : float
+        -2 log posterior.
+    parameters : dict of str to EffectSize
+        All fitted parameters, those of the effects named ``id@place.name``.
+    log_evidence : float
+        Against the base model.
+    unexplained : int
+        Measured modes that the model does not explain.
+    """
+
+    effects: tuple[str, ...]
+    error: float
+    heldout_error: float
+    chi2: float
+    objective: float
+    parameters: dict[str, EffectSize]
+    log_evidence: float
+    unexplained: int
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Rungs from the base model upwards, all at one noise level.
+
+    Attributes
+    ----------
+    rungs : tuple of Rung
+    frequency_noise, damping_noise, shape_noise : float
+        Standard uncertainties added to the test's own scatter (relative; shape in units of the largest
+        entry).
+    note : str
+        Why climbing stopped.
+    """
+
+    rungs: tuple[Rung, ...]
+    frequency_noise: float
+    damping_noise: float
+    shape_noise: float
+    note: str
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """Where a misfit acts and how.
+
+    Attributes
+    ----------
+    place : str
+        DOF, or two DOFs joined by ``-``.
+    acts_like : str
+        ``"stiffness"``, ``"mass"``, ``"viscous damping"`` or ``"hysteretic damping"``.
+    size : float
+        Of the element that would mend it best, N/m, kg, N·s/m.
+    score : float
+        Fall of the sum of squares that it promises to first order.
+    """
+
+    place: str
+    acts_like: str
+    size: float
+    score: float
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The answer to: which physics is the model missing?
+
+    Attributes
+    ----------
+    verdict : str
+        ``"adequate"``, ``"effect"``, ``"ambiguous"``, ``"unknown_effect"`` or ``"not_enough_data"``.
+    summary : str
+        The verdict in one or two plain sentences.
+    null_probability : float
+        Probability that nothing is missing.
+    candidates : tuple of Candidate
+        The most probable first.
+    indistinguishable : tuple of tuple of str
+        Groups of labels that these data cannot tell apart.
+    next_measurement : str
+        What would tell them apart, or raise the certainty, with its expected effect; empty where nothing
+        is needed.
+    localisation : tuple of Localisation
+        Best first; empty unless the model fails and nothing in the library mends it.
+    probabilities : dict of str to float
+        Of every hypothesis, ``"nothing"`` among them; adds up to 1.
+    error, heldout_error : float
+        Of the base model.
+    ladder : Ladder
+    notes : tuple of str
+        What the data's screening found.
+    """
+
+    verdict: VerdictWord
+    summary: str
+    null_probability: float
+    candidates: tuple[Candidate, ...]
+    indistinguishable: tuple[tuple[str, ...], ...]
+    next_measurement: str
+    localisation: tuple[Localisation, ...]
+    probabilities: dict[str, float]
+    error: float
+    heldout_error: float
+    ladder: Ladder
+    notes: tuple[str, ...] = ()
