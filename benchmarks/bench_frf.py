@@ -112,7 +112,8 @@ def main() -> None:
         memory_ours = peak_memory(lambda: ours(force, responses, channels))
         memory_peer = peak_memory(lambda: peer(force, responses))
     print(
-        f"{arguments.channels} channels x {arguments.hits} hits x {arguments.samples} samples, {size / 1e6:.0f} MB"
+        f"{arguments.channels} channels x {arguments.hits} hits x {arguments.samples} samples, "
+        f"{size / 1e6:.0f} MB"
     )
     print(f"ours        {time_ours * 1e3:8.0f} ms   extra memory {memory_ours / size:5.2f} x data")
     print(f"sdypy-FRF   {time_peer * 1e3:8.0f} ms   extra memory {memory_peer / size:5.2f} x data")

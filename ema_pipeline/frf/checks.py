@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
@@ -22,7 +21,7 @@ PEAK_SHARE = 0.01
 """Lines with at least this share of the largest |FRF|² are judged: zeros of the force blow up the rest."""
 
 NODE_LEVEL = 0.1
-"""An FRF below this share of the strongest at its sensor is near a node: its noise says little on the test."""
+"""An FRF below this share of the strongest at its sensor is near a node: its noise tells little."""
 
 NOISE_MARGIN = 2.0
 """Reciprocal FRFs may differ by their noise: this many times its power is taken off their difference."""
@@ -44,8 +43,9 @@ def check_frfs(frfs: FrfSet, settings: FrfSettings | None = None) -> tuple[Verdi
         reciprocity of each pair of points measured both ways. `channel` reads "output over input".
     """
     settings = settings or FrfSettings()
-    inside = (frfs.frequency_hz >= frfs.band_hz[0]) & (frfs.frequency_hz <= frfs.band_hz[1])
-    inside[0] = False
+    low, high = np.searchsorted(frfs.frequency_hz, frfs.band_hz)
+    # A slice, not a mask: views of large sets cost nothing. Line 0 is the sensors' offset.
+    inside = slice(max(int(low), 1), max(int(high), int(low) + 1) + 1)
     return (
         *_scatter(frfs, inside, settings),
         *_driving_points(frfs, inside, settings),
@@ -53,7 +53,7 @@ def check_frfs(frfs: FrfSet, settings: FrfSettings | None = None) -> tuple[Verdi
     )
 
 
-def _scatter(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings) -> list[Verdict]:
+def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict]:
     """Coherence and repeatability."""
     if not (frfs.hits > 1).any():
         return [
@@ -74,15 +74,16 @@ def _scatter(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings) -> 
         n = int(frfs.hits[o, i])
         if peak[o, i] <= NODE_LEVEL**2 * np.nanmax(peak[o]):
             continue
-        power = np.abs(frfs.frf[o, i, inside]) ** 2
-        power[power < PEAK_SHARE * peak[o, i]] = 0.0
+        power = _power(frfs, o, i, inside)
+        peaks = np.flatnonzero(power >= PEAK_SHARE * peak[o, i])
+        power = power[peaks]
         total = float(power.sum())
-        coherence = float(frfs.coherence[o, i, inside] @ power / total)
+        coherence = float(frfs.coherence[o, i, inside][peaks] @ power / total)
         # Variance of one hit's FRF, not of the mean over n. Noise is there at all lines, scatter of the blows
         # only where the structure answers.
         variance = frfs.variance[o, i, inside]
-        excess = (variance - median_filter(variance, variance.size // 16 + 1)).clip(min=0.0)
-        scatter = float(np.sqrt(n * excess[power > 0].sum() / total))
+        excess = (variance[peaks] - _floor(variance, peaks)).clip(min=0.0)
+        scatter = float(np.sqrt(n * excess.sum() / total))
         name = f"{frfs.outputs[o]} over {frfs.inputs[i]}"
         enough = n >= HITS_FOR_COHERENCE
         good = not enough or coherence >= settings.minimum_coherence
@@ -117,18 +118,40 @@ def _scatter(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings) -> 
     return verdicts
 
 
-def _peak_power(frfs: FrfSet, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _peak_power(frfs: FrfSet, inside: slice) -> NDArray[np.float64]:
     """Largest |FRF|² in the band, (n_outputs, n_inputs); NaN where not measured.
 
     A high quantile: a few lines in a zero of the force may hold noise as large as a resonance.
     """
     peak = np.full(frfs.hits.shape, np.nan)
     for o, i in np.argwhere(frfs.hits > 0):
-        peak[o, i] = np.quantile(np.abs(frfs.frf[o, i, inside]), 0.998) ** 2
+        power = _power(frfs, o, i, inside)
+        place = int(0.998 * (power.size - 1))
+        power.partition(place)
+        peak[o, i] = power[place]
     return peak
 
 
-def _driving_points(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings) -> list[Verdict]:
+def _power(frfs: FrfSet, output: int, source: int, inside: slice) -> NDArray[np.float64]:
+    """|FRF|² of one pair in the band."""
+    frf = frfs.frf[output, source, inside]
+    return np.asarray(frf.real**2 + frf.imag**2)
+
+
+def _floor(variance: NDArray[np.float64], lines: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Level of a variance between its peaks, at some lines: medians of sixteenths of the band, interpolated.
+
+    The variance has been smoothed over lines, so that every fourth one tells its median.
+    """
+    sparse = variance[::4]
+    width = max(sparse.size // 16, 1)
+    count = sparse.size // width
+    medians = np.median(sparse[: count * width].reshape(count, width), axis=1)
+    centres = 4 * width * (np.arange(count) + 0.5)
+    return np.asarray(np.interp(lines, centres, medians))
+
+
+def _driving_points(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict]:
     """Sign of driving points: a passive structure takes power in, so that Im(accelerance) ≥ 0."""
     verdicts = []
     for o, output in enumerate(frfs.outputs):
@@ -163,12 +186,14 @@ def _driving_points(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettin
     return verdicts
 
 
-def _reciprocity(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings) -> list[Verdict]:
+def _reciprocity(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict]:
     """H_ij against H_ji, in accelerance."""
-    verdicts = []
-    peak = _peak_power(frfs, inside)
+    verdicts: list[Verdict] = []
     place = {d: o for o, d in enumerate(frfs.outputs)}
     both = [(place[d], i) for i, d in enumerate(frfs.inputs) if d in place]
+    if len(both) < 2:
+        return verdicts
+    peak = _peak_power(frfs, inside)
     for first, (o1, i1) in enumerate(both):
         for o2, i2 in both[first + 1 :]:
             if frfs.hits[o1, i2] == 0 or frfs.hits[o2, i1] == 0:
@@ -180,7 +205,7 @@ def _reciprocity(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings)
             seen = power >= PEAK_SHARE * power.max()
             one, other = one[seen], other[seen]
             size = 0.5 * (np.linalg.norm(one) + np.linalg.norm(other))
-            noise = np.nan_to_num(frfs.variance[o1, i2, inside] + frfs.variance[o2, i1, inside])[seen]
+            noise = np.nan_to_num(_noise(frfs, o1, i2, inside) + _noise(frfs, o2, i1, inside))[seen]
             beyond = max(float(np.sum(np.abs(one - other) ** 2) - NOISE_MARGIN * np.sum(noise)), 0.0)
             difference = float(np.sqrt(beyond) / size) if size > 0 else 0.0
             passes = difference <= settings.reciprocity
@@ -204,7 +229,18 @@ def _reciprocity(frfs: FrfSet, inside: NDArray[np.bool_], settings: FrfSettings)
     return verdicts
 
 
-def _accelerance(frfs: FrfSet, output: int, source: int, inside: NDArray[np.bool_]) -> NDArray[np.complex128]:
+def _accelerance(frfs: FrfSet, output: int, source: int, inside: slice) -> NDArray[np.complex128]:
     """One FRF in the band as acceleration over force; the whole set at once would double the memory."""
+    return np.asarray(frfs.frf[output, source, inside] * _to_acceleration(frfs, output, inside))
+
+
+def _noise(frfs: FrfSet, output: int, source: int, inside: slice) -> NDArray[np.float64]:
+    """Variance of one accelerance."""
+    return np.asarray(
+        frfs.variance[output, source, inside] * np.abs(_to_acceleration(frfs, output, inside)) ** 2
+    )
+
+
+def _to_acceleration(frfs: FrfSet, output: int, inside: slice) -> NDArray[np.complex128]:
     power = {"acceleration": 0, "velocity": 1, "displacement": 2}[frfs.quantities[output]]
-    return np.asarray(frfs.frf[output, source, inside] * (2j * np.pi * frfs.frequency_hz[inside]) ** power)
+    return np.asarray((2j * np.pi * frfs.frequency_hz[inside]) ** power)
