@@ -58,6 +58,12 @@ class FitSettings(UncertaintySettings):
     iterations: int = Field(
         default=60, ge=1, description="Largest number of Gauss-Newton steps of one refinement."
     )
+    convergence: float = Field(
+        default=1e-7,
+        gt=0,
+        lt=1e-2,
+        description="A refinement ends when a step gains less than this share of the objective (plus one).",
+    )
     profile_points: int = Field(
         default=5,
         ge=2,

@@ -132,7 +132,8 @@ class FitProblem:
             c.parameter for c, r in zip(everything.coordinates, relevant, strict=True) if not r
         )
         self.evidence: list[Dataset] = [
-            dataset(m, MatrixFamily(rig, c, self.space), settings) for c, m in used.items()
+            dataset(m, families[c] if np.all(relevant) else MatrixFamily(rig, c, self.space), settings)
+            for c, m in used.items()
         ]
         undamped = np.any([_undamped_relevance(e.family) for e in self.evidence], axis=0)
         self.damping_only = ~np.asarray(undamped, dtype=bool)
@@ -163,6 +164,7 @@ def descend(
     mixture: Mixture,
     iterations: int,
     held: NDArray[np.bool_] | None = None,
+    convergence: float = 1e-7,
 ) -> Optimum:
     """Levenberg-Marquardt on the robust posterior (iteratively reweighted by the inlier probabilities).
 
@@ -175,6 +177,8 @@ def descend(
     iterations : int
     held : ndarray of bool, (P,), optional
         Coordinates that stay at their start.
+    convergence : float
+        The search ends when a step gains less than this share of the objective (plus one).
     """
     prior = space.has_prior.astype(float)
     moving = np.ones(start.size, dtype=bool) if held is None else ~held
@@ -210,7 +214,7 @@ def descend(
                 damping = max(damping / 10, 1e-9)
                 break
             damping = min(damping * 10, 1e9)
-        if not improved or gain < 1e-6 * (1 + abs(best)) * 0.1:
+        if not improved or gain < convergence * (1 + abs(best)):
             reason = "converged: no step improves the fit"
             break
     return Optimum(x, best, costs, mixture.inlier(costs), reason)
@@ -244,7 +248,10 @@ def refine(problem: FitProblem, start: NDArray[np.float64], scale: float = 1.0) 
             trusting = replace(mixture, outlier_cost=np.full_like(mixture.outlier_cost, np.inf))
             matched = PairedOnly(problem.exact(pairs))
             x = descend(matched, problem.space, x, trusting, 6, held).x
-        found = descend(problem.exact(pairs), problem.space, x, mixture, problem.settings.iterations)
+        found = descend(
+            problem.exact(pairs), problem.space, x, mixture, problem.settings.iterations, None,
+            problem.settings.convergence,
+        )  # fmt: skip
         if best is not None and found.objective >= best.objective - 1e-9:
             break
         best, x = found, found.x
