@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,7 +78,7 @@ def split(omega: Real, curve: Real) -> tuple[SubBand, ...]:
     smooth = scipy.ndimage.gaussian_filter1d(curve, 2.0)
     cuts = sorted({0, len(omega), *_cuts(omega, smooth, peaks, 0, len(omega))})
     parts = []
-    for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+    for a, b in itertools.pairwise(cuts):
         margin = max(int(OVERLAP * (b - a)), 16)
         first, stop = max(0, a - margin), min(len(omega), b + margin)
         parts.append(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.assurance import mpc
 from ema_pipeline.modal.bands import SubBand, indicator, split
+from ema_pipeline.modal.credibility import MIN_VOTES, PLAIN_DAMPING, credible, significant
 from ema_pipeline.modal.data import FitData, analysis_band, arrange
 from ema_pipeline.modal.engines import poles_of_all_orders
 from ema_pipeline.modal.fit import (
@@ -25,7 +27,7 @@ from ema_pipeline.modal.noise import Noise, fit_noise, second_difference_power
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.scaling import scale_shapes, scaling_note
 from ema_pipeline.modal.segment import SegmentFit, fit_segment
-from ema_pipeline.modal.selection import link, votes
+from ema_pipeline.modal.selection import Tracks, link, votes
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
 from ema_pipeline.modal.uncertainty import covariance
@@ -36,6 +38,7 @@ Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
 
 POLISH_ITERATIONS = 25
+FIRST_ITERATIONS = 4
 
 
 @dataclass(frozen=True)
@@ -85,16 +88,14 @@ def _identify(frfs: FrfSet, settings: ModalSettings, tell: Progress) -> ModalMod
     charts: list[PoleSet] = []
     found = Estimate(np.zeros(0, complex), np.zeros((0, data.measured.shape[1]), complex))
     for k, part in enumerate(bands):
-        tell(0.1 + 0.5 * k / len(bands), f"poles and modes of sub-band {k + 1} of {len(bands)}")
-        lines, noise = data.lines(part.first, part.stop), _cut(start, part)
-        poles = poles_of_all_orders(lines, noise.variance, part.n_peaks, settings)
+        tell(0.1 + 0.4 * k / len(bands), f"poles of sub-band {k + 1} of {len(bands)}")
+        lines = data.lines(part.first, part.stop)
+        poles = poles_of_all_orders(lines, _cut(start, part).variance, part.n_peaks, settings)
         charts.append(poles)
-        estimate = _candidates(poles, link(poles).representative)
-        if len(bands) > 1:  # a first guess of all modes, so that far ones can be taken off the data
-            fit = fit_segment(lines, _known(hits, part), noise, estimate, _voters(poles), min(iterations, 6))
-            estimate = fit.estimate
-        inside = (estimate.poles.imag >= part.low) & (estimate.poles.imag < part.high)
-        found = _stitched(found, estimate.take(inside))
+        estimate = _candidates(poles, link(poles))
+        found = _stitched(found, estimate.take(_between(estimate.poles, part.low, part.high)))
+    if len(bands) > 1:
+        found = _first_guess(data, hits, start, bands, found, min(iterations, FIRST_ITERATIONS), tell)
     tell(0.7, f"refining {len(found.poles)} modes")
     modes = _refined(data, hits, start, bands, charts, found, iterations)
     charts = [_inside(poles, part) for poles, part in zip(charts, bands, strict=True)]
@@ -130,12 +131,16 @@ def _voters(poles: PoleSet) -> Callable[[Estimate], Real]:
     return lambda estimate: votes(poles, estimate.poles)[0]
 
 
-def _candidates(poles: PoleSet, index: NDArray[np.int64]) -> Estimate:
+def _candidates(poles: PoleSet, tracks: Tracks) -> Estimate:
+    """Poles that stand for the tracks; those that only shape a background need more than a few orders."""
+    index = tracks.representative
+    slight = (poles.damping_ratio[index] > PLAIN_DAMPING) & (tracks.votes < MIN_VOTES)
+    index = index[~slight]
     return Estimate(poles.pole[index], normalised(poles.participation[index]))
 
 
 def _inside(poles: PoleSet, part: SubBand) -> PoleSet:
-    return poles.take((poles.pole.imag >= part.low) & (poles.pole.imag < part.high))
+    return poles.take(_between(poles.pole, part.low, part.high))
 
 
 def _stitched(known: Estimate, fresh: Estimate) -> Estimate:
@@ -147,6 +152,30 @@ def _stitched(known: Estimate, fresh: Estimate) -> Estimate:
     a, b = known.participation[-1], fresh.participation[0]
     alike = abs(np.vdot(a, b)) ** 2 > 0.8 * np.vdot(a, a).real * np.vdot(b, b).real
     return known.joined(fresh.take(np.arange(1, len(fresh.poles)))) if same and alike else known.joined(fresh)
+
+
+def _first_guess(
+    data: FitData,
+    hits: Noise | None,
+    start: Noise,
+    bands: tuple[SubBand, ...],
+    candidates: Estimate,
+    iterations: int,
+    tell: Progress,
+) -> Estimate:
+    """Fit of each sub-band on its own, so that far modes can then be taken off the data of the others."""
+    found = Estimate(candidates.poles[:0], candidates.participation[:0])
+    for k, part in enumerate(bands):
+        tell(0.5 + 0.2 * k / len(bands), f"modes of sub-band {k + 1} of {len(bands)}")
+        lines = data.lines(part.first, part.stop)
+        near = candidates.take(_between(candidates.poles, lines.omega[0], lines.omega[-1]))
+        fit = fit_segment(lines, _known(hits, part), _cut(start, part), near, significant, iterations)
+        found = _stitched(found, fit.estimate.take(_between(fit.estimate.poles, part.low, part.high)))
+    return found
+
+
+def _between(poles: Complex, low: float, high: float) -> NDArray[np.bool_]:
+    return np.asarray((poles.imag >= low) & (poles.imag < high))
 
 
 def _refined(
@@ -163,15 +192,15 @@ def _refined(
     if len(found.poles):
         everywhere = solve_linear(data, start.weight(data.measured), found)
         for part, chart in zip(bands, charts, strict=True):
-            near = (found.poles.imag >= data.omega[part.first]) & (found.poles.imag <= data.omega[part.stop - 1])
-            if not (near & (found.poles.imag >= part.low) & (found.poles.imag < part.high)).any():
+            near = _between(found.poles, data.omega[part.first], data.omega[part.stop - 1])
+            if not (near & _between(found.poles, part.low, part.high)).any():
                 continue
             lines = data.lines(part.first, part.stop)
             far = synthesis(lines, found.take(~near), everywhere.shapes[:, ~near])
             lines = replace(lines, frf=np.where(lines.measured[..., None], lines.frf - far, 0.0))
-            fit = fit_segment(
-                lines, _known(hits, part), _cut(start, part), found.take(near), _voters(chart), iterations
-            )
+            known = _known(hits, part)
+            judge = partial(credible, hits=known, votes=_voters(chart))
+            fit = fit_segment(lines, known, _cut(start, part), found.take(near), judge, iterations)
             parts.append(_final(lines, fit, part))
     n_rows, n_ref = data.measured.shape
     empty = _Modes(
@@ -182,21 +211,16 @@ def _refined(
         np.zeros((0, n_ref), complex),
         np.zeros((0, n_ref)),
     )
-    return _Modes(
-        *(np.concatenate([getattr(p, f.name) for p in [empty, *parts]]) for f in fields(_Modes))
-    )
+    return _Modes(*(np.concatenate([getattr(p, f.name) for p in [empty, *parts]]) for f in fields(_Modes)))
 
 
 def _final(lines: FitData, fit: SegmentFit, part: SubBand) -> _Modes:
     """Modes of a sub-band's core with their uncertainties."""
     estimate = fit.estimate
     cov = covariance(lines, fit.noise.weight(lines.measured), estimate, fit.solution, fit.noise)
-    core = np.flatnonzero((estimate.poles.imag >= part.low) & (estimate.poles.imag < part.high))
+    core = np.flatnonzero(_between(estimate.poles, part.low, part.high))
     stds = np.array(
-        [
-            np.sqrt(0.5 * (cov.shapes[:, 2 * r, 2 * r] + cov.shapes[:, 2 * r + 1, 2 * r + 1]))
-            for r in core
-        ]
+        [np.sqrt(0.5 * (cov.shapes[:, 2 * r, 2 * r] + cov.shapes[:, 2 * r + 1, 2 * r + 1])) for r in core]
     )
     return _Modes(
         poles=estimate.poles[core],

@@ -51,7 +51,9 @@ def polyreference_poles(
     equations = normal_equations(frf, weight, max(orders), 0, len(omega) - 1)
     parts = [_poles_of(fraction, equations, omega) for fraction in fractions(equations, orders)]
     return PoleSet(
-        order=np.concatenate([np.full(len(p), n) for n, (p, _, _) in zip(sorted(orders), parts, strict=True)]),
+        order=np.concatenate(
+            [np.full(len(p), n) for n, (p, _, _) in zip(sorted(orders), parts, strict=True)]
+        ),
         pole=np.concatenate([p for p, _, _ in parts]),
         shape=np.concatenate([s for _, s, _ in parts]),
         participation=np.concatenate([w for _, _, w in parts]),

@@ -60,7 +60,9 @@ def scale_shapes(
         False for a force in volts: shapes over the union are then only normalised to 1.
     """
     shared = [
-        (rows.index(d), k) for k, d in enumerate(references) if d in rows and not np.isnan(shapes[:, rows.index(d)]).all()
+        (rows.index(d), k)
+        for k, d in enumerate(references)
+        if d in rows and not np.isnan(shapes[:, rows.index(d)]).all()
     ]
     extra = [k for k, d in enumerate(references) if d not in rows] if shared else []
     dofs = (*rows, *(references[k] for k in extra))
@@ -80,7 +82,9 @@ def scale_shapes(
             ref_std = np.abs(factor / kappa) * participation_stds[r]
             std = np.hypot(std, np.abs(phi) * relative)
             for o, k in shared:  # the same number seen twice: φ_d² = product, errors halve
-                std[o] = 0.5 * np.hypot(shape_stds[r, o] * abs(kappa), ref_std[k]) if len(shared) == 1 else std[o]
+                std[o] = (
+                    0.5 * np.hypot(shape_stds[r, o] * abs(kappa), ref_std[k]) if len(shared) == 1 else std[o]
+                )
             phi = np.concatenate([phi, ref[extra]])
             std = np.concatenate([std, np.hypot(ref_std[extra], np.abs(ref[extra]) * relative)])
         out[r], stds[r] = _normalised(phi, std, keep_scale=bool(shared) and calibrated)
@@ -120,7 +124,5 @@ def scaling_note(has_shared: bool, calibrated: bool) -> str:
     if not calibrated:
         return "shapes are unscaled: the hammer signal is in volts; state its sensitivity_mv to scale them"
     if not has_shared:
-        return (
-            "shapes are unscaled: no driving point; measure the response at one point that is hit, in the direction of the hit"
-        )
+        return "shapes are unscaled: no driving point; measure the response at one point that is hit, in the direction of the hit"
     return ""

@@ -1,0 +1,239 @@
+"""Which candidates are modes: tests against the noise, the model orders, and each other.
+
+A candidate must stand out of the noise. Beyond that, real structures are never quite linear and never quite
+the same from hit to hit, and a fit mends such misfits with poles that are no modes. So a mode must also be
+supported: by the model orders that show it, by being plain to see in the FRFs, or because around it nothing
+but the scatter between hits is left over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.stats
+from numpy.typing import NDArray
+
+from ema_pipeline.modal.assurance import mac, mpc
+from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.fit import Estimate, LinearSolution, newton_step, residual_fit, synthesis
+from ema_pipeline.modal.noise import Noise
+from ema_pipeline.modal.segment import SegmentFit
+from ema_pipeline.modal.uncertainty import evidence
+
+Real = NDArray[np.float64]
+Votes = Callable[[Estimate], Real]
+"""Share of model orders that show each mode."""
+
+FALSE_ALARM = 1e-6
+"""Probability that noise at one line passes for a mode."""
+
+MAX_DAMPING_STD = 0.35
+"""A pole whose damping is not known to this share is not told from noise."""
+
+MAX_DAMPING_RATIO = 0.2
+
+MIN_VOTES = 0.3
+"""Share of model orders that must show a mode, unless the FRFs show it plainly or the noise is known."""
+
+HOPELESS = 0.3
+"""Candidates that reach less than this share of a limit are dropped together, others one at a time."""
+
+SURE_VOTES = 0.6
+"""The same for poles that are more often than not the fit's way around a misfit: heavily damped ones and twins."""
+
+PLAIN = 2.0
+"""A mode is plain where, at its frequency, its own response has this many times the power of all the rest."""
+
+PLAIN_DAMPING = 0.05
+"""Poles with more damping shape a background rather than a peak: they are only taken on votes."""
+
+EXPLAINED = 1.5
+"""Misfit around a mode over the scatter between hits, up to which nothing but noise is left over."""
+
+COINCIDENT = 0.3
+"""Poles closer than this, in decay rates, coincide."""
+
+RANK_ONE = 0.05
+"""Second over first singular value of the common residue of two coinciding poles, below which they are one
+mode, where a misfit is left over. A hundredth of it where the noise explains what is left."""
+
+SAME_RESPONSE = 0.9
+"""MAC at three or more sensors that measured together, above which two coinciding poles are one mode where a
+misfit is left over: its frequency drifts between hits, which splits it in two with one shape at the sensors."""
+
+RANDOM_PHASE = 0.25
+"""Modal phase collinearity below which the phases of a shape are random."""
+
+MIN_ROWS_FOR_PHASE = 6
+
+ECHO_REACH = 10.0
+"""Distance from a stronger mode, in its decay rates, within which a pole may be its echo: a mode whose
+frequency drifts between hits, or with the level, leaves a misfit that a second pole beside it mends."""
+
+ECHO_MAC = 0.6
+"""Product of the MACs at rows and references above which a nearby pole is an echo."""
+
+
+def significant(data: FitData, fit: SegmentFit) -> NDArray[np.bool_]:
+    """Candidates to drop from a first guess: impossible ones, else those that noise alone could make."""
+    out = _impossible(data, fit.estimate)
+    return out if out.any() else _next(_strength_over_noise(data, fit))
+
+
+def credible(data: FitData, fit: SegmentFit, hits: Noise | None, votes: Votes) -> NDArray[np.bool_]:
+    """Candidates to drop from a converged fit: impossible ones, else doubles, else the least credible.
+
+    Parameters
+    ----------
+    data : FitData
+    fit : SegmentFit
+    hits : Noise or None
+        Noise from the scatter over hits, where known.
+    votes : callable
+    """
+    estimate, solution = fit.estimate, fit.solution
+    out = _impossible(data, estimate)
+    if out.any():
+        return out
+    explained = np.zeros(len(out), dtype=bool)
+    if hits is not None:
+        explained = misfit(data, hits, estimate, solution) < EXPLAINED
+    doubles = np.flatnonzero(_doubles(data, estimate, solution, explained))
+    if len(doubles):  # one at a time: three poles on two modes mix their shapes
+        out[doubles[np.argmin(_size(estimate, solution)[doubles])]] = True
+        return out
+    zeta = -estimate.poles.real / np.abs(estimate.poles)
+    plain = np.where(zeta > PLAIN_DAMPING, 0.0, visibility(data, estimate, solution) / PLAIN)
+    distance = np.abs(estimate.poles[:, None] - estimate.poles[None]) + np.diag(np.full(len(zeta), np.inf))
+    twin = distance.min(axis=1) < COINCIDENT * -estimate.poles.real
+    needed = np.where((zeta > PLAIN_DAMPING) | twin, SURE_VOTES, MIN_VOTES)
+    support = np.maximum(votes(estimate) / needed, np.where(twin, 0.0, plain))
+    support = np.where(_incoherent(solution), 0.0, support)
+    support = np.where(explained, np.maximum(support, 1.0), support)
+    return _next(np.minimum(_strength_over_noise(data, fit), support))
+
+
+def _incoherent(solution: LinearSolution) -> NDArray[np.bool_]:
+    """Shapes with random phases: a tone that no blow has started, but that went on during all of them."""
+    if len(solution.shapes) < MIN_ROWS_FOR_PHASE:
+        return np.zeros(solution.shapes.shape[1], dtype=bool)
+    return np.array([mpc(shape) < RANDOM_PHASE for shape in solution.shapes.T])
+
+
+def _next(score: Real) -> NDArray[np.bool_]:
+    """Among candidates with a score below 1, the hopeless ones or the worst one."""
+    return np.asarray((score < 1) & (score <= max(HOPELESS, float(score.min()))))
+
+
+def _impossible(data: FitData, estimate: Estimate) -> NDArray[np.bool_]:
+    poles = estimate.poles
+    zeta = -poles.real / np.abs(poles)
+    outside = (poles.imag < data.omega[0]) | (poles.imag > data.omega[-1])
+    return np.asarray((poles.real >= 0) | (zeta > MAX_DAMPING_RATIO) | outside)
+
+
+def _strength_over_noise(data: FitData, fit: SegmentFit) -> Real:
+    """Above 1 where noise cannot have made the candidate, and its damping is known well enough."""
+    gain, threshold = significance(data, fit.noise, fit.estimate, fit.solution)
+    std = decay_std(fit.estimate, fit.solution)
+    return np.asarray(np.minimum(gain / threshold, MAX_DAMPING_STD / np.maximum(std, 1e-9)))
+
+
+def _size(estimate: Estimate, solution: LinearSolution) -> Real:
+    return np.asarray(
+        np.linalg.norm(solution.shapes, axis=0) * np.linalg.norm(estimate.participation, axis=1)
+    )
+
+
+def decay_std(estimate: Estimate, solution: LinearSolution) -> Real:
+    """Relative standard deviation of each pole's decay rate, from the fit alone."""
+    information = newton_step(estimate, solution).information
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    inverse = np.linalg.pinv(information * scale[:, None] * scale[None], rcond=1e-12)
+    std = np.sqrt(0.5 * np.maximum(np.diag(inverse), 0)) * scale
+    return np.asarray(std[0 : 2 * len(estimate.poles) : 2] / np.abs(estimate.poles.real))
+
+
+def visibility(data: FitData, estimate: Estimate, solution: LinearSolution) -> Real:
+    """Power of each mode at its frequency (three lines, all FRFs) over the power of all the rest."""
+    out = np.empty(len(estimate.poles))
+    for r, pole in enumerate(estimate.poles):
+        line = int(np.argmin(np.abs(data.omega - pole.imag)))
+        near = data.lines(max(0, line - 1), line + 2)
+        own = synthesis(near, estimate.take(np.array([r])), solution.shapes[:, [r]])
+        rest = np.where(data.measured[..., None], near.frf - own, 0.0)
+        own = np.where(data.measured[..., None], own, 0.0)
+        out[r] = np.sum(np.abs(own) ** 2) / max(float(np.sum(np.abs(rest) ** 2)), 1e-300)
+    return out
+
+
+def misfit(data: FitData, hits: Noise, estimate: Estimate, solution: LinearSolution) -> Real:
+    """What the fit leaves over around each mode, over what the scatter between hits explains."""
+    weight = hits.weight(data.measured)
+    modes = synthesis(data, estimate, solution.shapes)
+    left = np.abs(data.frf - modes - residual_fit(data, weight, modes)) ** 2 * weight
+    ratio = left.sum(axis=(0, 1)) / max(np.count_nonzero(data.measured), 1)
+    out = np.empty(len(estimate.poles))
+    for r, pole in enumerate(estimate.poles):
+        line = int(np.argmin(np.abs(data.omega - pole.imag)))
+        reach = int(np.clip(-3 * pole.real / (data.omega[1] - data.omega[0]), 6, 200))
+        out[r] = ratio[max(0, line - reach) : line + reach + 1].mean()
+    return np.maximum(out, 1e-9)
+
+
+def _doubles(
+    data: FitData, estimate: Estimate, solution: LinearSolution, explained: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """The weaker of two poles that are one mode: coinciding with one shape, or an echo of a stronger mode."""
+    rows, references = (
+        mac(solution.shapes.T, solution.shapes.T),
+        mac(estimate.participation, estimate.participation),
+    )
+    sensors = references if data.transposed else rows
+    n_sensors = data.measured.shape[1] if data.transposed else data.measured.shape[0]
+    decay = -estimate.poles.real
+    distance = np.abs(estimate.poles[:, None] - estimate.poles[None])
+    close = distance < COINCIDENT * np.maximum(decay[:, None], decay)
+    least = np.where(explained, 0.01 * RANK_ONE, RANK_ONE)[:, None]
+    double = close & (_second_singular(estimate, solution, close) < least)
+    if n_sensors > 2:
+        double |= close & (sensors > SAME_RESPONSE) & ~explained[:, None]
+    if min(data.measured.shape) > 2:
+        double |= (distance < ECHO_REACH * decay) & (rows * references > ECHO_MAC) & ~explained[:, None]
+    size = _size(estimate, solution)
+    return np.asarray((double & (size[:, None] < size)).any(axis=1))
+
+
+def _second_singular(estimate: Estimate, solution: LinearSolution, pairs: NDArray[np.bool_]) -> Real:
+    """Second over first singular value of the sum of two modes' residues, for the pairs asked for."""
+    out = np.ones(pairs.shape)
+    for a, b in np.argwhere(np.triu(pairs, 1)):
+        left = np.linalg.qr(solution.shapes[:, [a, b]])[1]
+        right = np.linalg.qr(estimate.participation[[a, b]].T)[1]
+        values = np.linalg.svd(left @ right.T, compute_uv=False)
+        out[a, b] = out[b, a] = values[1] / values[0] if len(values) > 1 else 0.0
+    return out
+
+
+def significance(
+    data: FitData, noise: Noise, estimate: Estimate, solution: LinearSolution
+) -> tuple[Real, Real]:
+    """Growth of χ² without each mode, and the growth that noise alone may reach.
+
+    Noise that all outputs share gives them one common chance to look like a mode, not one each; the limit
+    is raised by its share at the mode's frequency.
+    """
+    m = len(estimate.poles)
+    if not m:
+        return np.zeros(0), np.zeros(0)
+    gain, _ = evidence(solution, m)
+    rows = int(np.count_nonzero(data.measured.any(axis=1)))
+    chance = FALSE_ALARM / len(data.omega)
+    free = 2 * rows + 2 * data.measured.shape[1]
+    independent = scipy.stats.chi2.isf(chance, free)
+    coherent = free / 4 * scipy.stats.chi2.isf(chance, 4)
+    at = np.clip(np.searchsorted(data.omega, estimate.poles.imag), 0, len(data.omega) - 1)
+    weight = noise.weight(data.measured)
+    share = np.einsum("oil,oil->l", noise.common, weight)[at] / max(np.count_nonzero(data.measured), 1)
+    return gain, (1 - share) * independent + share * coherent
