@@ -19,8 +19,11 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.frf.windows import Windows, decay_rate
 from ema_pipeline.ingest.records import HitSamples
 
-BLOCK = 4
+BLOCK = 2
 """Channels transformed at a time: their spectra stay in the processor's cache."""
+
+NOTHING = 1e-28
+"""Share of the largest force autospectrum that rounding alone makes."""
 
 BAND_OVER_RATE = 1 / 2.56
 """Converters' anti-alias filters are flat up to the sample rate over 2.56."""
@@ -272,8 +275,8 @@ def _finish_one(
         cross[:] = complex(np.nan, np.nan)
         auto[:] = variance[:] = np.nan
         return
-    # A line without force carries nothing; its FRF comes out as 0, not as NaN.
-    inverse = 1.0 / np.maximum(force, np.finfo(float).tiny / np.finfo(float).eps)
+    # A line without force, but for rounding, carries nothing; its FRF comes out as 0, not as NaN.
+    inverse = np.divide(1.0, force, out=np.zeros_like(force), where=force > NOTHING * force.max())
     explained = (cross.real**2 + cross.imag**2) * inverse
     coherence = np.divide(explained, auto, out=np.zeros_like(auto), where=auto > 0).clip(max=1.0)
     if n > 1:

@@ -1,0 +1,401 @@
+"""FRFs, coherence and variance from hits, against independent computations, exact systems and real data."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import signal
+from simulate_hits import modal_response, record_of
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.errors import EmaError
+from ema_pipeline.frf import FrfSet, FrfSettings, estimate_frfs
+from ema_pipeline.frf.windows import force_window
+from ema_pipeline.ingest.description import read_campaign
+from ema_pipeline.ingest.load import load_records
+from ema_pipeline.ingest.quality import hits_of_test
+from ema_pipeline.ingest.records import Hit, HitSamples, Record, ResponseChannel, cut_hit
+
+RATE = 2048.0
+POLES = np.array([-6 + 2j * np.pi * 80, -9 + 2j * np.pi * 143.3, -12 + 2j * np.pi * 310])
+
+
+def half_sine(n: int, start: int, width: int, height: float) -> NDArray[np.float64]:
+    """A half-sine pulse of `width` samples."""
+    force = np.zeros(n)
+    force[start : start + width] = height * np.sin(np.pi * (np.arange(width) + 0.5) / width)
+    return force
+
+
+def hit_of(
+    force: NDArray[np.float64],
+    responses: NDArray[np.float64],
+    impact: str = "p0.z",
+    outputs: tuple[str, ...] | None = None,
+    file: str = "r",
+) -> HitSamples:
+    """A whole record as one hit."""
+    outputs = outputs or tuple(f"p{i}.z" for i in range(len(responses)))
+    channels = tuple(
+        ResponseChannel(f"a{i}", Dof.parse(d), "acceleration", 0.01 * i) for i, d in enumerate(outputs)
+    )
+    hit = Hit(file, 0, Dof.parse(impact), 0, force.size, int(np.argmax(np.abs(force))), float(force.max()))
+    return HitSamples(hit, RATE, force, responses, channels)
+
+
+def residues(output: int) -> NDArray[np.complex128]:
+    """Residues of the test structure."""
+    return np.random.default_rng(100 + output).normal(size=3) * np.array([80j, 140j, 310j])
+
+
+def exact(frequency_hz: NDArray[np.float64], output: int, decay: float = 0.0) -> NDArray[np.complex128]:
+    """FRF of `modal_response` (a sampled system, so a rational function of z) with added decay."""
+    z = np.exp(2j * np.pi * frequency_hz / RATE)
+    total = np.zeros(frequency_hz.size, dtype=complex)
+    for pole, residue in zip(POLES, residues(output), strict=True):
+        for s, a in ((pole, residue), (pole.conjugate(), residue.conjugate())):
+            total += a / RATE / (1 - np.exp((s - decay) / RATE) / z)
+    return total
+
+
+def error(frfs: FrfSet, row: int, column: int, output: int) -> float:
+    """Largest error of an FRF below 0.8 of the Nyquist frequency, over its largest value."""
+    lines = slice(1, int(0.8 * frfs.frequency_hz.size))
+    true = exact(frfs.frequency_hz[lines], output)
+    return float(np.abs(frfs.frf[row, column, lines] - true).max() / np.abs(true).max())
+
+
+def clean_hits(n_hits: int, n: int, outputs: int = 2, noise: float = 0.0, seed: int = 0) -> list[HitSamples]:
+    """Hits of varying force and width on the test structure."""
+    rng = np.random.default_rng(seed)
+    hits = []
+    for k in range(n_hits):
+        force = half_sine(n, 20, 5 + k % 3, rng.uniform(50, 100))
+        answers = np.array([modal_response(force, RATE, POLES, residues(o)) for o in range(outputs)])
+        hits.append(hit_of(force, answers + noise * rng.standard_normal(answers.shape), file=f"r{k}"))
+    return hits
+
+
+def test_h1_of_decayed_clean_hits_is_the_exact_frf() -> None:
+    frfs = estimate_frfs(clean_hits(2, 8192))
+    for o in range(2):
+        # What is left at the end, exp(-24), is all that differs, and no force is at the Nyquist frequency.
+        assert error(frfs, o, 0, o) < 1e-8
+    assert np.isfinite(frfs.frf).all()
+    assert frfs.frequency_hz[0] == 0
+    assert frfs.frequency_hz[-1] == RATE / 2
+    assert frfs.record_s == 4.0
+    assert frfs.delay_s[0] == pytest.approx(22.5 / RATE, abs=1.0 / RATE)
+    assert frfs.sensor_mass_kg.tolist() == [0.0, 0.01]
+
+
+def test_h1_and_coherence_equal_scipy_on_real_hits(test_data: Path) -> None:
+    frfs, records = real(test_data / "realdata" / "five_hits_25600hz")
+    cross = power = answer = 0.0
+    for record in records:
+        options = {
+            "fs": record.sample_rate_hz,
+            "window": "boxcar",
+            "nperseg": record.force.size,
+            "detrend": False,
+        }
+        cross = cross + signal.csd(record.force, record.responses[0], **options)[1]
+        power = power + signal.welch(record.force, **options)[1]
+        answer = answer + signal.welch(record.responses[0], **options)[1]
+    assert np.allclose(frfs.frf[0, 0], cross / power, rtol=1e-9, atol=0)
+    assert np.allclose(frfs.coherence[0, 0], np.abs(cross) ** 2 / (power * answer), rtol=1e-9, atol=0)
+    coherence = next(v for v in frfs.verdicts if v.check == "coherence")
+    assert coherence.passes
+    assert coherence.value > 0.99
+
+
+def real(folder: Path, settings: FrfSettings | None = None) -> tuple[FrfSet, list[Record]]:
+    """FRFs and records of a raw folder."""
+    (test,) = read_campaign(folder).tests
+    records = list(load_records(test))
+    by_file = {r.file: r for r in records}
+    hits = [h for h in hits_of_test(records) if h.accepted]
+    return estimate_frfs((cut_hit(by_file[h.file], h) for h in hits), settings), records
+
+
+def test_single_real_hits_agree_with_the_analyser_within_its_scatter(test_data: Path) -> None:
+    """One raw hit per point against an analyser's average of several.
+
+    Its coherence tells the scatter of one hit; its response window adds 0.139 rad/s of damping, which matters
+    within a line or two of a resonance.
+    """
+    folder = test_data / "realdata" / "aircraft_roving_hammer"
+    frfs, _ = real(folder)
+    analyser = np.load(folder / "analyser_frf.npz")
+    lines = (analyser["f_Hz"] > 15) & (analyser["f_Hz"] < 180)
+    frequency = analyser["f_Hz"][lines]
+    theirs = np.moveaxis(analyser["H_g_per_N"], 1, 0)[..., lines] * 9.80665
+    coherence = np.moveaxis(analyser["coherence"], 1, 0)[..., lines].clip(1e-6, 1 - 1e-6)
+    step = frfs.frequency_hz[1]
+    order = [int(str(d.body).removeprefix("point")) for d in frfs.inputs]
+    ours = np.empty_like(theirs)
+    for row in range(3):
+        for column, point in enumerate(order):
+            frf = frfs.frf[row, column]
+            ours[row, point] = np.interp(frequency, step * np.arange(frf.size), frf.real) + 1j * np.interp(
+                frequency, step * np.arange(frf.size), frf.imag
+            )
+    correlation = np.abs(np.sum(ours.conj() * theirs, axis=-1)) ** 2 / (
+        np.sum(np.abs(ours) ** 2, axis=-1) * np.sum(np.abs(theirs) ** 2, axis=-1)
+    )
+    assert np.median(correlation) > 0.98
+    scatter = np.abs(theirs) * np.sqrt((1 - coherence) / coherence)
+    ratio = np.median(np.abs(ours - theirs) / scatter)
+    assert ratio < 2.0
+    size = np.median(np.linalg.norm(ours, axis=-1) / np.linalg.norm(theirs, axis=-1))
+    assert size == pytest.approx(1, abs=0.05)
+
+
+def test_signs_of_hammer_and_sensors_are_applied() -> None:
+    hits = clean_hits(1, 4096)
+    plain = estimate_frfs(hits)
+    turned = estimate_frfs([hit_of(-h.force, h.responses, "-p0.z", ("-p0.z", "p1.z")) for h in hits])
+    assert [str(d) for d in (*turned.outputs, *turned.inputs)] == ["p0.z", "p1.z", "p0.z"]
+    assert np.allclose(turned.frf[0], -plain.frf[0])
+    assert np.allclose(turned.frf[1], plain.frf[1])
+
+
+def test_roving_sensors_and_points_give_the_union_with_nan_where_nothing_was_measured() -> None:
+    a, b, c = (clean_hits(1, 8192, seed=s)[0] for s in range(3))
+    hits = [
+        hit_of(a.force, a.responses, "p0.z", ("p0.z", "p1.z")),
+        hit_of(b.force, b.responses[:1], "p0.z", ("p0.z",)),
+        hit_of(c.force, c.responses, "p7.z", ("p1.z", "p2.z")),
+    ]
+    frfs = estimate_frfs(hits)
+    assert [str(d) for d in frfs.outputs] == ["p0.z", "p1.z", "p2.z"]
+    assert [str(d) for d in frfs.inputs] == ["p0.z", "p7.z"]
+    assert frfs.hits.tolist() == [[2, 0], [1, 1], [0, 1]]
+    assert np.array_equal(np.isnan(frfs.frf).all(axis=-1), frfs.hits == 0)
+    assert np.array_equal(np.isnan(frfs.coherence).all(axis=-1), frfs.hits < 2)
+    assert error(frfs, 0, 0, 0) < 1e-7
+    assert error(frfs, 1, 0, 1) < 1e-7
+    assert error(frfs, 1, 1, 0) < 1e-7
+
+
+def test_variance_of_h1_is_unbiased_and_predicts_the_scatter_of_repeated_tests() -> None:
+    """Monte Carlo: 200 tests of n hits; the mean of the estimates is the variance among the tests."""
+    for n, seed in ((2, 0), (5, 1)):
+        frf, variance = [], []
+        rng = np.random.default_rng(seed)
+        base = clean_hits(n, 512, outputs=1)
+        for _ in range(200):
+            noisy = [replace(h, responses=h.responses + 2.0 * rng.standard_normal((1, 512))) for h in base]
+            result = estimate_frfs(noisy)
+            frf.append(result.frf[0, 0])
+            variance.append(result.variance[0, 0])
+        band = slice(10, 150)
+        among = np.var(np.array(frf), axis=0)[band]
+        told = np.mean(np.array(variance), axis=0)[band]
+        assert np.mean(told / among) == pytest.approx(1, abs=0.03)
+        # Smoothed to 16 complex degrees of freedom: a relative deviation of 1/√16.
+        spread = np.std(np.array(variance), axis=0)[band] / told
+        assert np.mean(spread) == pytest.approx(0.25, abs=0.06)
+
+
+def test_one_hit_has_neither_coherence_nor_variance_and_says_so() -> None:
+    frfs = estimate_frfs(clean_hits(1, 4096))
+    assert np.isnan(frfs.coherence).all()
+    assert np.isnan(frfs.variance).all()
+    assert any("one hit" in v.message for v in frfs.verdicts)
+
+
+def test_two_hits_are_too_few_to_judge_coherence_by() -> None:
+    frfs = estimate_frfs(clean_hits(2, 4096, noise=3.0))
+    first = next(v for v in frfs.verdicts if v.check == "coherence")
+    assert first.passes
+    assert "too few" in first.message
+
+
+def test_h1_h2_and_hv_stand_in_the_right_order_with_noise_on_the_force() -> None:
+    rng = np.random.default_rng(0)
+    hits = [replace(h, force=h.force + 1.5 * rng.standard_normal(h.force.size)) for h in clean_hits(40, 4096)]
+    line = int(143.25 * 2)
+    size = {
+        e: float(np.abs(estimate_frfs(hits, FrfSettings(estimator=e)).frf[0, 0, line]))
+        for e in ("H1", "H2", "Hv")
+    }
+    true = float(np.abs(exact(np.array([line * 0.5]), 0)[0]))
+    assert size["H1"] < size["Hv"] < size["H2"]
+    assert size["H2"] == pytest.approx(true, rel=0.15)
+    assert size["Hv"] == pytest.approx(np.sqrt(size["H1"] * size["H2"]))
+
+
+def test_force_and_exponential_window_give_the_frf_with_the_added_damping() -> None:
+    """An undecayed record with offsets: exp(-0.5 s·6/s) is 5 % of the response at its end."""
+    rng = np.random.default_rng(0)
+    hits = []
+    for h in clean_hits(3, 1024):
+        force = h.force + 3.0 + 0.02 * rng.standard_normal(1024)
+        hits.append(replace(h, force=force, responses=h.responses + np.array([[40.0], [-7.0]])))
+    settings = FrfSettings(force_window="auto", exponential_window=12.0)
+    frfs = estimate_frfs(hits, settings)
+    assert frfs.response_decay_rad_s == 12.0
+    for o in range(2):
+        true = exact(frfs.frequency_hz, o, decay=12.0)
+        for pole in POLES:
+            line = int(np.argmin(np.abs(frfs.frequency_hz - pole.imag / 2 / np.pi)))
+            near = slice(line - 1, line + 2)
+            assert np.abs(frfs.frf[o, 0, near]) == pytest.approx(np.abs(true[near]), rel=0.01)
+
+
+def test_damping_is_exact_once_the_windows_share_is_taken_off() -> None:
+    (h,) = clean_hits(1, 4096, outputs=1)
+    settings = FrfSettings(exponential_window="auto")
+    frfs = estimate_frfs([h], settings)
+    assert frfs.response_decay_rad_s == pytest.approx(np.log(100) / 2.0)
+    # Rational fit in z of the exact order: 3 pairs of poles.
+    inside = slice(20, 900)
+    z = np.exp(-2j * np.pi * frfs.frequency_hz[inside] / RATE)
+    powers = z[:, None] ** np.arange(7)
+    measured = frfs.frf[0, 0, inside]
+    left = np.hstack([powers[:, :6], -measured[:, None] * powers[:, 1:]])
+    weights, *_ = np.linalg.lstsq(
+        np.vstack([left.real, left.imag]), np.concatenate([measured.real, measured.imag])
+    )
+    poles = RATE * np.log(np.roots([1.0, *weights[6:]]))
+    found = np.sort_complex(1j * poles[poles.imag > 0])[::-1] / 1j
+    found = found[np.argsort(found.imag)] + frfs.response_decay_rad_s
+    assert np.allclose(-found.real / np.abs(found), -POLES.real / np.abs(POLES), rtol=1e-4)
+
+
+def test_record_cut_at_the_blow_keeps_rational_frfs_although_it_has_not_decayed() -> None:
+    """At FFT lines, exponentials cut off at the end of the record are whole ones with other residues."""
+    n = 512
+    force = np.zeros(n)
+    force[0] = 50.0
+    answer = modal_response(force, RATE, POLES, residues(0))
+    frfs = estimate_frfs([hit_of(force, answer[None, :])])
+    z = np.exp(2j * np.pi * frfs.frequency_hz / RATE)
+    expected = np.zeros(frfs.frequency_hz.size, dtype=complex)
+    for pole, residue in zip(POLES, residues(0), strict=True):
+        for s, a in ((pole, residue), (pole.conjugate(), residue.conjugate())):
+            expected += a / RATE * (1 - np.exp(s * n / RATE)) / (1 - np.exp(s / RATE) / z)
+    assert np.allclose(frfs.frf[0, 0], expected, rtol=1e-9)
+
+
+def test_force_window_keeps_the_pulse_whole() -> None:
+    force = half_sine(4096, 100, 12, 60.0) + 0.01 * np.random.default_rng(0).standard_normal(4096)
+    window = force_window(force, int(np.argmax(force)))
+    assert (window[98:114] == 1).all()
+    assert (window[400:] == 0).all()
+
+
+def test_hits_stream_through_and_are_not_kept() -> None:
+    alive: list[weakref.ref[NDArray[np.float64]]] = []
+
+    def stream() -> Iterator[HitSamples]:
+        for h in range(6):
+            hit = clean_hits(1, 2048, seed=h)[0]
+            alive.append(weakref.ref(hit.responses))
+            yield hit
+            del hit
+            assert sum(r() is not None for r in alive) <= 1
+
+    assert estimate_frfs(stream()).hits[0, 0] == 6
+
+
+def test_hits_that_do_not_fit_together_are_refused_with_file_and_remedy() -> None:
+    good, short = clean_hits(1, 4096)[0], replace(clean_hits(1, 2048)[0])
+    with pytest.raises(EmaError, match="no accepted hit"):
+        estimate_frfs([])
+    with pytest.raises(EmaError, match="2048 samples, but 4096 in 'r0'"):
+        estimate_frfs([good, short])
+    with pytest.raises(EmaError, match="sample rate"):
+        estimate_frfs([good, replace(good, sample_rate_hz=1000.0)])
+    with pytest.raises(EmaError, match="calibrated"):
+        estimate_frfs([good, replace(good, force_calibrated=False)])
+    with pytest.raises(EmaError, match=r"'a0' and 'a1' both measure p0\.z"):
+        estimate_frfs([hit_of(good.force, good.responses, outputs=("p0.z", "-p0.z"))])
+    velocity = tuple(replace(c, quantity="velocity") for c in good.channels)
+    with pytest.raises(EmaError, match="velocity"):
+        estimate_frfs([good, replace(good, channels=velocity)])
+
+
+def test_band_of_a_soft_tip_ends_in_noise_and_of_a_hard_one_at_the_converters_limit() -> None:
+    rng = np.random.default_rng(0)
+    bands = {}
+    for width in (2, 40):
+        force = half_sine(8192, 100, width, 50.0) + 0.05 * rng.standard_normal(8192)
+        bands[width] = estimate_frfs([hit_of(force, rng.standard_normal((1, 8192)))]).band_hz
+    assert bands[2][1] == pytest.approx(RATE / 2.56)
+    # First zero of the half-sine of 40 samples: 1.5 widths, at 77 Hz; noise buries all lobes from about 4 on.
+    assert 55 < bands[40][1] < 320
+
+
+def checks(frfs: FrfSet, name: str) -> list[bool]:
+    """Outcomes of one check."""
+    return [v.passes for v in frfs.verdicts if v.check == name]
+
+
+def two_way_hits(sign: float, gain: float) -> list[HitSamples]:
+    """A reciprocal structure struck at both of its points; one sensor reversed or miscalibrated."""
+    shapes = np.array([[1.0, 0.7], [0.8, -1.0], [0.6, 0.9]])
+    rng = np.random.default_rng(0)
+    hits = []
+    for source in range(2):
+        for k in range(3):
+            force = half_sine(8192, 20, 5 + k, 60.0 + 10 * k)
+            # Residues jω·φφ/2 of accelerance, real modes.
+            rows = [
+                modal_response(force, RATE, POLES, 1j * POLES.imag / 2 * shapes[:, source] * shapes[:, o])
+                for o in range(2)
+            ]
+            answers = np.array(rows) * np.array([[1.0], [sign * gain]]) + 1e-3 * rng.standard_normal(
+                (2, 8192)
+            )
+            hits.append(hit_of(force, answers, f"p{source}.z"))
+    return hits
+
+
+def test_driving_points_and_reciprocity_pass_on_a_passive_reciprocal_structure() -> None:
+    frfs = estimate_frfs(two_way_hits(1.0, 1.0))
+    assert checks(frfs, "driving point") == [True, True]
+    assert checks(frfs, "reciprocity") == [True]
+    assert all(checks(frfs, "coherence"))
+    assert all(checks(frfs, "repeatability"))
+
+
+def test_reversed_sensor_shows_at_its_driving_point_and_in_reciprocity() -> None:
+    frfs = estimate_frfs(two_way_hits(-1.0, 1.0))
+    assert checks(frfs, "driving point") == [True, False]
+    assert checks(frfs, "reciprocity") == [False]
+    assert any("reversed" in v.message for v in frfs.verdicts)
+
+
+def test_miscalibrated_sensor_shows_in_reciprocity_only() -> None:
+    frfs = estimate_frfs(two_way_hits(1.0, 1.3))
+    assert checks(frfs, "driving point") == [True, True]
+    assert checks(frfs, "reciprocity") == [False]
+
+
+def test_blows_on_different_spots_show_in_coherence_and_repeatability() -> None:
+    rng = np.random.default_rng(0)
+    hits = [replace(h, responses=h.responses * rng.uniform(0.5, 1.5)) for h in clean_hits(5, 8192)]
+    frfs = estimate_frfs(hits)
+    assert not all(checks(frfs, "repeatability"))
+
+
+def test_records_of_the_same_channels_average_to_the_same_whatever_the_threads() -> None:
+    hits = clean_hits(3, 2048, outputs=9, noise=0.1)
+    one, two = (estimate_frfs(hits, FrfSettings(threads=t)) for t in (1, 2))
+    assert np.array_equal(one.frf, two.frf)
+    assert np.array_equal(one.variance, two.variance)
+
+
+def test_record_helper_gives_whole_records() -> None:
+    h = clean_hits(1, 2048)[0]
+    record = record_of(h.force, h.responses, RATE)
+    (hit,) = hits_of_test([record])
+    assert np.array_equal(cut_hit(record, hit).force, h.force)
