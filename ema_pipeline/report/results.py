@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ema_pipeline.correlate.types import Comparison, Pairing
+from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit
@@ -48,6 +49,12 @@ class RunResults:
     configurations : tuple of ConfigurationResults
     fit : FitResult or None
     comparison : Comparison or None
+        Of the model as it stands.
+    comparison_after : Comparison or None
+        Of the model with the effects that the diagnosis found, where it was made.
+    diagnosis : Diagnosis or None
+    ladder : Ladder or None
+        Of the effects that the user added; without it that of the diagnosis is shown.
     warnings : tuple of str
         One plain sentence each.
     provenance : mapping of str to str
@@ -64,3 +71,13 @@ class RunResults:
     warnings: tuple[str, ...] = ()
     provenance: Mapping[str, str] = field(default_factory=dict)
     settings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    diagnosis: Diagnosis | None = None
+    ladder: Ladder | None = None
+    comparison_after: Comparison | None = None
+
+    @property
+    def shown_ladder(self) -> Ladder | None:
+        """The user's own ladder, or else the diagnosis's."""
+        if self.ladder is not None:
+            return self.ladder
+        return None if self.diagnosis is None else self.diagnosis.ladder
