@@ -22,7 +22,7 @@ from ema_pipeline.mechanics.laws import (
     PolynomialSpring,
 )
 from ema_pipeline.mechanics.modes import normal_modes
-from ema_pipeline.mechanics.nonlinear import force_along, nonlinear_response
+from ema_pipeline.mechanics.nonlinear import force_along, nonlinear_response, steady_deviation
 from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.mechanics.time_response import time_response
 from ema_pipeline.rigs import load_rig
@@ -144,7 +144,7 @@ def test_maxwell_branch_has_its_closed_form_stiffness_and_loss() -> None:
     n = 4000
     phase = 2 * np.pi * np.arange(n) / n
     x, v = amplitude * np.cos(phase), -amplitude * 2 * np.pi * f * np.sin(phase)
-    force = force_along((Maxwell("relaxation", ROW, k, tau),), x, v, 1 / (f * n), periods=8)
+    force = force_along((Maxwell("relaxation", ROW, k, tau),), x, v, 1 / (f * n), deviation=steady_deviation)
     dynamic = 2 * np.fft.rfft(force)[1] / n / amplitude
     jwt = 2j * np.pi * f * tau
     assert dynamic == pytest.approx(k * jwt / (1 + jwt), rel=1e-5)

@@ -19,10 +19,8 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.laws import Nonlinear, check_element
 from ema_pipeline.mechanics.modes import eigen_solution, total_damping
-from ema_pipeline.mechanics.nonlinear import deviation_along, element_rows
+from ema_pipeline.mechanics.nonlinear import element_rows, steady_deviation
 from ema_pipeline.mechanics.system import LinearSystem
-
-_PERIODS = 3
 
 
 @dataclass(frozen=True)
@@ -154,9 +152,7 @@ def _deviations(
     full[:, :count] *= 1j * omega * order
     rate = np.fft.irfft(full, samples)
     step = 2 * np.pi / (omega * samples)
-    force = np.stack(
-        [deviation_along(e, motion[i], rate[i], step, periods=_PERIODS) for i, e in enumerate(elements)]
-    )
+    force = np.stack([steady_deviation(e, motion[i], rate[i], step) for i, e in enumerate(elements)])
     spectrum = np.fft.rfft(force)[:, :count] / samples
     return np.asarray(spectrum * np.where(order > 0, 2.0, 1.0))
 

@@ -13,11 +13,17 @@ Model*, 2007, chapter 2 (normalised form). For the describing functions: A. Gelb
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from math import cosh, exp, expm1, inf, log1p, tanh
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ema_pipeline.errors import EmaError
+
+_SETTLING = 400
 
 Row = Mapping[str, float]
 Step = tuple[float, float, float, float]
@@ -38,10 +44,9 @@ class Nonlinear:
     """What every nonlinear element offers.
 
     `tangent_stiffness` and `tangent_damping` are the slopes of its force that the linear system holds;
-    `has_memory` tells whether the force depends on the past; `start` is the state at rest.
+    `start` is the state at rest.
     """
 
-    has_memory = False
     start = 0.0
     name: str
     row: Row
@@ -60,6 +65,25 @@ class Nonlinear:
         """Deviation of the force from its tangent after a straight path from `before` to `stretch`, m."""
         raise NotImplementedError
 
+    def settled(self, path: Sequence[float], time_step: float) -> float:
+        """State at the end of a period, `path`, that has been run through for ever."""
+        return self.start
+
+    def along(
+        self,
+        path: NDArray[np.float64],
+        rates: NDArray[np.float64],
+        time_step: float,
+        before: float,
+        state: float,
+    ) -> NDArray[np.float64]:
+        """Deviation of the force at points of a path that comes from `before` in `state`, (n_points,)."""
+        result = [0.0] * len(path)
+        for k, (stretch, rate) in enumerate(zip(path.tolist(), rates.tolist(), strict=True)):
+            result[k], _fd, _fv, state = self.step(before, stretch, rate, state, time_step)
+            before = stretch
+        return np.array(result)
+
 
 @dataclass(frozen=True)
 class PolynomialSpring(Nonlinear):
@@ -74,6 +98,17 @@ class PolynomialSpring(Nonlinear):
         """See `Nonlinear.step`."""
         force = (self.quadratic + self.cubic * stretch) * stretch * stretch
         return force, (2 * self.quadratic + 3 * self.cubic * stretch) * stretch, 0.0, 0.0
+
+    def along(
+        self,
+        path: NDArray[np.float64],
+        rates: NDArray[np.float64],
+        time_step: float,
+        before: float,
+        state: float,
+    ) -> NDArray[np.float64]:
+        """See `Nonlinear.along`."""
+        return (self.quadratic + self.cubic * path) * path**2
 
 
 @dataclass(frozen=True)
@@ -152,7 +187,6 @@ class BoucWen(Nonlinear):
     closed form; other exponents take a fourth-order step.
     """
 
-    has_memory = True
     name: str
     row: Row
     limit: float
@@ -175,9 +209,58 @@ class BoucWen(Nonlinear):
         """See `Nonlinear.step`."""
         path = stretch - before
         direction = 1.0 if path >= 0 else -1.0
-        w = self._closed(state, path) if self.exponent == 1.0 else self._runge_kutta(state, path)
+        w = self._after(state, path)
         slope = self.limit * self.slope(w, direction) - self.tangent_stiffness
         return self.limit * w - self.tangent_stiffness * stretch, slope, 0.0, w
+
+    def settled(self, path: Sequence[float], time_step: float) -> float:
+        """See `Nonlinear.settled`: only the turning points count."""
+        turns = _turning_points(path)
+        w, before = self.start, path[-1]
+        for _ in range(_SETTLING):
+            begun = w
+            for stretch in turns:
+                w = self._after(w, stretch - before)
+                before = stretch
+            if abs(w - begun) < 1e-13:
+                break
+        return w
+
+    def along(
+        self,
+        path: NDArray[np.float64],
+        rates: NDArray[np.float64],
+        time_step: float,
+        before: float,
+        state: float,
+    ) -> NDArray[np.float64]:
+        """See `Nonlinear.along`: in closed form from one turning point to the next."""
+        if self.exponent != 1.0:
+            return super().along(path, rates, time_step, before, state)
+        w = np.empty(len(path))
+        steps = np.sign(np.diff(path, prepend=before))
+        cuts = np.flatnonzero(np.diff(steps)) + 1
+        for start, stop in pairwise([0, *cuts.tolist(), len(path)]):
+            branch = path[start:stop] - before
+            w[start:stop] = self._branch(state, branch, -1.0 if branch[-1] < 0 else 1.0)
+            before, state = float(path[stop - 1]), float(w[stop - 1])
+        return self.limit * w - self.tangent_stiffness * path
+
+    def _branch(self, w: float, path: NDArray[np.float64], direction: float) -> NDArray[np.float64]:
+        """w after ways `path` in one direction from a place where it was `w`."""
+        if w * direction >= 0:
+            return _exponential(w, direction, self.rho * path)
+        a = -direction * (1.0 - 2 * self.sigma)
+        crossing = log1p(-a * w) / a if abs(a) > 1e-12 else -w
+        x = self.rho * path
+        late = np.abs(x) >= abs(crossing)
+        result = np.empty(len(path))
+        result[~late] = _exponential(w, a, x[~late])
+        result[late] = _exponential(0.0, direction, x[late] - crossing)
+        return result
+
+    def _after(self, w: float, path: float) -> float:
+        return self._closed(w, path) if self.exponent == 1.0 else self._runge_kutta(w, path)
 
     def _closed(self, w: float, path: float) -> float:
         """dw/dδ = ρ(1 - a·w) with a constant between changes of sign of w."""
@@ -217,7 +300,6 @@ class Maxwell(Nonlinear):
     spring alone, i.e. motions faster than `time`; time and harmonic responses are exact.
     """
 
-    has_memory = True
     name: str
     row: Row
     stiffness: float
@@ -235,6 +317,27 @@ class Maxwell(Nonlinear):
         late = -expm1(-x) / x  # mean of e^{-s} over the step
         after = decay * state + (late - decay) * before + (1.0 - late) * stretch
         return -self.stiffness * after, -self.stiffness * (1.0 - late), 0.0, after
+
+    def settled(self, path: Sequence[float], time_step: float) -> float:
+        """See `Nonlinear.settled`: what is left of the start dies out as exp(-t/time)."""
+        state, before = 0.0, path[-1]
+        for stretch in path:
+            state = self.step(before, stretch, 0.0, state, time_step)[3]
+            before = stretch
+        return state / -expm1(-len(path) * time_step / self.time)
+
+
+def _exponential(w: float, a: float, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Solution of dw/dx = 1 - a·w from w at x = 0."""
+    if abs(a) <= 1e-12:
+        return w + x
+    return np.asarray(w * np.exp(-a * x) - np.expm1(-a * x) / a)
+
+
+def _turning_points(path: Sequence[float]) -> list[float]:
+    """Places where the path turns, and its last one."""
+    turns = [b for a, b, c in zip([path[-1], *path], path, path[1:], strict=False) if (b - a) * (c - b) <= 0]
+    return [*turns, path[-1]]
 
 
 def check_element(element: Nonlinear) -> None:

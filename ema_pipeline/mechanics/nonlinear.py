@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite
 
 import numpy as np
@@ -190,7 +190,7 @@ def force_along(
     velocity: NDArray[np.float64],
     time_step: float,
     *,
-    periods: int = 1,
+    deviation: Callable[..., NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
     """Force of elements side by side whose common stretch is prescribed.
 
@@ -202,9 +202,9 @@ def force_along(
         Stretch and its rate, m and m/s.
     time_step : float
         s.
-    periods : int
-        The motion is run through so often, and the last run's force returned: with 2 or more the motion is
-        one period of a steady state.
+    deviation : callable, optional
+        `deviation_along` (the default) for a motion that starts from rest, `steady_deviation` for one period
+        of a steady state.
 
     Returns
     -------
@@ -217,7 +217,7 @@ def force_along(
             total += element.coefficient * velocity
         elif isinstance(element, Nonlinear):
             total += element.tangent_stiffness * displacement + element.tangent_damping * velocity
-            total += deviation_along(element, displacement, velocity, time_step, periods=periods)
+            total += (deviation or deviation_along)(element, displacement, velocity, time_step)
         elif isinstance(element, Spring):
             total += element.stiffness * displacement
         else:
@@ -230,20 +230,20 @@ def deviation_along(
     displacement: NDArray[np.float64],
     velocity: NDArray[np.float64],
     time_step: float,
-    *,
-    periods: int = 1,
 ) -> NDArray[np.float64]:
-    """Deviation of a nonlinear element's force from its tangent along a prescribed stretch, (n_samples,)."""
-    stretches, rates = displacement.tolist(), velocity.tolist()
-    state = element.start
-    before = stretches[-1] if periods > 1 else stretches[0]
-    result = [0.0] * len(stretches)
-    step = element.step
-    for _ in range(periods if element.has_memory else 1):
-        for k, d in enumerate(stretches):
-            result[k], _fd, _fv, state = step(before, d, rates[k], state, time_step)
-            before = d
-    return np.array(result)
+    """Deviation of an element's force from its tangent, from rest at the first sample on, (n_samples,)."""
+    return element.along(displacement, velocity, time_step, float(displacement[0]), element.start)
+
+
+def steady_deviation(
+    element: Nonlinear,
+    displacement: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+    time_step: float,
+) -> NDArray[np.float64]:
+    """The same over one period of a motion that has gone on for ever, (n_samples,)."""
+    state = element.settled(displacement.tolist(), time_step)
+    return element.along(displacement, velocity, time_step, float(displacement[-1]), state)
 
 
 def element_rows(assembly: Assembly, elements: Sequence[Nonlinear]) -> NDArray[np.float64]:

@@ -1,0 +1,16 @@
+"""Force-displacement loops → stiffness, viscous damping and hysteresis of an isolator."""
+
+from ema_pipeline.hysteresis.identify import identify_isolator
+from ema_pipeline.hysteresis.loops import measure_loop
+from ema_pipeline.hysteresis.settings import HysteresisSettings
+from ema_pipeline.hysteresis.stage import analyse_hysteresis
+from ema_pipeline.hysteresis.types import IsolatorResult, Loop
+
+__all__ = [
+    "HysteresisSettings",
+    "IsolatorResult",
+    "Loop",
+    "analyse_hysteresis",
+    "identify_isolator",
+    "measure_loop",
+]

@@ -1,0 +1,31 @@
+"""Settings of the isolator identification."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from ema_pipeline.settings import Settings
+
+
+class HysteresisSettings(Settings):
+    """How loops are measured and fitted."""
+
+    points_per_cycle: int = Field(256, ge=32, le=2048, description="points of an averaged loop")
+    displacement_harmonics: int = Field(
+        9, ge=1, le=50, description="harmonics by which the noise of the displacement is smoothed"
+    )
+    frequency_search: float = Field(
+        0.03, ge=0, lt=0.3, description="the true frequency is sought within this share of the stated one"
+    )
+    steady_tolerance: float = Field(
+        0.03, gt=0, lt=0.5, description="cycles within this share of the largest amplitude are steady"
+    )
+    amplitude_tolerance: float = Field(
+        0.2, gt=0, description="largest difference between the stated and the measured amplitude"
+    )
+    held_out_parts: int = Field(
+        3, ge=2, le=10, description="parts into which the loops are dealt for held-out errors"
+    )
+    significance: float = Field(
+        2.0, gt=0, description="standard deviations from which a value counts as different from zero"
+    )

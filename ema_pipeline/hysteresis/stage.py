@@ -1,0 +1,59 @@
+"""From a test description with ``kind = "hysteresis"`` to an identified isolator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.hysteresis.identify import identify_isolator
+from ema_pipeline.hysteresis.loops import measure_loop
+from ema_pipeline.hysteresis.settings import HysteresisSettings
+from ema_pipeline.hysteresis.types import IsolatorResult, Loop
+from ema_pipeline.ingest.description import TestDescription
+from ema_pipeline.ingest.load import load_channels
+
+
+def analyse_hysteresis(
+    test: TestDescription,
+    settings: HysteresisSettings | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> IsolatorResult:
+    """Read all records of a hysteresis test and identify the isolator.
+
+    Raises
+    ------
+    EmaError
+        Names file, channel or record and what is wrong with it.
+    """
+    tell = progress or (lambda share, text: None)
+    loops = []
+    for i, loop in enumerate(load_loops(test, settings)):
+        loops.append(loop)
+        tell(0.3 * (i + 1) / len(test.records), f"loop {loop.name}")
+    tell(0.3, "least squares on all loops")
+    return identify_isolator(loops, settings)
+
+
+def load_loops(test: TestDescription, settings: HysteresisSettings | None = None) -> tuple[Loop, ...]:
+    """Averaged loops of all records."""
+    if test.kind != "hysteresis":
+        raise EmaError(f'{test.file}: is a hammer test; loops need kind = "hysteresis"')
+    displacement = next(c for c in test.responses if c.quantity == "displacement")
+    loops = []
+    for record in test.records:
+        data = load_channels(test, record)
+        assert record.frequency_hz is not None  # checked with the description
+        try:
+            loop = measure_loop(
+                data.samples[displacement.name],
+                data.samples[test.force.name],
+                data.sample_rate_hz,
+                record.frequency_hz,
+                record.amplitude_m,
+                name=record.file,
+                settings=settings,
+            )
+        except EmaError as error:
+            raise EmaError(f"{test.path_of(record).parent}/{error}") from None
+        loops.append(loop)
+    return tuple(loops)
