@@ -17,7 +17,7 @@ from ema_pipeline.errors import EmaError
 
 if TYPE_CHECKING:
     from ema_pipeline.pipeline import ShowStage
-    from ema_pipeline.stages.base import Progress
+    from ema_pipeline.stages.base import Progress, Run
 
 app = typer.Typer(
     name="ema",
@@ -34,6 +34,13 @@ RigOption = Annotated[
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more; show where a bug happened.")]
+EffectFiles = Annotated[
+    list[str] | None,
+    typer.Option("--effect-file", metavar="FILE.py", help="A file with an effect of your own."),
+]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one setting of the pipeline.")
+]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
@@ -85,20 +92,18 @@ def run(
     pipeline: Annotated[
         str | None, typer.Option("--pipeline", "-p", help="Pipeline: a shipped one's name, or a TOML file.")
     ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override one setting of the pipeline."),
-    ] = None,
+    effect_file: EffectFiles = None,
+    set_: Overrides = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
     """Go from raw hits to modes and, with a rig, to a fitted model. Unchanged stages are skipped."""
-    from ema_pipeline.job import run_raw
+    from ema_pipeline.job import run_raw, with_effect_files
 
+    folder = out or Path("results") / raw.resolve().name
     with _progress(quiet) as show:
-        result, computed = run_raw(
-            raw, rig, out or Path("results") / raw.resolve().name, pipeline, set_ or [], show
-        )
+        changes = with_effect_files((), effect_file or [], set_ or [])
+        result, computed = run_raw(raw, rig, folder, pipeline, changes, show)
     if not quiet:
         from ema_pipeline.report import terminal
         from ema_pipeline.stages.results import load_results
@@ -117,9 +122,7 @@ def _stage_command(name: str, help_text: str) -> None:
     @app.command(name, help=help_text)
     def command(
         out: Out,
-        set_: Annotated[
-            list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one setting.")
-        ] = None,
+        set_: Overrides = None,
         quiet: Quiet = False,
         verbose: Verbose = False,
     ) -> None:
@@ -169,10 +172,97 @@ def compare(out: Out) -> None:
 
     with _progress(False) as show:
         run, _ = run_on(out, ["correlate"], show=show)
-    run.require_rig("correlate")
+    run.require_model("compare")
     comparison = load_results(run).comparison
     assert comparison is not None  # the stage has just run
     _print(terminal.comparison_tables(comparison))
+
+
+@app.command()
+def diagnose(
+    out: Out,
+    auto: Annotated[
+        bool, typer.Option("--auto", help="Add what is supported, one effect after the other.")
+    ] = False,
+    effect_file: EffectFiles = None,
+    set_: Overrides = None,
+    quiet: Quiet = False,
+) -> None:
+    """Say which physical effect the model is missing, how sure that is, and what to measure next."""
+    from ema_pipeline.job import adding, change_effects, run_on, with_effect_files
+    from ema_pipeline.pipeline import existing_run
+    from ema_pipeline.report import terminal
+    from ema_pipeline.stages.results import load_results
+
+    with _progress(quiet) as show:
+        changes = with_effect_files(existing_run(out).effect_files, effect_file or [], set_ or [])
+        run, _ = run_on(out, ["diagnose", "report"], changes, show)
+        run.require_model("diagnose")
+        found = load_results(run).diagnosis
+        assert found is not None  # the stage has just run
+        supported = found.ladder.rungs[-1].effects
+        if auto and supported:
+            run = change_effects(out, adding(supported), (), show)
+    if quiet:
+        return
+    _print(terminal.diagnosis_screen(found))
+    if auto and supported:
+        _print_ladder(run)
+
+
+@app.command()
+def add(
+    out: Out,
+    effect: Annotated[list[str], typer.Argument(metavar="EFFECT@PLACE", help="See 'ema effects'.")],
+    effect_file: EffectFiles = None,
+    quiet: Quiet = False,
+) -> None:
+    """Add a physical effect to the model, refit, and show the error before and after."""
+    from ema_pipeline.job import adding, change_effects, with_effect_files
+    from ema_pipeline.pipeline import existing_run
+
+    with _progress(quiet) as show:
+        changes = with_effect_files(existing_run(out).effect_files, effect_file or [], [])
+        run = change_effects(out, adding(effect), changes, show)
+    if not quiet:
+        _print_ladder(run)
+
+
+@app.command()
+def remove(
+    out: Out,
+    effect: Annotated[str, typer.Argument(metavar="EFFECT@PLACE", help="An effect that was added.")],
+    quiet: Quiet = False,
+) -> None:
+    """Take an added effect out of the model again."""
+    from ema_pipeline.job import change_effects, removing
+
+    with _progress(quiet) as show:
+        run = change_effects(out, removing(effect), (), show)
+    if not quiet:
+        _print_ladder(run)
+
+
+@app.command()
+def ladder(out: Out) -> None:
+    """Show the models so far, each with its error on the data fitted and on data held out."""
+    from ema_pipeline.pipeline import existing_run
+
+    _print_ladder(existing_run(out))
+
+
+def _print_ladder(run: Run) -> None:
+    from ema_pipeline.report import terminal
+    from ema_pipeline.stages.results import load_results
+
+    results = load_results(run)
+    rungs = results.ladder or (None if results.diagnosis is None else results.diagnosis.ladder)
+    if rungs is None:
+        _print(
+            f"The model has no added effects. 'ema diagnose {run.store.folder}' says what it may be missing."
+        )
+    else:
+        _print(terminal.ladder_screen(rungs))
 
 
 @app.command()

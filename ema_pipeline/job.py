@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Iterable, Iterator
+import json
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.errors import EmaError, did_you_mean
@@ -29,7 +31,7 @@ from ema_pipeline.pipeline import (
 )
 from ema_pipeline.rigs import Rig, load_rig, model_modes, rig_names
 from ema_pipeline.simulate.campaign import SimulatedCampaign, simulate_campaign
-from ema_pipeline.stages.base import Run, RunInfo, save_info
+from ema_pipeline.stages.base import Run, RunInfo, load_info, save_info
 from ema_pipeline.store import Store
 
 DEFAULT_PIPELINE = "default"
@@ -75,6 +77,7 @@ def run_raw(
     info = describe(raw, rig, pipeline, overrides)
     store = Store(out)
     with _tidy(out), store.lock():
+        info = _with_effects_of(store, info)
         save_info(store, info)
         run = new_run(store, info)
         stages = PipelineSettings.model_validate_json(info.pipeline).stages
@@ -101,6 +104,80 @@ def run_on(
         return run, run_stages(run, stages, show)
 
 
+def change_effects(
+    folder: Path,
+    change: Callable[[tuple[str, ...]], tuple[str, ...]],
+    overrides: Iterable[str] = (),
+    show: ShowStage | None = None,
+) -> Run:
+    """Change the effects that were added to the model, and refit, compare and report.
+
+    Parameters
+    ----------
+    folder : Path
+        Results folder.
+    change : callable
+        Takes the effects as they are, returns them as they shall be.
+    overrides : iterable of str
+        ``stage.key=value``.
+    show : ShowStage or None
+
+    Raises
+    ------
+    EmaError
+        For effects or places that do not exist; nothing is changed then.
+    """
+    run = existing_run(folder)
+    run.require_model("add")
+    settings = override(PipelineSettings.model_validate_json(run.info.pipeline), overrides, folder)
+    store = Store(folder)
+    with store.lock():
+        info = dataclasses.replace(
+            run.info, effects=change(run.info.effects), pipeline=settings.model_dump_json()
+        )
+        run = new_run(store, info)
+        run.require_model("add")  # refuses unknown effects and places before anything is written
+        save_info(store, info)
+        run_stages(run, ("ladder", "fit", "correlate", "report"), show)
+    return run
+
+
+def with_effect_files(known: Iterable[str], files: Iterable[str], overrides: Iterable[str]) -> list[str]:
+    """Overrides that also name files with the user's own effects, in addition to the `known` ones."""
+    new = [str(Path(f).resolve()) for f in files]
+    if not new:
+        return list(overrides)
+    return [*overrides, f"effect_files={json.dumps(list(dict.fromkeys((*known, *new))))}"]
+
+
+def adding(labels: Iterable[str]) -> Callable[[tuple[str, ...]], tuple[str, ...]]:
+    """The change that adds effects on top."""
+
+    def change(effects: tuple[str, ...]) -> tuple[str, ...]:
+        for label in labels:
+            if label in effects:
+                raise EmaError(f"effect '{label}' is in the model already")
+            effects = (*effects, label)
+        return effects
+
+    return change
+
+
+def removing(label: str) -> Callable[[tuple[str, ...]], tuple[str, ...]]:
+    """The change that takes one effect away."""
+    return lambda effects: Hypothesis(effects).without(label).labels
+
+
+def _with_effects_of(store: Store, info: RunInfo) -> RunInfo:
+    """Keep the effects that the user had added to the same rig in an earlier run."""
+    if not store.path.is_file():
+        return info
+    before = load_info(store)
+    if before is None or before.rig != info.rig:
+        return info
+    return dataclasses.replace(info, effects=before.effects)
+
+
 def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterable[str]) -> RunInfo:
     """Check raw folder, rig and settings against each other, before anything is written."""
     campaign = read_campaign(raw)
@@ -119,7 +196,7 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
         if len(names) == 1
         else raw.resolve().name
     )
-    return describe_run(raw, title, _rig_text(source), source or "", names, settings)
+    return describe_run(raw, title, _rig_text(source), source or "", names, (), settings)
 
 
 def check_dofs(test: TestDescription, configuration: str, rig: Rig) -> None:

@@ -15,6 +15,7 @@ from typing import Any, Literal, cast
 from pydantic import Field
 
 from ema_pipeline.correlate.settings import CompareSettings, PairingSettings
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.frf.settings import FrfSettings
@@ -36,7 +37,7 @@ from ema_pipeline.stages.base import (
 )
 from ema_pipeline.store import ALL, Store
 
-STAGES = ("ingest", "hits", "frf", "modal", "fit", "correlate", "report")
+STAGES = ("ingest", "hits", "frf", "modal", "ladder", "fit", "correlate", "diagnose", "report")
 """All stages, in the order in which the data flow."""
 
 
@@ -62,17 +63,24 @@ class ModalStageSettings(Settings):
     circle: CircleSettings = Field(CircleSettings(), description="Nyquist circles")
 
 
+class LadderSettings(Settings):
+    """The ladder is measured with the settings of the diagnosis."""
+
+
 class PipelineSettings(Settings):
     """All settings of a pipeline; ``pipelines/*.toml`` are files of this kind."""
 
     rig: str | None = Field(None, description="rig that this pipeline is made for")
     stages: tuple[str, ...] = Field(STAGES, description="stages to run, in order")
+    effect_files: tuple[str, ...] = Field((), description="Python files with effects of the user's own")
     ingest: IngestSettings = Field(IngestSettings(), description="reading raw folders")
     hits: HitSettings = Field(HitSettings(), description="hit finding and quality limits")
     frf: FrfSettings = Field(FrfSettings(), description="windows and estimator")
     modal: ModalStageSettings = Field(ModalStageSettings(), description="modal identification")
     fit: FitSettings = Field(FitSettings(), description="fitting the model's parameters")
     correlate: CorrelateSettings = Field(CorrelateSettings(), description="pairing and comparison")
+    diagnose: DiagnoseSettings = Field(DiagnoseSettings(), description="search for missing physics")
+    ladder: LadderSettings = Field(LadderSettings(), description="the ladder of added effects")
     report: ReportSettings = Field(ReportSettings(), description="tables, plots and the report")
 
     def of(self, stage: str) -> Settings:
@@ -153,7 +161,7 @@ def toml_value(text: str) -> Any:
 def new_run(store: Store, info: RunInfo) -> Run:
     """A run with the settings that its description holds."""
     settings = PipelineSettings.model_validate_json(info.pipeline)
-    return Run(store, info, {name: settings.of(name) for name in STAGES})
+    return Run(store, info, {name: settings.of(name) for name in STAGES}, settings.effect_files)
 
 
 def existing_run(folder: Path) -> Run:
@@ -177,6 +185,7 @@ def describe_run(
     rig: str,
     rig_source: str,
     configurations: tuple[str, ...],
+    effects: tuple[str, ...],
     settings: PipelineSettings,
 ) -> RunInfo:
     """Description of a run, for the store."""
@@ -186,6 +195,7 @@ def describe_run(
         rig=rig,
         rig_source=rig_source,
         configurations=configurations,
+        effects=effects,
         pipeline=settings.model_dump_json(),
         versions=versions(),
     )
@@ -238,7 +248,7 @@ class Keys:
             "stage": name,
             "code": code_fingerprint(),
             "settings": run.settings[name].model_dump_json(),
-            "rig": run.info.rig if stage.NEEDS_RIG else "",
+            "rig": [run.info.rig, run.info.effects] if stage.NEEDS_RIG else "",
             "inputs": stage.inputs(run, configuration),
             "needed": needed,
         }

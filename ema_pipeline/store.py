@@ -154,12 +154,19 @@ class Store:
         EmaError
             If the stage has not been run.
         """
+        result = self.find(stage, configuration, name, cls)
+        if result is None:
+            raise EmaError(f"{self.path}: holds no result of stage '{stage}' ({configuration}); run it first")
+        return result
+
+    def find(self, stage: str, configuration: str, name: str, cls: type[T]) -> T | None:
+        """Load one result of a stage, None where there is none."""
+        if not self.path.is_file():
+            return None
         with self.reading() as file:
             group = file.get(_group(stage, configuration))
-            if group is None:
-                raise EmaError(
-                    f"{self.path}: holds no result of stage '{stage}' ({configuration}); run it first"
-                )
+            if group is None or (name not in group and name not in group.attrs):
+                return None
             result: T = codec.read(group, name, cls)
             return result
 

@@ -18,6 +18,10 @@ import pytest
 from ema_pipeline import cli
 from ema_pipeline.simulate import simulate_campaign
 
+STAGES = 'stages=["ingest", "hits", "frf", "modal", "ladder", "fit", "correlate", "report"]'
+"""All but the diagnosis, which takes longest and has tests of its own."""
+
+RIG = ("--rig", "planetary", "--set", STAGES)
 RUN = [sys.executable, "-m", "ema_pipeline.cli", "run"]
 
 
@@ -58,7 +62,7 @@ def small_raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def results(small_raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results of a run on the small test."""
     out = tmp_path_factory.mktemp("out") / "small"
-    command = [*RUN, str(small_raw), "--rig", "planetary", "--out", str(out)]
+    command = [*RUN, str(small_raw), *RIG, "--out", str(out)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "report.html" in done.stdout
@@ -97,7 +101,7 @@ def test_an_unchanged_second_run_computes_nothing(
     results: Path, small_raw: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = (results / "ema.h5").stat().st_mtime_ns
-    code, out, err = ema(capsys, "run", small_raw, "--rig", "planetary", "--out", results)
+    code, out, err = ema(capsys, "run", small_raw, *RIG, "--out", results)
     assert code == 0
     assert "Nothing had changed" in out
     assert err == ""
@@ -145,6 +149,36 @@ def test_compare_shows_each_mode_with_its_difference(
     summary = json.loads((results / "summary.json").read_text(encoding="utf-8"))
     for mode in summary["configurations"]["no_ring"]["modes"]:
         assert f"{int(mode['frequency_hz'])}." in out
+
+
+def test_an_effect_is_added_and_removed_and_the_ladder_shows_what_it_brought(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(results, out)
+    effect = "shaft_torsion@carrier"
+    code, text, _ = ema(capsys, "add", out, effect, "--quiet")
+    assert (code, text) == (0, "")
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert [rung["effects"] for rung in summary["ladder"]] == [[], [effect]]
+    assert summary["ladder"][1]["error"] <= summary["ladder"][0]["error"] + 1e-6
+    assert f"{effect}.stiffness" in summary["fit"]["parameters"]
+    code, text, _ = ema(capsys, "ladder", out)
+    assert code == 0
+    assert "shaft_torsion" in text
+    assert ema(capsys, "remove", out, effect)[0] == 0
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert f"{effect}.stiffness" not in summary["fit"]["parameters"]
+
+
+def test_an_effect_that_does_not_exist_is_refused_and_changes_nothing(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (results / "ema.h5").read_bytes()
+    for wrong in ("shaft_torsoin@carrier", "shaft_torsion@moon", "shaft_torsion", "sensor_mass@"):
+        assert_one_clear_line(*ema(capsys, "add", results, wrong))
+    assert_one_clear_line(*ema(capsys, "remove", results, "shaft_torsion@carrier"))
+    assert (results / "ema.h5").read_bytes() == before
 
 
 def test_check_shows_a_verdict_table_and_writes_nothing(
@@ -220,7 +254,7 @@ def test_a_run_killed_again_and_again_ends_with_the_same_tables(
     rng = np.random.default_rng(5)
     kills = 0
     for _ in range(10):
-        process = subprocess.Popen([*RUN, str(small_raw), "--rig", "planetary", "--out", str(out), "--quiet"])
+        process = subprocess.Popen([*RUN, str(small_raw), *RIG, "--out", str(out), "--quiet"])
         try:
             process.wait(float(rng.uniform(0.6, 3.5)))
         except subprocess.TimeoutExpired:
@@ -231,7 +265,7 @@ def test_a_run_killed_again_and_again_ends_with_the_same_tables(
             with h5py.File(out / "ema.h5") as file:
                 assert "run" in file
     assert kills >= 3
-    code, _, err = ema(capsys, "run", small_raw, "--rig", "planetary", "--out", out, "--quiet")
+    code, _, err = ema(capsys, "run", small_raw, *RIG, "--out", out, "--quiet")
     assert (code, err) == (0, "")
     for name in ("summary.json", "modes.csv"):
         assert (out / name).read_bytes() == (results / name).read_bytes()

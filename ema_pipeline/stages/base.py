@@ -9,9 +9,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 from ema_pipeline import __version__, codec
+from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.effects.base import Effect
+from ema_pipeline.effects.library import effect_library
 from ema_pipeline.errors import EmaError
 from ema_pipeline.rigs import Rig, load_rig, rig_kinds
 from ema_pipeline.rigs.files import rig_from_text
@@ -40,6 +44,8 @@ class RunInfo:
     rig_source : str
         Name or path under which the rig was given; empty without a rig.
     configurations : tuple of str
+    effects : tuple of str
+        Effects that the user added to the model, ``id@place``, in the order in which they were added.
     pipeline : str
         Settings of the pipeline, JSON.
     versions : dict of str to str
@@ -51,6 +57,7 @@ class RunInfo:
     rig: str
     rig_source: str
     configurations: tuple[str, ...]
+    effects: tuple[str, ...]
     pipeline: str
     versions: dict[str, str]
 
@@ -65,32 +72,52 @@ class Run:
     info : RunInfo
     settings : mapping of str to Settings
         The settings of each stage.
+    effect_files : tuple of str
+        Python files with the user's own effects.
     """
 
     store: Store
     info: RunInfo
     settings: Mapping[str, Settings]
+    effect_files: tuple[str, ...] = ()
+
+    @cached_property
+    def library(self) -> dict[str, Effect]:
+        """The effects that ship with the program and those of the user's files."""
+        return effect_library(self.effect_files)
+
+    def effect_hashes(self) -> str:
+        """Fingerprint of the files with the user's own effects."""
+        return " ".join(file_hash(Path(path)) for path in self.effect_files)
+
+    @cached_property
+    def model(self) -> Rig | None:
+        """The rig with the effects that the user added."""
+        if self.rig is None or not self.info.effects:
+            return self.rig
+        settings = cast(DiagnoseSettings, self.settings["diagnose"])
+        return make_rig(self.rig, Hypothesis(self.info.effects), self.library, settings.parameter_range)
 
     @cached_property
     def rig(self) -> Rig | None:
-        """The rig, None for a modal analysis without a model."""
+        """The rig without added effects, None for a modal analysis without a model."""
         if not self.info.rig:
             return None
         if "\n" in self.info.rig:
             return rig_from_text(self.info.rig, Path(self.info.rig_source), rig_kinds())
         return load_rig(self.info.rig)
 
-    def require_rig(self, stage: str) -> Rig:
-        """The rig.
+    def require_model(self, stage: str) -> Rig:
+        """The rig with the effects that the user added.
 
         Raises
         ------
         EmaError
             If the run has none.
         """
-        if self.rig is None:
-            raise EmaError(f"{self.store.folder}: stage '{stage}' needs a model; run again with --rig")
-        return self.rig
+        if self.model is None:
+            raise EmaError(f"{self.store.folder}: '{stage}' needs a model; run again with --rig")
+        return self.model
 
 
 class Stage(Protocol):
@@ -124,6 +151,21 @@ class Stage(Protocol):
 def configurations_of(stage: Stage, run: Run) -> tuple[str, ...]:
     """Configurations that a stage is run for, or `ALL`."""
     return run.info.configurations if stage.PER_CONFIGURATION else (ALL,)
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file.
+
+    Raises
+    ------
+    EmaError
+        If it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise EmaError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 @cache

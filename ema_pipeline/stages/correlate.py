@@ -9,7 +9,7 @@ from ema_pipeline.correlate.pairing import pair_rig
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.stages.base import Progress, Run
-from ema_pipeline.stages.fit import measured_modes
+from ema_pipeline.stages.modes import measured_modes
 from ema_pipeline.stages.results import fitted_values
 from ema_pipeline.store import ALL
 
@@ -30,7 +30,7 @@ def inputs(run: Run, configuration: str) -> str:
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Pair the modes at the fitted parameters, then compare modes, shapes and FRFs."""
     settings = cast("CorrelateSettings", run.settings[NAME])
-    rig = run.require_rig(NAME)
+    rig = run.require_model(NAME)
     values = fitted_values(run.store.load("fit", ALL, "fit", FitResult))
     measured = measured_modes(run)
     pairings = {name: pair_rig(rig, name, values, measured[name], settings.pairing) for name in measured}

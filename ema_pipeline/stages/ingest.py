@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.description import TestDescription, read_campaign
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Record
-from ema_pipeline.stages.base import Progress, Run
+from ema_pipeline.stages.base import Progress, Run, file_hash
 
 NAME = "ingest"
 NEEDS: tuple[str, ...] = ()
@@ -43,15 +41,7 @@ def _with_progress(records: Iterator[Record], count: int, progress: Progress) ->
 def file_hashes(test: TestDescription) -> dict[str, str]:
     """SHA-256 of the description and of every record file, by file name."""
     files = [test.file, *(test.path_of(entry) for entry in test.records)]
-    return {str(path.relative_to(test.folder)): _sha256(path) for path in files}
-
-
-def _sha256(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise EmaError(f"{path}: cannot be read ({error.strerror})") from None
+    return {str(path.relative_to(test.folder)): file_hash(path) for path in files}
 
 
 def _test(run: Run, configuration: str) -> TestDescription:

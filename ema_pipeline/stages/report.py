@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import cast
 
 from ema_pipeline.report.html import write_report
@@ -12,15 +13,16 @@ from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.results import load_results
 
 NAME = "report"
-NEEDS = ("hits", "frf", "modal", "fit", "correlate")
+NEEDS: tuple[str, ...] = ()
 PER_CONFIGURATION = False
 NEEDS_RIG = False
 OUTPUTS = ("summary.json", "modes.csv", "report.html")
 
 
 def inputs(run: Run, configuration: str) -> str:
-    """The title and the configurations' names stand in the report too."""
-    return f"{run.info.title} {run.info.configurations} {run.info.rig}"
+    """Everything that is there, whether the pipeline has all stages or not."""
+    keys = {str(at): p.key for at, p in run.store.provenance().items() if at[0] != NAME}
+    return json.dumps([keys, run.info.title, run.info.configurations, run.info.rig, run.info.effects])
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from typing import TypeVar
 
 from ema_pipeline.correlate.types import Comparison, Pairing
+from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit
@@ -14,24 +14,22 @@ from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.stages.base import Run
 from ema_pipeline.store import ALL
 
-T = TypeVar("T")
-
 
 def load_results(run: Run) -> RunResults:
     """Everything that has been computed so far; what is missing is None or empty."""
-    fit = _load(run, "fit", ALL, "fit", FitResult)
+    fit = run.store.find("fit", ALL, "fit", FitResult)
     values = fitted_values(fit)
     configurations = []
     for name in run.info.configurations:
-        modal = _load(run, "modal", name, "modal", ModalModel)
+        modal = run.store.find("modal", name, "modal", ModalModel)
         configurations.append(
             ConfigurationResults(
                 name=name,
-                hits=_load(run, "hits", name, "hits", tuple[Hit, ...]) or (),
-                frfs=_load(run, "frf", name, "frfs", FrfSet),
+                hits=run.store.find("hits", name, "hits", tuple[Hit, ...]) or (),
+                frfs=run.store.find("frf", name, "frfs", FrfSet),
                 modal=modal,
-                pairing=_load(run, "correlate", ALL, f"pairing {name}", Pairing),
-                system=None if run.rig is None else run.rig.system(name, values),
+                pairing=run.store.find("correlate", ALL, f"pairing {name}", Pairing),
+                system=None if run.model is None else run.model.system(name, values),
             )
         )
     return RunResults(
@@ -39,7 +37,9 @@ def load_results(run: Run) -> RunResults:
         rig=None if run.rig is None else run.rig.name,
         configurations=tuple(configurations),
         fit=fit,
-        comparison=_load(run, "correlate", ALL, "comparison", Comparison),
+        comparison=run.store.find("correlate", ALL, "comparison", Comparison),
+        diagnosis=run.store.find("diagnose", ALL, "diagnosis", Diagnosis),
+        ladder=run.store.find("ladder", ALL, "ladder", Ladder),
         warnings=warnings(tuple(configurations)),
         provenance=_provenance(run),
         settings={name: _flat(json.loads(s.model_dump_json())) for name, s in run.settings.items()},
@@ -65,12 +65,6 @@ def warnings(configurations: tuple[ConfigurationResults, ...]) -> tuple[str, ...
         if c.modal is not None:
             found += [f"{c.name}: {note}" for note in c.modal.notes]
     return tuple(found)
-
-
-def _load(run: Run, stage: str, configuration: str, name: str, cls: type[T]) -> T | None:
-    if not run.store.key(stage, configuration):
-        return None
-    return run.store.load(stage, configuration, name, cls)
 
 
 def _provenance(run: Run) -> dict[str, str]:

@@ -1,0 +1,38 @@
+"""Modes and model → which physics the model is missing."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from ema_pipeline.diagnose import DiagnoseSettings, diagnose
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.stages.base import Progress, Run
+from ema_pipeline.stages.modes import measured_modes
+
+NAME = "diagnose"
+NEEDS = ("frf", "modal")
+PER_CONFIGURATION = False
+NEEDS_RIG = True
+
+
+def inputs(run: Run, configuration: str) -> str:
+    """The user's own effects take part."""
+    return run.effect_hashes()
+
+
+def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
+    """Fit every effect of the library on top of the model as it stands, and judge what the data support."""
+    settings = cast(DiagnoseSettings, run.settings[NAME])
+    model = run.require_model(NAME)
+    measured = measured_modes(run)
+    found = diagnose(model, measured, settings, run.library, progress, failed_checks(run))
+    return {"diagnosis": found, "on_top_of": run.info.effects}
+
+
+def failed_checks(run: Run) -> tuple[str, ...]:
+    """What the checks on the FRFs found, for a reader who might otherwise blame the model."""
+    found = []
+    for name in run.info.configurations:
+        frfs = run.store.load("frf", name, "frfs", FrfSet)
+        found += [f"{name}: {v.message}" for v in frfs.verdicts if not v.passes and v.message]
+    return tuple(found)
