@@ -9,12 +9,12 @@ import numpy as np
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.explain import label_text, size_text, why
-from ema_pipeline.diagnose.fitting import Case, Fitted, fit_null, refit
+from ema_pipeline.diagnose.fitting import Case, Fitted, fit_null, holds, refit
 from ema_pipeline.diagnose.heldout import held_out
 from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, describe, extras, single_hypotheses
 from ema_pipeline.diagnose.ladder import Yardstick, assemble_ladder, noise_of, yardstick
 from ema_pipeline.diagnose.localise import localise
-from ema_pipeline.diagnose.noise import NoiseLevel
+from ema_pipeline.diagnose.noise import NoiseLevel, floors
 from ema_pipeline.diagnose.ranking import Ranking, rank
 from ema_pipeline.diagnose.screening import Screening, screen
 from ema_pipeline.diagnose.separate import best_measurement
@@ -137,12 +137,23 @@ def _climb(case: Case, thresholds: Mapping[str, float] | None, tell: Progress) -
     tell(0.0, "base model")
     base = fit_null(case, Hypothesis(), settings.fit, None)
     hypotheses = single_hypotheses(case.rig, configurations, case.library)
-    rough = rank(case, base, hypotheses, settings.fit, _part(tell, 0.05, 0.5))
-    best = min((rough.base, *rough.fitted), key=lambda f: f.evidence)
-    level = noise_of(case, best)
+    if holds(base):
+        # The base model itself tells the noise level; one round is enough unless a hypothesis leaves less.
+        level = noise_of(case, base)
+        base = fit_null(case, Hypothesis(), level.applied(settings.fit), base.values)
+        ranking = rank(case, base, hypotheses, level.applied(settings.fit), _part(tell, 0.05, 0.5), False)
+        first = ranking.base
+    else:
+        ranking = rank(case, base, hypotheses, settings.fit, _part(tell, 0.05, 0.5), True)
+        first, level = ranking.base, floors(settings.fit)
+    best = min((ranking.base, *ranking.fitted), key=lambda f: f.evidence)
+    finer = noise_of(case, best)
+    if finer.below(level):
+        level = finer
+        fit = level.applied(settings.fit)
+        base = refit(case, Hypothesis(), fit, first.values)
+        ranking = rank(case, base, hypotheses, fit, _part(tell, 0.55, 0.7), False, ranking.fitted)
     fit = level.applied(settings.fit)
-    base = fit_null(case, Hypothesis(), fit, rough.base.values)
-    ranking = rank(case, base, hypotheses, fit, _part(tell, 0.55, 0.7), False, rough.fitted)
     models, rankings = [ranking.base], [ranking]
     note = ""
     while True:
@@ -156,7 +167,7 @@ def _climb(case: Case, thresholds: Mapping[str, float] | None, tell: Progress) -
         models.append(top)
         rest = single_hypotheses(case.rig, configurations, case.library, top.hypothesis)
         tell(0.72, f"on top of {top.hypothesis.label}")
-        rankings.append(rank(case, top, rest, fit, _part(tell, 0.72, 0.85)))
+        rankings.append(rank(case, top, rest, fit, _part(tell, 0.72, 0.85), not holds(top)))
         models[-1] = rankings[-1].base
     return _Climb(models, rankings, level, note)
 
@@ -255,7 +266,6 @@ def _verdict(
     ladder: Ladder,
     stick: Yardstick,
 ) -> tuple[VerdictWord, str]:
-    settings = case.settings
     top = climbed.models[-1]
     error = ladder.rungs[-1].error
     wrong = _misfit(case, climbed, stick, error)
@@ -385,5 +395,3 @@ def _part(tell: Progress, low: float, high: float) -> Progress:
     """Progress of a part of the work within the whole."""
     return lambda share, text: tell(low + (high - low) * share, text)
 
-
-__all__ = ["diagnose", "refit"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,15 @@ from ema_pipeline.fit.latent import LatentObjective
 from ema_pipeline.fit.map_fit import posterior_covariance
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.solve import FitProblem, Optimum, descend, refine, search
-from ema_pipeline.fit.space import Coordinate
+from ema_pipeline.fit.space import Space
 from ema_pipeline.rigs.types import Rig
 
 _TAU_RUNGS = (0.1, 0.02, 0.004)
 _VISIBLE = 0.02
+_CLEAR_GAIN = 30.0
+_NEAR = 20.0
+_WIDENED = (30.0, 5.0)
+_HOLDS = 4.0
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,13 @@ class Fitted:
         return np.isfinite(self.costs) & (self.inlier > 0.5)
 
 
+def holds(fitted: Fitted) -> bool:
+    """True where a model explains all modes about as well as the data can tell."""
+    explained = fitted.explained
+    squares = float(np.sum(fitted.costs[explained])) + fitted.prior_cost
+    return bool(np.all(explained)) and squares < _HOLDS * float(np.sum(fitted.counts))
+
+
 def fit_null(
     case: Case, hypothesis: Hypothesis, fit: FitSettings, start: Mapping[str, float] | None
 ) -> Fitted:
@@ -99,11 +111,16 @@ def fit_null(
 def refit(case: Case, hypothesis: Hypothesis, fit: FitSettings, start: Mapping[str, float]) -> Fitted:
     """Fit from one starting point."""
     problem = case.problem(hypothesis, fit)
-    return judge(case, problem, hypothesis, refine(problem, problem.space.point(start)))
+    return judge(case, problem, hypothesis, settle(problem, problem.space.point(start)))
 
 
 def fit_hypothesis(
-    case: Case, hypothesis: Hypothesis, fit: FitSettings, base: Mapping[str, float], thorough: bool = True
+    case: Case,
+    hypothesis: Hypothesis,
+    fit: FitSettings,
+    base: Mapping[str, float],
+    base_objective: float,
+    thorough: bool,
 ) -> Fitted:
     """Fit of a hypothesis from the base model's optimum and from visible sizes of what it adds.
 
@@ -114,54 +131,101 @@ def fit_hypothesis(
     fit : FitSettings
     base : mapping of parameter to value
         Optimum of the poorer model (or, with the added parameters in it, of this one at another noise level).
+    base_objective : float
+        Its -2 log posterior.
     thorough : bool
-        Also anneal from every start.
+        Anneal from every start, as is needed where the base model fails. A base model that holds has all modes
+        where they belong, and the way from there is short.
     """
     problem = case.problem(hypothesis, fit)
     space = problem.space
     added = [e for e in extras(case.rig, hypothesis, case.library) if e.name in space.names]
     new = [e for e in added if e.name not in base]
+    if not new and not thorough:
+        # at another noise level, or a parameter whose prior is widened: the optimum is near
+        return judge(case, problem, hypothesis, settle(problem, space.point(base)))
+    last = hypothesis.labels[-1]
+    # a parameter out of tolerance is in the base already, at the value that its tolerance allowed
+    moved = new or [e for e in added if e.name == last.partition("@")[2]]
+    dynamic = not all(problem.damping_only[space.names.index(e.name)] for e in added)
     candidates: list[Optimum] = []
-    if not new:
-        candidates.append(refine(problem, space.point(base)))
-    # What a parameter out of tolerance widens is in the base already; its starts still compete.
-    freed = [e for e in added if e.name in base and e.name in case.rig.parameters]
-    if thorough:
-        dynamic = not all(problem.damping_only[space.names.index(e.name)] for e in added)
-        points = starting_points(new or freed)
-        screened = []
-        for number, point in enumerate(points):
-            given = {**base, **point}
-            from_base = space.point(given)
-            if not dynamic:
-                screened.append((0.0, number, from_base))
-                continue
-            nominal = from_base.copy()
-            nominal[space.has_prior] = 0.0
-            for order, x in enumerate((from_base, nominal)):
-                found = _descend_rungs(problem, x)
-                screened.append((found.objective, 2 * number + order, found.x))
-        screened.sort(key=lambda s: (s[0], s[1]))
-        kept: list[NDArray[np.float64]] = []
-        for _, _, x in screened:
-            if all(np.max(np.abs(x - k)) > 0.05 for k in kept):
-                kept.append(x)
-            if len(kept) == 3:
-                break
-        candidates += [refine(problem, x) for x in kept]
-        if dynamic and new:
-            small = {e.name: _near_null(e, space.coordinates[space.names.index(e.name)]) for e in new}
-            candidates.append(refine(problem, space.point({**base, **small})))
+    if thorough and dynamic:
+        starts = []
+        for point in starting_points(moved):
+            from_base = space.point({**base, **point})
+            nominal = np.where(space.has_prior, 0.0, from_base)
+            starts += [_descend_rungs(problem, x) for x in (from_base, nominal)]
+        candidates += [refine(problem, x) for x in _best_distinct(starts, 2)]
+    if not candidates or min(c.objective for c in candidates) > base_objective - _CLEAR_GAIN:
+        if not new:
+            candidates.append(settle(problem, space.point(base)))
+        near = [
+            _near_null(problem, {**base, **point}, moved, base_objective)
+            for point in _null_corners(moved, space)
+        ]
+        if len(near) > 1:
+            near = _best_distinct([_first_steps(problem, x) for x in near], 2)
+        candidates += [refine(problem, x) for x in near]
     best = min(candidates, key=lambda o: o.objective)
     return judge(case, problem, hypothesis, best)
 
 
-def _near_null(e: Extra, c: Coordinate) -> float:
-    if not np.isfinite(e.null):
-        return float(c.value(c.high))
-    if c.kind == "log":
-        return float(c.value(c.low)) if e.null <= c.value(c.low) else e.null
-    return e.null + 0.02 * (e.starts[0] - e.null)
+def _best_distinct(found: Sequence[Optimum], count: int) -> list[NDArray[np.float64]]:
+    """Points of the lowest optima that differ by more than a tolerance somewhere."""
+    kept: list[NDArray[np.float64]] = []
+    for o in sorted(found, key=lambda o: o.objective):
+        if all(np.max(np.abs(o.x - k)) > 0.5 for k in kept):
+            kept.append(o.x)
+        if len(kept) == count:
+            break
+    return kept
+
+
+def _null_corners(moved: Sequence[Extra], space: Space) -> list[dict[str, float]]:
+    """Visible sizes of what has a null; angles and quantities without one at all their starts."""
+    linear = [space.coordinates[space.names.index(e.name)].kind == "linear" and e.scale > 0 for e in moved]
+    axes = [(e.starts[0],) if flat else e.starts for e, flat in zip(moved, linear, strict=True)]
+    return [dict(zip((e.name for e in moved), v, strict=True)) for v in product(*axes)]
+
+
+def _near_null(
+    problem: FitProblem, values: Mapping[str, float], moved: Sequence[Extra], base_objective: float
+) -> NDArray[np.float64]:
+    """The point with sizes drawn towards null until no mode is lost: a lost mode no longer pulls."""
+    space, mixture = problem.space, problem.mixture()
+    linear = [e for e in moved if e.scale > 0 and space.coordinates[space.names.index(e.name)].kind == "linear"]
+    share = 0.1
+    x = space.point(values)
+    if not linear:
+        return x
+    pairs = problem.assignments(space.point({**values, **{e.name: e.null for e in linear}}))
+    objective = problem.exact(pairs)
+    for _ in range(8):
+        small = {e.name: e.null + share * (values[e.name] - e.null) for e in linear}
+        x = space.point({**values, **small})
+        cost = float(np.sum(mixture.robust(objective.costs(x))) + np.sum(x[space.has_prior] ** 2))
+        if cost < base_objective + _NEAR:
+            break
+        share *= 0.2
+    return x
+
+
+def settle(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
+    """Refine, uncertainties at first widened, so that modes which are off by some do not let go at once."""
+    for scale in _WIDENED:
+        pairs = problem.assignments(x)
+        x = descend(problem.exact(pairs), problem.space, x, problem.mixture(scale), 4).x
+    return refine(problem, x)
+
+
+def _first_steps(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
+    found = None
+    for scale in (*_WIDENED, 1.0):
+        pairs = problem.assignments(x)
+        found = descend(problem.exact(pairs), problem.space, x, problem.mixture(scale), 3)
+        x = found.x
+    assert found is not None
+    return found
 
 
 def _descend_rungs(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
@@ -225,7 +289,7 @@ def _occam(
         z = (c.value(float(found.x[i])) - e.null) / e.scale
         total += 2 * np.log(np.pi * scale * (1 + z**2)) - (2 * np.log(2) if e.one_sided else 0.0)
         hessian[i, i] += 2 / scale**2
-    sign, logdet = np.linalg.slogdet(hessian)
+    _, logdet = np.linalg.slogdet(hessian)
     return float(total + logdet - len(space.names) * np.log(2 * np.pi))
 
 

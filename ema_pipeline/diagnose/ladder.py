@@ -142,7 +142,9 @@ def fitted_rungs(case: Case, effects: Sequence[str], fit: FitSettings, tell: Pro
     models = [fit_null(case, Hypothesis(), fit, None)]
     for i, label in enumerate(effects):
         tell(0.1 + 0.4 * i / len(effects), f"fitting {label}")
-        models.append(fit_hypothesis(case, models[-1].hypothesis.plus(label), fit, models[-1].values))
+        last = models[-1]
+        added = last.hypothesis.plus(label)
+        models.append(fit_hypothesis(case, added, fit, last.values, last.objective, True))
     return models
 
 

@@ -24,6 +24,12 @@ class NoiseLevel:
     damping: float
     shape: float
 
+    def below(self, other: NoiseLevel) -> bool:
+        """True where it is clearly below another level in some kind of datum."""
+        mine = np.array([self.frequency, self.damping, self.shape])
+        theirs = np.array([other.frequency, other.damping, other.shape])
+        return bool(np.any(mine < 0.8 * theirs))
+
     def applied(self, settings: FitSettings) -> FitSettings:
         """Fit settings with these floors."""
         return settings.model_copy(

@@ -54,7 +54,7 @@ def rank(
     hypotheses: Sequence[Hypothesis],
     fit: FitSettings,
     tell: Progress,
-    thorough: bool = True,
+    thorough: bool,
     from_fits: Sequence[Fitted] = (),
 ) -> Ranking:
     """Fit all hypotheses and the base model from all of their optima.
@@ -74,7 +74,7 @@ def rank(
     starts = {f.hypothesis.label: f.values for f in from_fits}
 
     def one(h: Hypothesis) -> Fitted:
-        return fit_hypothesis(case, h, fit, starts.get(h.label, base.values), thorough)
+        return fit_hypothesis(case, h, fit, starts.get(h.label, base.values), base.objective, thorough)
 
     fitted = []
     for f in spread(one, hypotheses, case.settings.processes):
@@ -103,13 +103,16 @@ def settle_base(case: Case, base: Fitted, fitted: Sequence[Fitted], fit: FitSett
 
 
 def _never_worse(f: Fitted, base: Fitted) -> Fitted:
-    """A richer model holds the poorer one: where its fit ended higher, the poorer one's costs stand."""
+    """A richer model holds the poorer one: where its fit ended higher, the poorer one's costs stand.
+
+    Evidence cannot grow by more than the likelihood does.
+    """
     if f.objective <= base.objective:
-        return f
+        return replace(f, evidence=max(f.evidence, base.evidence + f.objective - base.objective))
     return replace(
         f,
         objective=base.objective,
-        evidence=f.evidence - (f.objective - base.objective),
+        evidence=max(f.evidence - (f.objective - base.objective), base.evidence),
         costs=base.costs,
         inlier=base.inlier,
         prior_cost=base.prior_cost,

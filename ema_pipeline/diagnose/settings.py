@@ -12,7 +12,8 @@ class DiagnoseSettings(Settings):
     """How missing physics is looked for."""
 
     fit: FitSettings = Field(
-        default=FitSettings(), description="How each hypothesis is fitted; its floors cap the noise level."
+        default=FitSettings(convergence=1e-5, starts_per_decade=1),
+        description="How each hypothesis is fitted; its floors cap the noise level.",
     )
     noise_least: float = Field(
         default=0.1,
