@@ -18,6 +18,14 @@ VALLEY = 0.012
 """Depth of the valley before a second impact, over the peak, below which noise may have made it."""
 
 
+DEEP = 0.04
+"""Depth of a valley that only a shoulder can make, whose own height is then looked at."""
+
+
+RESOLVED = 8.0
+"""Width of a pulse, samples, from which on a shoulder is more than the filter's ringing."""
+
+
 @dataclass(frozen=True)
 class Pulse:
     """Where a force pulse lies in its samples.
@@ -141,6 +149,9 @@ def find_second_impact(
     valley under the least log-concave curve above the force. That sees a bump tens of milliseconds away and a
     mere shoulder alike, without a template of the pulse.
 
+    What stays hidden is a second pulse under the first whose sum is log-concave again, e.g. two Gaussians
+    less than about three standard deviations apart: no shape tells it from one slightly skewed blow.
+
     Before that, (1) the droop of an AC-coupled amplifier is undone, f = y + a·∫y dt, with a from the
     samples after the pulse; (2) a Gaussian of 0.1 pulse widths, at least 1.2 samples, takes away the
     anti-alias filter's ringing, which would make bumps of pulses only a sample wide; (3) a bump counts
@@ -208,6 +219,13 @@ def _bump(
             if right < sooner or right - left < 2 or gap[left:right].max() < VALLEY:
                 continue
             best = max(best, _rise(near, int(right), width))
+            bottom = left + int(np.argmax(gap[left:right]))
+            if width >= RESOLVED and gap[bottom] > DEEP and 0.5 * sooner <= bottom < 2 * width:
+                # A shoulder has no top of its own: its height is the force where the valley is deepest.
+                trough = float(near[bottom : bottom + int(4 * width)].min())
+                best = max(
+                    best, (float(min(near[bottom], gap[bottom])) + 2 * min(0.0, trough), float(bottom))
+                )
     if scaled.size > reach:
         best = max(best, _rise(scaled, reach, width))
     return best if best[0] > 0 else (0.0, 0.0)
