@@ -36,7 +36,7 @@ MAX_DAMPING_RATIO = 0.2
 MIN_VOTES = 0.3
 """Share of model orders that must show a mode, unless the FRFs show it plainly or the noise is known."""
 
-HOPELESS = 0.3
+HOPELESS = 0.5
 """Candidates that reach less than this share of a limit are dropped together, others one at a time."""
 
 SURE_VOTES = 0.6
@@ -99,9 +99,8 @@ def credible(data: FitData, fit: SegmentFit, hits: Noise | None, votes: Votes) -
     explained = np.zeros(len(out), dtype=bool)
     if hits is not None:
         explained = misfit(data, hits, estimate, solution) < EXPLAINED
-    doubles = np.flatnonzero(_doubles(data, estimate, solution, explained))
-    if len(doubles):  # one at a time: three poles on two modes mix their shapes
-        out[doubles[np.argmin(_size(estimate, solution)[doubles])]] = True
+    out = _doubles(data, estimate, solution, explained)
+    if out.any():
         return out
     zeta = -estimate.poles.real / np.abs(estimate.poles)
     plain = np.where(zeta > PLAIN_DAMPING, 0.0, visibility(data, estimate, solution) / PLAIN)
@@ -202,7 +201,15 @@ def _doubles(
     if min(data.measured.shape) > 2:
         double |= (distance < ECHO_REACH * decay) & (rows * references > ECHO_MAC) & ~explained[:, None]
     size = _size(estimate, solution)
-    return np.asarray((double & (size[:, None] < size)).any(axis=1))
+    out = np.zeros(len(size), dtype=bool)
+    touched = np.zeros(len(size), dtype=bool)
+    # smallest first, and each mode in one pair at a time: three poles on two modes mix their shapes
+    for weak in np.argsort(size):
+        partners = np.flatnonzero(double[weak] & (size > size[weak]) & ~touched)
+        if len(partners) and not touched[weak]:
+            out[weak] = True
+            touched[partners] = touched[weak] = True
+    return out
 
 
 def _second_singular(estimate: Estimate, solution: LinearSolution, pairs: NDArray[np.bool_]) -> Real:

@@ -52,6 +52,10 @@ class Noise:
         """Sum of both shares."""
         return np.asarray(self.common + self.own)
 
+    def lines(self, first: int, stop: int) -> Noise:
+        """The same on lines ``first:stop``."""
+        return Noise(self.common[..., first:stop], self.own[..., first:stop])
+
     def weight(self, measured: NDArray[np.bool_]) -> Real:
         """One over variance; 0 where not measured."""
         return np.where(measured[..., None], 1.0 / np.where(self.variance > 0, self.variance, 1.0), 0.0)

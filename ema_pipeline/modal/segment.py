@@ -23,7 +23,7 @@ from ema_pipeline.modal.polish import polish
 Real = NDArray[np.float64]
 
 
-ROUGH = 6
+ROUGH = 4
 """Iterations of the polish while there is still something to drop."""
 
 
