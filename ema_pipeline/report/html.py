@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ema_pipeline.report import summary, tables
+from ema_pipeline.report import diagnosis, summary, tables
 from ema_pipeline.report.moving_gear import fill_of, moving_gears
 from ema_pipeline.report.numbers import format_value, slug, words
 from ema_pipeline.report.plots import Plot, Progress, render
@@ -16,6 +16,7 @@ from ema_pipeline.report.results import ConfigurationResults, RunResults
 HITS_LISTED = 300
 SECTIONS = (
     ("summary", "Summary"),
+    ("diagnosis", "Diagnosis"),
     ("frf", "FRFs and coherence"),
     ("nyquist", "Nyquist circles"),
     ("stabilisation", "Stabilisation charts"),
@@ -83,9 +84,13 @@ def _context(results: RunResults, plots: Sequence[Plot]) -> dict[str, Any]:
         }
         for p in shown
     ]
+    sections = tuple((i, t) for i, t in SECTIONS if i != "diagnosis" or results.shown_ladder is not None)
     return {
         "results": results,
-        "sections": SECTIONS,
+        "sections": sections,
+        "number": {name: k for k, (name, _) in enumerate(sections, start=1)},
+        "diagnosis": _diagnosis(results),
+        "ladder": _ladder(results),
         "images": images,
         "findings": summary.findings(results),
         "cautions": summary.cautions(results),
@@ -106,6 +111,33 @@ def _context(results: RunResults, plots: Sequence[Plot]) -> dict[str, Any]:
         "worst_dofs": tables.worst_dofs_table(compared) if compared and compared.dofs else None,
         "worst_bands": tables.worst_bands_table(compared) if compared and compared.bands else None,
         "fill_of": fill_of,
+    }
+
+
+def _diagnosis(results: RunResults) -> dict[str, Any] | None:
+    found = results.diagnosis
+    if found is None:
+        return None
+    return {
+        "heading": diagnosis.heading(found),
+        "summary": found.summary,
+        "candidates": diagnosis.candidates_table(found),
+        "alike": diagnosis.group_words(found),
+        "next": found.next_measurement,
+        "localisation": diagnosis.localisation_table(found) if found.localisation else None,
+        "notes": found.notes,
+    }
+
+
+def _ladder(results: RunResults) -> dict[str, Any] | None:
+    ladder = results.shown_ladder
+    if ladder is None or not ladder.rungs:
+        return None
+    return {
+        "table": diagnosis.ladder_table(ladder),
+        "noise": diagnosis.noise_words(ladder),
+        "note": ladder.note,
+        "users": results.ladder is not None,
     }
 
 

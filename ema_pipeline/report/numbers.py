@@ -82,6 +82,19 @@ def plain(value: float, figures: int = 4) -> str:
     return _minus(f"{value:.{figures}g}")
 
 
+def below(value: float, limit: float) -> str:
+    """A value under a limit with as many decimals as show that it is under it, two at least.
+
+    >>> below(0.6512, 0.8), below(0.7987, 0.8)
+    ('0.65', '0.799')
+    """
+    for decimals in range(2, 6):
+        text = f"{value:.{decimals}f}"
+        if float(text) < limit:
+            return text
+    return f"just under {limit:g}"
+
+
 def signed(value: float, decimals: int = 1) -> str:
     """A number with its sign; a dash where it is NaN.
 

@@ -11,7 +11,8 @@ from typing import Literal
 from matplotlib.figure import Figure
 
 from ema_pipeline.report import style
-from ema_pipeline.report.figures import comparison, fit, frf, mac, modes, nyquist, shapes
+from ema_pipeline.report.diagnosis import probability_threshold
+from ema_pipeline.report.figures import comparison, diagnosis, fit, frf, mac, modes, nyquist, shapes
 from ema_pipeline.report.numbers import slug
 from ema_pipeline.report.planetary import layout_of
 from ema_pipeline.report.results import ConfigurationResults, RunResults
@@ -63,7 +64,7 @@ class Plot:
 
 def figure_specs(results: RunResults) -> tuple[FigureSpec, ...]:
     """All figures that these results allow, in the order of the report."""
-    specs: list[FigureSpec] = []
+    specs: list[FigureSpec] = [*_diagnosed(results)]
     for configuration in results.configurations:
         specs += _measured(configuration)
     specs += _fitted(results)
@@ -134,6 +135,39 @@ def _render(spec: FigureSpec, formats: Collection[Format]) -> Plot:
 def _chunks(count: int, size: int) -> Iterator[list[int]]:
     for start in range(0, count, size):
         yield list(range(start, min(start + size, count)))
+
+
+def _diagnosed(results: RunResults) -> Iterator[FigureSpec]:
+    found, ladder = results.diagnosis, results.shown_ladder
+    if found is not None and results.comparison is not None and results.comparison.modes:
+        yield FigureSpec(
+            "diagnosis_where",
+            "diagnosis",
+            "",
+            "Where the model fails: the largest difference of every mode, and of the shapes on the gear set",
+            partial(
+                diagnosis.where_it_fails,
+                results.comparison,
+                [layout_of(c) for c in results.configurations],
+                results.comparison_after,
+            ),
+        )
+    if found is not None:
+        yield FigureSpec(
+            "diagnosis_candidates",
+            "diagnosis",
+            "",
+            "What may be missing: probabilities of the candidates and of nothing missing",
+            partial(diagnosis.candidate_probabilities, found, probability_threshold(results)),
+        )
+    if ladder is not None and ladder.rungs:
+        yield FigureSpec(
+            "diagnosis_ladder",
+            "diagnosis",
+            "",
+            "Error of the models rung by rung, on the data fitted and on data held out",
+            partial(diagnosis.ladder_errors, ladder),
+        )
 
 
 def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 
-from ema_pipeline.fit.types import FitResult, ParameterEstimate
-from ema_pipeline.report.numbers import format_value, plain, words
+from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
+from ema_pipeline.report import diagnosis
+from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_CHI2
+from ema_pipeline.report.numbers import below, format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
-
-LOW_MAC = 0.8
-"""Below this a pair is named as doubtful (common practice: 0.9 good, under 0.8 to be looked at)."""
-
-FAR_SIGMA = 3.0
-"""A difference beyond this many standard uncertainties is named."""
-
-POOR_CHI2 = 4.0
-"""χ² per degree of freedom beyond which fitted values are doubtful (misfit twice the uncertainty)."""
 
 SAME_KIND = 2
 """Cautions of one kind that are written out; the rest is counted."""
@@ -26,7 +20,8 @@ _DOF_OR_NUMBER = re.compile(r"-?\b[A-Za-z]\w*\.[a-z]\w*|[\d.]*\d")
 
 def findings(results: RunResults) -> tuple[str, ...]:
     """What was measured and how well the model follows it, one sentence each."""
-    lines = [_measured(c) for c in results.configurations]
+    lines = [] if results.diagnosis is None else [diagnosis.compact(results.diagnosis)]
+    lines += [_measured(c) for c in results.configurations]
     if not lines:
         lines = ["Nothing has been analysed yet."]
     compared, fit = results.comparison, results.fit
@@ -87,11 +82,7 @@ def cautions(results: RunResults) -> tuple[str, ...]:
                     f"{words(p.name)} was fitted to {value}, {abs(p.shift_z):.1f} tolerances from "
                     f"its nominal {format_value(p.nominal, p.prior_std, p.unit)}: check the nominal value."
                 )
-        lines += [
-            f"Error function of {words(s.parameter)}, {s.configuration}, {s.mode_count} modes: {s.note}"
-            for s in fit.sweeps
-            if not s.identified
-        ]
+        lines += _flat_sweeps(fit.sweeps)
     for c in results.configurations:
         lines += [f"{c.name}: {text}" for text in _cautions_of(c)]
     lines += results.warnings
@@ -139,10 +130,38 @@ def _cautions_of(c: ConfigurationResults) -> list[str]:
         ]
         weak = [p for p in c.pairing.pairs if p.mac < LOW_MAC]
         if weak:
-            named = ", ".join(f"{p.measured_frequency_hz:.5g} Hz ({p.mac:.2f})" for p in weak[:6])
+            named = ", ".join(f"{p.measured_frequency_hz:.5g} Hz ({below(p.mac, LOW_MAC)})" for p in weak[:6])
             more = f" and {len(weak) - 6} more" if len(weak) > 6 else ""
             lines.append(f"doubtful pairs with MAC under {LOW_MAC}: {named}{more}")
     return lines
+
+
+def _flat_sweeps(sweeps: Sequence[ErrorSweep]) -> list[str]:
+    """One sentence per stiffness whose error function determines nothing, over all its sweeps."""
+    groups: dict[tuple[str, str], list[ErrorSweep]] = {}
+    for s in sweeps:
+        if not s.identified:
+            groups.setdefault((s.parameter, s.configuration), []).append(s)
+    lines = []
+    for (parameter, configuration), mine in groups.items():
+        counts = " or ".join(str(n) for n in sorted({s.mode_count for s in mine}))
+        lines.append(
+            f"ε of {words(parameter)} ({configuration}) determines nothing with {counts} modes: "
+            f"{_flat_words(mine)}"
+        )
+    return lines
+
+
+def _flat_words(sweeps: Sequence[ErrorSweep]) -> str:
+    """How much ε changes over the sweeps, or why its minimum means nothing."""
+    flat = [s for s in sweeps if s.note.startswith("flat")]
+    if len(flat) == len(sweeps):
+        changes = [
+            100 * float((s.error.max() - s.error.min()) / max(float(s.error.min()), 1e-300)) for s in sweeps
+        ]
+        low, high = plain(min(changes), 2), plain(max(changes), 2)
+        return f"it changes by {low if low == high else f'{low}–{high}'} % over the sweep"
+    return "; ".join(dict.fromkeys(s.note for s in sweeps))
 
 
 def _worst(results: RunResults) -> list[str]:

@@ -7,10 +7,12 @@ import io
 import json
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 
@@ -65,6 +67,11 @@ def summary(results: RunResults) -> dict[str, Any]:
             "error": results.comparison.error,
             "frequency_error": results.comparison.frequency_error,
         }
+    if results.diagnosis is not None:
+        content["diagnosis"] = _diagnosis(results.diagnosis)
+    if results.shown_ladder is not None:
+        content["ladder"] = _ladder(results.shown_ladder)
+        content["ladder_note"] = results.shown_ladder.note
     content["warnings"] = list(results.warnings)
     return content
 
@@ -92,6 +99,61 @@ def _fit(fit: FitResult) -> dict[str, Any]:
         "two_step": None if fit.two_step is None else asdict(fit.two_step),
         "notes": list(fit.notes),
     }
+
+
+def _diagnosis(found: Diagnosis) -> dict[str, Any]:
+    """The diagnosis; `probabilities` are those of every hypothesis and add up to 1."""
+    return {
+        "verdict": found.verdict,
+        "summary": found.summary,
+        "candidates": [_candidate(c) for c in found.candidates],
+        "indistinguishable": [list(group) for group in found.indistinguishable],
+        "next_measurement": found.next_measurement,
+        "nothing_missing_probability": found.null_probability,
+        "probabilities": dict(found.probabilities),
+        "error": found.error,
+        "heldout_error": found.heldout_error,
+        "localisation": [asdict(place) for place in found.localisation],
+        "notes": list(found.notes),
+    }
+
+
+def _candidate(c: Candidate) -> dict[str, Any]:
+    return {
+        "effect": c.effect,
+        "at": c.at,
+        "title": c.title,
+        "probability": c.probability,
+        "parameters": _sizes(c.parameters),
+        "error_before": c.error_before,
+        "error_after": c.error_after,
+        "heldout_error_before": c.heldout_before,
+        "heldout_error_after": c.heldout_error_after,
+        "gain": c.gain,
+        "threshold": c.threshold,
+        "log_evidence": c.log_evidence,
+        "claimed": c.claimed,
+        "why": c.why,
+    }
+
+
+def _ladder(ladder: Ladder) -> list[dict[str, Any]]:
+    return [
+        {
+            "effects": list(r.effects),
+            "error": r.error,
+            "heldout_error": r.heldout_error,
+            "chi2": r.chi2,
+            "log_evidence": r.log_evidence,
+            "unexplained_modes": r.unexplained,
+            "parameters": _sizes(r.parameters),
+        }
+        for r in ladder.rungs
+    ]
+
+
+def _sizes(sizes: Mapping[str, EffectSize]) -> dict[str, Any]:
+    return {name: asdict(s) for name, s in sizes.items()}
 
 
 def _configuration(c: ConfigurationResults) -> dict[str, Any]:

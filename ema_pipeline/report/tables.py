@@ -10,8 +10,16 @@ from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.modal.types import ModalModel, Mode
-from ema_pipeline.report.numbers import format_percent, format_value, plain, prefixed, signed, words
-from ema_pipeline.report.summary import FAR_SIGMA, LOW_MAC
+from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC
+from ema_pipeline.report.numbers import (
+    below,
+    format_percent,
+    format_value,
+    plain,
+    prefixed,
+    signed,
+    words,
+)
 from ema_pipeline.verdict import Verdict
 
 
@@ -70,7 +78,7 @@ def pairs_table(pairing: Pairing, modal: ModalModel) -> Table:
                     str(p.model + 1),
                     plain(p.model_frequency_hz, 5),
                     signed(percent, 2),
-                    f"{p.mac:.2f}",
+                    below(p.mac, LOW_MAC) if weak else f"{p.mac:.2f}",
                     p.family,
                     remark,
                 ),

@@ -6,6 +6,7 @@ deserve a look start with ``!``.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 
 from rich import box
@@ -15,15 +16,21 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from ema_pipeline.correlate.types import Comparison, Pairing
+from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.report import summary, tables
+from ema_pipeline.report import diagnosis, summary, tables
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.results import RunResults
 
 Clean = Callable[[str], str]
 _SHORT = 15
+_VALUE = 32
+_ERROR_WORDS = (
+    "error: root mean square of (measurement - model)/σ, about 1 where the model explains the data; "
+    "held out: the same on data that the fit has not seen"
+)
 _ASCII = str.maketrans(
     {
         "±": "+/-",
@@ -35,7 +42,7 @@ _ASCII = str.maketrans(
         "²": "^2",
         "³": "^3",
         "ζ": "zeta",
-        "σ": " sigma",
+        "σ": "sigma",
         "ε": "epsilon",
         "χ": "chi",
         "µ": "u",
@@ -51,6 +58,13 @@ _ASCII = str.maketrans(
         "’": "'",
         "°": " deg",
         "ω": "omega",
+        "→": "->",
+        "◆": "*",
+        "½": "1/2",
+        "√": "sqrt ",
+        "ψ": "psi",
+        "λ": "lambda",
+        "\u00a0": " ",
         "Σ": "sum ",
     }
 )
@@ -153,8 +167,59 @@ def comparison_tables(compared: Comparison) -> RenderableType:
     return Group(*parts)
 
 
-def run_summary(results: RunResults) -> RenderableType:
-    """The run in a few sentences: findings, stiffnesses, and what to be careful about."""
+def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
+    """Verdict, candidates, what cannot be told apart, what to measure and what to type next.
+
+    Parameters
+    ----------
+    found : Diagnosis
+    out : str
+        Results folder as the user would type it.
+    """
+    parts: list[RenderableType] = [_heading(diagnosis.heading(found)), _line(found.summary)]
+    if found.candidates:
+        parts += [_line(""), _rich(diagnosis.short_candidates_table(found), "What may be missing")]
+        parts.append(_line(_ERROR_WORDS))
+    if found.verdict not in ("adequate", "not_enough_data"):
+        for c in diagnosis.leading(found):
+            parts += [_line(""), _line(f"{diagnosis.label_words(c.label)}: {c.title}. {c.why}")]
+    if found.indistinguishable:
+        parts += [_line(""), *(_line(f"! {text}") for text in diagnosis.group_words(found))]
+    if found.localisation:
+        parts += [_line(""), _rich(diagnosis.localisation_table(found), "Where the misfit sits")]
+    if found.next_measurement:
+        parts += [_line(""), _line(f"Measure next: {found.next_measurement}")]
+    if found.notes:
+        parts += [_line(""), _line("From the data's screening:"), *(_line(f"! {n}") for n in found.notes)]
+    parts += _commands(diagnosis.next_commands(found, out))
+    return Group(*parts)
+
+
+def ladder_screen(ladder: Ladder) -> RenderableType:
+    """Every model with its error on the data fitted and on data held out."""
+    heads = ("model", "size (±1σ)", "error", "held out", "left", "evidence")
+    parts: list[RenderableType] = [
+        _rich(_renamed(diagnosis.ladder_table(ladder), heads), "Ladder of models"),
+        _line(
+            f"{_ERROR_WORDS}; left: measured modes that the model does not explain; evidence: logarithm, "
+            "against the base model"
+        ),
+        _line(diagnosis.noise_words(ladder)),
+    ]
+    if ladder.note:
+        parts.append(_line(f"Where climbing ended: {ladder.note}."))
+    return Group(*parts)
+
+
+def run_summary(results: RunResults, out: str = "OUT") -> RenderableType:
+    """The run in a few sentences: findings, stiffnesses, what to be careful about, and what to type next.
+
+    Parameters
+    ----------
+    results : RunResults
+    out : str
+        Results folder as the user would type it.
+    """
     parts: list[RenderableType] = [_line(line) for line in summary.findings(results)]
     if results.fit is not None:
         parts += [
@@ -164,6 +229,11 @@ def run_summary(results: RunResults) -> RenderableType:
     cautions = summary.cautions(results)
     if cautions:
         parts += [_line(""), _line("Be careful about:"), *(_line(f"! {c}") for c in cautions)]
+    if results.diagnosis is not None:
+        added = (
+            results.ladder.rungs[-1].effects if results.ladder is not None and results.ladder.rungs else ()
+        )
+        parts += _commands(diagnosis.next_commands(results.diagnosis, out, added))
     return Group(*parts)
 
 
@@ -186,6 +256,7 @@ class Safe:
 
 
 def _to_ascii(text: str) -> str:
+    text = re.sub(r"(?<=\w)σ", " σ", text)  # 3σ reads 3 sigma
     return text.translate(_ASCII).encode("ascii", "replace").decode("ascii")
 
 
@@ -193,6 +264,15 @@ def _sweep_words(identified: bool, minimum: float, note: str) -> str:
     if identified:
         return f"minimum of ε at {format_value(minimum, float('nan'), 'N/m')}"
     return f"not identified ({note})" if note else "not identified"
+
+
+def _heading(text: str) -> Safe:
+    return Safe(lambda clean, rigid: Text(clean(text), style="bold"))
+
+
+def _commands(lines: Sequence[str]) -> list[RenderableType]:
+    """Commands to copy, one a line."""
+    return [_line(""), _line("Next:"), *(_line(f"  {line}") for line in lines)] if lines else []
 
 
 def _line(text: str) -> Safe:
@@ -232,8 +312,11 @@ def _build(source: tables.Table, title: str, clean: Clean, rigid: bool) -> RichT
     table.add_column("", width=1, no_wrap=True)
     for k in kept:
         numeric = k in source.numeric
-        short = max((len(r.cells[k]) for r in source.rows), default=0) <= _SHORT
-        value = any(r.cells[k][:1].isdigit() and "±" in r.cells[k] for r in source.rows)
+        longest = max((len(line) for r in source.rows for line in r.cells[k].splitlines()), default=0)
+        short = longest <= _SHORT
+        value = any(
+            "±" in r.cells[k] and (r.cells[k][:1].isdigit() or longest <= _VALUE) for r in source.rows
+        )
         table.add_column(
             Text(clean(source.head[k])),
             justify="right" if numeric else "left",

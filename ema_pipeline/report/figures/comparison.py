@@ -112,11 +112,8 @@ def dof_differences(dofs: Sequence[DofDifference], layout: GearLayout | None = N
     ax.set_title("Per DOF" + (f" (worst {len(keep)} of {len(dofs)})" if len(keep) < len(dofs) else ""))
     if layout is not None:
         gear = figure.add_axes((share + 0.01, 0.24, 0.97 - share, 0.68))
-        worst: dict[str, float] = {}
-        for d in dofs:
-            body = body_of(d.dof)
-            worst[body] = max(worst.get(body, 0.0), float(np.nan_to_num(d.z)))
-        norm, colours = _levels()
+        worst = worst_per_body(dofs)
+        norm, colours = severity()
         fills = {
             b.name: to_hex(colours(norm(worst[b.name]))) if b.name in worst else "#ffffff"
             for b in layout.bodies
@@ -165,7 +162,7 @@ def band_differences(bands: Sequence[BandDifference], configuration: str) -> Fig
     figure = new_figure(0.95 + max(0.145 * len(pairs), 0.8))
     grid = figure.add_gridspec(1, 1, **margins(figure, left=1.5, right=0.95, bottom=0.55, top=0.35))
     ax = figure.add_subplot(grid[0])
-    norm, colours = _levels()
+    norm, colours = severity()
     image = ax.imshow(values, norm=norm, cmap=colours, aspect="auto", interpolation="nearest")
     ax.grid(False)
     ax.set_yticks(range(len(pairs)), [f"{o} ← {i}" for o, i in pairs], fontsize=6)
@@ -198,6 +195,16 @@ def sigma_axis(ax: Axes, limit: float) -> None:
     ax.set_ylim(-limit, limit)
 
 
-def _levels() -> tuple[BoundaryNorm, matplotlib.colors.Colormap]:
+def worst_per_body(dofs: Sequence[DofDifference]) -> dict[str, float]:
+    """Largest shape difference of every body that carries a sensor, in σ."""
+    worst: dict[str, float] = {}
+    for d in dofs:
+        body = body_of(d.dof)
+        worst[body] = max(worst.get(body, 0.0), float(np.nan_to_num(d.z)))
+    return worst
+
+
+def severity() -> tuple[BoundaryNorm, matplotlib.colors.Colormap]:
+    """Colours of differences in σ, darker where worse."""
     colours = matplotlib.colormaps["OrRd"].with_extremes(bad=LIGHT)
     return BoundaryNorm(LEVELS, colours.N, extend="max"), colours

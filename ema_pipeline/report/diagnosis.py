@@ -1,0 +1,315 @@
+"""The diagnosis and the ladder in words and tables, for the report and for the terminal."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Mapping, Sequence
+
+from ema_pipeline.diagnose.explain import label_text
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder
+from ema_pipeline.report.numbers import format_value, plain, words
+from ema_pipeline.report.results import RunResults
+from ema_pipeline.report.tables import Row, Table
+
+NOTHING = "nothing"
+_COUNTS = {2: "Two", 3: "Three", 4: "Four", 5: "Five", 6: "Six"}
+
+
+def heading(found: Diagnosis) -> str:
+    """The verdict as a heading."""
+    if found.verdict == "effect":
+        return (
+            f"Missing: {' and '.join(label_words(c.label) for c in claimed(found)) or 'see the candidates'}"
+        )
+    if found.verdict == "ambiguous":
+        count = max((len(g) for g in found.indistinguishable), default=2)
+        return f"{_COUNTS.get(count, str(count))} explanations fit equally well"
+    return {
+        "adequate": "Nothing is missing as far as these data can tell",
+        "unknown_effect": "Something is missing that the library does not hold",
+        "not_enough_data": "Not enough data to tell what is missing",
+    }[found.verdict]
+
+
+def label_words(label: str) -> str:
+    """A label as a phrase, e.g. ``mesh stiffness loss at sun-planet1``."""
+    return words(label_text(label))
+
+
+def claimed(found: Diagnosis) -> tuple[Candidate, ...]:
+    """Candidates that the data support, in the order of the ladder."""
+    order = {label: k for k, label in enumerate(found.ladder.rungs[-1].effects)} if found.ladder.rungs else {}
+    mine = [c for c in found.candidates if c.claimed]
+    return tuple(sorted(mine, key=lambda c: order.get(c.label, len(order))))
+
+
+def leading(found: Diagnosis) -> tuple[Candidate, ...]:
+    """What a reader should hear of: the group that fits alike, the claimed candidates, or the best one."""
+    alike = {label for group in found.indistinguishable for label in group}
+    if alike:
+        return tuple(c for c in found.candidates if c.label in alike)
+    return claimed(found) or found.candidates[:1]
+
+
+def size_words(parameters: Mapping[str, EffectSize], between: str = "; ") -> str:
+    """Sizes with their uncertainty, e.g. ``fraction 0.3500 ± 0.0020``."""
+    return between.join(f"{words(n)} {format_value(s.value, s.std, s.unit)}" for n, s in parameters.items())
+
+
+def probability_words(p: float) -> str:
+    """A probability in per cent that is never rounded to certainty.
+
+    >>> probability_words(0.97), probability_words(0.99996), probability_words(1e-7)
+    ('97 %', '>99.9 %', '<0.1 %')
+    """
+    if not math.isfinite(p):
+        return "–"
+    if p > 0.999:
+        return ">99.9 %"
+    if p < 0.001:
+        return "<0.1 %"
+    return f"{100 * p:.1f} %" if p < 0.0995 or p > 0.9895 else f"{100 * p:.0f} %"
+
+
+def standing(found: Diagnosis, candidate: Candidate) -> str:
+    """What the data say of a candidate, in a word or two."""
+    if any(candidate.label in group for group in found.indistinguishable):
+        return "fits alike"
+    if candidate.claimed:
+        return "best, not enough" if found.verdict == "unknown_effect" else "supported"
+    if candidate.gain < candidate.threshold:
+        return "no better than chance"
+    return "less likely"
+
+
+def candidates_table(found: Diagnosis) -> Table:
+    """One row per candidate, and last what stays where nothing is missing."""
+    rows = [
+        Row(
+            (
+                words(c.effect),
+                words(c.at),
+                size_words(c.parameters),
+                probability_words(c.probability),
+                standing(found, c),
+                _change(c.error_before, c.error_after),
+                _change(c.heldout_before, c.heldout_error_after),
+                c.why,
+            ),
+            _stands_out(found, c),
+        )
+        for c in found.candidates
+    ]
+    rows.append(
+        Row(
+            (
+                "nothing missing",
+                "",
+                "",
+                probability_words(found.null_probability),
+                "",
+                plain(found.error, 3),
+                plain(found.heldout_error, 3),
+                "The model as it is.",
+            ),
+            found.verdict == "adequate",
+        )
+    )
+    head = ("effect", "where", "size (±1σ)", "probability", "data say", "error, σ", "held out, σ", "why")
+    return Table(head, tuple(rows), frozenset({3, 5, 6}))
+
+
+def short_candidates_table(found: Diagnosis) -> Table:
+    """The candidates as they fit 80 columns: errors after adding each."""
+    rows = [
+        Row(
+            (
+                label_words(c.label),
+                size_words(c.parameters, ";\n"),
+                probability_words(c.probability),
+                plain(c.error_after, 3),
+                plain(c.heldout_error_after, 3),
+            ),
+            _stands_out(found, c),
+        )
+        for c in found.candidates
+    ]
+    rows.append(
+        Row(
+            (
+                "nothing missing",
+                "",
+                probability_words(found.null_probability),
+                plain(found.error, 3),
+                plain(found.heldout_error, 3),
+            ),
+            found.verdict == "adequate",
+        )
+    )
+    return Table(
+        ("if this is added", "size (±1σ)", "probable", "error", "held out"),
+        tuple(rows),
+        frozenset({2, 3, 4}),
+    )
+
+
+def ladder_table(ladder: Ladder) -> Table:
+    """One row per model from the base model upwards, each with what it adds to the one before."""
+    rows: list[Row] = []
+    before: tuple[str, ...] = ()
+    for rung in ladder.rungs:
+        rows.append(
+            Row(
+                (
+                    rung_words(before, rung.effects),
+                    size_words(_own_sizes(before, rung.effects, rung.parameters), ";\n"),
+                    plain(rung.error, 3),
+                    plain(rung.heldout_error, 3),
+                    str(rung.unexplained),
+                    plain(rung.log_evidence, 3),
+                )
+            )
+        )
+        before = rung.effects
+    head = ("model", "size (±1σ)", "error, σ", "held out, σ", "modes left", "ln evidence")
+    return Table(head, tuple(rows), frozenset({2, 3, 4, 5}))
+
+
+def rung_words(before: Sequence[str], effects: Sequence[str]) -> str:
+    """What a rung adds, e.g. ``+ mesh stiffness loss at sun-planet1``."""
+    if not effects:
+        return "base model"
+    added = [label_words(e) for e in effects if e not in before]
+    dropped = [label_words(e) for e in before if e not in effects]
+    return " ".join([*(f"+ {t}" for t in added), *(f"− {t}" for t in dropped)]) or "the same"
+
+
+def noise_words(ladder: Ladder) -> str:
+    """What σ holds beside the test's own scatter."""
+    return (
+        f"σ: the test's own scatter and, beside it, {plain(100 * ladder.frequency_noise, 2)} % of frequency, "
+        f"{plain(100 * ladder.damping_noise, 2)} % of damping, "
+        f"{plain(100 * ladder.shape_noise, 2)} % of a shape's largest entry."
+    )
+
+
+def localisation_table(found: Diagnosis) -> Table:
+    """Where the misfit sits and how it acts, best first."""
+    units = {
+        "stiffness": "N/m",
+        "mass": "kg",
+        "viscous damping": "N·s/m",
+        "hysteretic damping": "N/m",
+    }
+    rows = tuple(
+        Row(
+            (
+                place.place,
+                place.acts_like,
+                format_value(place.size, math.nan, units.get(place.acts_like, "")),
+                plain(place.score, 3),
+            )
+        )
+        for place in found.localisation
+    )
+    return Table(("where", "acts like", "size", "χ² it takes away"), rows, frozenset({2, 3}))
+
+
+def group_words(found: Diagnosis) -> tuple[str, ...]:
+    """One sentence per group that the data cannot tell apart."""
+    return tuple(
+        f"These data cannot tell apart: {'; '.join(label_words(label) for label in group)}."
+        for group in found.indistinguishable
+    )
+
+
+def compact(found: Diagnosis) -> str:
+    """Verdict, best candidates with probability and size, error before and after, in a sentence or two."""
+    if found.verdict == "adequate":
+        odds = probability_words(found.null_probability)
+        return (
+            f"Diagnosis: {_lower(heading(found))} (probability {odds}); error {plain(found.error, 3)}, "
+            f"{plain(found.heldout_error, 3)} on held-out data."
+        )
+    if found.verdict == "not_enough_data":
+        return f"Diagnosis: {_lower(heading(found))}. {found.summary}"
+    if found.verdict == "effect":
+        return f"Diagnosis: {_named(found)}."
+    return f"Diagnosis: {_lower(heading(found))}. Best in the library: {_named(found)}."
+
+
+def _named(found: Diagnosis) -> str:
+    missing = "missing: " if found.verdict == "effect" else ""
+    named = "; ".join(
+        f"{missing}{label_words(c.label)}"
+        + (f", {size_words(c.parameters, ', ')}" if c.parameters else "")
+        + f" (probability {probability_words(c.probability)}, "
+        + f"error {plain(c.error_before, 3)} → {plain(c.error_after, 3)})"
+        for c in leading(found)
+    )
+    return named or "nothing"
+
+
+def next_commands(found: Diagnosis, out: str = "OUT", added: Sequence[str] = ()) -> tuple[str, ...]:
+    """What a user would type next.
+
+    Parameters
+    ----------
+    found : Diagnosis
+    out : str
+        Results folder as the user would type it.
+    added : sequence of str
+        Labels that are in the model already.
+    """
+    folder = shlex.quote(out) if out else "OUT"
+    if found.verdict == "effect":
+        new = [c.label for c in claimed(found) if c.label not in added]
+        return (f"ema add {folder} {' '.join(new)}", f"ema ladder {folder}") if new else ()
+    if found.verdict == "ambiguous":
+        # one of them, the user's choice: each line stands for itself
+        return tuple(f"ema add {folder} {c.label}" for c in leading(found) if c.label not in added)
+    if found.verdict == "unknown_effect":
+        return (f"ema compare {folder}", f"ema diagnose {folder} --effect-file my_effect.py")
+    return ()
+
+
+def probability_threshold(results: RunResults) -> float:
+    """Probability that a claim needs: as the diagnosis was set, or else by default."""
+    default = float(DiagnoseSettings().probability_least)
+    text = results.settings.get("diagnose", {}).get("probability_least", "")
+    try:
+        return float(text)
+    except ValueError:
+        return default
+
+
+def _stands_out(found: Diagnosis, c: Candidate) -> bool:
+    return c.claimed or any(c.label in group for group in found.indistinguishable)
+
+
+def _change(before: float, after: float) -> str:
+    """``3.10 → 1.02``; a dash where there is nothing after."""
+    return f"{plain(before, 3)} → {plain(after, 3)}" if math.isfinite(after) else "–"
+
+
+def _own_sizes(
+    before: Sequence[str], effects: Sequence[str], parameters: Mapping[str, EffectSize]
+) -> dict[str, EffectSize]:
+    """Sizes of what this rung adds, by their own names."""
+    own: dict[str, EffectSize] = {}
+    for label in effects:
+        if label in before:
+            continue
+        _, _, place = label.partition("@")
+        for name, size in parameters.items():
+            if name.startswith(f"{label}."):
+                own[name.removeprefix(f"{label}.")] = size
+            elif label == f"out_of_tolerance@{name}":
+                own[place] = size
+    return own
+
+
+def _lower(text: str) -> str:
+    return text[:1].lower() + text[1:]

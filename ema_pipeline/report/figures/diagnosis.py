@@ -1,0 +1,285 @@
+"""The diagnosis in pictures: where the model fails, what may be missing, and the error rung by rung."""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+from ema_pipeline.correlate.types import Comparison, ModeDifference
+from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.report.diagnosis import NOTHING, label_words, probability_words, rung_words
+from ema_pipeline.report.figures.comparison import severity, worst_per_body
+from ema_pipeline.report.figures.shapes import draw_gear
+from ema_pipeline.report.numbers import plain
+from ema_pipeline.report.planetary import GearLayout, Motion
+from ema_pipeline.report.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    VERMILLION,
+    margins,
+    new_figure,
+    styled,
+)
+
+HALF_IN = 3.55
+"""Width of figures that stand side by side."""
+
+MODES_SHOWN = 40
+_FLOOR = 0.5
+_QUANTITIES = (
+    ("frequency", "frequency_z", BLUE, ""),
+    ("damping", "damping_z", GREEN, "///"),
+    ("shape", "shape_z", VERMILLION, "..."),
+)
+
+
+@styled
+def candidate_probabilities(found: Diagnosis, threshold: float) -> Figure:
+    """Probabilities of the candidates, of all others together, and of nothing missing.
+
+    What the data support has a full bar and says so; the rest is hatched.
+    """
+    bars = [(label_words(c.label), c.probability, c.claimed) for c in found.candidates]
+    listed = {c.label for c in found.candidates} | {NOTHING}
+    others = [p for label, p in found.probabilities.items() if label not in listed]
+    if others:
+        bars.append((f"{len(others)} others together", math.fsum(others), False))
+    bars.append(("nothing missing", found.null_probability, found.verdict == "adequate"))
+    figure = new_figure(0.75 + 0.27 * max(len(bars), 4), HALF_IN)
+    ax = figure.add_subplot(
+        figure.add_gridspec(1, 1, **margins(figure, left=1.42, right=0.1, bottom=0.42))[0]
+    )
+    at = np.arange(len(bars))
+    for k, (_, p, supported) in enumerate(bars):
+        ax.barh(
+            k,
+            p,
+            0.62,
+            fc=BLUE if supported else "#ffffff",
+            ec=BLUE if supported else GREY,
+            hatch="" if supported else "////",
+            lw=0.8,
+        )
+        text = probability_words(p) + (" ◆" if supported else "")
+        inside = p > 0.6
+        ax.text(
+            0.03 if inside else p + 0.02,
+            k,
+            text,
+            ha="left",
+            va="center",
+            fontsize=7,
+            fontweight="bold" if supported else "normal",
+            color="white" if inside and supported else BLACK,
+            bbox={"fc": "white", "ec": "none", "pad": 0.8} if not (inside and supported) else None,
+        )
+    ax.axvline(threshold, color=VERMILLION, lw=1.0, ls="--", zorder=0.5 if threshold < 0.5 else 3)
+    ax.set_title(f"Probability (◆ supported; dashed: {threshold:g} needed)", x=-0.62, ha="left", fontsize=7.6)
+    ax.set_yticks(at, [textwrap.fill(name, 29, break_on_hyphens=False) for name, _, _ in bars], fontsize=6.2)
+    ax.set_ylim(len(bars) - 0.4, -0.6)
+    ax.set_xlim(0, 1)
+    ax.set_xticks([0, 0.25, 0.5, 0.75, 1.0], ["0", "0.25", "0.5", "0.75", "1"])
+    ax.set_xlabel("probability, 1")
+    ax.grid(False, axis="y")
+    return figure
+
+
+@styled
+def ladder_errors(ladder: Ladder) -> Figure:
+    """Error on the data fitted and on data held out, from the base model upwards."""
+    rungs = ladder.rungs
+    figure = new_figure(2.62, HALF_IN)
+    ax = figure.add_subplot(
+        figure.add_gridspec(1, 1, **margins(figure, left=0.55, right=0.1, bottom=0.86))[0]
+    )
+    at = np.arange(len(rungs))
+    fitted = np.array([r.error for r in rungs], dtype=float)
+    held = np.array([r.heldout_error for r in rungs], dtype=float)
+    every = np.concatenate([fitted, held])
+    every = every[np.isfinite(every) & (every > 0)]
+    low, high = min([0.7, *every]), max([3.0, *every])
+    room = (high / low) ** 0.16  # for the numbers beside the points
+    low, high = low / room, high * room
+    ax.axhline(1.0, color=BLACK, lw=0.9, ls=":", label="about 1: explained")
+    ax.plot(at - 0.04, fitted, "o-", color=BLUE, label="data fitted", ms=5)
+    ax.plot(at + 0.04, held, "s--", color=VERMILLION, label="data held out", ms=5, mfc="white")
+    for k in range(len(rungs)):
+        for value, other, side in ((fitted[k], held[k], -1), (held[k], fitted[k], 1)):
+            if not np.isfinite(value):
+                continue
+            # the larger of the two is written above, the smaller below
+            above = value > other or (value == other and side > 0) or not np.isfinite(other)
+            ax.annotate(
+                plain(float(value), 3),
+                (k + 0.04 * side, value),
+                (0, 5 if above else -5),
+                textcoords="offset points",
+                ha="center",
+                va="bottom" if above else "top",
+                fontsize=6.5,
+                color=BLUE if side < 0 else VERMILLION,
+                bbox={"fc": "white", "ec": "none", "pad": 0.4, "alpha": 0.8},
+            )
+    ax.set_yscale("log")
+    ax.set_ylim(low, high)
+    _plain_log(ax, low, high)
+    ax.set_xlim(-0.5, len(rungs) - 0.5)
+    wide = max(9, 44 // max(len(rungs), 1))
+    befores = [(), *(r.effects for r in rungs[:-1])]
+    ax.set_xticks(
+        at,
+        [
+            textwrap.fill(rung_words(b, r.effects), wide, break_on_hyphens=False)
+            for b, r in zip(befores, rungs, strict=True)
+        ],
+        fontsize=6,
+    )
+    ax.grid(False, axis="x")
+    ax.set_ylabel("error, σ root mean square")
+    ax.set_title("Error rung by rung", loc="left")
+    figure.legend(
+        loc="lower center", ncols=3, frameon=False, handlelength=2.4, columnspacing=1.0, fontsize=6.5
+    )
+    return figure
+
+
+@styled
+def where_it_fails(
+    before: Comparison, layouts: Sequence[GearLayout | None], after: Comparison | None = None
+) -> Figure:
+    """The largest difference of every mode, and the shape's misfit on a drawing of the gear set.
+
+    Parameters
+    ----------
+    before : Comparison
+        Of the model that was diagnosed.
+    layouts : sequence of GearLayout or None
+        One per configuration; the one with most bodies is drawn, and no gear where there is none.
+    after : Comparison or None
+        Of the model with what was found; drawn as hollow diamonds.
+    """
+    layout = max((g for g in layouts if g is not None), key=lambda g: len(g.bodies), default=None)
+    figure = new_figure(2.55)
+    width, height = figure.get_size_inches()
+    right = 2.35 if layout is not None and before.dofs else 0.1
+    ax = figure.add_axes(
+        (0.55 / width, 0.62 / height, (width - 0.55 - right) / width, (height - 1.08) / height)
+    )
+    _mode_bars(ax, before.modes, {} if after is None else {_key(m): _worst(m)[0] for m in after.modes})
+    handles = [Patch(fc=c, hatch=h, ec="white", label=name) for name, _, c, h in _QUANTITIES]
+    if after is not None:
+        (mark,) = ax.plot([], [], "D", mfc="white", mec=BLACK, ms=3.6, label="with what was found")
+        handles.append(mark)
+    figure.legend(
+        handles=[*handles, Patch(fc="#efefef", label="chance (2σ)")],
+        loc="upper left",
+        bbox_to_anchor=(0.06, 1.0),
+        ncols=len(handles) + 1,
+        frameon=False,
+        columnspacing=1.0,
+        handletextpad=0.5,
+        fontsize=6.4,
+    )
+    if layout is not None and before.dofs:
+        gear = figure.add_axes(((width - right + 0.1) / width, 0.0, (right - 0.1) / width, 0.9))
+        _gear_misfit(gear, layout, worst_per_body(before.dofs))
+    return figure
+
+
+def _mode_bars(ax: Axes, modes: Sequence[ModeDifference], after: Mapping[tuple[str, int], float]) -> None:
+    worst = {_key(m): _worst(m) for m in modes}
+    ranked = sorted(modes, key=lambda m: -worst[_key(m)][0])[:MODES_SHOWN]
+    shown = [m for m in modes if m in ranked]
+    at, names, x = [], [], 0.0
+    for k, m in enumerate(shown):
+        if k and m.configuration != shown[k - 1].configuration:
+            x += 1.2
+        at.append(x)
+        names.append(f"{m.measured_frequency_hz:.4g}")
+        x += 1.0
+    high = max([20.0, *(1.6 * worst[_key(m)][0] for m in shown), *(1.6 * v for v in after.values())])
+    ax.axhspan(_FLOOR, 2, color="#efefef", lw=0, zorder=0)
+    for place, m in zip(at, shown, strict=True):
+        size, quantity = worst[_key(m)]
+        _, _, color, hatch = _QUANTITIES[quantity]
+        ax.bar(
+            place,
+            max(size, _FLOOR) - _FLOOR,
+            0.8,
+            bottom=_FLOOR,
+            color=color,
+            hatch=hatch,
+            ec="white",
+            lw=0.3,
+        )
+        if _key(m) in after:
+            ax.plot(place, max(after[_key(m)], 1.1 * _FLOOR), "D", mfc="white", mec=BLACK, ms=3.6, zorder=4)
+    for name in dict.fromkeys(m.configuration for m in shown):
+        mine = [p for p, m in zip(at, shown, strict=True) if m.configuration == name]
+        ax.text(mine[0] - 0.4, 1.01, name, transform=ax.get_xaxis_transform(), fontsize=7, fontweight="bold")
+    ax.set_yscale("log")
+    ax.set_ylim(_FLOOR, high)
+    _plain_log(ax, _FLOOR, high)
+    ax.set_xlim(-0.8, max(x - 0.2, 1.0))
+    ax.set_xticks(at, names, rotation=90, fontsize=5.8)
+    ax.grid(False, axis="x")
+    cut = f" (worst {len(shown)} of {len(modes)})" if len(shown) < len(modes) else ""
+    ax.set_xlabel(f"measured mode{cut}, Hz")
+    ax.set_ylabel("largest |difference|/σ, 1")
+
+
+def _gear_misfit(ax: Axes, layout: GearLayout, worst: Mapping[str, float]) -> None:
+    norm, colours = severity()
+    fills = {
+        b.name: to_hex(colours(norm(worst[b.name]))) if b.name in worst else "#ffffff" for b in layout.bodies
+    }
+    still = {b.name: Motion(0, 0, 0, ("x", "y", "u")) for b in layout.bodies}
+    draw_gear(ax, layout, still, 0.0, fills)
+    top = max([5.0, *worst.values()])
+    for b in layout.bodies:
+        if b.name not in worst:
+            continue
+        diagonal = 0.71 * b.radius
+        x, y = {"carrier": (diagonal, diagonal), "ring": (0.0, b.radius + 0.18)}.get(b.name, (b.x, b.y))
+        z = worst[b.name]
+        ax.plot(x, y, "o", ms=11 + 13 * min(z / top, 1.0), mfc=fills[b.name], mec=BLACK, mew=0.7, zorder=6)
+        ax.text(
+            x, y, f"{z:.1f}", ha="center", va="center", fontsize=6.4, zorder=7,
+            color="white" if float(norm(z)) > 0.62 * colours.N else BLACK,
+        )  # fmt: skip
+    ax.set_title("Shape misfit per body, σ", fontsize=7.6, pad=1)
+    ax.text(
+        0.5, 0.005, "larger and darker: worse; white: not measured", transform=ax.transAxes, ha="center",
+        fontsize=5.8, color=GREY,
+    )  # fmt: skip
+
+
+def _worst(m: ModeDifference) -> tuple[float, int]:
+    """Largest of the three differences in σ, and which of `_QUANTITIES` it is."""
+    sizes = [abs(v) if math.isfinite(v) else 0.0 for v in (m.frequency_z, m.damping_z, m.shape_z)]
+    at = int(np.argmax(sizes))
+    return sizes[at], at
+
+
+def _key(m: ModeDifference) -> tuple[str, int]:
+    return m.configuration, m.measured
+
+
+def _plain_log(ax: Axes, low: float, high: float) -> None:
+    """Plain numbers on a logarithmic y axis, never crowded."""
+    decades = math.log10(high / low)
+    steps = (1, 2, 5) if decades < 2.2 else (1, 3) if decades < 3 else (1,)
+    ticks = [s * 10.0**p for p in range(-3, 9) for s in steps]
+    ax.yaxis.set_major_locator(FixedLocator([t for t in ticks if low <= t <= high]))
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))

@@ -1,0 +1,10 @@
+"""What a reader is told to look at: named limits, with their source."""
+
+LOW_MAC = 0.8
+"""Below this a pair is named as doubtful (common practice: 0.9 good, under 0.8 to be looked at)."""
+
+FAR_SIGMA = 3.0
+"""A difference beyond this many standard uncertainties is named."""
+
+POOR_CHI2 = 4.0
+"""χ² per degree of freedom beyond which fitted values are doubtful (misfit twice the uncertainty)."""
