@@ -85,7 +85,11 @@ def standing(found: Diagnosis, candidate: Candidate) -> str:
 
 
 def candidates_table(found: Diagnosis) -> Table:
-    """One row per candidate, and last what stays where nothing is missing."""
+    """One row per candidate, and last what stays where nothing is missing.
+
+    `reasons` holds why the leading ones were suspected.
+    """
+    told = leading(found) if reasons(found) else ()
     rows = [
         Row(
             (
@@ -96,7 +100,7 @@ def candidates_table(found: Diagnosis) -> Table:
                 standing(found, c),
                 _change(c.error_before, c.error_after),
                 _change(c.heldout_before, c.heldout_error_after),
-                c.why,
+                "see above" if c in told else c.why,
             ),
             _stands_out(found, c),
         )
@@ -186,6 +190,23 @@ def rung_words(before: Sequence[str], effects: Sequence[str]) -> str:
     return " ".join([*(f"+ {t}" for t in added), *(f"− {t}" for t in dropped)]) or "the same"
 
 
+def unexplained_words(ladder: Ladder) -> str:
+    """Measured modes without a counterpart, before and after; empty where there are none."""
+    if not ladder.rungs or not any(r.unexplained for r in ladder.rungs):
+        return ""
+    first, last = ladder.rungs[0].unexplained, ladder.rungs[-1].unexplained
+    if len(ladder.rungs) == 1:
+        return f"Measured modes that the model does not explain: {first}."
+    return f"Measured modes that the model does not explain: {first} before, {last} after."
+
+
+def reasons(found: Diagnosis) -> tuple[str, ...]:
+    """What was suspected and why, one text per candidate that matters."""
+    if found.verdict in ("adequate", "not_enough_data"):
+        return ()
+    return tuple(f"{_capital(label_words(c.label))}: {c.title}. {c.why}" for c in leading(found))
+
+
 def noise_words(ladder: Ladder) -> str:
     """What σ holds beside the test's own scatter."""
     return (
@@ -236,7 +257,7 @@ def compact(found: Diagnosis) -> str:
     if found.verdict == "not_enough_data":
         return f"Diagnosis: {_lower(heading(found))}. {found.summary}"
     if found.verdict == "effect":
-        return f"Diagnosis: {_named(found)}."
+        return f"Diagnosis: {_named(found)}. {unexplained_words(found.ladder)}".rstrip()
     return f"Diagnosis: {_lower(heading(found))}. Best in the library: {_named(found)}."
 
 
@@ -309,6 +330,10 @@ def _own_sizes(
             elif label == f"out_of_tolerance@{name}":
                 own[place] = size
     return own
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _lower(text: str) -> str:

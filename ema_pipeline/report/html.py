@@ -122,6 +122,8 @@ def _diagnosis(results: RunResults) -> dict[str, Any] | None:
         "heading": diagnosis.heading(found),
         "summary": found.summary,
         "candidates": diagnosis.candidates_table(found),
+        "reasons": diagnosis.reasons(found),
+        "unexplained": diagnosis.unexplained_words(found.ladder),
         "alike": diagnosis.group_words(found),
         "next": found.next_measurement,
         "localisation": diagnosis.localisation_table(found) if found.localisation else None,

@@ -149,6 +149,7 @@ def _diagnosed(results: RunResults) -> Iterator[FigureSpec]:
                 diagnosis.where_it_fails,
                 results.comparison,
                 [layout_of(c) for c in results.configurations],
+                {c.name: c.pairing.unpaired_measured for c in results.configurations if c.pairing},
                 results.comparison_after,
             ),
         )

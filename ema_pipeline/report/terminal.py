@@ -180,9 +180,10 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
     if found.candidates:
         parts += [_line(""), _rich(diagnosis.short_candidates_table(found), "What may be missing")]
         parts.append(_line(_ERROR_WORDS))
-    if found.verdict not in ("adequate", "not_enough_data"):
-        for c in diagnosis.leading(found):
-            parts += [_line(""), _line(f"{diagnosis.label_words(c.label)}: {c.title}. {c.why}")]
+    for text in diagnosis.reasons(found):
+        parts += [_line(""), _line(text)]
+    if unexplained := diagnosis.unexplained_words(found.ladder):
+        parts += [_line(""), _line(unexplained)]
     if found.indistinguishable:
         parts += [_line(""), *(_line(f"! {text}") for text in diagnosis.group_words(found))]
     if found.localisation:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from ema_pipeline.correlate.types import Comparison, ModeDifference
-from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.correlate.types import Comparison, ModeDifference, Unpaired
+from ema_pipeline.diagnose.types import Diagnosis, Ladder, Rung
 from ema_pipeline.report.diagnosis import NOTHING, label_words, probability_words, rung_words
 from ema_pipeline.report.figures.comparison import severity, worst_per_body
 from ema_pipeline.report.figures.shapes import draw_gear
@@ -36,6 +39,7 @@ HALF_IN = 3.55
 
 MODES_SHOWN = 40
 _FLOOR = 0.5
+_LONE: Any = {"fc": "white", "ec": BLACK, "hatch": "xxxx", "lw": 0.4}
 _QUANTITIES = (
     ("frequency", "frequency_z", BLUE, ""),
     ("damping", "damping_z", GREEN, "///"),
@@ -55,7 +59,7 @@ def candidate_probabilities(found: Diagnosis, threshold: float) -> Figure:
     if others:
         bars.append((f"{len(others)} others together", math.fsum(others), False))
     bars.append(("nothing missing", found.null_probability, found.verdict == "adequate"))
-    figure = new_figure(0.75 + 0.27 * max(len(bars), 4), HALF_IN)
+    figure = new_figure(0.75 + 0.235 * max(len(bars), 7), HALF_IN)
     ax = figure.add_subplot(
         figure.add_gridspec(1, 1, **margins(figure, left=1.42, right=0.1, bottom=0.42))[0]
     )
@@ -98,7 +102,7 @@ def candidate_probabilities(found: Diagnosis, threshold: float) -> Figure:
 def ladder_errors(ladder: Ladder) -> Figure:
     """Error on the data fitted and on data held out, from the base model upwards."""
     rungs = ladder.rungs
-    figure = new_figure(2.62, HALF_IN)
+    figure = new_figure(2.395, HALF_IN)
     ax = figure.add_subplot(
         figure.add_gridspec(1, 1, **margins(figure, left=0.55, right=0.1, bottom=0.86))[0]
     )
@@ -135,15 +139,9 @@ def ladder_errors(ladder: Ladder) -> Figure:
     _plain_log(ax, low, high)
     ax.set_xlim(-0.5, len(rungs) - 0.5)
     wide = max(9, 44 // max(len(rungs), 1))
-    befores = [(), *(r.effects for r in rungs[:-1])]
-    ax.set_xticks(
-        at,
-        [
-            textwrap.fill(rung_words(b, r.effects), wide, break_on_hyphens=False)
-            for b, r in zip(befores, rungs, strict=True)
-        ],
-        fontsize=6,
-    )
+    befores: list[tuple[str, ...]] = [(), *(r.effects for r in rungs[:-1])]
+    labels = [_rung_label(b, r, wide) for b, r in zip(befores, rungs, strict=True)]
+    ax.set_xticks(at, labels, fontsize=6)
     ax.grid(False, axis="x")
     ax.set_ylabel("error, σ root mean square")
     ax.set_title("Error rung by rung", loc="left")
@@ -153,9 +151,19 @@ def ladder_errors(ladder: Ladder) -> Figure:
     return figure
 
 
+def _rung_label(before: tuple[str, ...], rung: Rung, width: int) -> str:
+    text = textwrap.fill(rung_words(before, rung.effects), width, break_on_hyphens=False)
+    if not rung.unexplained:
+        return text
+    return f"{text}\n{rung.unexplained} mode{'' if rung.unexplained == 1 else 's'} unexplained"
+
+
 @styled
 def where_it_fails(
-    before: Comparison, layouts: Sequence[GearLayout | None], after: Comparison | None = None
+    before: Comparison,
+    layouts: Sequence[GearLayout | None],
+    lone: Mapping[str, Sequence[Unpaired]],
+    after: Comparison | None = None,
 ) -> Figure:
     """The largest difference of every mode, and the shape's misfit on a drawing of the gear set.
 
@@ -165,18 +173,23 @@ def where_it_fails(
         Of the model that was diagnosed.
     layouts : sequence of GearLayout or None
         One per configuration; the one with most bodies is drawn, and no gear where there is none.
+    lone : mapping of configuration to Unpaired
+        Measured modes without a partner in the model: bars to the top.
     after : Comparison or None
         Of the model with what was found; drawn as hollow diamonds.
     """
     layout = max((g for g in layouts if g is not None), key=lambda g: len(g.bodies), default=None)
-    figure = new_figure(2.55)
+    figure = new_figure(2.35)
     width, height = figure.get_size_inches()
     right = 2.35 if layout is not None and before.dofs else 0.1
     ax = figure.add_axes(
         (0.55 / width, 0.62 / height, (width - 0.55 - right) / width, (height - 1.08) / height)
     )
-    _mode_bars(ax, before.modes, {} if after is None else {_key(m): _worst(m)[0] for m in after.modes})
-    handles = [Patch(fc=c, hatch=h, ec="white", label=name) for name, _, c, h in _QUANTITIES]
+    bars = _bars(before.modes, lone)
+    _mode_bars(ax, bars, {} if after is None else {_key(m): _worst(m)[0] for m in after.modes})
+    handles: list[Artist] = [Patch(fc=c, hatch=h, ec="white", label=name) for name, _, c, h in _QUANTITIES]
+    if any(b.quantity < 0 for b in bars):
+        handles.append(Patch(label="no partner", **_LONE))
     if after is not None:
         (mark,) = ax.plot([], [], "D", mfc="white", mec=BLACK, ms=3.6, label="with what was found")
         handles.append(mark)
@@ -196,44 +209,56 @@ def where_it_fails(
     return figure
 
 
-def _mode_bars(ax: Axes, modes: Sequence[ModeDifference], after: Mapping[tuple[str, int], float]) -> None:
-    worst = {_key(m): _worst(m) for m in modes}
-    ranked = sorted(modes, key=lambda m: -worst[_key(m)][0])[:MODES_SHOWN]
-    shown = [m for m in modes if m in ranked]
-    at, names, x = [], [], 0.0
-    for k, m in enumerate(shown):
-        if k and m.configuration != shown[k - 1].configuration:
-            x += 1.2
+@dataclass(frozen=True)
+class _Bar:
+    """A measured mode; `quantity` points into `_QUANTITIES`, `size` is infinite without a partner."""
+
+    configuration: str
+    measured: int
+    frequency_hz: float
+    size: float
+    quantity: int = -1
+
+
+def _bars(modes: Sequence[ModeDifference], lone: Mapping[str, Sequence[Unpaired]]) -> list[_Bar]:
+    """All measured modes, configuration by configuration, in order of frequency."""
+    paired = [_Bar(m.configuration, m.measured, m.measured_frequency_hz, *_worst(m)) for m in modes]
+    alone = [_Bar(name, u.index, u.frequency_hz, math.inf) for name, us in lone.items() for u in us]
+    order = list(dict.fromkeys([*(m.configuration for m in modes), *lone]))
+    return sorted([*paired, *alone], key=lambda b: (order.index(b.configuration), b.frequency_hz))
+
+
+def _mode_bars(ax: Axes, bars: Sequence[_Bar], after: Mapping[tuple[str, int], float]) -> None:
+    worst = sorted(bars, key=lambda b: -b.size)[:MODES_SHOWN]
+    shown = [b for b in bars if b in worst]
+    at, x = [], 0.0
+    for k, b in enumerate(shown):
+        x += 1.2 if k and b.configuration != shown[k - 1].configuration else 0.0
         at.append(x)
-        names.append(f"{m.measured_frequency_hz:.4g}")
         x += 1.0
-    high = max([20.0, *(1.6 * worst[_key(m)][0] for m in shown), *(1.6 * v for v in after.values())])
+    sizes = [b.size for b in shown if math.isfinite(b.size)]
+    high = 1.6 * max([12.5, *sizes, *after.values()])
     ax.axhspan(_FLOOR, 2, color="#efefef", lw=0, zorder=0)
-    for place, m in zip(at, shown, strict=True):
-        size, quantity = worst[_key(m)]
-        _, _, color, hatch = _QUANTITIES[quantity]
-        ax.bar(
-            place,
-            max(size, _FLOOR) - _FLOOR,
-            0.8,
-            bottom=_FLOOR,
-            color=color,
-            hatch=hatch,
-            ec="white",
-            lw=0.3,
-        )
-        if _key(m) in after:
-            ax.plot(place, max(after[_key(m)], 1.1 * _FLOOR), "D", mfc="white", mec=BLACK, ms=3.6, zorder=4)
-    for name in dict.fromkeys(m.configuration for m in shown):
-        mine = [p for p, m in zip(at, shown, strict=True) if m.configuration == name]
-        ax.text(mine[0] - 0.4, 1.01, name, transform=ax.get_xaxis_transform(), fontsize=7, fontweight="bold")
+    for place, b in zip(at, shown, strict=True):
+        if b.quantity < 0:
+            ax.bar(place, high - _FLOOR, 0.8, bottom=_FLOOR, **_LONE)
+            continue
+        _, _, color, hatch = _QUANTITIES[b.quantity]
+        tall = max(b.size, 1.05 * _FLOOR) - _FLOOR
+        ax.bar(place, tall, 0.8, bottom=_FLOOR, color=color, hatch=hatch, ec="white", lw=0.3)
+        if (b.configuration, b.measured) in after:
+            left = max(after[b.configuration, b.measured], 1.1 * _FLOOR)
+            ax.plot(place, left, "D", mfc="white", mec=BLACK, ms=3.6, zorder=4)
+    for name in dict.fromkeys(b.configuration for b in shown):
+        start = next(p for p, b in zip(at, shown, strict=True) if b.configuration == name)
+        ax.text(start - 0.4, 1.01, name, transform=ax.get_xaxis_transform(), fontsize=7, fontweight="bold")
     ax.set_yscale("log")
     ax.set_ylim(_FLOOR, high)
     _plain_log(ax, _FLOOR, high)
     ax.set_xlim(-0.8, max(x - 0.2, 1.0))
-    ax.set_xticks(at, names, rotation=90, fontsize=5.8)
+    ax.set_xticks(at, [f"{b.frequency_hz:.4g}" for b in shown], rotation=90, fontsize=5.8)
     ax.grid(False, axis="x")
-    cut = f" (worst {len(shown)} of {len(modes)})" if len(shown) < len(modes) else ""
+    cut = f" (worst {len(shown)} of {len(bars)})" if len(shown) < len(bars) else ""
     ax.set_xlabel(f"measured mode{cut}, Hz")
     ax.set_ylabel("largest |difference|/σ, 1")
 
