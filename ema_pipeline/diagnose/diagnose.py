@@ -15,13 +15,14 @@ from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, describe, extr
 from ema_pipeline.diagnose.ladder import Yardstick, assemble_ladder, noise_of, yardstick
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.noise import NoiseLevel, floors
-from ema_pipeline.diagnose.ranking import Ranking, rank
+from ema_pipeline.diagnose.ranking import Ranking, rank, sharpen
 from ema_pipeline.diagnose.screening import Screening, screen
 from ema_pipeline.diagnose.separate import best_measurement
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.thresholds import threshold
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Localisation, VerdictWord
 from ema_pipeline.effects.library import Library
+from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.threads import single_blas_thread
 
@@ -137,14 +138,14 @@ def _climb(case: Case, thresholds: Mapping[str, float] | None, tell: Progress) -
     tell(0.0, "base model")
     base = fit_null(case, Hypothesis(), settings.fit, None)
     hypotheses = single_hypotheses(case.rig, configurations, case.library)
-    if holds(base):
+    if holds(base, settings.unexplained_limit):
         # The base model itself tells the noise level; one round is enough unless a hypothesis leaves less.
         level = noise_of(case, base)
         base = fit_null(case, Hypothesis(), level.applied(settings.fit), base.values)
-        ranking = rank(case, base, hypotheses, level.applied(settings.fit), _part(tell, 0.05, 0.5), False)
+        ranking = rank(case, base, hypotheses, level.applied(settings.fit), _part(tell, 0.05, 0.5))
         first = ranking.base
     else:
-        ranking = rank(case, base, hypotheses, settings.fit, _part(tell, 0.05, 0.5), True)
+        ranking = rank(case, base, hypotheses, settings.fit, _part(tell, 0.05, 0.5))
         first, level = ranking.base, floors(settings.fit)
     best = min((ranking.base, *ranking.fitted), key=lambda f: f.evidence)
     finer = noise_of(case, best)
@@ -152,12 +153,12 @@ def _climb(case: Case, thresholds: Mapping[str, float] | None, tell: Progress) -
         level = finer
         fit = level.applied(settings.fit)
         base = refit(case, Hypothesis(), fit, first.values)
-        ranking = rank(case, base, hypotheses, fit, _part(tell, 0.55, 0.7), False, ranking.fitted)
+        ranking = sharpen(case, ranking, base, fit, _part(tell, 0.55, 0.7))
     fit = level.applied(settings.fit)
     models, rankings = [ranking.base], [ranking]
     note = ""
     while True:
-        top = _claimable(case, rankings[-1], thresholds)
+        top = _claimable(case, rankings[-1], fit, thresholds)
         if top is None:
             note = "no further effect is supported by the data"
             break
@@ -167,24 +168,26 @@ def _climb(case: Case, thresholds: Mapping[str, float] | None, tell: Progress) -
         models.append(top)
         rest = single_hypotheses(case.rig, configurations, case.library, top.hypothesis)
         tell(0.72, f"on top of {top.hypothesis.label}")
-        rankings.append(rank(case, top, rest, fit, _part(tell, 0.72, 0.85), not holds(top)))
+        rankings.append(rank(case, top, rest, fit, _part(tell, 0.72, 0.85)))
         models[-1] = rankings[-1].base
     return _Climb(models, rankings, level, note)
 
 
-def _claimable(case: Case, ranking: Ranking, thresholds: Mapping[str, float] | None) -> Fitted | None:
+def _claimable(
+    case: Case, ranking: Ranking, fit: FitSettings, thresholds: Mapping[str, float] | None
+) -> Fitted | None:
     """The most probable hypothesis where something is missing for sure and held-out data agree."""
     settings = case.settings
-    base = ranking.base.hypothesis.label
-    if base != NOTHING and NOTHING not in ranking.probabilities:
+    if 1 - ranking.probabilities[NOTHING] < settings.probability_least or not ranking.fitted:
         return None
-    if 1 - ranking.probabilities[NOTHING] < settings.probability_least:
+    top = ranking.ordered()[0]
+    if ranking.gain(top) < threshold(top.hypothesis.family, settings.gain_least, thresholds):
         return None
-    for f in ranking.ordered():
-        if ranking.gain(f) >= threshold(f.hypothesis.family, settings.gain_least, thresholds):
-            return f
-        break
-    return None
+    stick = yardstick(case, fit, [ranking.base, *ranking.fitted])
+    before, after = (
+        stick.heldout_error(f, held_out(case, f, fit, settings.folds)) for f in (ranking.base, top)
+    )
+    return top if after < before else None
 
 
 def _group(case: Case, ranking: Ranking) -> list[Fitted]:

@@ -113,7 +113,7 @@ def extras(rig: Rig, hypothesis: Hypothesis, library: Library | None) -> tuple[E
         family, _, place = label.partition("@")
         if family == OUT_OF_TOLERANCE:
             v = rig.parameters[place].value
-            found.append(Extra(place, (0.6 * v, 1.6 * v, 0.1 * v, 10 * v), v, 0.0, False))
+            found.append(Extra(place, (0.3 * v, 3 * v), v, 0.0, False))
             continue
         for p in known[family].parameters:
             found.append(Extra(f"{label}.{p.name}", _starts(p), p.null, _scale(p), p.minimum >= p.null))

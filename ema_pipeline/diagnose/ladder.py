@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
-from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, fit_null, refit
+from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, fit_null, ground, refit
 from ema_pipeline.diagnose.heldout import HeldOut, error_of, held_out
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.noise import NoiseLevel, estimate_noise, floors
@@ -143,8 +143,7 @@ def fitted_rungs(case: Case, effects: Sequence[str], fit: FitSettings, tell: Pro
     for i, label in enumerate(effects):
         tell(0.1 + 0.4 * i / len(effects), f"fitting {label}")
         last = models[-1]
-        added = last.hypothesis.plus(label)
-        models.append(fit_hypothesis(case, added, fit, last.values, last.objective, True))
+        models.append(fit_hypothesis(case, last.hypothesis.plus(label), fit, ground(case, last, fit)))
     return models
 
 

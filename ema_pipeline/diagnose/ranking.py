@@ -7,15 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, refit
+from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, ground, refit
 from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, prior_probabilities
 from ema_pipeline.diagnose.pool import spread
 from ema_pipeline.fit.settings import FitSettings
 
 Progress = Callable[[float, str], None]
 
-_NULL_FROM = 8
+_NULL_FROM = 4
 _NULL_ROUNDS = 3
+_RACING = 8
+_OUT_OF_RACE = 60.0
+_NOTHING_GAINED = 4.0
 
 
 @dataclass(frozen=True)
@@ -49,15 +52,9 @@ class Ranking:
 
 
 def rank(
-    case: Case,
-    base: Fitted,
-    hypotheses: Sequence[Hypothesis],
-    fit: FitSettings,
-    tell: Progress,
-    thorough: bool,
-    from_fits: Sequence[Fitted] = (),
+    case: Case, base: Fitted, hypotheses: Sequence[Hypothesis], fit: FitSettings, tell: Progress
 ) -> Ranking:
-    """Fit all hypotheses and the base model from all of their optima.
+    """Fit all hypotheses on top of a base model, and the base model from all of their optima.
 
     Parameters
     ----------
@@ -66,16 +63,56 @@ def rank(
     hypotheses : sequence of Hypothesis
     fit : FitSettings
     tell : callable
-    thorough : bool
-        Anneal every hypothesis from visible sizes.
-    from_fits : sequence of Fitted
-        Fits of the same hypotheses at another noise level, to start from.
     """
-    starts = {f.hypothesis.label: f.values for f in from_fits}
+    below = ground(case, base, fit)
 
     def one(h: Hypothesis) -> Fitted:
-        return fit_hypothesis(case, h, fit, starts.get(h.label, base.values), base.objective, thorough)
+        return fit_hypothesis(case, h, fit, below)
 
+    return _ranked(case, base, hypotheses, one, fit, tell)
+
+
+def sharpen(case: Case, ranking: Ranking, base: Fitted, fit: FitSettings, tell: Progress) -> Ranking:
+    """The same ranking at another noise level, every fit started from its own optimum.
+
+    Hypotheses that are out of the race are not fitted again; they keep their distance from the base model.
+    """
+    best = min(f.evidence for f in (ranking.base, *ranking.fitted))
+    ordered = ranking.ordered()
+    racing = {f.hypothesis.label for f in ordered[:_RACING]}
+    racing |= {f.hypothesis.label for f in ordered if f.evidence < best + _OUT_OF_RACE}
+    starts = {f.hypothesis.label: f.values for f in ranking.fitted}
+
+    def one(h: Hypothesis) -> Fitted:
+        return refit(case, h, fit, starts[h.label])
+
+    sharp = _ranked(case, base, [f.hypothesis for f in ranking.fitted if f.hypothesis.label in racing], one, fit, tell)
+    by_label = {f.hypothesis.label: f for f in sharp.fitted}
+    fitted = [
+        by_label.get(f.hypothesis.label) or _moved_along(f, ranking.base, sharp.base) for f in ranking.fitted
+    ]
+    return Ranking(sharp.base, tuple(fitted), probabilities(case, sharp.base, fitted))
+
+
+def _moved_along(f: Fitted, old: Fitted, new: Fitted) -> Fitted:
+    return replace(
+        f,
+        objective=f.objective - old.objective + new.objective,
+        evidence=f.evidence - old.evidence + new.evidence,
+        costs=new.costs,
+        inlier=new.inlier,
+        prior_cost=new.prior_cost,
+    )
+
+
+def _ranked(
+    case: Case,
+    base: Fitted,
+    hypotheses: Sequence[Hypothesis],
+    one: Callable[[Hypothesis], Fitted],
+    fit: FitSettings,
+    tell: Progress,
+) -> Ranking:
     fitted = []
     for f in spread(one, hypotheses, case.settings.processes):
         fitted.append(f)
@@ -112,7 +149,7 @@ def _never_worse(f: Fitted, base: Fitted) -> Fitted:
     return replace(
         f,
         objective=base.objective,
-        evidence=max(f.evidence - (f.objective - base.objective), base.evidence),
+        evidence=max(f.evidence - (f.objective - base.objective), base.evidence + _NOTHING_GAINED),
         costs=base.costs,
         inlier=base.inlier,
         prior_cost=base.prior_cost,

@@ -94,6 +94,8 @@ def _separation(
     sigma: NDArray[np.float64] | float,
 ) -> float:
     """√(dᵀ V⁻¹ d) of two predictions, V of the measurement and of the first explanation's parameters."""
+    if first.shape[1] == 0 or first.shape[1] != second.shape[1]:
+        return 0.0
     d = first[0] - second[0]
     if d.size == 0 or not np.all(np.isfinite(d)):
         return 0.0
@@ -170,8 +172,6 @@ def _by_frequency(
     sigma: float,
 ) -> float:
     first = _frequencies(change(families[0].at(sides[0].points), families[0].system), band, None)
-    if first.shape[1] == 0 or len(families[1].system.dofs) < first.shape[1]:
-        return 0.0
     second = _frequencies(change(families[1].at(sides[1].points), families[1].system), band, first[0])
     return _separation(sides, first, second, sigma)
 
