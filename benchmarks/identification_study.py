@@ -23,16 +23,18 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from simulate_modal import FrfSet, Hits, TrueSystem, frf_set, h1, random_system, simulate_hits  # noqa: E402
+from simulate_modal import FrfSet, Hits, TrueSystem, frf_set, h1, random_system, simulate_hits
 
-from ema_pipeline.modal.identify import identify  # noqa: E402
-from ema_pipeline.modal.settings import ModalSettings  # noqa: E402
-from ema_pipeline.modal.types import ModalModel  # noqa: E402
+from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.modal.types import ModalModel
 
 INVISIBLE_STD = 0.2
 
 
-def crlb_decay(system: TrueSystem, hits: Hits, frfs: FrfSet, dofs_out: list[int], dofs_in: list[int]) -> np.ndarray:
+def crlb_decay(
+    system: TrueSystem, hits: Hits, frfs: FrfSet, dofs_out: list[int], dofs_in: list[int]
+) -> np.ndarray:
     """Cramér–Rao bound of each mode's relative decay rate, other modes known, this mode's residues unknown.
 
     Per FRF with residue Q and white noise density, a single mode's damping has information
@@ -62,9 +64,7 @@ def crlb_decay(system: TrueSystem, hits: Hits, frfs: FrfSet, dofs_out: list[int]
 def match(system: TrueSystem, model: ModalModel) -> tuple[dict[int, int], list[int]]:
     """True mode → identified mode, one to one, nearest first; and the identified modes without a partner."""
     f = np.array([m.frequency_hz for m in model.modes])
-    pairs = sorted(
-        (abs(fj - ft), t, j) for t, ft in enumerate(system.frequency_hz) for j, fj in enumerate(f)
-    )
+    pairs = sorted((abs(fj - ft), t, j) for t, ft in enumerate(system.frequency_hz) for j, fj in enumerate(f))
     found: dict[int, int] = {}
     used: set[int] = set()
     for distance, t, j in pairs:
@@ -130,7 +130,10 @@ def random_study(cases: int, first: int, settings: ModalSettings, peer: bool, ve
                 f"  seed {seed}: refs {len(dofs_in)} missed",
                 [(round(float(system.frequency_hz[t]), 2), round(float(bound[t]), 3)) for t in missed],
                 "extra",
-                [(round(model.modes[j].frequency_hz, 2), round(model.modes[j].damping_ratio, 4)) for j in extra],
+                [
+                    (round(model.modes[j].frequency_hz, 2), round(model.modes[j].damping_ratio, 4))
+                    for j in extra
+                ],
                 flush=True,
             )
     print(f"modes {truth} (+ {invisible} invisible)  time per case {clock / cases:.2f} s")
@@ -139,7 +142,9 @@ def random_study(cases: int, first: int, settings: ModalSettings, peer: bool, ve
     print(f"damping error   median {100 * np.median(ez):.3f} %  p95 {100 * np.quantile(ez, 0.95):.2f} %")
     for name, z in (("frequency", zf), ("damping", zz)):
         z = np.array(z)
-        print(f"95 % interval of {name} covers {np.mean(np.abs(z) < 1.96):.3f}, rms of z {np.sqrt(np.mean(np.minimum(z**2, 25))):.2f}")
+        print(
+            f"95 % interval of {name} covers {np.mean(np.abs(z) < 1.96):.3f}, rms of z {np.sqrt(np.mean(np.minimum(z**2, 25))):.2f}"
+        )
     if peer and ep:
         print(f"sdypy-EMA damping error median {100 * np.median(ep):.3f} % ({len(ep)} modes)")
 
@@ -153,7 +158,11 @@ def peer_errors(system: TrueSystem, frfs: FrfSet) -> list[float]:
     from sdypy import EMA  # progress bars go to stderr
 
     errors = []
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+    with (
+        warnings.catch_warnings(),
+        contextlib.redirect_stdout(io.StringIO()),
+        contextlib.redirect_stderr(io.StringIO()),
+    ):
         warnings.simplefilter("ignore")
         acc = frfs.accelerance()[:, 0]
         low, high = 0.7 * system.frequency_hz[0], frfs.band_hz[1]
@@ -174,7 +183,9 @@ def pair_case(seed: int) -> tuple[TrueSystem, Hits, FrfSet, list[int], list[int]
     """A system in which two modes are 0.5 % apart or equal, and at least two references."""
     rng = np.random.default_rng(10_000 + seed)
     f_max, n_out, n_ref = 800.0, int(rng.integers(8, 20)), int(rng.integers(2, 5))
-    base = random_system(rng, n_modes=int(rng.integers(4, 9)), n_dofs=n_out, low_hz=60, high_hz=740, min_spacing=0.05)
+    base = random_system(
+        rng, n_modes=int(rng.integers(4, 9)), n_dofs=n_out, low_hz=60, high_hz=740, min_spacing=0.05
+    )
     k = int(rng.integers(0, len(base.frequency_hz)))
     gap = 0.0 if seed % 2 else 0.005
     zeta = base.damping_ratio[k] * (1.0 if seed % 2 else rng.uniform(0.8, 1.25))
@@ -220,7 +231,9 @@ def pair_study(cases: int, first: int, settings: ModalSettings, verbose: bool) -
         if verbose and (not ok or value < 0.98 or extra):
             print(f"  seed {seed}: f {system.frequency_hz[a]:.2f} ζ {system.damping_ratio[a]:.4f} both {ok} subspace {value:.4f} extra",
                   [(round(model.modes[j].frequency_hz, 2), round(model.modes[j].damping_ratio, 4)) for j in extra], flush=True)  # fmt: skip
-    print(f"both members in {both} of {cases}; subspace MAC min {min(macs):.4f}, median {np.median(macs):.5f}; spurious {spurious}")
+    print(
+        f"both members in {both} of {cases}; subspace MAC min {min(macs):.4f}, median {np.median(macs):.5f}; spurious {spurious}"
+    )
 
 
 def noise_study(cases: int, first: int, settings: ModalSettings) -> None:
@@ -264,11 +277,15 @@ def coverage_study(cases: int, first: int, settings: ModalSettings) -> None:
             inside["shape"] += list(np.real(mode.shape - phi) / mode.shape_std)
     for name, z in inside.items():
         z = np.array(z)
-        print(f"95 % interval of {name}: covers {np.mean(np.abs(z) < 1.96):.4f} of {len(z)}; std of z {np.std(np.clip(z, -6, 6)):.3f}, mean {np.mean(np.clip(z, -6, 6)):.3f}")
+        print(
+            f"95 % interval of {name}: covers {np.mean(np.abs(z) < 1.96):.4f} of {len(z)}; std of z {np.std(np.clip(z, -6, 6)):.3f}, mean {np.mean(np.clip(z, -6, 6)):.3f}"
+        )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("study", choices=["random", "pairs", "noise", "coverage"])
     parser.add_argument("--cases", type=int, default=50)
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")

@@ -31,22 +31,42 @@ def aircraft(folder: Path) -> FrfSet:
     for k in range(75):
         with h5py.File(folder / f"run{k:02d}.h5") as file:
             force = np.asarray(file["hammer"], float)
-            responses = np.array([file[name] for name in ("wing", "horizontal_tail", "vertical_tail")], float) * G
+            responses = (
+                np.array([file[name] for name in ("wing", "horizontal_tail", "vertical_tail")], float) * G
+            )
         force = np.where(np.arange(4096) < 24, force - force[-500:].mean(), 0.0)  # the blow lasts 10 samples
         frf.append(ratio(force[None], responses[None])[0])
     matrix = np.array(frf).transpose(1, 0, 2)
     frequency = np.fft.rfftfreq(4096, 1 / 512)
-    names = {0: "wing", 1: "horizontal_tail", 2: "vertical_tail", **{3 + k: f"point{k:02d}" for k in range(75)}}
-    return frf_set(frequency, matrix, [0, 1, 2], list(range(3, 78)), band_hz=(0.0, 200.0), names=names, delay=5 / 512)
+    names = {
+        0: "wing",
+        1: "horizontal_tail",
+        2: "vertical_tail",
+        **{3 + k: f"point{k:02d}" for k in range(75)},
+    }
+    return frf_set(
+        frequency, matrix, [0, 1, 2], list(range(3, 78)), band_hz=(0.0, 200.0), names=names, delay=5 / 512
+    )
 
 
 def aircraft_analyser(folder: Path) -> FrfSet:
     """The analyser's own averaged FRFs of the same points."""
     data = np.load(folder / "analyser_frf.npz")
-    names = {0: "wing", 1: "horizontal_tail", 2: "vertical_tail", **{3 + k: f"point{k:02d}" for k in range(75)}}
+    names = {
+        0: "wing",
+        1: "horizontal_tail",
+        2: "vertical_tail",
+        **{3 + k: f"point{k:02d}" for k in range(75)},
+    }
     matrix = data["H_g_per_N"].astype(complex).transpose(1, 0, 2) * G
     return frf_set(
-        data["f_Hz"], matrix, [0, 1, 2], list(range(3, 78)), band_hz=(0.0, 200.0), names=names, decay_rad_s=0.13889
+        data["f_Hz"],
+        matrix,
+        [0, 1, 2],
+        list(range(3, 78)),
+        band_hz=(0.0, 200.0),
+        names=names,
+        decay_rad_s=0.13889,
     )
 
 
@@ -58,7 +78,13 @@ def five_hits(folder: Path) -> FrfSet:
     response = np.array([r[:n, -1] for r in rows])
     h, v = ratio(force, response[:, None])
     return frf_set(
-        np.fft.rfftfreq(n, 1 / 25600), h[:, None], [0], [0], variance=v[:, None], n_hits=5, band_hz=(0.0, 5000.0)
+        np.fft.rfftfreq(n, 1 / 25600),
+        h[:, None],
+        [0],
+        [0],
+        variance=v[:, None],
+        n_hits=5,
+        band_hz=(0.0, 5000.0),
     )
 
 

@@ -1,4 +1,4 @@
-"""Sub-bands: a wide band is split where the response is quiet, so that no model needs to hold too many modes."""
+"""Sub-bands: a wide band is split where the response is quiet, so that no model holds too many modes."""
 
 from __future__ import annotations
 

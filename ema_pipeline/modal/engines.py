@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.modal.basis import real_columns, residual_columns
 from ema_pipeline.modal.data import FitData
-from ema_pipeline.modal.plscf import polyreference_poles
+from ema_pipeline.modal.lscf import common_denominator_poles
+from ema_pipeline.modal.plscf import MAX_DAMPING_RATIO, polyreference_poles
 from ema_pipeline.modal.poles import PoleSet
+from ema_pipeline.modal.sdypy_engine import sdypy_poles
 from ema_pipeline.modal.settings import ModalSettings
 
 MAX_REFERENCES = 6
@@ -50,24 +53,87 @@ def poles_of_all_orders(
     frf = data.frf[np.ix_(rows, refs)]
     row_scale = np.exp(0.5 * np.log(np.maximum(variance[np.ix_(rows, refs)], 1e-300)).mean(axis=(1, 2)))
     scaled = frf / row_scale[:, None, None]
-    back = np.eye(len(refs), dtype=np.complex128)
-    if settings.engine == "plscf" and len(refs) > MAX_REFERENCES:
-        flat = scaled.transpose(1, 0, 2).reshape(len(refs), -1)
-        _, vectors = np.linalg.eigh((flat @ flat.conj().T).real)
-        back = vectors[:, -MAX_REFERENCES:].astype(np.complex128)
-        scaled = np.einsum("oil,ik->okl", scaled, back.real)
-    n_ref = scaled.shape[1]
-    highest = settings.max_order or max(MIN_TOP_ORDER, int(np.ceil(2 * modes / np.sqrt(n_ref))))
-    highest = int(np.clip(highest, 4, max(4, n_lines // 3)))
-    lowest = max(2, int(np.ceil(4 / n_ref)))
-    step = max(1, (highest - lowest) // MAX_ORDERS)
-    orders = list(range(lowest, highest + 1, step))
-    found = polyreference_poles(data.omega, scaled, np.ones(n_lines), orders)
+    back = np.eye(len(refs))
+    if settings.engine == "plscf":
+        if len(refs) > MAX_REFERENCES:
+            back = _strongest(scaled, MAX_REFERENCES)
+            scaled = np.einsum("oil,ik->okl", scaled, back)
+        n_ref = scaled.shape[1]
+        orders = _orders(settings, int(np.ceil(2 * modes / np.sqrt(n_ref))), n_lines, max(2, 4 // n_ref), 1)
+        found = polyreference_poles(data.omega, scaled, np.ones(n_lines), orders)
+    else:
+        orders = _orders(settings, 2 * modes, n_lines, 4, 2)
+        flat = scaled.reshape(-1, n_lines)
+        if settings.engine == "lscf":
+            step = float(data.omega[1] - data.omega[0])
+            poles = common_denominator_poles(flat, step, 0, n_lines - 1, orders)
+            poles = [p + 1j * data.omega[0] for p in poles]
+        else:
+            every = sdypy_poles(data.omega, flat, orders[-1] // 2)
+            poles = [every[n // 2 - 1] for n in orders]
+        found = _with_shapes(data.omega, scaled, orders, poles)
     shape = np.zeros((len(found.pole), len(data.measured)), dtype=np.complex128)
     shape[:, rows] = found.shape * row_scale
     part = np.zeros((len(found.pole), data.measured.shape[1]), dtype=np.complex128)
     part[:, refs] = found.participation @ back.T
     return PoleSet(found.order, found.pole, shape, part, found.orders)
+
+
+def _orders(settings: ModalSettings, wanted: int, n_lines: int, lowest: int, stride: int) -> list[int]:
+    """Polynomial orders to compute."""
+    highest = settings.max_order or max(MIN_TOP_ORDER, wanted)
+    highest = int(np.clip(highest, lowest + stride, max(lowest + stride, n_lines // 3)))
+    step = stride * max(1, (highest - lowest) // (stride * MAX_ORDERS))
+    return list(range(lowest, highest + 1, step))
+
+
+def _strongest(scaled: NDArray[np.complex128], count: int) -> NDArray[np.float64]:
+    """Orthonormal real combinations of references with the most power, (n_references, count)."""
+    flat = scaled.transpose(1, 0, 2).reshape(scaled.shape[1], -1)
+    return np.asarray(np.linalg.eigh((flat @ flat.conj().T).real)[1][:, -count:])
+
+
+def _with_shapes(
+    omega: NDArray[np.float64],
+    frf: NDArray[np.complex128],
+    orders: list[int],
+    poles: list[NDArray[np.complex128]],
+) -> PoleSet:
+    """Shapes and participations of poles that come without: least-squares residues, best rank-one parts."""
+    keep = [
+        p[
+            (p.imag > omega[0])
+            & (p.imag < omega[-1])
+            & (p.real < 0)
+            & (-p.real < MAX_DAMPING_RATIO * np.abs(p))
+        ]
+        for p in poles
+    ]
+    n_rows, n_ref, n_lines = frf.shape
+    flat = frf.reshape(-1, n_lines)
+    power = np.concatenate([flat.real, flat.imag], axis=1)
+    shapes, parts = [np.zeros((0, n_rows), complex)], [np.zeros((0, n_ref), complex)]
+    for p in keep:
+        columns, _ = real_columns(omega, p, np.inf)
+        basis = np.concatenate([columns, residual_columns(omega)])
+        stacked = np.concatenate([basis.real, basis.imag], axis=1)
+        gram = stacked @ stacked.T
+        scale = 1 / np.sqrt(np.diag(gram))
+        gram = gram * scale[:, None] * scale + 1e-10 * np.eye(len(gram))
+        solved = scale[:, None] * np.linalg.solve(gram, scale[:, None] * (stacked @ power.T))
+        residues = (solved[0 : 2 * len(p) : 2] + 1j * solved[1 : 2 * len(p) : 2]).reshape(-1, n_rows, n_ref)
+        u, s, vh = np.linalg.svd(residues, full_matrices=False)
+        shapes.append(u[:, :, 0] * s[:, :1])
+        parts.append(vh[:, 0])
+    return PoleSet(
+        order=np.concatenate([np.full(len(p), n) for n, p in zip(orders, keep, strict=True)]).astype(
+            np.int64
+        ),
+        pole=np.concatenate(keep),
+        shape=np.concatenate(shapes),
+        participation=np.concatenate(parts),
+        orders=tuple(orders),
+    )
 
 
 def complete_block(measured: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -1,0 +1,270 @@
+"""Modal identification end to end, on simulated hammer tests with known modes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from simulate_modal import TrueSystem, frf_set, h1, random_system, simulate_hits
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.modal.types import ModalModel
+
+
+def hammer_test(
+    system: TrueSystem,
+    dofs_out: list[int],
+    dofs_in: list[int],
+    *,
+    f_max: float = 400.0,
+    record_s: float = 4.0,
+    n_hits: int = 3,
+    noise: float = 0.01,
+    seed: int = 0,
+    decay_rad_s: float = 0.0,
+) -> FrfSet:
+    hits = simulate_hits(
+        system,
+        dofs_out,
+        dofs_in,
+        f_max=f_max,
+        record_s=record_s,
+        n_hits=n_hits,
+        force_noise=noise,
+        response_noise=noise,
+        rng=np.random.default_rng(seed),
+        decay_rad_s=decay_rad_s,
+    )
+    return h1(hits, dofs_out, dofs_in, f_max, decay_rad_s)
+
+
+def frequencies(model: ModalModel) -> np.ndarray:
+    return np.array([m.frequency_hz for m in model.modes])
+
+
+def dampings(model: ModalModel) -> np.ndarray:
+    return np.array([m.damping_ratio for m in model.modes])
+
+
+FIVE = TrueSystem(
+    np.array([48.0, 81.0, 120.0, 190.0, 310.0]),
+    np.array([0.012, 0.004, 0.008, 0.02, 0.005]),
+    np.random.default_rng(42).standard_normal((5, 8)),
+)
+
+
+@pytest.fixture(scope="module")
+def five() -> ModalModel:
+    return identify(hammer_test(FIVE, list(range(8)), [0, 3]), ModalSettings())
+
+
+def test_all_modes_are_found_and_none_invented(five: ModalModel) -> None:
+    assert frequencies(five) == pytest.approx(FIVE.frequency_hz, rel=1e-4)
+    assert dampings(five) == pytest.approx(FIVE.damping_ratio, rel=0.01)
+
+
+def test_errors_are_of_the_size_that_the_standard_deviations_say(five: ModalModel) -> None:
+    for k, mode in enumerate(five.modes):
+        assert abs(mode.frequency_hz - FIVE.frequency_hz[k]) < 4 * mode.frequency_std_hz
+        assert abs(mode.damping_ratio - FIVE.damping_ratio[k]) < 4 * mode.damping_std
+        assert mode.damping_std < 0.01 * mode.damping_ratio
+
+
+def test_shapes_are_mass_normalised_where_a_driving_point_was_measured(five: ModalModel) -> None:
+    assert five.scaled
+    assert five.scaling_note == ""
+    for k, mode in enumerate(five.modes):
+        truth = FIVE.shapes[k] * np.sign(np.vdot(FIVE.shapes[k], mode.shape).real)
+        assert np.max(np.abs(mode.shape - truth)) < 0.02 * np.max(np.abs(truth))
+        assert mode.mpc > 0.999
+
+
+def test_synthesis_follows_the_true_frfs(five: ModalModel) -> None:
+    truth = FIVE.accelerance(five.frequency_hz, list(range(8)), [0, 3])
+    error = np.sqrt(np.mean(np.abs(five.synthesis - truth) ** 2) / np.mean(np.abs(truth) ** 2))
+    assert error < 0.02
+
+
+def test_chart_shows_every_mode_as_selected_and_stable(five: ModalModel) -> None:
+    chart = five.chart
+    for k in range(5):
+        voters = chart.selected == k
+        assert np.count_nonzero(voters & chart.stable) >= 5
+        assert np.median(chart.frequency_hz[voters]) == pytest.approx(FIVE.frequency_hz[k], rel=1e-3)
+
+
+@pytest.mark.parametrize("engine", ["lscf", "sdypy"])
+def test_other_engines_lead_to_the_same_modes(engine: str, five: ModalModel) -> None:
+    model = identify(hammer_test(FIVE, list(range(8)), [0, 3]), ModalSettings(engine=engine))
+    assert frequencies(model) == pytest.approx(frequencies(five), rel=1e-6)
+    assert {m.method for m in model.modes} == {engine}
+
+
+def test_damping_error_without_polish_is_larger(five: ModalModel) -> None:
+    raw = identify(hammer_test(FIVE, list(range(8)), [0, 3]), ModalSettings(polish=False))
+    assert len(raw.modes) == 5
+    before = np.abs(dampings(raw) / FIVE.damping_ratio - 1)
+    after = np.abs(dampings(five) / FIVE.damping_ratio - 1)
+    assert np.median(after) < 0.5 * np.median(before)
+
+
+def test_roving_hammer_gives_the_modes_of_roving_sensors(five: ModalModel) -> None:
+    model = identify(hammer_test(FIVE, [0, 3], list(range(8))), ModalSettings())
+    assert frequencies(model) == pytest.approx(FIVE.frequency_hz, rel=1e-4)
+    assert [str(d) for d in model.references] == ["p0.z", "p3.z"]
+    for a, b in zip(model.modes, five.modes, strict=True):
+        assert np.max(np.abs(a.shape - b.shape)) < 0.03 * np.max(np.abs(b.shape))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_both_modes_of_a_repeated_pole_are_found_with_two_references(seed: int) -> None:
+    rng = np.random.default_rng(100 + seed)
+    system = TrueSystem(
+        np.array([90.0, 150.0, 150.0, 230.0]),
+        np.array([0.01, 0.006, 0.006, 0.01]),
+        rng.standard_normal((4, 10)),
+    )
+    model = identify(hammer_test(system, list(range(10)), [0, 4], seed=seed), ModalSettings())
+    assert frequencies(model) == pytest.approx(system.frequency_hz, rel=2e-4)
+    pair = np.array([m.shape for m in model.modes[1:3]])
+    qa, qb = np.linalg.qr(pair.T)[0], np.linalg.qr(system.shapes[1:3].T)[0]
+    assert np.min(np.linalg.svd(qa.conj().T @ qb, compute_uv=False)) ** 2 > 0.98
+
+
+def test_pair_half_a_percent_apart_is_told_apart_with_one_reference() -> None:
+    shapes = np.random.default_rng(5).standard_normal((3, 8))
+    system = TrueSystem(np.array([100.0, 100.5, 160.0]), np.array([0.005, 0.005, 0.01]), shapes)
+    model = identify(hammer_test(system, list(range(8)), [1]), ModalSettings())
+    assert frequencies(model) == pytest.approx(system.frequency_hz, rel=2e-4)
+    assert any("one reference cannot show a multiplicity" in note for note in model.notes)
+
+
+@pytest.mark.parametrize(("n_hits", "n_out"), [(1, 1), (1, 12), (3, 6)])
+def test_pure_noise_has_no_modes(n_hits: int, n_out: int) -> None:
+    rng = np.random.default_rng(n_hits + n_out)
+    each = rng.standard_normal((n_hits, n_out, 2, 1000, 2)) @ np.array([1, 1j])
+    variance = None if n_hits == 1 else np.var(each, axis=0) / (n_hits - 1)
+    frfs = frf_set(
+        np.arange(1000) * 0.5, each.mean(axis=0), list(range(n_out)), [0, 1], variance=variance, n_hits=n_hits
+    )
+    assert identify(frfs, ModalSettings()).modes == ()
+
+
+def test_rigid_body_motion_is_not_a_mode_but_is_in_the_synthesis() -> None:
+    frequency = np.arange(2001) * 0.25
+    system = TrueSystem(np.array([120.0]), np.array([0.01]), np.array([[1.0, -0.6, 0.3]]))
+    rng = np.random.default_rng(1)
+    frf = system.accelerance(frequency, [0, 1, 2], [0]) + 0.5
+    frf = frf + 1e-3 * (rng.standard_normal(frf.shape) + 1j * rng.standard_normal(frf.shape))
+    model = identify(frf_set(frequency, frf, [0, 1, 2], [0], band_hz=(5.0, 400.0)), ModalSettings())
+    assert frequencies(model) == pytest.approx([120.0], rel=1e-4)
+    low = np.argmin(np.abs(model.frequency_hz - 20))
+    assert model.synthesis[0, 0, low].real == pytest.approx(0.5, abs=0.05)
+
+
+def test_modes_of_a_wide_band_are_found_at_both_ends() -> None:
+    system = TrueSystem(
+        np.array([50.2, 52.1, 108.0, 330.0, 1100.0, 1400.0]),
+        np.full(6, 0.01),
+        np.random.default_rng(3).standard_normal((6, 12)),
+    )
+    frfs = hammer_test(system, list(range(12)), [0, 5], f_max=2000.0, record_s=2.0, n_hits=2)
+    model = identify(frfs, ModalSettings())
+    assert frequencies(model) == pytest.approx(system.frequency_hz, rel=3e-4)
+    assert dampings(model) == pytest.approx(np.full(6, 0.01), rel=0.04)
+
+
+def test_a_cut_record_does_not_bias_frequency_damping_or_scale() -> None:
+    system = TrueSystem(
+        np.array([40.0, 77.0]), np.array([0.001, 0.002]), np.random.default_rng(4).standard_normal((2, 6))
+    )
+    frfs = hammer_test(system, list(range(6)), [0], f_max=100.0, record_s=4.0, noise=0.003)
+    left_over = np.exp(-0.001 * 2 * np.pi * 40 * 4)
+    assert left_over > 0.3  # a third of the response is still there at the end
+    model = identify(frfs, ModalSettings())
+    assert frequencies(model) == pytest.approx(system.frequency_hz, rel=1e-4)
+    assert dampings(model) == pytest.approx(system.damping_ratio, rel=0.02)
+    for k, mode in enumerate(model.modes):
+        truth = system.shapes[k] * np.sign(np.vdot(system.shapes[k], mode.shape).real)
+        assert np.max(np.abs(mode.shape - truth)) < 0.02 * np.max(np.abs(truth))
+
+
+def test_damping_added_by_an_exponential_window_is_taken_off() -> None:
+    frfs = hammer_test(FIVE, list(range(8)), [0], record_s=2.0, decay_rad_s=2.0)
+    model = identify(frfs, ModalSettings())
+    assert dampings(model) == pytest.approx(FIVE.damping_ratio, rel=0.02)
+
+
+def test_frfs_that_were_not_measured_cost_no_modes_and_get_shapes_where_measured() -> None:
+    frfs = hammer_test(FIVE, list(range(8)), [0, 3])
+    frf = frfs.frf.copy()
+    frf[5, 1] = np.nan  # measured for the first reference only
+    frf[7] = np.nan  # not measured at all
+    model = identify(FrfSet(**{**frfs.__dict__, "frf": frf}), ModalSettings())
+    assert frequencies(model) == pytest.approx(FIVE.frequency_hz, rel=1e-4)
+    for k, mode in enumerate(model.modes):
+        truth = FIVE.shapes[k] * np.sign(np.vdot(FIVE.shapes[k][:7], mode.shape[:7]).real)
+        assert abs(mode.shape[5] - truth[5]) < 0.03 * np.max(np.abs(truth))
+        assert np.isnan(mode.shape[7])
+    assert np.isnan(model.synthesis[7]).all()
+
+
+def test_shapes_stay_unscaled_without_a_driving_point_and_the_note_says_so() -> None:
+    model = identify(hammer_test(FIVE, [1, 2, 4, 5], [0]), ModalSettings())
+    assert not model.scaled
+    assert "driving point" in model.scaling_note
+    for mode in model.modes:
+        assert np.max(np.abs(mode.shape)) == pytest.approx(1.0)
+
+
+def test_shapes_stay_unscaled_for_a_hammer_in_volts() -> None:
+    frfs = hammer_test(FIVE, list(range(8)), [0])
+    model = identify(FrfSet(**{**frfs.__dict__, "force_calibrated": False}), ModalSettings())
+    assert not model.scaled
+    assert "volts" in model.scaling_note
+
+
+def test_velocity_and_displacement_frfs_give_the_same_modes() -> None:
+    frfs = hammer_test(FIVE, list(range(8)), [0])
+    jw = 2j * np.pi * frfs.frequency_hz
+    jw[0] = 1.0
+    parts = {"frf": frfs.frf / jw**2, "variance": frfs.variance / np.abs(jw) ** 4}
+    model = identify(
+        FrfSet(**{**frfs.__dict__, **parts, "quantities": ("displacement",) * 8}), ModalSettings()
+    )
+    same = identify(frfs, ModalSettings())
+    assert frequencies(model) == pytest.approx(frequencies(same), rel=1e-6)
+
+
+def test_modes_outside_the_chosen_band_are_not_reported() -> None:
+    model = identify(hammer_test(FIVE, list(range(8)), [0, 3]), ModalSettings(low_hz=60, high_hz=250))
+    assert frequencies(model) == pytest.approx([81.0, 120.0, 190.0], rel=2e-4)
+
+
+def test_a_band_without_lines_is_refused_with_a_remedy() -> None:
+    frfs = hammer_test(FIVE, list(range(8)), [0], record_s=2.0)
+    with pytest.raises(EmaError, match="fewer than 16 lines"):
+        identify(frfs, ModalSettings(low_hz=100, high_hz=101))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_random_systems_lose_and_gain_no_modes(seed: int) -> None:
+    rng = np.random.default_rng(700 + seed)
+    system = random_system(rng, n_modes=8, n_dofs=10, low_hz=30, high_hz=380, min_spacing=0.02)
+    slowest = np.min(system.damping_ratio * system.frequency_hz) * 2 * np.pi
+    frfs = hammer_test(
+        system, list(range(10)), [0, 1, 2], record_s=float(np.clip(5 / slowest, 3, 12)), noise=0.02, seed=seed
+    )
+    model = identify(frfs, ModalSettings())
+    assert len(model.modes) == 8
+    assert frequencies(model) == pytest.approx(system.frequency_hz, rel=1e-3)
+
+
+def test_progress_is_told_and_rises() -> None:
+    seen: list[float] = []
+    frfs = hammer_test(FIVE, [0, 1], [0], record_s=1.0)
+    identify(frfs, ModalSettings(), lambda share, text: seen.append(share))
+    assert seen == sorted(seen)
+    assert seen[-1] >= 0.9
