@@ -75,8 +75,9 @@ def energy_figure(result: IsolatorResult) -> Figure:
             f, line.slope * 2 * np.pi * f + line.intercept, color=colour, ls=LINES[i % len(LINES)], lw=0.9
         )
     if result.energy:
-        ax.set_ylim(bottom=0.0)
-        ax.legend(loc="best")
+        most = max(float(np.max(line.energy_j)) for line in result.energy)
+        ax.set_ylim(0.0, (1.15 + 0.1 * len(result.energy)) * most)
+        ax.legend(loc="upper left")
     else:
         note(ax, "all loops were taken at one frequency")
     return figure

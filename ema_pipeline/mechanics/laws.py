@@ -164,6 +164,20 @@ class PartingSpring(Spring, Nonlinear):
             return -k * contact - rest, -k, 0.0, 0.0
         return k * self.gap - rest, 0.0, 0.0, 0.0
 
+    def along(
+        self,
+        path: NDArray[np.float64],
+        rates: NDArray[np.float64],
+        time_step: float,
+        before: float,
+        state: float,
+    ) -> NDArray[np.float64]:
+        """See `Nonlinear.along`."""
+        if self.preload == inf:
+            return np.zeros(len(path))
+        parted = np.clip(-path - self.preload, 0.0, self.gap)
+        return self.stiffness * (parted - max(-self.preload, 0.0))
+
 
 @dataclass(frozen=True)
 class BoucWen(Nonlinear):

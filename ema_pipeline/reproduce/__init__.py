@@ -1,0 +1,16 @@
+"""The tables and figures of the sources that this program grew from, computed anew beside what they print."""
+
+from ema_pipeline.reproduce.run import NAMES, reproduce, write_page
+from ema_pipeline.reproduce.text import markdown, terminal_text
+from ema_pipeline.reproduce.types import Entry, Reproduction, Table
+
+__all__ = [
+    "NAMES",
+    "Entry",
+    "Reproduction",
+    "Table",
+    "markdown",
+    "reproduce",
+    "terminal_text",
+    "write_page",
+]

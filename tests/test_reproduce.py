@@ -1,0 +1,133 @@
+"""The sources' numbers, computed anew: what agrees, what differs, and that the page says so."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.reproduce import Entry, Reproduction, Table, markdown, reproduce, terminal_text
+from ema_pipeline.reproduce.gearbox import recover_crack
+from ema_pipeline.reproduce.text import difference, number
+from ema_pipeline.rigs import load_rig
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+
+
+@pytest.fixture(scope="module")
+def planetary(tmp_path_factory: pytest.TempPathFactory) -> Reproduction:
+    return reproduce("planetary", tmp_path_factory.mktemp("planetary"))
+
+
+@pytest.fixture(scope="module")
+def isolator() -> Reproduction:
+    return reproduce("isolator")
+
+
+def entries(reproduction: Reproduction, title: str) -> dict[str, Entry]:
+    table = next(t for t in reproduction.tables if title in t.title)
+    return {e.item: e for e in table.entries}
+
+
+def test_lin_and_parkers_table_is_met_to_a_tenth_of_a_hertz(planetary: Reproduction) -> None:
+    table = entries(planetary, "Check of the assembly")
+    assert len(table) == 12
+    for entry in table.values():
+        assert abs(entry.value - (entry.printed or 0.0)) < 0.06
+        assert entry.remark == ""  # multiplicities as printed
+
+
+def test_ring_bearing_is_found_as_the_parameter_that_cannot_be_meant(planetary: Reproduction) -> None:
+    table = entries(planetary, "Which printed parameter")
+    assert set(table) == {"ring mass", "ring inertia", "ring bearing stiffness", "ring torsional stiffness"}
+    assert table["ring bearing stiffness"].value == pytest.approx(1.64e6, rel=0.02)
+    assert "met" in table["ring bearing stiffness"].remark
+    assert "cannot" in table["ring inertia"].remark
+    damping = entries(planetary, "Damping coefficients")
+    assert damping["bearing of the ring"].printed == pytest.approx(
+        2 * 0.01 * np.sqrt(1.647e6 * 4.30), rel=1e-3
+    )
+    assert damping["torsion of the ring"].value == pytest.approx(795, abs=1)
+
+
+def test_three_modes_give_no_estimate_and_four_give_another_one_than_printed(
+    planetary: Reproduction,
+) -> None:
+    table = entries(planetary, "minimum of the error function")
+    assert np.isnan(table["sun-planet, 3 modes"].value)
+    assert "flat" in table["sun-planet, 3 modes"].remark
+    assert table["sun-planet, 4 modes"].value == pytest.approx(5.5e6, rel=0.02)
+    assert 1.5e6 < table["ring-planet, 4 modes"].value < 1.9e6
+
+
+def test_misfit_at_519_and_712_hz_is_shown_not_hidden(planetary: Reproduction) -> None:
+    table = entries(planetary, "Case 2")
+    assert abs(table["measured 515 Hz"].difference or 0.0) > 0.3
+    assert "no reading" in table["measured 1117 Hz"].remark
+
+
+def test_figures_and_text_are_written(planetary: Reproduction, tmp_path: Path) -> None:
+    reproduce("planetary", tmp_path)
+    assert {p.stem for p in tmp_path.glob("*.png")} == set(planetary.figures) == set(planetary.captions)
+    text = (tmp_path / "planetary.txt").read_text(encoding="utf-8")
+    assert text == terminal_text(planetary)
+    assert max(map(len, text.splitlines()[2:])) <= 112
+
+
+def test_printed_energies_give_the_negative_of_the_printed_damper(isolator: Reproduction) -> None:
+    entry = entries(isolator, "Energy per cycle")["c from the printed energies"]
+    assert entry.value == pytest.approx(-38.1, abs=0.1)
+    assert entry.printed == 39.69
+    assert "negative" in entry.remark
+
+
+def test_isolator_parameters_come_back_from_simulated_loops(isolator: Reproduction) -> None:
+    table = entries(isolator, "Parameters")
+    for name in ("stiffness", "quadratic stiffness", "viscous damping", "k_w·ρ"):
+        assert abs(table[name].difference or 1.0) < 0.03, name
+    assert abs(table["hysteresis sigma"].difference or 1.0) < 0.10
+    assert "not told from zero" in table["cubic stiffness"].remark
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_cracked_mesh_is_recovered_within_five_percent_from_raw_hits(seed: int) -> None:
+    true, value, std = recover_crack(load_rig("gearbox"), seed)
+    assert abs(value / true - 1) < 0.05
+    assert abs(value - true) < 3 * std
+
+
+def test_unknown_source_is_refused_with_a_hint() -> None:
+    with pytest.raises(EmaError, match="did you mean 'gearbox'"):
+        reproduce("gearbx")
+
+
+def test_numbers_and_differences_are_short() -> None:
+    assert number(1475.71, "Hz") == "1475.7"
+    assert number(None) == "–"
+    assert number(float("nan")) == "none"
+    assert difference(Entry("x", 2.0, 2.1, "m")) == "+5.0 %"
+    assert difference(Entry("x", 1.0, 10.0, "m")) == "×10"
+    assert difference(Entry("x", None, 10.0, "m")) == ""
+    table = Table("t", "s", (Entry("x", 1.0, 2.0, "1", "why " * 60),), ("remark",))
+    text = terminal_text(Reproduction("n", "T", "S", (table,), {}, {}))
+    assert "* remark" in text
+
+
+@pytest.mark.parametrize("name", ["planetary", "isolator"])
+def test_documented_page_holds_what_comes_out(name: str, request: pytest.FixtureRequest) -> None:
+    page = (DOCS / "seeds.md").read_text(encoding="utf-8")
+    computed = markdown(request.getfixturevalue(name))
+    rows = [line for line in computed.splitlines() if line.startswith("|")]
+    assert rows
+    missing = [row for row in rows if _words(row) not in _words(page)]
+    assert not missing, missing[:3]
+    for figure in re.findall(r"\((figures/[\w.]+)\)", computed):
+        assert (DOCS / figure).stat().st_size < 100_000
+
+
+def _words(text: str) -> str:
+    """Text whose numbers are cut to two digits: the last ones may differ between machines."""
+    return re.sub(r"(\d\.?\d?)[\d.]*", r"\1", text)
