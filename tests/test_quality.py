@@ -213,3 +213,12 @@ def test_real_hits_raise_no_false_alarm(test_data: Path) -> None:
                 assert not hit.rejected_channels, hit.file
                 count += 1
     assert count >= 190
+
+
+def test_a_record_without_a_blow_is_left_out_while_the_others_go_on() -> None:
+    good = clean()
+    dead = replace(good, file="dead.csv", force=np.zeros_like(good.force))
+    hits = hits_of_test([good, dead, replace(good, file="second.csv")])
+    assert [h.file for h in hits] == [good.file, "dead.csv", "second.csv"]
+    assert [h.accepted for h in hits] == [True, False, True]
+    assert "no hit found on hammer channel" in hits[1].reason

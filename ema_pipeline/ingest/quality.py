@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
+from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.clipping import flat_top_share
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.hits import align_hits, find_hits, trim_hits
@@ -42,25 +43,43 @@ def hits_of_test(records: Sequence[Record], settings: HitSettings | None = None)
     Returns
     -------
     tuple of Hit
-        With verdicts, in the order of the records.
-
-    Raises
-    ------
-    EmaError
-        Where a record holds no hit.
+        With verdicts, in the order of the records; a record in which no blow is found is one rejected hit.
     """
     settings = settings or HitSettings()
     found: list[Hit] = []
     owner: list[int] = []
+    silent: dict[int, Hit] = {}
     for index, record in enumerate(records):
-        hits = find_hits(record, settings)
+        try:
+            hits = find_hits(record, settings)
+        except EmaError as error:
+            silent[index] = _silent_hit(record, str(error), settings)
+            continue
         found += hits
         owner += [index] * len(hits)
     if not found:
-        return ()
+        return tuple(silent.values())
     aligned = align_hits(found, records, settings)
     checked = [check_hit(records[i], hit, settings) for i, hit in zip(owner, aligned, strict=True)]
-    return trim_hits(checked, records, settings)
+    trimmed = trim_hits(checked, records, settings)
+    placed = [*zip(owner, trimmed, strict=True), *silent.items()]
+    return tuple(hit for _, hit in sorted(placed, key=lambda item: item[0]))
+
+
+def _silent_hit(record: Record, reason: str, settings: HitSettings) -> Hit:
+    """A record without a blow, as a hit that is left out."""
+    verdict = Verdict(
+        check="force level",
+        value=0.0,
+        limit=settings.trigger_noise,
+        unit="1",
+        passes=False,
+        clause="",
+        consequence="reject_hit",
+        channel=record.force_name,
+        message=reason.removeprefix(f"{record.file}: "),
+    )
+    return Hit(record.file, 0, record.impact, 0, record.force.size, 0, 0.0, (verdict,))
 
 
 def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> Hit:
