@@ -118,7 +118,6 @@ def candidates_table(found: Diagnosis) -> Table:
                 plain(found.heldout_error, 3),
                 "The model as it is.",
             ),
-            found.verdict == "adequate",
         )
     )
     head = ("effect", "where", "size (±1σ)", "probability", "data say", "error, σ", "held out, σ", "why")
@@ -149,7 +148,6 @@ def short_candidates_table(found: Diagnosis) -> Table:
                 plain(found.error, 3),
                 plain(found.heldout_error, 3),
             ),
-            found.verdict == "adequate",
         )
     )
     return Table(

@@ -107,9 +107,9 @@ def _measured(c: ConfigurationResults) -> str:
 
 def _cautions_of(c: ConfigurationResults) -> list[str]:
     lines = []
-    rejected = [h for h in c.hits if not h.accepted]
+    rejected = sum(not h.accepted for h in c.hits)
     if rejected:
-        lines.append(f"{_count(len(rejected), 'hit')} rejected; the reasons are under Hits")
+        lines.append(f"{rejected} of {len(c.hits)} hits were left out")
     if c.frfs is not None:
         singles = int((c.frfs.hits == 1).sum())
         if singles:

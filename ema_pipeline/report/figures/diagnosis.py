@@ -204,7 +204,7 @@ def where_it_fails(
         fontsize=6.4,
     )
     if layout is not None and before.dofs:
-        gear = figure.add_axes(((width - right + 0.1) / width, 0.0, (right - 0.1) / width, 0.9))
+        gear = figure.add_axes(((width - right + 0.1) / width, 0.03, (right - 0.1) / width, 0.87))
         _gear_misfit(gear, layout, worst_per_body(before.dofs))
     return figure
 
@@ -284,8 +284,8 @@ def _gear_misfit(ax: Axes, layout: GearLayout, worst: Mapping[str, float]) -> No
         )  # fmt: skip
     ax.set_title("Shape misfit per body, σ", fontsize=7.6, pad=1)
     ax.text(
-        0.5, 0.005, "larger and darker: worse; white: not measured", transform=ax.transAxes, ha="center",
-        fontsize=5.8, color=GREY,
+        0.5, 0.0, "larger and darker: worse; white: not measured", transform=ax.transAxes, ha="center",
+        va="bottom", fontsize=5.8, color=GREY,
     )  # fmt: skip
 
 

@@ -1,0 +1,443 @@
+"""Diagnosis and ladder in the report, on the terminal and in summary.json."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import report_example as example
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from ema_pipeline.diagnose.types import (
+    Candidate,
+    Diagnosis,
+    EffectSize,
+    Ladder,
+    Localisation,
+    Rung,
+    VerdictWord,
+)
+from ema_pipeline.fit.types import ErrorSweep
+from ema_pipeline.report import diagnosis, summary, terminal
+from ema_pipeline.report.html import report_html
+from ema_pipeline.report.numbers import below
+from ema_pipeline.report.plots import Plot, figure_specs
+from ema_pipeline.report.results import RunResults
+from ema_pipeline.report.summary_files import write_summary
+
+CRACK = "mesh_stiffness_loss@sun-planet1"
+OTHER = "planet_bearing_mistune@planet2"
+SUPPORT = "flexible_support@ring"
+
+
+def size(value: float, std: float, unit: str = "1") -> EffectSize:
+    return EffectSize(value, std, unit)
+
+
+def candidate(label: str, probability: float, after: float, held: float, **changes: object) -> Candidate:
+    effect, _, at = label.partition("@")
+    made = Candidate(
+        effect,
+        at,
+        "one mesh softer than the others",
+        probability,
+        {"fraction": size(0.34, 0.0102)},
+        3.1,
+        after,
+        3.3,
+        held,
+        120.0 if after < 2 else 1.5,
+        11.0,
+        55.0,
+        False,
+        f"Its signs: mode pairs split. The misfit falls most at 1441.9 Hz for {at}.",
+    )
+    return replace(made, **changes)  # type: ignore[arg-type]
+
+
+def rung(effects: tuple[str, ...], error: float, held: float, left: int) -> Rung:
+    sizes = {"sun_bearing_stiffness": size(2e6, 1e5, "N/m")} | {
+        f"{e}.fraction": size(0.34, 0.0102) for e in effects if not e.startswith("out_of_tolerance")
+    }
+    return Rung(effects, error, held, 100.0, 90.0, sizes, 55.0 if effects else 0.0, left)
+
+
+def found(verdict: VerdictWord) -> Diagnosis:
+    claims = verdict == "effect"
+    probability = {"effect": 0.97, "ambiguous": 0.5, "unknown_effect": 0.93}.get(verdict, 0.04)
+    rungs = [rung((), 3.1, 3.3, 2)]
+    if verdict in ("effect", "ambiguous", "unknown_effect"):
+        rungs.append(rung((CRACK,), 1.02 if verdict != "unknown_effect" else 2.4, 1.05, 0))
+    candidates = (
+        candidate(CRACK, probability, rungs[-1].error, 1.05, claimed=claims),
+        candidate(OTHER, 0.45 if verdict == "ambiguous" else 0.01, 1.03, 1.06),
+        candidate(SUPPORT, 0.005, 3.0, math.nan),
+    )
+    null = 0.9 if verdict in ("adequate", "not_enough_data") else 1e-7
+    shares = {"nothing": null} | {c.label: c.probability for c in candidates}
+    shares["spring@sun.x"] = 1 - math.fsum(shares.values())
+    return Diagnosis(
+        verdict,
+        "What was found, in a sentence.",
+        null,
+        candidates,
+        ((CRACK, OTHER),) if verdict == "ambiguous" else (),
+        "A known mass of 0.05 kg at planet1 would tell them apart: 4.2 σ." if verdict == "ambiguous" else "",
+        (Localisation("planet1.x-sun.x", "stiffness", -3.1e6, 812.0),) if verdict == "unknown_effect" else (),
+        shares,
+        3.1,
+        3.3,
+        Ladder(tuple(rungs), 1e-4, 0.03, 0.01, "no further effect is supported by the data"),
+        ("with_ring: single hits of carrier.y scatter by 18 %",),
+    )
+
+
+VERDICTS: tuple[VerdictWord, ...] = ("adequate", "effect", "ambiguous", "unknown_effect", "not_enough_data")
+
+
+@pytest.fixture(scope="module")
+def base() -> RunResults:
+    return example.planetary_run(lines=257)
+
+
+@pytest.fixture(scope="module")
+def run(base: RunResults) -> RunResults:
+    assert base.comparison is not None
+    better = replace(base.comparison, modes=tuple(replace(m, frequency_z=0.3) for m in base.comparison.modes))
+    return replace(base, diagnosis=found("effect"), comparison_after=better)
+
+
+def drawn(results: RunResults) -> dict[str, Figure]:
+    return {s.name: s.draw() for s in figure_specs(results) if s.section == "diagnosis"}
+
+
+def page(results: RunResults) -> str:
+    """The report's diagnosis section, with figures that are only named."""
+    plots = [
+        Plot(s, {"svg": b"<svg/>"}, 3.5 if "ladder" in s.name else 7.2)
+        for s in figure_specs(results)
+        if s.section == "diagnosis"
+    ]
+    return report_html(results, plots)
+
+
+def printed(renderable: object, width: int = 80, encoding: str = "utf-8") -> str:
+    file = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    Console(file=file, width=width, no_color=True, highlight=False).print(renderable)
+    file.flush()
+    assert isinstance(file.buffer, io.BytesIO)
+    return file.buffer.getvalue().decode(encoding)
+
+
+def flowing(text: str) -> str:
+    return re.sub(r"\s+", " ", text)
+
+
+# words
+
+
+@pytest.mark.parametrize(
+    ("verdict", "expected"),
+    [
+        ("adequate", "Nothing is missing as far as these data can tell"),
+        ("effect", "Missing: mesh stiffness loss at sun-planet1"),
+        ("ambiguous", "Two explanations fit equally well"),
+        ("unknown_effect", "Something is missing that the library does not hold"),
+        ("not_enough_data", "Not enough data to tell what is missing"),
+    ],
+)
+def test_every_verdict_has_its_plain_heading(verdict: VerdictWord, expected: str) -> None:
+    assert diagnosis.heading(found(verdict)) == expected
+
+
+def test_three_that_fit_alike_are_counted_in_the_heading() -> None:
+    three = replace(found("ambiguous"), indistinguishable=((CRACK, OTHER, SUPPORT),))
+    assert diagnosis.heading(three) == "Three explanations fit equally well"
+
+
+def test_probability_is_never_rounded_to_certainty_or_to_nothing() -> None:
+    words = [diagnosis.probability_words(p) for p in (1.0, 0.99951, 0.9949, 0.97, 0.5, 0.032, 0.0004, 0.0)]
+    assert words == [">99.9 %", ">99.9 %", "99.5 %", "97 %", "50 %", "3.2 %", "<0.1 %", "<0.1 %"]
+    assert diagnosis.probability_words(0.9951) != "100 %"
+
+
+def test_commands_add_what_is_claimed_and_leave_out_what_is_in_the_model() -> None:
+    assert diagnosis.next_commands(found("effect"), "results/a b") == (
+        f"ema add 'results/a b' {CRACK}",
+        "ema ladder 'results/a b'",
+    )
+    assert diagnosis.next_commands(found("effect"), "r", added=(CRACK,)) == ()
+    assert diagnosis.next_commands(found("ambiguous"), "r") == (f"ema add r {CRACK}", f"ema add r {OTHER}")
+    assert diagnosis.next_commands(found("adequate"), "r") == ()
+
+
+def test_rung_says_what_it_adds_with_its_size_and_not_the_rigs_parameters() -> None:
+    two = Ladder((rung((), 3, 3, 0), rung((CRACK,), 2, 2, 0), rung((CRACK, OTHER), 1, 1, 0)), 0, 0, 0, "")
+    rows = diagnosis.ladder_table(two).rows
+    assert [r.cells[0] for r in rows] == [
+        "base model",
+        "+ mesh stiffness loss at sun-planet1",
+        "+ planet bearing mistune at planet2",
+    ]
+    assert [r.cells[1] for r in rows] == ["", "fraction 0.340 ± 0.010", "fraction 0.340 ± 0.010"]
+
+
+def test_size_of_a_parameter_out_of_tolerance_is_found_under_the_parameters_name() -> None:
+    label = "out_of_tolerance@sun_bearing_stiffness"
+    ladder = Ladder((rung((), 3, 3, 0), rung((label,), 1, 1, 0)), 0, 0, 0, "")
+    cells = diagnosis.ladder_table(ladder).rows[1].cells
+    assert cells[0] == "+ parameter sun bearing stiffness out of tolerance"
+    assert cells[1] == "sun bearing stiffness 2.00 ± 0.10 MN/m"
+
+
+def test_findings_begin_with_the_diagnosis(run: RunResults) -> None:
+    first = summary.findings(run)[0]
+    assert first.startswith("Diagnosis: missing: mesh stiffness loss at sun-planet1, fraction 0.340 ± 0.010")
+    assert "probability 97 %" in first
+    assert "error 3.10 → 1.02" in first
+    assert "2 before, 0 after" in first
+    good = summary.findings(replace(run, diagnosis=found("adequate")))[0]
+    assert "nothing is missing" in good
+    assert "probability 90 %" in good
+
+
+def test_mac_just_under_the_limit_is_not_shown_as_the_limit(base: RunResults) -> None:
+    assert [below(v, 0.8) for v in (0.6512, 0.7987, 0.79996)] == ["0.65", "0.799", "0.79996"]
+    assert below(0.7999999, 0.8) == "just under 0.8"
+    c = base.configurations[0]
+    assert c.pairing is not None
+    pairs = (replace(c.pairing.pairs[0], mac=0.7984),)
+    run = RunResults("x", configurations=(replace(c, pairing=replace(c.pairing, pairs=pairs)),))
+    text = " ".join(summary.cautions(run))
+    assert "(0.798)" in text
+    assert "(0.80)" not in text
+
+
+def test_flat_error_functions_of_one_stiffness_make_one_caution(base: RunResults) -> None:
+    assert base.fit is not None
+    x = np.geomspace(1e6, 1e9, 5)
+
+    def flat(modes: int, rise: float) -> ErrorSweep:
+        error = np.array([1.0, 1.0, 1.0, 1.0, 1.0 + rise])
+        return ErrorSweep("sun_planet_mesh_stiffness", "no_ring", modes, x, error, 1e6, 0.0, False, "flat: …")
+
+    run = replace(base, fit=replace(base.fit, sweeps=(flat(3, 0.05), flat(4, 0.06))))
+    told = [c for c in summary.cautions(run) if "ε of" in c]
+    assert told == [
+        "ε of sun planet mesh stiffness (no_ring) determines nothing with 3 or 4 modes: "
+        "it changes by 5.0–6.0 % over the sweep."
+    ]
+
+
+# figures
+
+
+def test_bars_of_the_candidates_are_their_probabilities_and_add_up_to_one(run: RunResults) -> None:
+    ax = drawn(run)["diagnosis_candidates"].axes[0]
+    names = [t.get_text().replace("\n", " ") for t in ax.get_yticklabels()]
+    widths = [p.get_width() for p in ax.patches]  # type: ignore[attr-defined]
+    assert names[0] == "mesh stiffness loss at sun-planet1"
+    assert names[-1] == "nothing missing"
+    assert widths[:3] == [0.97, 0.01, 0.005]
+    assert sum(widths) == pytest.approx(1.0)
+    assert next(t.get_text() for t in ax.texts) == "97 % ◆"
+    assert not any("◆" in t.get_text() for t in ax.texts[1:])
+    (limit,) = [line for line in ax.lines if len(set(np.asarray(line.get_xdata()))) == 1]
+    assert np.asarray(limit.get_xdata())[0] == 0.9
+
+
+def test_threshold_in_the_figure_is_the_one_that_was_set(run: RunResults) -> None:
+    own = replace(run, settings={"diagnose": {"probability_least": "0.95"}})
+    assert diagnosis.probability_threshold(own) == 0.95
+    assert "0.95 needed" in drawn(own)["diagnosis_candidates"].axes[0].get_title()
+
+
+def test_ladder_figure_shows_both_errors_with_differing_marks(run: RunResults) -> None:
+    ax = drawn(run)["diagnosis_ladder"].axes[0]
+    lines = {str(line.get_label()): line for line in ax.lines}
+    np.testing.assert_allclose(lines["data fitted"].get_ydata(), [3.1, 1.02])
+    np.testing.assert_allclose(lines["data held out"].get_ydata(), [3.3, 1.05])
+    np.testing.assert_allclose(lines["about 1: explained"].get_ydata(), 1.0)
+    assert lines["data fitted"].get_marker() != lines["data held out"].get_marker()
+    assert lines["data fitted"].get_linestyle() != lines["data held out"].get_linestyle()
+    assert ax.get_yscale() == "log"
+    ticks = [t.get_text().replace("\n", " ") for t in ax.get_xticklabels()]
+    assert ticks == ["base model 2 modes unexplained", "+ mesh stiffness loss at sun-planet1"]
+
+
+def test_ladder_of_the_user_is_shown_before_that_of_the_diagnosis(run: RunResults) -> None:
+    mine = Ladder((rung((), 9.0, 9.5, 0), rung((SUPPORT,), 8.0, 8.5, 0)), 1e-4, 0.03, 0.01, "")
+    own = replace(run, ladder=mine)
+    assert own.shown_ladder is mine
+    ax = drawn(own)["diagnosis_ladder"].axes[0]
+    assert "+ flexible support" in ax.get_xticklabels()[1].get_text().replace("\n", " ")
+    assert "with the effects that were added" in page(own)
+
+
+def test_modes_without_partner_stand_out_where_the_model_fails(run: RunResults) -> None:
+    figure = drawn(run)["diagnosis_where"]
+    ax = figure.axes[0]
+    hatches = [p.get_hatch() for p in ax.patches]
+    lone = sum(len(c.pairing.unpaired_measured) for c in run.configurations if c.pairing)
+    assert lone == 2
+    assert hatches.count("xxxx") == lone
+    assert run.comparison is not None
+    assert len(ax.get_xticklabels()) == len(run.comparison.modes) + lone
+    after = [line for line in ax.lines if line.get_marker() == "D" and len(np.asarray(line.get_xdata()))]
+    assert len(after) == len(run.comparison.modes)
+
+
+def test_worst_body_has_the_largest_and_darkest_mark_on_the_gear(run: RunResults) -> None:
+    gear = drawn(run)["diagnosis_where"].axes[1]
+    texts = [t.get_text() for t in gear.texts]
+    discs = [line for line in gear.lines if line.get_markersize() > 5]
+    worst = max(discs, key=lambda line: line.get_markersize())
+    assert texts[discs.index(worst)] == "6.1"  # planet2, see the example
+    assert len({line.get_markerfacecolor() for line in discs}) > 1
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+def test_nothing_in_the_diagnosis_figures_leaves_them(base: RunResults, verdict: VerdictWord) -> None:
+    for name, figure in drawn(replace(base, diagnosis=found(verdict))).items():
+        figure.canvas.draw()
+        renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+        for ax in figure.axes:
+            texts = [*ax.texts, ax.title, ax.xaxis.label, ax.yaxis.label]
+            texts += [t for t in (*ax.get_xticklabels(), *ax.get_yticklabels()) if ax.axison]
+            for text in texts:
+                if not text.get_text() or (not ax.axison and text in (ax.xaxis.label, ax.yaxis.label)):
+                    continue
+                box = text.get_window_extent(renderer)
+                inside = (
+                    box.x0 > -1
+                    and box.y0 > -1
+                    and box.x1 < figure.bbox.x1 + 1
+                    and box.y1 < figure.bbox.y1 + 1
+                )
+                assert inside, f"{name}: '{text.get_text()}'"
+
+
+# report
+
+
+def test_report_tells_the_diagnosis_right_after_the_summary(run: RunResults) -> None:
+    html = page(run)
+    assert re.findall(r'<section id="(\w+)"', html)[:3] == ["summary", "diagnosis", "frf"]
+    numbers = [int(n) for n in re.findall(r"<h2>(\d+)\.", html)]
+    assert numbers == list(range(1, len(numbers) + 1))
+    text = html[html.index('<section id="diagnosis"') : html.index('<section id="frf"')]
+    assert "Missing: mesh stiffness loss at sun-planet1" in text
+    assert "Its signs: mode pairs split. The misfit falls most at 1441.9 Hz for sun-planet1." in text
+    for needed in ("fraction 0.340 ± 0.010", "97 %", "3.10 → 1.02", "3.30 → 1.05", "no better than chance"):
+        assert needed in text
+    assert text.count("<img") == 3
+    assert "no further effect is supported by the data" in text
+    assert "scatter by 18 %" in text
+    assert "Where the misfit sits" not in text
+
+
+def test_report_without_diagnosis_has_no_such_section(base: RunResults) -> None:
+    html = page(base)
+    assert 'id="diagnosis"' not in html
+    assert "<h2>2. FRFs" in html
+
+
+def test_report_names_what_cannot_be_told_apart_and_what_to_measure(base: RunResults) -> None:
+    html = page(replace(base, diagnosis=found("ambiguous")))
+    assert "Two explanations fit equally well" in html
+    assert (
+        "These data cannot tell apart: mesh stiffness loss at sun-planet1; planet bearing mistune at planet2."
+        in html
+    )
+    assert "A known mass of 0.05 kg at planet1" in html
+
+
+def test_report_says_where_an_unknown_effect_sits(base: RunResults) -> None:
+    html = page(replace(base, diagnosis=found("unknown_effect")))
+    row = html[html.index("planet1.x-sun.x") :][:200]
+    assert "stiffness" in row
+    assert "−3.100 MN/m" in row
+
+
+# terminal
+
+
+@pytest.mark.parametrize("verdict", VERDICTS)
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_screens_fit_80_columns_without_colour(verdict: VerdictWord, encoding: str) -> None:
+    told = found(verdict)
+    for screen in (terminal.diagnosis_screen(told, "results/a"), terminal.ladder_screen(told.ladder)):
+        text = printed(screen, 80, encoding)
+        assert "\x1b" not in text
+        assert "?" not in text
+        assert max(len(line) for line in text.splitlines()) <= 80
+
+
+def test_diagnosis_screen_tells_all_that_matters() -> None:
+    text = printed(terminal.diagnosis_screen(found("ambiguous"), "results/a"))
+    plain = flowing(text)
+    assert plain.startswith("Two explanations fit equally well What was found, in a sentence.")
+    assert "fraction 0.340 ± 0.010" in text  # never broken
+    assert "The misfit falls most at 1441.9 Hz for sun-planet1." in plain
+    assert "The misfit falls most at 1441.9 Hz for planet2." in plain
+    assert "Measure next: A known mass of 0.05 kg" in plain
+    assert f"  ema add results/a {CRACK}\n  ema add results/a {OTHER}" in text
+    marked = [line for line in text.splitlines() if line.startswith("!")]
+    assert len(marked) == 4  # both of the group, the group in words, the note of the screening
+
+
+def test_ladder_screen_shows_the_error_falling() -> None:
+    text = printed(terminal.ladder_screen(found("effect").ladder))
+    rows = [line for line in text.splitlines() if re.search(r"\d\.\d\d +\d\.\d\d +\d", line)]
+    assert re.findall(r"(\d\.\d\d) +(\d\.\d\d) +(\d)", rows[0]) == [("3.10", "3.30", "2")]
+    assert re.findall(r"(\d\.\d\d) +(\d\.\d\d) +(\d)", rows[1]) == [("1.02", "1.05", "0")]
+    assert "0.010 % of frequency" in flowing(text)
+
+
+def test_run_summary_ends_with_the_commands_to_type_next(run: RunResults) -> None:
+    assert printed(terminal.run_summary(run, "out")).endswith(
+        f"Next:\n  ema add out {CRACK}\n  ema ladder out\n"
+    )
+    taken = replace(run, ladder=found("effect").ladder)
+    assert "ema add" not in printed(terminal.run_summary(taken, "out"))
+
+
+# summary.json
+
+
+def test_summary_json_holds_diagnosis_and_ladder_as_agreed(run: RunResults, tmp_path: Path) -> None:
+    write_summary(run, tmp_path / "summary.json")
+    text = (tmp_path / "summary.json").read_text(encoding="utf-8")
+    content = json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    told = content["diagnosis"]
+    assert told["verdict"] == "effect"
+    first, _, third = told["candidates"]
+    assert (first["effect"], first["at"], first["probability"]) == (
+        "mesh_stiffness_loss",
+        "sun-planet1",
+        0.97,
+    )
+    assert first["parameters"] == {"fraction": {"value": 0.34, "std": 0.0102, "unit": "1"}}
+    assert (first["error_before"], first["error_after"], first["heldout_error_after"]) == (3.1, 1.02, 1.05)
+    assert third["heldout_error_after"] is None
+    assert math.fsum(told["probabilities"].values()) == pytest.approx(1.0)
+    assert told["probabilities"]["nothing"] == told["nothing_missing_probability"]
+    assert (told["indistinguishable"], told["next_measurement"]) == ([], "")
+    assert [(r["effects"], r["error"], r["heldout_error"]) for r in content["ladder"]] == [
+        ([], 3.1, 3.3),
+        ([CRACK], 1.02, 1.05),
+    ]
+    assert content["ladder"][1]["parameters"][f"{CRACK}.fraction"]["value"] == 0.34
+
+
+def test_summary_json_before_a_diagnosis_has_neither(base: RunResults, tmp_path: Path) -> None:
+    write_summary(base, tmp_path / "summary.json")
+    content = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert not {"diagnosis", "ladder"} & set(content)
