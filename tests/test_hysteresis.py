@@ -133,6 +133,14 @@ def test_one_frequency_does_not_part_viscous_from_hysteretic_loss() -> None:
     assert result.energy == ()
 
 
+def test_force_with_its_sign_the_wrong_way_round_is_flagged() -> None:
+    loops = []
+    for a in (1e-3, 2e-3):
+        x, force = simulate_sine_test(dict(PRINTED), 12.0, a)
+        loops.append(measure_loop(x, -force, 5120.0, 12.0, a))
+    assert any("check the sign" in flag for flag in identify_isolator(loops).flags)
+
+
 def test_run_up_and_run_down_are_left_out() -> None:
     x, force = simulate_sine_test(dict(PRINTED), 12.0, 1e-3, noise=0.0)
     n = len(x)
@@ -147,8 +155,10 @@ def test_run_up_and_run_down_are_left_out() -> None:
     [
         ({"amplitude_m": 2e-3}, r"amplitude is (1|0.999\d?) mm, amplitude_m says 2 mm.*correct"),
         ({"frequency_hz": 400.0}, r"samples per cycle.*raise sample_rate_hz"),
+        ({"frequency_hz": 9.0}, r"does not repeat at 9 Hz.*correct frequency_hz"),
         ({"displacement": np.zeros(5000)}, r"does not move"),
-        ({"displacement": np.zeros(100), "force": np.zeros(100)}, r"shorter than one cycle"),
+        ({"force": np.zeros(12800)}, r"force does not change"),
+        ({"displacement": np.zeros(100), "force": np.arange(100.0)}, r"shorter than one cycle"),
     ],
 )
 def test_records_without_a_loop_are_refused_in_one_line(change: dict[str, object], message: str) -> None:

@@ -14,6 +14,8 @@ from ema_pipeline.hysteresis.types import Loop
 FEWEST_SAMPLES = 32
 """Samples per cycle below which a loop has no shape."""
 _SIGNIFICANT = 5.0
+_NOT_PERIODIC = 0.3
+_LEAST_NOISE = 1e-6
 
 
 def measure_loop(
@@ -63,6 +65,8 @@ def measure_loop(
             f"{name}: {per_cycle:.3g} samples per cycle at {frequency_hz:g} Hz; a loop needs "
             f"{FEWEST_SAMPLES} or more: raise sample_rate_hz"
         )
+    if np.ptp(f) == 0:
+        raise EmaError(f"{name}: the force does not change; check the channel")
     start, stop = _steady(x, round(per_cycle), s.steady_tolerance, name)
     x, f = x[start:stop], f[start:stop]
     true_hz = _refine(x, sample_rate_hz, frequency_hz, s.frequency_search)
@@ -74,6 +78,12 @@ def measure_loop(
     count = int(min(s.points_per_cycle, per_cycle))
     series, coefficient_std = _series(phase, x, min(s.displacement_harmonics, count // 4))
     harmonics = len(series) // 2
+    left = float(np.std(x - fourier(phase, harmonics) @ series)) / float(np.std(x))
+    if left > _NOT_PERIODIC:
+        raise EmaError(
+            f"{name}: the displacement does not repeat at {frequency_hz:g} Hz ({100 * left:.0f} % of it is "
+            "left over); correct frequency_hz or sample_rate_hz"
+        )
     index = (phase * count).astype(int) % count
     number = np.bincount(index, minlength=count)
     filled = number > 0
@@ -91,7 +101,7 @@ def measure_loop(
         )
     series[0] -= 0.5 * (low + high)
     velocity = fourier_slope(at, harmonics) @ series * true_hz
-    noise = _noise(f)
+    noise = max(_noise(f), _LEAST_NOISE * float(np.ptp(f)))
     each = _energies(phase, f, harmonics, series, cycles)
     scatter = float(np.std(each, ddof=1) / np.sqrt(cycles)) if cycles > 1 else 0.0
     own = noise * float(np.sqrt(np.mean(velocity**2))) / (true_hz * np.sqrt(keep))
