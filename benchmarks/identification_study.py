@@ -5,11 +5,12 @@
     python benchmarks/identification_study.py coverage --cases 500
     python benchmarks/identification_study.py noise --cases 30
 
-Records are simulated (blow, response, noise on all channels) and turned into H1 estimates by the simulator of the
-tests. A true mode counts as found when an identified mode lies within 0.5 half-power bandwidths + 0.05 % of it.
+Records are simulated (blow, response, noise on all channels) and turned into H1 estimates by the simulator of
+the tests. A true mode counts as found when an identified mode lies within 0.5 half-power bandwidths + 0.05 %
+of it.
 
-A true mode is called invisible, and left out of recall, by a criterion on the truth alone: with the true noise,
-the Cramér–Rao bound of its decay rate, all other modes known, exceeds 20 % (`visible`).
+A true mode is called invisible, and left out of recall, by a criterion on the truth alone: with the true
+noise, the Cramér–Rao bound of its decay rate, all other modes known, exceeds 20 %.
 """
 
 from __future__ import annotations
@@ -143,7 +144,8 @@ def random_study(cases: int, first: int, settings: ModalSettings, peer: bool, ve
     for name, z in (("frequency", zf), ("damping", zz)):
         z = np.array(z)
         print(
-            f"95 % interval of {name} covers {np.mean(np.abs(z) < 1.96):.3f}, rms of z {np.sqrt(np.mean(np.minimum(z**2, 25))):.2f}"
+            f"95 % interval of {name} covers {np.mean(np.abs(z) < 1.96):.3f}, "
+            f"rms of z {np.sqrt(np.mean(np.minimum(z**2, 25))):.2f}"
         )
     if peer and ep:
         print(f"sdypy-EMA damping error median {100 * np.median(ep):.3f} % ({len(ep)} modes)")
@@ -229,10 +231,12 @@ def pair_study(cases: int, first: int, settings: ModalSettings, verbose: bool) -
             )
             macs.append(value)
         if verbose and (not ok or value < 0.98 or extra):
-            print(f"  seed {seed}: f {system.frequency_hz[a]:.2f} ζ {system.damping_ratio[a]:.4f} both {ok} subspace {value:.4f} extra",
-                  [(round(model.modes[j].frequency_hz, 2), round(model.modes[j].damping_ratio, 4)) for j in extra], flush=True)  # fmt: skip
+            beside = [round(model.modes[j].frequency_hz, 2) for j in extra]
+            where = f"f {system.frequency_hz[a]:.2f} ζ {system.damping_ratio[a]:.4f}"
+            print(f"  seed {seed}: {where} both {ok} subspace {value:.4f} extra {beside}", flush=True)
     print(
-        f"both members in {both} of {cases}; subspace MAC min {min(macs):.4f}, median {np.median(macs):.5f}; spurious {spurious}"
+        f"both members in {both} of {cases}; subspace MAC min {min(macs):.4f}, "
+        f"median {np.median(macs):.5f}; spurious {spurious}"
     )
 
 
@@ -259,11 +263,15 @@ def coverage_study(cases: int, first: int, settings: ModalSettings) -> None:
     for seed in range(first, first + cases):
         rng = np.random.default_rng(50_000 + seed)
         n_out, n_ref = int(rng.integers(2, 13)), int(rng.integers(1, 3))
-        system = random_system(rng, n_modes=int(rng.integers(2, 6)), n_dofs=n_out, low_hz=60, high_hz=360, min_spacing=0.05, damping=(0.003, 0.02))  # fmt: skip
+        system = random_system(
+            rng, n_modes=int(rng.integers(2, 6)), n_dofs=n_out, low_hz=60, high_hz=360, min_spacing=0.05,
+            damping=(0.003, 0.02),
+        )  # fmt: skip
         slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
         dofs_out, dofs_in = list(range(n_out)), list(range(n_ref))
         hits = simulate_hits(
-            system, dofs_out, dofs_in, f_max=400.0, record_s=max(6.0 / slowest, 1.28), n_hits=int(rng.integers(1, 6)),
+            system, dofs_out, dofs_in, f_max=400.0, record_s=max(6.0 / slowest, 1.28),
+            n_hits=int(rng.integers(1, 6)),
             force_noise=rng.uniform(0.002, 0.05), response_noise=rng.uniform(0.002, 0.05), rng=rng,
         )  # fmt: skip
         model = identify(h1(hits, dofs_out, dofs_in, 400.0), settings)
@@ -278,7 +286,8 @@ def coverage_study(cases: int, first: int, settings: ModalSettings) -> None:
     for name, z in inside.items():
         z = np.array(z)
         print(
-            f"95 % interval of {name}: covers {np.mean(np.abs(z) < 1.96):.4f} of {len(z)}; std of z {np.std(np.clip(z, -6, 6)):.3f}, mean {np.mean(np.clip(z, -6, 6)):.3f}"
+            f"95 % interval of {name}: covers {np.mean(np.abs(z) < 1.96):.4f} of {len(z)}; "
+            f"std of z {np.std(np.clip(z, -6, 6)):.3f}, mean {np.mean(np.clip(z, -6, 6)):.3f}"
         )
 
 

@@ -134,6 +134,7 @@ def planetary(folder: Path, high_hz: float = 2000.0) -> FrfSet:
     ins = [Dof.parse(i) for i in hits]
     base = frf_set(
         np.fft.rfftfreq(n, 1 / test["sample_rate_hz"]), frf, list(range(len(points))), list(range(len(ins))),
-        variance=np.array(variances).transpose(1, 0, 2), n_hits=2, band_hz=(0.0, high_hz), delay=float(np.mean(delay)),
+        variance=np.array(variances).transpose(1, 0, 2), n_hits=2, band_hz=(0.0, high_hz),
+        delay=float(np.mean(delay)),
     )  # fmt: skip
     return FrfSet(**{**base.__dict__, "outputs": tuple(points), "inputs": tuple(ins)})

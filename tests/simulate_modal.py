@@ -1,7 +1,7 @@
 """Independent simulator of hammer tests for the tests and studies of modal identification.
 
-It shares no code with the package but the types: a system is a list of modes; hits are computed as time records
-(half-sine blow, anti-alias filter, noise on every channel), and turned into H1 estimates.
+It shares no code with the package but the types: a system is a list of modes; hits are computed as time
+records (half-sine blow, anti-alias filter, noise on every channel), and turned into H1 estimates.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ AIRCRAFT_HZ = [
     143.37,
     166.27,
 ]
-"""Published for the structure by a commercial polyreference estimator; 97.07 sits at 97.53 in this campaign."""
+"""Published for the structure by a commercial polyreference estimator; 97.07 sits at 97.53 in these data."""
 
 
 def test_all_published_modes_of_the_aircraft_are_found_from_single_hits_and_no_others(

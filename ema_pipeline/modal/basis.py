@@ -51,7 +51,8 @@ def real_columns(omega: Real, poles: Complex, rest_s: float) -> tuple[Complex, C
     Returns
     -------
     columns, derivatives : complex ndarray, (2·n_poles, n_lines)
-        Rows 2r and 2r+1 belong to the real and imaginary part of mode r: Q gives Re Q · row 2r + Im Q · row 2r+1.
+        Rows 2r and 2r+1 belong to the real and imaginary part of mode r: Q gives Re Q times row 2r plus
+        Im Q times row 2r+1.
     """
     u, du = pole_functions(omega, poles, rest_s)
     uc, duc = pole_functions(omega, poles.conj(), rest_s)

@@ -1,7 +1,7 @@
 """Many rows to few: poles and participations are the same in any real combination of rows.
 
-Scaled to equal noise, the strongest combinations hold all that many rows know about the poles, at a fraction of
-the work. Only the shapes need every row.
+Scaled to equal noise, the strongest combinations hold all that many rows know about the poles, at a
+fraction of the work. Only the shapes need every row.
 """
 
 from __future__ import annotations

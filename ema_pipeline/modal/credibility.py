@@ -40,7 +40,7 @@ HOPELESS = 0.5
 """Candidates that reach less than this share of a limit are dropped together, others one at a time."""
 
 SURE_VOTES = 0.6
-"""The same for poles that are more often than not the fit's way around a misfit: heavily damped ones and twins."""
+"""The same for poles that mostly are the fit's way around a misfit: heavily damped ones and twins."""
 
 PLAIN = 2.0
 """A mode is plain where, at its frequency, its own response has this many times the power of all the rest."""
@@ -60,7 +60,7 @@ mode, where a misfit is left over. A hundredth of it where the noise explains wh
 
 SAME_RESPONSE = 0.9
 """MAC at three or more sensors that measured together, above which two coinciding poles are one mode where a
-misfit is left over: its frequency drifts between hits, which splits it in two with one shape at the sensors."""
+misfit is left over: its frequency drifts between hits, which splits it in two that look alike."""
 
 RANDOM_PHASE = 0.25
 """Modal phase collinearity below which the phases of a shape are random."""
@@ -234,7 +234,7 @@ def significance(
     m = len(estimate.poles)
     if not m:
         return np.zeros(0), np.zeros(0)
-    gain, _ = evidence(solution, m)
+    gain = evidence(solution, m)
     rows = int(np.count_nonzero(data.measured.any(axis=1)))
     chance = FALSE_ALARM / len(data.omega)
     free = 2 * rows + 2 * data.measured.shape[1]

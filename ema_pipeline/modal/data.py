@@ -75,8 +75,8 @@ def analysis_band(frfs: FrfSet, settings: ModalSettings) -> tuple[float, float]:
     )
     if (high - low) / df < 16:
         raise EmaError(
-            f"the band to analyse, {low:.4g} to {high:.4g} Hz, holds fewer than 16 lines of {df:.4g} Hz: widen "
-            "low_hz and high_hz, record for longer, or use a harder hammer tip"
+            f"the band to analyse, {low:.4g} to {high:.4g} Hz, holds fewer than 16 lines of {df:.4g} Hz: "
+            "widen low_hz and high_hz, record for longer, or use a harder hammer tip"
         )
     return low, high
 
@@ -93,17 +93,17 @@ def arrange(frfs: FrfSet, band_hz: tuple[float, float]) -> FitData:
     omega = 2 * np.pi * frfs.frequency_hz[inside]
     acc = frfs.accelerance()[..., inside]
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.abs(frfs.accelerance()[..., inside]) / np.abs(frfs.frf[..., inside])
+        ratio = np.abs(acc) / np.abs(frfs.frf[..., inside])
     variance = frfs.variance[..., inside] * np.where(np.isfinite(ratio), ratio, 0.0) ** 2
     finite = np.isfinite(acc)
-    measured = finite.all(axis=-1)
+    measured = np.asarray(finite.all(axis=-1))
     if not measured.any():
         raise EmaError("no FRF was measured: nothing to identify modes from")
     partly = finite.any(axis=-1) & ~measured
     if partly.any():
         o, i = np.argwhere(partly)[0]
         raise EmaError(
-            f"FRF {frfs.outputs[o]} over {frfs.inputs[i]} is not a number at some lines only: estimate it again"
+            f"FRF {frfs.outputs[o]} over {frfs.inputs[i]} is not a number at some lines: estimate it again"
         )
     acc = np.where(measured[..., None], acc, 0.0)
     variance = np.where(np.isfinite(variance) & (variance > 0), variance, np.nan)

@@ -154,7 +154,7 @@ def solve_linear(data: FitData, weight: Real, estimate: Estimate) -> LinearSolut
     mix = mixing(estimate.participation)
     normal = np.einsum("iba,oibc,icd->oad", mix, gram[:, :, : 2 * m, : 2 * m], mix, optimize=True)
     right = np.einsum("iba,oib->oa", mix, moment[:, :, : 2 * m])
-    solved = _solve_scaled(normal, right[..., None])[..., 0]
+    solved = solve_scaled(normal, right[..., None])[..., 0]
     cost = float(power.sum() - np.einsum("oa,oa->", right, solved))
     shapes = solved[:, 0::2] + 1j * solved[:, 1::2]
     return LinearSolution(shapes, gram, moment, normal, cost)
@@ -164,14 +164,14 @@ def _project_out(gram: Real, moment: Real, power: Real, keep: int) -> tuple[Real
     """Eliminate the columns after `keep` (the residual terms) from the normal equations."""
     corner = gram[:, keep:, keep:]
     side = np.concatenate([gram[:, keep:, :keep], moment[:, keep:, None]], axis=-1)
-    solved = _solve_scaled(corner, side)
+    solved = solve_scaled(corner, side)
     gram_out = gram[:, :keep, :keep] - np.matmul(side[:, :, :-1].transpose(0, 2, 1), solved[:, :, :-1])
     moment_out = moment[:, :keep] - np.einsum("fka,fk->fa", side[:, :, :-1], solved[:, :, -1])
     power_out = power - np.einsum("fk,fk->f", moment[:, keep:], solved[:, :, -1])
     return gram_out, moment_out, power_out
 
 
-def _solve_scaled(matrix: Real, right: Real) -> Real:
+def solve_scaled(matrix: Real, right: Real) -> Real:
     """Solve symmetric systems, columns scaled to unit diagonal; rows without data give 0."""
     diagonal = np.einsum("...aa->...a", matrix)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
@@ -236,7 +236,7 @@ def newton_step(estimate: Estimate, solution: LinearSolution) -> Step:
     gz = np.matmul(solution.gram, z)
     jj = np.tensordot(z, gz, axes=([0, 1, 2], [0, 1, 2]))
     cross = np.einsum("iba,oibp->oap", mix, gz[:, :, : 2 * m], optimize=True)
-    eliminated = _solve_scaled(solution.normal, cross)
+    eliminated = solve_scaled(solution.normal, cross)
     information = jj - np.tensordot(cross, eliminated, axes=([0, 1], [0, 1]))
     psi = np.stack([solution.shapes.real, solution.shapes.imag], axis=-1).reshape(len(solution.shapes), 2 * m)
     coefficients = np.einsum("iab,ob->oia", mix, psi)
@@ -269,5 +269,5 @@ def residual_fit(data: FitData, weight: Real, modes: Complex) -> Complex:
     gram, moment = weighted_grams(
         columns, weight.reshape(-1, n_lines), (data.frf - modes).reshape(-1, n_lines)
     )
-    coefficients = _solve_scaled(gram, moment[..., None])[..., 0]
+    coefficients = solve_scaled(gram, moment[..., None])[..., 0]
     return np.asarray((coefficients @ columns).reshape(data.frf.shape))

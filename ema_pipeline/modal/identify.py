@@ -186,7 +186,7 @@ def _mode(
 
 
 def _chart(charts: list[PoleSet], poles: Complex, decay: float) -> tuple[StabilisationChart, Real]:
-    """Chart of all sub-bands, and each mode's share of the orders in the upper half of its sub-band's chart."""
+    """Chart of all sub-bands, and each mode's share of the orders in the upper half of its chart."""
     selected, stable = [], []
     share = np.zeros(len(poles))
     for chart in charts:
@@ -217,7 +217,7 @@ def _notes(data: FitData, scaling: str) -> tuple[str, ...]:
     notes = [scaling] if scaling else []
     if data.measured.shape[1] == 1:
         notes.append(
-            "one reference cannot show a multiplicity: modes of equal frequency appear as one; hit or measure "
-            "at a second point to tell them apart"
+            "one reference cannot show a multiplicity: modes of equal frequency appear as one; hit or "
+            "measure at a second point to tell them apart"
         )
     return tuple(notes)

@@ -41,14 +41,15 @@ def common_denominator_poles(
     Returns
     -------
     list of complex ndarray
-        Poles s in rad/s, counted from the frequency that maps to θ = 0, by rising frequency. With `first_line`
-        counted from 0 Hz and `n_grid` the last line these are the poles of sdypy-EMA's LSCF at half the order.
+        Poles s in rad/s, counted from the frequency that maps to θ = 0, by rising frequency. With
+        `first_line` counted from 0 Hz and `n_grid` the last line these are the poles of sdypy-EMA's LSCF at
+        half the order.
     """
     equations = normal_equations(frf[:, None, :], np.ones(frf.shape[1]), max(orders), first_line, n_grid)
     coefficients = [f.denominator[:, 0, 0] for f in fractions(equations, orders)]
     step = np.pi / (n_grid * omega_step)
-    out = []
+    out: list[NDArray[np.complex128]] = []
     for z in stable_roots(coefficients):
-        pole = -np.log(z) / step
+        pole = np.asarray(-np.log(z) / step)
         out.append(pole[np.argsort(pole.imag)])
     return out

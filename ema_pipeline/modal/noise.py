@@ -29,7 +29,7 @@ MAX_NODES = 12
 ITERATIONS = 25
 
 FLOOR = 1e-6
-"""Relative noise amplitude that no measurement chain undercuts (24-bit converters): keeps weights finite for noise-free data."""
+"""Relative noise amplitude that no measurement chain undercuts; keeps weights finite for noise-free data."""
 
 
 @dataclass(frozen=True)

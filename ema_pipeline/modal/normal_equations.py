@@ -5,8 +5,8 @@ FRFs in the linear least-squares sense. Eliminating B leaves normal equations in
 
     M_n = T_n − Σ_rows S_nᵀ R_n⁻¹ S_n .
 
-With one Cholesky factor R = LLᵀ at the highest order and W = L⁻¹S, the sum for order n is over the first n + 1
-rows of W, so that all orders follow from a running sum.
+With one Cholesky factor R = LLᵀ at the highest order and W = L⁻¹S, the sum for order n is over the first
+n + 1 rows of W, so that all orders follow from a running sum.
 
 References
 ----------
@@ -140,7 +140,7 @@ def fractions(equations: NormalEquations, orders: list[int]) -> Iterator[Fractio
                 scipy.linalg.cho_factor(a, lower=True, check_finite=False), b, check_finite=False
             )
         except np.linalg.LinAlgError:
-            low = np.linalg.lstsq(a, b, rcond=None)[0]
+            low = np.asarray(scipy.linalg.lstsq(a, b, check_finite=False)[0])
         yield Fraction(n, np.concatenate([low.reshape(n, r, r), np.eye(r)[None]]))
 
 

@@ -124,5 +124,8 @@ def scaling_note(has_shared: bool, calibrated: bool) -> str:
     if not calibrated:
         return "shapes are unscaled: the hammer signal is in volts; state its sensitivity_mv to scale them"
     if not has_shared:
-        return "shapes are unscaled: no driving point; measure the response at one point that is hit, in the direction of the hit"
+        return (
+            "shapes are unscaled: no driving point; measure the response at one point that is hit, in the "
+            "direction of the hit"
+        )
     return ""

@@ -1,7 +1,7 @@
 """The LSCF of sdypy-EMA as an engine, for comparison.
 
-Its frequency axis must start at 0 Hz and a large ratio of the band's ends spoils its conditioning; so it gets the
-lines of a sub-band as if they began a few lines above 0 Hz.
+Its frequency axis must start at 0 Hz and a large ratio of the band's ends spoils its conditioning; so it
+gets the lines of a sub-band as if they began a few lines above 0 Hz.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SAFE_PRODUCT = 5.0
-"""Largest product of polynomial order and lower over upper end of the band; its poles go wrong from about 8."""
+"""Largest product of polynomial order and lower over upper end of the band; poles go wrong from about 8."""
 
 
 def sdypy_poles(

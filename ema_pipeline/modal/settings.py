@@ -14,8 +14,8 @@ class ModalSettings(Settings):
 
     engine: Literal["plscf", "lscf", "sdypy"] = Field(
         default="plscf",
-        description="Estimator of the poles: 'plscf' (polyreference LSCF, all references at once; the only one "
-        "that can tell both modes of a repeated pole), 'lscf' (common-denominator LSCF), 'sdypy' "
+        description="Estimator of the poles: 'plscf' (polyreference LSCF, all references at once; the only "
+        "one that can tell both modes of a repeated pole), 'lscf' (common-denominator LSCF), 'sdypy' "
         "(the LSCF of sdypy-EMA, for comparison; slow).",
     )
     low_hz: float | None = Field(
@@ -34,13 +34,13 @@ class ModalSettings(Settings):
         default=None,
         ge=4,
         le=400,
-        description="Highest polynomial order per sub-band (half the number of poles per reference). Left out: "
-        "chosen from the number of peaks seen in the sub-band.",
+        description="Highest polynomial order per sub-band (half the number of poles per reference). Left "
+        "out: chosen from the number of peaks seen in the sub-band.",
     )
     polish: bool = Field(
         default=True,
-        description="Refine poles by a weighted nonlinear least-squares fit on the FRFs. Off: the poles stay as "
-        "the engine gives them, with its bias.",
+        description="Refine poles by a weighted nonlinear least-squares fit on the FRFs. Off: the poles stay "
+        "as the engine gives them, with its bias.",
     )
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""All sub-bands: candidates from the charts, a first guess of all modes, and the final fit of each sub-band."""
+"""All sub-bands: candidates from the charts, a first guess of all modes, the final fit of each sub-band."""
 
 from __future__ import annotations
 

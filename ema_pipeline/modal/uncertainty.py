@@ -15,6 +15,7 @@ from ema_pipeline.modal.fit import (
     mixing,
     newton_step,
     parameter_columns,
+    solve_scaled,
     weighted_grams,
 )
 from ema_pipeline.modal.noise import Noise
@@ -71,7 +72,7 @@ def covariance(
     n_rows, n_ref, n_lines = data.frf.shape
     gz = np.matmul(solution.gram, z)
     cross = np.einsum("iba,oibp->oap", mix, gz[:, :, : 2 * m], optimize=True)
-    eliminated = np.linalg.solve(_regular(solution.normal), cross)  # dψ/dθ, negative
+    eliminated = solve_scaled(solution.normal, cross)  # minus dψ/dθ
     # parameter sensitivity on lines: columns that act on [mode columns, derivatives], residual terms removed
     meat = np.zeros((n_par, n_par))
     groups = n_rows if data.transposed else n_ref
@@ -99,8 +100,8 @@ def covariance(
             x = mix[i].T @ projected[: 2 * m] * w
             row_meat += 0.5 * ((x * noise.variance[o, i]) @ x.conj().T).real
         shape_cov[o] = linear_inverse @ row_meat @ linear_inverse
-    for group in per_group:
-        meat += 0.5 * (group @ group.conj().T).real
+    for coherent in per_group:
+        meat += 0.5 * (coherent @ coherent.conj().T).real
     parameters = inverse @ meat @ inverse
     shape_cov += np.einsum("oap,pq,obq->oab", eliminated, parameters, eliminated, optimize=True)
     return Covariance(0.5 * (parameters + parameters.T), shape_cov)
@@ -113,28 +114,19 @@ def _inverse(matrix: Real) -> Real:
     )
 
 
-def _regular(matrix: Real) -> Real:
-    out = matrix.copy()
-    index = np.arange(out.shape[-1])
-    diagonal = out[..., index, index]
-    out[..., index, index] = np.where(diagonal > 0, diagonal * (1 + 1e-12), 1.0)
-    return out
-
-
-def evidence(solution: LinearSolution, n_modes: int) -> tuple[Real, Real]:
-    """How much the weighted sum of squares would grow without each mode.
+def evidence(solution: LinearSolution, n_modes: int) -> Real:
+    """How much the weighted sum of squares would grow without each mode, the other poles kept.
 
     Returns
     -------
-    gain : ndarray, (n_modes,)
+    ndarray, (n_modes,)
         Growth of χ², in units where each real datum adds 1.
-    rows : ndarray, (n_rows, n_modes)
-        Growth by row.
     """
-    inverse = np.linalg.inv(_regular(solution.normal))
-    rows = np.empty((len(inverse), n_modes))
+    identity = np.broadcast_to(np.eye(2 * n_modes), solution.normal.shape)
+    inverse = solve_scaled(solution.normal, identity)
+    gain = np.empty(n_modes)
     for r in range(n_modes):
-        block = np.linalg.inv(_regular(inverse[:, 2 * r : 2 * r + 2, 2 * r : 2 * r + 2]))
+        two = slice(2 * r, 2 * r + 2)
         psi = np.stack([solution.shapes[:, r].real, solution.shapes[:, r].imag], axis=-1)
-        rows[:, r] = 2.0 * np.einsum("oa,oab,ob->o", psi, block, psi)
-    return rows.sum(axis=0), rows
+        gain[r] = 2.0 * np.sum(psi * solve_scaled(inverse[:, two, two], psi[..., None])[..., 0])
+    return gain
