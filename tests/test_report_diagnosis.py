@@ -7,6 +7,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from ema_pipeline.diagnose.types import (
 )
 from ema_pipeline.fit.types import ErrorSweep
 from ema_pipeline.report import diagnosis, summary, terminal
+from ema_pipeline.report.figures.diagnosis import ladder_errors, where_it_fails
 from ema_pipeline.report.html import report_html
 from ema_pipeline.report.numbers import below
 from ema_pipeline.report.plots import Plot, figure_specs
@@ -301,6 +303,27 @@ def test_worst_body_has_the_largest_and_darkest_mark_on_the_gear(run: RunResults
     worst = max(discs, key=lambda line: line.get_markersize())
     assert texts[discs.index(worst)] == "6.1"  # planet2, see the example
     assert len({line.get_markerfacecolor() for line in discs}) > 1
+
+
+@pytest.mark.parametrize("rungs", [1, 2, 4, 7])
+def test_labels_of_many_rungs_do_not_overlap(rungs: int) -> None:
+    effects = (CRACK, OTHER, SUPPORT, "shaft_coupling@carrier-sun", "sensor_mass@all", "local_damper@planet2")
+    ladder = Ladder(tuple(rung(effects[:k], 9.0 / (k + 1), 8.0, 7 - k) for k in range(rungs)), 0, 0, 0, "")
+    figure = ladder_errors(ladder)
+    figure.canvas.draw()
+    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    ax = figure.axes[0]
+    boxes = [t.get_window_extent(renderer) for t in ax.get_xticklabels()]
+    legend = figure.legends[0].get_window_extent(renderer)
+    assert not any(a.overlaps(b) for a, b in pairwise(boxes))
+    assert not any(legend.overlaps(b) for b in boxes)
+
+
+def test_figure_says_so_where_no_mode_differs(base: RunResults) -> None:
+    assert base.comparison is not None
+    still = [replace(m, frequency_z=0.1, damping_z=math.nan, shape_z=0.2) for m in base.comparison.modes]
+    ax = where_it_fails(replace(base.comparison, modes=tuple(still)), [None], {}).axes[0]
+    assert "all differences are under 0.5σ" in [t.get_text() for t in ax.texts]
 
 
 @pytest.mark.parametrize("verdict", VERDICTS)

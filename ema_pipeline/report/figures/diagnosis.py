@@ -29,14 +29,17 @@ from ema_pipeline.report.style import (
     GREEN,
     GREY,
     VERMILLION,
+    WIDTH_IN,
     margins,
     new_figure,
+    note,
     styled,
 )
 
 HALF_IN = 3.55
 """Width of figures that stand side by side."""
 
+RUNGS_IN_HALF = 4
 MODES_SHOWN = 40
 _FLOOR = 0.5
 _LONE: Any = {"fc": "white", "ec": BLACK, "hatch": "xxxx", "lw": 0.4}
@@ -57,7 +60,8 @@ def candidate_probabilities(found: Diagnosis, threshold: float) -> Figure:
     listed = {c.label for c in found.candidates} | {NOTHING}
     others = [p for label, p in found.probabilities.items() if label not in listed]
     if others:
-        bars.append((f"{len(others)} others together", math.fsum(others), False))
+        name = "1 other" if len(others) == 1 else f"{len(others)} others together"
+        bars.append((name, math.fsum(others), False))
     bars.append(("nothing missing", found.null_probability, found.verdict == "adequate"))
     figure = new_figure(0.75 + 0.235 * max(len(bars), 7), HALF_IN)
     ax = figure.add_subplot(
@@ -102,9 +106,16 @@ def candidate_probabilities(found: Diagnosis, threshold: float) -> Figure:
 def ladder_errors(ladder: Ladder) -> Figure:
     """Error on the data fitted and on data held out, from the base model upwards."""
     rungs = ladder.rungs
-    figure = new_figure(2.395, HALF_IN)
+    width = HALF_IN if len(rungs) <= RUNGS_IN_HALF else WIDTH_IN
+    wide = max(9, round(12.4 * width) // len(rungs))
+    befores: list[tuple[str, ...]] = [(), *(r.effects for r in rungs[:-1])]
+    labels = [_rung_label(b, r, wide) for b, r in zip(befores, rungs, strict=True)]
+    lines = max(label.count("\n") + 1 for label in labels)
+    figure = new_figure(2.14 + 0.1 * max(lines, 3), width)
     ax = figure.add_subplot(
-        figure.add_gridspec(1, 1, **margins(figure, left=0.55, right=0.1, bottom=0.86))[0]
+        figure.add_gridspec(1, 1, **margins(figure, left=0.55, right=0.1, bottom=0.5 + 0.1 * max(lines, 3)))[
+            0
+        ]
     )
     at = np.arange(len(rungs))
     fitted = np.array([r.error for r in rungs], dtype=float)
@@ -138,9 +149,6 @@ def ladder_errors(ladder: Ladder) -> Figure:
     ax.set_ylim(low, high)
     _plain_log(ax, low, high)
     ax.set_xlim(-0.5, len(rungs) - 0.5)
-    wide = max(9, 44 // max(len(rungs), 1))
-    befores: list[tuple[str, ...]] = [(), *(r.effects for r in rungs[:-1])]
-    labels = [_rung_label(b, r, wide) for b, r in zip(befores, rungs, strict=True)]
     ax.set_xticks(at, labels, fontsize=6)
     ax.grid(False, axis="x")
     ax.set_ylabel("error, σ root mean square")
@@ -155,7 +163,8 @@ def _rung_label(before: tuple[str, ...], rung: Rung, width: int) -> str:
     text = textwrap.fill(rung_words(before, rung.effects), width, break_on_hyphens=False)
     if not rung.unexplained:
         return text
-    return f"{text}\n{rung.unexplained} mode{'' if rung.unexplained == 1 else 's'} unexplained"
+    left = f"{rung.unexplained} mode{'' if rung.unexplained == 1 else 's'} unexplained"
+    return f"{text}\n{textwrap.fill(left, width)}"
 
 
 @styled
@@ -191,7 +200,7 @@ def where_it_fails(
     if any(b.quantity < 0 for b in bars):
         handles.append(Patch(label="no partner", **_LONE))
     if after is not None:
-        (mark,) = ax.plot([], [], "D", mfc="white", mec=BLACK, ms=3.6, label="with what was found")
+        (mark,) = ax.plot([], [], "D", mfc="white", mec=BLACK, ms=3.6, label="with it added")
         handles.append(mark)
     figure.legend(
         handles=[*handles, Patch(fc="#efefef", label="chance (2σ)")],
@@ -199,9 +208,9 @@ def where_it_fails(
         bbox_to_anchor=(0.06, 1.0),
         ncols=len(handles) + 1,
         frameon=False,
-        columnspacing=1.0,
-        handletextpad=0.5,
-        fontsize=6.4,
+        columnspacing=0.8,
+        handletextpad=0.4,
+        fontsize=6.2,
     )
     if layout is not None and before.dofs:
         gear = figure.add_axes(((width - right + 0.1) / width, 0.03, (right - 0.1) / width, 0.87))
@@ -249,6 +258,8 @@ def _mode_bars(ax: Axes, bars: Sequence[_Bar], after: Mapping[tuple[str, int], f
         if (b.configuration, b.measured) in after:
             left = max(after[b.configuration, b.measured], 1.1 * _FLOOR)
             ax.plot(place, left, "D", mfc="white", mec=BLACK, ms=3.6, zorder=4)
+    if all(b.size < _FLOOR for b in shown):
+        note(ax, f"all differences are under {_FLOOR:g}σ")
     for name in dict.fromkeys(b.configuration for b in shown):
         start = next(p for p, b in zip(at, shown, strict=True) if b.configuration == name)
         ax.text(start - 0.4, 1.01, name, transform=ax.get_xaxis_transform(), fontsize=7, fontweight="bold")
