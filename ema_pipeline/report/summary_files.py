@@ -144,7 +144,7 @@ def _ladder(ladder: Ladder) -> list[dict[str, Any]]:
             "error": r.error,
             "heldout_error": r.heldout_error,
             "chi2": r.chi2,
-            "log_evidence": r.log_evidence,
+            "log_evidence": r.log_evidence + 0.0,  # never -0.0
             "unexplained_modes": r.unexplained,
             "parameters": _sizes(r.parameters),
         }

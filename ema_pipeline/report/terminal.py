@@ -161,9 +161,9 @@ def comparison_tables(compared: Comparison) -> RenderableType:
         ),
     ]
     if compared.dofs:
-        parts.append(_rich(tables.worst_dofs_table(compared), "DOFs that differ most"))
+        parts += [_line(""), _rich(tables.worst_dofs_table(compared), "DOFs that differ most")]
     if compared.bands:
-        parts.append(_rich(tables.worst_bands_table(compared), "FRF bands that differ most"))
+        parts += [_line(""), _rich(tables.worst_bands_table(compared), "FRF bands that differ most")]
     return Group(*parts)
 
 
