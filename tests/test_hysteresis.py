@@ -201,3 +201,19 @@ def test_friction_device_is_fitted_and_its_play_is_named(test_data: Path) -> Non
     assert "play (backlash)" in words
     assert "2 of 2 loops" in words
     assert "energy per cycle" in words  # two tensions are two devices
+
+
+def test_summary_is_plain_json_and_the_terminal_says_what_was_found(identified: IsolatorResult) -> None:
+    import json
+
+    from ema_pipeline.hysteresis.summary import summary, terminal_lines
+
+    numbers = json.loads(json.dumps(summary(identified), allow_nan=False))
+    assert numbers["parameters"]["viscous_damping"]["value"] == identified.parameters["viscous_damping"].value
+    assert len(numbers["loops"]) == 9
+    assert [len(r["effects"]) for r in numbers["ladder"]] == [0, 2, 3, 4]
+    text = "\n".join(terminal_lines(identified))
+    assert "9 loops" in text
+    assert "linear spring" in text
+    assert "cubic stiffness" in text
+    assert "not told from zero" in text
