@@ -108,7 +108,7 @@ def run(
         from ema_pipeline.report import terminal
         from ema_pipeline.stages.results import load_results
 
-        _print(terminal.run_summary(load_results(result)))
+        _print(terminal.run_summary(load_results(result), str(folder)))
         if not computed:
             _print("Nothing had changed: all results are those of the earlier run.")
         elif verbose:
@@ -205,7 +205,7 @@ def diagnose(
             run = change_effects(out, adding(supported), (), show)
     if quiet:
         return
-    _print(terminal.diagnosis_screen(found))
+    _print(terminal.diagnosis_screen(found, str(out)))
     if auto and supported:
         _print_ladder(run)
 

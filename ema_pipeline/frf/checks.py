@@ -80,10 +80,12 @@ def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict
         total = float(power.sum())
         coherence = float(frfs.coherence[o, i, inside][peaks] @ power / total)
         # Variance of one hit's FRF, not of the mean over n. Noise is there at all lines, scatter of the blows
-        # only where the structure answers.
+        # only where the structure answers. Lines count by their accuracy: the force fades towards the zeros of
+        # its spectrum.
         variance = frfs.variance[o, i, inside]
-        excess = (variance[peaks] - _floor(variance, peaks)).clip(min=0.0)
-        scatter = float(np.sqrt(n * excess.sum() / total))
+        seen = np.maximum(variance[peaks], 1e-20 * float(power.max()))
+        excess = (seen - _floor(variance, peaks)).clip(min=0.0)
+        scatter = float(np.sqrt(n * np.sum(excess / seen) / np.sum(power / seen)))
         name = f"{frfs.outputs[o]} over {frfs.inputs[i]}"
         enough = n >= HITS_FOR_COHERENCE
         good = not enough or coherence >= settings.minimum_coherence
