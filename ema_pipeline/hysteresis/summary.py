@@ -9,7 +9,7 @@ from ema_pipeline.hysteresis.types import Estimate, IsolatorResult
 
 
 def terminal_lines(result: IsolatorResult) -> list[str]:
-    """Parameters, damper per amplitude, loss factors, ladder, then what cannot be and where the model fails."""
+    """Parameters, dampers, loss factors, ladder, what cannot be, and where the model fails."""
     lines = [f"{len(result.loops)} loops; parameters by least squares on all of them:"]
     lines += [f"  {_line(name, e)}" for name, e in result.parameters.items()]
     if result.relaxation:

@@ -46,7 +46,8 @@ def reproduce_isolator() -> Reproduction:
     low, high = float(largest.min()), float(largest.max())
     captions = {
         "isolator_loops_printed": "Figure 3 (b) and (c): loops of the printed parameters at 12 Hz and at "
-        "1 mm. The source's axis for 2 mm ends at 200 N and -300 N; the printed parameters give "
+        "1 mm. As far as its tick labels could be recovered, the source's axis for 2 mm ends at 200 N and "
+        "-300 N; the printed parameters give "
         f"{high:.0f} N and {low:.0f} N",
         "isolator_energy_printed": "The printed energies fall with frequency: the damper that follows is "
         "negative",

@@ -105,7 +105,7 @@ def _assembly_table() -> Table:
             entries.append(Entry(f"{f:g} Hz, {times}", f, value, "Hz", remark))
     return Table(
         "Check of the assembly: Lin & Parker's rig with three planets",
-        "their Table 2",
+        "their table of natural frequencies",
         tuple(entries),
         (
             "The model is assembled from the stretch of every spring, K = Σ k·v·vᵀ. The blocks printed in "
