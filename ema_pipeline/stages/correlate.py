@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.correlate.compare import compare
 from ema_pipeline.correlate.pairing import pair_rig
+from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.rigs.types import Rig
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.modes import measured_modes
 from ema_pipeline.stages.results import fitted_values
@@ -29,12 +32,15 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Pair the modes at the fitted parameters, then compare modes, shapes and FRFs."""
-    settings = cast("CorrelateSettings", run.settings[NAME])
-    rig = run.require_model(NAME)
     values = fitted_values(run.store.load("fit", ALL, "fit", FitResult))
+    pairings, comparison = correlate(run, run.require_model(NAME), values)
+    return {f"pairing {name}": p for name, p in pairings.items()} | {"comparison": comparison}
+
+
+def correlate(run: Run, rig: Rig, values: Mapping[str, float]) -> tuple[dict[str, Pairing], Comparison]:
+    """Pair the measured modes with those of a model, and compare the two."""
+    settings = cast("CorrelateSettings", run.settings[NAME])
     measured = measured_modes(run)
     pairings = {name: pair_rig(rig, name, values, measured[name], settings.pairing) for name in measured}
-    progress(0.3, "comparing")
     frfs = {name: run.store.load("frf", name, "frfs", FrfSet) for name in measured}
-    comparison = compare(rig, values, measured, frfs, pairings, settings.compare)
-    return {f"pairing {name}": p for name, p in pairings.items()} | {"comparison": comparison}
+    return pairings, compare(rig, values, measured, frfs, pairings, settings.compare)

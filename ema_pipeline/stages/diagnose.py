@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import cast
 
 from ema_pipeline.diagnose import DiagnoseSettings, diagnose
+from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.stages.base import Progress, Run
+from ema_pipeline.stages.correlate import correlate
 from ema_pipeline.stages.modes import measured_modes
 
 NAME = "diagnose"
@@ -26,7 +28,13 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     model = run.require_model(NAME)
     measured = measured_modes(run)
     found = diagnose(model, measured, settings, run.library, progress, failed_checks(run))
-    return {"diagnosis": found, "on_top_of": run.info.effects}
+    results: dict[str, object] = {"diagnosis": found, "on_top_of": run.info.effects}
+    top = found.ladder.rungs[-1]
+    if top.effects:
+        mended = make_rig(model, Hypothesis(top.effects), run.library, settings.parameter_range)
+        values = {name: size.value for name, size in top.parameters.items()}
+        _, results["comparison_after"] = correlate(run, mended, values)
+    return results
 
 
 def failed_checks(run: Run) -> tuple[str, ...]:

@@ -38,6 +38,7 @@ def load_results(run: Run) -> RunResults:
         configurations=tuple(configurations),
         fit=fit,
         comparison=run.store.find("correlate", ALL, "comparison", Comparison),
+        comparison_after=run.store.find("diagnose", ALL, "comparison_after", Comparison),
         diagnosis=run.store.find("diagnose", ALL, "diagnosis", Diagnosis),
         ladder=run.store.find("ladder", ALL, "ladder", Ladder),
         warnings=warnings(tuple(configurations)),
