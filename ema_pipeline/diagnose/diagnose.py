@@ -105,8 +105,10 @@ def _diagnose(
     stick = yardstick(case, climbed.level.applied(case.settings.fit), [*climbed.models, *first.fitted])
     members = _group(case, first)
     candidates = _candidates(case, first, members, climbed, ladder, stick, thresholds)
-    verdict, summary = _verdict(case, screening, climbed, candidates, members, ladder, stick)
-    # A claim holds only where the verdict stands by it.
+    if len(climbed.models) == 1:
+        mending = [f for f in members if _mends(case, f, stick)]
+        members = mending or members[:1]
+    verdict, summary = _verdict(case, screening, climbed, members, ladder, stick)
     tell(0.97, "next measurement")
     groups = (tuple(f.hypothesis.label for f in members),) if verdict == "ambiguous" else ()
     localised: tuple[Localisation, ...] = ()
@@ -264,7 +266,6 @@ def _verdict(
     case: Case,
     screening: Screening,
     climbed: _Climb,
-    candidates: Sequence[Candidate],
     members: Sequence[Fitted],
     ladder: Ladder,
     stick: Yardstick,
@@ -275,6 +276,9 @@ def _verdict(
     added = top.hypothesis.labels
     if screening.too_few:
         return "not_enough_data", screening.too_few
+    if wrong and not added and len(members) > 1:
+        names = ", ".join(label_text(f.hypothesis.label) for f in members)
+        return "ambiguous", f"The model fails ({wrong}); each of these would mend it: {names}."
     if wrong:
         best = f" {label_text(added[0])} helps most but does not mend it." if added else ""
         return "unknown_effect", f"The model fails ({wrong}) and nothing in the library mends it.{best}"
@@ -312,6 +316,12 @@ def _misfit(case: Case, climbed: _Climb, stick: Yardstick, error: float) -> str:
     if len(solid) > 1 or np.mean(~top.explained) > settings.unexplained_limit:
         return f"{int(np.sum(~top.explained))} measured modes have no counterpart in it"
     return ""
+
+
+def _mends(case: Case, f: Fitted, stick: Yardstick) -> bool:
+    """True where a hypothesis alone makes the model hold."""
+    few = np.mean(~f.explained) <= case.settings.unexplained_limit
+    return bool(few and len(_solid_unexplained(case, f)) < 2 and stick.error(f) <= case.settings.error_limit)
 
 
 def _solid_unexplained(case: Case, model: Fitted) -> list[str]:

@@ -74,6 +74,11 @@ class Fitted:
         Sum of squares of the shifts of all parameters with a tolerance.
     missed : int
         Model modes that the test should have shown and did not.
+    volume : float
+        What the freedom of near modes to mix costs, as -2 log: see `mixing_volume`.
+    alone : ndarray, (R,)
+        Squared distance of each measured mode's frequency from the nearest model mode that has no partner, in
+        standard uncertainties: what a mode without partner costs at least.
     """
 
     hypothesis: Hypothesis
@@ -87,6 +92,8 @@ class Fitted:
     prior_cost: float
     prior_count: int
     missed: int
+    volume: float
+    alone: NDArray[np.float64]
 
     @property
     def explained(self) -> NDArray[np.bool_]:
@@ -267,6 +274,8 @@ def judge(case: Case, problem: FitProblem, hypothesis: Hypothesis, found: Optimu
     added = extras(case.rig, hypothesis, case.library)
     evidence = found.objective + _occam(problem, found, covariance, added)
     evidence += -2 * np.log(case.settings.missed_mode) * missed
+    volume = mixing_volume(problem, found.x, found.inlier)
+    evidence += volume
     prior = space.has_prior
     return Fitted(
         hypothesis=hypothesis,
@@ -280,6 +289,8 @@ def judge(case: Case, problem: FitProblem, hypothesis: Hypothesis, found: Optimu
         prior_cost=float(np.sum(found.x[prior] ** 2)),
         prior_count=int(np.sum(prior)),
         missed=missed,
+        volume=volume,
+        alone=lonely_cost(problem, found.x),
     )
 
 
@@ -311,6 +322,53 @@ def _occam(
         hessian[i, i] += 2 / scale**2
     _, logdet = np.linalg.slogdet(hessian)
     return float(total + logdet - len(space.names) * np.log(2 * np.pi))
+
+
+def mixing_volume(problem: FitProblem, x: NDArray[np.float64], inlier: NDArray[np.float64]) -> float:
+    """Occam's factor of the mixing of near modes, as -2 log.
+
+    Modes that nearly coincide may exchange their shapes (see `correlate.residuals`). A model that puts a further
+    mode beside a measured one thereby gets a free shape to fit noise with. Integrated over the mixing amplitudes,
+    this freedom costs log det(1 + BᴴB/d²), once for the real and once for the imaginary parts.
+    """
+    total, start = 0.0, 0
+    mixing = problem.settings.mode_mixing
+    for e, pairs in zip(problem.evidence, problem.assignments(x), strict=True):
+        share = inlier[start : start + pairs.size]
+        start += pairs.size
+        if not e.has_shapes:
+            continue
+        modes = observable_modes(e.family.at(x[None]))
+        at, values = e.rows @ modes.shapes[0], modes.omega[0] ** 2
+        parts = 2.0 if np.any(e.shapes.imag) else 1.0
+        for r in np.flatnonzero(pairs >= 0):
+            k = int(pairs[r])
+            others = np.arange(values.size) != k
+            size = np.linalg.norm(e.shapes[r]) / max(float(np.linalg.norm(at[:, k])), 1e-30)
+            d = np.abs(values - values[k]) / (mixing * max(float(values[k]), 1e-12)) / max(size, 1e-150)
+            b = e.shape_weight[r][:, None] * at
+            own = b[:, k] / max(float(np.linalg.norm(b[:, k])), 1e-30)
+            b = b[:, others] - own[:, None] * (own.conj() @ b[:, others])[None]
+            b = b / np.maximum(d[others], 1e-3)
+            # det(1 + BᴴB) = det(1 + BBᴴ), of the size of the sensors
+            _, logdet = np.linalg.slogdet(np.eye(b.shape[0]) + b @ b.conj().T)
+            total += parts * float(share[r]) * float(logdet)
+    return total
+
+
+def lonely_cost(problem: FitProblem, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Squared distance of every measured frequency from the nearest model mode without partner, (R,)."""
+    parts = []
+    for e, pairs in zip(problem.evidence, problem.assignments(x), strict=True):
+        omega = problem.model_omega(e, x)
+        free = np.ones(omega.size, dtype=bool)
+        free[pairs[pairs >= 0]] = False
+        free &= omega > 1.0
+        if not np.any(free):
+            free = omega > 1.0
+        relative = np.abs(omega[free][None, :] / e.omega[:, None] - 1)
+        parts.append((np.min(relative, axis=1) / e.relative_std) ** 2)
+    return np.concatenate(parts)
 
 
 def missed_modes(problem: FitProblem, x: NDArray[np.float64]) -> int:

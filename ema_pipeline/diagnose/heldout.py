@@ -152,17 +152,16 @@ def _predicted(
 def error_of(
     costs: NDArray[np.float64],
     counts: NDArray[np.float64],
-    outlier_cost: NDArray[np.float64],
+    unpaired: NDArray[np.float64],
     counted: NDArray[np.bool_],
     prior_squares: float,
     prior_count: int,
 ) -> float:
     """Root-mean-square of (measurement - model)/standard uncertainty over modes and nominal values.
 
-    A mode without partner counts with the cost of "anything anywhere in the band"; modes that no hypothesis at
-    all explains are not `counted`.
+    A mode without partner counts as `unpaired`; modes that no hypothesis at all explains are not `counted`.
     """
-    with_partner = np.where(np.isfinite(costs), costs, outlier_cost)
+    with_partner = np.where(np.isfinite(costs), costs, unpaired)
     total = float(np.sum(with_partner[counted])) + prior_squares
     size = float(np.sum(counts[counted])) + prior_count
     return float(np.sqrt(total / size)) if size else float("nan")

@@ -36,7 +36,7 @@ class Yardstick:
     counted : ndarray of bool, (R,)
         Measured modes that at least one model explains.
     outlier_cost : ndarray, (R,)
-        What a mode without partner counts.
+        What a mode without partner counts at least.
     prior_count : int
         Nominal values of the base model.
     """
@@ -46,16 +46,20 @@ class Yardstick:
     outlier_cost: NDArray[np.float64]
     prior_count: int
 
+    def unpaired(self, fitted: Fitted) -> NDArray[np.float64]:
+        """What each measured mode costs where it has no partner."""
+        return np.maximum(self.outlier_cost, fitted.alone)
+
     def error(self, fitted: Fitted) -> float:
         """Error on the data that the model was fitted to."""
         return error_of(
-            fitted.costs, fitted.counts, self.outlier_cost, self.counted, fitted.prior_cost, self.prior_count
+            fitted.costs, fitted.counts, self.unpaired(fitted), self.counted, fitted.prior_cost, self.prior_count
         )
 
     def heldout_error(self, fitted: Fitted, out: HeldOut) -> float:
         """Error on data that the fits had not seen."""
         return error_of(
-            out.modes, fitted.counts, self.outlier_cost, self.counted, sum(out.parameters.values()),
+            out.modes, fitted.counts, self.unpaired(fitted), self.counted, sum(out.parameters.values()),
             self.prior_count,
         )  # fmt: skip
 

@@ -43,8 +43,8 @@ class Ranking:
         return sorted(self.fitted, key=lambda f: -self.probabilities[f.hypothesis.label])
 
     def gain(self, f: Fitted) -> float:
-        """Fall of -2 log posterior."""
-        return self.base.objective - f.objective
+        """Fall of -2 log posterior, the mixing of near modes integrated out."""
+        return self.base.objective + self.base.volume - f.objective - f.volume
 
     def log_evidence(self, f: Fitted) -> float:
         """Natural logarithm of the Bayes factor against the base model."""
@@ -102,6 +102,8 @@ def _moved_along(f: Fitted, old: Fitted, new: Fitted) -> Fitted:
         costs=new.costs,
         inlier=new.inlier,
         prior_cost=new.prior_cost,
+        volume=f.volume - old.volume + new.volume,
+        alone=new.alone,
     )
 
 
@@ -153,6 +155,8 @@ def _never_worse(f: Fitted, base: Fitted) -> Fitted:
         costs=base.costs,
         inlier=base.inlier,
         prior_cost=base.prior_cost,
+        volume=base.volume,
+        alone=base.alone,
     )
 
 
