@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -26,6 +26,7 @@ _VISIBLE = 0.02
 _CLEAR_GAIN = 30.0
 _NEAR = 20.0
 _PROMISE = 3.0
+_STALE = 1.0
 _WIDENED = (30.0, 5.0)
 _HOLDS = 4.0
 
@@ -120,7 +121,7 @@ def fit_null(
 def refit(case: Case, hypothesis: Hypothesis, fit: FitSettings, start: Mapping[str, float]) -> Fitted:
     """Fit from one starting point."""
     problem = case.problem(hypothesis, fit)
-    return judge(case, problem, hypothesis, settle(problem, problem.space.point(start)))
+    return judge(case, problem, hypothesis, honest(problem, settle(problem, problem.space.point(start))))
 
 
 @dataclass(frozen=True)
@@ -193,8 +194,24 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
         if len(near) > 1:
             near = _best_distinct([_first_steps(problem, x) for x in near], 2)
         candidates += [refine(problem, x) for x in near]
-    best = min(candidates, key=lambda o: o.objective)
+    best = min((honest(problem, o) for o in candidates), key=lambda o: o.objective)
     return judge(case, problem, hypothesis, best)
+
+
+def honest(problem: FitProblem, found: Optimum) -> Optimum:
+    """The optimum with the pairs that its own parameters give.
+
+    A fit with held pairs may drive a mode that it is paired with out of the sensors' sight, where mixed with its
+    neighbours it fits anything. Paired anew there, the measured mode has lost its partner and shows it.
+    """
+    objective = problem.exact(problem.assignments(found.x))
+    costs = objective.costs(found.x)
+    mixture = problem.mixture()
+    prior = problem.space.has_prior
+    value = float(np.sum(mixture.robust(costs)) + np.sum(found.x[prior] ** 2))
+    if value <= found.objective + _STALE:
+        return found
+    return replace(found, objective=value, costs=costs, inlier=mixture.inlier(costs))
 
 
 def _best_distinct(found: Sequence[Optimum], count: int) -> list[NDArray[np.float64]]:

@@ -28,6 +28,8 @@ from ema_pipeline.rigs.types import Rig
 
 Progress = Callable[[float, str], None]
 
+_UNSEEN = 0.05
+
 
 class Objective(Protocol):
     """Costs of the measured modes and their Gauss-Newton terms."""
@@ -315,6 +317,10 @@ def _assignment(e: Dataset, x: NDArray[np.float64], settings: FitSettings) -> ND
     groups = close_groups(model_hz, settings.pairing.group_width)
     single, grouped = shape_agreement(e.measured, np.asarray(shapes, dtype=complex), groups)
     elastic = model_hz > 1e-3
+    if e.has_shapes:
+        # A mode that no sensor sees cannot have been measured; mixed with its neighbours it would fit anything.
+        seen = np.linalg.norm(shapes, axis=1)
+        elastic &= seen > _UNSEEN * float(np.max(seen, initial=0.0))
     distance = np.where(
         elastic, np.abs(np.log(e.measured.frequency_hz[:, None] / np.where(elastic, model_hz, 1.0))), np.inf
     )
