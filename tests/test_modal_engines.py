@@ -13,7 +13,7 @@ from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.engines import complete_block
 from ema_pipeline.modal.fit import Estimate, moved, newton_step, solve_linear
 from ema_pipeline.modal.lscf import common_denominator_poles
-from ema_pipeline.modal.normal_equations import fractions, normal_equations
+from ema_pipeline.modal.normal_equations import fractions, increments, normal_equations
 from ema_pipeline.modal.plscf import polyreference_poles
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.roots import stable_roots
@@ -71,7 +71,7 @@ def test_denominators_of_all_orders_equal_those_of_a_direct_least_squares_fit() 
     weight = np.random.default_rng(7).uniform(0.5, 2.0, 191)
     half = np.where((np.arange(191) == 0) | (np.arange(191) == 190), 0.5, 1.0) * weight
     equations = normal_equations(frf, weight, 6, 0, 190)
-    for fraction in fractions(equations, [3, 6]):
+    for fraction in fractions(equations.total, increments(equations, [3, 6]), [3, 6], 2):
         n = fraction.order
         basis = np.exp(-1j * np.pi * np.arange(191) / 190)[:, None] ** np.arange(n + 1)
         blocks, right = [], []

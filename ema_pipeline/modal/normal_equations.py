@@ -29,6 +29,10 @@ from numpy.typing import NDArray
 Real = NDArray[np.float64]
 
 
+BLOCK = 64
+"""Rows of a triangular product that are done together."""
+
+
 @dataclass(frozen=True)
 class Fraction:
     """Coefficients of one order.
@@ -52,8 +56,8 @@ class NormalEquations:
     ----------
     factor : ndarray, (n + 1, n + 1)
         Lower Cholesky factor of R.
-    whitened : ndarray, (n_rows, n + 1, (n + 1)·n_references)
-        W of every row.
+    whitened : ndarray, (n + 1, n_rows, (n + 1)·n_references)
+        Row k of W, of every row of FRFs.
     total : ndarray, ((n + 1)·n_references, (n + 1)·n_references)
         T, summed over rows.
     n_references : int
@@ -96,50 +100,72 @@ def normal_equations(
     r = _lags(weight.astype(np.complex128), first_line, n_grid, order)[back]
     r[np.diag_indices_from(r)] *= 1 + 1e-14
     factor = np.linalg.cholesky(r)
-    s_lags = _lags(frf * weight, first_line, n_grid, order)
-    # S[row][j, (k, a)]: conj(z^j) z^k has lag j − k because z = exp(−jθ)
-    s = s_lags[:, :, back].transpose(0, 2, 3, 1).reshape(len(frf), order + 1, (order + 1) * n_ref)
-    whitened = _solve_lower(factor, s)
+    s_lags = np.ascontiguousarray(_lags(frf * weight, first_line, n_grid, order).transpose(0, 2, 1))
+    s = np.empty((order + 1, len(frf), order + 1, n_ref))
+    for j in range(order + 1):  # conj(z^j) z^k has lag j − k because z = exp(−jθ)
+        s[j] = s_lags[:, j : j + order + 1][:, ::-1]
+    whitened = _solve_lower(factor, s.reshape(order + 1, -1)).reshape(order + 1, len(frf), -1)
     cross = np.einsum("oaf,obf->abf", frf.conj(), frf * weight)
     t = _lags(cross, first_line, n_grid, order)[:, :, back]
     total = t.transpose(2, 0, 3, 1).reshape((order + 1) * n_ref, (order + 1) * n_ref)
     return NormalEquations(factor, whitened, total, n_ref)
 
 
-def _solve_lower(factor: Real, s: Real) -> Real:
-    """L⁻¹S for all rows in one triangular solve."""
-    n_rows, n, width = s.shape
-    stacked = s.transpose(1, 0, 2).reshape(n, n_rows * width)
+def _solve_lower(factor: Real, right: Real) -> Real:
+    """L⁻¹ times a wide matrix, in blocks of rows."""
     if np.count_nonzero(factor - np.diag(np.diag(factor))) == 0:
-        solved = stacked / np.diag(factor)[:, None]
-    else:
-        solved = scipy.linalg.solve_triangular(factor, stacked, lower=True, check_finite=False)
-    return np.ascontiguousarray(solved.reshape(n, n_rows, width).transpose(1, 0, 2))
+        right /= np.diag(factor)[:, None]
+        return right
+    inverse = scipy.linalg.solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False)
+    out = np.empty_like(right)
+    for start in range(0, len(factor), BLOCK):
+        stop = min(start + BLOCK, len(factor))
+        np.matmul(inverse[start:stop, :stop], right[:stop], out=out[start:stop])
+    return out
 
 
-def fractions(equations: NormalEquations, orders: list[int]) -> Iterator[Fraction]:
-    """Denominators of the given orders, lowest first, with A_order = I.
+def increments(equations: NormalEquations, orders: list[int]) -> list[Real]:
+    """What the sum over rows of Sᵀ R⁻¹ S gains from each order to the next; they add up over sets of rows.
+
+    Only the upper triangles are filled.
+    """
+    out, done = [], 0
+    for n in orders:
+        fresh = equations.whitened[done : n + 1].reshape(-1, equations.total.shape[0])
+        out.append(scipy.linalg.blas.dsyrk(1.0, fresh.T, lower=1).T)
+        done = n + 1
+    return out
+
+
+def fractions(total: Real, gains: list[Real], orders: list[int], n_references: int) -> Iterator[Fraction]:
+    """Denominators of the given orders, with A_order = I.
 
     With z = exp(−jθ) and the highest coefficient fixed, poles that only fit noise come out unstable and are
     easily told from physical ones.
+
+    Parameters
+    ----------
+    total : ndarray
+        T of the highest order.
+    gains : list of ndarray
+        From `increments` for the same orders.
+    orders : list of int
+        Ascending.
+    n_references : int
     """
-    r = equations.n_references
-    accumulated = np.zeros_like(equations.total)
-    done = 0
-    for n in sorted(orders):
-        size = (n + 1) * r
-        # W has a column block per coefficient; the rows up to n of all outputs add to the running sum
-        fresh = equations.whitened[:, done : n + 1].reshape(-1, equations.total.shape[0])
-        accumulated += fresh.T @ fresh
-        done = n + 1
-        m = equations.total[:size, :size] - accumulated[:size, :size]
-        lead = n * r
+    r = n_references
+    accumulated = np.zeros_like(total)
+    for n, gain in zip(orders, gains, strict=True):
+        accumulated += gain
+        size, lead = (n + 1) * r, n * r
+        m = total[:size, :size] - accumulated[:size, :size]
         a, b = m[:lead, :lead], -m[:lead, lead:]
         try:
             low = scipy.linalg.cho_solve(
-                scipy.linalg.cho_factor(a, lower=True, check_finite=False), b, check_finite=False
+                scipy.linalg.cho_factor(a, lower=False, check_finite=False), b, check_finite=False
             )
         except np.linalg.LinAlgError:
+            a = np.triu(a) + np.triu(a, 1).T
             low = np.asarray(scipy.linalg.lstsq(a, b, check_finite=False)[0])
         yield Fraction(n, np.concatenate([low.reshape(n, r, r), np.eye(r)[None]]))
 
@@ -148,8 +174,7 @@ def numerator(equations: NormalEquations, fraction: Fraction) -> Real:
     """B_k of every row for a denominator, (n_rows, order + 1, n_references)."""
     n, r = fraction.order, equations.n_references
     a = fraction.denominator.reshape((n + 1) * r, r)
-    wa = equations.whitened[:, : n + 1, : (n + 1) * r] @ a
-    stacked = wa.transpose(1, 0, 2).reshape(n + 1, -1)
+    stacked = (equations.whitened[: n + 1, :, : (n + 1) * r] @ a).reshape(n + 1, -1)
     b = scipy.linalg.solve_triangular(
         equations.factor[: n + 1, : n + 1], stacked, lower=True, trans="T", check_finite=False
     )

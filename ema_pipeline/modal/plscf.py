@@ -15,6 +15,7 @@ from ema_pipeline.modal.normal_equations import (
     Fraction,
     NormalEquations,
     fractions,
+    increments,
     normal_equations,
     numerator,
 )
@@ -49,15 +50,16 @@ def polyreference_poles(
         Stable poles inside the band.
     """
     equations = normal_equations(frf, weight, max(orders), 0, len(omega) - 1)
-    parts = [_poles_of(fraction, equations, omega) for fraction in fractions(equations, orders)]
+    orders = sorted(orders)
+    gains = increments(equations, orders)
+    found = fractions(equations.total, gains, orders, frf.shape[1])
+    parts = [_poles_of(fraction, equations, omega) for fraction in found]
     return PoleSet(
-        order=np.concatenate(
-            [np.full(len(p), n) for n, (p, _, _) in zip(sorted(orders), parts, strict=True)]
-        ),
+        order=np.concatenate([np.full(len(p), n) for n, (p, _, _) in zip(orders, parts, strict=True)]),
         pole=np.concatenate([p for p, _, _ in parts]),
         shape=np.concatenate([s for _, s, _ in parts]),
         participation=np.concatenate([w for _, _, w in parts]),
-        orders=tuple(sorted(orders)),
+        orders=tuple(orders),
     )
 
 
