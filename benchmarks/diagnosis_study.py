@@ -53,12 +53,16 @@ class Noise:
 def draw(rig: Rig, rng: np.random.Generator) -> dict[str, float]:
     """True values of the base rig's parameters."""
     return {
-        n: 10 ** rng.uniform(6.8, 7.3) if p.free else p.value * (1 + p.tolerance * float(np.clip(rng.normal(), -2.5, 2.5)))
+        n: 10 ** rng.uniform(6.8, 7.3)
+        if p.free
+        else p.value * (1 + p.tolerance * float(np.clip(rng.normal(), -2.5, 2.5)))
         for n, p in rig.parameters.items()
     }
 
 
-def true_rig(planets: int, effects: list[str], values: dict[str, float], noise: Noise, rng: np.random.Generator) -> tuple[Rig, dict[str, float]]:
+def true_rig(
+    planets: int, effects: list[str], values: dict[str, float], noise: Noise, rng: np.random.Generator
+) -> tuple[Rig, dict[str, float]]:
     """The rig with its effect, and planets that differ slightly."""
     parameters, given = {}, dict(values)
     for n in range(1, planets + 1):
@@ -70,7 +74,9 @@ def true_rig(planets: int, effects: list[str], values: dict[str, float], noise: 
     return rig_with_effects(planetary(planets, parameters), effects), given
 
 
-def measure(rig: Rig, configuration: str, values: Mapping[str, float], noise: Noise, rng: np.random.Generator) -> MeasuredModes:
+def measure(
+    rig: Rig, configuration: str, values: Mapping[str, float], noise: Noise, rng: np.random.Generator
+) -> MeasuredModes:
     """Measured modes with scatter, misses and spurious ones."""
     system = rig.system(configuration, values)
     modes = observable_modes(matrices(system))
@@ -193,13 +199,19 @@ def right(row: dict[str, object]) -> str:
 
 def main() -> None:
     """Run the study and print its tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--null", type=int, default=10, help="cases with nothing missing")
     parser.add_argument("--cases", type=int, default=1, help="cases per effect, place and size")
-    parser.add_argument("--effects", default="", help="ids, separated by commas; all linear ones where left out")
+    parser.add_argument(
+        "--effects", default="", help="ids, separated by commas; all linear ones where left out"
+    )
     parser.add_argument("--places", type=int, default=1, help="places per effect, drawn at random")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--noise", type=float, default=1.0, help="1: 0.1 %% frequency, 10 %% damping, 2 %% shape")
+    parser.add_argument(
+        "--noise", type=float, default=1.0, help="1: 0.1 %% frequency, 10 %% damping, 2 %% shape"
+    )
     parser.add_argument("--planets", type=int, default=2)
     parser.add_argument("--planet-scatter", type=float, default=1e-3, help="relative difference of planets")
     parser.add_argument("--processes", type=int, default=1)
@@ -209,7 +221,11 @@ def main() -> None:
 
     base = planetary(o.planets) if o.planets != 2 else load_rig("planetary")
     noise = replace(
-        Noise(), frequency=1e-3 * o.noise, damping=0.1 * o.noise, shape=0.02 * o.noise, planets=o.planet_scatter
+        Noise(),
+        frequency=1e-3 * o.noise,
+        damping=0.1 * o.noise,
+        shape=0.02 * o.noise,
+        planets=o.planet_scatter,
     )
     rng = np.random.default_rng(o.seed)
     labels: list[tuple[str, float]] = [("nothing", 0.0)] * o.null
@@ -259,14 +275,18 @@ def tables(rows: list[dict[str, object]]) -> None:
     """Outcomes by effect and size, confusions, calibration."""
     print("\noutcomes by effect and size (share of the effect's scale)")
     for key in dict.fromkeys((str(r["truth"]).partition("@")[0], r["share"]) for r in rows):
-        outcomes = Counter(r["outcome"] for r in rows if (str(r["truth"]).partition("@")[0], r["share"]) == key)
+        outcomes = Counter(
+            r["outcome"] for r in rows if (str(r["truth"]).partition("@")[0], r["share"]) == key
+        )
         print(f"  {key[0]:26s} {key[1]!s:5s} {dict(outcomes)}")
     print("confusions")
     for (truth, first), n in Counter(
         (r["truth"], r["first"]) for r in rows if r["outcome"] == "wrong"
     ).most_common(20):
         print(f"  {truth} taken for {first}: {n}")
-    print("calibration: probability of the first candidate (over something missing) and how often it is right")
+    print(
+        "calibration: probability of the first candidate (over something missing) and how often it is right"
+    )
     for low, high in ((0.0, 0.5), (0.5, 0.9), (0.9, 0.99), (0.99, 1.01)):
         picked = [r for r in rows if r["truth"] != "nothing" and low <= float(str(r["p"])) < high]
         if picked:

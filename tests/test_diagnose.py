@@ -12,7 +12,14 @@ import pytest
 
 from ema_pipeline import codec
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
-from ema_pipeline.diagnose import DiagnoseSettings, Diagnosis, add_effect, diagnose, make_ladder, remove_effect
+from ema_pipeline.diagnose import (
+    DiagnoseSettings,
+    Diagnosis,
+    add_effect,
+    diagnose,
+    make_ladder,
+    remove_effect,
+)
 from ema_pipeline.diagnose.fitting import Case, fit_hypothesis, fit_null, ground
 from ema_pipeline.diagnose.hypotheses import Hypothesis, prior_probabilities, single_hypotheses
 from ema_pipeline.diagnose.separate import options
@@ -33,7 +40,10 @@ CRACK, TORSION = "mesh_stiffness_loss@sun-planet1", "shaft_torsion@carrier"
 
 
 def measure(
-    effects: Mapping[str, float], changed: Mapping[str, float] | None = None, seed: int = 1, noise: float = 0.3
+    effects: Mapping[str, float],
+    changed: Mapping[str, float] | None = None,
+    seed: int = 1,
+    noise: float = 0.3,
 ) -> dict[str, MeasuredModes]:
     """Modes of the rig without ring, drawn from its tolerances, with 0.03 % of frequency scatter and so on."""
     rng = np.random.default_rng(seed)

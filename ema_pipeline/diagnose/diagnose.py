@@ -407,4 +407,3 @@ def _capital(text: str) -> str:
 def _part(tell: Progress, low: float, high: float) -> Progress:
     """Progress of a part of the work within the whole."""
     return lambda share, text: tell(low + (high - low) * share, text)
-

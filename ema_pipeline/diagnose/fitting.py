@@ -237,7 +237,9 @@ def _near_null(
 ) -> NDArray[np.float64]:
     """The point with sizes drawn towards null until no mode is lost: a lost mode no longer pulls."""
     space, mixture = problem.space, problem.mixture()
-    linear = [e for e in moved if e.scale > 0 and space.coordinates[space.names.index(e.name)].kind == "linear"]
+    linear = [
+        e for e in moved if e.scale > 0 and space.coordinates[space.names.index(e.name)].kind == "linear"
+    ]
     share = 0.1
     x = space.point(values)
     if not linear:

@@ -223,7 +223,7 @@ def _direction(
 
 
 def _alike(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
-    return a.size == b.size and min(np.linalg.norm(a - b), np.linalg.norm(a + b)) < _SMALL
+    return a.size == b.size and bool(min(np.linalg.norm(a - b), np.linalg.norm(a + b)) < _SMALL)
 
 
 def prior_probabilities(

@@ -53,7 +53,12 @@ class Yardstick:
     def error(self, fitted: Fitted) -> float:
         """Error on the data that the model was fitted to."""
         return error_of(
-            fitted.costs, fitted.counts, self.unpaired(fitted), self.counted, fitted.prior_cost, self.prior_count
+            fitted.costs,
+            fitted.counts,
+            self.unpaired(fitted),
+            self.counted,
+            fitted.prior_cost,
+            self.prior_count,
         )
 
     def heldout_error(self, fitted: Fitted, out: HeldOut) -> float:

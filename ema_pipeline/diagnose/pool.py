@@ -6,7 +6,7 @@ import multiprocessing
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from ema_pipeline.threads import single_blas_thread
 
@@ -33,7 +33,7 @@ def spread(job: Callable[[A], R], items: Sequence[A], processes: int) -> Iterato
     try:
         context = multiprocessing.get_context("fork")
         with ProcessPoolExecutor(min(processes, len(items)), mp_context=context) as pool:
-            yield from pool.map(_run, range(len(items)), [list(items)] * len(items))
+            yield from cast("Iterator[R]", pool.map(_run, range(len(items)), [list(items)] * len(items)))
     finally:
         _job = None
 

@@ -86,7 +86,9 @@ def sharpen(case: Case, ranking: Ranking, base: Fitted, fit: FitSettings, tell: 
     def one(h: Hypothesis) -> Fitted:
         return refit(case, h, fit, starts[h.label])
 
-    sharp = _ranked(case, base, [f.hypothesis for f in ranking.fitted if f.hypothesis.label in racing], one, fit, tell)
+    sharp = _ranked(
+        case, base, [f.hypothesis for f in ranking.fitted if f.hypothesis.label in racing], one, fit, tell
+    )
     by_label = {f.hypothesis.label: f for f in sharp.fitted}
     fitted = [
         by_label.get(f.hypothesis.label) or _moved_along(f, ranking.base, sharp.base) for f in ranking.fitted
