@@ -84,7 +84,12 @@ def _root(
 
 @app.command()
 def run(
-    raw: Raw,
+    raw: Annotated[
+        Path | None, typer.Argument(metavar="RAW", help="Raw folder: test.toml and the record files.")
+    ] = None,
+    modes: Annotated[
+        Path | None, typer.Option("--modes", metavar="FILE", help="A table of modes in place of raw data.")
+    ] = None,
     rig: RigOption = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Results folder; results/<name of RAW> if left out.")
@@ -98,22 +103,37 @@ def run(
     verbose: Verbose = False,
 ) -> None:
     """Go from raw hits to modes and, with a rig, to a fitted model. Unchanged stages are skipped."""
-    from ema_pipeline.job import run_raw, with_effect_files
+    from ema_pipeline.job import describe_modes, run_raw, with_effect_files
 
-    folder = out or Path("results") / raw.resolve().name
+    source = modes or raw
+    if source is None or (modes is not None and raw is not None):
+        raise typer.BadParameter("give either RAW or --modes FILE")
+    folder = out or Path("results") / (source.stem if modes else source.resolve().name)
     with _progress(quiet) as show:
         changes = with_effect_files((), effect_file or [], set_ or [])
-        result, computed = run_raw(raw, rig, folder, pipeline, changes, show)
+        describe_source = describe_modes if modes else None
+        result, computed = run_raw(source, rig, folder, pipeline, changes, show, describe_source)
     if not quiet:
-        from ema_pipeline.report import terminal
-        from ema_pipeline.stages.results import load_results
-
-        _print(terminal.run_summary(load_results(result), str(folder)))
+        _print_summary(result)
         if not computed:
             _print("Nothing had changed: all results are those of the earlier run.")
         elif verbose:
             _print(f"Computed: {', '.join(computed)}")
         _print(f"Report: {result.store.folder / 'report.html'}")
+
+
+def _print_summary(done: Run) -> None:
+    if done.info.kind == "hysteresis":
+        from ema_pipeline.hysteresis.summary import terminal_lines
+        from ema_pipeline.stages.results import isolators
+
+        for name, result in isolators(done).items():
+            _print("\n".join([name, *terminal_lines(result)]))
+        return
+    from ema_pipeline.report import terminal
+    from ema_pipeline.stages.results import load_results
+
+    _print(terminal.run_summary(load_results(done), str(done.store.folder)))
 
 
 def _stage_command(name: str, help_text: str) -> None:
@@ -319,6 +339,23 @@ def model(
     else:
         for name, modes in listed.items():
             _print(model_table(name, modes))
+
+
+@app.command()
+def reproduce(
+    which: Annotated[
+        str | None, typer.Argument(help="planetary, gearbox or isolator; all if left out.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for the figures; none are drawn if left out.")
+    ] = None,
+) -> None:
+    """Compute the tables and figures of the source papers anew, beside what they print."""
+    from ema_pipeline.reproduce import NAMES, terminal_text
+    from ema_pipeline.reproduce import reproduce as compute
+
+    for name in (which,) if which else NAMES:
+        _print(terminal_text(compute(name, out)))
 
 
 @app.command()

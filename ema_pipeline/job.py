@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from ema_pipeline.correlate.mode_table import read_mode_table
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import shipped_effects
@@ -36,6 +37,9 @@ from ema_pipeline.store import Store
 
 DEFAULT_PIPELINE = "default"
 
+DescribeSource = Callable[[Path, str | None, str | None, Iterable[str]], RunInfo]
+"""Checks what a run starts from; takes source, rig, pipeline and overrides."""
+
 
 def run_raw(
     raw: Path,
@@ -44,13 +48,14 @@ def run_raw(
     pipeline: str | None = None,
     overrides: Iterable[str] = (),
     show: ShowStage | None = None,
+    describe_source: DescribeSource | None = None,
 ) -> tuple[Run, list[str]]:
-    """Run a whole pipeline on a raw folder.
+    """Run a whole pipeline on a raw folder, or on a table of modes.
 
     Parameters
     ----------
     raw : Path
-        Raw folder.
+        Raw folder, or a file with a table of modes.
     rig : str or None
         Name of a rig or path of a rig file. Left out: the ``rig.toml`` beside test.toml, then the rig that
         test.toml names, then none.
@@ -62,6 +67,8 @@ def run_raw(
         ``stage.key=value``.
     show : ShowStage or None
         Display of progress.
+    describe_source : callable
+        `describe` for raw folders, `describe_modes` for a table of modes.
 
     Returns
     -------
@@ -74,7 +81,7 @@ def run_raw(
     EmaError
         Whatever is wrong with data or settings, in one line.
     """
-    info = describe(raw, rig, pipeline, overrides)
+    info = (describe_source or describe)(raw, rig, pipeline, overrides)
     store = Store(out)
     with _tidy(out), store.lock():
         info = _with_effects_of(store, info)
@@ -181,9 +188,11 @@ def _with_effects_of(store: Store, info: RunInfo) -> RunInfo:
 def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterable[str]) -> RunInfo:
     """Check raw folder, rig and settings against each other, before anything is written."""
     campaign = read_campaign(raw)
-    for test in campaign.tests:
-        if test.kind != "hammer":
-            raise EmaError(f"{test.file}: kind = '{test.kind}': only hammer tests can be run yet")
+    kinds = {test.kind for test in campaign.tests}
+    if len(kinds) > 1:
+        raise EmaError(f"{raw}: holds hammer and hysteresis tests; run their folders one by one")
+    if kinds == {"hysteresis"}:
+        return _describe_loops(campaign, pipeline, overrides)
     source = rig or _rig_of(campaign)
     model = None if source is None else load_rig(source)
     names = tuple(_configuration(test, model) for test in campaign.tests)
@@ -196,7 +205,25 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
         if len(names) == 1
         else raw.resolve().name
     )
-    return describe_run(raw, title, _rig_text(source), source or "", names, (), settings)
+    return describe_run("hammer", raw, title, _rig_text(source), source or "", names, (), settings)
+
+
+def _describe_loops(campaign: Campaign, pipeline: str | None, overrides: Iterable[str]) -> RunInfo:
+    """Hysteresis tests: the isolator's model is identified from the loops themselves."""
+    names = tuple(test.configuration or "default" for test in campaign.tests)
+    title = campaign.tests[0].title or campaign.root.resolve().name
+    settings = load_pipeline(pipeline or DEFAULT_PIPELINE, overrides)
+    return describe_run("hysteresis", campaign.root, title, "", "", names, (), settings)
+
+
+def describe_modes(file: Path, rig: str | None, pipeline: str | None, overrides: Iterable[str]) -> RunInfo:
+    """Check a table of modes against its rig, before anything is written."""
+    if rig is None:
+        raise EmaError(f"{file}: a table of modes needs a model to compare with; name it with --rig")
+    model = load_rig(rig)
+    names = tuple(read_mode_table(file, model))
+    settings = load_pipeline(pipeline or _pipeline_for(model), overrides)
+    return describe_run("modes", file, file.stem, _rig_text(rig), rig, names, (), settings)
 
 
 def check_dofs(test: TestDescription, configuration: str, rig: Rig) -> None:

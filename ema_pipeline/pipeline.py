@@ -19,6 +19,7 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.hysteresis.settings import HysteresisSettings
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.settings import ModalSettings
@@ -37,8 +38,15 @@ from ema_pipeline.stages.base import (
 )
 from ema_pipeline.store import ALL, Store
 
-STAGES = ("ingest", "hits", "frf", "modal", "ladder", "fit", "correlate", "diagnose", "report")
+STAGES = ("ingest", "hits", "frf", "modal", "ladder", "fit", "correlate", "diagnose", "loops", "report")
 """All stages, in the order in which the data flow."""
+
+STAGES_OF_KIND = {
+    "hammer": frozenset(STAGES) - {"loops"},
+    "modes": frozenset(STAGES) - {"ingest", "hits", "frf", "loops"},
+    "hysteresis": frozenset({"loops", "report"}),
+}
+"""Stages that have something to do, by kind of test."""
 
 
 class IngestSettings(Settings):
@@ -80,6 +88,7 @@ class PipelineSettings(Settings):
     fit: FitSettings = Field(FitSettings(), description="fitting the model's parameters")
     correlate: CorrelateSettings = Field(CorrelateSettings(), description="pairing and comparison")
     diagnose: DiagnoseSettings = Field(DiagnoseSettings(), description="search for missing physics")
+    loops: HysteresisSettings = Field(HysteresisSettings(), description="force-displacement loops")
     ladder: LadderSettings = Field(LadderSettings(), description="the ladder of added effects")
     report: ReportSettings = Field(ReportSettings(), description="tables, plots and the report")
 
@@ -180,6 +189,7 @@ def existing_run(folder: Path) -> Run:
 
 
 def describe_run(
+    kind: str,
     raw: Path,
     title: str,
     rig: str,
@@ -190,6 +200,7 @@ def describe_run(
 ) -> RunInfo:
     """Description of a run, for the store."""
     return RunInfo(
+        kind=kind,
         raw=str(raw),
         title=title,
         rig=rig,
@@ -239,6 +250,7 @@ class Keys:
         needed = [
             self(other, c)
             for other in stage.NEEDS
+            if other in STAGES_OF_KIND[run.info.kind]
             if run.rig is not None or not stage_module(other).NEEDS_RIG
             for c in (
                 (configuration,) if configuration != ALL else configurations_of(stage_module(other), run)
@@ -277,7 +289,7 @@ def run_stages(run: Run, names: Iterable[str], show: ShowStage | None = None) ->
     keys = Keys(run, names)
     for name in names:
         stage = stage_module(name)
-        if stage.NEEDS_RIG and run.rig is None:
+        if name not in STAGES_OF_KIND[run.info.kind] or (stage.NEEDS_RIG and run.rig is None):
             continue
         for configuration in configurations_of(stage, run):
             key = keys(name, configuration)

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from ema_pipeline import cli
+from ema_pipeline.hysteresis.simulate import PRINTED, write_sine_tests
 from ema_pipeline.simulate import simulate_campaign
 
 STAGES = 'stages=["ingest", "hits", "frf", "modal", "ladder", "fit", "correlate", "report"]'
@@ -178,6 +179,42 @@ def test_an_effect_that_does_not_exist_is_refused_and_changes_nothing(
         assert_one_clear_line(*ema(capsys, "add", results, wrong))
     assert_one_clear_line(*ema(capsys, "remove", results, "shaft_torsion@carrier"))
     assert (results / "ema.h5").read_bytes() == before
+
+
+def test_a_table_of_modes_takes_the_place_of_raw_data(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = tmp_path / "case1.toml"
+    table.write_text("schema = 1\n[no_ring]\nfrequency_hz = [62.5, 85.7, 134.0]\n", encoding="utf-8")
+    out = tmp_path / "out"
+    code, text, err = ema(capsys, "run", "--modes", table, *RIG, "--out", out)
+    assert code == 0, err
+    assert "not identified" in text
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    mesh = summary["fit"]["parameters"]["sun_planet_mesh_stiffness"]
+    assert (mesh["identified"], mesh["value"]) == (False, None)
+    assert [m["frequency_hz"] for m in summary["configurations"]["no_ring"]["modes"]] == [62.5, 85.7, 134.0]
+    assert (out / "report.html").exists()
+
+
+def test_hysteresis_tests_run_through_the_same_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_sine_tests(tmp_path / "raw", PRINTED)
+    out = tmp_path / "out"
+    code, text, err = ema(capsys, "run", tmp_path / "raw", "--out", out)
+    assert code == 0, err
+    assert "viscous damping" in text
+    found = json.loads((out / "summary.json").read_text(encoding="utf-8"))["configurations"]["default"]
+    assert found["parameters"]["stiffness"]["value"] == pytest.approx(PRINTED["stiffness"], rel=0.03)
+    assert list((out / "plots").glob("*.png"))
+
+
+def test_the_papers_tables_are_reproduced(capsys: pytest.CaptureFixture[str]) -> None:
+    code, text, _ = ema(capsys, "reproduce", "planetary")
+    assert code == 0
+    assert "1395" in text
+    assert ema(capsys, "reproduce", "planetry")[0] == 1
 
 
 def test_check_shows_a_verdict_table_and_writes_nothing(

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from ema_pipeline.correlate.settings import UncertaintySettings
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
-from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.modal.assurance import mpc
+from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,47 @@ class MeasuredModes:
         return int(self.frequency_hz.size)
 
 
+def to_modal_model(measured: MeasuredModes) -> ModalModel:
+    """A table of modes in the form that an identification has, so that both are reported alike."""
+    empty = np.zeros(0)
+    count = len(measured.dofs) if measured.shapes is not None else 0
+    modes = []
+    for r in range(len(measured)):
+        shape = np.zeros(0, complex) if measured.shapes is None else measured.shapes[r]
+        std = np.full(count, np.nan) if measured.shape_std is None else measured.shape_std[r]
+        f, zeta = float(measured.frequency_hz[r]), float(measured.damping_ratio[r])
+        pole = 2 * np.pi * f * complex(-np.nan_to_num(zeta), np.sqrt(1 - np.nan_to_num(zeta) ** 2))
+        modes.append(
+            Mode(
+                frequency_hz=f,
+                frequency_std_hz=float(measured.frequency_std_hz[r]),
+                damping_ratio=zeta,
+                damping_std=float(measured.damping_std[r]),
+                pole=pole,
+                shape=shape,
+                shape_std=std,
+                mpc=mpc(shape) if count else float("nan"),
+                method="table",
+            )
+        )
+    nothing = StabilisationChart(
+        empty.astype(np.int64), empty, empty, empty.astype(np.bool_), empty.astype(np.int64)
+    )
+    return ModalModel(
+        dofs=measured.dofs if count else (),
+        modes=tuple(modes),
+        band_hz=measured.band_hz or (float("nan"), float("nan")),
+        scaled=measured.scaled,
+        scaling_note="" if measured.scaled else "the table of modes does not say that its shapes are scaled",
+        references=measured.references,
+        frequency_hz=empty,
+        synthesis=np.zeros((0, 0, 0), complex),
+        outputs=(),
+        inputs=(),
+        chart=nothing,
+    )
+
+
 def from_modal_model(model: ModalModel, configuration: str) -> MeasuredModes:
     """Collect an identified modal model into arrays."""
     modes = model.modes
@@ -64,11 +106,11 @@ def from_modal_model(model: ModalModel, configuration: str) -> MeasuredModes:
         frequency_std_hz=np.array([m.frequency_std_hz for m in modes], dtype=float),
         damping_ratio=np.array([m.damping_ratio for m in modes], dtype=float),
         damping_std=np.array([m.damping_std for m in modes], dtype=float),
-        shapes=np.array([m.shape for m in modes], dtype=complex).reshape(-1, n_dofs),
-        shape_std=np.array([m.shape_std for m in modes], dtype=float).reshape(-1, n_dofs),
+        shapes=np.array([m.shape for m in modes], dtype=complex).reshape(-1, n_dofs) if n_dofs else None,
+        shape_std=np.array([m.shape_std for m in modes], dtype=float).reshape(-1, n_dofs) if n_dofs else None,
         dofs=model.dofs,
         scaled=model.scaled,
-        band_hz=model.band_hz,
+        band_hz=None if np.isnan(model.band_hz[0]) else model.band_hz,
         references=model.references,
     )
 

@@ -204,14 +204,15 @@ def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:
             caption = f"Nyquist circles of mode {i + 1} at {mode.frequency_hz:.5g} Hz in its best FRFs"
             draw = partial(nyquist.nyquist_sheet, modal, i, calibrated)
             yield FigureSpec(f"{stem}_nyquist_{i + 1:02d}", "nyquist", name, caption, draw)
-    yield FigureSpec(
-        f"{stem}_stabilisation",
-        "stabilisation",
-        name,
-        "Stabilisation chart: poles of all model orders over the CMIF",
-        partial(modes.stabilisation_chart, modal, frfs),
-        "png",
-    )
+    if modal.chart.order.size or frfs is not None:
+        yield FigureSpec(
+            f"{stem}_stabilisation",
+            "stabilisation",
+            name,
+            "Stabilisation chart: poles of all model orders over the CMIF",
+            partial(modes.stabilisation_chart, modal, frfs),
+            "png",
+        )
     if modal.modes:
         yield FigureSpec(
             f"{stem}_modes",
@@ -220,6 +221,7 @@ def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:
             "Natural frequencies and damping ratios with their uncertainty",
             partial(modes.modes_overview, modal),
         )
+    if modal.modes and modal.dofs:
         yield FigureSpec(
             f"{stem}_mac_measured",
             "pairing",

@@ -163,8 +163,8 @@ def frequency_range(
     """Range to show, and whether it needs a logarithmic axis (modes over more than one decade)."""
     modes = np.asarray(modes_hz, dtype=float)
     lines = np.asarray(lines_hz, dtype=float)
-    low, high = float(band_hz[0]), float(band_hz[1])
-    if not np.isfinite(high) or high <= low:
+    low, high = (float(b) if np.isfinite(b) else 0.0 for b in band_hz)
+    if high <= low and lines.size:
         high = float(lines[-1])
     if modes.size:
         low, high = min(low, 0.9 * float(modes.min())), max(high, 1.03 * float(modes.max()))

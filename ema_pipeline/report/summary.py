@@ -99,7 +99,9 @@ def _measured(c: ConfigurationResults) -> str:
     if c.modal is None:
         return text + "; no modes identified yet."
     low, high = c.modal.band_hz
-    text += f"; {_count(len(c.modal.modes), 'mode')} between {low:.4g} and {high:.5g} Hz"
+    text += "; " if c.hits or c.frfs is not None else " "
+    text += _count(len(c.modal.modes), "mode")
+    text += f" between {low:.4g} and {high:.5g} Hz" if math.isfinite(high) else " from a table"
     if c.pairing is not None:
         text += f", {len(c.pairing.pairs)} of them paired with the model"
     return text + "."

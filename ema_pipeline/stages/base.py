@@ -36,8 +36,10 @@ class RunInfo:
 
     Attributes
     ----------
+    kind : str
+        ``"hammer"``, ``"modes"`` (a table of modes in place of raw data) or ``"hysteresis"``.
     raw : str
-        Folder that the records came from.
+        Folder that the records came from, or the file with the table of modes.
     title : str
     rig : str
         Name of a shipped rig, or the whole text of the user's rig file; empty without a rig.
@@ -52,6 +54,7 @@ class RunInfo:
         Versions of the program, Python and the libraries that compute.
     """
 
+    kind: str
     raw: str
     title: str
     rig: str

@@ -42,5 +42,6 @@ def correlate(run: Run, rig: Rig, values: Mapping[str, float]) -> tuple[dict[str
     settings = cast("CorrelateSettings", run.settings[NAME])
     measured = measured_modes(run)
     pairings = {name: pair_rig(rig, name, values, measured[name], settings.pairing) for name in measured}
-    frfs = {name: run.store.load("frf", name, "frfs", FrfSet) for name in measured}
+    found = {name: run.store.find("frf", name, "frfs", FrfSet) for name in measured}
+    frfs = {name: f for name, f in found.items() if f is not None}
     return pairings, compare(rig, values, measured, frfs, pairings, settings.compare)

@@ -41,6 +41,7 @@ def failed_checks(run: Run) -> tuple[str, ...]:
     """What the checks on the FRFs found, for a reader who might otherwise blame the model."""
     found = []
     for name in run.info.configurations:
-        frfs = run.store.load("frf", name, "frfs", FrfSet)
-        found += [f"{name}: {v.message}" for v in frfs.verdicts if not v.passes and v.message]
+        frfs = run.store.find("frf", name, "frfs", FrfSet)
+        verdicts = () if frfs is None else frfs.verdicts
+        found += [f"{name}: {v.message}" for v in verdicts if not v.passes and v.message]
     return tuple(found)

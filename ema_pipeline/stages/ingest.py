@@ -19,12 +19,12 @@ NEEDS_RIG = False
 
 def inputs(run: Run, configuration: str) -> str:
     """Hashes of the description and of every record file."""
-    return json.dumps(file_hashes(_test(run, configuration)))
+    return json.dumps(file_hashes(test_of(run, configuration)))
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Read every record, check it against the description, and scale it to SI."""
-    test = _test(run, configuration)
+    test = test_of(run, configuration)
     return {
         "sources": file_hashes(test),
         "title": test.title,
@@ -44,6 +44,7 @@ def file_hashes(test: TestDescription) -> dict[str, str]:
     return {str(path.relative_to(test.folder)): file_hash(path) for path in files}
 
 
-def _test(run: Run, configuration: str) -> TestDescription:
+def test_of(run: Run, configuration: str) -> TestDescription:
+    """Description of the test of one configuration."""
     tests = read_campaign(Path(run.info.raw)).tests
     return next(t for t in tests if (t.configuration or run.info.configurations[0]) == configuration)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from ema_pipeline.correlate.measured import to_modal_model
+from ema_pipeline.correlate.mode_table import read_mode_table
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.circle import attach_circles, identify_by_circle
 from ema_pipeline.modal.identify import identify
-from ema_pipeline.stages.base import Progress, Run
+from ema_pipeline.stages.base import Progress, Run, file_hash
 
 if TYPE_CHECKING:
     from ema_pipeline.pipeline import ModalStageSettings
@@ -19,12 +22,15 @@ NEEDS_RIG = False
 
 
 def inputs(run: Run, configuration: str) -> str:
-    """Nothing but the FRFs."""
-    return ""
+    """Nothing but the FRFs, or the table of modes in place of them."""
+    return file_hash(Path(run.info.raw)) if run.info.kind == "modes" else ""
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Identify the modes, and look at each of them with circle fits."""
+    if run.info.kind == "modes":
+        measured = read_mode_table(Path(run.info.raw), run.require_model(NAME))
+        return {"modal": to_modal_model(measured[configuration])}
     settings = cast("ModalStageSettings", run.settings[NAME])
     frfs = run.store.load("frf", configuration, "frfs", FrfSet)
     if settings.method == "circle":

@@ -6,17 +6,18 @@ import json
 from typing import cast
 
 from ema_pipeline.report.html import write_report
+from ema_pipeline.report.loops import write_loops_report
 from ema_pipeline.report.plots import write_plots
 from ema_pipeline.report.settings import ReportSettings
 from ema_pipeline.report.summary_files import write_modes_csv, write_summary
 from ema_pipeline.stages.base import Progress, Run
-from ema_pipeline.stages.results import load_results
+from ema_pipeline.stages.results import isolators, load_results, provenance
 
 NAME = "report"
 NEEDS: tuple[str, ...] = ()
 PER_CONFIGURATION = False
 NEEDS_RIG = False
-OUTPUTS = ("summary.json", "modes.csv", "report.html")
+OUTPUTS = ("summary.json", "report.html")
 
 
 def inputs(run: Run, configuration: str) -> str:
@@ -28,8 +29,11 @@ def inputs(run: Run, configuration: str) -> str:
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Write every file of the results folder but the store."""
     settings = cast(ReportSettings, run.settings[NAME])
-    results = load_results(run)
     folder = run.store.folder
+    if run.info.kind == "hysteresis":
+        write_loops_report(isolators(run), run.info.title, provenance(run), folder)
+        return {"files": OUTPUTS}
+    results = load_results(run)
     write_summary(results, folder / "summary.json")
     write_modes_csv(results, folder / "modes.csv")
 

@@ -8,6 +8,7 @@ from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.hysteresis.types import IsolatorResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report.results import ConfigurationResults, RunResults
@@ -42,9 +43,16 @@ def load_results(run: Run) -> RunResults:
         diagnosis=run.store.find("diagnose", ALL, "diagnosis", Diagnosis),
         ladder=run.store.find("ladder", ALL, "ladder", Ladder),
         warnings=warnings(tuple(configurations)),
-        provenance=_provenance(run),
+        provenance=provenance(run),
         settings={name: _flat(json.loads(s.model_dump_json())) for name, s in run.settings.items()},
     )
+
+
+def isolators(run: Run) -> dict[str, IsolatorResult]:
+    """Identified isolators of hysteresis tests, by configuration."""
+    return {
+        name: run.store.load("loops", name, "isolator", IsolatorResult) for name in run.info.configurations
+    }
 
 
 def fitted_values(fit: FitResult | None) -> dict[str, float]:
@@ -68,16 +76,17 @@ def warnings(configurations: tuple[ConfigurationResults, ...]) -> tuple[str, ...
     return tuple(found)
 
 
-def _provenance(run: Run) -> dict[str, str]:
+def provenance(run: Run) -> dict[str, str]:
+    """Where the results come from: files with their hashes, versions, dates."""
     facts = {"raw folder": run.info.raw, "rig": run.info.rig_source or "none"}
     facts |= {f"version of {name}": version for name, version in run.info.versions.items()}
     for (stage, configuration), p in run.store.provenance().items():
         label = stage if configuration == ALL else f"{stage} ({configuration})"
         facts[f"stage {label}"] = f"{p.finished}, {p.seconds:.2f} s, key {p.key[:12]}"
     for configuration in run.info.configurations:
-        if not run.store.key("ingest", configuration):
-            continue
-        for file, digest in run.store.load("ingest", configuration, "sources", dict[str, str]).items():
+        stage = "loops" if run.info.kind == "hysteresis" else "ingest"
+        sources = run.store.find(stage, configuration, "sources", dict[str, str]) or {}
+        for file, digest in sources.items():
             facts[f"SHA-256 of {configuration}/{file}"] = digest
     return facts
 
