@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ema_pipeline.modal.assurance import mac, mpc
 from ema_pipeline.modal.data import FitData
-from ema_pipeline.modal.fit import Estimate, LinearSolution, newton_step, residual_fit, synthesis
+from ema_pipeline.modal.fit import Estimate, LinearSolution, newton_step, synthesis
+from ema_pipeline.modal.missed import left_over
 from ema_pipeline.modal.noise import Noise
 from ema_pipeline.modal.segment import SegmentFit
 from ema_pipeline.modal.uncertainty import evidence
@@ -169,10 +170,7 @@ def visibility(data: FitData, estimate: Estimate, solution: LinearSolution) -> R
 
 def misfit(data: FitData, hits: Noise, estimate: Estimate, solution: LinearSolution) -> Real:
     """What the fit leaves over around each mode, over what the scatter between hits explains."""
-    weight = hits.weight(data.measured)
-    modes = synthesis(data, estimate, solution.shapes)
-    left = np.abs(data.frf - modes - residual_fit(data, weight, modes)) ** 2 * weight
-    ratio = left.sum(axis=(0, 1)) / max(np.count_nonzero(data.measured), 1)
+    _, ratio = left_over(data, hits, estimate, solution)
     out = np.empty(len(estimate.poles))
     for r, pole in enumerate(estimate.poles):
         line = int(np.argmin(np.abs(data.omega - pole.imag)))

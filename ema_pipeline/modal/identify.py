@@ -22,7 +22,15 @@ from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.scaling import scale_shapes, scaling_note
 from ema_pipeline.modal.selection import link, votes
 from ema_pipeline.modal.settings import ModalSettings
-from ema_pipeline.modal.sweep import FittedModes, NoiseModels, between, candidates, first_guess, refined
+from ema_pipeline.modal.sweep import (
+    FittedModes,
+    NoiseModels,
+    between,
+    candidates,
+    first_guess,
+    refined,
+    tracked,
+)
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
 from ema_pipeline.threads import single_blas_thread
 
@@ -77,7 +85,11 @@ def _identify(frfs: FrfSet, settings: ModalSettings, tell: Progress) -> ModalMod
         tell(0.4, f"first fit of {len(sure.poles)} candidates")
         sure = first_guess(data, noise, bands, sure, iterations)
     tell(0.6, f"refining {len(sure.poles)} modes, trying {len(found.weak.poles)} more")
-    modes = refined(data, noise, bands, charts, sure, found.weak, iterations)
+
+    def search(window: FitData, known: Noise) -> Estimate:
+        return tracked(poles_of_all_orders(window, known.variance, 2, settings))
+
+    modes = refined(data, noise, bands, charts, sure, found.weak, search, iterations)
     tell(0.9, "shapes and synthesis")
     cores = [chart.take(between(chart.pole, b.low, b.high)) for chart, b in zip(charts, bands, strict=True)]
     return _model(frfs, settings, band, data, noise.start, modes, cores)

@@ -21,6 +21,7 @@ from ema_pipeline.modal.credibility import (
 )
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, free_participations, normalised, solve_linear, synthesis
+from ema_pipeline.modal.missed import Search, missed
 from ema_pipeline.modal.noise import Noise
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.segment import SegmentFit, fit_segment
@@ -29,6 +30,9 @@ from ema_pipeline.modal.uncertainty import covariance
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
+
+ROUNDS = 2
+"""How often a sub-band is searched for missed modes."""
 
 FIRST_ITERATIONS = 4
 """Iterations of the first guess, which only serves to take far modes off the data."""
@@ -107,6 +111,12 @@ def candidates(charts: list[PoleSet], bands: tuple[SubBand, ...], n_references: 
     return Candidates(sure, weak)
 
 
+def tracked(poles: PoleSet) -> Estimate:
+    """Every pole that stands for a track of a chart."""
+    index = link(poles).representative
+    return Estimate(poles.pole[index], normalised(poles.participation[index]))
+
+
 def between(poles: Complex, low: float, high: float) -> NDArray[np.bool_]:
     """True for poles between two frequencies, rad/s."""
     return np.asarray((poles.imag >= low) & (poles.imag < high))
@@ -144,6 +154,7 @@ def refined(
     charts: list[PoleSet],
     sure: Estimate,
     weak: Estimate,
+    search: Search,
     iterations: int,
 ) -> FittedModes:
     """Final fit, sub-band by sub-band, with the modes of the other sub-bands taken off the data."""
@@ -153,12 +164,14 @@ def refined(
         low, high = float(data.omega[part.first]), float(data.omega[part.stop - 1])
         near, also = between(sure.poles, low, high), between(weak.poles, low, high)
         inside = np.concatenate([sure.poles[near], weak.poles[also]])
-        if not between(inside, part.low, part.high).any():
+        if noise.hits is None and not between(inside, part.low, part.high).any():
             continue
         lines = data.lines(part.first, part.stop)
         far = synthesis(lines, sure.take(~near), everywhere[:, ~near])
         lines = replace(lines, frf=np.where(lines.measured[..., None], lines.frf - far, 0.0))
-        fit = _fit_part(lines, noise.cut(part), sure.take(near), weak.take(also), _voters(chart), iterations)
+        fit = _fit_part(
+            lines, noise.cut(part), sure.take(near), weak.take(also), _voters(chart), search, iterations
+        )
         parts.append(_final(lines, fit, part))
     n_rows, n_ref = data.measured.shape
     empty = FittedModes(
@@ -185,9 +198,10 @@ def _fit_part(
     sure: Estimate,
     weak: Estimate,
     voters: Callable[[Estimate], Real],
+    search: Search,
     iterations: int,
 ) -> SegmentFit:
-    """Sure modes first, then the weak ones on top; at last all rows where they had been combined."""
+    """Sure modes first, then weak and missed ones on top; at last all rows where they had been combined."""
     small, hits, start = compress(lines, noise.hits, noise.start)
     judge = partial(credible, hits=hits, votes=voters)
     fit = fit_segment(small, hits, start, sure, judge, iterations)
@@ -196,6 +210,16 @@ def _fit_part(
         more = fit_segment(small, hits, fit.noise, fit.estimate.joined(weak.take(free)), judge, iterations)
         if _holds(more.estimate, fit.estimate):
             fit = more
+    for _ in range(ROUNDS if hits is not None else 0):
+        assert hits is not None
+        extra = missed(small, hits, fit.estimate, fit.solution, search)
+        extra = extra.take(_apart(extra, fit.estimate))
+        if not len(extra.poles):
+            break
+        more = fit_segment(small, hits, fit.noise, fit.estimate.joined(extra), judge, iterations)
+        if not _holds(more.estimate, fit.estimate) or len(more.estimate.poles) <= len(fit.estimate.poles):
+            break
+        fit = more
     if small is lines:
         return fit
     judge = partial(credible, hits=noise.hits, votes=voters)

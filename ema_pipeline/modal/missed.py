@@ -1,0 +1,86 @@
+"""Modes that the charts missed: where more is left over than hits scatter, a narrow window is searched again.
+
+A weak or sharp mode takes up few lines of a sub-band, and a model of the whole sub-band may spend all its orders
+elsewhere. What the fit leaves over shows where such a mode is. The search only pays, and is only made, where the
+scatter between hits tells how much should be left over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import scipy.ndimage
+from numpy.typing import NDArray
+
+from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.fit import Estimate, LinearSolution, residual_fit, synthesis
+from ema_pipeline.modal.noise import Noise
+
+Complex = NDArray[np.complex128]
+Real = NDArray[np.float64]
+Search = Callable[[FitData, Noise], Estimate]
+"""Candidates in the FRFs of a window with known noise."""
+
+TOO_MUCH = 2.5
+"""What is left over, over the scatter between hits (mean over a few lines), above which a mode may be missing."""
+
+FEWEST = 4
+"""FRFs without which shapes cannot confirm what a misfit suggests."""
+
+HALF_WINDOW = 48
+"""Lines on either side."""
+
+WINDOWS = 4
+"""Windows searched, the worst first."""
+
+
+def left_over(
+    data: FitData, hits: Noise, estimate: Estimate, solution: LinearSolution
+) -> tuple[Complex, Real]:
+    """What the fit leaves of the FRFs, and its power on each line over what the scatter between hits explains.
+
+    Returns
+    -------
+    left : complex ndarray, (n_rows, n_references, n_lines)
+    ratio : ndarray, (n_lines,)
+    """
+    weight = hits.weight(data.measured)
+    modes = synthesis(data, estimate, solution.shapes)
+    left = np.where(data.measured[..., None], data.frf - modes - residual_fit(data, weight, modes), 0.0)
+    power = np.sum(np.abs(left) ** 2 * weight, axis=(0, 1))
+    return left, power / max(int(np.count_nonzero(data.measured)), 1)
+
+
+def missed(
+    data: FitData, hits: Noise, estimate: Estimate, solution: LinearSolution, search: Search
+) -> Estimate:
+    """Candidates where too much is left over.
+
+    Parameters
+    ----------
+    data : FitData
+    hits : Noise
+        From the scatter over hits.
+    estimate, solution
+        The fit so far.
+    search : callable
+    """
+    found = estimate.take(np.zeros(len(estimate.poles), dtype=bool))
+    if np.count_nonzero(data.measured) < FEWEST:
+        return found
+    left, ratio = left_over(data, hits, estimate, solution)
+    ratio = scipy.ndimage.gaussian_filter1d(ratio, 1.5, mode="nearest")
+    for _ in range(WINDOWS):
+        peak = int(np.argmax(ratio))
+        if ratio[peak] < TOO_MUCH:
+            break
+        first = int(np.clip(peak - HALF_WINDOW, 0, max(len(ratio) - 2 * HALF_WINDOW, 0)))
+        stop = min(first + 2 * HALF_WINDOW, len(ratio))
+        window = replace(data.lines(first, stop), frf=left[..., first:stop])
+        fresh = search(window, hits.lines(first, stop))
+        distance = np.abs(fresh.poles[:, None] - found.poles[None]).min(axis=1, initial=np.inf)
+        found = found.joined(fresh.take(distance > -0.5 * fresh.poles.real))
+        ratio[max(0, peak - HALF_WINDOW // 2) : peak + HALF_WINDOW // 2] = 0.0
+    return found
