@@ -28,6 +28,9 @@ from ema_pipeline.modal.data import FitData
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
 
+LINES_AT_ONCE = 64
+"""Block of lines in a Gram matrix."""
+
 RIDGE = 1e-12
 """Relative ridge that keeps Gram matrices of coinciding poles solvable."""
 
@@ -119,9 +122,15 @@ def weighted_grams(columns: Complex, weight: Real, data: Complex) -> tuple[Real,
     n = len(columns)
     upper = np.triu_indices(n)
     re, im = np.ascontiguousarray(columns.real), np.ascontiguousarray(columns.imag)
-    products = re[upper[0]] * re[upper[1]]
-    products += im[upper[0]] * im[upper[1]]
-    packed = weight @ products.T
+    packed = np.zeros((len(weight), len(upper[0])))
+    for start in range(0, columns.shape[1], LINES_AT_ONCE):  # small blocks stay in the cache
+        block = slice(start, start + LINES_AT_ONCE)
+        products = re[:, block][upper[0]]
+        products *= re[:, block][upper[1]]
+        other = im[:, block][upper[0]]
+        other *= im[:, block][upper[1]]
+        products += other
+        packed += weight[:, block] @ products.T
     gram = np.empty((len(weight), n, n))
     gram[:, upper[0], upper[1]] = packed
     gram[:, upper[1], upper[0]] = packed
