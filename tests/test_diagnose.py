@@ -163,7 +163,7 @@ def test_a_diagnosis_survives_the_store(tmp_path: Path) -> None:
         codec.write(file, "d", d)
         back = codec.read(file, "d", Diagnosis)
     assert repr(back.candidates) == repr(d.candidates)  # NaN is not equal to itself
-    assert repr(back.ladder) == repr(d.ladder)
+    assert back.ladder == d.ladder
     assert back.probabilities == d.probabilities
 
 

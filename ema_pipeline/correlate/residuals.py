@@ -20,6 +20,9 @@ from ema_pipeline.correlate.evidence import Evidence
 from ema_pipeline.mechanics.system import LinearSystem
 
 
+_FAINT = 0.1
+
+
 @dataclass(frozen=True)
 class Matrices:
     """Matrices of a batch of systems: mass, stiffness, damping, structural (B, n, n); damping ratio (B,)."""
@@ -154,7 +157,11 @@ def mode_residuals(e: Evidence, pairs: NDArray[np.int64], modes: Modes, mixing: 
         eigenvalues = modes.omega**2
         own = np.maximum(eigenvalues[:, k], 1e-12)
         d = np.abs(eigenvalues[:, None, :] - own[:, :, None]) / (mixing * own[:, :, None])
-        seen = np.maximum(np.sum(np.abs(at_sensors[:, :, k]) ** 2, axis=1), 1e-30)
+        # A mode that the sensors hardly see must not buy its shape from its neighbours at the price of its own
+        # small amplitude: it would fit anything.
+        every = np.sum(np.abs(at_sensors) ** 2, axis=1)
+        least = (_FAINT**2) * np.max(every, axis=1, keepdims=True)
+        seen = np.maximum(np.maximum(every[:, k], least), 1e-30)
         size = np.sqrt(np.sum(np.abs(e.shapes[has]) ** 2, axis=1) / seen)
         d = d / np.maximum(size, 1e-150)[:, :, None]
         normal = b.conj().swapaxes(-1, -2) @ b

@@ -140,7 +140,7 @@ def _climb(case: Case, thresholds: Mapping[str, float] | None, tell: Progress) -
     tell(0.0, "base model")
     base = fit_null(case, Hypothesis(), settings.fit, None)
     hypotheses = single_hypotheses(case.rig, configurations, case.library)
-    if holds(base, settings.unexplained_limit):
+    if holds(base):
         # The base model itself tells the noise level; one round is enough unless a hypothesis leaves less.
         level = noise_of(case, base)
         base = fit_null(case, Hypothesis(), level.applied(settings.fit), base.values)

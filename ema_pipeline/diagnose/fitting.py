@@ -102,11 +102,11 @@ class Fitted:
         return np.isfinite(self.costs) & (self.inlier > 0.5)
 
 
-def holds(fitted: Fitted, unexplained: float) -> bool:
-    """True where a model explains nearly all modes about as well as the data can tell."""
+def holds(fitted: Fitted) -> bool:
+    """True where a model explains all modes but one (which may be spurious) about as well as data can tell."""
     explained = fitted.explained
     squares = float(np.sum(fitted.costs[explained])) + fitted.prior_cost
-    few = float(np.mean(~explained)) <= unexplained
+    few = int(np.sum(~explained)) <= 1
     return few and squares < _HOLDS * float(np.sum(fitted.counts))
 
 
@@ -146,7 +146,7 @@ class Ground:
 
 def ground(case: Case, base: Fitted, fit: FitSettings) -> Ground:
     """Prepare a base model for the hypotheses on top of it."""
-    if holds(base, case.settings.unexplained_limit):
+    if holds(base):
         return Ground(base.values, base.objective, np.inf)
     problem = case.problem(base.hypothesis, fit)
     x = problem.space.point(base.values)

@@ -28,7 +28,7 @@ from ema_pipeline.rigs.types import Rig
 
 Progress = Callable[[float, str], None]
 
-_UNSEEN = 0.05
+_UNSEEN = 0.02
 
 
 class Objective(Protocol):
