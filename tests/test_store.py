@@ -59,7 +59,10 @@ class Everything:
 
 
 def example() -> Everything:
-    rows = (Row("ä", 1.5, "a", Dof("sun", "x", -1), True), Row("b", float("nan"), "b", Dof("p1", "zeta"), False))
+    rows = (
+        Row("ä", 1.5, "a", Dof("sun", "x", -1), True),
+        Row("b", float("nan"), "b", Dof("p1", "zeta"), False),
+    )
     nested = Nested(rows, "two rows")
     return Everything(
         text="m/s²",
@@ -90,7 +93,19 @@ def test_what_is_written_is_read_back_equal(tmp_path: Path) -> None:
     assert_array_equal(after.masks, before.masks)
     assert repr(after.something) == repr(before.something)  # nan is not equal to itself
     assert repr(after.deep) == repr(before.deep)
-    for name in ("text", "number", "ratio", "pole", "flag", "nothing", "band", "words", "dofs", "empty", "infinite"):
+    for name in (
+        "text",
+        "number",
+        "ratio",
+        "pole",
+        "flag",
+        "nothing",
+        "band",
+        "words",
+        "dofs",
+        "empty",
+        "infinite",
+    ):
         assert getattr(after, name) == getattr(before, name), name
         assert type(getattr(after, name)) is type(getattr(before, name)), name
     assert after.mapping == before.mapping
@@ -107,12 +122,17 @@ def test_plain_hdf5_tools_can_read_scalars_arrays_and_tables(tmp_path: Path) -> 
         assert file["it/dofs"][1] == b"-ring.u"
 
 
+def change_and_fail(store: Store) -> None:
+    with store.changing() as file:
+        del file["stages/frf/all/result"]
+        raise RuntimeError("half-way")
+
+
 def test_a_stage_that_fails_half_way_leaves_the_store_as_it_was(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.save("frf", ALL, "key1", "{}", 0.1, result=Nested((), "old"))
-    with pytest.raises(RuntimeError, match="half-way"), store.changing() as file:
-        del file["stages/frf/all/result"]
-        raise RuntimeError("half-way")
+    with pytest.raises(RuntimeError, match="half-way"):
+        change_and_fail(store)
     assert store.load("frf", ALL, "result", Nested).note == "old"
     assert store.key("frf") == "key1"
     assert [p.name for p in tmp_path.iterdir()] == ["ema.h5"]

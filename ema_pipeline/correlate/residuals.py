@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from ema_pipeline.correlate.evidence import Evidence
 from ema_pipeline.mechanics.system import LinearSystem
 
-
 _FAINT = 0.1
 
 
