@@ -28,6 +28,9 @@ from ema_pipeline.threads import single_blas_thread
 
 Progress = Callable[[float, str], None]
 
+_SPURIOUS = 2
+"""Well-determined modes without counterpart that may still be of the foundation, or spurious."""
+
 
 def diagnose(
     rig: Rig,
@@ -289,9 +292,10 @@ def _verdict(
                 f"These data would show only {100 * seen:.0f} % of the effects in the library at a size to expect."
             )
         p = climbed.rankings[0].probabilities[NOTHING]
-        return (
-            "adequate",
-            f"The model explains the data (error {error:.2f}); nothing is missing ({100 * p:.0f} %).",
+        left = _solid_unexplained(case, top)
+        odd = f" Not explained, perhaps not of the rig: {', '.join(left)}." if left else ""
+        return "adequate", (
+            f"The model explains the data (error {error:.2f}); nothing is missing ({100 * p:.0f} %).{odd}"
         )
     if len(members) > 1:
         names = ", ".join(label_text(f.hypothesis.label) for f in members)
@@ -313,7 +317,7 @@ def _misfit(case: Case, climbed: _Climb, stick: Yardstick, error: float) -> str:
     if not error <= settings.error_limit:
         return f"error {error:.3g}, {settings.error_limit:g} is the limit"
     solid = _solid_unexplained(case, top)
-    if len(solid) > 1 or np.mean(~top.explained) > settings.unexplained_limit:
+    if len(solid) > _SPURIOUS or np.mean(~top.explained) > settings.unexplained_limit:
         return f"{int(np.sum(~top.explained))} measured modes have no counterpart in it"
     return ""
 
@@ -321,7 +325,9 @@ def _misfit(case: Case, climbed: _Climb, stick: Yardstick, error: float) -> str:
 def _mends(case: Case, f: Fitted, stick: Yardstick) -> bool:
     """True where a hypothesis alone makes the model hold."""
     few = np.mean(~f.explained) <= case.settings.unexplained_limit
-    return bool(few and len(_solid_unexplained(case, f)) < 2 and stick.error(f) <= case.settings.error_limit)
+    return bool(
+        few and len(_solid_unexplained(case, f)) <= _SPURIOUS and stick.error(f) <= case.settings.error_limit
+    )
 
 
 def _solid_unexplained(case: Case, model: Fitted) -> list[str]:
