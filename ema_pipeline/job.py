@@ -7,16 +7,13 @@ import dataclasses
 import json
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ema_pipeline.correlate.mode_table import read_mode_table
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.dof import Dof
-from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.ingest.description import Campaign, TestDescription, read_campaign
 from ema_pipeline.ingest.load import load_records
-from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.pipeline import (
     PipelineSettings,
@@ -31,9 +28,11 @@ from ema_pipeline.pipeline import (
     toml_value,
 )
 from ema_pipeline.rigs import Rig, load_rig, model_modes, rig_names
-from ema_pipeline.simulate.campaign import SimulatedCampaign, simulate_campaign
 from ema_pipeline.stages.base import Run, RunInfo, load_info, save_info
 from ema_pipeline.store import Store
+
+if TYPE_CHECKING:
+    from ema_pipeline.simulate.campaign import SimulatedCampaign
 
 DEFAULT_PIPELINE = "default"
 
@@ -218,6 +217,8 @@ def _describe_loops(campaign: Campaign, pipeline: str | None, overrides: Iterabl
 
 def describe_modes(file: Path, rig: str | None, pipeline: str | None, overrides: Iterable[str]) -> RunInfo:
     """Check a table of modes against its rig, before anything is written."""
+    from ema_pipeline.correlate.mode_table import read_mode_table
+
     if rig is None:
         raise EmaError(f"{file}: a table of modes needs a model to compare with; name it with --rig")
     model = load_rig(rig)
@@ -295,6 +296,8 @@ def _pipeline_for(rig: Rig | None) -> str:
 
 def check_raw(raw: Path) -> dict[str, tuple[Hit, ...]]:
     """Hits of every configuration of a raw folder with their verdicts; nothing is written."""
+    from ema_pipeline.ingest.quality import hits_of_test
+
     settings = load_pipeline(DEFAULT_PIPELINE).hits
     judged = {}
     for test in read_campaign(raw).tests:
@@ -330,6 +333,8 @@ def list_model_modes(rig: str, configuration: str | None) -> dict[str, list[dict
 
 def list_effects(rig: str) -> list[dict[str, Any]]:
     """Effects that can sit on a rig, with places, parameters and tell-tale signs."""
+    from ema_pipeline.effects.library import shipped_effects
+
     loaded = load_rig(rig)
     listed = []
     for effect in shipped_effects().values():
@@ -364,6 +369,8 @@ def simulate_raw(
     settings: list[str],
 ) -> SimulatedCampaign:
     """Simulate a campaign; values and settings are given as ``"name=value"``."""
+    from ema_pipeline.simulate.campaign import simulate_campaign
+
     return simulate_campaign(
         out,
         rig,

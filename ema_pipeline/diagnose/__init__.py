@@ -1,9 +1,32 @@
 """Diagnosis: which physics is the model missing, how sure is that, and what should be measured next."""
 
-from ema_pipeline.diagnose.diagnose import diagnose
-from ema_pipeline.diagnose.ladder import add_effect, climb, make_ladder, remove_effect
-from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Localisation, Rung
+from typing import TYPE_CHECKING
+
+from ema_pipeline.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from ema_pipeline.diagnose.diagnose import diagnose
+    from ema_pipeline.diagnose.ladder import add_effect, climb, make_ladder, remove_effect
+    from ema_pipeline.diagnose.settings import DiagnoseSettings
+    from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Localisation, Rung
+else:
+    __getattr__ = lazy_names(
+        __name__,
+        {
+            "diagnose": "diagnose",
+            "add_effect": "ladder",
+            "climb": "ladder",
+            "make_ladder": "ladder",
+            "remove_effect": "ladder",
+            "DiagnoseSettings": "settings",
+            "Candidate": "types",
+            "Diagnosis": "types",
+            "EffectSize": "types",
+            "Ladder": "types",
+            "Localisation": "types",
+            "Rung": "types",
+        },
+    )
 
 __all__ = [
     "Candidate",

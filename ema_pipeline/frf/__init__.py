@@ -1,7 +1,16 @@
 """Hits to frequency response functions with coherence, variance and verdicts."""
 
-from ema_pipeline.frf.estimate import estimate_frfs
-from ema_pipeline.frf.settings import FrfSettings
-from ema_pipeline.frf.types import FrfSet
+from typing import TYPE_CHECKING
+
+from ema_pipeline.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from ema_pipeline.frf.estimate import estimate_frfs
+    from ema_pipeline.frf.settings import FrfSettings
+    from ema_pipeline.frf.types import FrfSet
+else:
+    __getattr__ = lazy_names(
+        __name__, {"estimate_frfs": "estimate", "FrfSettings": "settings", "FrfSet": "types"}
+    )
 
 __all__ = ["FrfSet", "FrfSettings", "estimate_frfs"]

@@ -1,10 +1,27 @@
 """Force-displacement loops → stiffness, viscous damping and hysteresis of an isolator."""
 
-from ema_pipeline.hysteresis.identify import identify_isolator
-from ema_pipeline.hysteresis.loops import measure_loop
-from ema_pipeline.hysteresis.settings import HysteresisSettings
-from ema_pipeline.hysteresis.stage import analyse_hysteresis
-from ema_pipeline.hysteresis.types import IsolatorResult, Loop
+from typing import TYPE_CHECKING
+
+from ema_pipeline.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from ema_pipeline.hysteresis.identify import identify_isolator
+    from ema_pipeline.hysteresis.loops import measure_loop
+    from ema_pipeline.hysteresis.settings import HysteresisSettings
+    from ema_pipeline.hysteresis.stage import analyse_hysteresis
+    from ema_pipeline.hysteresis.types import IsolatorResult, Loop
+else:
+    __getattr__ = lazy_names(
+        __name__,
+        {
+            "identify_isolator": "identify",
+            "measure_loop": "loops",
+            "HysteresisSettings": "settings",
+            "analyse_hysteresis": "stage",
+            "IsolatorResult": "types",
+            "Loop": "types",
+        },
+    )
 
 __all__ = [
     "HysteresisSettings",

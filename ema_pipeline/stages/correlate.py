@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, cast
 
-from ema_pipeline.correlate.compare import compare
-from ema_pipeline.correlate.pairing import pair_rig
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
@@ -39,6 +37,9 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
 def correlate(run: Run, rig: Rig, values: Mapping[str, float]) -> tuple[dict[str, Pairing], Comparison]:
     """Pair the measured modes with those of a model, and compare the two."""
+    from ema_pipeline.correlate.compare import compare
+    from ema_pipeline.correlate.pairing import pair_rig
+
     settings = cast("CorrelateSettings", run.settings[NAME])
     measured = measured_modes(run)
     pairings = {name: pair_rig(rig, name, values, measured[name], settings.pairing) for name in measured}

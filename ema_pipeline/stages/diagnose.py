@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import cast
 
-from ema_pipeline.diagnose import DiagnoseSettings, diagnose
 from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.correlate import correlate
@@ -24,6 +24,8 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit every effect of the library on top of the model as it stands, and judge what the data support."""
+    from ema_pipeline.diagnose import diagnose
+
     settings = cast(DiagnoseSettings, run.settings[NAME])
     model = run.require_model(NAME)
     measured = measured_modes(run)

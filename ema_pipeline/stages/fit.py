@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import cast
 
 from ema_pipeline.diagnose.types import Ladder
-from ema_pipeline.fit.map_fit import fit_rig
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.modes import measured_modes
@@ -24,6 +23,8 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit all parameters to all configurations at once."""
+    from ema_pipeline.fit.map_fit import fit_rig
+
     settings = cast(FitSettings, run.settings[NAME])
     rig = run.require_model(NAME)
     ladder = run.store.find("ladder", ALL, "ladder", Ladder)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import cast
 
-from ema_pipeline.frf import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.hits import accepted_hits
@@ -22,5 +21,7 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Average the accepted hits of every impact point."""
+    from ema_pipeline.frf.estimate import estimate_frfs
+
     settings = cast(FrfSettings, run.settings[NAME])
     return {"frfs": estimate_frfs(accepted_hits(run.store, configuration, progress), settings)}

@@ -8,7 +8,6 @@ from typing import Any, cast
 from ema_pipeline import codec
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.hit_settings import HitSettings
-from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import Hit, HitSamples, Record, cut_hit
 from ema_pipeline.stages.base import Progress, Run, silent
 from ema_pipeline.store import Store
@@ -26,6 +25,8 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Find the hits of every record and judge them; every impact point needs one that is good."""
+    from ema_pipeline.ingest.quality import hits_of_test
+
     settings = cast(HitSettings, run.settings[NAME])
     hits = hits_of_test(StoredRecords(run.store, configuration), settings)
     require_good_hits(hits, configuration)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import cast
 
-from ema_pipeline.diagnose import DiagnoseSettings, make_ladder
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.errors import EmaError
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.modes import measured_modes
@@ -22,6 +22,8 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit the base model and every rung above it; without added effects there is no ladder to climb."""
+    from ema_pipeline.diagnose import make_ladder
+
     if not run.info.effects:
         return {}
     if run.rig is None:

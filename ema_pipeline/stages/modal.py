@@ -5,11 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from ema_pipeline.correlate.measured import to_modal_model
-from ema_pipeline.correlate.mode_table import read_mode_table
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.modal.circle import attach_circles, identify_by_circle
-from ema_pipeline.modal.identify import identify
 from ema_pipeline.stages.base import Progress, Run, file_hash
 
 if TYPE_CHECKING:
@@ -28,6 +24,11 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Identify the modes, and look at each of them with circle fits."""
+    from ema_pipeline.correlate.measured import to_modal_model
+    from ema_pipeline.correlate.mode_table import read_mode_table
+    from ema_pipeline.modal.circle import attach_circles, identify_by_circle
+    from ema_pipeline.modal.identify import identify
+
     if run.info.kind == "modes":
         measured = read_mode_table(Path(run.info.raw), run.require_model(NAME))
         return {"modal": to_modal_model(measured[configuration])}

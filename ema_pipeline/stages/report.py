@@ -5,11 +5,7 @@ from __future__ import annotations
 import json
 from typing import cast
 
-from ema_pipeline.report.html import write_report
-from ema_pipeline.report.loops import write_loops_report
-from ema_pipeline.report.plots import write_plots
 from ema_pipeline.report.settings import ReportSettings
-from ema_pipeline.report.summary_files import write_modes_csv, write_summary
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.results import isolators, load_results, provenance
 
@@ -28,6 +24,11 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Write every file of the results folder but the store."""
+    from ema_pipeline.report.html import write_report
+    from ema_pipeline.report.loops import write_loops_report
+    from ema_pipeline.report.plots import write_plots
+    from ema_pipeline.report.summary_files import write_modes_csv, write_summary
+
     settings = cast(ReportSettings, run.settings[NAME])
     folder = run.store.folder
     if run.info.kind == "hysteresis":
