@@ -40,7 +40,7 @@ class Candidate:
     gain : float
         Fall of -2 log posterior.
     threshold : float
-        Gain that its family reaches by chance in at most one of a hundred tests with nothing missing.
+        Gain that a claim of its family needs; tests with nothing missing stay below it.
     log_evidence : float
         Natural logarithm of the evidence against "nothing is missing" (its Bayes factor).
     claimed : bool
