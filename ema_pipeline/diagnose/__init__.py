@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from ema_pipeline.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from ema_pipeline.diagnose.diagnose import diagnose
+    from ema_pipeline.diagnose.diagnosis import diagnose
     from ema_pipeline.diagnose.ladder import add_effect, climb, make_ladder, remove_effect
     from ema_pipeline.diagnose.settings import DiagnoseSettings
     from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Localisation, Rung
@@ -13,7 +13,7 @@ else:
     __getattr__ = lazy_names(
         __name__,
         {
-            "diagnose": "diagnose",
+            "diagnose": "diagnosis",
             "add_effect": "ladder",
             "climb": "ladder",
             "make_ladder": "ladder",

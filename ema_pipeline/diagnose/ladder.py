@@ -207,7 +207,7 @@ def climb(
     progress: Progress | None = None,
 ) -> Ladder:
     """The ladder that the data support: effects are added as long as each is claimed."""
-    from ema_pipeline.diagnose.diagnose import diagnose  # the diagnosis builds its ladder with this module
+    from ema_pipeline.diagnose.diagnosis import diagnose  # the diagnosis builds its ladder with this module
 
     return diagnose(rig, measured, settings, library, progress).ladder
 
