@@ -165,7 +165,7 @@ def test_an_effect_is_added_and_removed_and_the_ladder_shows_what_it_brought(
     assert f"{effect}.stiffness" in summary["fit"]["parameters"]
     code, text, _ = ema(capsys, "ladder", out)
     assert code == 0
-    assert "shaft_torsion" in text
+    assert "shaft torsion" in text
     assert ema(capsys, "remove", out, effect)[0] == 0
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert f"{effect}.stiffness" not in summary["fit"]["parameters"]

@@ -16,8 +16,12 @@ def _places(assembly: Assembly) -> tuple[str, ...]:
 
 def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
     bodies = assembly.bodies if place == ALL else (place,)
-    # A sensor on the base circle adds m·r² to the inertia about the axis, so m to I/r² of u = r·θ.
-    dofs = [d for body in bodies for d in assembly.coordinates(body)]
+    # What a sensor adds to the inertia about the axis depends on its radius, which nobody states; near the
+    # axis it is nothing. Bodies that only turn have nothing else to be added to: there it sits on the base circle.
+    dofs = []
+    for body in bodies:
+        own = assembly.coordinates(body)
+        dofs += [d for d in own if not d.endswith(".u")] or own
     return assembly.add(*(Mass(f"{d} sensor mass", {d: 1.0}, values["mass"]) for d in dofs))
 
 
@@ -33,7 +37,7 @@ EFFECT = Effect(
             0.03,
             0.0,
             1.0,
-            "mass per body, on its base circle: added to m and to I/r²",
+            "mass per body: added to its translation (to I/r² of bodies that only turn)",
         ),
     ),
     find_places=_places,
