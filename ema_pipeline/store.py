@@ -167,7 +167,12 @@ class Store:
             group = file.get(_group(stage, configuration))
             if group is None or (name not in group and name not in group.attrs):
                 return None
-            result: T = codec.read(group, name, cls)
+            try:
+                result: T = codec.read(group, name, cls)
+            except KeyError:
+                raise EmaError(
+                    f"{self.path}: stage '{stage}' was written by another version of ema; run it again"
+                ) from None
             return result
 
     def provenance(self) -> dict[tuple[str, str], Provenance]:

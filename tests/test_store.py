@@ -195,3 +195,12 @@ while True:
         assert np.ptp(values) == 0.0
     with Store(tmp_path).lock():
         assert not list(tmp_path.glob(".ema.h5.*.tmp"))
+
+
+def test_results_of_another_version_are_refused_in_one_line(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key", "{}", 0.1, result=Nested((), "old"))
+    with store.changing() as file:
+        del file["stages/frf/all/result"].attrs["note"]
+    with pytest.raises(EmaError, match="written by another version of ema"):
+        store.load("frf", ALL, "result", Nested)

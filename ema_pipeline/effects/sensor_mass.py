@@ -18,7 +18,7 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
     bodies = assembly.bodies if place == ALL else (place,)
     # What a sensor adds to the inertia about the axis depends on its radius, which nobody states; near the
     # axis it is nothing. Bodies that only turn have nothing else to be added to: there it sits on the base circle.
-    dofs = []
+    dofs: list[str] = []
     for body in bodies:
         own = assembly.coordinates(body)
         dofs += [d for d in own if not d.endswith(".u")] or own

@@ -205,9 +205,12 @@ def save_info(store: Store, info: RunInfo) -> None:
 
 
 def load_info(store: Store) -> RunInfo | None:
-    """The run's description, None where the store has none yet."""
+    """The run's description, None where the store has none that this version can read."""
     with store.reading() as file:
         if "run" not in file:
             return None
-        info: RunInfo = codec.read(file, "run", RunInfo)
+        try:
+            info: RunInfo = codec.read(file, "run", RunInfo)
+        except KeyError:  # written by a version that knew less; a new run writes it again
+            return None
         return info
