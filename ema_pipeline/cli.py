@@ -299,6 +299,20 @@ def view(
 
 
 @app.command()
+def export(
+    out: Out,
+    to: Annotated[
+        Path | None, typer.Option("--to", metavar="FOLDER", help="Folder to write; OUT/export if left out.")
+    ] = None,
+) -> None:
+    """Write FRFs, modes and shapes as universal file (58, 55) and CSV for other programs."""
+    from ema_pipeline.job import export_results
+
+    for path in export_results(out, to or out / "export"):
+        _print(str(path))
+
+
+@app.command()
 def rigs() -> None:
     """List the rigs that ship with the program."""
     from ema_pipeline.rigs import rig_kinds

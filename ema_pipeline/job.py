@@ -319,6 +319,37 @@ def report_path(out: Path) -> Path:
     return path.resolve()
 
 
+def export_results(out: Path, folder: Path) -> list[Path]:
+    """Write FRFs, modes and shapes of every configuration as universal file and as CSV.
+
+    Raises
+    ------
+    EmaError
+        If nothing has been identified yet, or the folder cannot be written.
+    """
+    from ema_pipeline.exchange.tables import shapes_table, write_frf_csv, write_table
+    from ema_pipeline.exchange.uff import write_uff
+    from ema_pipeline.frf.types import FrfSet
+    from ema_pipeline.modal.types import ModalModel
+
+    run = existing_run(out)
+    written = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise EmaError(f"{folder}: cannot be written ({error.strerror}); name another folder") from None
+    for name in run.info.configurations:
+        modal = run.store.load("modal", name, "modal", ModalModel)
+        frfs = run.store.find("frf", name, "frfs", FrfSet)
+        files = [folder / f"{name}.uff", folder / f"{name}_shapes.csv", folder / f"{name}_frfs.csv"]
+        write_uff(files[0], frfs, modal)
+        write_table(files[1], shapes_table(modal, name))
+        if frfs is not None:
+            write_frf_csv(files[2], frfs)
+        written += [f for f in files if f.exists()]
+    return written
+
+
 def list_model_modes(rig: str, configuration: str | None) -> dict[str, list[dict[str, Any]]]:
     """The model's own modes for one configuration, or for all of them."""
     loaded = load_rig(rig)

@@ -14,6 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import pyuff
 
 from ema_pipeline import cli
 from ema_pipeline.hysteresis.simulate import PRINTED, write_sine_tests
@@ -179,6 +180,21 @@ def test_an_effect_that_does_not_exist_is_refused_and_changes_nothing(
         assert_one_clear_line(*ema(capsys, "add", results, wrong))
     assert_one_clear_line(*ema(capsys, "remove", results, "shaft_torsion@carrier"))
     assert (results / "ema.h5").read_bytes() == before
+
+
+def test_exported_files_are_read_by_another_program(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, text, err = ema(capsys, "export", results, "--to", tmp_path / "export")
+    assert code == 0, err
+    assert len(text.splitlines()) == 3
+    sets = pyuff.UFF(str(tmp_path / "export" / "no_ring.uff")).read_sets()
+    kinds = [s["type"] for s in sets]
+    summary = json.loads((results / "summary.json").read_text(encoding="utf-8"))
+    frequencies = {m["frequency_hz"] for m in summary["configurations"]["no_ring"]["modes"]}
+    assert kinds.count(55) == 2 * len(frequencies)  # as real and as complex shapes
+    frf = next(s for s in sets if s["type"] == 58)
+    assert np.iscomplexobj(frf["data"])
 
 
 def test_a_table_of_modes_takes_the_place_of_raw_data(
