@@ -12,7 +12,7 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, fit_null, ground, refit
 from ema_pipeline.diagnose.heldout import HeldOut, error_of, held_out
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.noise import NoiseLevel, estimate_noise, floors
+from ema_pipeline.diagnose.noise import NoiseLevel, estimate_noise
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung
 from ema_pipeline.effects.library import Library
@@ -210,8 +210,3 @@ def climb(
     from ema_pipeline.diagnose.diagnosis import diagnose  # the diagnosis builds its ladder with this module
 
     return diagnose(rig, measured, settings, library, progress).ladder
-
-
-def floor_level(case: Case) -> NoiseLevel:
-    """The noise level before anything is known of the data."""
-    return floors(case.settings.fit)
