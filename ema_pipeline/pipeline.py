@@ -21,6 +21,7 @@ from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.hysteresis.settings import HysteresisSettings
 from ema_pipeline.ingest.hit_settings import HitSettings
+from ema_pipeline.levels.settings import LevelSettings
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.report.settings import ReportSettings
@@ -38,13 +39,15 @@ from ema_pipeline.stages.base import (
 )
 from ema_pipeline.store import ALL, Store
 
-STAGES = ("ingest", "hits", "frf", "modal", "ladder", "fit", "correlate", "diagnose", "loops", "report")
+STAGES = (
+    "ingest", "hits", "frf", "modal", "levels", "loops", "ladder", "fit", "correlate", "diagnose", "report",
+)  # fmt: skip
 """All stages, in the order in which the data flow."""
 
 STAGES_OF_KIND = {
     "hammer": frozenset(STAGES) - {"loops"},
-    "modes": frozenset(STAGES) - {"ingest", "hits", "frf", "loops"},
-    "hysteresis": frozenset({"loops", "report"}),
+    "modes": frozenset(STAGES) - {"ingest", "hits", "frf", "levels", "loops"},
+    "hysteresis": frozenset({"loops", "ladder", "diagnose", "report"}),
 }
 """Stages that have something to do, by kind of test."""
 
@@ -85,6 +88,7 @@ class PipelineSettings(Settings):
     hits: HitSettings = Field(HitSettings(), description="hit finding and quality limits")
     frf: FrfSettings = Field(FrfSettings(), description="windows and estimator")
     modal: ModalStageSettings = Field(ModalStageSettings(), description="modal identification")
+    levels: LevelSettings = Field(LevelSettings(), description="what moves with the force of the hits")
     fit: FitSettings = Field(FitSettings(), description="fitting the model's parameters")
     correlate: CorrelateSettings = Field(CorrelateSettings(), description="pairing and comparison")
     diagnose: DiagnoseSettings = Field(DiagnoseSettings(), description="search for missing physics")

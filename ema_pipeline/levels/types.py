@@ -1,0 +1,124 @@
+"""What the level stage hands on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.verdict import Verdict
+
+
+@dataclass(frozen=True)
+class ForceLevel:
+    """Hits of about the same peak force.
+
+    Attributes
+    ----------
+    force_n : float
+        Median of the peak forces.
+    hits : tuple of str
+        ``file#number`` of every accepted hit of this level.
+    frfs : FrfSet
+        Averaged over the hits of this level alone.
+    """
+
+    force_n: float
+    hits: tuple[str, ...]
+    frfs: FrfSet
+
+
+@dataclass(frozen=True)
+class ModeLevels:
+    """One mode at every force level.
+
+    Attributes
+    ----------
+    mode : int
+        Index into the modes of the configuration's `ModalModel`.
+    frequency_hz, frequency_std_hz, damping_ratio, damping_std : ndarray, (n_levels,)
+        NaN where the mode could not be followed to a level.
+    amplitude_m : ndarray, (n_levels, n_impacts)
+        Largest displacement amplitude of this mode at any sensor just after the hit, per impact point of
+        `LevelStudy.inputs`.
+    frequency_p, damping_p : float
+        Probability of a scatter as large as this where nothing depends on the level; NaN where unknown.
+    depends : bool
+        True where frequency or damping moves with the level beyond what scatter explains, all modes' tests
+        taken into account.
+    trend : str
+        ``"hardening"``, ``"softening"``, ``"damping falls"``, ``"damping rises"``, joined by ``", "``; empty where
+        nothing moves.
+    """
+
+    mode: int
+    frequency_hz: NDArray[np.float64]
+    frequency_std_hz: NDArray[np.float64]
+    damping_ratio: NDArray[np.float64]
+    damping_std: NDArray[np.float64]
+    amplitude_m: NDArray[np.float64]
+    frequency_p: float
+    damping_p: float
+    depends: bool
+    trend: str
+
+
+@dataclass(frozen=True)
+class DecayCurve:
+    """Instantaneous frequency and damping of one mode over its amplitude, from the free decay after one hit.
+
+    Attributes
+    ----------
+    mode : int
+    hit : str
+        ``file#number``.
+    output : Dof
+        The sensor where the mode shows best.
+    amplitude_m : ndarray, (n,)
+        Displacement amplitude, falling.
+    frequency_hz, frequency_std_hz, damping_ratio, damping_std : ndarray, (n,)
+    """
+
+    mode: int
+    hit: str
+    output: Dof
+    amplitude_m: NDArray[np.float64]
+    frequency_hz: NDArray[np.float64]
+    frequency_std_hz: NDArray[np.float64]
+    damping_ratio: NDArray[np.float64]
+    damping_std: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LevelStudy:
+    """What moves with the force level in one configuration.
+
+    Attributes
+    ----------
+    levels : tuple of ForceLevel
+        From the softest hits up; one entry where all hits are about as hard.
+    inputs : tuple of Dof
+        Impact points.
+    modes : tuple of ModeLevels
+    decays : tuple of DecayCurve
+    verdicts : tuple of Verdict
+        Homogeneity of the FRFs, coherence dips at resonances, distortion of Nyquist circles.
+    level_dependent : bool
+        The answer of all tests together, at the false-alarm rate of the settings.
+    p_value : float
+        Probability of data as level-dependent as these from a linear structure; NaN where it cannot be known.
+    summary : str
+        One or two plain sentences; with one level only, what cannot be known.
+    """
+
+    levels: tuple[ForceLevel, ...]
+    inputs: tuple[Dof, ...]
+    modes: tuple[ModeLevels, ...]
+    decays: tuple[DecayCurve, ...]
+    verdicts: tuple[Verdict, ...]
+    level_dependent: bool
+    p_value: float
+    summary: str

@@ -1,0 +1,44 @@
+"""Hits, FRFs and modes → what moves with the force of the hits."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.levels.settings import LevelSettings
+from ema_pipeline.levels.types import LevelStudy
+from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.stages.base import Progress, Run
+from ema_pipeline.stages.hits import accepted_hits
+
+NAME = "levels"
+NEEDS = ("ingest", "hits", "frf", "modal")
+PER_CONFIGURATION = True
+NEEDS_RIG = False
+
+
+def inputs(run: Run, configuration: str) -> str:
+    """FRFs of single levels are made with the settings of all of them."""
+    return run.settings["frf"].model_dump_json()
+
+
+def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
+    """Follow every mode over the force levels."""
+    from ema_pipeline.levels import study_levels
+
+    frfs = run.store.load("frf", configuration, "frfs", FrfSet)
+    modal = run.store.load("modal", configuration, "modal", ModalModel)
+    settings = cast(LevelSettings, run.settings[NAME])
+    frf_settings = cast(FrfSettings, run.settings["frf"])
+
+    study = study_levels(
+        lambda: accepted_hits(run.store, configuration), frfs, modal, settings, frf_settings, progress
+    )
+    return {"study": study}
+
+
+def level_studies(run: Run) -> dict[str, LevelStudy]:
+    """The studies of all configurations that have one; none for a table of modes."""
+    found = {name: run.store.find(NAME, name, "study", LevelStudy) for name in run.info.configurations}
+    return {name: study for name, study in found.items() if study is not None}
