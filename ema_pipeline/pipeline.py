@@ -251,9 +251,11 @@ class Keys:
 
     def _compute(self, name: str, configuration: str) -> str:
         stage, run = stage_module(name), self._run
+        stored = {name for name, _ in run.store.provenance()}
+        present = [o for o in getattr(stage, "USES", ()) if o in self._names or o in stored]
         needed = [
             self(other, c)
-            for other in stage.NEEDS
+            for other in (*stage.NEEDS, *present)
             if other in STAGES_OF_KIND[run.info.kind]
             if run.rig is not None or not stage_module(other).NEEDS_RIG
             for c in (

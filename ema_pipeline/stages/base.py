@@ -130,7 +130,8 @@ class Stage(Protocol):
     ----------
     NAME : str
     NEEDS : tuple of str
-        Stages whose results it reads.
+        Stages whose results it reads. A module may also have ``USES``: stages whose results it reads where a
+        pipeline has them.
     PER_CONFIGURATION : bool
         True where it works on one configuration at a time.
     NEEDS_RIG : bool

@@ -12,7 +12,8 @@ from ema_pipeline.stages.correlate import correlate
 from ema_pipeline.stages.modes import measured_modes
 
 NAME = "diagnose"
-NEEDS = ("frf", "modal", "levels", "loops")
+NEEDS = ("frf", "modal")
+USES = ("levels", "loops")
 PER_CONFIGURATION = False
 NEEDS_RIG = True
 

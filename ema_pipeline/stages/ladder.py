@@ -10,7 +10,8 @@ from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.modes import measured_modes
 
 NAME = "ladder"
-NEEDS = ("modal", "levels", "loops")
+NEEDS = ("modal",)
+USES = ("levels", "loops")
 PER_CONFIGURATION = False
 NEEDS_RIG = True
 
