@@ -6,7 +6,7 @@ from ema_pipeline.lazy import lazy_names
 
 if TYPE_CHECKING:
     from ema_pipeline.diagnose.diagnosis import diagnose
-    from ema_pipeline.diagnose.ladder import add_effect, climb, make_ladder, remove_effect
+    from ema_pipeline.diagnose.ladder import make_ladder
     from ema_pipeline.diagnose.settings import DiagnoseSettings
     from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Localisation, Rung
 else:
@@ -14,10 +14,7 @@ else:
         __name__,
         {
             "diagnose": "diagnosis",
-            "add_effect": "ladder",
-            "climb": "ladder",
             "make_ladder": "ladder",
-            "remove_effect": "ladder",
             "DiagnoseSettings": "settings",
             "Candidate": "types",
             "Diagnosis": "types",
@@ -36,9 +33,6 @@ __all__ = [
     "Ladder",
     "Localisation",
     "Rung",
-    "add_effect",
-    "climb",
     "diagnose",
     "make_ladder",
-    "remove_effect",
 ]
