@@ -23,21 +23,22 @@ class EigenSensitivity:
     ----------
     eigenvalues : ndarray, (n,)
         ω², (rad/s)².
-    shapes : ndarray, (n, n)
-        Mass-normalised, one mode per column.
     groups : tuple of (int, int)
         Ranges start:stop of modes with equal eigenvalues; a range of one for a mode on its own.
     eigenvalue_derivatives : ndarray, (p, n)
         For a repeated eigenvalue the derivatives of its branches, in ascending order.
+    shapes : ndarray, (p, n, n)
+        ``[k, :, r]`` is shape r, mass-normalised. Of the shapes of a repeated eigenvalue those are given that
+        lead into its branches along direction k, so they differ from direction to direction.
     shape_derivatives : ndarray, (p, n, n)
-        ``[k, :, r]`` is the derivative of shape r along direction k. Inside a group of equal eigenvalues only
-        the change that leads out of the group's subspace, and that of the scale, is defined and given.
+        ``[k, :, r]`` is the derivative of ``shapes[k, :, r]`` along direction k. Branches that do not part to
+        first order have no shapes of their own: among these only the change of scale is given.
     """
 
     eigenvalues: NDArray[np.float64]
-    shapes: NDArray[np.float64]
     groups: tuple[tuple[int, int], ...]
     eigenvalue_derivatives: NDArray[np.float64]
+    shapes: NDArray[np.float64]
     shape_derivatives: NDArray[np.float64]
 
     @property
@@ -53,46 +54,84 @@ class EigenSensitivity:
 def eigen_sensitivity(
     system: LinearSystem, mass_changes: NDArray[np.float64], stiffness_changes: NDArray[np.float64]
 ) -> EigenSensitivity:
-    """Analytic derivatives of all modes.
+    """Analytic derivatives of all modes, also of repeated ones.
 
     Parameters
     ----------
     system : LinearSystem
     mass_changes, stiffness_changes : ndarray, (p, n, n)
-        dM/dp and dK/dp for each of p parameters.
+        dM/dp and dK/dp for each of p parameters, on which M and K depend linearly (as they do on masses
+        and stiffnesses). Second derivatives would enter the shapes of repeated eigenvalues only.
 
     Notes
     -----
-    dλ_r = φ_rᵀ(K' - λM')φ_r; for a repeated eigenvalue the eigenvalues of that form on its subspace. Shapes
-    by modal expansion, complete here because all modes are at hand.
+    dλ_r = φ_rᵀ(K' - λM')φ_r; for a repeated eigenvalue the eigenvalues of that form on its subspace, whose
+    eigenvectors turn the shapes into those of the branches. Shapes by modal expansion, complete here because
+    all modes are at hand; within a repeated eigenvalue from the second derivative of the eigenproblem.
 
     References
     ----------
     R. L. Fox, M. P. Kapoor, "Rates of change of eigenvalues and eigenvectors", *AIAA J.* 6 (1968) 2426-2429.
-    R. B. Nelson, *AIAA J.* 14 (1976) 1201-1205; for repeated eigenvalues I. U. Ojalvo, *AIAA J.* 26 (1988)
-    361-366.
+    R. L. Dailey, "Eigenvector derivatives with repeated eigenvalues", *AIAA J.* 27 (1989) 486-491.
     """
-    values, phi = eigen_solution(system)
-    dm = np.einsum("ir,kij,js->krs", phi, np.asarray(mass_changes, dtype=float), phi, optimize=True)
-    dk = np.einsum("ir,kij,js->krs", phi, np.asarray(stiffness_changes, dtype=float), phi, optimize=True)
+    values, basis = eigen_solution(system)
     groups = equal_groups(values)
-    forms = dk - values[None, None, :] * dm  # [k, s, r] = φ_sᵀ(K' - λ_r M')φ_r
-    d_values = np.empty((len(dm), len(values)))
-    label = np.empty(len(values), dtype=int)
-    for i, (start, stop) in enumerate(groups):
-        label[start:stop] = i
-        block = forms[:, start:stop, start:stop]
-        d_values[:, start:stop] = np.linalg.eigvalsh(0.5 * (block + block.transpose(0, 2, 1)))
-    together = label[:, None] == label[None, :]
-    gap = np.where(together, 1.0, values[None, :] - values[:, None])  # [s, r] = λ_r - λ_s
-    weights = np.where(together[None], -0.5 * dm, forms / gap[None])
+    slopes, shapes, derivatives = [], [], []
+    for dm, dk in zip(np.asarray(mass_changes, float), np.asarray(stiffness_changes, float), strict=True):
+        phi = basis @ _into_branches(basis.T @ dm @ basis, basis.T @ dk @ basis, values, groups)
+        m, k = phi.T @ dm @ phi, phi.T @ dk @ phi
+        slope = np.diag(k) - values * np.diag(m)
+        slopes.append(slope)
+        shapes.append(phi)
+        derivatives.append(phi @ _expansion(m, k, values, slope, groups))
+    size = (len(slopes), len(values))
     return EigenSensitivity(
         eigenvalues=values,
-        shapes=phi,
         groups=groups,
-        eigenvalue_derivatives=d_values,
-        shape_derivatives=np.einsum("is,ksr->kir", phi, weights, optimize=True),
+        eigenvalue_derivatives=np.reshape(slopes, size),
+        shapes=np.reshape(shapes, (*size, size[1])),
+        shape_derivatives=np.reshape(derivatives, (*size, size[1])),
     )
+
+
+def _into_branches(
+    m: NDArray[np.float64],
+    k: NDArray[np.float64],
+    values: NDArray[np.float64],
+    groups: tuple[tuple[int, int], ...],
+) -> NDArray[np.float64]:
+    """Rotation of the modes within each group that makes K' - λM' diagonal there, (n, n)."""
+    turn = np.eye(len(values))
+    for start, stop in groups:
+        if stop - start > 1:
+            g = slice(start, stop)
+            form = k[g, g] - np.mean(values[g]) * m[g, g]
+            turn[g, g] = np.linalg.eigh(0.5 * (form + form.T))[1]
+    return turn
+
+
+def _expansion(
+    m: NDArray[np.float64],
+    k: NDArray[np.float64],
+    values: NDArray[np.float64],
+    slope: NDArray[np.float64],
+    groups: tuple[tuple[int, int], ...],
+) -> NDArray[np.float64]:
+    """Coefficients of the shapes' derivatives over the shapes, (n, n): column r belongs to mode r."""
+    forms = k - values[None, :] * m  # [s, r] = φ_sᵀ(K' - λ_r M')φ_r
+    weights = np.zeros_like(m)
+    for start, stop in groups:
+        g = slice(start, stop)
+        others = np.r_[0:start, stop : len(values)]
+        out = forms[others, g] / (values[None, g] - values[others, None])
+        weights[others, g] = out
+        inside = -0.5 * m[g, g]
+        parting = slope[None, g] - slope[g, None]  # [i, j] = λ'_j - λ'_i
+        apart = np.abs(parting) > EQUAL * max(float(np.max(np.abs(slope))), 1e-300)
+        second = forms[others, g].T @ out - m[g, g] * slope[None, g]
+        inside[apart] = second[apart] / parting[apart]
+        weights[g, g] = inside
+    return weights
 
 
 def equal_groups(values: NDArray[np.float64]) -> tuple[tuple[int, int], ...]:
