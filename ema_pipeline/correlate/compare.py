@@ -104,7 +104,7 @@ def band_differences(
     measured = picked.accelerance()
     factor = np.abs(measured) ** 2 / np.maximum(np.abs(picked.frf) ** 2, 1e-300)
     variance = np.nan_to_num(picked.variance) * factor
-    model = _windowed_accelerance(system, picked)
+    model = windowed_accelerance(system, picked)
     if not frfs.force_calibrated:
         scale = np.nansum(np.abs(measured * model.conj()), axis=(0, 2)) / np.maximum(
             np.sum(np.abs(model) ** 2 * np.isfinite(measured), axis=(0, 2)), 1e-300
@@ -139,7 +139,7 @@ def band_differences(
     return out
 
 
-def _windowed_accelerance(system: LinearSystem, frfs: FrfSet) -> NDArray[np.complex128]:
+def windowed_accelerance(system: LinearSystem, frfs: FrfSet) -> NDArray[np.complex128]:
     """Accelerance as a test with an exponential window sees it: at jω + σ in place of jω."""
     sigma = frfs.response_decay_rad_s
     if sigma > 0:
