@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.verdict import Verdict
 
 
@@ -24,11 +25,15 @@ class ForceLevel:
         ``file#number`` of every accepted hit of this level.
     frfs : FrfSet
         Averaged over the hits of this level alone.
+    modal : ModalModel or None
+        Identified from `frfs` alone, without circle fits; None where all hits are of one level. The softest
+        level's is the closest to the linear structure.
     """
 
     force_n: float
     hits: tuple[str, ...]
     frfs: FrfSet
+    modal: ModalModel | None = None
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,8 @@ class ModeLevels:
     trend : str
         ``"hardening"``, ``"softening"``, ``"damping falls"``, ``"damping rises"``, joined by ``", "``; empty where
         nothing moves.
+    level_modes : ndarray of int, (n_levels,), or None
+        Index into the modes of each level's own `ModalModel`; -1 where the mode was not found there.
     """
 
     mode: int
@@ -64,6 +71,7 @@ class ModeLevels:
     damping_p: float
     depends: bool
     trend: str
+    level_modes: NDArray[np.int64] | None = None
 
 
 @dataclass(frozen=True)

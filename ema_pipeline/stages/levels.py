@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
@@ -12,6 +12,9 @@ from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.hits import accepted_hits
 
+if TYPE_CHECKING:
+    from ema_pipeline.pipeline import ModalStageSettings
+
 NAME = "levels"
 NEEDS = ("ingest", "hits", "frf", "modal")
 PER_CONFIGURATION = True
@@ -19,8 +22,8 @@ NEEDS_RIG = False
 
 
 def inputs(run: Run, configuration: str) -> str:
-    """FRFs of single levels are made with the settings of all of them."""
-    return run.settings["frf"].model_dump_json()
+    """FRFs and modes of single levels are made with the settings of all of them."""
+    return run.settings["frf"].model_dump_json() + run.settings["modal"].model_dump_json()
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
@@ -30,10 +33,14 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     frfs = run.store.load("frf", configuration, "frfs", FrfSet)
     modal = run.store.load("modal", configuration, "modal", ModalModel)
     settings = cast(LevelSettings, run.settings[NAME])
-    frf_settings = cast(FrfSettings, run.settings["frf"])
-
     study = study_levels(
-        lambda: accepted_hits(run.store, configuration), frfs, modal, settings, frf_settings, progress
+        lambda: accepted_hits(run.store, configuration),
+        frfs,
+        modal,
+        settings,
+        cast(FrfSettings, run.settings["frf"]),
+        cast("ModalStageSettings", run.settings["modal"]).identify,
+        progress,
     )
     return {"study": study}
 
