@@ -13,7 +13,7 @@ from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.engines import complete_block
 from ema_pipeline.modal.fit import Estimate, moved, newton_step, solve_linear
 from ema_pipeline.modal.lscf import common_denominator_poles
-from ema_pipeline.modal.normal_equations import fractions, increments, normal_equations
+from ema_pipeline.modal.normal_equations import fractions, normal_equations, numerator
 from ema_pipeline.modal.plscf import polyreference_poles
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.roots import stable_roots
@@ -64,16 +64,18 @@ def test_stable_roots_are_those_that_numpy_finds() -> None:
         assert max(np.min(np.abs(found - z)) for z in expected) < 1e-9
 
 
-def test_denominators_of_all_orders_equal_those_of_a_direct_least_squares_fit() -> None:
+@pytest.mark.parametrize(("first", "grid"), [(0, 190), (20, 210), (40, 300)])
+def test_denominators_of_all_orders_equal_those_of_a_direct_least_squares_fit(first: int, grid: int) -> None:
     system = random_system(np.random.default_rng(5), n_modes=3, n_dofs=3, low_hz=10, high_hz=90)
     frequency = np.linspace(5, 100, 191)
     frf = noisy(system, frequency, 3, 2, 0.01, 6)
     weight = np.random.default_rng(7).uniform(0.5, 2.0, 191)
-    half = np.where((np.arange(191) == 0) | (np.arange(191) == 190), 0.5, 1.0) * weight
-    equations = normal_equations(frf, weight, 6, 0, 190)
-    for fraction in fractions(equations.total, increments(equations, [3, 6]), [3, 6], 2):
+    line = first + np.arange(191)
+    half = np.where((line == 0) | (line == grid), 0.5, 1.0) * weight
+    equations = normal_equations(frf, weight, 6, first, grid)
+    for fraction in fractions(equations, [1, 3, 6]):
         n = fraction.order
-        basis = np.exp(-1j * np.pi * np.arange(191) / 190)[:, None] ** np.arange(n + 1)
+        basis = np.exp(-1j * np.pi * line / grid)[:, None] ** np.arange(n + 1)
         blocks, right = [], []
         for o in range(3):
             known = np.zeros((191, 3, n + 1), complex)
@@ -84,8 +86,10 @@ def test_denominators_of_all_orders_equal_those_of_a_direct_least_squares_fit() 
             right.append(-(basis[:, n, None] * frf[o].T) * np.sqrt(half)[:, None])
         a, b = np.concatenate(blocks), np.concatenate(right)
         a, b = np.concatenate([a.real, a.imag]), np.concatenate([b.real, b.imag])
-        direct = np.linalg.lstsq(a, b, rcond=None)[0][3 * (n + 1) :].reshape(n, 2, 2)
-        assert np.allclose(fraction.denominator[:-1], direct, rtol=1e-6, atol=1e-8)
+        direct = np.linalg.lstsq(a, b, rcond=None)[0]
+        numerators, denominators = direct[: 3 * (n + 1)], direct[3 * (n + 1) :].reshape(n, 2, 2)
+        assert np.allclose(fraction.denominator[:-1], denominators, rtol=1e-6, atol=1e-8)
+        assert np.allclose(numerator(equations, fraction).reshape(-1, 2), numerators, rtol=1e-6, atol=1e-8)
 
 
 def test_polyreference_finds_both_modes_of_a_repeated_pole_with_their_shapes() -> None:

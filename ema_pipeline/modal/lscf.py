@@ -12,10 +12,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.normal_equations import fractions, increments, normal_equations
+from ema_pipeline.modal.normal_equations import fractions, normal_equations
 from ema_pipeline.modal.roots import stable_roots
-
-ROWS_AT_ONCE = 16
 
 
 def common_denominator_poles(
@@ -47,20 +45,8 @@ def common_denominator_poles(
         `first_line` counted from 0 Hz and `n_grid` the last line these are the poles of sdypy-EMA's LSCF at
         half the order.
     """
-    total: NDArray[np.float64] | None = None
-    gains: list[NDArray[np.float64]] = []
-    for start in range(0, len(frf), ROWS_AT_ONCE):  # small blocks stay in the cache
-        rows = frf[start : start + ROWS_AT_ONCE, None, :]
-        equations = normal_equations(rows, np.ones(frf.shape[1]), max(orders), first_line, n_grid)
-        more = increments(equations, orders)
-        if total is None:
-            total, gains = equations.total, more
-        else:
-            total += equations.total
-            for gain, extra in zip(gains, more, strict=True):
-                gain += extra
-    assert total is not None
-    coefficients = [f.denominator[:, 0, 0] for f in fractions(total, gains, orders, 1)]
+    equations = normal_equations(frf[:, None, :], np.ones(frf.shape[1]), max(orders), first_line, n_grid)
+    coefficients = [f.denominator[:, 0, 0] for f in fractions(equations, orders)]
     step = np.pi / (n_grid * omega_step)
     out: list[NDArray[np.complex128]] = []
     for z in stable_roots(coefficients):

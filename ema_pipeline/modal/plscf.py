@@ -15,7 +15,6 @@ from ema_pipeline.modal.normal_equations import (
     Fraction,
     NormalEquations,
     fractions,
-    increments,
     normal_equations,
     numerator,
 )
@@ -49,11 +48,9 @@ def polyreference_poles(
     PoleSet
         Stable poles inside the band.
     """
-    equations = normal_equations(frf, weight, max(orders), 0, len(omega) - 1)
     orders = sorted(orders)
-    gains = increments(equations, orders)
-    found = fractions(equations.total, gains, orders, frf.shape[1])
-    parts = [_poles_of(fraction, equations, omega) for fraction in found]
+    equations = normal_equations(frf, weight, orders[-1], 0, len(omega) - 1)
+    parts = [_poles_of(fraction, equations, omega) for fraction in fractions(equations, orders)]
     return PoleSet(
         order=np.concatenate([np.full(len(p), n) for n, (p, _, _) in zip(orders, parts, strict=True)]),
         pole=np.concatenate([p for p, _, _ in parts]),
@@ -66,7 +63,7 @@ def polyreference_poles(
 def _poles_of(
     fraction: Fraction, equations: NormalEquations, omega: NDArray[np.float64]
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128], NDArray[np.complex128]]:
-    n, r = fraction.order, equations.n_references
+    n, r = fraction.order, fraction.denominator.shape[1]
     companion = np.eye(n * r, k=r)
     companion[-r:] = -fraction.denominator[:-1].transpose(1, 0, 2).reshape(r, n * r)
     z = np.linalg.eigvals(companion)
