@@ -56,7 +56,7 @@ def test_every_hit_of_a_continuous_recording_is_found_whatever_its_size() -> Non
     assert [round(h.peak / RATE, 1) for h in hits] == times
     assert [h.number for h in hits] == [0, 1, 2, 3, 4]
     assert all(a.stop <= b.start for a, b in pairwise(hits))
-    aligned = align_hits(hits, [record])
+    aligned = align_hits(hits, RATE)
     lengths = {h.stop - h.start for h in aligned}
     assert len(lengths) == 1
     assert all(h.start < h.peak - 3 for h in aligned)
@@ -95,7 +95,7 @@ def test_slow_drift_of_the_hammer_amplifier_is_no_blow() -> None:
 
 def test_hit_without_room_is_rejected_rather_than_shortening_all_others() -> None:
     record = recording([0.5, 2.5, 4.5, 6.5], [50.0] * 4, 6.8)
-    aligned = align_hits(find_hits(record), [record])
+    aligned = align_hits(find_hits(record), RATE)
     assert [h.accepted for h in aligned] == [True, True, True, False]
     assert "only 0.309 s" in aligned[-1].reason
     assert aligned[0].stop - aligned[0].start > 1.9 * RATE

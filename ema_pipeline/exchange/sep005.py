@@ -46,7 +46,7 @@ def to_sep005(record: Record) -> list[dict[str, Any]]:
             "group": record.file,
             "dof": str(channel.dof),
         }
-        for channel, samples in zip(record.channels, record.responses, strict=True)
+        for channel, samples in zip(record.channels, np.asarray(record.responses), strict=True)
     ]
     return [force, *responses]
 

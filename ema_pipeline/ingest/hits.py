@@ -91,7 +91,7 @@ def find_hits(record: Record, settings: HitSettings | None = None) -> tuple[Hit,
 
 
 def align_hits(
-    hits: Sequence[Hit], records: Sequence[Record], settings: HitSettings | None = None
+    hits: Sequence[Hit], sample_rate_hz: float, settings: HitSettings | None = None
 ) -> tuple[Hit, ...]:
     """Give all hits of a test one length, so that their FRFs share a frequency axis.
 
@@ -104,8 +104,8 @@ def align_hits(
     ----------
     hits : sequence of Hit
         All hits of one configuration, as `find_hits` returned them.
-    records : sequence of Record
-        The records of that configuration; only the first one's sample rate is used.
+    sample_rate_hz : float
+        Of the records that they were found in.
     settings : HitSettings, optional
 
     Returns
@@ -116,8 +116,7 @@ def align_hits(
     settings = settings or HitSettings()
     if len({h.stop - h.start for h in hits}) <= 1:
         return tuple(hits)
-    rate = records[0].sample_rate_hz
-    guard = _guard(rate, settings)
+    guard = _guard(sample_rate_hz, settings)
     starts = [max(h.start, h.peak - guard) for h in hits]
     room = np.array([h.stop - start for h, start in zip(hits, starts, strict=True)])
     longest: dict[str, int] = defaultdict(int)
@@ -127,7 +126,7 @@ def align_hits(
     best = max(allowed, key=lambda length: int(length) * int(np.sum(room >= length)))
     length = _fast_length_below(int(best))
     return tuple(
-        _with_length(hit, start, int(space), length, rate)
+        _with_length(hit, start, int(space), length, sample_rate_hz)
         for hit, start, space in zip(hits, starts, room, strict=True)
     )
 

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.ingest.description import ChannelDescription, RecordDescription, TestDescription
 from ema_pipeline.ingest.readers import read_raw
-from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord, split_unit
+from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord, Samples, split_unit
 from ema_pipeline.ingest.records import Record, ResponseChannel
 from ema_pipeline.ingest.swap import find_swap
+from ema_pipeline.rows import Rows
 from ema_pipeline.units import Unit, find_unit
 
 MINIMUM_SAMPLES = 64
@@ -39,6 +40,29 @@ class ScaledChannels:
     sample_rate_hz: float
     samples: dict[str, NDArray[np.float64]]
     full_scale: dict[str, float]
+
+
+@dataclass(frozen=True)
+class _Source:
+    """One described channel of an open record file: its samples times `factor` are in SI."""
+
+    samples: Samples
+    factor: float
+    full_scale: float
+
+    def scaled(self, start: int = 0, stop: int | None = None) -> NDArray[np.float64]:
+        return np.asarray(self.samples[start:stop] * self.factor, dtype=np.float64)
+
+
+class _ScaledRows(Rows):
+    """Responses of one record in SI; each is scaled, and read where its format allows it, when asked for."""
+
+    def __init__(self, sources: list[_Source]) -> None:
+        self._sources = sources
+        self.shape = (len(sources), sources[0].samples.size)
+
+    def read(self, row: int, start: int, stop: int) -> NDArray[np.float64]:
+        return self._sources[row].scaled(start, stop)
 
 
 def load_records(test: TestDescription) -> Iterator[Record]:
@@ -75,7 +99,7 @@ def load_record(test: TestDescription, entry: RecordDescription) -> Record:
     Returns
     -------
     Record
-        Force in N (V where deliberately uncalibrated), responses in m/s², m/s or m.
+        Force in N (V where deliberately uncalibrated), responses in m/s², m/s or m, scaled when asked for.
 
     Raises
     ------
@@ -86,10 +110,10 @@ def load_record(test: TestDescription, entry: RecordDescription) -> Record:
     """
     if entry.impact is None:
         raise EmaError(f"{test.file}: record '{entry.file}' has no impact: it is no hammer record")
-    scaled = load_channels(test, entry)
-    force = scaled.samples[test.force.name]
-    responses = {c.name: scaled.samples[c.name] for c in test.responses}
-    swap = find_swap(force, responses)
+    rate, sources = _open(test, entry)
+    hammer, responses = sources[test.force.name], {c.name: sources[c.name] for c in test.responses}
+    force = hammer.scaled()
+    swap = find_swap(force, {name: source.samples for name, source in responses.items()})
     if swap is not None:
         raise EmaError(
             f"{test.path_of(entry)}: channels '{test.force.name}' and '{swap.channel}' look swapped: "
@@ -107,18 +131,18 @@ def load_record(test: TestDescription, entry: RecordDescription) -> Record:
                 dof=dof,
                 quantity=channel.quantity,
                 sensor_mass_kg=channel.sensor_mass_kg,
-                full_scale=scaled.full_scale[channel.name],
+                full_scale=responses[channel.name].full_scale,
             )
         )
     return Record(
         file=entry.file,
         impact=entry.impact,
-        sample_rate_hz=scaled.sample_rate_hz,
+        sample_rate_hz=rate,
         force_name=test.force.name,
         force=force,
-        responses=np.vstack(list(responses.values())),
+        responses=_ScaledRows(list(responses.values())),
         channels=tuple(channels),
-        force_full_scale=scaled.full_scale[test.force.name],
+        force_full_scale=hammer.full_scale,
         force_calibrated=not test.force.uncalibrated,
     )
 
@@ -131,20 +155,28 @@ def load_channels(test: TestDescription, entry: RecordDescription) -> ScaledChan
     EmaError
         As `load_record`, but for what is special to hammer tests.
     """
+    rate, sources = _open(test, entry)
+    return ScaledChannels(
+        rate,
+        {name: source.scaled() for name, source in sources.items()},
+        {name: source.full_scale for name, source in sources.items()},
+    )
+
+
+def _open(test: TestDescription, entry: RecordDescription) -> tuple[float, dict[str, _Source]]:
+    """Sample rate and described channels of a record file, checked."""
     path = test.path_of(entry)
     raw = read_raw(path)
     rate = _sample_rate(test, raw, str(path))
     found = {c.name: _find_channel(c.name, raw, str(path)) for c in test.channels}
     _check_lengths(found, str(path))
-    samples, full_scale = {}, {}
+    sources = {}
     for channel in test.channels:
         where = f"{path}: channel '{channel.name}'"
         source = found[channel.name]
-        _check_finite(source.samples, rate, where)
-        factor = _factor(channel, source, where)
-        samples[channel.name] = np.asarray(source.samples * factor, dtype=np.float64)
-        full_scale[channel.name] = _full_scale(channel)
-    return ScaledChannels(rate, samples, full_scale)
+        _check_finite(np.asarray(source.samples), rate, where)
+        sources[channel.name] = _Source(source.samples, _factor(channel, source, where), _full_scale(channel))
+    return rate, sources
 
 
 def _sample_rate(test: TestDescription, raw: RawRecord, where: str) -> float:

@@ -37,7 +37,7 @@ def hits_of_test(records: Sequence[Record], settings: HitSettings | None = None)
     Parameters
     ----------
     records : sequence of Record
-        All records of the configuration; gone through three times, so a lazy sequence may load anew.
+        All records of the configuration; gone through up to three times, but responses are read once.
     settings : HitSettings, optional
 
     Returns
@@ -59,8 +59,11 @@ def hits_of_test(records: Sequence[Record], settings: HitSettings | None = None)
         owner += [index] * len(hits)
     if not found:
         return tuple(silent.values())
-    aligned = align_hits(found, records, settings)
-    checked = [check_hit(records[i], hit, settings) for i, hit in zip(owner, aligned, strict=True)]
+    aligned = align_hits(found, record.sample_rate_hz, settings)
+    checked: list[Hit] = []
+    for index, record in enumerate(records):
+        mine = [hit for hit, i in zip(aligned, owner, strict=True) if i == index]
+        checked += [check_hit(record, hit, settings) for hit in mine]
     trimmed = trim_hits(checked, records, settings)
     placed = [*zip(owner, trimmed, strict=True), *silent.items()]
     return tuple(hit for _, hit in sorted(placed, key=lambda item: item[0]))
@@ -111,8 +114,9 @@ def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> 
     ]
     # Before the first hit of a record the structure is at rest: what is there is noise and hum.
     rest = pulse.start if hit.start == 0 and hit.number == 0 else 0
-    for channel, samples in zip(record.channels, record.responses, strict=True):
-        verdicts += _check_response(channel, samples[hit.start : hit.stop], pulse, rest, rate, settings)
+    for row, channel in enumerate(record.channels):
+        samples = record.responses[row, hit.start : hit.stop]
+        verdicts += _check_response(channel, samples, pulse, rest, rate, settings)
     return replace(hit, verdicts=tuple(verdicts))
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
+from ema_pipeline.rows import CutRows, Rows
 from ema_pipeline.verdict import Verdict
 
 
@@ -53,8 +54,8 @@ class Record:
         Name of the hammer channel.
     force : ndarray, (n_samples,)
         Force, N (V where `force_calibrated` is false).
-    responses : ndarray, (n_channels, n_samples)
-        Responses in SI.
+    responses : Rows or ndarray, (n_channels, n_samples)
+        Responses in SI; `Rows` are read where they are sliced.
     channels : tuple of ResponseChannel
         One per row of `responses`.
     force_full_scale : float
@@ -68,7 +69,7 @@ class Record:
     sample_rate_hz: float
     force_name: str
     force: NDArray[np.float64]
-    responses: NDArray[np.float64]
+    responses: Rows | NDArray[np.float64]
     channels: tuple[ResponseChannel, ...]
     force_full_scale: float = float("inf")
     force_calibrated: bool = True
@@ -134,8 +135,8 @@ class HitSamples:
     sample_rate_hz : float
     force : ndarray, (n_samples,)
         N, or V for an uncalibrated hammer.
-    responses : ndarray, (n_channels, n_samples)
-        SI.
+    responses : Rows or ndarray, (n_channels, n_samples)
+        SI; `Rows` are read where they are sliced.
     channels : tuple of ResponseChannel
         One per row of `responses`; channels rejected in this hit are already left out.
     force_calibrated : bool
@@ -144,7 +145,7 @@ class HitSamples:
     hit: Hit
     sample_rate_hz: float
     force: NDArray[np.float64]
-    responses: NDArray[np.float64]
+    responses: Rows | NDArray[np.float64]
     channels: tuple[ResponseChannel, ...]
     force_calibrated: bool = True
 
@@ -156,7 +157,7 @@ def cut_hit(record: Record, hit: Hit) -> HitSamples:
         hit=hit,
         sample_rate_hz=record.sample_rate_hz,
         force=record.force[hit.start : hit.stop],
-        responses=record.responses[keep, hit.start : hit.stop],
+        responses=CutRows(record.responses, keep, hit.start, hit.stop),
         channels=tuple(record.channels[i] for i in keep),
         force_calibrated=record.force_calibrated,
     )

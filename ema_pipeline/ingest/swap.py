@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
 _PULSE_SIDE = 0.9  # share of the energy on one side of zero: pulses on real hammers have 0.89 to 1.00
 _PULSE_SPREAD = 0.004  # share of samples with 90 % of the energy: 0.0002 to 0.0008 on real hammers
@@ -54,13 +54,14 @@ class _Shape:
         return self.side <= _RINGING_SIDE and low <= self.spread <= high and self.crest < _RINGING_CREST
 
 
-def find_swap(force: NDArray[np.float64], responses: Mapping[str, NDArray[np.float64]]) -> Swap | None:
+def find_swap(force: ArrayLike, responses: Mapping[str, ArrayLike]) -> Swap | None:
     """Return the response that was exchanged with the force channel, or None.
 
     Parameters
     ----------
-    force : ndarray, (n_samples,)
-    responses : mapping of str to ndarray, (n_samples,)
+    force : array_like, (n_samples,)
+    responses : mapping of str to array_like, (n_samples,)
+        Looked at one after the other, and only where the force channel rings.
     """
     shape = _shape(force)
     if not shape.rings:
@@ -71,13 +72,14 @@ def find_swap(force: NDArray[np.float64], responses: Mapping[str, NDArray[np.flo
     return Swap(pulses[0][0], pulses[0][1].spread, shape.spread)
 
 
-def is_pulse(samples: NDArray[np.float64]) -> bool:
+def is_pulse(samples: ArrayLike) -> bool:
     """True where samples (n,) look like a hammer: short pulses that push one way."""
     return _shape(samples).is_pulse
 
 
-def _shape(samples: NDArray[np.float64]) -> _Shape:
-    x = samples - np.median(samples)
+def _shape(samples: ArrayLike) -> _Shape:
+    x = np.array(samples, dtype=np.float64)
+    x -= np.median(x)
     energy = x**2
     total = float(energy.sum())
     if total == 0.0:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
-from typing import Any, cast
+from dataclasses import fields
+from typing import Any, cast, get_type_hints
+
+import h5py
 
 from ema_pipeline import codec
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.records import Hit, HitSamples, Record, cut_hit
+from ema_pipeline.rows import StoredRows
 from ema_pipeline.stages.base import Progress, Run, silent
 from ema_pipeline.store import Store
 
@@ -28,7 +33,8 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     from ema_pipeline.ingest.quality import hits_of_test
 
     settings = cast(HitSettings, run.settings[NAME])
-    hits = hits_of_test(StoredRecords(run.store, configuration), settings)
+    with stored_records(run.store, configuration) as records:
+        hits = hits_of_test(records, settings)
     require_good_hits(hits, configuration)
     return {"hits": hits}
 
@@ -49,30 +55,37 @@ def require_good_hits(hits: tuple[Hit, ...], configuration: str) -> None:
 
 
 class StoredRecords(Sequence[Record]):
-    """The records of one configuration in the store, read one at a time."""
+    """Records in an open store, read one at a time; their responses stay there until they are sliced."""
 
-    def __init__(self, store: Store, configuration: str) -> None:
-        self._store = store
-        self._path = f"stages/ingest/{configuration}/records"
-        with store.reading() as file:
-            self._count = len(file[self._path])
+    def __init__(self, group: h5py.Group) -> None:
+        self._group = group
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._group)
 
     def __getitem__(self, index: Any) -> Any:
-        if not 0 <= index < self._count:
+        if not 0 <= index < len(self):
             raise IndexError(index)
-        with self._store.reading() as file:
-            return codec.read(file[self._path], str(index), Record)
+        group, hints = self._group[str(index)], get_type_hints(Record)
+        small = {
+            f.name: codec.read(group, f.name, hints[f.name]) for f in fields(Record) if f.name != "responses"
+        }
+        return Record(responses=StoredRows(group["responses"]), **small)
+
+
+@contextlib.contextmanager
+def stored_records(store: Store, configuration: str) -> Iterator[StoredRecords]:
+    """The records of one configuration in the store."""
+    with store.reading() as file:
+        yield StoredRecords(file[f"stages/ingest/{configuration}/records"])
 
 
 def accepted_hits(store: Store, configuration: str, progress: Progress = silent) -> Iterator[HitSamples]:
     """The good hits of one configuration with their samples, read one record at a time."""
     hits = store.load(NAME, configuration, "hits", tuple[Hit, ...])
-    records = StoredRecords(store, configuration)
-    for i, record in enumerate(records):
-        progress(i / len(records), record.file)
-        for hit in hits:
-            if hit.file == record.file and hit.accepted:
-                yield cut_hit(record, hit)
+    with stored_records(store, configuration) as records:
+        for i, record in enumerate(records):
+            progress(i / len(records), record.file)
+            for hit in hits:
+                if hit.file == record.file and hit.accepted:
+                    yield cut_hit(record, hit)

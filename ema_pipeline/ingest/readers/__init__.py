@@ -134,4 +134,4 @@ def _read_gzip(path: Path) -> RawRecord:
                 plain.write_bytes(packed.read())
         except (OSError, EOFError, zlib.error) as error:
             raise EmaError(f"{path}: cannot be unpacked ({error}); copy it again") from None
-        return _read(plain, _head(plain) if plain.stat().st_size else b"", str(path))
+        return _read(plain, _head(plain) if plain.stat().st_size else b"", str(path)).in_memory()

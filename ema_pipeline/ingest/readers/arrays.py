@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, clean_unit
+from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, Samples, StoredSamples, clean_unit
 from ema_pipeline.ingest.readers.timebase import (
     is_time_name,
     is_uniform_ramp,
@@ -39,14 +39,14 @@ class NamedArray:
     ----------
     path : tuple of str
         Groups or structs, then the name.
-    values : ndarray
+    values : ndarray or StoredSamples
         Any shape.
     attributes : mapping
         What the file says about it.
     """
 
     path: tuple[str, ...]
-    values: NDArray[Any]
+    values: NDArray[Any] | StoredSamples
     attributes: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -59,7 +59,7 @@ class _Column:
     """One vector on its way to becoming a channel; `axis_rate` where it came with its own axis."""
 
     path: tuple[str, ...]
-    samples: NDArray[np.float64]
+    samples: Samples
     attributes: Mapping[str, Any]
     axis_rate: float | None = None
 
@@ -84,7 +84,12 @@ def assemble(arrays: Sequence[NamedArray], file_attributes: Mapping[str, Any] | 
     notes: list[str] = []
     for array in arrays:
         label = "/".join(array.path)
-        values = np.squeeze(np.asarray(array.values))
+        values = array.values
+        if isinstance(values, StoredSamples):
+            rates.read(label, array.attributes)
+            columns.append(_Column(array.path, values, array.attributes))
+            continue
+        values = np.squeeze(np.asarray(values))
         if values.dtype.kind in "USO":
             if _key(array.name) in _NAME_KEYS:
                 column_names = _texts(values)
@@ -100,7 +105,7 @@ def assemble(arrays: Sequence[NamedArray], file_attributes: Mapping[str, Any] | 
             rates.read(label, {array.name: values})
             continue
         rates.read(label, array.attributes)
-        numbers = values.astype(np.float64)
+        numbers = values.astype(np.float64, copy=False)
         if values.ndim == 1 and is_time_name(array.name):
             scale = time_unit_scale(array.name, _text(array.attributes, _UNIT_KEYS))
             rates.add(label, rate_from_times(numbers * scale))

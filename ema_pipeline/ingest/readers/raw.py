@@ -3,15 +3,53 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.errors import EmaError
 from ema_pipeline.units import find_unit
 
 FULL_SCALE = "fraction of full scale"
 """Stands in place of a unit where samples are fractions of the converter's range (integer WAV)."""
+
+
+@dataclass(frozen=True)
+class StoredSamples:
+    """A channel that stays in its HDF5 file until it is sliced or made an array.
+
+    Attributes
+    ----------
+    path : Path
+    name : str
+        Path of a one-dimensional dataset within the file.
+    size : int
+    """
+
+    path: Path
+    name: str
+    size: int
+
+    def __getitem__(self, cut: slice) -> NDArray[np.float64]:
+        import h5py
+
+        try:
+            with h5py.File(self.path, "r") as file:
+                return np.asarray(file[self.name][cut], dtype=np.float64)
+        except (OSError, KeyError) as error:
+            raise EmaError(
+                f"{self.path}: dataset '{self.name}' cannot be read ({error}); the file is damaged, "
+                "copy or export it again"
+            ) from None
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self[:], dtype=dtype)
+
+
+Samples = NDArray[np.float64] | StoredSamples
 
 
 @dataclass(frozen=True)
@@ -20,7 +58,7 @@ class RawChannel:
 
     Attributes
     ----------
-    samples : ndarray, (n_samples,)
+    samples : ndarray or StoredSamples, (n_samples,)
         In `unit`; NaN where the file says so.
     unit : str or None
         As the file spells it, None where it is silent, `FULL_SCALE` for integer WAV.
@@ -28,7 +66,7 @@ class RawChannel:
         Hint such as ``"12.z"``, for drafting a description only.
     """
 
-    samples: NDArray[np.float64]
+    samples: Samples
     unit: str | None = None
     dof: str | None = None
 
@@ -53,6 +91,11 @@ class RawRecord:
     sample_rate_hz: float | None = None
     notes: tuple[str, ...] = ()
     rate_tolerance: float = 0.0
+
+    def in_memory(self) -> RawRecord:
+        """The same with all samples read, for a file that will not stay."""
+        channels = {name: replace(c, samples=np.asarray(c.samples)) for name, c in self.channels.items()}
+        return replace(self, channels=channels)
 
 
 def split_unit(label: str) -> tuple[str, str | None]:
