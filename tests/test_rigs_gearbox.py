@@ -14,6 +14,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.harmonic import harmonic_response
 from ema_pipeline.mechanics.modes import complex_modes, normal_modes
 from ema_pipeline.mechanics.system import sensor_rows
+from ema_pipeline.report.planetary import Motion, missing_words, motions, torsional_layout
 from ema_pipeline.rigs import load_rig, model_modes
 from ema_pipeline.rigs.gearbox import default_parameters, gearbox
 from ema_pipeline.rigs.planetary import planetary
@@ -88,6 +89,20 @@ def test_effects_that_make_sense_find_their_places_on_the_gearbox() -> None:
             before = complex_modes(assembly.system()).poles
             after = complex_modes(effect.apply(assembly, place, start).system()).poles
             assert np.max(np.abs(before - after)) > 0.1
+
+
+def test_drawn_gearbox_turns_in_a_fixed_ring_and_its_carrier_takes_the_planets_along() -> None:
+    layout = torsional_layout(GEARBOX.assembly("default").dofs)
+    assert layout is not None
+    assert layout.torsional
+    assert [b.name for b in layout.bodies] == ["carrier", "ring", "sun", "planet1", "planet2", "planet3"]
+    moved = motions(layout, {"carrier.u": 0.5, "sun.u": 1.0, "planet1.u": -1.0, "planet2.u": 0.2})
+    assert (moved["planet1"].x, moved["planet1"].y, moved["planet1"].u) == (0.0, 0.5, -1.0)
+    # Planet 2 of 3 sits at 120°: a carrier that turns takes it along -x and -y.
+    assert moved["planet2"].x == pytest.approx(-0.5 * np.sin(2 * np.pi / 3))
+    assert moved["planet2"].y == pytest.approx(0.5 * np.cos(2 * np.pi / 3))
+    assert moved["ring"] == Motion(0.0, 0.0, 0.0)
+    assert missing_words(moved) == "not measured: u of planet3"
 
 
 def test_a_single_planets_mesh_can_be_named_in_a_rig_file(tmp_path: Path) -> None:

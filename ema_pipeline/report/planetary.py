@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,10 +36,15 @@ class GearBody:
 
 @dataclass(frozen=True)
 class GearLayout:
-    """All bodies, drawn in this order; `reach` is the radius of a circle round the whole set."""
+    """All bodies, drawn in this order; `reach` is the radius of a circle round the whole set.
+
+    `torsional`: every centre is held but those of the planets, which the carrier takes along, and the ring does
+    not move. Then u is all that there is to measure.
+    """
 
     bodies: tuple[GearBody, ...]
     reach: float
+    torsional: bool = False
 
 
 @dataclass(frozen=True)
@@ -89,12 +94,20 @@ def gear_layout(points: Iterable[str]) -> GearLayout | None:
     return GearLayout(tuple(layout), 1 + 2 * planet + (0.75 if "ring" in bodies else 0.45))
 
 
+def torsional_layout(points: Sequence[str]) -> GearLayout | None:
+    """Layout of a set whose bodies only turn, inside a ring that is fixed; None as in `gear_layout`."""
+    layout = gear_layout((*points, "ring.u"))
+    return None if layout is None else replace(layout, torsional=True)
+
+
 def motions(layout: GearLayout, values: Mapping[str, complex]) -> dict[str, Motion]:
     """Motion of every body from the shape's entries; NaN entries and absent DOFs count as missing.
 
     A planet's x and y come from themselves, or else from its zeta and eta.
     """
     known = {k: v for k, v in values.items() if np.isfinite(v)}
+    if layout.torsional:
+        return {body.name: _turning(body, known) for body in layout.bodies}
     result = {}
     for body in layout.bodies:
         b = body.name
@@ -115,6 +128,18 @@ def motions(layout: GearLayout, values: Mapping[str, complex]) -> dict[str, Moti
         missing = tuple(d for d, v in (("x", x), ("y", y), ("u", u)) if v is None)
         result[b] = Motion(x or 0, y or 0, u or 0, missing)
     return result
+
+
+def _turning(body: GearBody, known: Mapping[str, complex]) -> Motion:
+    """Motion of a body of a torsional set."""
+    u = known.get(f"{body.name}.u")
+    x: complex = 0.0
+    y: complex = 0.0
+    if _PLANET.match(body.name):
+        carried = known.get("carrier.u", 0.0)
+        x, y = -np.sin(body.psi) * carried, np.cos(body.psi) * carried
+    missing = ("u",) if u is None and body.name != "ring" else ()
+    return Motion(x, y, u or 0, missing)
 
 
 def missing_words(moved: Mapping[str, Motion]) -> str:
@@ -222,7 +247,9 @@ def drawing_scale(layout: GearLayout, moved: Mapping[str, Motion], share: float 
 def layout_of(configuration: ConfigurationResults) -> GearLayout | None:
     """Layout from the model's DOFs, or else from the measured ones."""
     if configuration.system is not None:
-        return gear_layout(configuration.system.dofs)
+        dofs = configuration.system.dofs
+        only_turn = all(d.endswith(".u") for d in dofs)
+        return torsional_layout(dofs) if only_turn else gear_layout(dofs)
     if configuration.modal is not None:
         return gear_layout(d.point for d in configuration.modal.dofs)
     return None

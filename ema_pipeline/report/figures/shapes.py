@@ -94,7 +94,8 @@ def draw_gear(
         rest = Affine2D().translate(body.x, body.y) + ax.transData
         kind = body.name.rstrip("0123456789")
         fill = (fills or {}).get(body.name, FILLS[kind])
-        unknown = len(moved[body.name].missing) == 3 and fills is None
+        everything = 1 if layout.torsional else 3
+        unknown = len(moved[body.name].missing) == everything and fills is None
         if kind == "carrier":
             circle = outline(body)
             ax.add_artist(Polygon(circle, fill=False, ec="#a0a0a0", lw=0.5, ls=(0, (3, 2)), transform=rest))
