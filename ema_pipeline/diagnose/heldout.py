@@ -70,7 +70,9 @@ def held_out(case: Case, fitted: Fitted, fit: FitSettings, folds: int) -> HeldOu
         }
         part = FitProblem(replace(rig, parameters=changed), kept, fit)
         found = refine(part, part.space.point(fitted.values))
-        covariance = posterior_covariance(part, found, 1.0)
+        # a model that fails has turned data into outliers: without them it would know too little to be wrong
+        trusting = replace(found, inlier=np.ones_like(found.inlier))
+        covariance = posterior_covariance(part, trusting, 1.0)
         values = {**fitted.values, **part.space.named(found.x)}
         for n in loose:
             if n not in part.space.names:

@@ -67,6 +67,14 @@ class DiagnoseSettings(Settings):
     )
     folds: int = Field(default=5, ge=2, le=20, description="Parts that the data are held out in, in turn.")
     most_rungs: int = Field(default=3, ge=1, le=6, description="Most effects that the ladder adds by itself.")
+    bootstrap: int = Field(
+        default=0,
+        ge=0,
+        le=10000,
+        description="Simulated tests with nothing missing from which this test's own thresholds are read; each "
+        "takes about as long as one diagnosis, 0 for the shipped thresholds. What is done is kept, so that an "
+        "interrupted run goes on.",
+    )
     candidates: int = Field(default=5, ge=1, description="Number of candidates that are reported.")
     processes: int = Field(
         default=2, ge=1, le=64, description="Processes that share the hypotheses; 1 for none but this one."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -47,6 +48,11 @@ class Candidate:
         True where probability, gain and held-out data all support it.
     why : str
         Two plain sentences.
+    frf_error_before, frf_error_after : float
+        Root-mean-square of (measurement - model)/standard uncertainty of the FRFs around the modes, which were
+        not fitted, without and with it; NaN where there are none.
+    frf_impacts_better, frf_impacts : int
+        Impact points whose FRFs come nearer with it, and how many there are.
     """
 
     effect: str
@@ -63,6 +69,10 @@ class Candidate:
     log_evidence: float
     claimed: bool
     why: str
+    frf_error_before: float = float("nan")
+    frf_error_after: float = float("nan")
+    frf_impacts_better: int = 0
+    frf_impacts: int = 0
 
     @property
     def label(self) -> str:
@@ -89,6 +99,8 @@ class Rung:
         Against the base model.
     unexplained : int
         Measured modes that the model does not explain.
+    frf_error : float
+        Of the FRFs around the modes, see `Candidate`.
     """
 
     effects: tuple[str, ...]
@@ -99,6 +111,7 @@ class Rung:
     parameters: dict[str, EffectSize]
     log_evidence: float
     unexplained: int
+    frf_error: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -145,6 +158,53 @@ class Localisation:
 
 
 @dataclass(frozen=True)
+class DetectionLimit:
+    """The least size of an effect that these data would show nine times in ten.
+
+    Attributes
+    ----------
+    label : str
+        ``id@place``.
+    parameter : str
+    size : float
+        Distance from null; infinite where no allowed size would be seen. Relative to the nominal value for a
+        parameter out of tolerance.
+    unit : str
+    """
+
+    label: str
+    parameter: str
+    size: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class HeldOutMode:
+    """One measured frequency, predicted by the model fitted to the other modes.
+
+    Attributes
+    ----------
+    configuration : str
+    measured_hz, measured_std_hz : float
+    predicted_hz, predicted_std_hz : float
+        NaN where the model has no such mode.
+    """
+
+    configuration: str
+    measured_hz: float
+    measured_std_hz: float
+    predicted_hz: float
+    predicted_std_hz: float
+
+    @property
+    def z(self) -> float:
+        """Difference over the uncertainty of both."""
+        return (self.measured_hz - self.predicted_hz) / math.hypot(
+            self.measured_std_hz, self.predicted_std_hz
+        )
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """The answer to: which physics is the model missing?
 
@@ -172,6 +232,12 @@ class Diagnosis:
     ladder : Ladder
     notes : tuple of str
         What the data's screening found.
+    detection_limits : tuple of DetectionLimit
+        What these data would show; empty where even the best model fails.
+    heldout_modes : tuple of HeldOutMode
+        Every frequency as the best model predicts it from the other modes.
+    thresholds_from : str
+        Where the thresholds come from, in a few words.
     """
 
     verdict: VerdictWord
@@ -186,3 +252,6 @@ class Diagnosis:
     heldout_error: float
     ladder: Ladder
     notes: tuple[str, ...] = ()
+    detection_limits: tuple[DetectionLimit, ...] = ()
+    heldout_modes: tuple[HeldOutMode, ...] = ()
+    thresholds_from: str = ""

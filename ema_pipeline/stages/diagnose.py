@@ -30,7 +30,8 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     settings = cast(DiagnoseSettings, run.settings[NAME])
     model = run.require_model(NAME)
     measured = measured_modes(run)
-    found = diagnose(model, measured, settings, run.library, progress, failed_checks(run))
+    frfs = {name: f for name in measured if (f := run.store.find("frf", name, "frfs", FrfSet)) is not None}
+    found = diagnose(model, measured, settings, run.library, progress, failed_checks(run), frfs=frfs)
     results: dict[str, object] = {"diagnosis": found, "on_top_of": run.info.effects}
     top = found.ladder.rungs[-1]
     if top.effects:

@@ -1,0 +1,71 @@
+"""What to measure next, in a sentence with the effect that is to be expected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ema_pipeline.diagnose.explain import label_text
+from ema_pipeline.diagnose.fitting import Case, Fitted
+from ema_pipeline.diagnose.hypotheses import NOTHING
+from ema_pipeline.diagnose.ranking import Ranking
+from ema_pipeline.diagnose.separate import Option, best_measurement
+from ema_pipeline.diagnose.types import VerdictWord
+from ema_pipeline.fit.settings import FitSettings
+
+_LEAST = 1.0
+_WORTH = 2.0
+_CERTAIN = 100.0
+
+
+def next_measurement(
+    case: Case, verdict: VerdictWord, ranking: Ranking, members: Sequence[Fitted], fit: FitSettings
+) -> str:
+    """The measurement that would help most; empty where nothing is needed.
+
+    Parameters
+    ----------
+    case : Case
+    verdict : str
+    ranking : Ranking
+        On top of the base model.
+    members : sequence of Fitted
+        What explains the data alike.
+    fit : FitSettings
+        At the noise level.
+    """
+    if verdict == "ambiguous" and members:
+        second = members[1] if len(members) > 1 else ranking.base
+        names = (_name(members[0]), _name(second))
+        option = best_measurement(case, members[0], second, fit)
+        if option is None or option.separation < _LEAST:
+            return f"No single further measurement that was tried would tell {names[0]} from {names[1]}."
+        return f"{_capital(option.text)} would tell {names[0]} from {names[1]}: {_expected(option, *names)}."
+    if verdict == "unknown_effect":
+        return (
+            "Hit at three force levels: if a natural frequency moves, the missing effect depends on amplitude; "
+            "if not, put further sensors around the place named."
+        )
+    if verdict == "not_enough_data":
+        return "Measure mode shapes at every body, in every configuration of the rig."
+    if verdict == "adequate" and ranking.probabilities[NOTHING] < case.settings.probability_least:
+        ordered = ranking.ordered()
+        option = best_measurement(case, ordered[0], ranking.base, fit) if ordered else None
+        if option is not None and option.separation > _WORTH:
+            name = _name(ordered[0])
+            expected = _expected(option, "it", "nothing missing")
+            return f"{_capital(option.text)} would show whether {name} is there: {expected}."
+    return ""
+
+
+def _expected(option: Option, first: str, second: str) -> str:
+    effect = option.effect.format(first=first, second=second)
+    size = f"more than {_CERTAIN:g}" if option.separation > _CERTAIN else f"{option.separation:.1f}"
+    return f"{effect}, a difference of {size} σ" if effect else f"a difference of {size} σ"
+
+
+def _name(f: Fitted) -> str:
+    return label_text(f.hypothesis.labels[-1]) if f.hypothesis.labels else "the model as it is"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

@@ -1,0 +1,157 @@
+"""From the base model upwards: rank all hypotheses, add the one that is claimed, and rank again on top of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from ema_pipeline.diagnose.fitting import Case, Fitted, fit_null, holds, refit
+from ema_pipeline.diagnose.heldout import held_out
+from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, single_hypotheses
+from ema_pipeline.diagnose.ladder import noise_of, yardstick
+from ema_pipeline.diagnose.noise import NoiseLevel, floors
+from ema_pipeline.diagnose.ranking import Ranking, rank, sharpen
+from ema_pipeline.diagnose.thresholds import threshold
+from ema_pipeline.diagnose.witness import Witness, contradicts
+from ema_pipeline.fit.settings import FitSettings
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Climb:
+    """Models of the ladder and the rankings on top of each.
+
+    Attributes
+    ----------
+    models : list of Fitted
+        The base model first.
+    rankings : list of Ranking
+    level : NoiseLevel
+    note : str
+        Why climbing stopped.
+    """
+
+    models: list[Fitted]
+    rankings: list[Ranking]
+    level: NoiseLevel
+    note: str
+
+    @property
+    def top(self) -> Fitted:
+        """The model at the top of the ladder."""
+        return self.models[-1]
+
+
+def first_ranking(case: Case, tell: Progress) -> tuple[Ranking, NoiseLevel]:
+    """All hypotheses on the base model, at the noise level that the best of them leaves."""
+    settings = case.settings
+    tell(0.0, "base model")
+    base = fit_null(case, Hypothesis(), settings.fit, None)
+    hypotheses = single_hypotheses(case.rig, list(case.measured), case.library)
+    if holds(base):
+        # The base model itself tells the noise level; one round is enough unless a hypothesis leaves less.
+        level = noise_of(case, base)
+        base = fit_null(case, Hypothesis(), level.applied(settings.fit), base.values)
+        ranking = rank(case, base, hypotheses, level.applied(settings.fit), part(tell, 0.05, 0.8))
+    else:
+        level = floors(settings.fit)
+        ranking = rank(case, base, hypotheses, settings.fit, part(tell, 0.05, 0.8))
+    best = min((ranking.base, *ranking.fitted), key=lambda f: f.evidence)
+    finer = noise_of(case, best)
+    if finer.below(level):
+        level = finer
+        fit = level.applied(settings.fit)
+        base = refit(case, Hypothesis(), fit, ranking.base.values)
+        ranking = sharpen(case, ranking, base, fit, part(tell, 0.8, 1.0))
+    return ranking, level
+
+
+def climb(case: Case, witness: Witness, thresholds: Mapping[str, float] | None, tell: Progress) -> Climb:
+    """Add what is claimed, one effect after the other.
+
+    Parameters
+    ----------
+    case : Case
+    witness : Witness
+        What its FRFs contradict is not added.
+    thresholds : mapping of family to gain, optional
+    tell : callable
+    """
+    settings = case.settings
+    ranking, level = first_ranking(case, part(tell, 0.0, 0.8))
+    fit = level.applied(settings.fit)
+    models, rankings = [ranking.base], [ranking]
+    while True:
+        claim, note = claimable(case, rankings[-1], fit, witness, thresholds)
+        if claim is None:
+            break
+        if len(models) > settings.most_rungs:
+            note = f"stopped after {settings.most_rungs} effects"
+            break
+        models.append(claim)
+        rest = single_hypotheses(case.rig, list(case.measured), case.library, claim.hypothesis)
+        told = part(tell, 0.8, 1.0)
+        told(0.0, f"on top of {claim.hypothesis.label}")
+        rankings.append(rank(case, claim, rest, fit, told))
+        models[-1] = rankings[-1].base
+    return Climb(models, rankings, level, note)
+
+
+def claimable(
+    case: Case,
+    ranking: Ranking,
+    fit: FitSettings,
+    witness: Witness,
+    thresholds: Mapping[str, float] | None,
+) -> tuple[Fitted | None, str]:
+    """The most probable hypothesis where something is missing for sure, and held-out data and FRFs agree.
+
+    Returns
+    -------
+    Fitted or None
+    str
+        Why nothing is claimed.
+    """
+    settings = case.settings
+    nothing = "no further effect is supported by the data"
+    if 1 - ranking.probabilities[NOTHING] < settings.probability_least or not ranking.fitted:
+        return None, nothing
+    top = ranking.ordered()[0]
+    if ranking.gain(top) < threshold(top.hypothesis.family, settings.gain_least, thresholds):
+        return None, nothing
+    stick = yardstick(case, fit, [ranking.base, *ranking.fitted])
+    before, after = (
+        stick.heldout_error(f, held_out(case, f, fit, settings.folds)) for f in (ranking.base, top)
+    )
+    label = top.hypothesis.labels[-1]
+    if not after < before:
+        return None, f"{label} does not improve held-out data ({before:.3g} before, {after:.3g} after)"
+    without, with_it = witness.error(ranking.base), witness.error(top)
+    if contradicts(without, with_it):
+        return None, (
+            f"the FRFs contradict {label}: error {without.error:.3g} before, {with_it.error:.3g} after"
+        )
+    return top, ""
+
+
+def group(case: Case, ranking: Ranking, witness: Witness) -> list[Fitted]:
+    """The smallest set of hypotheses that holds `probability_least` of all that is not "nothing".
+
+    Rivals whose FRFs are clearly further from the measured ones than those of the first are left out.
+    """
+    something = 1 - ranking.probabilities[NOTHING]
+    members: list[Fitted] = []
+    held = 0.0
+    for f in ranking.ordered():
+        if members and held >= case.settings.probability_least * something:
+            break
+        held += ranking.probabilities[f.hypothesis.label]
+        if not members or not witness.prefers(members[0], f):
+            members.append(f)
+    return members
+
+
+def part(tell: Progress, low: float, high: float) -> Progress:
+    """Progress of a part of the work within the whole."""
+    return lambda share, text: tell(low + (high - low) * share, text)
