@@ -197,6 +197,11 @@ class HeldOutMode:
     predicted_std_hz: float
 
     @property
+    def predicted(self) -> bool:
+        """False where the model has no such mode."""
+        return math.isfinite(self.predicted_hz)
+
+    @property
     def z(self) -> float:
         """Difference over the uncertainty of both."""
         return (self.measured_hz - self.predicted_hz) / math.hypot(

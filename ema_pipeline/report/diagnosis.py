@@ -8,8 +8,16 @@ from collections.abc import Mapping, Sequence
 
 from ema_pipeline.diagnose.explain import label_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder
-from ema_pipeline.report.numbers import format_value, plain, words
+from ema_pipeline.diagnose.types import (
+    OUT_OF_TOLERANCE,
+    Candidate,
+    DetectionLimit,
+    Diagnosis,
+    EffectSize,
+    Ladder,
+)
+from ema_pipeline.report.limits import FAR_SIGMA
+from ema_pipeline.report.numbers import format_value, plain, prefixed, signed, words
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.tables import Row, Table
 
@@ -158,7 +166,10 @@ def short_candidates_table(found: Diagnosis) -> Table:
 
 
 def ladder_table(ladder: Ladder) -> Table:
-    """One row per model from the base model upwards, each with what it adds to the one before."""
+    """One row per model from the base model upwards, each with what it adds to the one before.
+
+    The column of FRFs is empty where there are none.
+    """
     rows: list[Row] = []
     before: tuple[str, ...] = ()
     for rung in ladder.rungs:
@@ -169,14 +180,15 @@ def ladder_table(ladder: Ladder) -> Table:
                     size_words(_own_sizes(before, rung.effects, rung.parameters), ";\n"),
                     plain(rung.error, 3),
                     plain(rung.heldout_error, 3),
+                    plain(rung.frf_error, 3) if math.isfinite(rung.frf_error) else "",
                     str(rung.unexplained),
                     plain(rung.log_evidence, 3),
                 )
             )
         )
         before = rung.effects
-    head = ("model", "size (±1σ)", "error, σ", "held out, σ", "modes left", "ln evidence")
-    return Table(head, tuple(rows), frozenset({2, 3, 4, 5}))
+    head = ("model", "size (±1σ)", "error, σ", "held out, σ", "FRFs, σ", "modes left", "ln evidence")
+    return Table(head, tuple(rows), frozenset({2, 3, 4, 5, 6}))
 
 
 def rung_words(before: Sequence[str], effects: Sequence[str]) -> str:
@@ -202,7 +214,110 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
     """What was suspected and why, one text per candidate that matters."""
     if found.verdict in ("adequate", "not_enough_data"):
         return ()
-    return tuple(f"{_capital(label_words(c.label))}: {c.title}. {c.why}" for c in leading(found))
+    return tuple(
+        f"{_capital(label_words(c.label))}: {c.title}. {c.why} {frf_words(c)}".rstrip()
+        for c in leading(found)
+    )
+
+
+def frf_words(c: Candidate) -> str:
+    """What the FRFs, which were not fitted, say of a candidate; empty where there are none."""
+    if not (math.isfinite(c.frf_error_before) and math.isfinite(c.frf_error_after)):
+        return ""
+    return (
+        f"FRFs around the modes, which were not fitted: {plain(c.frf_error_before, 3)} σ off without it, "
+        f"{plain(c.frf_error_after, 3)} σ with it; nearer at {c.frf_impacts_better} of {c.frf_impacts} "
+        f"impact point{'' if c.frf_impacts == 1 else 's'}."
+    )
+
+
+def detection_words(found: Diagnosis) -> str:
+    """What these data would show, in one sentence; empty where that is not known."""
+    shown = [
+        f"{words(effect)} ≥ {_limit_words(sizes[0])}"
+        for effect, sizes in _limits_by_effect(found).items()
+        if effect != OUT_OF_TOLERANCE and math.isfinite(sizes[0].size)
+    ]
+    if not shown:
+        return ""
+    return f"These data would show, nine times in ten and at the best place: {', '.join(shown)}."
+
+
+def detection_table(found: Diagnosis) -> Table:
+    """Least size of every effect that these data would show, at the best and at the worst place."""
+    rows = []
+    for effect, limits in _limits_by_effect(found).items():
+        best, worst = limits[0], limits[-1]
+        rows.append(
+            Row(
+                (
+                    words(effect),
+                    words(best.parameter) if effect != OUT_OF_TOLERANCE else "deviation",
+                    f"{_limit_words(best)} ({_place(best)})",
+                    f"{_limit_words(worst)} ({_place(worst)})" if len(limits) > 1 else "",
+                )
+            )
+        )
+    return Table(
+        ("effect", "size", "seen from (best place)", "seen from (worst place)"), tuple(rows), frozenset()
+    )
+
+
+def _limits_by_effect(found: Diagnosis) -> dict[str, list[DetectionLimit]]:
+    """Limits of each effect, the smallest first."""
+    grouped: dict[str, list[DetectionLimit]] = {}
+    for limit in found.detection_limits:
+        effect = limit.label.rpartition(" + ")[2].partition("@")[0]
+        grouped.setdefault(effect, []).append(limit)
+    return {effect: sorted(limits, key=lambda x: x.size) for effect, limits in grouped.items()}
+
+
+def _limit_words(limit: DetectionLimit) -> str:
+    if not math.isfinite(limit.size):
+        return "no size"
+    if limit.unit in ("", "1"):
+        return f"{plain(100 * limit.size, 2)} %"
+    scale, unit = prefixed(limit.size, limit.unit)
+    return f"{plain(scale * limit.size, 2)} {unit}"
+
+
+def _place(limit: DetectionLimit) -> str:
+    return words(limit.label.rpartition("@")[2])
+
+
+def heldout_table(found: Diagnosis) -> Table:
+    """Every measured frequency beside its prediction by a fit that has not seen it."""
+    rows = tuple(
+        Row(
+            (
+                m.configuration,
+                format_value(m.measured_hz, m.measured_std_hz, "Hz"),
+                format_value(m.predicted_hz, m.predicted_std_hz, "Hz") if m.predicted else "no such mode",
+                signed(m.z),
+            ),
+            not abs(m.z) <= FAR_SIGMA,
+        )
+        for m in found.heldout_modes
+    )
+    return Table(("configuration", "measured (±1σ)", "predicted from the others (±1σ)", "difference, σ"), rows,
+                 frozenset({3}))  # fmt: skip
+
+
+def heldout_words(found: Diagnosis) -> str:
+    """How well frequencies are predicted from the others, in a sentence; empty where none was left out."""
+    modes = found.heldout_modes
+    if not modes:
+        return ""
+    near = sum(abs(m.z) <= FAR_SIGMA for m in modes)
+    text = f"{near} of {len(modes)} frequencies are predicted within {FAR_SIGMA:g}σ by a fit to the others"
+    told = [m for m in modes if m.predicted]
+    if not told:
+        return f"{text}."
+    worst = max(told, key=lambda m: abs(m.z))
+    return (
+        f"{text}; furthest off: {format_value(worst.predicted_hz, worst.predicted_std_hz, 'Hz')} for the measured "
+        f"{format_value(worst.measured_hz, worst.measured_std_hz, 'Hz')} ({worst.configuration})."
+    )
 
 
 def noise_words(ladder: Ladder) -> str:

@@ -127,6 +127,8 @@ def _diagnosis(results: RunResults) -> dict[str, Any] | None:
         "alike": diagnosis.group_words(found),
         "next": found.next_measurement,
         "localisation": diagnosis.localisation_table(found) if found.localisation else None,
+        "heldout": diagnosis.heldout_words(found),
+        "detection": diagnosis.detection_table(found) if found.detection_limits else None,
         "notes": found.notes,
     }
 

@@ -115,6 +115,9 @@ def _diagnosis(found: Diagnosis) -> dict[str, Any]:
         "heldout_error": found.heldout_error,
         "localisation": [asdict(place) for place in found.localisation],
         "notes": list(found.notes),
+        "detection_limits": [asdict(limit) for limit in found.detection_limits],
+        "heldout_modes": [asdict(m) for m in found.heldout_modes],
+        "thresholds_from": found.thresholds_from or "shipped with the program",
     }
 
 
@@ -134,6 +137,8 @@ def _candidate(c: Candidate) -> dict[str, Any]:
         "log_evidence": c.log_evidence,
         "claimed": c.claimed,
         "why": c.why,
+        "frf_error_before": c.frf_error_before,
+        "frf_error_after": c.frf_error_after,
     }
 
 
@@ -146,6 +151,7 @@ def _ladder(ladder: Ladder) -> list[dict[str, Any]]:
             "chi2": r.chi2,
             "log_evidence": r.log_evidence + 0.0,  # never -0.0
             "unexplained_modes": r.unexplained,
+            "frf_error": r.frf_error,
             "parameters": _sizes(r.parameters),
         }
         for r in ladder.rungs

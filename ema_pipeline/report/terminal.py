@@ -26,6 +26,7 @@ from ema_pipeline.report.results import RunResults
 
 Clean = Callable[[str], str]
 _SHORT = 15
+_HELD_OUT_SHOWN = 8
 _VALUE = 32
 _ERROR_WORDS = (
     "error: root mean square of (measurement - model)/σ, about 1 where the model explains the data; "
@@ -190,6 +191,12 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
         parts += [_line(""), _rich(diagnosis.localisation_table(found), "Where the misfit sits")]
     if found.next_measurement:
         parts += [_line(""), _line(f"Measure next: {found.next_measurement}")]
+    if 0 < len(found.heldout_modes) <= _HELD_OUT_SHOWN:
+        parts += [_line(""), _rich(diagnosis.heldout_table(found), "Each mode predicted from the others")]
+    elif told := diagnosis.heldout_words(found):
+        parts += [_line(""), _line(told)]
+    if shown := diagnosis.detection_words(found):
+        parts += [_line(""), _line(shown)]
     if found.notes:
         parts += [_line(""), _line("From the data's screening:"), *(_line(f"! {n}") for n in found.notes)]
     parts += _commands(diagnosis.next_commands(found, out))
@@ -198,7 +205,7 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
 
 def ladder_screen(ladder: Ladder) -> RenderableType:
     """Every model with its error on the data fitted and on data held out."""
-    heads = ("model", "size (±1σ)", "error", "held out", "left", "evidence")
+    heads = ("model", "size (±1σ)", "error", "held out", "FRFs", "left", "evidence")
     parts: list[RenderableType] = [
         _rich(_renamed(diagnosis.ladder_table(ladder), heads), "Ladder of models"),
         _line(
