@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,16 +17,17 @@ from ema_pipeline.modal.settings import ModalSettings
 
 if TYPE_CHECKING:
     from ema_pipeline.ingest.records import HitSamples
+    from ema_pipeline.levels.single import HitPoles
+    from ema_pipeline.levels.trend import Trend
     from ema_pipeline.modal.types import ModalModel
 
 Progress = Callable[[float, str], None]
 Hits = Callable[[], "Iterable[HitSamples]"]
 Real = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
-ONE_LEVEL = (
-    "All hits are about as hard; whether the structure is linear cannot be known from them. "
-    "Strike every point at two or three forces, each at least twice the last."
-)
+TRUSTED_VOTES = 0.3
+"""Share of model orders that must show a mode which the softest hits do not show."""
 
 
 def study_levels(
@@ -54,24 +56,40 @@ def study_levels(
         Those that `modal` was identified with.
     progress : callable
         Called with the share done (0…1) and a word on what is being done.
+
+    Returns
+    -------
+    LevelStudy
+        Levels from the FRFs of their hits alone; whether a mode moves is decided on single hits, see
+        `single.single_hits` and `trend.trends`.
     """
     from ema_pipeline.levels.sort import sort_levels
+    from ema_pipeline.levels.words import one_level, several_levels
 
     found = [(h.hit.impact.point, abs(h.hit.peak_force), f"{h.hit.file}#{h.hit.number}") for h in hits()]
     force = np.array([f for _, f, _ in found])
+    names = tuple(name for _, _, name in found)
     place = sort_levels([p for p, _, _ in found], force.tolist(), settings.level_ratio)
-    names = [name for _, _, name in found]
-    if place.max() == 0:
-        level = ForceLevel(float(np.median(force)), tuple(names), frfs)
-        return LevelStudy((level,), frfs.inputs, (), (), (), False, float("nan"), ONE_LEVEL)
+    n_levels = int(place.max()) + 1
+    if n_levels == 1:
+        level = ForceLevel(float(np.median(force)), names, frfs)
+        study = LevelStudy((level,), frfs.inputs, (), (), (), False, float("nan"), "")
+        return replace(study, summary=one_level(study))
 
     levels = []
-    for k in range(int(place.max()) + 1):
-        progress(0.8 * k / (place.max() + 1), f"modes at {np.median(force[place == k]):.3g} N")
+    for k in range(n_levels):
+        level_force = float(np.median(force[place == k]))
+        progress(0.7 * k / n_levels, f"modes at {level_force:.3g} N")
         chosen = tuple(n for n, p in zip(names, place, strict=True) if p == k)
-        levels.append(_level(hits, chosen, float(np.median(force[place == k])), frf_settings, modal_settings))
+        levels.append(_level(hits, chosen, level_force, frf_settings, modal_settings))
+    progress(0.7, "modes of single hits")
     modes = _modes(modal, levels, len(frfs.inputs))
-    return LevelStudy(tuple(levels), frfs.inputs, modes, (), (), False, float("nan"), "")
+    modes, p_value = _tested(
+        modes, modal, hits, frfs, frf_settings, dict(zip(names, place, strict=True)), settings
+    )
+    depends = bool(p_value < settings.false_alarm)
+    study = LevelStudy(tuple(levels), frfs.inputs, modes, (), (), depends, p_value, "")
+    return replace(study, summary=several_levels(study, modal, settings))
 
 
 def _level(
@@ -124,3 +142,108 @@ def _modes(modal: ModalModel, levels: list[ForceLevel], n_inputs: int) -> tuple[
             )
         )
     return tuple(out)
+
+
+def _tested(
+    modes: tuple[ModeLevels, ...],
+    modal: ModalModel,
+    hits: Hits,
+    frfs: FrfSet,
+    frf_settings: FrfSettings,
+    place: dict[str, int],
+    settings: LevelSettings,
+) -> tuple[tuple[ModeLevels, ...], float]:
+    """The modes with their tests, and the p value of all tests together."""
+    from ema_pipeline.levels.single import single_hits
+    from ema_pipeline.levels.tracks import echoes
+    from ema_pipeline.levels.trend import holm, samples, trends
+    from ema_pipeline.levels.words import trend_words
+
+    votes = np.array([m.stability for m in modal.modes])
+    soft = np.array([m.level_modes is not None and m.level_modes[0] >= 0 for m in modes], dtype=bool)
+    base = np.flatnonzero(soft | ((votes >= TRUSTED_VOTES) & ~echoes(modal, soft)))
+    if not len(base):
+        return modes, float("nan")
+    found = single_hits(hits, replace(modal, modes=tuple(modal.modes[k] for k in base)), frfs, frf_settings)
+    level = np.array([place[name] for name in found.names], dtype=np.int64)
+
+    def tests(values: Real, stds: Real) -> tuple[Trend, ...]:
+        excitation = _excitation(found)
+        return trends(
+            [
+                samples(values[:, r], stds[:, r], found.sheet, level, found.force_n, excitation[:, r])
+                for r in range(len(base))
+            ]
+        )
+
+    frequency = tests(found.frequency_hz, found.frequency_std_hz)
+    damping = tests(found.damping_ratio, found.damping_std)
+    adjusted = holm(np.array([t.p for t in (*frequency, *damping)]))
+    moves = np.nan_to_num(adjusted, nan=1.0) < settings.false_alarm
+    out = list(modes)
+    for r, k in enumerate(base):
+        both = moves[r], moves[r + len(base)]
+        out[k] = replace(
+            _with_scatter(modes[k], found, level, r, frequency[r].extra_std, damping[r].extra_std),
+            amplitude_m=_amplitudes(found, level, r, modes[k].amplitude_m.shape),
+            frequency_p=frequency[r].p,
+            damping_p=damping[r].p,
+            depends=bool(any(both)),
+            trend=trend_words(both[0], frequency[r].slope, both[1], damping[r].slope),
+        )
+    p_value = float(np.nanmin(adjusted)) if np.isfinite(adjusted).any() else float("nan")
+    return tuple(out), p_value
+
+
+def _excitation(found: HitPoles) -> Real:
+    """Amplitude per force at each hit's point, (n_hits, n_modes): the median over the point's hits."""
+    ratio = found.amplitude_m / found.force_n[:, None]
+    if not np.isfinite(ratio).any():  # uncalibrated hammer
+        return np.ones(ratio.shape)
+    out = np.zeros(ratio.shape)
+    for p in np.unique(found.point):
+        out[found.point == p] = np.nanmedian(ratio[found.point == p], axis=0)
+    return out
+
+
+def _with_scatter(
+    mode: ModeLevels, found: HitPoles, level: Integers, r: int, frequency_extra: float, damping_extra: float
+) -> ModeLevels:
+    """A mode's values at every level with the scatter of hits added; filled in from single hits where missing."""
+    values = [mode.frequency_hz.copy(), mode.frequency_std_hz.copy(), mode.damping_ratio.copy(),
+              mode.damping_std.copy()]  # fmt: skip
+    singles = [found.frequency_hz[:, r], found.frequency_std_hz[:, r], found.damping_ratio[:, r],
+               found.damping_std[:, r]]  # fmt: skip
+    for k in range(len(values[0])):
+        of = level == k
+        for i, extra in ((0, frequency_extra), (2, damping_extra)):
+            weight = 1 / (singles[i + 1][of] ** 2 + extra**2)
+            total = float(weight.sum())
+            if np.isnan(values[i][k]) and total > 0:
+                values[i][k] = float(np.sum(weight * np.nan_to_num(singles[i][of]))) / total
+                values[i + 1][k] = total**-0.5
+            elif total > 0:  # hits count by how much they tell of the mode
+                effective = total**2 / float(np.sum(weight**2))
+                values[i + 1][k] = float(np.hypot(values[i + 1][k], extra / np.sqrt(effective)))
+    return replace(
+        mode,
+        frequency_hz=values[0],
+        frequency_std_hz=values[1],
+        damping_ratio=values[2],
+        damping_std=values[3],
+    )
+
+
+def _amplitudes(found: HitPoles, level: Integers, r: int, shape: tuple[int, ...]) -> Real:
+    out = np.full(shape, np.nan)
+    for k in range(shape[0]):
+        for i in range(shape[1]):
+            of = (level == k) & (found.point == i)
+            if of.any():
+                out[k, i] = float(np.median(found.amplitude_m[of, r]))
+    return out
+
+
+def moving_modes(modes: Sequence[ModeLevels]) -> tuple[ModeLevels, ...]:
+    """Those that depend on the level."""
+    return tuple(m for m in modes if m.depends)

@@ -10,6 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.modal.assurance import mac
+from ema_pipeline.modal.credibility import ECHO_MAC, ECHO_REACH
 from ema_pipeline.modal.types import ModalModel, Mode
 
 Real = NDArray[np.float64]
@@ -108,3 +109,15 @@ def mode_at(models: Sequence[ModalModel], track: Integers, level: int) -> Mode |
 def _shapes(model: ModalModel, dofs: tuple[Dof, ...]) -> NDArray[np.complex128]:
     columns = [model.dofs.index(d) for d in dofs]
     return np.array([m.shape[columns] for m in model.modes])
+
+
+def echoes(modal: ModalModel, sure: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Modes that look like, and lie beside, a sure one, (n_modes,).
+
+    A fit mends the misfit that a mode leaves whose frequency moves with the level by further poles beside it.
+    """
+    poles = np.array([m.pole for m in modal.modes])
+    shapes = np.array([m.shape for m in modal.modes])
+    alike = np.nan_to_num(mac(shapes, shapes)) > ECHO_MAC
+    near = np.abs(poles[:, None] - poles[None]) < ECHO_REACH * np.abs(poles.real)[None]
+    return np.asarray(~sure & (alike & near & sure[None]).any(axis=1))

@@ -1,0 +1,289 @@
+"""Poles of every single hit, as small differences from what all hits of its point show together.
+
+What a fit of modes to FRFs leaves over (far modes, leakage, small errors of the shapes) is the same in every hit
+of a point. So not the FRFs themselves are fitted, but the difference of each hit's FRFs from the mean over its
+point's hits, with the derivatives of the modes by their poles and participations. Whatever is systematic
+cancels, and what is left over is noise, whose size it tells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import rfft
+
+from ema_pipeline.frf.estimate import estimate_frfs
+from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.frf.windows import Windows
+from ema_pipeline.ingest.records import HitSamples
+from ema_pipeline.modal.basis import pole_functions
+from ema_pipeline.modal.noise import fit_noise
+from ema_pipeline.modal.types import ModalModel
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Hits = Callable[[], Iterable[HitSamples]]
+
+REACH = 8.0
+"""Half-power half-widths on either side of a mode that tell its pole."""
+
+FEWEST_LINES = 12
+"""Lines on either side at least."""
+
+SMOOTH_TERMS = 3
+"""Polynomial in frequency per FRF that takes up how far modes differ from hit to hit."""
+
+UNKNOWN = 0.3
+"""A hit whose pole is not known to this share of the decay rate tells nothing of the mode: the differences are
+only small ones in a hit that excites it."""
+
+
+@dataclass(frozen=True)
+class HitPoles:
+    """Poles of every mode in every single hit.
+
+    Attributes
+    ----------
+    names : tuple of str
+        ``file#number``.
+    point : ndarray of int, (n_hits,)
+        Index of the impact point.
+    sheet : ndarray of int, (n_hits,)
+        Hits of one sheet share impact point and sensors: only their differences mean something.
+    force_n : ndarray, (n_hits,)
+        Peak force.
+    frequency_hz, frequency_std_hz, damping_ratio, damping_std : ndarray, (n_hits, n_modes)
+        Standard deviations from noise alone; ``inf`` where a hit tells nothing of the mode.
+    amplitude_m : ndarray, (n_hits, n_modes)
+        Largest displacement amplitude at any sensor just after the hit; NaN for an uncalibrated hammer.
+    """
+
+    names: tuple[str, ...]
+    point: NDArray[np.int64]
+    sheet: NDArray[np.int64]
+    force_n: Real
+    frequency_hz: Real
+    frequency_std_hz: Real
+    damping_ratio: Real
+    damping_std: Real
+    amplitude_m: Real
+
+
+@dataclass(frozen=True)
+class Window:
+    """Lines and the modes among them: `lines` of the FRFs' axis, `modes` as indices."""
+
+    lines: slice
+    modes: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Hit:
+    """What is kept of one hit: accelerance and power of the force in each window, the force at each mode."""
+
+    name: str
+    force_n: float
+    rest_s: float
+    frf: tuple[Complex, ...]
+    power: tuple[Real, ...]
+    impulse: Complex
+    calibrated: bool
+
+
+def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSettings) -> HitPoles:
+    """Poles of every mode in every single hit.
+
+    Parameters
+    ----------
+    hits : callable
+        Gives the accepted hits.
+    modal : ModalModel
+        Modes to look for; poles and shapes where the linearisation starts.
+    frfs : FrfSet
+        Of all hits, for their axis and exponential window.
+    frf_settings : FrfSettings
+    """
+    decay = frfs.response_decay_rad_s
+    poles = np.array([m.pole for m in modal.modes], dtype=np.complex128) - decay
+    windows = windows_about(poles, frfs.frequency_hz)
+    frequency = np.abs(poles) / (2 * np.pi)
+    sheets: dict[tuple[str, tuple[str, ...]], list[tuple[int, _Hit]]] = {}
+    count = 0
+    for hit in hits():
+        one = estimate_frfs([hit], frf_settings)
+        key = (one.inputs[0].point, tuple(d.point for d in one.outputs))
+        sheets.setdefault(key, []).append((count, _spectra(hit, one, windows, frequency, frf_settings)))
+        count += 1
+    shape = (count, len(poles))
+    names, force = [""] * count, np.zeros(count)
+    point, sheet = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+    pole, std = np.tile(poles, (count, 1)), np.full(shape, np.inf)
+    amplitude = np.full(shape, np.nan)
+    places = [d.point for d in frfs.inputs]
+    dofs = [d.point for d in modal.dofs]
+    shapes = np.array([m.shape for m in modal.modes]).reshape(len(poles), len(dofs))
+    for number, ((struck, outputs), found) in enumerate(sheets.items()):
+        index = np.array([i for i, _ in found])
+        members = [h for _, h in found]
+        for i, h in found:
+            names[i], force[i] = h.name, h.force_n
+        point[index], sheet[index] = places.index(struck), number
+        seen = np.nan_to_num(shapes[:, [dofs.index(o) for o in outputs]])
+        for k, window in enumerate(windows):
+            omega = 2 * np.pi * frfs.frequency_hz[window.lines]
+            m = window.modes
+            solved = _solve(omega, [h.frf[k] for h in members], np.array([h.power[k] for h in members]),
+                            poles[m], seen[m], float(np.mean([h.rest_s for h in members])))  # fmt: skip
+            pole[np.ix_(index, m)] = solved.poles
+            known = solved.std < -UNKNOWN * poles[m].real
+            std[np.ix_(index, m)] = np.where(known, solved.std, np.inf)
+            if members[0].calibrated:
+                impulse = np.array([np.abs(h.impulse[m]) for h in members])
+                largest = np.abs(seen[m]).max(axis=1)
+                amplitude[np.ix_(index, m)] = (
+                    2 * np.abs(solved.participation) * largest * impulse / np.abs(poles[m]) ** 2
+                )
+    physical = pole + decay
+    return HitPoles(
+        tuple(names), point, sheet, force,
+        np.abs(physical) / (2 * np.pi), std / (2 * np.pi),
+        -physical.real / np.abs(physical), std / np.abs(physical), amplitude,
+    )  # fmt: skip
+
+
+def windows_about(poles: Complex, frequency_hz: Real) -> tuple[Window, ...]:
+    """Lines about every pole, joined where they overlap."""
+    step = float(frequency_hz[1] - frequency_hz[0])
+    order = np.argsort(poles.imag)
+    parts: list[tuple[int, int, list[int]]] = []
+    for r in order:
+        centre = poles[r].imag / (2 * np.pi) / step
+        half = max(REACH * -poles[r].real / (2 * np.pi) / step, FEWEST_LINES)
+        first, stop = max(int(centre - half), 1), min(int(centre + half) + 1, len(frequency_hz))
+        if parts and first < parts[-1][1]:
+            start, end, inside = parts[-1]
+            parts[-1] = (min(start, first), max(end, stop), [*inside, int(r)])
+        else:
+            parts.append((first, stop, [int(r)]))
+    return tuple(Window(slice(a, b), np.array(m, dtype=np.int64)) for a, b, m in parts)
+
+
+def _spectra(
+    hit: HitSamples, one: FrfSet, windows: tuple[Window, ...], frequency_hz: Real, settings: FrfSettings
+) -> _Hit:
+    """Cut what the windows need out of one hit."""
+    prepared = Windows(hit, settings)
+    force = np.asarray(rfft(prepared.force(hit.force))) / hit.sample_rate_hz
+    power = tuple(np.maximum(np.abs(force[w.lines]) ** 2, 1e-300) for w in windows)
+    line = np.clip(np.rint(frequency_hz * one.record_s).astype(int), 0, len(force) - 1)
+    acc = one.accelerance()[:, 0]
+    return _Hit(
+        f"{hit.hit.file}#{hit.hit.number}",
+        abs(hit.hit.peak_force),
+        max(one.record_s - float(one.delay_s[0]), 0.5 * one.record_s),
+        tuple(acc[:, w.lines].copy() for w in windows),
+        power,
+        force[line],
+        hit.force_calibrated,
+    )
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Per hit and mode: pole, standard deviation of its parts, participation."""
+
+    poles: Complex
+    std: Real
+    participation: Complex
+
+
+def _solve(
+    omega: Real, frfs: list[Complex], power: Real, poles: Complex, shapes: Complex, rest_s: float
+) -> _Solved:
+    """Differences of every hit's poles from the mean of its sheet, in one window.
+
+    Parameters
+    ----------
+    omega : ndarray, (n_lines,)
+    frfs : list of complex ndarray, (n_outputs, n_lines)
+        Accelerance of each hit.
+    power : ndarray, (n_hits, n_lines)
+        Force power of each hit: its noise is inverse to it.
+    poles : complex ndarray, (n_modes,)
+    shapes : complex ndarray, (n_modes, n_outputs)
+    rest_s : float
+    """
+    data = np.array(frfs)
+    n_hits, n_out, n_lines = data.shape
+    m = len(poles)
+    mean = np.einsum("hl,hol->ol", power / power.sum(axis=0), data)
+    smooth = np.linalg.qr(np.vander(np.linspace(-1, 1, n_lines), SMOOTH_TERMS))[0].T
+
+    def rough(values: Complex) -> Complex:
+        """Without the polynomial that far modes make."""
+        return np.asarray(values - (values @ smooth.T) @ smooth)
+
+    u, du = pole_functions(omega, poles, rest_s)
+    u, du = rough(u), rough(du)
+    difference = rough(data - mean)
+    level = np.median(np.abs(difference) ** 2 * power[:, None], axis=(0, 2))
+    level = np.maximum(level, 1e-24 * np.max(np.abs(mean) ** 2) * power.max())
+    scale = np.broadcast_to(1 / np.sqrt(level[:, None]), (n_out, n_lines))  # for unit force power
+    root = np.sqrt(power)[:, None]
+
+    along = shapes.T[:, :, None] * u  # (n_outputs, n_modes, n_lines)
+    start = _least_squares(along * scale[:, None], rough(mean) * scale)
+    columns = np.concatenate([shapes.T[:, :, None] * start[:, None] * du, along], axis=1)
+    if n_hits == 1:
+        return _Solved(poles[None], np.full((1, m), np.inf), start[None])
+    for _ in range(2):
+        solution = np.array(
+            [
+                _least_squares(columns * (scale * r)[:, None], d * scale * r)
+                for d, r in zip(difference, root, strict=True)
+            ]
+        )
+        left = difference - np.einsum("hc,ocl->hol", solution, columns)
+        free = max(1.0 - (2 * m / n_out + SMOOTH_TERMS) / n_lines, 0.2) * (n_hits - 1)
+        left_power = np.einsum("hl,hol->ol", power, np.abs(left) ** 2) / free
+        model = fit_noise(
+            left_power[:, None], mean[:, None], np.ones((n_out, 1), dtype=bool), inputs_are_rows=False
+        )
+        scale = 1 / np.sqrt(model.variance[:, 0])
+    std = np.array(
+        [
+            _deviations(columns, scale * r, model.own[:, 0] / r**2, model.common[:, 0] / r**2, mean)[:m]
+            for r in root
+        ]
+    )
+    return _Solved(poles + solution[:, :m], std, start + solution[:, m:])
+
+
+def _least_squares(columns: Complex, data: Complex) -> Complex:
+    """Coefficients of columns (n_outputs, n_columns, n_lines) in data (n_outputs, n_lines)."""
+    gram, right = _normal(columns, data)
+    size = 1 / np.sqrt(np.maximum(gram.diagonal().real, 1e-300))
+    scaled = gram * size[:, None] * size
+    return np.asarray(size * np.linalg.lstsq(scaled, size * right, rcond=1e-10)[0])
+
+
+def _normal(columns: Complex, data: Complex) -> tuple[Complex, Complex]:
+    flat = columns.swapaxes(0, 1).reshape(columns.shape[1], -1)
+    return flat.conj() @ flat.T, flat.conj() @ data.ravel()
+
+
+def _deviations(columns: Complex, scale: Real, own: Real, common: Real, mean: Complex) -> Real:
+    """Standard deviations of the coefficients' parts, noise that all outputs have in common included."""
+    weighted = columns * scale[:, None]
+    gram, _ = _normal(weighted, np.zeros(weighted.shape[::2], complex))
+    size = 1 / np.sqrt(np.maximum(gram.diagonal().real, 1e-300))
+    inverse = size[:, None] * np.linalg.pinv(gram * size[:, None] * size, rcond=1e-12, hermitian=True) * size
+    estimator = np.einsum("cd,odl->col", inverse, weighted.conj() * scale[:, None], optimize=True)
+    phase = mean / np.maximum(np.abs(mean), 1e-300)
+    together = np.einsum("col,ol->cl", estimator, np.sqrt(common) * phase)
+    variance = np.einsum("col,ol->c", np.abs(estimator) ** 2, own) + np.sum(np.abs(together) ** 2, axis=1)
+    return np.sqrt(variance / 2)
