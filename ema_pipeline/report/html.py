@@ -98,11 +98,13 @@ def _context(results: RunResults, plots: Sequence[Plot]) -> dict[str, Any]:
             {
                 "name": words(p.name),
                 "value": format_value(p.value, p.std, p.unit),
-                "words": summary.identified_words(p),
-                "identified": p.identified,
+                "words": summary.identified_words(p, fit),
+                "identified": p.identified and not summary.fails(fit),
             }
-            for p in (summary.stiffnesses(fit) if fit else ())
-        ],
+            for p in summary.stiffnesses(fit)
+        ]
+        if fit
+        else [],
         "configurations": [_configuration(c) for c in results.configurations],
         "parameters": tables.parameters_table(fit) if fit else None,
         "sweeps": tables.sweeps_table(fit) if fit and fit.sweeps else None,

@@ -52,8 +52,15 @@ def stiffnesses(fit: FitResult) -> tuple[ParameterEstimate, ...]:
     return free or tuple(p for p in fit.parameters.values() if "mesh_stiffness" in p.name)
 
 
-def identified_words(p: ParameterEstimate) -> str:
+def fails(fit: FitResult) -> bool:
+    """True where the model does not fit, so that its values hold only for a model that lacks nothing."""
+    return fit.chi2_per_dof > POOR_CHI2
+
+
+def identified_words(p: ParameterEstimate, fit: FitResult) -> str:
     """``"identified by the data"`` or why not."""
+    if p.identified and fails(fit):
+        return "what a model that fails makes of the data: no result yet"
     if p.identified:
         return "identified by the data"
     if p.free:
@@ -66,7 +73,7 @@ def cautions(results: RunResults) -> tuple[str, ...]:
     lines: list[str] = []
     fit = results.fit
     if fit is not None:
-        if fit.chi2_per_dof > POOR_CHI2:
+        if fails(fit):
             lines.append(
                 f"The model does not fit (χ² per degree of freedom {plain(fit.chi2_per_dof, 3)}): "
                 "the fitted values and their uncertainties hold only for a model that lacks nothing"
@@ -75,7 +82,7 @@ def cautions(results: RunResults) -> tuple[str, ...]:
             value = format_value(p.value, p.std, p.unit)
             if p.free and not p.identified:
                 lines.append(
-                    f"{words(p.name)} ({value}) is {identified_words(p)}. Do not quote it as a result."
+                    f"{words(p.name)} ({value}) is {identified_words(p, fit)}. Do not quote it as a result."
                 )
             elif math.isfinite(p.shift_z) and abs(p.shift_z) > FAR_SIGMA:
                 lines.append(

@@ -231,7 +231,10 @@ def run_summary(results: RunResults, out: str = "OUT") -> RenderableType:
     parts: list[RenderableType] = [_line(line) for line in summary.findings(results)]
     if results.fit is not None:
         parts += [
-            _line(f"{words(p.name)} = {format_value(p.value, p.std, p.unit)}, {summary.identified_words(p)}")
+            _line(
+                f"{words(p.name)} = {format_value(p.value, p.std, p.unit)}, "
+                f"{summary.identified_words(p, results.fit)}"
+            )
             for p in summary.stiffnesses(results.fit)
         ]
     cautions = summary.cautions(results)
