@@ -140,6 +140,18 @@ def _real_shape(shape: NDArray[np.complex128], mass: NDArray[np.float64]) -> NDA
     return np.asarray(real / np.sqrt(real @ mass @ real))
 
 
+MOST = 200
+"""Planets, storeys …: more are a slip of the hand, and their matrices would fill the memory."""
+
+
+def check_count(what: str, parts: str, count: int, least: int) -> None:
+    """EmaError where a rig's number of parts makes no sense."""
+    if count < least:
+        raise EmaError(f"a {what} needs at least {least} {parts}, not {count}; set {parts} = {least} or more")
+    if count > MOST:
+        raise EmaError(f"{parts} = {count}: a {what} can have {MOST} at most")
+
+
 @dataclass(frozen=True)
 class RigKind:
     """A kind of rig that rig files can name as their base; one per module of this package, as ``RIG``.

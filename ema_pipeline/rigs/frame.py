@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import partial
 
-from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly, Mass, Row, Spring, difference
-from ema_pipeline.rigs.base import ParametricRig, RigKind
+from ema_pipeline.rigs.base import ParametricRig, RigKind, check_count
 from ema_pipeline.rigs.types import Parameter
 
 
@@ -28,10 +27,9 @@ def frame(storeys: int = 3, parameters: Mapping[str, Parameter] | None = None) -
     Raises
     ------
     EmaError
-        For fewer than one storey.
+        For fewer than one storey, or far too many.
     """
-    if storeys < 1:
-        raise EmaError(f"a frame needs at least 1 storey, not {storeys}; set storeys = 1 or more")
+    check_count("frame", "storeys", storeys, 1)
     return ParametricRig(
         name="frame",
         configurations=("default",),

@@ -25,10 +25,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Mass, Row, Spring
 from ema_pipeline.mechanics.system import LinearSystem
-from ema_pipeline.rigs.base import Families, ParametricRig, RigKind
+from ema_pipeline.rigs.base import Families, ParametricRig, RigKind, check_count
 from ema_pipeline.rigs.types import Parameter
 
 _SINGLE = re.compile(r"planet(?P<a>\d+)_inertia$|(sun|ring)_planet(?P<b>\d+)_mesh_stiffness$")
@@ -64,10 +63,9 @@ def gearbox(planets: int = 3, parameters: Mapping[str, Parameter] | None = None)
     Raises
     ------
     EmaError
-        For fewer than two planets.
+        For fewer than two planets, or far too many.
     """
-    if planets < 2:
-        raise EmaError(f"a gearbox needs at least 2 planets, not {planets}; set planets = 2 or more")
+    check_count("gearbox", "planets", planets, 2)
     return ParametricRig(
         name="gearbox",
         configurations=("default",),

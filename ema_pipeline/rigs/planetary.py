@@ -19,10 +19,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Mass, Row, Spring
 from ema_pipeline.mechanics.system import LinearSystem
-from ema_pipeline.rigs.base import Families, ParametricRig, RigKind
+from ema_pipeline.rigs.base import Families, ParametricRig, RigKind, check_count
 from ema_pipeline.rigs.types import Parameter
 
 CONFIGURATIONS = ("no_ring", "with_ring")
@@ -92,10 +91,9 @@ def planetary(planets: int = 2, parameters: Mapping[str, Parameter] | None = Non
     Raises
     ------
     EmaError
-        For fewer than two planets.
+        For fewer than two planets, or far too many.
     """
-    if planets < 2:
-        raise EmaError(f"a planetary rig needs at least 2 planets, not {planets}; set planets = 2 or more")
+    check_count("planetary rig", "planets", planets, 2)
     given = dict(parameters or {})
     complete = default_parameters() | given
     if any(re.sub(r"\d", "", n) in _DAMPING for n in given) and "modal_damping_ratio" not in given:

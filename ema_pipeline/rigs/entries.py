@@ -1,0 +1,120 @@
+"""What all rig files share: parameters as a file states them, and mistakes that know their place in the file."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.rigs.types import Parameter
+from ema_pipeline.settings import Settings, parse
+from ema_pipeline.toml_lines import Location
+
+M = TypeVar("M", bound=BaseModel)
+LARGEST_TOLERANCE = 3.0
+
+
+class Mistake(Exception):
+    """Something wrong at a place of a rig file; the reader puts file and line in front."""
+
+    def __init__(self, location: Location, message: str) -> None:
+        super().__init__(message)
+        self.location = location
+
+
+class ParameterEntry(Settings):
+    """One parameter of a rig file; what is left out keeps its default."""
+
+    model_config = ConfigDict(strict=True)
+
+    value: float | None = Field(None, description="nominal value in `unit`")
+    unit: str | None = Field(None, description="unit, checked against the one that the rig works in")
+    tolerance: float | None = Field(
+        None, ge=0, description="relative standard deviation of the nominal value"
+    )
+    min: float | None = Field(None, description="lower bound")
+    max: float | None = Field(None, description="upper bound")
+    free: bool | None = Field(None, description="true where the data alone must determine the parameter")
+
+
+def parsed(model: type[M], data: dict[str, Any]) -> M:
+    """A rig file's content as `model`.
+
+    Raises
+    ------
+    Mistake
+        For unknown keys, wrong types and values out of range.
+    """
+    try:
+        return parse(model, data, "")
+    except EmaError as error:
+        message = (
+            str(error)
+            .removeprefix(":")
+            .strip()
+            .replace("valid tuple", "list in [ ]")
+            .replace("Tuple", "List")
+        )
+        try:
+            model.model_validate(data)
+        except ValidationError as details:
+            raise Mistake(details.errors()[0]["loc"], message) from None
+        raise
+
+
+def merged(default: Parameter, given: ParameterEntry) -> Parameter:
+    """The default parameter with what the file says instead; a stated tolerance makes it a known one.
+
+    Raises
+    ------
+    Mistake
+        For another unit, and values that contradict each other.
+    """
+    name = default.name
+    here: Location = ("parameters", name)
+    unit = "" if default.unit == "1" else f" {default.unit}"
+    if given.unit is not None and _plain_unit(given.unit) != _plain_unit(default.unit):
+        raise Mistake(
+            (*here, "unit"),
+            f"parameter '{name}' has unit '{given.unit}', the rig works in '{default.unit}'; "
+            f"convert the value to {default.unit}",
+        )
+    if given.tolerance is not None and given.tolerance > LARGEST_TOLERANCE:
+        raise Mistake(
+            (*here, "tolerance"),
+            f"parameter '{name}' has tolerance {given.tolerance:g}, which is {100 * given.tolerance:g} %; "
+            f"tolerances are relative: 10 % is 0.10",
+        )
+    free = given.free if given.free is not None else default.free and given.tolerance is None
+    result = Parameter(
+        name=name,
+        value=default.value if given.value is None else given.value,
+        unit=default.unit,
+        tolerance=default.tolerance if given.tolerance is None else given.tolerance,
+        minimum=default.minimum if given.min is None else given.min,
+        maximum=default.maximum if given.max is None else given.max,
+        free=free,
+    )
+    if result.minimum > result.maximum:
+        raise Mistake(
+            (*here, "max" if given.max is not None else "min"),
+            f"parameter '{name}' has min {result.minimum:g}{unit} above max {result.maximum:g}{unit}; "
+            "exchange them",
+        )
+    if not result.minimum <= result.value <= result.maximum:
+        raise Mistake(
+            (*here, "value"),
+            f"parameter '{name}' = {result.value:g}{unit} lies outside its bounds "
+            f"{result.minimum:g} … {result.maximum:g}; change value, min or max",
+        )
+    if default.unit == "kg" and result.value <= 0:
+        raise Mistake((*here, "value"), f"parameter '{name}' = {result.value:g}{unit}: give a mass above 0")
+    return result
+
+
+def _plain_unit(unit: str) -> str:
+    """Units as people type them: N·s/m = N*s/m = Ns/m, deg = °, 1 = '' = '-'."""
+    plain = re.sub(r"[\s·*.]", "", unit)
+    return {"°": "deg", "degree": "deg", "degrees": "deg", "": "1", "-": "1"}.get(plain, plain)

@@ -1,0 +1,243 @@
+"""Rig files: what they can say, and what is said where they are wrong."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.errors import EmaError
+from ema_pipeline.mechanics.modes import complex_modes
+from ema_pipeline.rigs import Rig, load_rig, model_modes
+from ema_pipeline.toml_lines import key_lines, line_of
+
+RIG_FILE = """\
+base = "planetary"
+name = "mine"
+[geometry]
+planets = 3
+[parameters]
+carrier_mass = { value = 1.50, unit = "kg", tolerance = 0.02 }
+sun_planet_mesh_stiffness = { value = 2e7, unit = "N/m", min = 1e6, max = 1e9, free = true }
+planet2_mass = 0.5
+sun_mass = 2.2
+"""
+
+
+def frequencies(rig: Rig, configuration: str) -> list[float]:
+    return [m.frequency_hz for m in model_modes(rig, configuration)]
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "rig.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_rig_file_specialises_a_shipped_rig(tmp_path: Path) -> None:
+    rig = load_rig(write(tmp_path, RIG_FILE))
+    assert rig.name == "mine"
+    assert rig.parameters["carrier_mass"].value == 1.5
+    assert rig.parameters["carrier_mass"].tolerance == 0.02
+    assert rig.parameters["sun_mass"].value == 2.2
+    assert rig.parameters["sun_mass"].tolerance == 0.01
+    system = rig.system("no_ring")
+    mass = dict(zip(system.dofs, np.diag(system.mass), strict=True))
+    assert mass["planet1.zeta"] == 0.43
+    assert mass["planet2.zeta"] == 0.5
+    assert "planet3.u" in mass
+
+
+def test_tolerance_on_a_free_parameter_makes_it_a_known_one(tmp_path: Path) -> None:
+    text = 'base = "planetary"\n[parameters]\nsun_planet_mesh_stiffness = { value = 2e7, tolerance = 0.1 }\n'
+    assert not load_rig(write(tmp_path, text)).parameters["sun_planet_mesh_stiffness"].free
+
+
+def test_viscous_coefficients_take_the_place_of_modal_damping(tmp_path: Path) -> None:
+    # Table I prints c = 2·0.01·√(k·m) for the sun bearing as 28.57: one percent of the bare sun.
+    text = (
+        'base = "planetary"\n[parameters]\nsun_bearing_damping = { value = 28.57, unit = "Ns/m" }\n'
+        "planet_bearing_damping = 2.56\n"
+    )
+    rig = load_rig(write(tmp_path, text))
+    assert rig.parameters["modal_damping_ratio"].value == 0.0
+    ratios = complex_modes(rig.system("no_ring")).damping_ratio
+    assert 0.003 < ratios.max() < 0.02
+
+
+ELEMENTS = """\
+name = "two blocks"
+configurations = ["free", "clamped"]
+[parameters]
+link = { value = 1e5, unit = "N/m", tolerance = 0.1 }
+[[masses]]
+at = "top.x"
+value = 1.0
+[[masses]]
+at = "base.x"
+value = 3.0
+[[springs]]
+name = "link"
+between = ["top.x", "base.x"]
+value = "link"
+[[springs]]
+at = "base.x"
+value = 1e6
+configurations = ["clamped"]
+[[dampers]]
+row = { "top.x" = 1.0, "base.x" = -1.0 }
+value = 5.0
+[[sensors]]
+dof = "middle.x"
+row = { "top.x" = 0.5, "base.x" = 0.5 }
+"""
+
+
+def test_rig_from_scratch_is_made_of_elements(tmp_path: Path) -> None:
+    rig = load_rig(write(tmp_path, ELEMENTS))
+    free = frequencies(rig, "free")
+    assert free[0] == 0.0
+    assert free[1] == pytest.approx(np.sqrt(1e5 * (1 / 1.0 + 1 / 3.0)) / (2 * np.pi), rel=1e-9)
+    assert frequencies(rig, "clamped")[0] > 10.0
+    assert rig.knows("free", Dof("middle", "x"))
+    assert set(rig.used("free")) == {"link", "modal_damping_ratio"}
+    soft = rig.system("free", {"link": 5e4}).stiffness
+    np.testing.assert_allclose(soft, rig.system("free").stiffness / 2)
+
+
+def test_a_row_may_name_its_dofs_with_or_without_quotes(tmp_path: Path) -> None:
+    plain = ELEMENTS.replace('{ "top.x" = 1.0, "base.x" = -1.0 }', "{ top.x = 1.0, base.x = -1.0 }")
+    assert plain != ELEMENTS
+    rigs = [load_rig(write(tmp_path, text)) for text in (ELEMENTS, plain)]
+    np.testing.assert_array_equal(rigs[0].system("free").damping, rigs[1].system("free").damping)
+
+
+MISTAKES = [
+    ("planets = 3", 'planets = "three"', 4, "geometry.planets = 'three'"),
+    ("planets = 3", "planets = 3.5", 4, "geometry.planets = 3.5"),
+    ("planets = 3", "planets = 1", 4, "at least 2 planets"),
+    ("planets = 3", "planets = 100000", 4, "200 at most"),
+    ("planets = 3", "planet = 3", 4, "'geometry.planet' (did you mean 'planets'?)"),
+    ("[geometry]", "[geometri]", 3, "'geometri' (did you mean 'geometry'?)"),
+    ("[parameters]", "[parameter]", 5, "'parameter' (did you mean 'parameters'?)"),
+    ('"planetary"', '"planetery"', 1, "did you mean 'planetary'?"),
+    ('"planetary"', "planetary", 1, "not valid TOML: Invalid value in 'base = planetary'"),
+    ('base = "planetary"\n', "", 1, "key 'base'"),
+    ("carrier_mass", "carier_mass", 6, "'parameters.carier_mass' (did you mean 'carrier_mass'?)"),
+    ('"kg"', '"g"', 6, "'carrier_mass' has unit 'g', the rig works in 'kg'; convert the value to kg"),
+    ("tolerance = 0.02", "tolerence = 0.02", 6, "did you mean 'tolerance'?"),
+    ("tolerance = 0.02", "tolerance = -0.02", 6, "carrier_mass.tolerance = -0.02"),
+    ("tolerance = 0.02", 'tolerance = "2 %"', 6, "carrier_mass.tolerance = '2 %'"),
+    ("tolerance = 0.02", "tolerance = 10", 6, "'carrier_mass' has tolerance 10, which is 1000 %"),
+    ("value = 1.50", 'value = "heavy"', 6, "carrier_mass.value = 'heavy'"),
+    ("value = 1.50", "value = nan", 6, "finite"),
+    ("value = 1.50", "value = -1.5", 6, "'carrier_mass' = -1.5 kg lies outside its bounds 0 … inf"),
+    ("value = 2e7", "value = 2e3", 7, "outside its bounds 1e+06 … 1e+09"),
+    ("min = 1e6, max = 1e9", "min = 1e9, max = 1e6", 7, "has min 1e+09 N/m above max 1e+06 N/m"),
+    ("free = true", 'free = "yes"', 7, "sun_planet_mesh_stiffness.free = 'yes'"),
+    ("planet2_mass", "planet9_mass", 8, "'parameters.planet9_mass'"),
+    ("sun_mass = 2.2", 'sun_mass = "2.2"', 9, "parameters.sun_mass.value = '2.2'"),
+    ("sun_mass = 2.2", "sun_mass = 0", 9, "'sun_mass' = 0 kg: give a mass above 0"),
+    ("sun_mass = 2.2", "carrier_mass = 2.2", 9, "not valid TOML: Cannot overwrite a value in 'carrier_mass"),
+    ("sun_mass = 2.2", "modal_damping_ratio = 1.5", 9, "'modal_damping_ratio' = 1.5 lies outside"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "line", "words"), MISTAKES)
+def test_mistakes_in_a_rig_file_name_file_line_and_key(
+    tmp_path: Path, old: str, new: str, line: int, words: str
+) -> None:
+    _expect(tmp_path, RIG_FILE, old, new, line, words)
+
+
+ELEMENT_MISTAKES = [
+    ('name = "two blocks"\n', "", 1, "key 'name' is missing"),
+    ('["free", "clamped"]', "[]", 2, "configurations = []"),
+    ('["free", "clamped"]', '["free", "free"]', 2, "configuration 'free' is named twice"),
+    ("[[masses]]", "[[mases]]", 5, "'mases' (did you mean 'masses'?)"),
+    ('at = "base.x"\nvalue = 3', 'att = "base.x"\nvalue = 3', 9, "did you mean 'at'?"),
+    ('at = "base.x"\nvalue = 3', 'at = "base"\nvalue = 3', 9, "dof 'base' is not of the form"),
+    ("value = 3.0", "", 8, "key 'masses.1.value' is missing"),
+    ("value = 3.0", "value = 0", 10, "value = 0 kg: give a mass above 0"),
+    (
+        'name = "link"\n',
+        'name = "link"\nat = "top.x"\n',
+        14,
+        "needs one of at, between or row, it has at and between",
+    ),
+    ('"top.x", "base.x"]', '"top.x", "bas.x"]', 13, "dof 'bas.x' has no mass"),
+    ('"top.x", "base.x"]', '"top.x"]', 13, "springs.0.between = ['top.x']: name two DOFs"),
+    ('"top.x", "base.x"]', '"top.x", "top.x"]', 13, "no stretch"),
+    ('value = "link"', 'value = "lnk"', 14, "value 'lnk' is no parameter (did you mean 'link'?)"),
+    ("value = 1e6", 'value = "1e6"', 17, "without quotes: value = 1e+06"),
+    ("value = 1e6", "value = -1e9", 17, "stiffness is negative around 'base.x'"),
+    ("value = 1e6", 'name = "link"\nvalue = 1e6', 17, "two elements are named 'link'"),
+    ('["clamped"]', '["clampd"]', 18, "unknown configuration 'clampd' (did you mean 'clamped'?)"),
+    ('["clamped"]', '"clamped"', 18, "configurations = 'clamped': Input should be a list"),
+    ('"top.x" = 1.0', '"tip.x" = 1.0', 20, "dof 'tip.x' has no mass in configuration 'free'"),
+    ("value = 5.0", "value = -5.0", 21, "a damper cannot be negative"),
+    ('dof = "middle.x"', 'dof = "top.x"', 23, "'top.x' has mass and so is a coordinate already"),
+    ('"top.x" = 0.5', '"tip.x" = 0.5', 24, "dof 'tip.x' has no mass"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "line", "words"), ELEMENT_MISTAKES)
+def test_mistakes_in_a_rig_from_scratch_name_file_line_and_key(
+    tmp_path: Path, old: str, new: str, line: int, words: str
+) -> None:
+    _expect(tmp_path, ELEMENTS, old, new, line, words)
+
+
+def _expect(folder: Path, text: str, old: str, new: str, line: int, words: str) -> None:
+    assert old in text
+    path = write(folder, text.replace(old, new) if old.startswith("[[") else text.replace(old, new, 1))
+    with pytest.raises(EmaError) as caught:
+        load_rig(path)
+    message = str(caught.value)
+    assert message.startswith(f"{path}, line {line}: "), message
+    assert words in message, message
+
+
+TOML = """\
+base = "x" # base = 1
+[geometry]
+planets = 3
+[parameters]
+a.b = 1
+c = { value = 1.5, unit = "k]g#", list = [1,
+  2] }
+"quoted.key" = 'it''s'
+long = \"\"\"
+fake = 3
+\"\"\"
+[[masses]]
+value = 1
+[[masses]]
+row = { "t.x" = 1.0 }
+[masses.more]
+z = 2020-01-01
+""".replace("it''s", "its")
+
+
+def test_lines_of_keys_are_found_in_every_form_of_toml() -> None:
+    lines = key_lines(TOML)
+
+    def paths(value: Any, path: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
+        items = (
+            value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+        )
+        return [path, *(p for key, inner in items for p in paths(inner, (*path, key)))]
+
+    assert set(lines) == set(paths(tomllib.loads(TOML))) - {()}
+    text = TOML.splitlines()
+    for path, line in lines.items():
+        if isinstance(path[-1], str):
+            assert path[-1] in text[line - 1]
+    assert lines["parameters", "c", "list", 1] == 7
+    assert lines["masses", 1, "row", "t.x"] == 15
+    assert line_of(lines, ("masses", 0, "at")) == lines["masses", 0] == 12
+    assert line_of(lines, ("nowhere",)) is None
