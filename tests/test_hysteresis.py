@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -52,15 +51,6 @@ def test_parameters_come_back_from_nine_noisy_loops_with_intervals_that_cover(
     assert cubic.note
     assert identified.flags == ()
     assert identified.misfit_scale < 1.1
-
-
-def test_ladder_falls_to_the_noise_on_loops_that_were_left_out(identified: IsolatorResult) -> None:
-    heldout = [rung.heldout_error for rung in identified.ladder]
-    assert [len(r.effects) for r in identified.ladder] == [0, 2, 3, 4]
-    assert identified.ladder[-1].effects[-1] == "hysteresis@isolator"
-    assert all(b < a for a, b in pairwise(heldout))
-    assert 0.8 < heldout[-1] < 1.2
-    assert heldout[0] > 10
 
 
 def test_energy_slopes_agree_with_the_damper(identified: IsolatorResult) -> None:
@@ -112,8 +102,6 @@ def test_loss_that_falls_with_frequency_is_flagged_and_a_relaxation_mends_it() -
     assert any("negative damper cannot be" in flag for flag in result.flags)
     assert result.relaxation["relaxation_stiffness"].value == pytest.approx(4e4, rel=0.1)
     assert result.relaxation["relaxation_time"].value == pytest.approx(0.05, rel=0.15)
-    assert result.ladder[-1].effects[-1] == "relaxation@isolator"
-    assert result.ladder[-1].heldout_error < 0.7 * result.ladder[-2].heldout_error
 
 
 def test_closed_form_steps_give_bouc_wen_once_stiffness_is_known() -> None:
@@ -211,9 +199,7 @@ def test_summary_is_plain_json_and_the_terminal_says_what_was_found(identified: 
     numbers = json.loads(json.dumps(summary(identified), allow_nan=False))
     assert numbers["parameters"]["viscous_damping"]["value"] == identified.parameters["viscous_damping"].value
     assert len(numbers["loops"]) == 9
-    assert [len(r["effects"]) for r in numbers["ladder"]] == [0, 2, 3, 4]
     text = "\n".join(terminal_lines(identified))
     assert "9 loops" in text
-    assert "linear spring" in text
     assert "cubic stiffness" in text
     assert "not told from zero" in text

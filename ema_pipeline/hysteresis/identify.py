@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-import scipy.optimize
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
@@ -17,43 +15,20 @@ from ema_pipeline.hysteresis.closed_form import (
     energy_lines,
     hysteresis_force,
 )
-from ema_pipeline.hysteresis.model import (
-    ALL_TERMS,
-    CUBIC,
-    DAMPING,
-    FORCE,
-    QUADRATIC,
-    RELAXATION,
-    RHO,
-    SIGMA,
-    STIFFNESS,
-    TIME,
-    UNITS,
-    Problem,
-    Terms,
-    loop_force,
-)
+from ema_pipeline.hysteresis.effects import Structure
+from ema_pipeline.hysteresis.fitting import Fitted, LoopSet, fit, loop_set
+from ema_pipeline.hysteresis.model import CUBIC, DAMPING, FORCE, RELAXATION, RHO, STIFFNESS, UNITS
+from ema_pipeline.hysteresis.search import widening_of
 from ema_pipeline.hysteresis.settings import HysteresisSettings
-from ema_pipeline.hysteresis.types import Estimate, IsolatorResult, Loop, LoopFit, LossFactor, Rung
+from ema_pipeline.hysteresis.types import Estimate, IsolatorResult, Loop, LoopFit, LossFactor
 from ema_pipeline.hysteresis.words import failures
 from ema_pipeline.threads import single_blas_thread
 
 HYSTERESIS_STIFFNESS = "hysteresis_stiffness"
-
-RUNGS: tuple[tuple[tuple[str, ...], Terms], ...] = (
-    ((), (STIFFNESS,)),
-    (("quadratic_stiffness", "cubic_stiffness"), (STIFFNESS, QUADRATIC, CUBIC)),
-    (("viscous_damping",), (STIFFNESS, QUADRATIC, CUBIC, DAMPING)),
-    (("hysteresis",), ALL_TERMS),
-    (("relaxation",), (*ALL_TERMS, RELAXATION)),
-)
-"""Effects that each rung adds, and all terms of its model."""
+SOURCE_MODEL = Structure(("quadratic_stiffness", "cubic_stiffness", "viscous_damping", "hysteresis"))
+"""The published model of a metal-mesh isolator."""
 
 ONE_FREQUENCY = "not fitted: tests at one frequency do not part viscous from hysteretic loss"
-
-# Grids of starts: ρ as a share of 1/X of the largest loop, σ, and τ as a share of 1/ω.
-_RHO, _SIGMA, _TIME = (0.2, 0.6, 2.0, 6.0, 30.0), (0.2, 0.5, 1.0), (0.3, 3.0)
-_LIMITS = {RHO: (1e-4, 1e4), SIGMA: (0.01, 5.0), TIME: (1e-3, 1e3)}
 
 
 def identify_isolator(loops: Sequence[Loop], settings: HysteresisSettings | None = None) -> IsolatorResult:
@@ -78,8 +53,8 @@ def identify_isolator(loops: Sequence[Loop], settings: HysteresisSettings | None
     Notes
     -----
     The closed-form steps use a few points of single loops, and the backbone of a loop still holds the middle
-    line of its hysteresis. They are therefore only the start of least squares on all points of all loops,
-    whose covariance is widened where the model does not reach the data's own accuracy.
+    line of its hysteresis. They are therefore shown, but the parameters come from least squares on all points of
+    all loops, whose covariance is widened where the model does not reach the data's own accuracy.
     """
     if not loops:
         raise EmaError("no loops to identify an isolator from; record steady sine tests")
@@ -87,156 +62,86 @@ def identify_isolator(loops: Sequence[Loop], settings: HysteresisSettings | None
     with single_blas_thread():
         lines = energy_lines(loops, s.significance)
         start = closed_form(loops, lines)
-        terms = ALL_TERMS if _several_frequencies(loops) else tuple(t for t in ALL_TERMS if t != DAMPING)
-        fit = _fit(loops, terms, start)
-        parameters, covariance, scale = _estimates(fit, s.significance)
-        if DAMPING not in terms:
+        structure = SOURCE_MODEL if _several_frequencies(loops) else SOURCE_MODEL.without("viscous_damping")
+        together = loop_set(loops, structure)
+        fitted = fit(together, structure, physical=False)
+        parameters, covariance, scale = _estimates(fitted, together, s.significance)
+        if DAMPING not in fitted.values:
             parameters[DAMPING] = Estimate(float("nan"), float("nan"), UNITS[DAMPING], False, ONE_FREQUENCY)
-        alone = tuple(_loop_fits(_fit((loop,), terms, fit.values))[0] for loop in loops)
+        alone = tuple(_alone(loop, structure, fitted) for loop in loops)
         flags = [f"{_frequencies(line.frequency_hz)} at {_mm(line.amplitude_m)}: {line.reason}"
                  for line in lines if not line.possible]  # fmt: skip
-        flags += _impossible(parameters, s.significance)
+        flags += _giving(loops, s.significance) + _impossible(parameters, s.significance)
         relaxation: dict[str, Estimate] = {}
-        negative = any(not line.possible for line in lines) or parameters[DAMPING].value < 0
-        if negative:
-            with_branch = _fit(loops, (*terms, RELAXATION), fit.values)
-            relaxation = _estimates(with_branch, s.significance)[0]
-        fits = _loop_fits(fit)
+        if any(not line.possible for line in lines) or parameters[DAMPING].value < 0:
+            branch = fit(together, structure.plus("relaxation"), fitted.values, physical=False)
+            relaxation = _estimates(branch, together, s.significance)[0]
+        fits = loop_fits(together, fitted)
         largest = max(loops, key=lambda loop: loop.amplitude_m)
         return IsolatorResult(
             loops=tuple(loops),
             parameters=parameters,
-            names=fit.names,
+            names=fitted.names,
             covariance=covariance,
             closed_form=start,
             closed_form_hysteresis=bouc_wen_steps(
-                largest, hysteresis_force(largest, {DAMPING: 0.0, **fit.values})
+                largest, hysteresis_force(largest, {DAMPING: 0.0, **fitted.values})
             ),
             energy=lines,
-            loss=_loss_factors(loops, fit, covariance),
+            loss=_loss_factors(loops, fitted, covariance),
             fits=fits,
             alone=alone,
             misfit_scale=scale,
             relaxation=relaxation,
-            ladder=_ladder(loops, fit, s, with_relaxation=negative),
             flags=tuple(flags),
             notes=failures(loops, fits, alone, scale),
         )
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """A least-squares fit: its problem, the values, the offsets and the weighted residuals."""
-
-    problem: Problem
-    values: dict[str, float]
-    linear: NDArray[np.float64]
-    residual: NDArray[np.float64]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return (*self.problem.terms, *self.problem.shape_names)
-
-    @property
-    def shape(self) -> dict[str, float]:
-        return {n: self.values[n] for n in self.problem.shape_names}
-
-
-def _fit(loops: Sequence[Loop], terms: Terms, start: Mapping[str, float]) -> _Fit:
-    """Best of the starts on the grid and the given one, refined."""
-    problem = Problem(loops, terms)
-    names = problem.shape_names
-    amplitude = max(loop.amplitude_m for loop in loops)
-    omega = 2 * np.pi * float(np.mean([loop.frequency_hz for loop in loops]))
-    unit = {RHO: 1 / amplitude, SIGMA: 1.0, TIME: 1 / omega}
-
-    def shape_of(theta: NDArray[np.float64]) -> dict[str, float]:
-        return {n: float(np.exp(t)) * unit[n] for n, t in zip(names, theta, strict=True)}
-
-    theta = np.zeros(0)
-    if names:
-        low = np.log([_LIMITS[n][0] for n in names])
-        high = np.log([_LIMITS[n][1] for n in names])
-        starts = _starts(names, start, unit)
-        starts = [np.clip(t, low + 1e-6, high - 1e-6) for t in starts]
-        cost = [float(np.sum(problem.solve(shape_of(t))[1] ** 2)) for t in starts]
-        best = None
-
-        def left(theta: NDArray[np.float64]) -> NDArray[np.float64]:
-            return problem.solve(shape_of(theta))[1]
-
-        for i in np.argsort(cost)[: 1 if cost[0] <= 1.1 * min(cost) else 2]:
-            found = scipy.optimize.least_squares(
-                left,
-                starts[i],
-                bounds=(low, high),
-                x_scale=0.3,
-                diff_step=[1e-4] * len(names),
-                xtol=1e-8,
-                ftol=1e-9,
-                max_nfev=40,
+def loop_fits(loops: LoopSet, fitted: Fitted) -> tuple[LoopFit, ...]:
+    """The model's force, offset included, beside that of every loop."""
+    force, _ = loops.motion.force(fitted.values, fitted.structure.terms)
+    fits = []
+    for loop, part, scale in zip(loops.loops, loops.parts, fitted.scales, strict=True):
+        model = scale * force[part]
+        model = model + float(np.mean(loop.force - model))
+        energy = float(np.mean(model * loop.velocity)) / loop.frequency_hz
+        difference = float(np.sqrt(np.mean((model - loop.force) ** 2)))
+        fits.append(
+            LoopFit(
+                name=loop.name,
+                force=model,
+                energy_j=energy,
+                energy_error=energy / loop.energy_j - 1 if loop.energy_j else float("nan"),
+                misfit=difference / max(0.5 * float(np.ptp(loop.force)), 1e-300),
             )
-            best = found if best is None or found.cost < best.cost else best
-        assert best is not None
-        theta = best.x
-    shape = shape_of(theta)
-    linear, residual = problem.solve(shape)
-    values = {n: float(v) for n, v in zip(terms, linear, strict=False)} | shape
-    return _Fit(problem, values, linear, residual)
+        )
+    return tuple(fits)
 
 
-def _starts(
-    names: tuple[str, ...], start: Mapping[str, float], unit: Mapping[str, float]
-) -> list[NDArray[np.float64]]:
-    grids = {RHO: _RHO, SIGMA: _SIGMA, TIME: _TIME}
-    given = []
-    if all(np.isfinite(start.get(n, np.nan)) and start[n] > 0 for n in names if n != TIME):
-        rest = [start[n] / unit[n] if n in start else 1.0 for n in names]
-        given.append(np.log(rest))
-    if TIME in names and given:
-        at = names.index(TIME)
-        for t in _TIME:
-            other = given[0].copy()
-            other[at] = np.log(t)
-            given.append(other)
-        return given
-    mesh = np.meshgrid(*(np.log(grids[n]) for n in names), indexing="ij")
-    return given + list(np.stack([m.ravel() for m in mesh], axis=1))
+def _alone(loop: Loop, structure: Structure, together: Fitted) -> LoopFit:
+    one = loop_set((loop,), structure)
+    return loop_fits(one, fit(one, structure, together.values, physical=False))[0]
 
 
-def _estimates(fit: _Fit, significance: float) -> tuple[dict[str, Estimate], NDArray[np.float64], float]:
+def _estimates(
+    fitted: Fitted, loops: LoopSet, significance: float
+) -> tuple[dict[str, Estimate], NDArray[np.float64], float]:
     """Estimates of all parameters, their covariance, and the factor that it was widened by."""
-    problem, names = fit.problem, fit.names
-    columns = problem.columns(fit.shape)
-    moved = []
-    for name in problem.shape_names:
-        step = 1e-4 * fit.values[name]
-        change = problem.columns({**fit.shape, name: fit.values[name] + step}) - columns
-        moved.append(change @ fit.linear / step)
-    count, loops = len(problem.terms), len(problem.loops)
-    jacobian = np.column_stack([columns, *moved])
-    size = np.linalg.norm(jacobian, axis=0)
-    size[size == 0] = 1.0
-    dof = max(len(fit.residual) - jacobian.shape[1], 1)
-    scale = float(np.sqrt(max(1.0, np.sum(fit.residual**2) / dof)))
-    whole = (
-        scale**2 * np.linalg.pinv((jacobian / size).T @ (jacobian / size), rcond=1e-13) / np.outer(size, size)
-    )
-    shift = whole / scale**2 @ jacobian.T @ _displacement_errors(fit)
-    whole = whole + shift @ shift.T
-    keep = [*range(count), *range(count + loops, count + loops + len(problem.shape_names))]
-    covariance = whole[np.ix_(keep, keep)]
+    names = fitted.names
+    widening = widening_of(fitted, loops)
+    covariance = fitted.covariance(widening)
     result = {}
     for i, name in enumerate(names):
-        value, std = fit.values[name], float(np.sqrt(np.maximum(covariance[i, i], 0.0)))
+        value, std = fitted.values[name], float(np.sqrt(np.maximum(covariance[i, i], 0.0)))
         identified = abs(value) > significance * std
         note = "" if identified else "not told from zero by these loops"
         result[name] = Estimate(value, std, UNITS[name], bool(identified), note)
     if FORCE in names:
         a, b = names.index(FORCE), names.index(RHO)
         slope = np.zeros(len(names))
-        slope[a], slope[b] = fit.values[RHO], fit.values[FORCE]
-        product = fit.values[FORCE] * fit.values[RHO]
+        slope[a], slope[b] = fitted.values[RHO], fitted.values[FORCE]
+        product = fitted.values[FORCE] * fitted.values[RHO]
         std = float(np.sqrt(np.maximum(slope @ covariance @ slope, 0.0)))
         known = abs(product) > significance * std
         result[HYSTERESIS_STIFFNESS] = Estimate(
@@ -246,25 +151,8 @@ def _estimates(fit: _Fit, significance: float) -> tuple[dict[str, Estimate], NDA
         e = result.get(name)
         if e is not None and e.value < -significance * e.std:
             result[name] = dataclasses.replace(e, note=reason)
-    return result, covariance, scale
-
-
-def _displacement_errors(fit: _Fit) -> NDArray[np.float64]:
-    """Weighted change of the model's force by one standard deviation of each coefficient of each loop's
-    displacement, (n_points, n_coefficients): the displacement is measured too."""
-    columns, start = [], 0
-    total = len(fit.residual)
-    for loop in fit.problem.loops:
-        n = len(loop.force)
-        step = 1e-4 * loop.amplitude_m
-        before = loop_force(fit.values, loop.series, loop.frequency_hz, loop.phase)
-        for change in step * np.eye(len(loop.series)):
-            moved = loop_force(fit.values, loop.series + change, loop.frequency_hz, loop.phase)
-            column = np.zeros(total)
-            column[start : start + n] = (moved - before) / step * loop.displacement_std_m / loop.force_std_n
-            columns.append(column)
-        start += n
-    return np.column_stack(columns)
+    reduced = fitted.chi2 / max(loops.freedom - len(names), 1)
+    return result, covariance, float(np.sqrt(max(1.0, reduced)))
 
 
 _REASONS = {
@@ -275,6 +163,15 @@ _REASONS = {
 }
 
 
+def _giving(loops: Sequence[Loop], significance: float) -> list[str]:
+    """Loops that are run through the wrong way round."""
+    names = [loop.name for loop in loops if loop.energy_j < -significance * loop.energy_std_j]
+    if not names:
+        return []
+    which = f"{len(names)} of {len(loops)} loops give" if len(names) > 1 else f"{names[0]} gives"
+    return [f"{which} energy out every cycle: it cannot be; check the sign of force or displacement"]
+
+
 def _impossible(parameters: Mapping[str, Estimate], significance: float) -> list[str]:
     return [
         f"{name.replace('_', ' ')} = {e.value:.4g} ± {e.std:.2g} {e.unit}: {_REASONS[name]}"
@@ -283,35 +180,15 @@ def _impossible(parameters: Mapping[str, Estimate], significance: float) -> list
     ]
 
 
-def _loop_fits(fit: _Fit) -> tuple[LoopFit, ...]:
-    fits, start = [], 0
-    for loop in fit.problem.loops:
-        stop = start + len(loop.force)
-        force = loop.force + fit.residual[start:stop] * loop.force_std_n
-        start = stop
-        energy = float(np.mean(force * loop.velocity)) / loop.frequency_hz
-        difference = float(np.sqrt(np.mean((force - loop.force) ** 2)))
-        fits.append(
-            LoopFit(
-                name=loop.name,
-                force=force,
-                energy_j=energy,
-                energy_error=energy / loop.energy_j - 1 if loop.energy_j else float("nan"),
-                misfit=difference / max(0.5 * float(np.ptp(loop.force)), 1e-300),
-            )
-        )
-    return tuple(fits)
-
-
 def _loss_factors(
-    loops: Sequence[Loop], fit: _Fit, covariance: NDArray[np.float64]
+    loops: Sequence[Loop], fitted: Fitted, covariance: NDArray[np.float64]
 ) -> tuple[LossFactor, ...]:
     """η = E/(2πW) of every loop.
 
     W is the energy stored by the stiffness and by the linear term k_wρ of the hysteresis, averaged over both
     sides (source's Eq. 16), in which the quadratic term cancels: W = ½(K1 + k_wρ)X² + ¼K3X⁴.
     """
-    v, names = fit.values, fit.names
+    v, names = fitted.values, fitted.names
     found = []
     for loop in loops:
         x = loop.amplitude_m
@@ -334,45 +211,9 @@ def _loss_factors(
     return tuple(found)
 
 
-def _ladder(
-    loops: Sequence[Loop], full: _Fit, settings: HysteresisSettings, *, with_relaxation: bool
-) -> tuple[Rung, ...]:
-    """Error of every rung, on all loops and on loops that were left out of its fit."""
-    parts = min(settings.held_out_parts, len(loops))
-    rungs: list[Rung] = []
-    effects: tuple[str, ...] = ()
-    for added, terms in RUNGS:
-        if RELAXATION in terms and not with_relaxation:
-            continue
-        if DAMPING not in full.problem.terms:
-            if added == ("viscous_damping",):
-                continue
-            terms = tuple(t for t in terms if t != DAMPING)
-        effects += tuple(f"{e}@isolator" for e in added)
-        fit = full if terms == full.problem.terms else _fit(loops, terms, full.values)
-        rungs.append(Rung(effects, _rms(fit.residual), _held_out(loops, terms, fit, parts)))
-    return tuple(rungs)
-
-
-def _held_out(loops: Sequence[Loop], terms: Terms, fit: _Fit, parts: int) -> float:
-    if parts < 2:
-        return float("nan")
-    left = []
-    for part in range(parts):
-        kept = [loop for i, loop in enumerate(loops) if i % parts != part]
-        others = [loop for i, loop in enumerate(loops) if i % parts == part]
-        trained = _fit(kept, terms, fit.values)
-        left.append(Problem(others, terms).residual(trained.linear, trained.shape))
-    return _rms(np.concatenate(left))
-
-
 def _several_frequencies(loops: Sequence[Loop]) -> bool:
     f = [loop.frequency_hz for loop in loops]
     return max(f) > 1.02 * min(f)
-
-
-def _rms(residual: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(residual**2)))
 
 
 def _mm(amplitude_m: float) -> str:

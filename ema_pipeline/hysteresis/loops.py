@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
@@ -16,6 +19,7 @@ FEWEST_SAMPLES = 32
 _SIGNIFICANT = 5.0
 _NOT_PERIODIC = 0.3
 _LEAST_NOISE = 1e-6
+_CYCLES = 3
 
 
 def measure_loop(
@@ -101,7 +105,8 @@ def measure_loop(
         )
     series[0] -= 0.5 * (low + high)
     velocity = fourier_slope(at, harmonics) @ series * true_hz
-    noise = max(_noise(f), _LEAST_NOISE * float(np.ptp(f)))
+    between = f - np.interp(phase % 1.0, at, mean_force, period=1.0)
+    noise = max(_noise(f), _cycle_scatter(between, index, phase, count), _LEAST_NOISE * float(np.ptp(f)))
     each = _energies(phase, f, harmonics, series, cycles)
     scatter = float(np.std(each, ddof=1) / np.sqrt(cycles)) if cycles > 1 else 0.0
     own = noise * float(np.sqrt(np.mean(velocity**2))) / (true_hz * np.sqrt(keep))
@@ -119,6 +124,29 @@ def measure_loop(
         energy_j=float(np.mean(each)),
         energy_std_j=float(max(scatter, own)),
         displacement_std_m=coefficient_std,
+    )
+
+
+def share_noise(loops: Sequence[Loop]) -> tuple[Loop, ...]:
+    """Loops of too few cycles to know their scatter take that of the others, as a share of the force.
+
+    Otherwise a loop of a single cycle would count as the most certain of all.
+    """
+    known = [
+        one.force_std_n / float(np.ptp(one.force)) * np.sqrt(one.cycles)
+        for one in loops
+        if one.cycles >= _CYCLES
+    ]
+    if not known:
+        return tuple(loops)
+    share = float(np.median(known))
+
+    def least(one: Loop) -> float:
+        return share * float(np.ptp(one.force)) / float(np.sqrt(one.cycles))
+
+    return tuple(
+        one if one.cycles >= _CYCLES else replace(one, force_std_n=max(one.force_std_n, least(one)))
+        for one in loops
     )
 
 
@@ -176,6 +204,27 @@ def _noise(force: NDArray[np.float64]) -> float:
     """Standard deviation of white noise from second differences, which a smooth signal hardly has."""
     second = force[:-2] - 2 * force[1:-1] + force[2:]
     return float(np.sqrt(np.mean(second**2) / 6.0))
+
+
+def _cycle_scatter(
+    left: NDArray[np.float64], index: NDArray[np.intp], phase: NDArray[np.float64], count: int
+) -> float:
+    """Standard deviation of a sample as the scatter between cycles tells it; 0 for fewer than three cycles.
+
+    Larger than that of neighbouring samples where the cycles themselves differ.
+    """
+    cycles = int(phase[-1]) + 1
+    cell = index + count * phase.astype(int)
+    number = np.bincount(cell, minlength=count * cycles).reshape(cycles, count)
+    if cycles < _CYCLES or np.any(number.sum(axis=0) == 0):
+        return 0.0
+    total = np.bincount(cell, left, count * cycles).reshape(cycles, count)
+    mean = total / np.maximum(number, 1)
+    kept = np.all(number > 0, axis=0)
+    if not kept.any():
+        return 0.0
+    variance = np.var(mean[:, kept], axis=0, ddof=1) * (1 / np.mean(1 / number[:, kept], axis=0))
+    return float(np.sqrt(np.mean(variance)))
 
 
 def _energies(

@@ -1,18 +1,20 @@
-"""The isolator's force along a loop: a sum of elements, most of whose parameters enter linearly.
+"""The isolator's force along loops: a sum of elements, most of whose parameters enter linearly.
 
-Force = K1 x + K2 x² + K3 x³ + c ẋ + k_w w(ρ, σ; x) + relaxation(τ; x) + an offset per loop. Only ρ, σ and τ
-do not enter linearly; for given ones the best of the rest follow from a linear fit (variable projection, G.
-H. Golub, V. Pereyra, *SIAM J. Numer. Anal.* 10 (1973) 413-432).
+Force = K1 x + K2 x² + K3 x³ + c ẋ + k_w w(ρ, σ, n; x) + relaxation(τ; x) + an offset per loop. With free play
+the elements see the motion less the play: where the force would change its sign, it stays at zero until the
+play has been run through.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.hysteresis.branches import LimitCycle
 from ema_pipeline.hysteresis.fourier import fourier, fourier_slope
 from ema_pipeline.hysteresis.types import Loop
 from ema_pipeline.mechanics.assembly import Damper, Element, Spring
@@ -22,6 +24,7 @@ from ema_pipeline.mechanics.nonlinear import force_along, steady_deviation
 STIFFNESS, QUADRATIC, CUBIC = "stiffness", "quadratic_stiffness", "cubic_stiffness"
 DAMPING, FORCE, RELAXATION = "viscous_damping", "hysteresis_force", "relaxation_stiffness"
 RHO, SIGMA, TIME = "hysteresis_rho", "hysteresis_sigma", "relaxation_time"
+EXPONENT, GAP = "hysteresis_exponent", "backlash_gap"
 UNITS = {
     STIFFNESS: "N/m",
     QUADRATIC: "N/m²",
@@ -31,27 +34,29 @@ UNITS = {
     RELAXATION: "N/m",
     RHO: "1/m",
     SIGMA: "1",
+    EXPONENT: "1",
     TIME: "s",
+    GAP: "m",
 }
-
 Terms = tuple[str, ...]
-"""Names of the linear parameters that a model has."""
+"""Names of linear parameters, in the order of their columns."""
 
-ALL_TERMS: Terms = (STIFFNESS, QUADRATIC, CUBIC, DAMPING, FORCE)
 _ROW = {"isolator.x": 1.0}
 POINTS = 512
 """Points per cycle at which the elements are run through."""
+_ROUNDS = 3
 
 
 def elements(values: Mapping[str, float]) -> tuple[Element, ...]:
-    """The isolator as elements of the mechanics."""
+    """The isolator as elements of the mechanics, without free play."""
     found: list[Element] = [
         Spring("stiffness", _ROW, values.get(STIFFNESS, 0.0)),
         PolynomialSpring("curvature", _ROW, values.get(QUADRATIC, 0.0), values.get(CUBIC, 0.0)),
         Damper("viscous", _ROW, values.get(DAMPING, 0.0)),
     ]
     if values.get(FORCE):
-        found.append(BoucWen("hysteresis", _ROW, values[FORCE], values[RHO], values[SIGMA]))
+        exponent = values.get(EXPONENT, 1.0)
+        found.append(BoucWen("hysteresis", _ROW, values[FORCE], values[RHO], values[SIGMA], exponent))
     if values.get(RELAXATION):
         found.append(Maxwell("relaxation", _ROW, values[RELAXATION], values[TIME]))
     return tuple(found)
@@ -63,7 +68,7 @@ def loop_force(
     frequency_hz: float,
     phase: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Steady force of the isolator at phases of the cycle, N, (n_points,).
+    """Steady force of an isolator without play at phases of the cycle, N, (n_points,).
 
     Parameters
     ----------
@@ -84,65 +89,152 @@ def loop_force(
     return np.interp(phase, grid, force, period=1.0)
 
 
-@dataclass(frozen=True)
-class Problem:
-    """The loops as one linear fit for given ρ, σ, τ, weighted by the standard deviations of the force."""
+class Motion:
+    """Motion of several loops, and the force that an isolator answers it with, fast enough for thousands of fits.
 
-    loops: Sequence[Loop]
-    terms: Terms
+    A loop is taken as one way up and one way down; reversals in between, which a noisy displacement has, are
+    passed over.
 
-    @property
-    def shape_names(self) -> tuple[str, ...]:
-        """Parameters that do not enter linearly."""
-        return ((RHO, SIGMA) if FORCE in self.terms else ()) + ((TIME,) if RELAXATION in self.terms else ())
+    Attributes
+    ----------
+    parts : list of slice
+        Points of each loop among all.
+    x, velocity, way, span, direction : ndarray, (n_points,)
+        Displacement, m; velocity, m/s; way since the last turning point and between turning points, m; +1 on
+        the way up, -1 on the way down.
+    """
 
-    def columns(self, shape: Mapping[str, float]) -> NDArray[np.float64]:
-        """Weighted columns of all terms and of one offset per loop, (n_points, n_terms + n_loops)."""
-        blocks = []
-        for i, loop in enumerate(self.loops):
-            block = np.zeros((len(loop.force), len(self.terms) + len(self.loops)))
-            for j, term in enumerate(self.terms):
-                block[:, j] = _unit_force(term, loop, shape)
-            block[:, len(self.terms) + i] = 1.0
-            blocks.append(block / loop.force_std_n)
-        return np.vstack(blocks)
+    def __init__(self, loops: Sequence[Loop]) -> None:
+        self.loops = tuple(loops)
+        ends = np.cumsum([0] + [len(loop.force) for loop in loops])
+        self.parts = [slice(int(a), int(b)) for a, b in pairwise(ends)]
+        self.x = np.concatenate([loop.displacement for loop in loops])
+        self.velocity = np.concatenate([loop.velocity for loop in loops])
+        self.span = np.repeat([np.ptp(loop.displacement) for loop in loops], np.diff(ends))
+        ways = [_ways(loop.displacement) for loop in loops]
+        self.direction = np.concatenate([direction for direction, _ in ways])
+        self.way = np.concatenate([way for _, way in ways])
+        self._fixed = {STIFFNESS: self.x, QUADRATIC: self.x**2, CUBIC: self.x**3, DAMPING: self.velocity}
 
-    def data(self) -> NDArray[np.float64]:
-        """Weighted forces, (n_points,)."""
-        return np.concatenate([loop.force / loop.force_std_n for loop in self.loops])
+    def force(
+        self, values: Mapping[str, float], terms: Terms
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Force, N, (n_points,), and its slopes by the linear `terms`, (n_points, n_terms)."""
+        p = np.array([values[t] for t in terms])
+        gap = values.get(GAP, 0.0)
+        if gap == 0.0:
+            columns = np.stack([self.column(t, values) for t in terms], axis=1)
+            return columns @ p, columns
+        # Before the play the back contact carries (stretch x + s·gap/2), after it the front contact.
+        s = self.direction
+        gaps = np.minimum(gap, 0.98 * self.span)
+        back = self._contact(values, terms, self.x + 0.5 * s * gaps, self.way, gaps)
+        front = self._contact(values, terms, self.x - 0.5 * s * gaps, np.maximum(self.way - gaps, 0.0), gaps)
+        before, after = _touching(s, back @ p, front @ p)
+        if RELAXATION in terms:
+            at = terms.index(RELAXATION)
+            for _ in range(_ROUNDS):
+                late = self._relaxed(self._held(gaps, before, after), values[TIME])
+                back[:, at] = front[:, at] = late
+                before, after = _touching(s, back @ p, front @ p)
+        columns = np.where(before[:, None], back, np.where(after[:, None], front, 0.0))
+        return columns @ p, columns
 
-    def solve(self, shape: Mapping[str, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Best linear parameters and offsets, and the weighted residuals (model - measured)."""
-        columns, data = self.columns(shape), self.data()
-        size = np.linalg.norm(columns, axis=0)
-        size[size == 0] = 1.0
-        solution = np.linalg.lstsq(columns / size, data, rcond=1e-12)[0] / size
-        return solution, columns @ solution - data
+    def column(self, term: str, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """Force without play by one linear term of size 1, (n_points,)."""
+        if term == FORCE:
+            return self._hysteresis(values, self.way, self.span)
+        if term == RELAXATION:
+            return self._relaxation(values[TIME])
+        return self._fixed[term]
 
-    def residual(self, linear: NDArray[np.float64], shape: Mapping[str, float]) -> NDArray[np.float64]:
-        """Weighted residuals of loops left out of a fit: the terms are held, only the offsets fitted."""
-        columns, data = self.columns(shape), self.data()
-        count = len(self.terms)
-        left = data - columns[:, :count] @ linear[:count]
-        offsets = columns[:, count:]
-        return np.asarray(offsets @ np.linalg.lstsq(offsets, left, rcond=None)[0] - left)
+    def _hysteresis(
+        self, values: Mapping[str, float], way: NDArray[np.float64], span: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        cycle = _limit_cycle(values[SIGMA], values.get(EXPONENT, 1.0))
+        return self.direction * cycle.along(values[RHO] * way, values[RHO] * span)
 
+    def _contact(
+        self,
+        values: Mapping[str, float],
+        terms: Terms,
+        stretch: NDArray[np.float64],
+        way: NDArray[np.float64],
+        gaps: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Slopes by the terms while one of the contacts carries, (n_points, n_terms)."""
+        powers = {STIFFNESS: 1, QUADRATIC: 2, CUBIC: 3}
+        columns = np.zeros((len(stretch), len(terms)))
+        for j, term in enumerate(terms):
+            if term == FORCE:
+                columns[:, j] = self._hysteresis(values, way, self.span - gaps)
+            elif term == DAMPING:
+                columns[:, j] = self.velocity
+            elif term in powers:
+                columns[:, j] = stretch ** powers[term]
+        return columns
 
-def _unit_force(term: str, loop: Loop, shape: Mapping[str, float]) -> NDArray[np.float64]:
-    x = loop.displacement
-    if term == RELAXATION:
+    def _held(
+        self, gaps: NDArray[np.float64], before: NDArray[np.bool_], after: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
+        """Stretch of the isolator: in the play it stays where the contact was lost."""
+        half = 0.5 * self.direction * gaps
+        u = np.where(before, self.x + half, self.x - half)
+        for part in self.parts:
+            idle = ~(before[part] | after[part])
+            if idle.any() and not idle.all():
+                known, at = np.flatnonzero(~idle), np.flatnonzero(idle)
+                inside = u[part]
+                inside[at] = inside[known[np.searchsorted(known, at) - 1]]
+        return u
+
+    def _relaxation(self, time: float) -> NDArray[np.float64]:
         # Linear, so each harmonic of the displacement has its closed-form factor jωτ/(1 + jωτ).
-        count = len(loop.series) // 2
-        jwt = 2j * np.pi * loop.frequency_hz * shape[TIME] * np.arange(1, count + 1)
-        harmonics = (loop.series[1 : count + 1] - 1j * loop.series[count + 1 :]) * jwt / (1 + jwt)
-        series = np.concatenate([[0.0], harmonics.real, -harmonics.imag])
-        return fourier(loop.phase, count) @ series
-    if term == STIFFNESS:
-        return x
-    if term == QUADRATIC:
-        return x**2
-    if term == CUBIC:
-        return x**3
-    if term == DAMPING:
-        return loop.velocity
-    return loop_force({term: 1.0, **shape}, loop.series, loop.frequency_hz, loop.phase)
+        found = np.empty(len(self.x))
+        for loop, part, basis in zip(self.loops, self.parts, self._bases, strict=True):
+            series, count = loop.series, len(loop.series) // 2
+            jwt = 2j * np.pi * loop.frequency_hz * time * np.arange(1, count + 1)
+            harmonics = (series[1 : count + 1] - 1j * series[count + 1 :]) * jwt / (1 + jwt)
+            found[part] = basis @ np.concatenate([[0.0], harmonics.real, -harmonics.imag])
+        return found
+
+    @cached_property
+    def _bases(self) -> list[NDArray[np.float64]]:
+        return [fourier(loop.phase, len(loop.series) // 2) for loop in self.loops]
+
+    def _relaxed(self, stretch: NDArray[np.float64], time: float) -> NDArray[np.float64]:
+        """Force of a Maxwell branch of stiffness 1 N/m along periodic stretches, (n_points,)."""
+        grid = np.arange(POINTS) / POINTS
+        found = np.empty(len(stretch))
+        for loop, part in zip(self.loops, self.parts, strict=True):
+            spectrum = np.fft.rfft(np.interp(grid, loop.phase, stretch[part], period=1.0))
+            jwt = 2j * np.pi * time * loop.frequency_hz * np.arange(len(spectrum))
+            force = np.fft.irfft(spectrum * jwt / (1 + jwt), POINTS)
+            found[part] = np.interp(loop.phase, grid, force, period=1.0)
+        return found
+
+
+def _touching(
+    direction: NDArray[np.float64], back: NDArray[np.float64], front: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Points at which the back and at which the front contact carries, from the force that each would have."""
+    before = direction * back < 0
+    return before, ~before & (direction * front > 0)
+
+
+def _ways(x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Direction, ±1, and way since the last turning point of a cycle, m, each (n_points,)."""
+    bottom, top = int(np.argmin(x)), int(np.argmax(x))
+    order = (np.arange(len(x)) - bottom) % len(x)
+    rising = order <= (top - bottom) % len(x)
+    way = np.empty(len(x))
+    for up in (True, False):
+        mine = np.flatnonzero(rising == up)
+        mine = mine[np.argsort(order[mine])]
+        way[mine] = np.maximum.accumulate(x[mine] - x[bottom] if up else x[top] - x[mine])
+    return np.where(rising, 1.0, -1.0), way
+
+
+@lru_cache(maxsize=256)
+def _limit_cycle(sigma: float, exponent: float) -> LimitCycle:
+    return LimitCycle(sigma, exponent)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.hysteresis.identify import identify_isolator
-from ema_pipeline.hysteresis.loops import measure_loop
+from ema_pipeline.hysteresis.loops import measure_loop, share_noise
 from ema_pipeline.hysteresis.settings import HysteresisSettings
 from ema_pipeline.hysteresis.types import IsolatorResult, Loop
 from ema_pipeline.ingest.description import TestDescription
@@ -26,10 +26,7 @@ def analyse_hysteresis(
         Names file, channel or record and what is wrong with it.
     """
     tell = progress or (lambda share, text: None)
-    loops = []
-    for i, loop in enumerate(load_loops(test, settings)):
-        loops.append(loop)
-        tell(0.3 * (i + 1) / len(test.records), f"loop {loop.name}")
+    loops = load_loops(test, settings)
     tell(0.3, "least squares on all loops")
     return identify_isolator(loops, settings)
 
@@ -56,4 +53,4 @@ def load_loops(test: TestDescription, settings: HysteresisSettings | None = None
         except EmaError as error:
             raise EmaError(f"{test.path_of(record).parent}/{error}") from None
         loops.append(loop)
-    return tuple(loops)
+    return share_noise(loops)

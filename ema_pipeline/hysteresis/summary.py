@@ -28,10 +28,6 @@ def terminal_lines(result: IsolatorResult) -> list[str]:
             f"  {loop.name}: {loop.energy_j:.4g} ± {loop.energy_std_j:.2g} J, {fit.energy_j:.4g} J, "
             f"η = {loss.value:.3g} ± {loss.std:.2g}"
         )
-    lines.append("ladder, error and held-out error in standard deviations of the force:")
-    for rung in result.ladder:
-        added = ", ".join(rung.effects) or "linear spring"
-        lines.append(f"  {rung.error:8.3g} {rung.heldout_error:8.3g}  {added}")
     lines += [f"! {flag}" for flag in result.flags]
     lines += [f"- {note}" for note in result.notes]
     return lines
@@ -79,10 +75,6 @@ def summary(result: IsolatorResult) -> dict[str, Any]:
                 "reason": line.reason,
             }
             for line in result.energy
-        ],
-        "ladder": [
-            {"effects": list(r.effects), "error": _known(r.error), "heldout_error": _known(r.heldout_error)}
-            for r in result.ladder
         ],
         "flags": list(result.flags),
         "notes": list(result.notes),

@@ -130,19 +130,6 @@ class LoopFit:
 
 
 @dataclass(frozen=True)
-class Rung:
-    """One rung of the ladder: a set of effects, and how far the force loops are from it.
-
-    `error` and `heldout_error` are root-mean-square differences in standard deviations of the force points,
-    on the loops fitted and on loops left out of the fit (NaN for a single loop).
-    """
-
-    effects: tuple[str, ...]
-    error: float
-    heldout_error: float
-
-
-@dataclass(frozen=True)
 class IsolatorResult:
     """An identified isolator.
 
@@ -173,7 +160,6 @@ class IsolatorResult:
         accuracy; 1 where it does.
     relaxation : dict of str to Estimate
         Parameters of a fit with a Maxwell branch, made where the damper came out negative; empty otherwise.
-    ladder : tuple of Rung
     flags : tuple of str
         Results that cannot be, with the reason.
     notes : tuple of str
@@ -192,6 +178,5 @@ class IsolatorResult:
     alone: tuple[LoopFit, ...]
     misfit_scale: float
     relaxation: dict[str, Estimate]
-    ladder: tuple[Rung, ...]
     flags: tuple[str, ...]
     notes: tuple[str, ...]
