@@ -23,7 +23,7 @@ from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.modes import normal_modes
-from ema_pipeline.mechanics.system import sensor_rows
+from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
 from ema_pipeline.rigs import load_rig
 
 RIG = load_rig("planetary")
@@ -33,20 +33,27 @@ FEW = {k: shipped_effects()[k] for k in ("mesh_stiffness_loss", "planet_bearing_
 CRACK, TORSION = "mesh_stiffness_loss@sun-planet1", "shaft_torsion@carrier"
 
 
+def true_system(
+    effects: Mapping[str, float], changed: Mapping[str, float], rng: np.random.Generator
+) -> tuple[LinearSystem, float]:
+    """The rig without ring, drawn from its tolerances, and its damping ratio."""
+    rig = rig_with_effects(RIG, [k.partition(".")[0] for k in effects])
+    values = {
+        n: 1e7 if p.free else p.value * (1 + p.tolerance * float(np.clip(rng.normal(), -2, 2)))
+        for n, p in RIG.parameters.items()
+    }
+    return rig.system("no_ring", {**values, **effects, **changed}), values["modal_damping_ratio"]
+
+
 def measure(
     effects: Mapping[str, float],
     changed: Mapping[str, float] | None = None,
     seed: int = 1,
     noise: float = 0.3,
 ) -> dict[str, MeasuredModes]:
-    """Modes of the rig without ring, drawn from its tolerances, with 0.03 % of frequency scatter and so on."""
+    """Modes of a rig drawn from its tolerances, with 0.03 % of frequency scatter and so on."""
     rng = np.random.default_rng(seed)
-    rig = rig_with_effects(RIG, [k.partition(".")[0] for k in effects])
-    values = {
-        n: 1e7 if p.free else p.value * (1 + p.tolerance * float(np.clip(rng.normal(), -2, 2)))
-        for n, p in RIG.parameters.items()
-    }
-    system = rig.system("no_ring", {**values, **effects, **(changed or {})})
+    system, damping = true_system(effects, changed or {}, rng)
     f, phi = normal_modes(system)
     inside = (f > 5) & (f < 2000)
     dofs = tuple(Dof(b, d) for b in BODIES for d in ("x", "y", "u"))
@@ -58,8 +65,8 @@ def measure(
         configuration="no_ring",
         frequency_hz=f * (1 + 1e-3 * noise * rng.normal(size=f.size)),
         frequency_std_hz=1e-3 * noise * f,
-        damping_ratio=values["modal_damping_ratio"] * (1 + 0.1 * noise * rng.normal(size=f.size)),
-        damping_std=np.full(f.size, 0.1 * noise * values["modal_damping_ratio"]),
+        damping_ratio=damping * (1 + 0.1 * noise * rng.normal(size=f.size)),
+        damping_std=np.full(f.size, 0.1 * noise * damping),
         shapes=shapes + 0.02 * noise * scatter,
         shape_std=np.full(shapes.shape, 0.02 * noise),
         dofs=dofs,

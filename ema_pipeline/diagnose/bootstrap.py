@@ -8,8 +8,11 @@ makes the table (A. C. Davison, D. V. Hinkley, *Bootstrap Methods and their Appl
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +26,7 @@ from ema_pipeline.diagnose.ladder import noise_of
 from ema_pipeline.diagnose.noise import floors
 from ema_pipeline.diagnose.screening import screen
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.thresholds import from_null_gains
 from ema_pipeline.effects.library import Library
 from ema_pipeline.fit.evidence import Dataset
 from ema_pipeline.fit.settings import FitSettings
@@ -33,6 +37,83 @@ from ema_pipeline.threads import single_blas_thread
 Progress = Callable[[float, str], None]
 _REACH = 3.0
 """Nominal values are drawn within so many tolerances."""
+
+
+def own_thresholds(
+    rig: Rig,
+    measured: Mapping[str, MeasuredModes],
+    settings: DiagnoseSettings,
+    library: Library | None,
+    memory: Path,
+    version: str,
+    tell: Progress,
+) -> dict[str, float]:
+    """Thresholds of every family from `settings.bootstrap` simulated tests with nothing missing.
+
+    Parameters
+    ----------
+    rig, measured, settings, library
+        As for `diagnose.diagnose`.
+    memory : Path
+        File that keeps the gains of every sample, one JSON object a line; samples that it holds for the same
+        data, rig, settings and version are not simulated again.
+    version : str
+        Of the program and of the user's own effects.
+    tell : callable
+
+    Returns
+    -------
+    dict of family to gain
+    """
+    key = _fingerprint(rig, measured, settings, version)
+    gains = _remembered(memory, key)[: settings.bootstrap]
+    if len(gains) < settings.bootstrap:
+        null = fitted_null(rig, measured, settings, library)
+        lines = [{"key": key}, *gains]  # written anew: a crash may have cut off the last line
+        memory.write_text("".join(json.dumps(entry) + "\n" for entry in lines), encoding="utf-8")
+        for found in null_gains(null, len(gains), settings.bootstrap, tell):
+            gains.append(found)
+            with memory.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(found) + "\n")
+    return from_null_gains(gains)
+
+
+def _fingerprint(
+    rig: Rig, measured: Mapping[str, MeasuredModes], settings: DiagnoseSettings, version: str
+) -> str:
+    digest = hashlib.sha256(version.encode())
+    digest.update(settings.model_dump_json(exclude={"bootstrap", "processes"}).encode())
+    digest.update(repr(sorted(rig.parameters.items())).encode())
+    for name, m in sorted(measured.items()):
+        digest.update(f"{name} {m.dofs} {m.band_hz} {m.references}".encode())
+        for array in (
+            m.frequency_hz,
+            m.frequency_std_hz,
+            m.damping_ratio,
+            m.damping_std,
+            m.shapes,
+            m.shape_std,
+        ):
+            digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _remembered(memory: Path, key: str) -> list[dict[str, float]]:
+    """Gains that an earlier run kept; a line that was cut off by a crash ends the list."""
+    if not memory.is_file():
+        return []
+    found: list[dict[str, float]] = []
+    for number, line in enumerate(memory.read_text(encoding="utf-8").splitlines()):
+        try:
+            entry = json.loads(line)
+        except json.JSONDecodeError:
+            break
+        if number == 0:
+            if entry.get("key") != key:
+                return []
+            continue
+        found.append({str(k): float(v) for k, v in entry.items()})
+    return found
 
 
 @dataclass(frozen=True)

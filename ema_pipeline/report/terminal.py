@@ -197,6 +197,8 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
         parts += [_line(""), _line(told)]
     if shown := diagnosis.detection_words(found):
         parts += [_line(""), _line(shown)]
+    if found.thresholds_from:
+        parts += [_line(""), _line(f"Thresholds of claims: {found.thresholds_from}.")]
     if found.notes:
         parts += [_line(""), _line("From the data's screening:"), *(_line(f"! {n}") for n in found.notes)]
     parts += _commands(diagnosis.next_commands(found, out))
