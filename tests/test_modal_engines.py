@@ -50,18 +50,55 @@ def test_lscf_gives_the_poles_of_sdypy_at_the_same_order() -> None:
             assert np.min(np.abs(mine - pole)) < 1e-9 * abs(pole)
 
 
+def polynomial(z: np.ndarray, real: np.ndarray) -> np.ndarray:
+    """Ascending coefficients from the roots of the upper half plane and the real roots."""
+    return np.real(np.poly(np.concatenate([z, z.conj(), real])))[::-1]
+
+
 def test_stable_roots_are_those_that_numpy_finds() -> None:
     rng = np.random.default_rng(3)
     polynomials = []
-    for n in (4, 12, 40):
+    for n in (1, 4, 12, 30, 40):
         angle, radius = rng.uniform(0.1, 3.0, n // 2), rng.uniform(0.7, 1.3, n // 2)
-        z = radius * np.exp(1j * angle)
-        polynomials.append(np.real(np.poly(np.concatenate([z, z.conj()])))[::-1])
+        polynomials.append(
+            polynomial(radius * np.exp(1j * angle), rng.uniform(-1.3, 1.3, n % 2 + 2 * (n > 20)))
+        )
     for c, found in zip(polynomials, stable_roots(polynomials), strict=True):
         expected = np.roots(c[::-1])
         expected = expected[(expected.imag < 0) & (np.abs(expected) > 1)]
         assert len(found) == len(expected)
-        assert max(np.min(np.abs(found - z)) for z in expected) < 1e-9
+        assert all(np.min(np.abs(found - z)) < 1e-9 for z in expected)
+
+
+def test_stable_roots_close_to_one_another_and_close_to_the_circles_are_all_found() -> None:
+    rng = np.random.default_rng(4)
+    others = 0.85 * np.exp(1j * np.linspace(0.05, 3.1, 16))
+    for gap in (1e-2, 1e-3, 1e-4):
+        pair = 1.003 * np.exp(1j * rng.uniform(0.3, 2.8)) * np.array([1, 1 + gap * 1j, 1 + 0.5 * gap])
+        rim = (1 + gap**2) * np.exp(1j * rng.uniform(0.3, 2.8, 1))
+        outside = 1.601 * np.exp(1j * rng.uniform(0.3, 2.8, 1))
+        c = polynomial(np.concatenate([pair, rim, outside, others]), np.array([1.2, -1.05, 0.9]))
+        found = stable_roots([c])[0]
+        assert len(found) == 4
+        power = found[:, None] ** np.arange(len(c))
+        assert np.all(np.abs(power @ c) < 1e-14 * (np.abs(power) @ np.abs(c)))  # as small as rounding allows
+        assert min(abs(a - b) for i, a in enumerate(found) for b in found[:i]) > 0.1 * gap
+
+
+def test_roots_of_noisy_charts_equal_companion_eigenvalues() -> None:
+    rng = np.random.default_rng(15)
+    for noise, lines, channels in ((0.0, 300, 2), (1e-4, 600, 5), (0.3, 900, 3)):
+        system = random_system(rng, n_modes=6, n_dofs=channels, low_hz=0.1 * lines, high_hz=0.9 * lines)
+        frf = noisy(system, np.arange(lines + 1.0), channels, 1, noise, 16)
+        orders = list(range(30, 81, 10))
+        equations = normal_equations(frf, np.ones(lines + 1), orders[-1], 0, lines)
+        denominators = [f.denominator[:, 0, 0] for f in fractions(equations, orders)]
+        for c, found in zip(denominators, stable_roots(denominators), strict=True):
+            z = np.roots(c[::-1])
+            radius = np.abs(z)
+            expected = z[(z.imag < -1e-9) & (radius > 1 + 1e-9) & (radius < 1.6)]
+            assert all(np.min(np.abs(found - e)) < 1e-9 for e in expected)
+            assert len(found) <= np.count_nonzero((z.imag < 1e-9) & (radius > 1 - 1e-9))
 
 
 @pytest.mark.parametrize(("first", "grid"), [(0, 190), (20, 210), (40, 300)])

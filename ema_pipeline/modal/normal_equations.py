@@ -3,15 +3,12 @@
 The right matrix fraction H(ω) = B(z) A(z)⁻¹, z = exp(−jθ(ω)), with real coefficients is fitted to rows of
 FRFs in the linear least-squares sense. Eliminating B leaves normal equations in A of every order n,
 
-    M_n = T_n − Σ_rows S_nᵀ R_n⁻¹ S_n ,
+    M_n = T_n − Σ_rows S_nᵀ R_n⁻¹ S_n .
 
-with R, S and T Toeplitz: they are kept as their lags, and no more of them is ever formed. By the
-Gohberg–Semencul formula for the inverse of R, M_n changes along its diagonals by
-
-    M_n[a + 1, b + 1] − M_n[a, b] = Σ_rows (e_n[a] e_n[b] − g_n[a] g_n[b]) / E_n ,
-
-where e_n and g_n are the forward and backward prediction errors that the lattice filter of R makes of the lags
-of S, at a few operations per lag from each order to the next.
+With one Cholesky factor R = LLᵀ at the highest order and W = L⁻¹S, the sum for order n is over the first
+n + 1 rows of W, so that all orders follow from a running sum. R and S are Toeplitz: the rows of L⁻¹ are the
+prediction-error filters of R, and W comes one row after the other out of the lattice of these filters, at two
+operations per lag, without S ever being formed.
 
 References
 ----------
@@ -19,7 +16,7 @@ Guillaume, Verboven, Vanlanduit, Van der Auweraer & Peeters, "A poly-reference i
 least-squares complex frequency-domain estimator", IMAC XXI, 2003.
 Peeters, Van der Auweraer, Guillaume & Leuridan, "The PolyMAX frequency-domain method: a new standard for
 modal parameter estimation?", Shock and Vibration 11, 2004.
-Kailath & Sayed, "Displacement structure: theory and applications", SIAM Review 37, 1995.
+Makhoul, "Linear prediction: a tutorial review", Proceedings of the IEEE 63, 1975 (lattice).
 """
 
 from __future__ import annotations
@@ -55,21 +52,21 @@ class Fraction:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """R, S and T of the highest order N, by their lags.
+    """R, S and T of the highest order N.
 
     Attributes
     ----------
     factor : ndarray, (N + 1, N + 1)
         Lower Cholesky factor of R.
     cross : ndarray, (2N + 1, n_references, n_rows)
-        S_jk of row and reference at index N − j + k.
-    power : ndarray, (n_references, (N + 1)·n_references)
-        First block row of T, summed over rows.
+        Lags of S: S_jk of a reference and a row at index N − j + k.
+    total : ndarray, ((N + 1)·n_references, (N + 1)·n_references)
+        T, summed over rows.
     """
 
     factor: Real
     cross: Real
-    power: Real
+    total: Real
 
 
 def normal_equations(
@@ -98,29 +95,21 @@ def normal_equations(
         np.multiply(block, weight, out=weighted[..., lines])
         cross[..., start : start + at_once] = _lags(weighted, order)[..., ::-1].transpose(2, 1, 0)
         for i in range(n_ref):
-            for k in range(i, n_ref):
-                products[i, k, lines] += _product(block[:, i], weighted[:, k, lines])
+            left, right = block[:, i], weighted[:, i, lines]
+            products[i, i, lines] += np.einsum("ol,ol->l", left.real, right.real)
+            products[i, i, lines] += np.einsum("ol,ol->l", left.imag, right.imag)
+            for k in range(i + 1, n_ref):
+                products[i, k, lines] += np.einsum("ol,ol->l", left.conj(), weighted[:, k, lines])
+                products[k, i, lines] = products[i, k, lines].conj()
     weights = np.zeros(n_grid + 1, dtype=np.complex128)
     weights[lines] = weight
     r = _lags(weights, order)[order:]
     r[0] *= 1 + 1e-14
-    power = _lags(products, order)
-    below = np.tril_indices(n_ref, -1)
-    power[below] = power.transpose(1, 0, 2)[below][:, ::-1]
-    first = power[..., order::-1].transpose(0, 2, 1).reshape(n_ref, -1)
+    m = np.arange(order + 1)
+    power = _lags(products, order)[:, :, order + m[:, None] - m]  # T_jk has lag j − k, as S
+    total = power.transpose(2, 0, 3, 1).reshape((order + 1) * n_ref, -1)
     factor = np.asarray(np.linalg.cholesky(scipy.linalg.toeplitz(r)), dtype=np.float64)
-    return NormalEquations(factor, cross, first)
-
-
-def _product(left: NDArray[np.complex128], right: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Σ_rows conj(left)·right, (n_lines,)."""
-    parts = [
-        np.einsum("ol,ol->l", a, b)
-        for a, b in (
-            (left.real, right.real), (left.imag, right.imag), (left.real, right.imag), (left.imag, right.real)
-        )
-    ]  # fmt: skip
-    return np.asarray(parts[0] + parts[1] + 1j * (parts[2] - parts[3]))
+    return NormalEquations(factor, cross, total)
 
 
 def _lags(values: NDArray[np.complex128], order: int) -> Real:
@@ -153,7 +142,8 @@ def fractions(equations: NormalEquations, orders: list[int]) -> Iterator[Fractio
     )
     forward = equations.cross.reshape(-1, equations.cross.shape[2]).copy()
     backward = forward.copy()  # of order n from lag n on, so that it stays in place
-    gained = np.zeros((r, (top + 1) * r))
+    normal = np.array(equations.total, order="F")
+    fresh: list[Real] = []
     wanted = set(orders)
     for n in range(orders[-1] + 1):
         if n:
@@ -161,38 +151,22 @@ def fractions(equations: NormalEquations, orders: list[int]) -> Iterator[Fractio
             fed = reflection[n] * ahead
             ahead += reflection[n] * behind
             behind += fed
-        row = forward[(top - n) * r : (2 * top + 1 - n) * r]
-        gained += (row[:r] @ row.T) / deviation[n] ** 2
+        fresh.append(forward[(top - n) * r : (2 * top + 1 - n) * r] / deviation[n])
         if n in wanted:
-            m = _normal_matrix(
-                equations.power[:, : (n + 1) * r] - gained[:, : (n + 1) * r],
-                forward[(top - n) * r : top * r],
-                backward[(top + 1) * r : (top + 1 + n) * r],
-                1 / deviation[n] ** 2,
-            )
-            low = _solved(m[: n * r, : n * r], -m[: n * r, n * r :])
+            w = np.concatenate(fresh, axis=1)
+            fresh.clear()
+            normal = scipy.linalg.blas.dsyrk(
+                -1.0, w.T, beta=1.0, c=normal, trans=1, lower=1, overwrite_c=1
+            )  # below the diagonal only
+            low = _solved(normal[: n * r, : n * r], -normal[n * r : (n + 1) * r, : n * r].T)
             yield Fraction(n, np.concatenate([low.reshape(n, r, r), np.eye(r)[None]]))
 
 
-def _normal_matrix(first: Real, forward: Real, backward: Real, scale: float) -> Real:
-    """M from its first block row and the changes along its diagonals; only its upper triangle is filled."""
-    r, width = first.shape
-    change = scipy.linalg.blas.dsyrk(scale, forward.T, trans=1, lower=1)
-    change = scipy.linalg.blas.dsyrk(-scale, backward.T, trans=1, lower=1, beta=1.0, c=change, overwrite_c=1)
-    # each row of blocks read one block further on: what lies on one diagonal then lies in one column
-    skewed = np.zeros((width // r, r * (width + 1)))
-    m = skewed.reshape(-1)[: width * width].reshape(width, width)
-    m[:r] = first
-    m[r:, r:] = change.T
-    np.cumsum(skewed[:, : r * width], axis=0, out=skewed[:, : r * width])
-    return m
-
-
 def _solved(matrix: Real, right: Real) -> Real:
-    """Solution for a symmetric matrix of which the upper triangle is given."""
-    _, low, info = scipy.linalg.lapack.dposv(matrix.T, right, lower=1)
+    """Solution for a symmetric matrix of which the lower triangle is valid."""
+    _, low, info = scipy.linalg.lapack.dposv(matrix, right, lower=1)
     if info:
-        full = np.triu(matrix) + np.triu(matrix, 1).T
+        full = np.tril(matrix) + np.tril(matrix, -1).T
         low = scipy.linalg.lstsq(full, right, check_finite=False)[0]
     return np.asarray(low)
 
