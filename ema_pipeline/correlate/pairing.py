@@ -128,14 +128,26 @@ def shape_agreement(
         return np.full(size, np.nan), np.full(size, np.nan)
     single = mac(measured.shapes, shapes)
     grouped = single.copy()
-    for g in np.unique(groups):
+    finite = np.isfinite(measured.shapes)
+    for g in np.flatnonzero(np.bincount(groups) > 1):
         members = np.flatnonzero(groups == g)
-        if members.size > 1:
-            # A span of as many shapes as there are sensors holds everything: no comparison at all.
-            for r, y in enumerate(measured.shapes):
-                if int(np.sum(np.isfinite(y))) > members.size:
-                    grouped[r, members] = subspace_mac(y, shapes[members])
+        # A span of as many shapes as there are sensors holds everything: no comparison at all.
+        compared = np.flatnonzero(finite.sum(axis=1) > members.size)
+        if np.all(finite[compared]):
+            share = _shares_inside(measured.shapes[compared], shapes[members])
+        else:
+            share = np.array([subspace_mac(measured.shapes[r], shapes[members]) for r in compared])
+        grouped[np.ix_(compared, members)] = share.reshape(-1, 1)
     return single, grouped
+
+
+def _shares_inside(shapes: NDArray[np.complex128], span: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """`subspace_mac` of several complete shapes with one span, (R,)."""
+    size = np.linalg.norm(span, axis=1, keepdims=True)
+    u, s, _ = np.linalg.svd((span / np.where(size > 0, size, 1.0)).T, full_matrices=False)
+    basis = u[:, s > s[0] * max(span.shape) * np.finfo(float).eps]
+    inside = np.sum(np.abs(shapes @ basis.conj()) ** 2, axis=1)
+    return np.asarray(np.minimum(inside / np.sum(np.abs(shapes) ** 2, axis=1), 1.0))
 
 
 def assign(

@@ -1,12 +1,10 @@
 """Residuals of paired modes: frequencies, damping ratios and shapes of the model's own modes.
 
-Unlike the latent-shape objective this one leaves no freedom to coordinates that carry no sensor: the model's
-mode
+Unlike the latent-shape objective this one leaves no freedom to coordinates that carry no sensor: the model's mode
 must have the measured frequency, damping and shape. Shapes of modes that nearly coincide are compared by the
 space that they span, with a smooth transition: mode j may mix into mode k with an amplitude of the order
 mixing·λ_k/|λ_j - λ_k|, which is what an unmodelled relative perturbation `mixing` of the matrices does
-(first-order
-perturbation theory). Equal eigenvalues mix freely, distant ones not at all.
+(first-order perturbation theory). Equal eigenvalues mix freely, distant ones not at all.
 """
 
 from __future__ import annotations
@@ -67,12 +65,10 @@ class Basis:
 
 def modal_basis(m: Matrices) -> Basis:
     """Undamped modes of a batch of systems."""
-    lower = np.linalg.cholesky(m.mass)
-    half = np.linalg.solve(lower, m.stiffness)
-    scaled = np.linalg.solve(lower, half.swapaxes(-1, -2))
+    inverse = np.linalg.inv(np.linalg.cholesky(m.mass))
+    scaled = inverse @ m.stiffness @ inverse.swapaxes(-1, -2)
     values, directions = np.linalg.eigh(0.5 * (scaled + scaled.swapaxes(-1, -2)))
-    shapes = np.linalg.solve(lower.swapaxes(-1, -2), directions)
-    return Basis(values, shapes, directions)
+    return Basis(values, inverse.swapaxes(-1, -2) @ directions, directions)
 
 
 @dataclass(frozen=True)
@@ -123,6 +119,78 @@ def observable_modes(m: Matrices) -> Modes:
     return Modes(size, ratio, basis.shapes @ modal, basis.directions @ modal)
 
 
+@dataclass(frozen=True)
+class ShapeFit:
+    """The mixture of model modes that comes nearest to each paired measured shape, R modes of B systems.
+
+    Attributes
+    ----------
+    amplitudes : complex ndarray, (B, R, n)
+        Of the model's modes.
+    price : ndarray, (B, R)
+        1/(mixing·λ_k·size): what a unit amplitude of a mode costs per distance of its eigenvalue from λ_k; the
+        size is that of the measured over the model's shape.
+    penalty : ndarray, (B, R, n)
+        (λ_j - λ_k)·price.
+    weighted : ndarray, (B, R, n_dofs, n)
+        The model's modes at the sensors over the standard deviations of the measured shape.
+    normal : ndarray, (B, R, n, n)
+        Of the least squares: weightedᴴ·weighted + penalty².
+    """
+
+    amplitudes: NDArray[np.complex128]
+    price: NDArray[np.float64]
+    penalty: NDArray[np.float64]
+    weighted: NDArray[np.float64] | NDArray[np.complex128]
+    normal: NDArray[np.float64] | NDArray[np.complex128]
+
+
+def visibility(at_sensors: NDArray[np.float64] | NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Square of each mode's motion at the sensors, (B, n), at least a share of the largest.
+
+    A mode that the sensors hardly see must not buy its shape from its neighbours at the price of its own small
+    motion: it would fit anything.
+    """
+    seen = np.sum(np.abs(at_sensors) ** 2, axis=-2)
+    return np.asarray(np.maximum(np.maximum(seen, _FAINT**2 * seen.max(axis=-1, keepdims=True)), 1e-30))
+
+
+def shape_fit(e: Evidence, pairs: NDArray[np.int64], modes: Modes, mixing: float) -> ShapeFit | None:
+    """Fit of the shapes of the measured modes that have a partner, see `mode_residuals`; None without shapes."""
+    has = np.flatnonzero(pairs >= 0)
+    if not e.has_shapes or not has.size:
+        return None
+    k = pairs[has]
+    at_sensors = e.rows @ modes.shapes
+    weight = e.shape_weight[has]
+    weighted = weight[None, :, :, None] * at_sensors[:, None]
+    target = (e.shapes[has] * weight)[None, :, :, None]
+    eigenvalues = modes.omega**2
+    own = np.maximum(eigenvalues[:, k], 1e-12)
+    size = np.sqrt(np.sum(np.abs(e.shapes[has]) ** 2, axis=1) / visibility(at_sensors)[:, k])
+    price = 1 / (mixing * own * np.maximum(size, 1e-150))
+    penalty = (eigenvalues[:, None, :] - own[:, :, None]) * price[:, :, None]
+    amplitudes, normal = ridge(weighted, target, penalty)
+    return ShapeFit(amplitudes, price, penalty, weighted, normal)
+
+
+def ridge(
+    weighted: NDArray[np.float64] | NDArray[np.complex128],
+    target: NDArray[np.complex128],
+    penalty: NDArray[np.float64],
+) -> tuple[NDArray[np.complex128], NDArray[np.float64] | NDArray[np.complex128]]:
+    """Amplitudes q, (..., n), of least ‖weighted·q - target‖² + ‖penalty·q‖², and the normal matrix."""
+    transposed = weighted.conj().swapaxes(-1, -2)
+    normal = transposed @ weighted
+    diagonal = np.einsum("...ii->...i", normal)
+    diagonal += penalty**2 + 1e-9 * diagonal.real.mean(axis=-1, keepdims=True) + 1e-30
+    if np.iscomplexobj(normal):
+        return np.asarray(np.linalg.solve(normal, transposed @ target)[..., 0], dtype=complex), normal
+    parts = transposed @ np.concatenate([target.real, target.imag], axis=-1)
+    both = np.linalg.solve(normal, parts)
+    return both[..., 0] + 1j * both[..., 1], normal
+
+
 def mode_residuals(e: Evidence, pairs: NDArray[np.int64], modes: Modes, mixing: float) -> NDArray[np.float64]:
     """Measurement minus model of paired modes, in units of the standard uncertainty.
 
@@ -142,40 +210,23 @@ def mode_residuals(e: Evidence, pairs: NDArray[np.int64], modes: Modes, mixing: 
         Columns: frequency, damping ratio, shape (n_dofs real parts, n_dofs imaginary parts), mixing. Zero for
         modes without partner.
     """
-    batch = len(modes.omega)
+    return residuals_of(e, pairs, modes, shape_fit(e, pairs, modes, mixing))
+
+
+def residuals_of(
+    e: Evidence, pairs: NDArray[np.int64], modes: Modes, fit: ShapeFit | None
+) -> NDArray[np.float64]:
+    """`mode_residuals` where the shapes are fitted already."""
     has = np.flatnonzero(pairs >= 0)
     k = pairs[has]
     frequency = (modes.omega[:, k] / e.omega[has] - 1) / e.relative_std[has]
     damping = (modes.damping_ratio[:, k] - e.damping[has]) * e.damping_weight[has]
     columns = [frequency[..., None], damping[..., None]]
-    if e.has_shapes and has.size:
-        at_sensors = e.rows @ modes.shapes
-        weight = e.shape_weight[has]
-        b = weight[None, :, :, None] * at_sensors[:, None]
-        rhs = e.shapes[has] * weight
-        eigenvalues = modes.omega**2
-        own = np.maximum(eigenvalues[:, k], 1e-12)
-        d = np.abs(eigenvalues[:, None, :] - own[:, :, None]) / (mixing * own[:, :, None])
-        # A mode that the sensors hardly see must not buy its shape from its neighbours at the price of its own
-        # small amplitude: it would fit anything.
-        every = np.sum(np.abs(at_sensors) ** 2, axis=1)
-        least = (_FAINT**2) * np.max(every, axis=1, keepdims=True)
-        seen = np.maximum(np.maximum(every[:, k], least), 1e-30)
-        size = np.sqrt(np.sum(np.abs(e.shapes[has]) ** 2, axis=1) / seen)
-        d = d / np.maximum(size, 1e-150)[:, :, None]
-        normal = b.conj().swapaxes(-1, -2) @ b
-        diagonal = np.einsum("brii->bri", normal)
-        diagonal += d**2 + 1e-9 * diagonal.mean(axis=2, keepdims=True) + 1e-30
-        right = np.einsum("brsn,rs->brn", b.conj(), rhs, optimize=True)
-        if np.iscomplexobj(normal):
-            q = np.linalg.solve(normal, right[..., None])[..., 0]
-        else:
-            both = np.linalg.solve(normal, np.stack([right.real, right.imag], axis=-1))
-            q = both[..., 0] + 1j * both[..., 1]
-        misfit = np.einsum("brsn,brn->brs", b, q, optimize=True) - rhs
-        mixed = np.einsum("bmn,brn->brm", modes.directions, d * q, optimize=True)
+    if fit is not None:
+        misfit = (fit.weighted @ fit.amplitudes[..., None])[..., 0] - e.shapes[has] * e.shape_weight[has]
+        mixed = (fit.penalty * fit.amplitudes) @ modes.directions.swapaxes(-1, -2)
         columns += [misfit.real, misfit.imag, mixed.real, mixed.imag]
     part = np.concatenate(columns, axis=2)
-    out = np.zeros((batch, pairs.size, part.shape[2]))
+    out = np.zeros((len(modes.omega), pairs.size, part.shape[2]))
     out[:, has] = part
     return out

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
-from ema_pipeline.correlate.residuals import observable_modes
 from ema_pipeline.diagnose.hypotheses import Extra, Hypothesis, extras, make_rig, starting_points
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.library import Library
 from ema_pipeline.fit.latent import LatentObjective
 from ema_pipeline.fit.map_fit import posterior_covariance
+from ema_pipeline.fit.matrices import MatrixFamily
 from ema_pipeline.fit.settings import FitSettings
-from ema_pipeline.fit.solve import FitProblem, Optimum, descend, refine, search
+from ema_pipeline.fit.solve import FitProblem, Optimum, descend, prepare, refine, search
 from ema_pipeline.fit.space import Space
 from ema_pipeline.rigs.types import Rig
 
@@ -47,11 +47,39 @@ class Case:
     measured: Mapping[str, MeasuredModes]
     settings: DiagnoseSettings
     library: Library | None = None
+    families: dict[tuple[str, ...], dict[str, MatrixFamily]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+    """Matrices of the hypotheses' rigs, by their effects and configuration: made once."""
 
-    def problem(self, hypothesis: Hypothesis, fit: FitSettings) -> FitProblem:
-        """The fit of a hypothesis, prepared."""
+    def problem(
+        self,
+        hypothesis: Hypothesis,
+        fit: FitSettings,
+        measured: Mapping[str, MeasuredModes] | None = None,
+        loosened: Mapping[str, float] | None = None,
+    ) -> FitProblem:
+        """The fit of a hypothesis, prepared.
+
+        Parameters
+        ----------
+        hypothesis : Hypothesis
+        fit : FitSettings
+        measured : mapping of configuration to MeasuredModes, optional
+            In place of the case's own.
+        loosened : mapping of parameter to float, optional
+            By what the tolerances of some parameters are multiplied.
+        """
         rig = make_rig(self.rig, hypothesis, self.library, self.settings.parameter_range)
-        return FitProblem(rig, self.measured, fit)
+        changed = dict(rig.parameters)
+        for name, factor in (loosened or {}).items():
+            changed[name] = replace(changed[name], tolerance=changed[name].tolerance * factor)
+        key = hypothesis.effects
+        if key not in self.families:
+            self.families[key] = prepare(rig, self.measured, self.families.get(key[:-1]))
+        return FitProblem(
+            replace(rig, parameters=changed), measured or self.measured, fit, self.families[key]
+        )
 
 
 @dataclass(frozen=True)
@@ -122,6 +150,15 @@ def refit(case: Case, hypothesis: Hypothesis, fit: FitSettings, start: Mapping[s
     """Fit from one starting point."""
     problem = case.problem(hypothesis, fit)
     return judge(case, problem, hypothesis, honest(problem, settle(problem, problem.space.point(start))))
+
+
+def follow(case: Case, fitted: Fitted, fit: FitSettings) -> Fitted:
+    """The same hypothesis at another noise level; straight from its optimum unless modes are lost thereby."""
+    problem = case.problem(fitted.hypothesis, fit)
+    found = honest(problem, refine(problem, problem.space.point(fitted.values)))
+    if np.any((found.inlier < 0.5) & fitted.explained):
+        return refit(case, fitted.hypothesis, fit, fitted.values)
+    return judge(case, problem, fitted.hypothesis, found)
 
 
 @dataclass(frozen=True)
@@ -352,12 +389,11 @@ def mixing_volume(problem: FitProblem, x: NDArray[np.float64], inlier: NDArray[n
     """
     total, start = 0.0, 0
     mixing = problem.settings.mode_mixing
-    for e, pairs in zip(problem.evidence, problem.assignments(x), strict=True):
+    for e, pairs, modes in zip(problem.evidence, problem.assignments(x), problem.modes(x), strict=True):
         share = inlier[start : start + pairs.size]
         start += pairs.size
         if not e.has_shapes:
             continue
-        modes = observable_modes(e.family.at(x[None]))
         at, values = e.rows @ modes.shapes[0], modes.omega[0] ** 2
         parts = 2.0 if np.any(e.shapes.imag) else 1.0
         for r in np.flatnonzero(pairs >= 0):
@@ -378,8 +414,8 @@ def mixing_volume(problem: FitProblem, x: NDArray[np.float64], inlier: NDArray[n
 def lonely_cost(problem: FitProblem, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Squared distance of every measured frequency from the nearest model mode without partner, (R,)."""
     parts = []
-    for e, pairs in zip(problem.evidence, problem.assignments(x), strict=True):
-        omega = problem.model_omega(e, x)
+    for e, pairs, modes in zip(problem.evidence, problem.assignments(x), problem.modes(x), strict=True):
+        omega = modes.omega[0]
         free = np.ones(omega.size, dtype=bool)
         free[pairs[pairs >= 0]] = False
         free &= omega > 1.0
@@ -393,11 +429,10 @@ def lonely_cost(problem: FitProblem, x: NDArray[np.float64]) -> NDArray[np.float
 def missed_modes(problem: FitProblem, x: NDArray[np.float64]) -> int:
     """Model modes inside the band, moving sensors and struck points, that no measured mode is paired with."""
     count = 0
-    for e, pairs in zip(problem.evidence, problem.assignments(x), strict=True):
+    for e, pairs, modes in zip(problem.evidence, problem.assignments(x), problem.modes(x), strict=True):
         m = e.measured
         if m.band_hz is None or not m.dofs:
             continue
-        modes = observable_modes(e.family.at(x[None]))
         f = modes.omega[0] / (2 * np.pi)
         at = np.abs(e.rows @ modes.shapes[0])
         seen = np.sqrt(np.sum(at**2, axis=0))

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.residuals import mode_residuals, observable_modes
 from ema_pipeline.diagnose.fitting import Case, Fitted
-from ema_pipeline.diagnose.hypotheses import make_rig
 from ema_pipeline.fit.map_fit import posterior_covariance
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.solve import FitProblem, refine
@@ -51,8 +50,7 @@ def held_out(case: Case, fitted: Fitted, fit: FitSettings, folds: int) -> HeldOu
     folds : int
         Parts; modes are dealt out in turn over all configurations, so that each part spans all frequencies.
     """
-    rig = make_rig(case.rig, fitted.hypothesis, case.library, case.settings.parameter_range)
-    full = FitProblem(rig, case.measured, fit)
+    full = case.problem(fitted.hypothesis, fit)
     owners = np.concatenate([np.arange(len(e.measured)) for e in full.evidence])
     modes = np.full(owners.size, np.inf)
     parameters: dict[str, float] = {}
@@ -64,11 +62,7 @@ def held_out(case: Case, fitted: Fitted, fit: FitSettings, folds: int) -> HeldOu
         kept = _without(case, full, out)
         if not any(len(m) for m in kept.values()):
             continue
-        changed = {
-            n: replace(p, tolerance=p.tolerance * _LOOSE) if n in loose else p
-            for n, p in rig.parameters.items()
-        }
-        part = FitProblem(replace(rig, parameters=changed), kept, fit)
+        part = case.problem(fitted.hypothesis, fit, kept, dict.fromkeys(loose, _LOOSE))
         found = refine(part, part.space.point(fitted.values))
         # a model that fails has turned data into outliers: without them it would know too little to be wrong
         trusting = replace(found, inlier=np.ones_like(found.inlier))

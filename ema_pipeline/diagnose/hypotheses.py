@@ -49,6 +49,11 @@ class Hypothesis:
     def place(self) -> str:
         return self.labels[-1].partition("@")[2] if self.labels else ""
 
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Labels of the effects, parameters out of tolerance left out."""
+        return tuple(x for x in self.labels if not x.startswith(f"{OUT_OF_TOLERANCE}@"))
+
     def plus(self, label: str) -> Hypothesis:
         """With one more effect."""
         return Hypothesis((*self.labels, label))
@@ -86,8 +91,7 @@ class Extra:
 
 def make_rig(rig: Rig, hypothesis: Hypothesis, library: Library | None, span: float) -> ParametricRig:
     """The rig of a hypothesis; a parameter out of tolerance is free within a factor `span`."""
-    effects = [x for x in hypothesis.labels if not x.startswith(f"{OUT_OF_TOLERANCE}@")]
-    made = rig_with_effects(rig, effects, library)
+    made = rig_with_effects(rig, hypothesis.effects, library)
     changed = dict(made.parameters)
     for label in hypothesis.labels:
         family, _, name = label.partition("@")
@@ -158,9 +162,7 @@ def single_hypotheses(
     """
     base = base or Hypothesis()
     known = shipped_effects() if library is None else library
-    made = rig_with_effects(
-        rig, [x for x in base.labels if not x.startswith(f"{OUT_OF_TOLERANCE}@")], library
-    )
+    made = rig_with_effects(rig, base.effects, library)
     directions: list[NDArray[np.float64]] = []
     chosen: list[Hypothesis] = []
     for effect_id in sorted(known):

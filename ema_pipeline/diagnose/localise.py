@@ -20,7 +20,8 @@ from ema_pipeline.diagnose.fitting import Case
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.types import Localisation
 from ema_pipeline.fit.evidence import Dataset
-from ema_pipeline.fit.latent import LatentObjective, _ridge_jacobian
+from ema_pipeline.fit.latent import LatentObjective
+from ema_pipeline.fit.matrices import Derivatives
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.solve import FitProblem
 
@@ -83,28 +84,22 @@ def _dynamic(
     singles = [i for i, name in enumerate(rows) if "-" not in name]
     total = n + k + len(singles)
     normal, gradient = np.zeros((total, total)), np.zeros(total)
-    for e, tau in zip(objective.evidence, objective.tau, strict=True):
+    for e, solved in zip(objective.evidence, objective.solved(x), strict=True):
         if not e.has_shapes:
             continue
-        basis = modal_basis(e.family.at(x[None]))
-        d_mass, d_stiffness = e.family.derivatives(x)
+        by = e.family.derivatives(x)
         v = _vectors(e, rows)
         outer = v[:, :, None] * v[:, None, :]
         zero_k, zero_m = np.zeros_like(outer), np.zeros_like(outer[singles])
-        jacobian, residual = _ridge_jacobian(
-            e,
-            tau,
-            basis,
-            np.concatenate([d_mass, zero_k, outer[singles]]),
-            np.concatenate([d_stiffness, outer, zero_m]),
+        elements = Derivatives(
+            np.concatenate([by.mass, zero_k, outer[singles]]),
+            np.concatenate([by.stiffness, outer, zero_m]),
+            np.zeros(total),
         )
         # Far modes are held at a bounded weight: one wild mode must not say all.
-        size = np.sum(np.abs(residual) ** 2, axis=1)
-        weight = 1 / (1 + size / e.counts)
-        flat = jacobian.reshape(total, -1)
-        scaled = (jacobian * weight[None, :, None]).reshape(total, -1)
-        normal += (scaled @ flat.conj().T).real
-        gradient += (scaled.conj() @ residual.ravel()).real
+        part, slope = solved.terms(e, elements, 1 / (1 + solved.costs / e.counts))
+        normal += part
+        gradient += slope
     normal[:n, :n] += np.diag(prior + 1e-9)
     gradient[:n] += prior * x
     inner = np.linalg.solve(normal[:n, :n], np.column_stack([gradient[:n], normal[:n, n:]]))

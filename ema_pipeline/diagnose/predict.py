@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.fitting import Case, Fitted
 from ema_pipeline.diagnose.heldout import subset
-from ema_pipeline.diagnose.hypotheses import make_rig
 from ema_pipeline.diagnose.types import HeldOutMode
 from ema_pipeline.fit.map_fit import posterior_covariance
 from ema_pipeline.fit.settings import FitSettings
@@ -31,8 +30,7 @@ def predict_left_out(case: Case, fitted: Fitted, fit: FitSettings) -> tuple[Held
         The model, at its optimum.
     fit : FitSettings
     """
-    rig = make_rig(case.rig, fitted.hypothesis, case.library, case.settings.parameter_range)
-    full = FitProblem(rig, case.measured, fit)
+    full = case.problem(fitted.hypothesis, fit)
     total = sum(len(e.measured) for e in full.evidence)
     folds = total if total <= _ONE_BY_ONE else case.settings.folds
     number = np.arange(total) % folds
@@ -45,7 +43,7 @@ def predict_left_out(case: Case, fitted: Fitted, fit: FitSettings) -> tuple[Held
             start += len(m)
         if not any(len(m) for m in kept.values()):
             continue
-        part = FitProblem(rig, kept, fit)
+        part = case.problem(fitted.hypothesis, fit, kept)
         optimum = refine(part, part.space.point(fitted.values))
         # what a failing model has turned into outliers speaks as well
         trusting = replace(optimum, inlier=np.ones_like(optimum.inlier))

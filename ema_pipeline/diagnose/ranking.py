@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, ground, refit
+from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, follow, ground, refit
 from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, prior_probabilities
 from ema_pipeline.diagnose.pool import spread
 from ema_pipeline.fit.settings import FitSettings
@@ -81,10 +81,10 @@ def sharpen(case: Case, ranking: Ranking, base: Fitted, fit: FitSettings, tell: 
     ordered = ranking.ordered()
     racing = {f.hypothesis.label for f in ordered[:_RACING]}
     racing |= {f.hypothesis.label for f in ordered if f.evidence < best + _OUT_OF_RACE}
-    starts = {f.hypothesis.label: f.values for f in ranking.fitted}
+    found = {f.hypothesis.label: f for f in ranking.fitted}
 
     def one(h: Hypothesis) -> Fitted:
-        return refit(case, h, fit, starts[h.label])
+        return follow(case, found[h.label], fit)
 
     sharp = _ranked(
         case, base, [f.hypothesis for f in ranking.fitted if f.hypothesis.label in racing], one, fit, tell

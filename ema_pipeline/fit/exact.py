@@ -7,10 +7,25 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.correlate.residuals import mode_residuals, observable_modes
+from ema_pipeline.correlate.residuals import (
+    Basis,
+    Modes,
+    ShapeFit,
+    mode_residuals,
+    observable_modes,
+    residuals_of,
+    shape_fit,
+    visibility,
+)
 from ema_pipeline.fit.evidence import Dataset
+from ema_pipeline.fit.latent import eigenvalue_slopes, projected_terms
+from ema_pipeline.fit.matrices import Derivatives
+from ema_pipeline.fit.remembered import Remembered
 
 _STEP = 1e-4
+_EQUAL = 1e-5
+
+Terms = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class ExactObjective:
@@ -23,15 +38,23 @@ class ExactObjective:
         Per configuration the model mode of each measured mode, -1 where it has none.
     mixing : float
         See `ema_pipeline.correlate.residuals`.
+    alone : float
+        Cost of a mode without partner.
     """
 
     def __init__(
-        self, evidence: Sequence[Dataset], pairs: Sequence[NDArray[np.int64]], mixing: float
+        self,
+        evidence: Sequence[Dataset],
+        pairs: Sequence[NDArray[np.int64]],
+        mixing: float,
+        alone: float = np.inf,
     ) -> None:
         self.evidence = evidence
         self.pairs = pairs
         self.mixing = mixing
+        self.alone = alone
         self.paired = np.concatenate([p >= 0 for p in pairs])
+        self._solved = Remembered(self._solve)
 
     def residuals(self, x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """Residuals in units of the standard uncertainty, per configuration (B, R, m), at points (B, P).
@@ -44,44 +67,108 @@ class ExactObjective:
             for e, p in zip(self.evidence, self.pairs, strict=True)
         ]
 
-    def costs(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Cost of every measured mode at one point, (R,); infinite where the mode has no partner."""
-        squares = np.concatenate([np.sum(r[0] ** 2, axis=1) for r in self.residuals(x[None])])
-        return np.where(self.paired, squares, np.inf)
-
-    def normal_equations(
-        self, x: NDArray[np.float64], weight: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """JᵀJ, (P, P), and Jᵀr, (P,), with `weight` (R,) on each mode; Jacobian by forward differences.
-
-        A step of 1e-4 tolerances leaves an error of about 1e-6 of the Jacobian, at half the price of central ones.
-        """
-        count = x.size
-        points = np.vstack([x[None], x + _STEP * np.eye(count)])
-        normal, gradient = np.zeros((count, count)), np.zeros(count)
-        start = 0
-        for r in self.residuals(points):
-            w = np.sqrt(weight[start : start + r.shape[1]])[None, :, None]
-            start += r.shape[1]
-            weighted = (r * w).reshape(len(points), -1)
-            jacobian = (weighted[1:] - weighted[0]) / _STEP
-            normal += jacobian @ jacobian.T
-            gradient += jacobian @ weighted[0]
-        return normal, gradient
-
-
-class PairedOnly:
-    """The same residuals where modes without partner cost nothing: for a plain least-squares step."""
-
-    def __init__(self, inner: ExactObjective) -> None:
-        self.inner = inner
+    def _solve(self, x: NDArray[np.float64]) -> list[tuple[Modes, ShapeFit | None]]:
+        found = []
+        for e, pairs in zip(self.evidence, self.pairs, strict=True):
+            modes = observable_modes(e.family.at(x[None]))
+            found.append((modes, shape_fit(e, pairs, modes, self.mixing)))
+        return found
 
     def costs(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Cost of every measured mode at one point, (R,)."""
-        return np.where(self.inner.paired, self.inner.costs(x), 0.0)
+        squares = [
+            np.sum(residuals_of(e, p, modes, fit)[0] ** 2, axis=1)
+            for e, p, (modes, fit) in zip(self.evidence, self.pairs, self._solved(x), strict=True)
+        ]
+        return np.where(self.paired, np.concatenate(squares), self.alone)
 
-    def normal_equations(
-        self, x: NDArray[np.float64], weight: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """See `ExactObjective.normal_equations`."""
-        return self.inner.normal_equations(x, weight)
+    def normal_equations(self, x: NDArray[np.float64], weight: NDArray[np.float64]) -> Terms:
+        """JᵀJ, (P, P), and Jᵀr, (P,), with `weight` (R,) on each mode."""
+        normal, gradient = np.zeros((x.size, x.size)), np.zeros(x.size)
+        start = 0
+        for e, pairs, (modes, fit) in zip(self.evidence, self.pairs, self._solved(x), strict=True):
+            w = weight[start : start + pairs.size]
+            start += pairs.size
+            if e.family.damped:
+                part, slope = _damped_terms(e, pairs, self.mixing, x, w)
+            else:
+                part, slope = _undamped_terms(e, pairs, modes, fit, e.family.derivatives(x), w)
+            normal += part
+            gradient += slope
+        return normal, gradient
+
+
+def _damped_terms(
+    e: Dataset, pairs: NDArray[np.int64], mixing: float, x: NDArray[np.float64], weight: NDArray[np.float64]
+) -> Terms:
+    """By forward differences.
+
+    A step of 1e-4 tolerances leaves an error of about 1e-6 of the Jacobian, at half the price of central ones.
+    """
+    points = np.vstack([x[None], x + _STEP * np.eye(x.size)])
+    residuals = mode_residuals(e, pairs, observable_modes(e.family.at(points)), mixing)
+    weighted = (residuals * np.sqrt(weight)[None, :, None]).reshape(len(points), -1)
+    jacobian = (weighted[1:] - weighted[0]) / _STEP
+    return jacobian @ jacobian.T, jacobian @ weighted[0]
+
+
+def _undamped_terms(
+    e: Dataset,
+    pairs: NDArray[np.int64],
+    modes: Modes,
+    fit: ShapeFit | None,
+    by: Derivatives,
+    weight: NDArray[np.float64],
+) -> Terms:
+    """By the derivatives of eigenvalues, in the modal coordinates of the point.
+
+    The mixing residual is (K - λ_k M)u/(mixing·λ_k·size) in mass-scaled coordinates, u the fitted shape: it needs no
+    derivatives of single modes, which for modes that nearly coincide do not exist.
+    """
+    has = np.flatnonzero(pairs >= 0)
+    k, w = pairs[has], weight[has]
+    basis = Basis(modes.omega**2, modes.shapes.real, modes.directions.real)
+    own = np.maximum(basis.eigenvalues[0, k], 1e-12)
+    phi = basis.shapes[0]
+    stiffness, mass = phi.T @ by.stiffness @ phi, phi.T @ by.mass @ phi
+    slopes = eigenvalue_slopes(basis, by)[:, k]
+
+    frequency = slopes / (2 * np.sqrt(own) * e.omega[has] * e.relative_std[has])
+    frequency_residual = (np.sqrt(own) / e.omega[has] - 1) / e.relative_std[has]
+    damping = by.modal_damping_ratio[:, None] * e.damping_weight[has]
+    damping_residual = (modes.damping_ratio[0, k] - e.damping[has]) * e.damping_weight[has]
+    normal = (frequency * w) @ frequency.T + (damping * w) @ damping.T
+    gradient = frequency @ (w * frequency_residual) + damping @ (w * damping_residual)
+    if fit is None:
+        return normal, gradient
+
+    mixed, change = fit.penalty[0] * fit.amplitudes[0], fit.price[0][:, None] * fit.amplitudes[0]
+    relative = _amplitude_slopes(e.rows @ phi, basis.eigenvalues[0], k, stiffness, mass) - slopes / own
+    moved = change @ stiffness - (change * own[:, None] + 0.5 * mixed) @ mass
+    moved += relative[:, :, None] * mixed - slopes[:, :, None] * change
+    part, slope = projected_terms(moved, mixed, fit.penalty[0], fit.normal[0], w)
+    return normal + part, gradient + slope
+
+
+def _amplitude_slopes(
+    at_sensors: NDArray[np.float64],
+    eigenvalues: NDArray[np.float64],
+    k: NDArray[np.int64],
+    stiffness: NDArray[np.float64],
+    mass: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Derivatives of the logarithm of the motion of modes `k` at the sensors, (P, R).
+
+    Modes that coincide turn into each other at no price; they are left out. A mode whose motion is below the
+    least that counts has 0.
+    """
+    own = eigenvalues[k]
+    gap = own[:, None] - eigenvalues[None, :]
+    inverse = gap / (gap**2 + (_EQUAL * own[:, None]) ** 2 + 1e-300)
+    coupling = stiffness[:, k, :] - own[:, None] * mass[:, k, :]
+    gram = (at_sensors.T @ at_sensors)[k]
+    change = np.sum(coupling * inverse * gram, axis=2)
+    size = gram[np.arange(k.size), k]
+    own_mass = 0.5 * mass[:, k, k] * size
+    faint = size < visibility(at_sensors)[k]
+    return np.asarray(np.where(faint, 0.0, (change - own_mass) / np.where(faint, 1.0, size)))

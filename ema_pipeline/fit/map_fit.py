@@ -245,8 +245,8 @@ def _not_measured(p: Parameter) -> ParameterEstimate:
 
 def _paired_frequency_error(problem: FitProblem, x: NDArray[np.float64]) -> float:
     total = 0.0
-    for e, pairs in zip(problem.evidence, problem.assignments(x), strict=True):
-        omega = problem.model_omega(e, x)
+    for e, pairs, modes in zip(problem.evidence, problem.assignments(x), problem.modes(x), strict=True):
+        omega = modes.omega[0]
         has = pairs >= 0
         total += float(np.sum((e.omega[has] / omega[pairs[has]] - 1) ** 2))
     return total

@@ -1,13 +1,15 @@
 """System matrices as polynomials of the parameters, so that thousands of systems are one matrix product.
 
-Masses, springs and dampers enter the matrices linearly, a stiffness loss as a product of two parameters.
-Where
-that is so (it is checked, not assumed) the matrices are a + Σ b_i v_i + Σ c_ij v_i v_j; where it is not, the
-rig
+Masses, springs and dampers enter the matrices linearly, a stiffness loss as a product of two parameters. Where
+that is so (it is checked, not assumed) the matrices are a + Σ b_i v_i + Σ c_ij v_i v_j; where it is not, the rig
 builds every system itself.
 """
 
 from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +20,16 @@ from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.rigs.types import Rig
 
 _EXACT = 1e-9
+_STEP = 1e-4
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """By the coordinates at one point: mass, stiffness (P, n, n) and the modal damping ratio (P,)."""
+
+    mass: NDArray[np.float64]
+    stiffness: NDArray[np.float64]
+    modal_damping_ratio: NDArray[np.float64]
 
 
 class MatrixFamily:
@@ -27,12 +39,34 @@ class MatrixFamily:
     ----------
     rig, configuration
     space : Space
+    poorer : MatrixFamily, optional
+        Of a rig that has fewer parameters at the same nominal values: what it knows is not found out again.
+
+    Attributes
+    ----------
+    coefficients : ndarray, (1 + P + pairs, 4n² + 1)
+        Matrices at `origin`, their slopes by the values of the parameters, and products of the `pairs`.
+    interacting : ndarray of bool, (P,)
+        Parameters whose slope is not the same everywhere.
+    polynomial : bool
+        Whether the coefficients say it all.
+    relevant : ndarray of bool, (P,)
+        Parameters that this configuration depends on.
+    damped : bool
+        Whether there are dampers or loss factors.
     """
 
-    def __init__(self, rig: Rig, configuration: str, space: Space) -> None:
+    coefficients: NDArray[np.float64]
+    pairs: NDArray[np.int64]
+    interacting: NDArray[np.bool_]
+    polynomial: bool
+
+    def __init__(
+        self, rig: Rig, configuration: str, space: Space, poorer: MatrixFamily | None = None
+    ) -> None:
         self.configuration = configuration
         self.space = space
-        self._build = lambda v: _flat(rig.system(configuration, dict(zip(space.names, v, strict=True))))
+        self._rig = rig
         self.system = rig.system(configuration, space.named(space.point()))
         self.size = len(self.system.dofs)
         self.origin = space.values(space.point())
@@ -42,40 +76,101 @@ class MatrixFamily:
                 for c, v in zip(space.coordinates, self.origin, strict=True)
             ]
         )
-        self._fit_polynomial(steps)
+        if poorer is None or not poorer.polynomial or poorer.system.dofs != self.system.dofs:
+            self._probe(steps)
+        else:
+            self._extend(poorer, steps)
         self.relevant = self._relevant(steps)
-        point = self.origin + 0.3 * steps
         n2 = self.size**2
-        self.damped = bool(np.any(self._build(point)[2 * n2 : 4 * n2]))
+        self.damped = bool(np.any(self._build(self.origin + 0.3 * steps)[2 * n2 : 4 * n2]))
 
-    def _fit_polynomial(self, steps: NDArray[np.float64]) -> None:
-        count = len(steps)
-        base = self._build(self.origin)
-        slopes = np.array(
-            [(self._build(_moved(self.origin, i, steps)) - base) / steps[i] for i in range(count)]
+    def over(self, space: Space) -> MatrixFamily:
+        """The same matrices over other coordinates of the same parameters, or of some of them.
+
+        Parameters that `space` leaves out stay at their nominal values.
+        """
+        kept = np.array([self.space.names.index(n) for n in space.names], dtype=int)
+        place = {int(k): i for i, k in enumerate(kept)}
+        inside = [i for i, (a, b) in enumerate(self.pairs) if int(a) in place and int(b) in place]
+        products = 1 + len(self.space.names) + np.array(inside, dtype=int)
+        other = copy(self)
+        other.space = space
+        other.origin = self.origin[kept]
+        other.relevant = self.relevant[kept]
+        other.interacting = self.interacting[kept]
+        other.coefficients = self.coefficients[np.concatenate([[0], 1 + kept, products])]
+        other.pairs = np.array([[place[int(v)] for v in self.pairs[i]] for i in inside], dtype=int).reshape(
+            -1, 2
         )
-        slopes = slopes.reshape(count, base.size)
-        other = self.origin + 0.37 * steps
-        other_base = self._build(other)
-        scale = np.maximum(np.abs(base), np.abs(other_base)).max(initial=1.0)
-        interacting = []
-        for i in range(count):
-            slope = (self._build(_moved(other, i, steps)) - other_base) / steps[i]
-            if np.max(np.abs(slope - slopes[i]) * abs(steps[i]), initial=0.0) > _EXACT * scale:
-                interacting.append(i)
+        return other
+
+    def _build(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        named = dict(zip(self.space.names, values.tolist(), strict=True))
+        return _flat(self._rig.system(self.configuration, named))
+
+    def _probe(self, steps: NDArray[np.float64]) -> None:
+        """Find slopes, and products by slopes that change from one point to another."""
+        slopes = self._slopes(self.origin, steps)
+        elsewhere = self._slopes(self.origin + 0.37 * steps, steps)
+        self.interacting = self._differ(slopes, elsewhere, steps)
+        self._add_products(slopes, steps)
+
+    def _extend(self, poorer: MatrixFamily, steps: NDArray[np.float64]) -> None:
+        """Take over what a poorer model knows; look closer only where the new parameters change it."""
+        names, count = list(self.space.names), len(steps)
+        old = np.array([names.index(n) for n in poorer.space.names], dtype=int)
+        new = np.setdiff1d(np.arange(count), old)
+        slopes = np.zeros((count, poorer.coefficients.shape[1]))
+        slopes[old] = poorer.coefficients[1 : 1 + old.size]
+        slopes[new] = self._slopes(self.origin, steps, new)
+        self.interacting = np.zeros(count, dtype=bool)
+        self.interacting[old] = poorer.interacting
+        self.pairs = old[poorer.pairs]
+        base = self._build(self.origin)
+        self.coefficients = np.vstack([base[None], slopes, poorer.coefficients[1 + old.size :]])
+        self.polynomial = self._holds(steps)
+        if not self.polynomial:
+            probed = self._slopes(self.origin, steps)
+            self.interacting |= self._differ(probed, slopes, steps)
+            self.interacting[new] = True
+            self._add_products(probed, steps)
+
+    def _slopes(
+        self, origin: NDArray[np.float64], steps: NDArray[np.float64], which: NDArray[np.int64] | None = None
+    ) -> NDArray[np.float64]:
+        base = self._build(origin)
+        chosen = range(len(steps)) if which is None else which
+        found = [(self._build(_moved(origin, i, steps)) - base) / steps[i] for i in chosen]
+        return np.array(found).reshape(len(found), base.size)
+
+    def _differ(
+        self, a: NDArray[np.float64], b: NDArray[np.float64], steps: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        change = np.max(np.abs(a - b), axis=1, initial=0.0) * np.abs(steps)
+        return np.asarray(change > _EXACT * self._size())
+
+    def _size(self) -> float:
+        return float(np.max(np.abs(self._build(self.origin)), initial=1.0))
+
+    def _add_products(self, slopes: NDArray[np.float64], steps: NDArray[np.float64]) -> None:
+        base, size = self._build(self.origin), self._size()
         pairs, products = [], []
-        for a, i in enumerate(interacting):
-            for j in interacting[a + 1 :]:
-                both = self._build(_moved(_moved(self.origin, i, steps), j, steps))
-                term = (both - base - slopes[i] * steps[i] - slopes[j] * steps[j]) / (steps[i] * steps[j])
-                if np.max(np.abs(term)) * abs(steps[i] * steps[j]) > _EXACT * scale:
-                    pairs.append((i, j))
-                    products.append(term)
+        for i, j in combinations(np.flatnonzero(self.interacting).tolist(), 2):
+            both = self._build(_moved(_moved(self.origin, i, steps), j, steps))
+            term = (both - base - slopes[i] * steps[i] - slopes[j] * steps[j]) / (steps[i] * steps[j])
+            if np.max(np.abs(term)) * abs(steps[i] * steps[j]) > _EXACT * size:
+                pairs.append((i, j))
+                products.append(term)
         self.pairs = np.array(pairs, dtype=int).reshape(-1, 2)
         self.coefficients = np.vstack([base[None], slopes, np.reshape(products, (-1, base.size))])
-        checks = [self.origin + 0.61 * steps * np.cos(np.arange(count) + s) ** 2 for s in (0.0, 1.0)]
-        self.polynomial = all(
-            np.max(np.abs(self._polynomial(v[None])[0] - self._build(v))) <= 1e3 * _EXACT * scale
+        self.polynomial = self._holds(steps)
+
+    def _holds(self, steps: NDArray[np.float64]) -> bool:
+        """Is the polynomial what the rig builds, at points that it was not made from?"""
+        count = np.arange(len(steps))
+        checks = [self.origin + 0.61 * steps * np.cos(count + s) ** 2 for s in (0.0, 1.0)]
+        return all(
+            np.max(np.abs(self._polynomial(v[None])[0] - self._build(v))) <= 1e3 * _EXACT * self._size()
             for v in checks
         )
 
@@ -100,24 +195,26 @@ class MatrixFamily:
         blocks = flat[:, : 4 * n * n].reshape(len(x), 4, n, n)
         return Matrices(blocks[:, 0], blocks[:, 1], blocks[:, 2], blocks[:, 3], flat[:, -1], self.damped)
 
-    def derivatives(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """d mass/d x and d stiffness/d x at one point, each (n_parameters, n, n)."""
+    def derivatives(self, x: NDArray[np.float64]) -> Derivatives:
+        """Derivatives by the coordinates at one point, (P,)."""
         values, slopes = self.space.values(x), self.space.slopes(x)
-        n = self.size
+        by_value = self.coefficients[1 : 1 + len(x)].copy()
         if self.polynomial:
-            by_value = self.coefficients[1 : 1 + len(x)].copy()
             d = values - self.origin
             for (i, j), product in zip(self.pairs, self.coefficients[1 + len(x) :], strict=True):
                 by_value[i] += d[j] * product
                 by_value[j] += d[i] * product
         else:
-            h = 1e-4 * np.where(self.space.high - self.space.low < 1, 0.1, 1.0)
-            h = np.where(x + h > self.space.high, -h, h)
+            # The slopes by parameters that do not interact are the same everywhere.
+            h = np.where(x + _STEP > self.space.high, -_STEP, _STEP)
             base = self._build(values)
-            moved = [self._build(self.space.values(x + h[i] * np.eye(len(x))[i])) for i in range(len(x))]
-            by_value = np.array([(m - base) / (h[i] * slopes[i]) for i, m in enumerate(moved)])
-        by_x = (by_value * slopes[:, None])[:, : 2 * n * n].reshape(len(x), 2, n, n)
-        return by_x[:, 0], by_x[:, 1]
+            for i in np.flatnonzero(self.interacting):
+                there = self._build(self.space.values(x + np.where(np.arange(len(x)) == i, h, 0.0)))
+                by_value[i] = (there - base) / (h[i] * slopes[i])
+        n = self.size
+        by_x = by_value * slopes[:, None]
+        blocks = by_x[:, : 2 * n * n].reshape(len(x), 2, n, n)
+        return Derivatives(blocks[:, 0], blocks[:, 1], by_x[:, -1])
 
 
 def _flat(system: LinearSystem) -> NDArray[np.float64]:

@@ -1,7 +1,6 @@
 """The search for the most probable parameters: annealed latent shapes first, paired eigen-residuals last.
 
-The posterior is a product over measured modes of a mixture (a mode of the rig, or an outlier) and of the
-Gaussian
+The posterior is a product over measured modes of a mixture (a mode of the rig, or an outlier) and of the Gaussian
 priors that the tolerances state; free parameters have no prior but their bounds.
 """
 
@@ -16,12 +15,13 @@ from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.pairing import assign, close_groups, shape_agreement
-from ema_pipeline.correlate.residuals import observable_modes
+from ema_pipeline.correlate.residuals import Modes, observable_modes
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.fit.evidence import Dataset, dataset
-from ema_pipeline.fit.exact import ExactObjective, PairedOnly
+from ema_pipeline.fit.exact import ExactObjective
 from ema_pipeline.fit.latent import LatentObjective
 from ema_pipeline.fit.matrices import MatrixFamily
+from ema_pipeline.fit.remembered import Remembered
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.space import Space, make_space
 from ema_pipeline.rigs.types import Rig
@@ -100,6 +100,8 @@ class FitProblem:
     rig : Rig
     measured : mapping of configuration to MeasuredModes
     settings : FitSettings
+    families : mapping of configuration to MatrixFamily, optional
+        Matrices prepared before for a rig that differs from this one in tolerances and bounds only.
 
     Raises
     ------
@@ -107,39 +109,36 @@ class FitProblem:
         If there are no modes, or a configuration or DOF is unknown to the rig.
     """
 
-    def __init__(self, rig: Rig, measured: Mapping[str, MeasuredModes], settings: FitSettings) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        measured: Mapping[str, MeasuredModes],
+        settings: FitSettings,
+        families: Mapping[str, MatrixFamily] | None = None,
+    ) -> None:
         self.rig = rig
         self.settings = settings
         used = {c: m for c, m in measured.items() if len(m)}
         if not used:
             raise EmaError("no measured modes to fit: identify modes first, or widen the analysed band")
-        for c, m in used.items():
-            if c not in rig.configurations:
-                raise EmaError(
-                    f"rig '{rig.name}' has no configuration '{c}'{did_you_mean(c, rig.configurations)}"
-                )
-            for dof in m.dofs:
-                if not rig.knows(c, dof):
-                    raise EmaError(
-                        f"{c}: rig '{rig.name}' has no dof '{dof.point}'; correct 'dof' in test.toml"
-                    )
         everything = make_space(list(rig.parameters.values()))
-        families = {c: MatrixFamily(rig, c, everything) for c in used}
-        relevant = np.any([f.relevant for f in families.values()], axis=0)
+        known = families or prepare(rig, used)
+        over = {c: known[c].over(everything) for c in used}
+        relevant = np.any([f.relevant for f in over.values()], axis=0)
         if not any(np.any(np.isfinite(m.damping_ratio)) for m in used.values()) or not settings.damping:
             # Nothing speaks about damping: such parameters stay at their nominal values.
-            relevant &= np.any([_undamped_relevance(f) for f in families.values()], axis=0)
+            relevant &= np.any([_undamped_relevance(f) for f in over.values()], axis=0)
         self.space = Space(tuple(c for c, r in zip(everything.coordinates, relevant, strict=True) if r))
         self.irrelevant = tuple(
             c.parameter for c, r in zip(everything.coordinates, relevant, strict=True) if not r
         )
         self.evidence: list[Dataset] = [
-            dataset(m, families[c] if np.all(relevant) else MatrixFamily(rig, c, self.space), settings)
-            for c, m in used.items()
+            dataset(m, over[c].over(self.space), settings) for c, m in used.items()
         ]
         undamped = np.any([_undamped_relevance(e.family) for e in self.evidence], axis=0)
         self.damping_only = ~np.asarray(undamped, dtype=bool)
         self.counts = np.concatenate([e.counts for e in self.evidence])
+        self._paired = Remembered(self._pair)
 
     def mixture(self, scale: float = 1.0) -> Mixture:
         """Robust cost with all standard uncertainties multiplied by `scale`."""
@@ -148,15 +147,58 @@ class FitProblem:
 
     def assignments(self, x: NDArray[np.float64]) -> list[NDArray[np.int64]]:
         """Model mode of each measured mode at a point, -1 where none, per configuration."""
-        return [_assignment(e, x, self.settings) for e in self.evidence]
+        return self._paired(x)[1]
+
+    def modes(self, x: NDArray[np.float64]) -> list[Modes]:
+        """Modes of the model at a point, per configuration."""
+        return self._paired(x)[0]
 
     def model_omega(self, e: Dataset, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Frequencies of the model of one configuration at a point, rad/s, (n,)."""
         return np.asarray(observable_modes(e.family.at(x[None])).omega[0])
 
-    def exact(self, pairs: Sequence[NDArray[np.int64]]) -> ExactObjective:
-        """Eigen-residual objective with fixed pairs."""
-        return ExactObjective(self.evidence, pairs, self.settings.mode_mixing)
+    def _pair(self, x: NDArray[np.float64]) -> tuple[list[Modes], list[NDArray[np.int64]]]:
+        modes = [observable_modes(e.family.at(x[None])) for e in self.evidence]
+        pairs = [_assignment(e, m, self.settings) for e, m in zip(self.evidence, modes, strict=True)]
+        return modes, pairs
+
+    def exact(self, pairs: Sequence[NDArray[np.int64]], alone: float = np.inf) -> ExactObjective:
+        """Eigen-residual objective with fixed pairs; `alone` is the cost of a mode without partner."""
+        return ExactObjective(self.evidence, pairs, self.settings.mode_mixing, alone)
+
+
+def prepare(
+    rig: Rig, measured: Mapping[str, MeasuredModes], poorer: Mapping[str, MatrixFamily] | None = None
+) -> dict[str, MatrixFamily]:
+    """Matrix families of all configurations that have modes.
+
+    Parameters
+    ----------
+    rig : Rig
+    measured : mapping of configuration to MeasuredModes
+    poorer : mapping of configuration to MatrixFamily, optional
+        Of a rig with fewer parameters: saves most of the work.
+
+    Raises
+    ------
+    EmaError
+        If a configuration or DOF is unknown to the rig.
+    """
+    space = make_space(list(rig.parameters.values()))
+    made = {}
+    for c, m in measured.items():
+        if not len(m):
+            continue
+        if c not in rig.configurations:
+            raise EmaError(
+                f"rig '{rig.name}' has no configuration '{c}'{did_you_mean(c, rig.configurations)}"
+            )
+        assembly = rig.assembly(c)
+        for dof in m.dofs:
+            if not assembly.has_dof(dof.point):
+                raise EmaError(f"{c}: rig '{rig.name}' has no dof '{dof.point}'; correct 'dof' in test.toml")
+        made[c] = MatrixFamily(rig, c, space, (poorer or {}).get(c))
+    return made
 
 
 def descend(
@@ -248,7 +290,7 @@ def refine(problem: FitProblem, start: NDArray[np.float64], scale: float = 1.0) 
             # The latent shapes say nothing of damping: far from it every mode would look like an outlier.
             held = ~problem.damping_only
             trusting = replace(mixture, outlier_cost=np.full_like(mixture.outlier_cost, np.inf))
-            matched = PairedOnly(problem.exact(pairs))
+            matched = problem.exact(pairs, alone=0.0)
             x = descend(matched, problem.space, x, trusting, 6, held).x
         found = descend(
             problem.exact(pairs), problem.space, x, mixture, problem.settings.iterations, None,
@@ -268,8 +310,7 @@ def search(
 ) -> Optimum:
     """Most probable parameters over a grid of starts of the free parameters.
 
-    The whole annealing from the nominal values finds the optimum nearly always. It leans towards soft free
-    springs
+    The whole annealing from the nominal values finds the optimum nearly always. It leans towards soft free springs
     (a loose dynamic residual prefers them), so every point of the grid also competes further down the ladder,
     and
     the best of these are followed to its end. With `start` given (the fit of a poorer model, say) that point
@@ -310,8 +351,7 @@ def _distinct(points: list[NDArray[np.float64]], count: int) -> list[NDArray[np.
     return out
 
 
-def _assignment(e: Dataset, x: NDArray[np.float64], settings: FitSettings) -> NDArray[np.int64]:
-    modes = observable_modes(e.family.at(x[None]))
+def _assignment(e: Dataset, modes: Modes, settings: FitSettings) -> NDArray[np.int64]:
     omega, shapes = modes.omega[0], (e.rows @ modes.shapes[0]).T
     model_hz = omega / (2 * np.pi)
     groups = close_groups(model_hz, settings.pairing.group_width)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import Literal
 
@@ -67,33 +68,45 @@ class Space:
 
     coordinates: tuple[Coordinate, ...]
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         return tuple(c.parameter.name for c in self.coordinates)
 
-    @property
+    @cached_property
     def low(self) -> NDArray[np.float64]:
         return np.array([c.low for c in self.coordinates])
 
-    @property
+    @cached_property
     def high(self) -> NDArray[np.float64]:
         return np.array([c.high for c in self.coordinates])
 
-    @property
+    @cached_property
     def has_prior(self) -> NDArray[np.bool_]:
         return np.array([c.kind == "prior" for c in self.coordinates], dtype=bool)
 
+    @cached_property
+    def _logarithmic(self) -> NDArray[np.int64]:
+        return np.array([i for i, c in enumerate(self.coordinates) if c.kind == "log"], dtype=np.int64)
+
+    @cached_property
+    def _scale(self) -> NDArray[np.float64]:
+        return np.array([c.scale for c in self.coordinates])
+
+    @cached_property
+    def _origin(self) -> NDArray[np.float64]:
+        return np.array([c.parameter.value if c.kind == "prior" else 0.0 for c in self.coordinates])
+
     def values(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Parameter values at points x, (..., n)."""
-        out = np.empty(x.shape)
-        for i, c in enumerate(self.coordinates):
-            origin = c.parameter.value if c.kind == "prior" else 0.0
-            out[..., i] = np.exp(x[..., i]) if c.kind == "log" else origin + c.scale * x[..., i]
-        return out
+        out = self._origin + self._scale * x
+        out[..., self._logarithmic] = np.exp(x[..., self._logarithmic])
+        return np.asarray(out)
 
     def slopes(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """d value / d x at a point, (n,)."""
-        return np.array([c.slope(float(v)) for c, v in zip(self.coordinates, x, strict=True)])
+        out = self._scale.copy()
+        out[self._logarithmic] = np.exp(x[self._logarithmic])
+        return np.asarray(out)
 
     def point(self, values: Mapping[str, float] | None = None) -> NDArray[np.float64]:
         """Coordinates at named values; nominal where left out."""
@@ -113,9 +126,8 @@ class Space:
         linear in a stiffness, so that this lands at once where steps of the logarithm would creep.
         """
         out = x + step
-        for i, c in enumerate(self.coordinates):
-            if c.kind == "log":
-                out[i] = x[i] + np.log(np.clip(1 + step[i], 0.02, 50.0))
+        log = self._logarithmic
+        out[log] = x[log] + np.log(np.clip(1 + step[log], 0.02, 50.0))
         return np.clip(out, self.low, self.high)
 
     def starts(self, per_decade: int, most: int = 64) -> NDArray[np.float64]:
