@@ -65,6 +65,11 @@ class Nonlinear:
         """Deviation of the force from its tangent after a straight path from `before` to `stretch`, m."""
         raise NotImplementedError
 
+    @property
+    def law(self) -> tuple[int, float, float, float] | None:
+        """Which of `LAWS` gives the force, and its three numbers; None for an element with a law of its own."""
+        return None
+
     def settled(self, path: Sequence[float], time_step: float) -> float:
         """State at the end of a period, `path`, that has been run through for ever."""
         return self.start
@@ -85,6 +90,40 @@ class Nonlinear:
         return np.array(result)
 
 
+Law = tuple[float, float, float]
+"""Deviation of the force, N, and its derivatives by stretch and by rate."""
+
+
+def polynomial(stretch: float, rate: float, quadratic: float, cubic: float, unused: float) -> Law:
+    """Force of a `PolynomialSpring`."""
+    force = (quadratic + cubic * stretch) * stretch * stretch
+    return force, (2 * quadratic + 3 * cubic * stretch) * stretch, 0.0
+
+
+def friction(stretch: float, rate: float, limit: float, velocity: float, unused: float) -> Law:
+    """Force of `DryFriction`."""
+    x = rate / velocity
+    slope = 0.0 if abs(x) > 300 else limit / (velocity * cosh(x) ** 2)
+    return limit * tanh(x), 0.0, slope
+
+
+def parting(stretch: float, rate: float, k: float, preload: float, gap: float) -> Law:
+    """Deviation of a `PartingSpring` from its stiffness in contact."""
+    if preload == inf:
+        return 0.0, 0.0, 0.0
+    contact = stretch + preload
+    rest = 0.0 if preload > 0 else -k * preload  # the tangent's force is counted from contact
+    if contact >= 0:
+        return -rest, 0.0, 0.0
+    if contact >= -gap:
+        return -k * contact - rest, -k, 0.0
+    return k * gap - rest, 0.0, 0.0
+
+
+LAWS = (polynomial, friction, parting)
+"""Laws without memory, which `mechanics.batch` compiles."""
+
+
 @dataclass(frozen=True)
 class PolynomialSpring(Nonlinear):
     """Force quadratic·δ² + cubic·δ³; N/m², N/m³. The linear term is a `Spring` beside it."""
@@ -94,10 +133,14 @@ class PolynomialSpring(Nonlinear):
     quadratic: float = 0.0
     cubic: float = 0.0
 
+    @property
+    def law(self) -> tuple[int, float, float, float]:
+        """See `Nonlinear.law`."""
+        return 0, self.quadratic, self.cubic, 0.0
+
     def step(self, before: float, stretch: float, rate: float, state: float, time_step: float) -> Step:
         """See `Nonlinear.step`."""
-        force = (self.quadratic + self.cubic * stretch) * stretch * stretch
-        return force, (2 * self.quadratic + 3 * self.cubic * stretch) * stretch, 0.0, 0.0
+        return *polynomial(stretch, rate, self.quadratic, self.cubic, 0.0), 0.0
 
     def along(
         self,
@@ -125,11 +168,14 @@ class DryFriction(Nonlinear):
     limit: float
     velocity: float = 1e-3
 
+    @property
+    def law(self) -> tuple[int, float, float, float]:
+        """See `Nonlinear.law`."""
+        return 1, self.limit, self.velocity, 0.0
+
     def step(self, before: float, stretch: float, rate: float, state: float, time_step: float) -> Step:
         """See `Nonlinear.step`."""
-        x = rate / self.velocity
-        slope = 0.0 if abs(x) > 300 else self.limit / (self.velocity * cosh(x) ** 2)
-        return self.limit * tanh(x), 0.0, slope, 0.0
+        return *friction(stretch, rate, self.limit, self.velocity, 0.0), 0.0
 
 
 @dataclass(frozen=True)
@@ -147,22 +193,18 @@ class PartingSpring(Spring, Nonlinear):
     gap: float = inf
 
     @property
+    def law(self) -> tuple[int, float, float, float]:
+        """See `Nonlinear.law`."""
+        return 2, self.stiffness, self.preload, self.gap
+
+    @property
     def tangent_stiffness(self) -> float:
         """Stiffness in contact, N/m."""
         return self.stiffness
 
     def step(self, before: float, stretch: float, rate: float, state: float, time_step: float) -> Step:
         """See `Nonlinear.step`."""
-        if self.preload == inf:
-            return 0.0, 0.0, 0.0, 0.0
-        k = self.stiffness
-        contact = stretch + self.preload
-        rest = 0.0 if self.preload > 0 else -k * self.preload  # the tangent's force is counted from contact
-        if contact >= 0:
-            return -rest, 0.0, 0.0, 0.0
-        if contact >= -self.gap:
-            return -k * contact - rest, -k, 0.0, 0.0
-        return k * self.gap - rest, 0.0, 0.0, 0.0
+        return *parting(stretch, rate, self.stiffness, self.preload, self.gap), 0.0
 
     def along(
         self,

@@ -1,0 +1,295 @@
+"""Fit of a model, nonlinear or not, to measured hits by simulating them with the measured force records.
+
+What a linear model gets wrong, it gets wrong in proportion to the force: the same error of the FRF at every force
+level. Such an error, up to the share `common` of the measured response, is integrated out, so that an imperfect
+linear model (a mode of the foundation, planets that differ) neither hides nor feigns an effect that depends on the
+level.
+
+References
+----------
+K. Worden, G. R. Tomlinson, *Nonlinearity in Structural Dynamics*, 2001, section 2.4 (normalised mean square error:
+the square of the misfit used here). M. C. Kennedy, A. O'Hagan, "Bayesian calibration of computer models", *J. R.
+Stat. Soc. B* 63 (2001) 425-464 (model discrepancy integrated out).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.diagnose.levels.data import HitWindows
+from ema_pipeline.errors import EmaError
+from ema_pipeline.fit.space import Space, make_space
+from ema_pipeline.mechanics.assembly import Assembly
+from ema_pipeline.mechanics.batch import Blows, batch_response
+from ema_pipeline.mechanics.system import sensor_rows
+from ema_pipeline.rigs.types import Rig
+
+_STEP = 1e-3
+_CHUNK = 256
+"""Pairs of model and hit that are simulated side by side."""
+
+
+class TimeProblem:
+    """A rig against windows of measured hits.
+
+    Parameters
+    ----------
+    rig : Rig
+        With its effects, if any.
+    windows : sequence of HitWindows
+        One per configuration.
+    substeps : int
+        Steps of the integration per sample.
+    """
+
+    def __init__(self, rig: Rig, windows: Sequence[HitWindows], substeps: int) -> None:
+        self.rig = rig
+        self.windows = tuple(windows)
+        self.substeps = substeps
+        used = {n for w in windows for n in rig.used(w.configuration)}
+        self.space: Space = make_space([p for n, p in rig.parameters.items() if n in used])
+
+    def simulate(self, points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """What the sensors read at points (B, P): per configuration (B, n_hits, n_sensors, n_samples).
+
+        Raises
+        ------
+        EmaError
+            Where the motion of a model grows without bound.
+        """
+        result = []
+        for w in self.windows:
+            assemblies = [self._assembly(w, x) for x in points]
+            system = assemblies[0].system()
+            blows = Blows(
+                w.sample_rate_hz, w.force, sensor_rows(system, w.impacts),
+                sensor_rows(system, w.sensors), w.quantities,
+            )  # fmt: skip
+            step = max(1, _CHUNK // len(w.names))
+            parts = [
+                batch_response(assemblies[i : i + step], blows, self.substeps)
+                for i in range(0, len(assemblies), step)
+            ]
+            result.append(np.concatenate(parts))
+        return result
+
+    def _assembly(self, w: HitWindows, x: NDArray[np.float64]) -> Assembly:
+        return self.rig.assembly(w.configuration, self.space.named(x))
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """How the differences of measured and simulated lines of one configuration are weighted.
+
+    Attributes
+    ----------
+    fade_s : float
+        Time constant of the exponential weight.
+    scale : ndarray, (n_hits, n_sensors, n_lines)
+        One over the standard uncertainty of what is not common to all levels; 0 where a sensor is absent.
+    common : ndarray, (n_hits, n_sensors, n_lines)
+        Direction, of length 1 over the hits of each impact point, of an error common to all levels.
+    taken : ndarray, (n_points, n_sensors, n_lines)
+        Share of that direction which is taken off.
+    point : ndarray of int, (n_hits,)
+        Impact point of each hit.
+    measured : ndarray, (n_hits, n_sensors, n_lines)
+    """
+
+    fade_s: float
+    scale: NDArray[np.float64]
+    common: NDArray[np.complex128]
+    taken: NDArray[np.float64]
+    point: NDArray[np.int64]
+    measured: NDArray[np.complex128]
+
+    def applied(self, simulated: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Weighted differences for simulated lines (B, n_hits, n_sensors, n_lines)."""
+        r = (simulated - self.measured) * self.scale
+        for point in range(len(self.taken)):
+            at = np.flatnonzero(self.point == point)
+            along = np.sum(self.common[at].conj() * r[:, at], axis=1) * self.taken[point]
+            r[:, at] -= along[:, None] * self.common[at]
+        return r
+
+
+@dataclass(frozen=True)
+class NoiseFloor:
+    """What may be left beside the sensors' noise, as shares of the measured amplitude around each line.
+
+    Attributes
+    ----------
+    own : float
+        At each hit by itself.
+    common : float
+        In the FRF, alike at every force level.
+    """
+
+    own: float
+    common: float
+
+
+def whitenings(windows: Sequence[HitWindows], floor: NoiseFloor, data_per_mode: float) -> list[Whitening]:
+    """Weights where one mode in one hit is worth `data_per_mode` independent numbers.
+
+    A line's real and imaginary part are worth numbers in proportion to 1/f, since a mode of given damping ratio
+    spreads over lines in proportion to its frequency. Signals fade out, so that the windows' ends leave no trace.
+    """
+    result = []
+    for w in windows:
+        fade = 0.5 * float(w.time_s[-1])
+        sigma = w.sigma(fade, floor.own)
+        even = 1 / w.frequency_hz
+        worth = data_per_mode * w.modes * len(w.names) * even / np.sum(np.isfinite(sigma) * even)
+        measured = w.spectra(w.measured, fade)
+        force = w.spectra(w.force, fade)
+        known = {d: i for i, d in enumerate(dict.fromkeys(str(d) for d in w.impacts))}
+        point = np.array([known[str(d)] for d in w.impacts], dtype=np.int64)
+        common = np.zeros(measured.shape, dtype=complex)
+        taken = np.zeros((len(known), *measured.shape[1:]))
+        size = w.amplitude(fade)
+        for k in range(len(known)):
+            at = np.flatnonzero(point == k)
+            per_newton = np.sum(size[at], axis=0) / np.sum(np.abs(force[at]), axis=0)
+            u = floor.common * per_newton * force[at][:, None] / sigma[at]
+            length = np.sqrt(np.sum(np.abs(u) ** 2, axis=0))
+            common[at] = u / np.maximum(length, 1e-300)
+            taken[k] = 1 - 1 / np.sqrt(1 + length**2)
+        scale = np.sqrt(worth) / sigma
+        result.append(Whitening(fade, scale, common, taken, point, measured))
+    return result
+
+
+def residuals(
+    problem: TimeProblem, weights: Sequence[Whitening], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Weighted differences of measured and simulated lines, real and imaginary, (B, n)."""
+    return weighted(problem.windows, weights, problem.simulate(points))
+
+
+def weighted(
+    windows: Sequence[HitWindows], weights: Sequence[Whitening], simulated: Sequence[NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """The same for simulated signals."""
+    parts = []
+    for w, weight, signals in zip(windows, weights, simulated, strict=True):
+        flat = weight.applied(w.spectra(signals, weight.fade_s)).reshape(len(signals), -1)
+        parts += [flat.real, flat.imag]
+    return np.concatenate(parts, axis=1)
+
+
+@dataclass(frozen=True)
+class TimeFit:
+    """A model at its optimum.
+
+    Attributes
+    ----------
+    x : ndarray, (P,)
+    values : dict of str to float
+    objective : float
+        -2 log posterior up to a constant: weighted sum of squares, and squared shifts in tolerances.
+    squares : float
+        The weighted sum of squares of the data alone.
+    hessian : ndarray, (P, P)
+        Gauss-Newton's, priors included.
+    """
+
+    x: NDArray[np.float64]
+    values: dict[str, float]
+    objective: float
+    squares: float
+    hessian: NDArray[np.float64]
+
+
+def fit(
+    problem: TimeProblem,
+    weights: Sequence[Whitening],
+    start: NDArray[np.float64],
+    most: int,
+    tolerance: float = 0.05,
+) -> TimeFit:
+    """Levenberg-Marquardt steps with finite differences, all models of a step side by side.
+
+    Parameters
+    ----------
+    problem : TimeProblem
+    weights : sequence of Whitening
+    start : ndarray, (P,)
+    most : int
+        Steps at most.
+    tolerance : float
+        Ends where a step lowers the objective by less than this and a thousandth.
+    """
+    space = problem.space
+    prior = space.has_prior.astype(float)
+    x = np.clip(np.asarray(start, dtype=float), space.low, space.high)
+    damping = 1e-3
+    while True:
+        r, jacobian = _linearised(problem, weights, x)
+        value = float(r @ r) + float(prior @ x**2)
+        normal = jacobian @ jacobian.T + np.diag(prior)
+        gradient = jacobian @ r + prior * x
+        if most <= 0:
+            break
+        ladder = damping * np.array([0.1, 1.0, 30.0, 1000.0])
+        scale = np.diag(normal).clip(1e-9)
+        trials = np.array(
+            [space.retract(x, -np.linalg.solve(normal + d * np.diag(scale), gradient)) for d in ladder]
+        )
+        found = objectives(problem, weights, trials)
+        best = int(np.argmin(found))
+        if not found[best] < value:
+            break
+        x = trials[best]
+        damping = float(np.clip(ladder[best], 1e-6, 1e6))
+        most -= 1
+        if value - found[best] < tolerance + 1e-3 * found[best]:
+            value = float(found[best])
+            break
+        value = float(found[best])
+    return TimeFit(x, space.named(x), value, value - float(prior @ x**2), normal)
+
+
+def _linearised(
+    problem: TimeProblem, weights: Sequence[Whitening], x: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Residual (n,) and Jacobian (P, n) by forward differences that stay inside the bounds."""
+    step = np.where(x + _STEP > problem.space.high, -_STEP, _STEP)
+    r = residuals(problem, weights, np.vstack([x[None], x + np.diag(step)]))
+    return r[0], (r[1:] - r[0]) / step[:, None]
+
+
+def objectives(
+    problem: TimeProblem, weights: Sequence[Whitening], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """-2 log posterior at points, (B,); infinite where the motion of a model has no solution."""
+    prior = problem.space.has_prior.astype(float)
+    try:
+        r = residuals(problem, weights, points)
+    except EmaError:
+        if len(points) == 1:
+            return np.array([np.inf])
+        return np.concatenate([objectives(problem, weights, p[None]) for p in points])
+    value = np.sum(r**2, axis=1) + points**2 @ prior
+    return np.asarray(np.where(np.isfinite(value), value, np.inf))
+
+
+def misfits(problem: TimeProblem, values: Mapping[str, float]) -> list[NDArray[np.float64]]:
+    """Normalised time-domain misfit of each hit, per configuration (n_hits,).
+
+    Root-mean-square of measured - simulated over that of the measured, over all sensors, in the band.
+    """
+    simulated = problem.simulate(problem.space.point(values)[None])
+    return [hit_misfits(w, s[0]) for w, s in zip(problem.windows, simulated, strict=True)]
+
+
+def hit_misfits(w: HitWindows, simulated: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The same for given signals, (n_hits,)."""
+    use = w.present[..., None]
+    measured = w.in_band(w.measured) * use
+    difference = measured - w.in_band(simulated) * use
+    return np.asarray(np.sqrt(np.sum(difference**2, axis=(1, 2)) / np.sum(measured**2, axis=(1, 2))))

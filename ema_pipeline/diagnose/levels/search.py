@@ -1,0 +1,168 @@
+"""Fits of all hypotheses: sizes over decades compete first, the best are followed to the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
+
+import numpy as np
+import scipy.optimize
+
+from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, prior_probabilities
+from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, judged, level_hypotheses, size_grid, sized
+from ema_pipeline.diagnose.levels.problem import NoiseFloor, fit, objectives, weighted
+from ema_pipeline.diagnose.pool import spread
+
+Progress = Callable[[float, str], None]
+
+_FOLLOWED = 3
+_STEPS = 10
+_AGAIN = 6
+
+
+def fit_base(
+    case: LevelCase, hypothesis: Hypothesis, floor: NoiseFloor, sizes: Mapping[str, float]
+) -> Simulated:
+    """The best fit of a model from all of the case's starts."""
+    problem = case.problem(hypothesis, sizes)
+    weights = case.weights(floor)
+    found = [fit(problem, weights, problem.space.point({**s, **sizes}), _STEPS) for s in case.starts]
+    return judged(problem, hypothesis, sizes, min(found, key=lambda f: f.objective))
+
+
+def again(case: LevelCase, model: Simulated, floor: NoiseFloor, steps: int = _AGAIN) -> Simulated:
+    """The same model at another floor of the noise, from its own optimum."""
+    sizes = {n: model.values.get(n, v) or v for n, v in model.sizes.items()}
+    problem = case.problem(model.hypothesis, sizes)
+    found = fit(problem, case.weights(floor), problem.space.point(model.values), steps)
+    return judged(problem, model.hypothesis, sizes, found)
+
+
+def fit_effect(case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: NoiseFloor) -> Simulated:
+    """Fit of a hypothesis on top of a base model, from sizes over many decades.
+
+    Parameters
+    ----------
+    case : LevelCase
+    hypothesis : Hypothesis
+        The base model's and one more effect.
+    base : Simulated
+    floor : NoiseFloor
+    """
+    weights = case.weights(floor)
+    grids = [size_grid(p, i == 0) for i, p in enumerate(case.parameters_of(hypothesis.labels[-1]))]
+    points = list(product(*grids))
+    rough = case.problem(hypothesis)
+    starts = (base.values, *case.starts)
+    tried: list[tuple[float, int, tuple[float, ...]]] = []
+    for k, start in enumerate(starts):
+        x = np.array([rough.space.point({**start, **sized(case, hypothesis, v)}) for v in points])
+        tried += [(float(o), k, v) for o, v in zip(objectives(rough, weights, x), points, strict=True)]
+    best: Simulated | None = None
+    for value, k, sizes_tried in _distinct(sorted(tried)):
+        if not np.isfinite(value):
+            continue
+        sizes = {**base.sizes, **sized(case, hypothesis, sizes_tried)}
+        problem = case.problem(hypothesis, sizes)
+        found = fit(problem, weights, problem.space.point({**starts[k], **sizes}), _STEPS)
+        model = judged(problem, hypothesis, sizes, found)
+        if best is None or model.fit.objective < best.fit.objective:
+            best = model
+    if best is None:
+        raise AssertionError(f"no size of {hypothesis.label} can be simulated")
+    return best
+
+
+def _distinct(
+    tried: Sequence[tuple[float, int, tuple[float, ...]]],
+) -> list[tuple[float, int, tuple[float, ...]]]:
+    """The lowest of the tried sizes that are no neighbours of each other."""
+    kept: list[tuple[float, int, tuple[float, ...]]] = []
+    for t in tried:
+        if all(abs(np.log(abs(t[2][0] / k[2][0]))) > 2 or t[2][0] * k[2][0] < 0 for k in kept):
+            kept.append(t)
+        if len(kept) == _FOLLOWED:
+            break
+    return kept
+
+
+def own_floor(case: LevelCase, model: Simulated) -> NoiseFloor:
+    """The floor at which a model's error is 1, within the limits of the settings."""
+    s = case.settings.levels
+    problem = case.problem(model.hypothesis, model.sizes)
+    x = problem.space.point(model.values)[None]
+    simulated = problem.simulate(x)
+
+    def excess(log_own: float) -> float:
+        floor = NoiseFloor(float(np.exp(log_own)), s.common_error)
+        r = weighted(case.windows, case.weights(floor), simulated)[0]
+        return float(r @ r) - case.data
+
+    low, high = np.log(s.noise_least), np.log(s.noise_most)
+    if excess(low) <= 0:
+        return NoiseFloor(s.noise_least, s.common_error)
+    if excess(high) >= 0:
+        return NoiseFloor(s.noise_most, s.common_error)
+    own = scipy.optimize.brentq(excess, low, high, xtol=0.05)
+    return NoiseFloor(float(np.exp(own)), s.common_error)
+
+
+class LevelRanking:
+    """A base model and every hypothesis on top of it, all at one floor of the noise.
+
+    Attributes
+    ----------
+    base : Simulated
+    fitted : list of Simulated
+    probabilities : dict of str to float
+        By label, ``"nothing"`` for the base model; adds up to 1.
+    """
+
+    def __init__(self, case: LevelCase, base: Simulated, fitted: Sequence[Simulated]) -> None:
+        self.base = base
+        self.fitted = list(fitted)
+        s = case.settings
+        prior = prior_probabilities([f.hypothesis for f in fitted], s.null_prior, s.parameter_prior)
+        evidence = {NOTHING: base.evidence}
+        for f in fitted:
+            # a richer model holds the poorer one; its evidence cannot grow by more than the likelihood does
+            least = base.evidence + min(f.fit.objective - base.fit.objective, 0.0)
+            evidence[f.hypothesis.label] = max(f.evidence, least)
+        logs = {label: np.log(max(prior[label], 1e-300)) - 0.5 * e for label, e in evidence.items()}
+        top = max(logs.values())
+        weights = {label: float(np.exp(v - top)) for label, v in logs.items()}
+        total = sum(weights.values())
+        self.evidence = evidence
+        self.probabilities = {label: w / total for label, w in weights.items()}
+
+    def ordered(self) -> list[Simulated]:
+        """The most probable first."""
+        return sorted(self.fitted, key=lambda f: -self.probabilities[f.hypothesis.label])
+
+    def gain(self, f: Simulated) -> float:
+        """Fall of -2 log posterior."""
+        return self.base.fit.objective - f.fit.objective
+
+    def log_evidence(self, f: Simulated) -> float:
+        """Natural logarithm of the Bayes factor against the base model."""
+        return 0.5 * (self.base.evidence - self.evidence[f.hypothesis.label])
+
+
+def ranked(case: LevelCase, base: Simulated, floor: NoiseFloor, tell: Progress) -> LevelRanking:
+    """Fits of all hypotheses on top of a base model at one floor."""
+    hypotheses = level_hypotheses(case, base.hypothesis)
+    fitted = []
+    for f in spread(lambda h: fit_effect(case, h, base, floor), hypotheses, case.settings.processes):
+        fitted.append(f)
+        tell(len(fitted) / len(hypotheses), f.hypothesis.labels[-1])
+    return LevelRanking(case, base, fitted)
+
+
+def at_floor(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor, tell: Progress) -> LevelRanking:
+    """The same ranking at another floor, every fit from its own optimum."""
+    models = [ranking.base, *ranking.fitted]
+    fitted = []
+    for f in spread(lambda m: again(case, m, floor), models, case.settings.processes):
+        fitted.append(f)
+        tell(len(fitted) / len(models), f.hypothesis.label)
+    return LevelRanking(case, fitted[0], fitted[1:])

@@ -1,0 +1,192 @@
+"""Responses of many assemblies to many hammer blows at once, nonlinear elements included.
+
+The linear part, tangents of the nonlinear elements included, is advanced exactly in its own complex modes, where
+every state is a number of its own; the nonlinear elements only need their stretches. A compiled loop takes all
+pairs of assembly and blow through time: this is what a fit needs, which asks for the same blows at a dozen
+neighbouring sets of parameters. Elements with a memory take the slower way of
+`mechanics.nonlinear.nonlinear_response`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.mechanics.assembly import Assembly
+from ema_pipeline.mechanics.laws import check_element
+from ema_pipeline.mechanics.modes import eigen_solution
+from ema_pipeline.mechanics.nonlinear import element_rows, nonlinear_response
+from ema_pipeline.mechanics.system import LinearSystem
+
+ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+"""Number of derivatives of each quantity that a sensor may measure."""
+
+_NO_FORCE = (0.0, 0.0, 0.0, 0.0)
+_SLOWEST_HZ = 0.2
+"""Rigid-body modes are held by springs so soft that a record of seconds does not see them."""
+
+
+@dataclass(frozen=True)
+class Blows:
+    """Hammer blows of one configuration, as sampled.
+
+    Attributes
+    ----------
+    sample_rate_hz : float
+    force : ndarray, (n_blows, n_samples)
+        N, from rest on.
+    in_rows : ndarray, (n_blows, n)
+        Where each blow strikes, over the coordinates.
+    out_rows : ndarray, (n_outputs, n)
+        Where the sensors sit.
+    quantities : tuple of str
+        What each sensor measures, see `ORDERS`.
+    """
+
+    sample_rate_hz: float
+    force: NDArray[np.float64]
+    in_rows: NDArray[np.float64]
+    out_rows: NDArray[np.float64]
+    quantities: tuple[str, ...]
+
+
+def batch_response(assemblies: Sequence[Assembly], blows: Blows, substeps: int) -> NDArray[np.float64]:
+    """What the sensors read, (n_assemblies, n_blows, n_outputs, n_samples).
+
+    Parameters
+    ----------
+    assemblies : sequence of Assembly
+        With the same coordinates; nonlinear elements of one name act along one row.
+    blows : Blows
+        Between samples the force is band-limited, as an analyser with an anti-alias filter records it.
+    substeps : int
+        Steps per sample; the error of the nonlinear forces falls with the square of the step.
+
+    Raises
+    ------
+    EmaError
+        For structural damping, and where the motion grows without bound.
+    """
+    from ema_pipeline.mechanics.kernel import march  # compiles at its first use
+
+    elements = {e.name: e for a in assemblies for e in a.nonlinear}
+    if any(e.law is None for e in elements.values()):
+        return _one_by_one(assemblies, blows, substeps)
+    for assembly in assemblies:
+        for element in assembly.nonlinear:
+            check_element(element)
+    modes = [_modal(a.system()) for a in assemblies]
+    m = len(elements)
+    size = max(len(p.poles) for p in modes)
+    count, hits = len(assemblies), len(blows.force)
+    rows = element_rows(assemblies[0], list(elements.values()))
+    step = 1 / (blows.sample_rate_hz * substeps)
+
+    poles = np.zeros((count, size), dtype=complex)
+    inputs = np.zeros((count, hits + m, size), dtype=complex)
+    outputs = np.zeros((count, len(blows.out_rows), size), dtype=complex)
+    stretch = np.zeros((count, 2 * m, size), dtype=complex)
+    direct = np.zeros((count, len(blows.out_rows), hits + m))
+    into = np.vstack([blows.in_rows, -rows])
+    order = np.array([ORDERS[q] for q in blows.quantities])
+    laws = np.zeros((count, m, 4))
+    for i, (assembly, p) in enumerate(zip(assemblies, modes, strict=True)):
+        k = len(p.poles)
+        poles[i, :k] = p.poles
+        inputs[i, :, :k] = (p.left @ into.T).T
+        outputs[i, :, :k] = (blows.out_rows @ p.right) * p.poles ** order[:, None]
+        stretch[i, :m, :k] = rows @ p.right
+        stretch[i, m:, :k] = (rows @ p.right) * p.poles
+        direct[i] = np.where(order[:, None] == 2, blows.out_rows @ p.flexibility @ into.T, 0.0)
+        own = {e.name: e.law for e in assembly.nonlinear}
+        for j, name in enumerate(elements):
+            laws[i, j] = own.get(name) or _NO_FORCE
+
+    force, straight = _fine(blows.force, substeps)
+    result, failed = march(
+        laws, poles, inputs, stretch, outputs, direct[:, :, hits:], straight, step, substeps
+    )
+    if failed:
+        names = ", ".join(elements)
+        raise EmaError(
+            f"no solution with {names}: the motion grows without bound, or the step of {step:.3g} s is too long"
+        )
+    result = result.swapaxes(2, 3)
+    result += direct[:, :, :hits].transpose(0, 2, 1)[..., None] * force[None, :, None, ::substeps]
+    return result
+
+
+def _one_by_one(assemblies: Sequence[Assembly], blows: Blows, substeps: int) -> NDArray[np.float64]:
+    """The same for elements with a memory or a law of their own."""
+    order = [ORDERS[q] for q in blows.quantities]
+    result = []
+    for assembly in assemblies:
+        for force, row in zip(blows.force, blows.in_rows, strict=True):
+            r = nonlinear_response(
+                assembly, blows.sample_rate_hz, force[None], blows.out_rows, row[None], substeps=substeps
+            )
+            read = (r.displacement, r.velocity, r.acceleration)
+            result.append([read[k][i] for i, k in enumerate(order)])
+    return np.array(result).reshape(len(assemblies), len(blows.force), len(order), -1)
+
+
+@dataclass(frozen=True)
+class _Modal:
+    """ż = poles·z + left·f, x = Re(right·z); `flexibility` is the inverse of the mass matrix."""
+
+    poles: NDArray[np.complex128]
+    left: NDArray[np.complex128]
+    right: NDArray[np.complex128]
+    flexibility: NDArray[np.float64]
+
+
+def _modal(system: LinearSystem) -> _Modal:
+    """Complex modes of the damped system; of each conjugate pair the one with Im > 0, counted twice."""
+    if np.any(system.structural):
+        raise EmaError(
+            "a loss factor holds at steady state only and has no time response; use the frequency domain"
+        )
+    values, phi = eigen_solution(system)
+    omega = np.maximum(np.sqrt(values), 2 * np.pi * _SLOWEST_HZ)
+    own = 2 * system.modal_damping_ratio * omega
+    viscous = phi.T @ system.damping @ phi
+    flexibility = phi @ phi.T
+    coupled = np.max(np.abs(viscous - np.diag(np.diag(viscous))), initial=0.0) > 1e-9 * omega[-1]
+    total = own + np.diag(viscous)
+    if not coupled and np.all(total < 2 * omega):
+        decay = 0.5 * total
+        damped = np.sqrt(omega**2 - decay**2)
+        return _Modal(-decay + 1j * damped, phi.T.astype(complex), phi / (1j * damped), flexibility)
+    n = len(omega)
+    a = np.zeros((2 * n, 2 * n))
+    a[:n, n:] = np.eye(n)
+    a[n:, :n] = -np.diag(omega**2)
+    a[n:, n:] = -(viscous + np.diag(own))
+    poles, vectors = np.linalg.eig(a)
+    left = np.linalg.inv(vectors)[:, n:] @ phi.T
+    right = phi @ vectors[:n]
+    keep = poles.imag >= 0
+    twice = np.where(poles.imag > 0, 2.0, 1.0)
+    return _Modal(poles[keep].astype(complex), left[keep], (right * twice)[:, keep], flexibility)
+
+
+def _fine(force: NDArray[np.float64], substeps: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The force at the steps, and the values whose straight connections act on slow motions as it does.
+
+    Straight lines between steps weaken what happens at frequency f by sinc²(f·step).
+    """
+    n = force.shape[1]
+    length = scipy.fft.next_fast_len(n + 64, real=True)
+    padded = np.pad(force, ((0, 0), (0, length - n)))
+    spectrum = scipy.fft.rfft(padded, axis=1)
+    ramp = np.sinc(np.arange(spectrum.shape[1]) / (length * substeps)) ** 2
+    fine, straight = (
+        scipy.fft.irfft(s * substeps, length * substeps, axis=1)[:, : (n - 1) * substeps + 1]
+        for s in (spectrum, spectrum / ramp)
+    )
+    return fine, straight

@@ -1,0 +1,154 @@
+"""The compiled loop of `mechanics.batch`: modal states through time, nonlinear elements solved at every step."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.mechanics.laws import LAWS
+
+_polynomial, _friction, _parting = (numba.njit(law, inline="always") for law in LAWS)
+
+_NEWTON = 60
+_TOLERANCE = 1e-8
+
+
+def march(
+    laws: NDArray[np.float64],
+    poles: NDArray[np.complex128],
+    inputs: NDArray[np.complex128],
+    stretch: NDArray[np.complex128],
+    outputs: NDArray[np.complex128],
+    direct: NDArray[np.float64],
+    force: NDArray[np.float64],
+    step: float,
+    keep_every: int,
+) -> tuple[NDArray[np.float64], bool]:
+    """What the sensors read, but for what the blow itself gives an accelerometer; and whether it failed.
+
+    Parameters
+    ----------
+    laws : ndarray, (A, m, 4)
+        Law and numbers of each element, see `Nonlinear.law`.
+    poles : complex ndarray, (A, P)
+    inputs : complex ndarray, (A, n_blows + m, P)
+        What a force adds to the rate of the states: of each blow, of each element.
+    stretch : complex ndarray, (A, 2m, P)
+        Stretches and rates of the elements are the real parts of `stretch` times the states.
+    outputs : complex ndarray, (A, n_outputs, P)
+    direct : ndarray, (A, n_outputs, m)
+        What the elements' forces add to the outputs at once.
+    force : ndarray, (n_blows, n_steps)
+        At every step; straight in between.
+    step : float
+        s.
+    keep_every : int
+
+    Returns
+    -------
+    ndarray, (A, n_blows, n_kept, n_outputs)
+    bool
+        True where no solution was found at some step.
+
+    Notes
+    -----
+    With a force that runs straight over a step, z₊ = Ez + Γ₀f + Γ₁f₊; for y = z - Γ₁f this is
+    y₊ = Ey + (Γ₀ + EΓ₁)f, which needs the force at the start of the step only.
+    """
+    hits = len(force)
+    x = poles * step
+    small = np.abs(x) < 1e-4
+    safe = np.where(small, 1.0, x)
+    decay = np.exp(x)
+    whole = np.where(small, 1 + x / 2, (decay - 1) / safe) * step
+    late = np.where(small, 0.5 + x / 6, (decay - 1 - x) / safe**2) * step
+    early = whole - late + decay * late
+    begun, ended = inputs * early[:, None], inputs * late[:, None]
+    # what a force at the end of a step adds to stretches and outputs
+    reach = np.einsum("asp,acp->asc", stretch, ended).real
+    seen = np.einsum("aop,acp->aoc", outputs, ended).real
+    seen[:, :, hits:] += direct
+    kept = (force.shape[1] - 1) // keep_every + 1
+    result = np.zeros((len(poles), hits, kept, outputs.shape[1]))
+    failed = _march(
+        laws, decay, begun, _halves(stretch), _halves(outputs), reach, seen, force, step, keep_every, result
+    )
+    return result, bool(failed)
+
+
+def _halves(rows: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """(A, n, 2P): rows that give Re(row·z) from real and imaginary parts of z."""
+    return np.ascontiguousarray(np.concatenate([rows.real, -rows.imag], axis=2))
+
+
+@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+def _march(laws, decay, begun, stretch, outputs, reach, seen, force, step, keep_every, result):  # type: ignore[no-untyped-def]
+    count, size = decay.shape
+    hits, steps = force.shape
+    m = laws.shape[1]
+    channels = outputs.shape[1]
+    y = np.zeros(2 * size)
+    g, d, v = np.zeros(m), np.zeros(m), np.zeros(m)
+    for a in range(count):
+        turn, fade = decay[a].imag.copy(), decay[a].real.copy()
+        for h in range(hits):
+            y[:] = 0.0
+            g[:] = 0.0
+            scale = 1e-9
+            b_re, b_im = begun[a, h].real.copy(), begun[a, h].imag.copy()
+            for c in range(channels):
+                result[a, h, 0, c] = seen[a, c, h] * force[h, 0]
+            for k in range(1, steps):
+                f = force[h, k - 1]
+                for p in range(size):
+                    re, im = y[p], y[size + p]
+                    y[p] = fade[p] * re - turn[p] * im + b_re[p] * f
+                    y[size + p] = turn[p] * re + fade[p] * im + b_im[p] * f
+                for j in range(m):
+                    if g[j] != 0.0:
+                        for p in range(size):
+                            y[p] += begun[a, hits + j, p].real * g[j]
+                            y[size + p] += begun[a, hits + j, p].imag * g[j]
+                f = force[h, k]
+                for j in range(m):
+                    dj, vj = reach[a, j, h] * f, reach[a, m + j, h] * f
+                    for p in range(2 * size):
+                        dj += stretch[a, j, p] * y[p]
+                        vj += stretch[a, m + j, p] * y[p]
+                    d[j], v[j] = dj, vj
+                worst = 0.0
+                for _ in range(_NEWTON):
+                    worst = 0.0
+                    for j in range(m):
+                        dj, vj = d[j], v[j]
+                        for i in range(m):
+                            dj += reach[a, j, hits + i] * g[i]
+                            vj += reach[a, m + j, hits + i] * g[i]
+                        kind = laws[a, j, 0]
+                        n1, n2, n3 = laws[a, j, 1], laws[a, j, 2], laws[a, j, 3]
+                        if kind == 0.0:
+                            found, by_d, by_v = _polynomial(dj, vj, n1, n2, n3)
+                        elif kind == 1.0:
+                            found, by_d, by_v = _friction(dj, vj, n1, n2, n3)
+                        else:
+                            found, by_d, by_v = _parting(dj, vj, n1, n2, n3)
+                        error = found - g[j]
+                        slope = by_d * reach[a, j, hits + j] + by_v * reach[a, m + j, hits + j]
+                        g[j] += error / max(1.0 - slope, 0.1)
+                        scale = max(scale, abs(found))
+                        worst = max(worst, abs(error))
+                    if not worst > _TOLERANCE * scale:
+                        break
+                if not worst <= 1e-4 * scale:
+                    return True
+                if k % keep_every == 0:
+                    at = k // keep_every
+                    for c in range(channels):
+                        s = seen[a, c, h] * f
+                        for j in range(m):
+                            s += seen[a, c, hits + j] * g[j]
+                        for p in range(2 * size):
+                            s += outputs[a, c, p] * y[p]
+                        result[a, h, at, c] = s
+    return False
