@@ -55,7 +55,9 @@ def indicator(data: FitData, level: Real) -> Real:
     level : ndarray, (n_rows, n_references)
         Noise variance of each FRF.
     """
-    power = np.einsum("oil,oi->l", np.abs(data.frf) ** 2, np.where(data.measured, 1.0 / level, 0.0))
+    power = np.zeros(len(data.omega))
+    for row, share in zip(data.frf, np.where(data.measured, 1.0 / level, 0.0), strict=True):
+        power += share @ np.abs(row) ** 2
     return np.asarray(10 * np.log10(np.maximum(power / max(data.measured.sum(), 1), 1e-30)))
 
 

@@ -6,48 +6,131 @@ fraction of the work. Only the shapes need every row.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.modal.data import FitData
-from ema_pipeline.modal.noise import Noise
+from ema_pipeline.modal.fit import Estimate, synthesis
+from ema_pipeline.modal.noise import Noise, NoiseLaw
 
+Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
 
 MAX_ROWS = 20
 
 
-def compress(data: FitData, hits: Noise | None, start: Noise) -> tuple[FitData, Noise | None, Noise]:
-    """The strongest combinations of rows with their noise; the data as they are where rows are few or gappy.
+@dataclass(frozen=True)
+class Window:
+    """Lines of a sub-band with all their rows; modes of the other sub-bands are taken off where it is used.
+
+    Attributes
+    ----------
+    data : FitData
+        As measured.
+    noise : NoiseLaw
+    from_hits : bool
+        True where the noise is known from the scatter over hits; else it is a first guess.
+    far : Estimate
+    far_shapes : complex ndarray, (n_rows, n_far_modes)
+    """
+
+    data: FitData
+    noise: NoiseLaw
+    from_hits: bool
+    far: Estimate
+    far_shapes: Complex
+
+    def rows(self, rows: slice) -> Window:
+        """The same for some rows."""
+        return replace(
+            self, data=self.data.rows(rows), noise=self.noise.rows(rows), far_shapes=self.far_shapes[rows]
+        )
+
+    def lines(self, first: int, stop: int) -> Window:
+        """The same on lines ``first:stop``."""
+        return replace(self, data=self.data.lines(first, stop), noise=self.noise.lines(first, stop))
+
+    def near(self) -> Local:
+        """Data without far modes, and noise, as arrays."""
+        frf = self.data.frf
+        if len(self.far.poles):
+            left = frf - synthesis(self.data, self.far, self.far_shapes)
+            frf = np.where(self.data.measured[..., None], left, 0.0)
+        return Local(replace(self.data, frf=frf), self.noise.at(self.data.frf), self.from_hits)
+
+
+@dataclass(frozen=True)
+class Local:
+    """Few rows of a sub-band as the fit takes them.
+
+    Attributes
+    ----------
+    data : FitData
+    noise : Noise
+    from_hits : bool
+    """
+
+    data: FitData
+    noise: Noise
+    from_hits: bool
+
+    @property
+    def hits(self) -> Noise | None:
+        """Noise from the scatter over hits, None where that is not known."""
+        return self.noise if self.from_hits else None
+
+
+def compressible(data: FitData) -> bool:
+    """True where rows are many, and all were measured for all references."""
+    return bool(len(data.frf) > MAX_ROWS and data.measured.all())
+
+
+def compress(window: Window) -> Local:
+    """The strongest combinations of rows with their noise; all rows where they are few or gappy.
 
     Parameters
     ----------
-    data : FitData
-    hits : Noise or None
-    start : Noise
+    window : Window
     """
-    if len(data.frf) <= MAX_ROWS or not data.measured.all():
-        return data, hits, start
-    level = np.exp(-0.5 * np.log(start.variance).mean(axis=(1, 2)))
-    scaled = (data.frf * level[:, None, None]).reshape(len(level), -1)
-    gram = scaled.real @ scaled.real.T + scaled.imag @ scaled.imag.T
+    data = window.data
+    if not compressible(data):
+        return window.near()
+    n_rows, n_ref, n_lines = data.frf.shape
+    log_level = np.zeros(n_rows)
+    for block in data.line_blocks():
+        part = window.lines(block.start, block.stop)
+        log_level += np.log(part.noise.at(part.data.frf).variance).sum(axis=(1, 2))
+    level = np.exp(-0.5 * log_level / (n_ref * n_lines))
+    gram = np.zeros((n_rows, n_rows))
+    for block in data.line_blocks():
+        local = window.lines(block.start, block.stop).near()
+        scaled = (local.data.frf * level[:, None, None]).reshape(n_rows, -1)
+        gram += (scaled @ scaled.conj().T).real
     mixer = np.linalg.eigh(gram)[1][:, ::-1][:, :MAX_ROWS].T * level  # (kept, rows)
-    frf = np.einsum("ko,oil->kil", mixer, data.frf, optimize=True)
+    parts = [_mixed(window.lines(block.start, block.stop), mixer) for block in data.line_blocks()]
     small = replace(
         data,
-        frf=frf,
-        variance=np.einsum("ko,oil->kil", mixer**2, data.variance, optimize=True),
-        measured=np.ones(frf.shape[:2], dtype=bool),
+        frf=np.concatenate([frf for frf, _ in parts], axis=-1),
+        variance=np.broadcast_to(np.nan, (MAX_ROWS, n_ref, n_lines)),
+        measured=np.ones((MAX_ROWS, n_ref), dtype=bool),
     )
+    noise = Noise(
+        np.concatenate([noise.common for _, noise in parts], axis=-1),
+        np.concatenate([noise.own for _, noise in parts], axis=-1),
+    )
+    return Local(small, noise, window.from_hits)
 
-    def mixed(noise: Noise) -> Noise:
-        own = np.einsum("ko,oil->kil", mixer**2, noise.own, optimize=True)
-        if data.transposed:  # rows are inputs, whose force noise is independent
-            return Noise(np.einsum("ko,oil->kil", mixer**2, noise.common, optimize=True), own)
-        power = np.sum(np.abs(data.frf) ** 2, axis=0)
-        alpha = noise.common.sum(axis=0) / np.where(power > 0, power, 1.0)
-        return Noise(alpha * np.abs(frf) ** 2, own)
 
-    return small, None if hits is None else mixed(hits), mixed(start)
+def _mixed(window: Window, mixer: Real) -> tuple[Complex, Noise]:
+    """Combinations of rows on a few lines, and their noise."""
+    local, measured = window.near(), window.data.frf
+    own = np.einsum("ko,oil->kil", mixer**2, local.noise.own, optimize=True)
+    if window.data.transposed:  # rows are inputs, whose force noise is independent
+        common = np.einsum("ko,oil->kil", mixer**2, local.noise.common, optimize=True)
+    else:
+        power = np.sum(np.abs(measured) ** 2, axis=0)
+        alpha = local.noise.common.sum(axis=0) / np.where(power > 0, power, 1.0)
+        common = alpha * np.abs(np.einsum("ko,oil->kil", mixer, measured, optimize=True)) ** 2
+    return np.einsum("ko,oil->kil", mixer, local.data.frf, optimize=True), Noise(common, own)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,9 @@ PERIODS_AT_LOW_END = 3
 
 HIGHEST_SHARE_OF_NYQUIST = 0.95
 
+AT_ONCE = 1 << 18
+"""Numbers of a block, so that what is made of it on the way fits into a few megabytes."""
+
 
 @dataclass(frozen=True)
 class FitData:
@@ -26,9 +29,10 @@ class FitData:
     omega : ndarray, (n_lines,)
         rad/s, equally spaced.
     frf : complex ndarray, (n_rows, n_references, n_lines)
-        Accelerance, (m/s²)/N; 0 where not measured. A roving hammer is transposed by reciprocity.
+        Accelerance, (m/s²)/N; 0 where not measured. A roving hammer is transposed by reciprocity. A view of the
+        FRFs where they are accelerances already: not to be written to.
     variance : ndarray, (n_rows, n_references, n_lines)
-        From the scatter over hits; NaN where unknown.
+        From the scatter over hits; NaN or 0 where unknown.
     measured : ndarray of bool, (n_rows, n_references)
     rest_s : float
         Mean time from hit to end of the record.
@@ -54,6 +58,20 @@ class FitData:
             self.rest_s,
             self.transposed,
         )
+
+    def rows(self, rows: slice) -> FitData:
+        """Some rows on the same lines."""
+        return replace(self, frf=self.frf[rows], variance=self.variance[rows], measured=self.measured[rows])
+
+    def row_blocks(self) -> list[slice]:
+        """Rows in blocks that are small beside the whole, for what can be done row by row."""
+        at_once = max(1, AT_ONCE // max(1, self.frf[0].size))
+        return [slice(k, min(k + at_once, len(self.frf))) for k in range(0, len(self.frf), at_once)]
+
+    def line_blocks(self) -> list[slice]:
+        """The same over lines."""
+        at_once = max(64, AT_ONCE // max(1, self.measured.size))
+        return [slice(k, min(k + at_once, len(self.omega))) for k in range(0, len(self.omega), at_once)]
 
 
 def analysis_band(frfs: FrfSet, settings: ModalSettings) -> tuple[float, float]:
@@ -89,12 +107,16 @@ def arrange(frfs: FrfSet, band_hz: tuple[float, float]) -> FitData:
     EmaError
         Where nothing was measured, or an FRF is not finite on some lines only.
     """
-    inside = (frfs.frequency_hz >= band_hz[0]) & (frfs.frequency_hz <= band_hz[1])
+    low = int(np.searchsorted(frfs.frequency_hz, band_hz[0]))
+    inside = slice(low, int(np.searchsorted(frfs.frequency_hz, band_hz[1], side="right")))
     omega = 2 * np.pi * frfs.frequency_hz[inside]
-    acc = frfs.accelerance()[..., inside]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.abs(acc) / np.abs(frfs.frf[..., inside])
-    variance = frfs.variance[..., inside] * np.where(np.isfinite(ratio), ratio, 0.0) ** 2
+    acc, variance = frfs.frf[..., inside], frfs.variance[..., inside]
+    if set(frfs.quantities) != {"acceleration"}:
+        derivatives = np.array(
+            [{"acceleration": 0, "velocity": 1, "displacement": 2}[q] for q in frfs.quantities]
+        )
+        factors = (1j * omega) ** derivatives[:, None, None]
+        acc, variance = acc * factors, variance * np.abs(factors) ** 2
     finite = np.isfinite(acc)
     measured = np.asarray(finite.all(axis=-1))
     if not measured.any():
@@ -105,10 +127,10 @@ def arrange(frfs: FrfSet, band_hz: tuple[float, float]) -> FitData:
         raise EmaError(
             f"FRF {frfs.outputs[o]} over {frfs.inputs[i]} is not a number at some lines: estimate it again"
         )
-    acc = np.where(measured[..., None], acc, 0.0)
-    variance = np.where(np.isfinite(variance) & (variance > 0), variance, np.nan)
+    if not measured.all():
+        acc = np.where(measured[..., None], acc, 0.0)
     rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
     transposed = acc.shape[0] < acc.shape[1]
     if transposed:
         acc, variance, measured = acc.swapaxes(0, 1), variance.swapaxes(0, 1), measured.T
-    return FitData(omega, np.ascontiguousarray(acc), variance, measured, rest_s, transposed)
+    return FitData(omega, acc, variance, measured, rest_s, transposed)

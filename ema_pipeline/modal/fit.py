@@ -31,6 +31,9 @@ Real = NDArray[np.float64]
 LINES_AT_ONCE = 64
 """Block of lines in a Gram matrix."""
 
+COLUMNS_AT_ONCE = 4096
+"""Lines for which the functions of frequency are made at a time: of many modes they outgrow the FRFs."""
+
 RIDGE = 1e-12
 """Relative ridge that keeps Gram matrices of coinciding poles solvable."""
 
@@ -105,8 +108,8 @@ def mixing(participation: Complex) -> Real:
     return out.reshape(n_ref, 2 * n_modes, 2 * n_modes)
 
 
-def weighted_grams(columns: Complex, weight: Real, data: Complex) -> tuple[Real, Real]:
-    """Re(Eᴴ W E) and Re(Eᴴ W y) for every FRF.
+def weighted_grams(columns: Complex, weight: Real, data: Complex) -> tuple[Real, Real, Real]:
+    """Re(Eᴴ W E), Re(Eᴴ W y) and yᴴ W y for every FRF.
 
     Parameters
     ----------
@@ -118,11 +121,14 @@ def weighted_grams(columns: Complex, weight: Real, data: Complex) -> tuple[Real,
     -------
     gram : ndarray, (n_frfs, n_columns, n_columns)
     moment : ndarray, (n_frfs, n_columns)
+    power : ndarray, (n_frfs,)
+        yᴴ W y.
     """
     n = len(columns)
     upper = np.triu_indices(n)
     re, im = np.ascontiguousarray(columns.real), np.ascontiguousarray(columns.imag)
     packed = np.zeros((len(weight), len(upper[0])))
+    moment, power = np.zeros((len(weight), n)), np.zeros(len(weight))
     for start in range(0, columns.shape[1], LINES_AT_ONCE):  # small blocks stay in the cache
         block = slice(start, start + LINES_AT_ONCE)
         products = re[:, block][upper[0]]
@@ -131,11 +137,14 @@ def weighted_grams(columns: Complex, weight: Real, data: Complex) -> tuple[Real,
         other *= im[:, block][upper[1]]
         products += other
         packed += weight[:, block] @ products.T
+        weighted = weight[:, block] * data[:, block]
+        moment += weighted.real @ re[:, block].T
+        moment += weighted.imag @ im[:, block].T
+        power += np.sum(weighted.real * data[:, block].real + weighted.imag * data[:, block].imag, axis=1)
     gram = np.empty((len(weight), n, n))
     gram[:, upper[0], upper[1]] = packed
     gram[:, upper[1], upper[0]] = packed
-    moment = (weight * data.real) @ re.T + (weight * data.imag) @ im.T
-    return gram, moment
+    return gram, moment, power
 
 
 def solve_linear(data: FitData, weight: Real, estimate: Estimate) -> LinearSolution:
@@ -150,13 +159,18 @@ def solve_linear(data: FitData, weight: Real, estimate: Estimate) -> LinearSolut
     """
     n_rows, n_ref, n_lines = data.frf.shape
     m = len(estimate.poles)
-    columns, derivatives = real_columns(data.omega, estimate.poles, data.rest_s)
     residual = residual_columns(data.omega)
-    everything = np.concatenate([columns, derivatives, residual])
-    flat_weight = weight.reshape(-1, n_lines)
-    flat = data.frf.reshape(-1, n_lines)
-    gram, moment = weighted_grams(everything, flat_weight, flat)
-    power = np.einsum("fl,fl->f", flat_weight, flat.real**2 + flat.imag**2)
+    n_columns, n_frfs = 4 * m + len(residual), n_rows * n_ref
+    gram, moment = np.zeros((n_frfs, n_columns, n_columns)), np.zeros((n_frfs, n_columns))
+    power = np.zeros(n_frfs)
+    for block in _blocks(n_lines):
+        columns, derivatives = real_columns(data.omega[block], estimate.poles, data.rest_s)
+        some = weighted_grams(
+            np.concatenate([columns, derivatives, residual[:, block]]),
+            weight[..., block].reshape(n_frfs, -1),
+            data.frf[..., block].reshape(n_frfs, -1),
+        )
+        gram, moment, power = gram + some[0], moment + some[1], power + some[2]
     gram, moment, power = _project_out(gram, moment, power, 4 * m)
     gram = gram.reshape(n_rows, n_ref, 4 * m, 4 * m)
     moment = moment.reshape(n_rows, n_ref, 4 * m)
@@ -266,16 +280,23 @@ def moved(estimate: Estimate, change: Real) -> Estimate:
 
 def synthesis(data: FitData, estimate: Estimate, shapes: Complex) -> Complex:
     """What the modes alone add to the FRFs, (n_rows, n_references, n_lines)."""
-    columns, _ = real_columns(data.omega, estimate.poles, data.rest_s)
     residues = shapes[:, None, :] * estimate.participation.T[None]
-    return np.asarray(residues.real @ columns[0::2] + residues.imag @ columns[1::2])
+    out = np.empty(data.frf.shape, dtype=np.complex128)
+    for block in _blocks(len(data.omega)):
+        columns, _ = real_columns(data.omega[block], estimate.poles, data.rest_s)
+        out[..., block] = residues.real @ columns[0::2] + residues.imag @ columns[1::2]
+    return out
+
+
+def _blocks(n_lines: int) -> list[slice]:
+    return [slice(k, min(k + COLUMNS_AT_ONCE, n_lines)) for k in range(0, n_lines, COLUMNS_AT_ONCE)]
 
 
 def residual_fit(data: FitData, weight: Real, modes: Complex) -> Complex:
     """Best residual terms for what the modes leave over, (n_rows, n_references, n_lines)."""
     columns = residual_columns(data.omega)
     n_lines = data.frf.shape[-1]
-    gram, moment = weighted_grams(
+    gram, moment, _ = weighted_grams(
         columns, weight.reshape(-1, n_lines), (data.frf - modes).reshape(-1, n_lines)
     )
     coefficients = solve_scaled(gram, moment[..., None])[..., 0]

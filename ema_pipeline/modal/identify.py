@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.assurance import mpc
-from ema_pipeline.modal.bands import indicator, split
+from ema_pipeline.modal.bands import SubBand, indicator, split
+from ema_pipeline.modal.compress import Window, compress
 from ema_pipeline.modal.data import FitData, analysis_band, arrange
 from ema_pipeline.modal.engines import poles_of_all_orders
 from ema_pipeline.modal.fit import (
@@ -17,19 +18,19 @@ from ema_pipeline.modal.fit import (
     residual_fit,
     synthesis,
 )
-from ema_pipeline.modal.noise import Noise, fit_noise, second_difference_power
+from ema_pipeline.modal.noise import Noise, fit_law, flat_law, second_difference_power
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.scaling import scale_shapes, scaling_note
 from ema_pipeline.modal.selection import link, votes
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.sweep import (
     FittedModes,
-    NoiseModels,
     between,
     candidates,
     first_guess,
     refined,
     tracked,
+    whole,
 )
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
 from ema_pipeline.threads import single_blas_thread
@@ -70,54 +71,52 @@ def identify(frfs: FrfSet, settings: ModalSettings, progress: Progress | None = 
 def _identify(frfs: FrfSet, settings: ModalSettings, tell: Progress) -> ModalModel:
     band = analysis_band(frfs, settings)
     data = arrange(frfs, band)
-    noise, level = _first_noise(data)
+    window, level = _first_noise(data)
     bands = split(data.omega, indicator(data, level))
     iterations = POLISH_ITERATIONS if settings.polish else 0
 
     charts: list[PoleSet] = []
     for k, part in enumerate(bands):
         tell(0.1 + 0.3 * k / len(bands), f"poles of sub-band {k + 1} of {len(bands)}")
-        lines, local = data.lines(part.first, part.stop), noise.cut(part)
-        charts.append(poles_of_all_orders(lines, local.start.variance, part.n_peaks, settings))
+        charts.append(_chart_of(window.lines(part.first, part.stop), part, settings))
     found = candidates(charts, bands, data.measured.shape[1])
     sure = found.sure
     if len(bands) > 1:
         tell(0.4, f"first fit of {len(sure.poles)} candidates")
-        sure = first_guess(data, noise, bands, sure, iterations)
+        sure = first_guess(window, bands, sure, iterations)
     tell(0.6, f"refining {len(sure.poles)} modes, trying {len(found.weak.poles)} more")
 
     def search(window: FitData, known: Noise) -> Estimate:
         return tracked(poles_of_all_orders(window, known.variance, 2, settings))
 
-    modes = refined(data, noise, bands, charts, sure, found.weak, search, iterations)
+    modes = refined(window, bands, charts, sure, found.weak, search, iterations)
     tell(0.9, "shapes and synthesis")
     cores = [chart.take(between(chart.pole, b.low, b.high)) for chart, b in zip(charts, bands, strict=True)]
-    return _model(frfs, settings, band, data, noise.start, modes, cores)
+    return _model(frfs, settings, band, window, modes, cores)
 
 
-def _first_noise(data: FitData) -> tuple[NoiseModels, Real]:
-    """Noise from hits or a first guess of it, and noise level of every FRF."""
-    known = np.isfinite(data.variance).any()
-    second = np.maximum(second_difference_power(data.frf), 1e-300)
-    floor = 1e-12 * np.mean(np.abs(data.frf) ** 2, axis=-1)
-    level = np.where(data.measured, np.maximum(second, np.maximum(floor, 1e-300)), 1.0)
+def _first_noise(data: FitData) -> tuple[Window, Real]:
+    """Data with noise from hits or a first guess of it, and noise level of every FRF."""
+    known = any(np.any(row > 0) for row in data.variance)
     if known:
-        hits = fit_noise(data.variance, data.frf, data.measured, inputs_are_rows=data.transposed)
-        level = np.where(data.measured, np.median(hits.own, axis=-1), 1.0)
-        return NoiseModels(hits, hits), level
-    own = np.broadcast_to(level[..., None], data.frf.shape).copy()
-    return NoiseModels(None, Noise(1e-4 * np.abs(data.frf) ** 2, own)), level
+        hits = fit_law(data.variance, data.frf, data.measured, inputs_are_rows=data.transposed)
+        typical = hits.level * np.median(hits.shape @ hits.hats, axis=-1) + hits.floor
+        return whole(data, hits, from_hits=True), np.where(data.measured, typical, 1.0)
+    floor = np.array([np.mean(np.abs(row) ** 2, axis=-1) for row in data.frf])
+    second = np.array([second_difference_power(row) for row in data.frf])
+    level = np.where(data.measured, np.maximum(second, np.maximum(1e-12 * floor, 1e-300)), 1.0)
+    return whole(data, flat_law(level, len(data.omega)), from_hits=False), level
 
 
 def _model(
     frfs: FrfSet,
     settings: ModalSettings,
     band: tuple[float, float],
-    data: FitData,
-    start: Noise,
+    window: Window,
     modes: FittedModes,
     charts: list[PoleSet],
 ) -> ModalModel:
+    data = window.data
     order = np.argsort(np.abs(modes.poles))
     rows, references = frfs.outputs, frfs.inputs
     if data.transposed:
@@ -156,7 +155,7 @@ def _model(
         scaling_note=note,
         references=references,
         frequency_hz=data.omega / (2 * np.pi),
-        synthesis=_synthesis(data, start, modes),
+        synthesis=_synthesis(window, modes),
         outputs=frfs.outputs,
         inputs=frfs.inputs,
         chart=chart,
@@ -217,12 +216,24 @@ def _chart(charts: list[PoleSet], poles: Complex, decay: float) -> tuple[Stabili
     ), share
 
 
-def _synthesis(data: FitData, noise: Noise, modes: FittedModes) -> Complex:
-    """Accelerance of the modes and residual terms, in the order (outputs, inputs)."""
-    fitted = synthesis(data, Estimate(modes.poles, modes.participation), modes.shapes.T)
-    total = fitted + residual_fit(data, noise.weight(data.measured), fitted)
-    total = np.where(data.measured[..., None], total, np.nan)
+def _synthesis(window: Window, modes: FittedModes) -> Complex:
+    """Accelerance of the modes and residual terms, in the order (outputs, inputs); NaN where not measured."""
+    data = window.data
+    total = np.empty(data.frf.shape, dtype=np.complex128)
+    estimate = Estimate(modes.poles, modes.participation)
+    for rows in data.row_blocks():
+        some = data.rows(rows)
+        fitted = synthesis(some, estimate, modes.shapes.T[rows])
+        noise = window.noise.rows(rows).at(some.frf)
+        fitted += residual_fit(some, noise.weight(some.measured), fitted)
+        total[rows] = np.where(some.measured[..., None], fitted, np.nan)
     return np.asarray(total.swapaxes(0, 1) if data.transposed else total)
+
+
+def _chart_of(window: Window, part: SubBand, settings: ModalSettings) -> PoleSet:
+    """Poles of all orders of a sub-band."""
+    few = compress(window)
+    return poles_of_all_orders(few.data, few.noise.variance, part.n_peaks, settings)
 
 
 def _notes(data: FitData, scaling: str) -> tuple[str, ...]:

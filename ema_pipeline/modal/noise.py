@@ -16,10 +16,13 @@ Neural Computation 21, 2009.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ema_pipeline.modal.data import AT_ONCE
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -73,53 +76,140 @@ def second_difference_power(frf: Complex) -> Real:
     return np.asarray(np.median(difference, axis=-1) / np.log(2.0))
 
 
+@dataclass(frozen=True)
+class NoiseLaw:
+    """The noise model by its parameters: evaluated where it is needed, it takes no memory.
+
+    Attributes
+    ----------
+    common, shape : ndarray, (n_rows or 1, n_references or 1, n_nodes)
+        α and g of each input at the nodes.
+    level, floor : ndarray, (n_rows, n_references)
+        b, and what is added to it as the least noise.
+    hats : ndarray, (n_nodes, n_lines)
+    """
+
+    common: Real
+    shape: Real
+    level: Real
+    floor: Real
+    hats: Real
+
+    def at(self, response: Complex) -> Noise:
+        """Noise of FRFs (n_rows, n_references, n_lines)."""
+        own = self.level[..., None] * (self.shape @ self.hats) + self.floor[..., None]
+        return Noise((self.common @ self.hats) * np.abs(response) ** 2, own)
+
+    def lines(self, first: int, stop: int) -> NoiseLaw:
+        """The same on lines ``first:stop``."""
+        return replace(self, hats=self.hats[:, first:stop])
+
+    def rows(self, rows: slice) -> NoiseLaw:
+        """The same for some rows."""
+        per_row = len(self.common) > 1
+        return NoiseLaw(
+            self.common[rows] if per_row else self.common,
+            self.shape[rows] if per_row else self.shape,
+            self.level[rows],
+            self.floor[rows],
+            self.hats,
+        )
+
+
+def flat_law(level: Real, n_lines: int) -> NoiseLaw:
+    """A first guess where the scatter over hits is not known: white, (n_rows, n_references), and little in common."""
+    return NoiseLaw(
+        np.full((1, 1, 1), 1e-4), np.ones((1, 1, 1)), level, np.zeros(level.shape), np.ones((1, n_lines))
+    )
+
+
 def fit_noise(power: Real, response: Complex, measured: NDArray[np.bool_], *, inputs_are_rows: bool) -> Noise:
+    """Fit the noise model to squared errors, and evaluate it; as `fit_law`."""
+    return fit_law(power, response, measured, inputs_are_rows=inputs_are_rows).at(response)
+
+
+def fit_law(
+    power: Real, response: Complex, measured: NDArray[np.bool_], *, inputs_are_rows: bool
+) -> NoiseLaw:
     """Fit the noise model to squared errors.
 
     Parameters
     ----------
     power : ndarray, (n_rows, n_references, n_lines)
-        Squared modulus of the error, or variance from hits; NaN where unknown.
+        Squared modulus of the error, or variance from hits; NaN or 0 where unknown.
     response : complex ndarray, (n_rows, n_references, n_lines)
         The FRFs themselves (best from a model, so that their noise does not leak into the weights).
     measured : ndarray of bool, (n_rows, n_references)
     inputs_are_rows : bool
         True for a roving hammer, where rows are inputs.
     """
-    n_lines = power.shape[-1]
+    n_rows, n_ref, n_lines = power.shape
     hats = _hats(n_lines)
-    square = np.abs(response) ** 2
-    known = measured[..., None] & np.isfinite(power)
-    mask = known.astype(float)
-    floor = FLOOR**2 * np.where(measured, np.mean(square, axis=-1), 1.0)[..., None]
-    z = np.where(known, np.maximum(np.where(known, power, 1.0), floor), 1.0)
     axis = 1 if inputs_are_rows else 0  # the axis that outputs run along
+    at_once = max(1, AT_ONCE // (n_ref * n_lines))
+    blocks = [slice(k, min(k + at_once, n_rows)) for k in range(0, n_rows, at_once)]
+    floor, own_level = np.empty((n_rows, n_ref)), np.empty((n_rows, n_ref))
+
+    def prepared(rows: slice) -> _Block:
+        square = np.abs(response[rows]) ** 2
+        known = measured[rows, :, None] & np.isfinite(power[rows]) & (power[rows] > 0)
+        floor[rows] = FLOOR**2 * np.where(measured[rows], np.mean(square, axis=-1), 1.0)
+        z = np.where(known, np.maximum(np.where(known, power[rows], 1.0), floor[rows, :, None]), 1.0)
+        return _Block(rows, rows if inputs_are_rows else slice(None), known.astype(float), z, square)
+
+    kept = [prepared(blocks[0])] if len(blocks) == 1 else []
+
+    def each() -> Iterator[_Block]:
+        return iter(kept) if kept else map(prepared, blocks)
+
     # start: noise of each FRF at its quiet lines; a small common share
-    with np.errstate(divide="ignore", invalid="ignore"):
-        own_level = np.exp(np.sum(mask * np.log(z), axis=-1) / np.maximum(mask.sum(axis=-1), 1)) * 1.78
-    own_level = np.where(own_level > 0, own_level, 1.0)
-    group_shape = (z.shape[0], 1) if inputs_are_rows else (1, z.shape[1])
-    g = np.ones((*group_shape, len(hats)))
-    alpha = np.full((*group_shape, len(hats)), 1e-4)
-    b = own_level
-    for _ in range(ITERATIONS):
-        own = b[..., None] * (g @ hats)
-        v = (alpha @ hats) * square + own + floor
-        first, second = mask / v, mask * z / v**2
-        alpha = alpha * np.sqrt(_collect(second * square, hats, axis) / _collect(first * square, hats, axis))
-        v = (alpha @ hats) * square + own + floor
-        first, second = mask / v, mask * z / v**2
-        g = g * np.sqrt(
-            _collect(second * b[..., None], hats, axis) / _collect(first * b[..., None], hats, axis)
-        )
-        shape = g @ hats
-        own = b[..., None] * shape
-        v = (alpha @ hats) * square + own + floor
-        first, second = mask / v, mask * z / v**2
+    for p in each():
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.sum(second * shape, axis=-1) / np.sum(first * shape, axis=-1)
-        b = b * np.sqrt(np.where(np.isfinite(ratio), ratio, 1.0))
-    return Noise((alpha @ hats) * square, b[..., None] * (g @ hats) + floor)
+            quiet = np.exp(np.sum(p.mask * np.log(p.z), axis=-1) / np.maximum(p.mask.sum(axis=-1), 1)) * 1.78
+        own_level[p.rows] = np.where(quiet > 0, quiet, 1.0)
+    group_shape = (n_rows, 1, len(hats)) if inputs_are_rows else (1, n_ref, len(hats))
+    g, alpha, b = np.ones(group_shape), np.full(group_shape, 1e-4), own_level
+
+    def ratios(p: _Block) -> tuple[Real, Real]:
+        """Derivatives of the likelihood by the variance, less and more."""
+        own = b[p.rows, :, None] * (g[p.groups] @ hats)
+        v = (alpha[p.groups] @ hats) * p.square + own + floor[p.rows, :, None]
+        first = p.mask / v
+        return first, first * p.z / v
+
+    for _ in range(ITERATIONS):
+        less, more = np.zeros(group_shape), np.zeros(group_shape)
+        for p in each():
+            first, second = ratios(p)
+            less[p.groups] += _collect(first * p.square, hats, axis)
+            more[p.groups] += _collect(second * p.square, hats, axis)
+        alpha = alpha * np.sqrt(more / less)
+        less, more = np.zeros(group_shape), np.zeros(group_shape)
+        for p in each():
+            first, second = ratios(p)
+            less[p.groups] += _collect(first * b[p.rows, :, None], hats, axis)
+            more[p.groups] += _collect(second * b[p.rows, :, None], hats, axis)
+        g = g * np.sqrt(more / less)
+        step = np.ones(b.shape)
+        for p in each():
+            first, second = ratios(p)
+            spectrum = g[p.groups] @ hats
+            with np.errstate(divide="ignore", invalid="ignore"):
+                ratio = np.sum(second * spectrum, axis=-1) / np.sum(first * spectrum, axis=-1)
+            step[p.rows] = np.sqrt(np.where(np.isfinite(ratio), ratio, 1.0))
+        b = b * step
+    return NoiseLaw(alpha, g, b, floor, hats)
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Some rows of the squared errors: where they are known, limited from below, and the FRFs' own power."""
+
+    rows: slice
+    groups: slice
+    mask: Real
+    z: Real
+    square: Real
 
 
 def _collect(values: Real, hats: Real, axis: int) -> Real:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.modal.bands import SubBand
-from ema_pipeline.modal.compress import compress
+from ema_pipeline.modal.compress import Local, Window, compress, compressible
 from ema_pipeline.modal.credibility import (
     COINCIDENT,
     MIN_VOTES,
@@ -20,13 +20,13 @@ from ema_pipeline.modal.credibility import (
     significant,
 )
 from ema_pipeline.modal.data import FitData
-from ema_pipeline.modal.fit import Estimate, free_participations, normalised, solve_linear, synthesis
+from ema_pipeline.modal.fit import Estimate, free_participations, normalised, solve_linear
 from ema_pipeline.modal.missed import Search, missed
-from ema_pipeline.modal.noise import Noise
+from ema_pipeline.modal.noise import NoiseLaw
 from ema_pipeline.modal.poles import PoleSet
-from ema_pipeline.modal.segment import SegmentFit, fit_segment
+from ema_pipeline.modal.segment import SegmentFit, fit_segment, measured_noise
 from ema_pipeline.modal.selection import link, votes
-from ema_pipeline.modal.uncertainty import covariance
+from ema_pipeline.modal.uncertainty import parameter_covariance, shape_covariance
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -75,25 +75,11 @@ class FittedModes:
     participation_stds: Real
 
 
-@dataclass(frozen=True)
-class NoiseModels:
-    """Noise of all FRFs on all lines.
-
-    Attributes
-    ----------
-    hits : Noise or None
-        From the scatter over hits, where known.
-    start : Noise
-        The same, or a first guess.
-    """
-
-    hits: Noise | None
-    start: Noise
-
-    def cut(self, part: SubBand) -> NoiseModels:
-        """The same on the lines of a sub-band."""
-        start = self.start.lines(part.first, part.stop)
-        return NoiseModels(None if self.hits is None else self.hits.lines(part.first, part.stop), start)
+def whole(data: FitData, noise: NoiseLaw, from_hits: bool) -> Window:
+    """All lines, with no mode taken off."""
+    n_rows, n_ref = data.measured.shape
+    none = Estimate(np.zeros(0, complex), np.zeros((0, n_ref), complex))
+    return Window(data, noise, from_hits, none, np.zeros((n_rows, 0), complex))
 
 
 def candidates(charts: list[PoleSet], bands: tuple[SubBand, ...], n_references: int) -> Candidates:
@@ -133,23 +119,19 @@ def _stitched(known: Estimate, fresh: Estimate) -> Estimate:
     return known.joined(fresh.take(np.arange(1, len(fresh.poles)))) if same and alike else known.joined(fresh)
 
 
-def first_guess(
-    data: FitData, noise: NoiseModels, bands: tuple[SubBand, ...], modes: Estimate, iterations: int
-) -> Estimate:
+def first_guess(window: Window, bands: tuple[SubBand, ...], modes: Estimate, iterations: int) -> Estimate:
     """Fit of each sub-band on its own, so that far modes can then be taken off the data of the others."""
     found = modes.take(np.zeros(len(modes.poles), dtype=bool))
     for part in bands:
-        lines, local = data.lines(part.first, part.stop), noise.cut(part)
-        near = modes.take(between(modes.poles, lines.omega[0], lines.omega[-1]))
-        small, hits, start = compress(lines, local.hits, local.start)
-        fit = fit_segment(small, hits, start, near, significant, min(iterations, FIRST_ITERATIONS))
+        few = compress(window.lines(part.first, part.stop))
+        near = modes.take(between(modes.poles, few.data.omega[0], few.data.omega[-1]))
+        fit = fit_segment(few.data, few.hits, few.noise, near, significant, min(iterations, FIRST_ITERATIONS))
         found = _stitched(found, fit.estimate.take(between(fit.estimate.poles, part.low, part.high)))
     return found
 
 
 def refined(
-    data: FitData,
-    noise: NoiseModels,
+    window: Window,
     bands: tuple[SubBand, ...],
     charts: list[PoleSet],
     sure: Estimate,
@@ -159,20 +141,21 @@ def refined(
 ) -> FittedModes:
     """Final fit, sub-band by sub-band, with the modes of the other sub-bands taken off the data."""
     parts: list[FittedModes] = []
-    everywhere = solve_linear(data, noise.start.weight(data.measured), sure).shapes
+    data = window.data
+    everywhere = _shapes(window, sure)
     for part, chart in zip(bands, charts, strict=True):
         low, high = float(data.omega[part.first]), float(data.omega[part.stop - 1])
         near, also = between(sure.poles, low, high), between(weak.poles, low, high)
         inside = np.concatenate([sure.poles[near], weak.poles[also]])
-        if noise.hits is None and not between(inside, part.low, part.high).any():
+        if not window.from_hits and not between(inside, part.low, part.high).any():
             continue
-        lines = data.lines(part.first, part.stop)
-        far = synthesis(lines, sure.take(~near), everywhere[:, ~near])
-        lines = replace(lines, frf=np.where(lines.measured[..., None], lines.frf - far, 0.0))
-        fit = _fit_part(
-            lines, noise.cut(part), sure.take(near), weak.take(also), _voters(chart), search, iterations
+        lines = replace(
+            window.lines(part.first, part.stop), far=sure.take(~near), far_shapes=everywhere[:, ~near]
         )
-        parts.append(_final(lines, fit, part))
+        few = compress(lines)
+        fit = _fit_part(few, sure.take(near), weak.take(also), _voters(chart), search, iterations)
+        if len(fit.estimate.poles):
+            parts.append(_final(lines, few.data, fit, part))
     n_rows, n_ref = data.measured.shape
     empty = FittedModes(
         np.zeros(0, complex),
@@ -192,19 +175,27 @@ def _voters(poles: PoleSet) -> Callable[[Estimate], Real]:
     return lambda estimate: votes(poles, estimate.poles)[0]
 
 
+def _shapes(window: Window, estimate: Estimate) -> Complex:
+    """Shapes that fit best on all lines, (n_rows, n_modes)."""
+    shapes = []
+    for rows in window.data.row_blocks():
+        some = window.rows(rows).near()
+        shapes.append(solve_linear(some.data, some.noise.weight(some.data.measured), estimate).shapes)
+    return np.concatenate(shapes)
+
+
 def _fit_part(
-    lines: FitData,
-    noise: NoiseModels,
+    few: Local,
     sure: Estimate,
     weak: Estimate,
     voters: Callable[[Estimate], Real],
     search: Search,
     iterations: int,
 ) -> SegmentFit:
-    """Sure modes first, then weak and missed ones on top; at last all rows where they had been combined."""
-    small, hits, start = compress(lines, noise.hits, noise.start)
+    """Sure modes first, then weak and missed ones on top."""
+    small, hits = few.data, few.hits
     judge = partial(credible, hits=hits, votes=voters)
-    fit = fit_segment(small, hits, start, sure, judge, iterations)
+    fit = fit_segment(small, hits, few.noise, sure, judge, iterations)
     free = _apart(weak, fit.estimate)
     if free.any():
         more = fit_segment(small, hits, fit.noise, fit.estimate.joined(weak.take(free)), judge, iterations)
@@ -220,10 +211,7 @@ def _fit_part(
         if not _holds(more.estimate, fit.estimate) or len(more.estimate.poles) <= len(fit.estimate.poles):
             break
         fit = more
-    if small is lines:
-        return fit
-    judge = partial(credible, hits=noise.hits, votes=voters)
-    return fit_segment(lines, noise.hits, noise.start, fit.estimate, judge, iterations)
+    return fit
 
 
 def _apart(weak: Estimate, known: Estimate) -> NDArray[np.bool_]:
@@ -244,22 +232,47 @@ def _holds(larger: Estimate, smaller: Estimate) -> bool:
     return bool(np.all(distance < 2 * -smaller.poles.real))
 
 
-def _final(lines: FitData, fit: SegmentFit, part: SubBand) -> FittedModes:
-    """Modes of a sub-band's core with their uncertainties."""
+def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand) -> FittedModes:
+    """Modes of a sub-band's core with their uncertainties, and with shapes at all rows."""
     estimate = fit.estimate
-    cov = covariance(lines, fit.noise.weight(lines.measured), estimate, fit.solution, fit.noise)
+    weight = fit.noise.weight(few.measured)
+    parameters = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
+    if compressible(window.data):
+        made = [
+            _shapes_and_stds(*_linear_fit(window.rows(rows), estimate), parameters)
+            for rows in window.data.row_blocks()
+        ]
+        shapes, stds = np.concatenate([s for s, _ in made]), np.concatenate([s for _, s in made])
+    else:
+        shapes, stds = _shapes_and_stds(few, fit, parameters)
     core = np.flatnonzero(between(estimate.poles, part.low, part.high))
-    stds = np.array(
-        [np.sqrt(0.5 * (cov.shapes[:, 2 * r, 2 * r] + cov.shapes[:, 2 * r + 1, 2 * r + 1])) for r in core]
-    )
     return FittedModes(
         poles=estimate.poles[core],
-        pole_cov=np.array([cov.poles(int(r)) for r in core]).reshape(len(core), 2, 2),
-        shapes=fit.solution.shapes.T[core],
-        shape_stds=stds.reshape(len(core), len(lines.frf)),
+        pole_cov=np.array([parameters[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] for r in core]).reshape(-1, 2, 2),
+        shapes=shapes.T[core],
+        shape_stds=stds.T[core],
         participation=estimate.participation[core],
-        participation_stds=_participation_stds(estimate, cov.parameters)[core],
+        participation_stds=_participation_stds(estimate, parameters)[core],
     )
+
+
+def _linear_fit(window: Window, estimate: Estimate) -> tuple[FitData, SegmentFit]:
+    """Shapes of some rows for poles that are known, at the noise that they leave over."""
+    local = window.near()
+    data, noise = local.data, local.noise
+    for _ in range(2):
+        weight = noise.weight(data.measured)
+        solution = solve_linear(data, weight, estimate)
+        noise = measured_noise(data, local.hits, estimate, solution, weight)
+    return data, SegmentFit(estimate, solve_linear(data, noise.weight(data.measured), estimate), noise)
+
+
+def _shapes_and_stds(data: FitData, fit: SegmentFit, parameters: Real) -> tuple[Complex, Real]:
+    """Shapes of some rows and their standard deviations, (n_rows, n_modes)."""
+    weight = fit.noise.weight(data.measured)
+    cov = shape_covariance(data, weight, fit.estimate, fit.solution, fit.noise, parameters)
+    diagonal = np.einsum("oaa->oa", cov)
+    return fit.solution.shapes, np.sqrt(0.5 * (diagonal[:, 0::2] + diagonal[:, 1::2]))
 
 
 def _participation_stds(estimate: Estimate, parameters: Real) -> Real:

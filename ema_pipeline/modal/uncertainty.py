@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,33 +18,14 @@ from ema_pipeline.modal.fit import (
 )
 from ema_pipeline.modal.noise import Noise
 
+Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Covariance:
-    """Covariance of the nonlinear parameters and of the shapes.
-
-    Attributes
-    ----------
-    parameters : ndarray, (n_parameters, n_parameters)
-        In the order of `fit.parameter_columns`.
-    shapes : ndarray, (n_rows, 2M, 2M)
-        Covariance of (Re, Im) of all modes' shape entries of each row, the poles' errors included.
-    """
-
-    parameters: Real
-    shapes: Real
-
-    def poles(self, mode: int) -> Real:
-        """2 × 2 covariance of (Re s, Im s)."""
-        return self.parameters[2 * mode : 2 * mode + 2, 2 * mode : 2 * mode + 2]
-
-
-def covariance(
+def parameter_covariance(
     data: FitData, weight: Real, estimate: Estimate, solution: LinearSolution, noise: Noise
-) -> Covariance:
-    """Covariance by linear propagation of the noise through the weighted fit.
+) -> Real:
+    """Covariance of poles and participations by linear propagation of the noise through the weighted fit.
 
     Noise that all outputs of an input have in common does not average out over channels; its share is
     propagated coherently (a sandwich covariance).
@@ -59,52 +38,98 @@ def covariance(
     estimate, solution
         Result of the fit with these weights.
     noise : Noise
+
+    Returns
+    -------
+    ndarray, (n_parameters, n_parameters)
+        In the order of `fit.parameter_columns`.
     """
     m = len(estimate.poles)
-    step = newton_step(estimate, solution)
-    inverse = _inverse(step.information)
+    inverse = _inverse(newton_step(estimate, solution).information)
     mix = mixing(estimate.participation)
     z = parameter_columns(estimate, solution.shapes)
-    n_par = z.shape[-1]
-    columns, derivatives = real_columns(data.omega, estimate.poles, data.rest_s)
-    signal = np.concatenate([columns, derivatives])
+    eliminated = _eliminated(estimate, solution)
+    signal = np.concatenate(real_columns(data.omega, estimate.poles, data.rest_s))
     residual = residual_columns(data.omega)
     n_rows, n_ref, n_lines = data.frf.shape
-    gz = np.matmul(solution.gram, z)
-    cross = np.einsum("iba,oibp->oap", mix, gz[:, :, : 2 * m], optimize=True)
-    eliminated = solve_scaled(solution.normal, cross)  # minus dψ/dθ
-    # parameter sensitivity on lines: columns that act on [mode columns, derivatives], residual terms removed
+    n_par = z.shape[-1]
     meat = np.zeros((n_par, n_par))
-    groups = n_rows if data.transposed else n_ref
-    per_group = np.zeros((groups, n_par, n_lines), dtype=np.complex128)
-    ratio = np.sqrt(noise.common)
-    phase = np.where(np.abs(data.frf) > 0, data.frf / np.maximum(np.abs(data.frf), 1e-300), 0.0)
-    shape_cov = np.zeros((n_rows, 2 * m, 2 * m))
-    for o in range(n_rows):
-        row_meat = np.zeros((2 * m, 2 * m))
-        linear_inverse = _inverse(solution.normal[o])
-        for i in range(n_ref):
+    # what all outputs share adds up over the outputs of one input before it is squared
+    together = [[(o, i) for i in range(n_ref)] for o in range(n_rows)]
+    if not data.transposed:
+        together = [list(group) for group in zip(*together, strict=True)]
+    for group in together:
+        coherent = np.zeros((n_par, n_lines), dtype=np.complex128)
+        for o, i in group:
             w = weight[o, i]
             if not np.any(w):
                 continue
             coefficients = z[o, i].copy()
             coefficients[: 2 * m] -= mix[i] @ eliminated[o]
-            corner, _ = weighted_grams(residual, w[None], np.zeros((1, n_lines), complex))
-            side = (residual.conj() * w) @ signal.T
-            projected = signal - np.linalg.lstsq(corner[0], side.real, rcond=None)[0].T @ residual
-            a = coefficients.T @ projected * w  # (n_par, n_lines)
-            own = noise.own[o, i]
-            meat += 0.5 * ((a * own) @ a.conj().T).real
-            group = o if data.transposed else i
-            per_group[group] += a.conj() * (ratio[o, i] * phase[o, i])
-            x = mix[i].T @ projected[: 2 * m] * w
-            row_meat += 0.5 * ((x * noise.variance[o, i]) @ x.conj().T).real
-        shape_cov[o] = linear_inverse @ row_meat @ linear_inverse
-    for coherent in per_group:
+            a = coefficients.T @ _projected(signal, residual, w) * w  # (n_par, n_lines)
+            meat += 0.5 * ((a * noise.own[o, i]) @ a.conj().T).real
+            size = np.abs(data.frf[o, i])
+            phase = np.where(size > 0, data.frf[o, i] / np.maximum(size, 1e-300), 0.0)
+            coherent += a.conj() * (np.sqrt(noise.common[o, i]) * phase)
         meat += 0.5 * (coherent @ coherent.conj().T).real
     parameters = inverse @ meat @ inverse
-    shape_cov += np.einsum("oap,pq,obq->oab", eliminated, parameters, eliminated, optimize=True)
-    return Covariance(0.5 * (parameters + parameters.T), shape_cov)
+    return np.asarray(0.5 * (parameters + parameters.T))
+
+
+def shape_covariance(
+    data: FitData,
+    weight: Real,
+    estimate: Estimate,
+    solution: LinearSolution,
+    noise: Noise,
+    parameters: Real,
+) -> Real:
+    """Covariance of (Re, Im) of all modes' shape entries of each row, the poles' errors included.
+
+    Parameters
+    ----------
+    data, weight, estimate, solution, noise
+        As for `parameter_covariance`; rows are independent of each other.
+    parameters : ndarray, (n_parameters, n_parameters)
+        From `parameter_covariance`.
+
+    Returns
+    -------
+    ndarray, (n_rows, 2M, 2M)
+    """
+    m = len(estimate.poles)
+    mix = mixing(estimate.participation)
+    columns, _ = real_columns(data.omega, estimate.poles, data.rest_s)
+    residual = residual_columns(data.omega)
+    variance = noise.variance
+    out = np.zeros((len(data.frf), 2 * m, 2 * m))
+    for o in range(len(data.frf)):
+        meat = np.zeros((2 * m, 2 * m))
+        for i in range(data.frf.shape[1]):
+            w = weight[o, i]
+            if np.any(w):
+                x = mix[i].T @ _projected(columns, residual, w) * w
+                meat += 0.5 * ((x * variance[o, i]) @ x.conj().T).real
+        inverse = _inverse(solution.normal[o])
+        out[o] = inverse @ meat @ inverse
+    eliminated = _eliminated(estimate, solution)
+    out += np.einsum("oap,pq,obq->oab", eliminated, parameters, eliminated, optimize=True)
+    return out
+
+
+def _eliminated(estimate: Estimate, solution: LinearSolution) -> Real:
+    """Minus the derivative of each row's shape entries by the parameters, (n_rows, 2M, n_parameters)."""
+    m = len(estimate.poles)
+    gz = np.matmul(solution.gram, parameter_columns(estimate, solution.shapes))
+    cross = np.einsum("iba,oibp->oap", mixing(estimate.participation), gz[:, :, : 2 * m], optimize=True)
+    return solve_scaled(solution.normal, cross)
+
+
+def _projected(columns: Complex, residual: Complex, weight: Real) -> Complex:
+    """Columns with what the residual terms can follow taken off, for one FRF's weights (n_lines,)."""
+    corner, *_ = weighted_grams(residual, weight[None], np.zeros((1, len(weight)), complex))
+    side = (residual.conj() * weight) @ columns.T
+    return np.asarray(columns - np.linalg.lstsq(corner[0], side.real, rcond=None)[0].T @ residual)
 
 
 def _inverse(matrix: Real) -> Real:

@@ -60,7 +60,7 @@ def identify_by_circle(frfs: FrfSet, settings: CircleSettings | None = None) -> 
 
 def _identify(frfs: FrfSet, settings: CircleSettings) -> ModalModel:
     data = mobilities(frfs)
-    if data.mobility.shape[0] == 0:
+    if data.output.size == 0:
         raise EmaError("circle fit: no measured FRF; check impacts and channels in test.toml")
     targets = find_peak_targets(data, frfs.band_hz, settings)
     kept: list[tuple[Target, list[CircleFit]]] = []
@@ -101,9 +101,9 @@ def find_peak_targets(
     data: Mobilities, band_hz: tuple[float, float], settings: CircleSettings
 ) -> list[Target]:
     """Peaks of the sum of |mobility|² over all FRFs, each over its own mean in the band."""
-    inside = (data.frequency_hz >= band_hz[0]) & (data.frequency_hz <= band_hz[1])
+    inside = _inside(data, band_hz)
     f = data.frequency_hz[inside]
-    mobility = data.mobility[:, inside]
+    mobility = data.mobility(inside)
     mobility = mobility[np.median(np.abs(mobility), axis=1) > 0]
     power = np.abs(mobility) ** 2
     if f.size < 2 * settings.minimum_points or power.size == 0:
@@ -123,6 +123,12 @@ def find_peak_targets(
         Target(float(f[k]), float(np.clip(width / (2 * f[k]), 1e-5, settings.maximum_damping_ratio)))
         for k, width in zip(peaks, widths, strict=True)
     ]
+
+
+def _inside(data: Mobilities, band_hz: tuple[float, float]) -> slice:
+    """Lines of a band."""
+    low = int(np.searchsorted(data.frequency_hz, band_hz[0]))
+    return slice(low, int(np.searchsorted(data.frequency_hz, band_hz[1], side="right")))
 
 
 def rank_one(matrix: NDArray[np.complex128]) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
@@ -156,9 +162,8 @@ def _assemble(
     dofs = outputs + tuple(i for i in inputs if i not in outputs) if driving else outputs
     if not driving and len(inputs) > len(outputs):
         dofs = inputs  # a roving hammer
-    inside = (data.frequency_hz >= frfs.band_hz[0]) & (data.frequency_hz <= frfs.band_hz[1])
-    f = data.frequency_hz[inside]
-    total = np.zeros((data.mobility.shape[0], f.size), dtype=complex)
+    f = data.frequency_hz[_inside(data, frfs.band_hz)]
+    total = np.zeros((data.output.size, f.size), dtype=complex)
     modes = []
     for index, (target, circles) in enumerate(kept):
         lines = line_range(data.frequency_hz, targets, index, settings)
@@ -222,7 +227,7 @@ def _modal_constants(
     """φ_o·φ_i of every FRF from its circle's diameter at given frequency and damping; std per real part."""
     term = _term(data.frequency_hz[lines], target)
     columns = np.stack([np.ones_like(term), term / np.abs(term).max()], axis=1)
-    values = data.mobility[:, lines].T
+    values = data.mobility(lines).T
     solution, *_ = np.linalg.lstsq(columns, values, rcond=None)
     misfit = values - columns @ solution
     noise = np.sum(np.abs(misfit) ** 2, axis=0) / max(2 * (term.size - 2), 1)

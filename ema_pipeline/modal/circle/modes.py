@@ -40,38 +40,44 @@ class Target:
 class Mobilities:
     """Measured FRFs of a set as mobility, one row per output-input pair that was measured.
 
+    Only the lines that are asked for are turned into mobilities: the whole would be as large as the set.
+
     Attributes
     ----------
     frequency_hz : ndarray, (n_lines,)
         Without 0 Hz.
-    mobility : complex ndarray, (n_pairs, n_lines)
-    variance : ndarray, (n_pairs, n_lines)
-        NaN where not known.
+    frfs : FrfSet
     output, input : ndarray of int, (n_pairs,)
         Index into the set's outputs and inputs.
     """
 
     frequency_hz: NDArray[np.float64]
-    mobility: NDArray[np.complex128]
-    variance: NDArray[np.float64]
+    frfs: FrfSet
     output: NDArray[np.int64]
     input: NDArray[np.int64]
+
+    def mobility(self, lines: slice, row: int | slice = slice(None)) -> NDArray[np.complex128]:
+        """Mobility of some lines, (n_pairs, n_lines), or of one row, (n_lines,)."""
+        frf = self.frfs.frf[..., 1:][..., lines][self.output[row], self.input[row]]
+        return np.asarray(frf * self._factor(lines, row))
+
+    def variance(self, lines: slice, row: int | slice = slice(None)) -> NDArray[np.float64]:
+        """Their variance; NaN where not known."""
+        variance = self.frfs.variance[..., 1:][..., lines][self.output[row], self.input[row]]
+        return np.asarray(variance * np.abs(self._factor(lines, row)) ** 2)
+
+    def _factor(self, lines: slice, row: int | slice) -> NDArray[np.complex128]:
+        """From the quantity of each output to velocity."""
+        jw = 2j * np.pi * self.frequency_hz[lines]
+        power = {"acceleration": -1, "velocity": 0, "displacement": 1}
+        exponent = np.array([power[q] for q in self.frfs.quantities])[self.output[row]]
+        return np.asarray(jw ** exponent[..., None])
 
 
 def mobilities(frfs: FrfSet) -> Mobilities:
     """Turn all measured FRFs into mobilities; FRFs with values that are not finite are left out."""
-    frequency = frfs.frequency_hz[1:]
-    jw = 2j * np.pi * frequency
-    power = {"acceleration": -1, "velocity": 0, "displacement": 1}
-    factor = np.stack([jw ** power[q] for q in frfs.quantities])[:, None, :]
     output, input_ = np.nonzero(np.all(np.isfinite(frfs.frf[:, :, 1:]), axis=2))
-    return Mobilities(
-        frequency_hz=frequency,
-        mobility=(frfs.frf[:, :, 1:] * factor)[output, input_],
-        variance=(frfs.variance[:, :, 1:] * np.abs(factor) ** 2)[output, input_],
-        output=output,
-        input=input_,
-    )
+    return Mobilities(frequency_hz=frfs.frequency_hz[1:], frfs=frfs, output=output, input=input_)
 
 
 def circle_fits(
@@ -159,8 +165,8 @@ def rank_rows(data: Mobilities, target: Target, lines: slice) -> NDArray[np.int6
 
     The noise is that found over hits, or else the misfit of the mode with a constant.
     """
-    diameter, misfit = _linear_diameters(data.frequency_hz[lines], data.mobility[:, lines], target)
-    variance = np.mean(data.variance[:, lines], axis=1)
+    diameter, misfit = _linear_diameters(data.frequency_hz[lines], data.mobility(lines), target)
+    variance = np.mean(data.variance(lines), axis=1)
     noise = np.where(np.isfinite(variance) & (variance > 0), variance, misfit)
     noise = np.maximum(noise, np.finfo(float).tiny)
     score = np.abs(diameter) / np.sqrt(noise)
@@ -242,8 +248,8 @@ def _fit_once(
     try:
         return fit_circle(
             data.frequency_hz[lines],
-            data.mobility[row, lines] - taken_off,
-            data.variance[row, lines],
+            data.mobility(lines, row) - taken_off,
+            data.variance(lines, row),
             start,
         )
     except EmaError:  # too few lines, or no circle at all: this FRF says nothing about the mode
