@@ -357,7 +357,8 @@ def _occam(
 
     Parameters with a tolerance have a standard normal prior in their coordinate; logarithms are spread evenly
     between their bounds; sizes of effects follow a Cauchy distribution about null (half of one where they have
-    one sign), which leaves room for effects larger than expected.
+    one sign), which leaves room for effects larger than expected. So does the logarithm of a parameter out of its
+    tolerance, in units of that tolerance: a weighed mass is less often off by a factor than a bearing's stiffness.
     """
     space = problem.space
     total = 0.0
@@ -368,6 +369,11 @@ def _occam(
             total += np.log(2 * np.pi)
             continue
         e = by_name.get(c.parameter.name)
+        if c.kind == "log" and e is not None and e.scale > 0:
+            z = (float(found.x[i]) - np.log(e.null)) / e.scale
+            total += 2 * np.log(np.pi * e.scale * (1 + z**2))
+            hessian[i, i] += 2 / (e.scale**2 * (1 + z**2))
+            continue
         if c.kind == "log" or e is None or e.scale == 0:
             width = space.high[i] - space.low[i]
             total += 2 * np.log(width) if np.isfinite(width) else 0.0

@@ -22,6 +22,8 @@ GENERIC = ("spring", "mass", "damper")
 
 NOTHING = "nothing"
 _SMALL = 1e-3
+_OUT = 3.0
+"""Tolerances beyond which a parameter counts as out of them."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,8 @@ class Extra:
     null : float
         Value at which it is absent.
     scale : float
-        Size to expect; 0 for a quantity spread evenly over its range.
+        Size to expect; 0 for a quantity spread evenly over its range. Of the logarithm for a parameter out of its
+        tolerance.
     one_sided : bool
     """
 
@@ -117,7 +120,8 @@ def extras(rig: Rig, hypothesis: Hypothesis, library: Library | None) -> tuple[E
         family, _, place = label.partition("@")
         if family == OUT_OF_TOLERANCE:
             v = rig.parameters[place].value
-            found.append(Extra(place, (0.3 * v, 3 * v), v, 0.0, False))
+            scale = _OUT * rig.parameters[place].tolerance
+            found.append(Extra(place, (0.3 * v, 3 * v), v, scale, False))
             continue
         for p in known[family].parameters:
             found.append(Extra(f"{label}.{p.name}", _starts(p), p.null, _scale(p), p.minimum >= p.null))

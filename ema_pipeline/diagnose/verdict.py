@@ -13,7 +13,7 @@ from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras
 from ema_pipeline.diagnose.ladder import Yardstick
 from ema_pipeline.diagnose.ranking import Ranking
 from ema_pipeline.diagnose.screening import Screening
-from ema_pipeline.diagnose.types import EffectSize, Ladder, VerdictWord
+from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE, EffectSize, Ladder, VerdictWord
 
 _SPURIOUS = 2
 """Well-determined modes without counterpart that may still be of the foundation, or spurious."""
@@ -130,7 +130,7 @@ def solid_unexplained(case: Case, model: Fitted) -> list[str]:
                 found.append(f"{m.frequency_hz[r]:.1f} Hz ({c})")
                 continue
             largest = float(np.nanmax(np.abs(m.shapes[r])))
-            if np.nanmedian(m.shape_std[r]) < _WELL_DETERMINED * largest:
+            if not np.any(np.isfinite(m.shape_std[r])) or np.nanmedian(m.shape_std[r]) < _WELL_DETERMINED * largest:
                 found.append(f"{m.frequency_hz[r]:.1f} Hz ({c})")
     return found
 
@@ -154,6 +154,8 @@ def visible_share(case: Case, ranking: Ranking) -> float:
     """Share of the effects whose size the data would determine to less than half of what is to be expected."""
     seen, total = 0, 0
     for f in ranking.fitted:
+        if f.hypothesis.family == OUT_OF_TOLERANCE:
+            continue
         for e in extras(case.rig, f.hypothesis, case.library):
             if e.scale > 0 and e.name in f.std:
                 total += 1
