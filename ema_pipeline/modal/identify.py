@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.assurance import mpc
 from ema_pipeline.modal.bands import SubBand, indicator, split
-from ema_pipeline.modal.compress import Window, compress
+from ema_pipeline.modal.compress import Window
 from ema_pipeline.modal.data import FitData, analysis_band, arrange
 from ema_pipeline.modal.engines import poles_of_all_orders
 from ema_pipeline.modal.fit import (
@@ -231,9 +231,9 @@ def _synthesis(window: Window, modes: FittedModes) -> Complex:
 
 
 def _chart_of(window: Window, part: SubBand, settings: ModalSettings) -> PoleSet:
-    """Poles of all orders of a sub-band."""
-    few = compress(window)
-    return poles_of_all_orders(few.data, few.noise.variance, part.n_peaks, settings)
+    """Poles of all orders of a sub-band, from all rows: a few combinations of them lose weak modes."""
+    variance = window.noise.at(window.data.frf).variance
+    return poles_of_all_orders(window.data, variance, part.n_peaks, settings)
 
 
 def _notes(data: FitData, scaling: str) -> tuple[str, ...]:
