@@ -172,6 +172,40 @@ def windows_about(poles: Complex, frequency_hz: Real) -> tuple[Window, ...]:
     return tuple(Window(slice(a, b), np.array(m, dtype=np.int64)) for a, b, m in parts)
 
 
+def participations(omega: Real, frf: Complex, poles: Complex, shapes: Complex, rest_s: float) -> Complex:
+    """Participation of each mode of a window in FRFs of one impact point, the shapes given.
+
+    Parameters
+    ----------
+    omega : ndarray, (n_lines,)
+        rad/s.
+    frf : complex ndarray, (n_outputs, n_lines)
+        Accelerance.
+    poles : complex ndarray, (n_modes,)
+    shapes : complex ndarray, (n_modes, n_outputs)
+    rest_s : float
+        Time from the hit to the end of the record.
+
+    Returns
+    -------
+    complex ndarray, (n_modes,)
+        Residue over shape.
+    """
+    smooth = _smooth(len(omega))
+    u, _ = pole_functions(omega, poles, rest_s)
+    return _least_squares(shapes.T[:, :, None] * _rough(u, smooth), _rough(frf, smooth))
+
+
+def _smooth(n_lines: int) -> Real:
+    """Orthonormal polynomials over the lines of a window, (n_terms, n_lines)."""
+    return np.asarray(np.linalg.qr(np.vander(np.linspace(-1, 1, n_lines), SMOOTH_TERMS))[0].T)
+
+
+def _rough(values: Complex, smooth: Real) -> Complex:
+    """Values over lines without the polynomial that far modes make."""
+    return np.asarray(values - (values @ smooth.T) @ smooth)
+
+
 def _spectra(
     hit: HitSamples, one: FrfSet, windows: tuple[Window, ...], frequency_hz: Real, settings: FrfSettings
 ) -> _Hit:
@@ -221,22 +255,17 @@ def _solve(
     n_hits, n_out, n_lines = data.shape
     m = len(poles)
     mean = np.einsum("hl,hol->ol", power / power.sum(axis=0), data)
-    smooth = np.linalg.qr(np.vander(np.linspace(-1, 1, n_lines), SMOOTH_TERMS))[0].T
-
-    def rough(values: Complex) -> Complex:
-        """Without the polynomial that far modes make."""
-        return np.asarray(values - (values @ smooth.T) @ smooth)
-
+    smooth = _smooth(n_lines)
     u, du = pole_functions(omega, poles, rest_s)
-    u, du = rough(u), rough(du)
-    difference = rough(data - mean)
+    u, du = _rough(u, smooth), _rough(du, smooth)
+    difference = _rough(data - mean, smooth)
     level = np.median(np.abs(difference) ** 2 * power[:, None], axis=(0, 2))
     level = np.maximum(level, 1e-24 * np.max(np.abs(mean) ** 2) * power.max())
     scale = np.broadcast_to(1 / np.sqrt(level[:, None]), (n_out, n_lines))  # for unit force power
     root = np.sqrt(power)[:, None]
 
     along = shapes.T[:, :, None] * u  # (n_outputs, n_modes, n_lines)
-    start = _least_squares(along * scale[:, None], rough(mean) * scale)
+    start = _least_squares(along * scale[:, None], _rough(mean, smooth) * scale)
     columns = np.concatenate([shapes.T[:, :, None] * start[:, None] * du, along], axis=1)
     if n_hits == 1:
         return _Solved(poles[None], np.full((1, m), np.inf), start[None])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels.settings import LevelSettings
-from ema_pipeline.levels.types import ForceLevel, LevelStudy, ModeLevels
+from ema_pipeline.levels.types import DecayCurve, ForceLevel, LevelStudy, ModeLevels
 from ema_pipeline.modal.settings import ModalSettings
 
 if TYPE_CHECKING:
@@ -73,8 +73,11 @@ def study_levels(
     n_levels = int(place.max()) + 1
     if n_levels == 1:
         level = ForceLevel(float(np.median(force)), names, frfs)
-        study = LevelStudy((level,), frfs.inputs, (), (), (), False, float("nan"), "")
-        return replace(study, summary=one_level(study))
+        progress(0.2, "decays of single hits")
+        modes, curves, p_value = _from_decays(modal, hits, frfs, settings)
+        depends = bool(p_value < settings.false_alarm)
+        study = LevelStudy((level,), frfs.inputs, modes, curves, (), depends, p_value, "")
+        return replace(study, summary=one_level(study, modal))
 
     levels = []
     for k in range(n_levels):
@@ -84,11 +87,13 @@ def study_levels(
         levels.append(_level(hits, chosen, level_force, frf_settings, modal_settings))
     progress(0.7, "modes of single hits")
     modes = _modes(modal, levels, len(frfs.inputs))
-    modes, p_value = _tested(
-        modes, modal, hits, frfs, frf_settings, dict(zip(names, place, strict=True)), settings
-    )
+    base = _trusted(modal, modes)
+    level_of = dict(zip(names, place.tolist(), strict=True))
+    modes, p_value = _tested(modes, base, modal, hits, frfs, frf_settings, level_of, settings)
+    progress(0.9, "decays of single hits")
+    curves = _decays(modal, base, hits, frfs)
     depends = bool(p_value < settings.false_alarm)
-    study = LevelStudy(tuple(levels), frfs.inputs, modes, (), (), depends, p_value, "")
+    study = LevelStudy(tuple(levels), frfs.inputs, modes, curves, (), depends, p_value, "")
     return replace(study, summary=several_levels(study, modal, settings))
 
 
@@ -146,6 +151,7 @@ def _modes(modal: ModalModel, levels: list[ForceLevel], n_inputs: int) -> tuple[
 
 def _tested(
     modes: tuple[ModeLevels, ...],
+    base: Integers,
     modal: ModalModel,
     hits: Hits,
     frfs: FrfSet,
@@ -155,16 +161,12 @@ def _tested(
 ) -> tuple[tuple[ModeLevels, ...], float]:
     """The modes with their tests, and the p value of all tests together."""
     from ema_pipeline.levels.single import single_hits
-    from ema_pipeline.levels.tracks import echoes
-    from ema_pipeline.levels.trend import holm, samples, trends
+    from ema_pipeline.levels.trend import holm, samples, shifts, trends
     from ema_pipeline.levels.words import trend_words
 
-    votes = np.array([m.stability for m in modal.modes])
-    soft = np.array([m.level_modes is not None and m.level_modes[0] >= 0 for m in modes], dtype=bool)
-    base = np.flatnonzero(soft | ((votes >= TRUSTED_VOTES) & ~echoes(modal, soft)))
     if not len(base):
         return modes, float("nan")
-    found = single_hits(hits, replace(modal, modes=tuple(modal.modes[k] for k in base)), frfs, frf_settings)
+    found = single_hits(hits, _only(modal, base), frfs, frf_settings)
     level = np.array([place[name] for name in found.names], dtype=np.int64)
 
     def tests(values: Real, stds: Real) -> tuple[Trend, ...]:
@@ -182,17 +184,82 @@ def _tested(
     moves = np.nan_to_num(adjusted, nan=1.0) < settings.false_alarm
     out = list(modes)
     for r, k in enumerate(base):
-        both = moves[r], moves[r + len(base)]
+        both = bool(moves[r]), bool(moves[r + len(base)])
+        shift = shifts(
+            found.frequency_hz[:, r], found.frequency_std_hz[:, r], found.sheet, level, frequency[r]
+        )
+        damping_shift = shifts(
+            found.damping_ratio[:, r], found.damping_std[:, r], found.sheet, level, damping[r]
+        )
         out[k] = replace(
-            _with_scatter(modes[k], found, level, r, frequency[r].extra_std, damping[r].extra_std),
+            _with_scatter(modes[k], found, level, r),
             amplitude_m=_amplitudes(found, level, r, modes[k].amplitude_m.shape),
             frequency_p=frequency[r].p,
             damping_p=damping[r].p,
-            depends=bool(any(both)),
+            depends=any(both),
             trend=trend_words(both[0], frequency[r].slope, both[1], damping[r].slope),
+            frequency_shift_hz=shift[0],
+            frequency_shift_std_hz=shift[1],
+            damping_shift=damping_shift[0],
+            damping_shift_std=damping_shift[1],
         )
     p_value = float(np.nanmin(adjusted)) if np.isfinite(adjusted).any() else float("nan")
     return tuple(out), p_value
+
+
+def _trusted(modal: ModalModel, modes: Sequence[ModeLevels]) -> Integers:
+    """Modes that the softest hits show, and others that are plain and no echo of these."""
+    from ema_pipeline.levels.tracks import echoes
+
+    votes = np.array([m.stability for m in modal.modes])
+    soft = np.array([m.level_modes is not None and m.level_modes[0] >= 0 for m in modes], dtype=bool)
+    if not len(votes):
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(soft | ((votes >= TRUSTED_VOTES) & ~echoes(modal, soft)))
+
+
+def _only(modal: ModalModel, chosen: Integers) -> ModalModel:
+    return replace(modal, modes=tuple(modal.modes[k] for k in chosen))
+
+
+def _decays(modal: ModalModel, chosen: Integers, hits: Hits, frfs: FrfSet) -> tuple[DecayCurve, ...]:
+    """Decay curves of some modes, numbered as in the whole model."""
+    from ema_pipeline.levels.decay import decays
+
+    return tuple(replace(c, mode=int(chosen[c.mode])) for c in decays(hits, frfs, _only(modal, chosen)))
+
+
+def _from_decays(
+    modal: ModalModel, hits: Hits, frfs: FrfSet, settings: LevelSettings
+) -> tuple[tuple[ModeLevels, ...], tuple[DecayCurve, ...], float]:
+    """What the decays after hits of one level tell: the modes with their tests, the curves, and the p value."""
+    from ema_pipeline.levels.decay import decay_trends
+    from ema_pipeline.levels.trend import holm
+    from ema_pipeline.levels.words import trend_words
+
+    n = len(modal.modes)
+    chosen = np.flatnonzero(np.array([m.stability for m in modal.modes]) >= TRUSTED_VOTES)
+    curves = _decays(modal, chosen, hits, frfs)
+    frequency, damping = decay_trends(curves, tuple(range(n)))
+    adjusted = holm(np.array([t.p for t in (*frequency, *damping)]))
+    moves = np.nan_to_num(adjusted, nan=1.0) < settings.false_alarm
+    modes = tuple(
+        ModeLevels(
+            mode=k,
+            frequency_hz=np.array([mode.frequency_hz]),
+            frequency_std_hz=np.array([mode.frequency_std_hz]),
+            damping_ratio=np.array([mode.damping_ratio]),
+            damping_std=np.array([mode.damping_std]),
+            amplitude_m=np.full((1, len(frfs.inputs)), np.nan),
+            frequency_p=frequency[k].p,
+            damping_p=damping[k].p,
+            depends=bool(moves[k] or moves[k + n]),
+            trend=trend_words(bool(moves[k]), frequency[k].slope, bool(moves[k + n]), damping[k].slope),
+            level_modes=np.array([k]),
+        )
+        for k, mode in enumerate(modal.modes)
+    )
+    return modes, curves, float(np.nanmin(adjusted)) if np.isfinite(adjusted).any() else float("nan")
 
 
 def _excitation(found: HitPoles) -> Real:
@@ -206,32 +273,43 @@ def _excitation(found: HitPoles) -> Real:
     return out
 
 
-def _with_scatter(
-    mode: ModeLevels, found: HitPoles, level: Integers, r: int, frequency_extra: float, damping_extra: float
-) -> ModeLevels:
+def _with_scatter(mode: ModeLevels, found: HitPoles, level: Integers, r: int) -> ModeLevels:
     """A mode's values at every level with the scatter of hits added; filled in from single hits where missing."""
-    values = [mode.frequency_hz.copy(), mode.frequency_std_hz.copy(), mode.damping_ratio.copy(),
-              mode.damping_std.copy()]  # fmt: skip
-    singles = [found.frequency_hz[:, r], found.frequency_std_hz[:, r], found.damping_ratio[:, r],
-               found.damping_std[:, r]]  # fmt: skip
-    for k in range(len(values[0])):
-        of = level == k
-        for i, extra in ((0, frequency_extra), (2, damping_extra)):
-            weight = 1 / (singles[i + 1][of] ** 2 + extra**2)
-            total = float(weight.sum())
-            if np.isnan(values[i][k]) and total > 0:
-                values[i][k] = float(np.sum(weight * np.nan_to_num(singles[i][of]))) / total
-                values[i + 1][k] = total**-0.5
-            elif total > 0:  # hits count by how much they tell of the mode
-                effective = total**2 / float(np.sum(weight**2))
-                values[i + 1][k] = float(np.hypot(values[i + 1][k], extra / np.sqrt(effective)))
+    frequency = _at_levels(
+        mode.frequency_hz, mode.frequency_std_hz, found.frequency_hz[:, r], found.frequency_std_hz[:, r],
+        level, found.sheet,
+    )  # fmt: skip
+    damping = _at_levels(
+        mode.damping_ratio, mode.damping_std, found.damping_ratio[:, r], found.damping_std[:, r],
+        level, found.sheet,
+    )  # fmt: skip
     return replace(
         mode,
-        frequency_hz=values[0],
-        frequency_std_hz=values[1],
-        damping_ratio=values[2],
-        damping_std=values[3],
+        frequency_hz=frequency[0],
+        frequency_std_hz=frequency[1],
+        damping_ratio=damping[0],
+        damping_std=damping[1],
     )
+
+
+def _at_levels(
+    values: Real, stds: Real, single: Real, single_std: Real, level: Integers, sheet: Integers
+) -> tuple[Real, Real]:
+    """Values and standard deviations at every level, widened where hits scatter by more than their noise."""
+    from ema_pipeline.levels.trend import birge_ratio
+
+    values, stds = values.copy(), stds.copy()
+    for k in range(len(values)):
+        of = (level == k) & np.isfinite(single_std)
+        if not of.any():
+            continue
+        ratio = birge_ratio(single[of], single_std[of], sheet[of])
+        if np.isnan(values[k]):
+            weight = single_std[of] ** -2.0
+            values[k] = float(np.average(single[of], weights=weight))
+            stds[k] = float(weight.sum() ** -0.5)
+        stds[k] *= ratio
+    return values, stds
 
 
 def _amplitudes(found: HitPoles, level: Integers, r: int, shape: tuple[int, ...]) -> Real:
@@ -242,8 +320,3 @@ def _amplitudes(found: HitPoles, level: Integers, r: int, shape: tuple[int, ...]
             if of.any():
                 out[k, i] = float(np.median(found.amplitude_m[of, r]))
     return out
-
-
-def moving_modes(modes: Sequence[ModeLevels]) -> tuple[ModeLevels, ...]:
-    """Those that depend on the level."""
-    return tuple(m for m in modes if m.depends)

@@ -117,8 +117,8 @@ def trends(modes: Sequence[Samples]) -> tuple[Trend, ...]:
     by four. Scatter of n hits with ν degrees of freedom counts like this: with w = 1/(σ² + τ²), τ² so that
     chi-square equals ν (Paule & Mandel [1]_), the slope's t value is referred to Student's distribution with
     ν + `PRIOR_DOF` degrees of freedom, its variance scaled by a weighted mean of the observed scatter and 1
-    (moderated as in [2]_). Where the hits of this mode, or of all modes together, scatter by more than their
-    noise, the noise counts for nothing, and ν alone remains.
+    (moderated as in [2]_), never below 1. Where the hits of this mode, or of all modes together, scatter by more
+    than their noise, the noise counts for nothing, and ν alone remains.
 
     References
     ----------
@@ -186,9 +186,9 @@ class _Try:
         repeated = self._about is not _about_one_slope
         explained = noise_holds and repeated and chi2.sf(self.noise_only, self.dof) > AT_ODDS
         prior = PRIOR_DOF if explained else 0.0
-        scale = (prior + self._chi_square(self.extra)) / (prior + self.dof)
+        scale = max((prior + self._chi_square(self.extra)) / (prior + self.dof), 1.0)
         beta = float(np.sum(weight * across * given.values)) / strength
-        p = 2 * float(student.sf(abs(beta) * np.sqrt(strength / max(scale, 1e-300)), prior + self.dof))
+        p = 2 * float(student.sf(abs(beta) * np.sqrt(strength / scale), prior + self.dof))
         force = _centred(given.log_force, weight, given.sheet)
         return p, beta * float(np.sum(weight * across * force) / np.sum(weight * force**2))
 
@@ -215,6 +215,44 @@ def _best(tries: list[_Try], noise_holds: bool) -> Trend:
     return Trend(min(1.0, len(tries) * p), slope, float(np.sqrt(extra)))
 
 
+def birge_ratio(values: Real, stds: Real, groups: Integers) -> float:
+    """How many times their noise values of one group scatter; at least 1, and near 1 where there are few."""
+    weight = stds**-2.0
+    dof = len(values) - len(np.unique(groups))
+    chi_square = float(
+        np.sum(weight * _centred(values, weight, np.unique(groups, return_inverse=True)[1]) ** 2)
+    )
+    return float(np.sqrt(max((PRIOR_DOF + chi_square) / (PRIOR_DOF + dof), 1.0)))
+
+
+def shifts(values: Real, stds: Real, sheet: Integers, level: Integers, found: Trend) -> tuple[Real, Real]:
+    """Mean difference of every level from the softest one, and its standard deviation, (n_levels,).
+
+    Only hits of one sheet are compared; NaN where no sheet leads from one level to the other.
+    """
+    n_levels = int(level.max()) + 1
+    shift, std = np.full((2, n_levels), np.nan)
+    shift[0] = std[0] = 0.0
+    use = np.isfinite(values) & np.isfinite(stds) & (stds > 0)
+    if not use.any():
+        return shift, std
+    weight = 1.0 / np.sqrt(stds[use] ** 2 + found.extra_std**2)
+    sheets = _dummies(sheet[use])
+    levels = np.asarray(level[use][:, None] == np.arange(1, n_levels)[None], dtype=float)
+    design = np.hstack([levels, sheets]) * weight[:, None]
+    size = np.sqrt(np.maximum(np.sum(design**2, axis=0), 1e-300))
+    left, values_, right = np.linalg.svd(design / size, full_matrices=False)
+    good = values_ > 1e-8 * values_[0]
+    inverse = (right[good].T / values_[good]) @ left[:, good].T
+    solution = inverse @ (weight * (values[use] - values[use].mean())) / size
+    # a level that the data do not tie to the softest one shows in the null space
+    tied = np.abs(right[~good][:, : n_levels - 1]).max(axis=0, initial=0.0) < 1e-6
+    known = tied & (levels.sum(axis=0) > 0)
+    shift[1:][known] = solution[: n_levels - 1][known]
+    std[1:][known] = (np.sqrt(np.sum(inverse**2, axis=1)) / size)[: n_levels - 1][known]
+    return shift, std
+
+
 def holm(p_values: Real) -> Real:
     """Adjusted p values: below α where a test is rejected at a family-wise rate of α; NaN stays NaN.
 
@@ -227,6 +265,11 @@ def holm(p_values: Real) -> Real:
     out = np.full(len(p_values), np.nan)
     out[order] = np.minimum(np.maximum.accumulate(p_values[order] * np.arange(len(order), 0, -1)), 1.0)
     return out
+
+
+def _dummies(groups: Integers) -> Real:
+    """One column per group."""
+    return np.asarray(groups[:, None] == np.unique(groups)[None], dtype=float)
 
 
 def _centred(values: Real, weight: Real, groups: Integers) -> Real:

@@ -50,7 +50,8 @@ class ModeLevels:
         Largest displacement amplitude of this mode at any sensor just after the hit, per impact point of
         `LevelStudy.inputs`.
     frequency_p, damping_p : float
-        Probability of a scatter as large as this where nothing depends on the level; NaN where unknown.
+        Probability of a trend as clear as this where nothing depends on the level, from single hits (from
+        decays where there is one level); NaN where unknown.
     depends : bool
         True where frequency or damping moves with the level beyond what scatter explains, all modes' tests
         taken into account.
@@ -59,6 +60,8 @@ class ModeLevels:
         nothing moves.
     level_modes : ndarray of int, (n_levels,), or None
         Index into the modes of each level's own `ModalModel`; -1 where the mode was not found there.
+    frequency_shift_hz, frequency_shift_std_hz, damping_shift, damping_shift_std : ndarray, (n_levels,), or None
+        Difference from the softest level in single hits, each compared with hits on its own point alone.
     """
 
     mode: int
@@ -72,6 +75,10 @@ class ModeLevels:
     depends: bool
     trend: str
     level_modes: NDArray[np.int64] | None = None
+    frequency_shift_hz: NDArray[np.float64] | None = None
+    frequency_shift_std_hz: NDArray[np.float64] | None = None
+    damping_shift: NDArray[np.float64] | None = None
+    damping_shift_std: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

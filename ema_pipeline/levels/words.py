@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ema_pipeline.levels.settings import LevelSettings
 from ema_pipeline.levels.types import LevelStudy, ModeLevels
 from ema_pipeline.modal.types import ModalModel
+
+Real = NDArray[np.float64]
+
+CLEAR = 3.0
+"""A change between two levels of this many standard deviations can be read off the levels' own FRFs."""
 
 
 def trend_words(frequency_moves: bool, slope: float, damping_moves: bool, damping_slope: float) -> str:
@@ -19,12 +25,31 @@ def trend_words(frequency_moves: bool, slope: float, damping_moves: bool, dampin
     return ", ".join(words)
 
 
-def one_level(study: LevelStudy) -> str:
+def one_level(study: LevelStudy, modal: ModalModel) -> str:
     """What can be said from hits that are all about as hard."""
+    advice = (
+        "To know more, strike every point at two or three forces, each at least twice the last, and two or more "
+        "times at each."
+    )
+    about = f"All hits are about as hard ({study.levels[0].force_n:.3g} N)"
+    moving = [m for m in study.modes if m.depends]
+    tested = [m for m in study.modes if np.isfinite(m.frequency_p)]
+    if moving:
+        names = ", ".join(
+            f"{modal.modes[m.mode].frequency_hz:.4g} Hz ({m.trend} with amplitude)" for m in moving[:3]
+        )
+        more = f" and {len(moving) - 3} more" if len(moving) > 3 else ""
+        return (
+            f"{about}, but modes move while they decay: {names}{more}. The structure is not linear. {advice}"
+        )
+    if tested:
+        return (
+            f"{about}: their FRFs cannot tell whether anything depends on the force. The decays of {len(tested)} of "
+            f"{len(study.modes)} modes show nothing that moves with the amplitude. {advice}"
+        )
     return (
-        f"All hits are about as hard ({study.levels[0].force_n:.3g} N): whether frequencies and damping depend on "
-        "the force cannot be known from their FRFs. Strike every point at two or three forces, each at least "
-        "twice the last, and two or more times at each."
+        f"{about}, and no decay is long and clean enough: whether frequencies and damping depend on the force cannot "
+        f"be known. {advice}"
     )
 
 
@@ -55,35 +80,61 @@ def forces_text(study: LevelStudy) -> str:
 
 
 def move_text(study: LevelStudy, mode: ModeLevels) -> str:
-    """``"frequency rises with force: 101.2 → 104.7 Hz from 30 to 300 N"``; empty where nothing moves."""
+    """``"frequency rises with force: 101.20 ± 0.02 → 104.70 ± 0.03 Hz from 30 to 300 N"``; empty for none."""
     parts = []
     if "hardening" in mode.trend or "softening" in mode.trend:
         word = "rises" if "hardening" in mode.trend else "falls"
-        parts.append(
-            f"frequency {word} with force: {_ends(study, mode.frequency_hz, mode.frequency_std_hz, 1)} Hz"
-        )
+        ends = _ends(
+            mode.frequency_hz, mode.frequency_std_hz, mode.frequency_shift_hz, mode.frequency_shift_std_hz,
+            1.0 if word == "rises" else -1.0,
+        )  # fmt: skip
+        parts.append(f"frequency {word} with {_cause(study)}{_arrow(ends, 1)}" + (" Hz" if ends else ""))
     if "damping" in mode.trend:
         word = "rises" if "damping rises" in mode.trend else "falls"
-        parts.append(
-            f"damping {word} with force: {_ends(study, mode.damping_ratio, mode.damping_std, 100)} %"
-        )
+        ends = _ends(
+            mode.damping_ratio, mode.damping_std, mode.damping_shift, mode.damping_shift_std,
+            1.0 if word == "rises" else -1.0,
+        )  # fmt: skip
+        parts.append(f"damping {word} with {_cause(study)}{_arrow(ends, 100)}" + (" %" if ends else ""))
     if not parts:
         return ""
-    first, last = _known(mode.frequency_hz)
-    return f"{', '.join(parts)} from {study.levels[first].force_n:.3g} to {study.levels[last].force_n:.3g} N"
+    span = f" from {study.levels[0].force_n:.3g} to {study.levels[-1].force_n:.3g} N"
+    return ", ".join(parts) + (span if len(study.levels) > 1 else "")
 
 
-def _ends(study: LevelStudy, values: np.ndarray, stds: np.ndarray, factor: float) -> str:
-    first, last = _known(values)
-    return " → ".join(
-        with_uncertainty(factor * float(values[k]), factor * float(stds[k])) for k in (first, last)
+def _cause(study: LevelStudy) -> str:
+    return "force" if len(study.levels) > 1 else "amplitude"
+
+
+Ends = tuple[float, float, float, float]
+
+
+def _ends(values: Real, stds: Real, shift: Real | None, shift_std: Real | None, sign: float) -> Ends | None:
+    """Value and standard deviation at the softest and the hardest level.
+
+    From the FRFs of the levels where these show the change; where they do not (impact points that move a mode by
+    different amounts smear it), from the differences between single hits.
+    """
+    if len(values) < 2 or not np.isfinite(values[0]):
+        return None
+    change, noise = float(values[-1] - values[0]), float(np.hypot(stds[0], stds[-1]))
+    if np.isfinite(change) and sign * change > CLEAR * noise:
+        return float(values[0]), float(stds[0]), float(values[-1]), float(stds[-1])
+    if shift is None or shift_std is None or not np.isfinite(shift[-1]):
+        return None
+    return (
+        float(values[0]),
+        float(stds[0]),
+        float(values[0] + shift[-1]),
+        float(np.hypot(stds[0], shift_std[-1])),
     )
 
 
-def _known(values: np.ndarray) -> tuple[int, int]:
-    """Softest and hardest level at which a value is known."""
-    known = np.flatnonzero(np.isfinite(values))
-    return (int(known[0]), int(known[-1])) if len(known) else (0, len(values) - 1)
+def _arrow(ends: Ends | None, factor: float) -> str:
+    if ends is None:
+        return ""
+    soft, soft_std, hard, hard_std = (factor * e for e in ends)
+    return f": {with_uncertainty(soft, soft_std)} → {with_uncertainty(hard, hard_std)}"
 
 
 def with_uncertainty(value: float, std: float) -> str:
