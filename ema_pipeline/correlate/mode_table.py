@@ -194,6 +194,13 @@ def _measured(name: str, table: ConfigurationModes, path: Path, rig: Rig | None)
     damping = _column(table.damping_ratio, count, "damping_ratio", where)
     if np.any(damping < 0):
         raise EmaError(f"{where}: damping_ratio = {np.nanmin(damping):g} is negative; correct it")
+    if np.any(damping >= 1):
+        raise EmaError(
+            f"{where}: damping_ratio = {np.nanmax(damping):g}: a mode's ratio is below 1; 1 % is written 0.01"
+        )
+    if table.band_hz is not None and not 0 <= table.band_hz[0] < table.band_hz[1]:
+        low, high = table.band_hz
+        raise EmaError(f"{where}: band_hz = [{low:g}, {high:g}]: give the lower limit first")
     dofs, references = _places(table.dofs, name, where, rig), _places(table.references, name, where, rig)
     shapes = _shapes(table, count, where)
     order = np.argsort(frequency, kind="stable")
@@ -208,9 +215,9 @@ def _measured(name: str, table: ConfigurationModes, path: Path, rig: Rig | None)
     return MeasuredModes(
         configuration=name,
         frequency_hz=frequency[order],
-        frequency_std_hz=_column(table.frequency_std_hz, count, "frequency_std_hz", where)[order],
+        frequency_std_hz=_spread(table.frequency_std_hz, count, "frequency_std_hz", where)[order],
         damping_ratio=damping[order],
-        damping_std=_column(table.damping_std, count, "damping_std", where)[order],
+        damping_std=_spread(table.damping_std, count, "damping_std", where)[order],
         shapes=shapes,
         shape_std=shape_std,
         dofs=dofs,
@@ -244,6 +251,18 @@ def _column(
     if len(given) != count:
         raise EmaError(f"{where}: {name} has {len(given)} numbers for {count} frequencies; give one per mode")
     return np.array(given, dtype=float)
+
+
+def _spread(
+    given: float | tuple[float, ...] | None, count: int, name: str, where: str
+) -> NDArray[np.float64]:
+    """One standard deviation per mode, (n_modes,); NaN where not given."""
+    values = _column(given, count, name, where)
+    if np.any(values <= 0):
+        raise EmaError(
+            f"{where}: {name} = {np.nanmin(values):g}: a standard deviation is above 0; leave out what is unknown"
+        )
+    return values
 
 
 def _shapes(table: ConfigurationModes, count: int, where: str) -> NDArray[np.complex128] | None:
