@@ -14,7 +14,8 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
     if values["force"] == 0.0:
         return assembly
     row = isolator_row(assembly, place)
-    return assembly.add(BoucWen(f"{place} hysteresis", row, values["force"], values["rho"], values["sigma"]))
+    shape = (values["rho"], values["sigma"], values["exponent"])
+    return assembly.add(BoucWen(f"{place} hysteresis", row, values["force"], *shape))
 
 
 EFFECT = Effect(
@@ -26,6 +27,7 @@ EFFECT = Effect(
             "rho", "1/m", 600.0, 600.0, 600.0, 1.0, 1e7, "k_w·rho is its stiffness at small motions"
         ),
         EffectParameter("sigma", "1", 0.5, 0.5, 0.5, 0.0, 5.0, "shape of the unloading branch"),
+        EffectParameter("exponent", "1", 1.0, 1.0, 1.0, 1.0, 20.0, "n: the larger, the sharper the yield"),
     ),
     find_places=isolators,
     edit=_edit,

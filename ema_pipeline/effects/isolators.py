@@ -12,8 +12,13 @@ def isolators(assembly: Assembly) -> tuple[str, ...]:
     return tuple(e.name.removesuffix(_SPRING) for e in assembly.springs(suffix=f"isolator{_SPRING}"))
 
 
+def isolator_spring(place: str) -> str:
+    """Name of the isolator's spring."""
+    return place + _SPRING
+
+
 def isolator_row(assembly: Assembly, place: str) -> Row:
     """Stretch of the isolator."""
-    spring = assembly.named(place + _SPRING)
+    spring = assembly.named(isolator_spring(place))
     assert isinstance(spring, Spring)
     return spring.row

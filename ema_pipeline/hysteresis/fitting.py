@@ -8,7 +8,7 @@ whitening matrix, so that what is left over counts in standard deviations.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -73,6 +73,7 @@ class LoopSet:
     def __init__(self, loops: Sequence[Loop], own_scale: bool = False, misfit: float = 1.0) -> None:
         self.loops = tuple(loops)
         self.own_scale = own_scale
+        self.misfit = misfit
         self.motion = Motion(loops)
         self.parts = self.motion.parts
         self._std = np.concatenate([np.full(len(loop.force), loop.force_std_n) for loop in loops])
@@ -86,6 +87,14 @@ class LoopSet:
     def data(self) -> NDArray[np.float64]:
         """Whitened forces, (n_points,)."""
         return self.whitened(np.concatenate([loop.force for loop in self.loops])[:, None])[:, 0]
+
+    def subset(self, indices: Sequence[int]) -> LoopSet:
+        """Some of the loops, weighted alike."""
+        return LoopSet([self.loops[i] for i in indices], self.own_scale, self.misfit)
+
+    def with_loop(self, loop: Loop) -> LoopSet:
+        """One loop more."""
+        return LoopSet((*self.loops, loop), self.own_scale, self.misfit)
 
     @property
     def freedom(self) -> int:
@@ -183,6 +192,13 @@ class Fitted:
     def chi2(self) -> float:
         """Sum of squares."""
         return float(self.residual @ self.residual)
+
+    def reordered(self, effects: tuple[str, ...]) -> Fitted:
+        """The same fit with its effects named in another order."""
+        structure = Structure(effects, self.structure.free_exponent)
+        old, new = self.names, (*structure.terms, *structure.shapes)
+        columns = [*(old.index(n) for n in new), *range(len(old), self.jacobian.shape[1])]
+        return replace(self, structure=structure, jacobian=self.jacobian[:, columns])
 
     def covariance(self, widening: float = 1.0) -> NDArray[np.float64]:
         """Covariance of `names`, whose variances are `widening` times those of the noise, (n, n)."""

@@ -6,7 +6,7 @@ the most probable ones are fitted in full, and evidence is Laplace's, with prior
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +34,8 @@ class Ranking:
     fitted : dict of frozenset to Fitted
     log_evidence : dict of frozenset to float
         Against the base.
+    log_posterior : dict of frozenset to float
+        Evidence times prior, not normalised.
     probabilities : dict of frozenset to float
         Add up to 1.
     widening : float
@@ -44,6 +46,7 @@ class Ranking:
     base: tuple[str, ...]
     fitted: dict[frozenset[str], Fitted]
     log_evidence: dict[frozenset[str], float]
+    log_posterior: dict[frozenset[str], float]
     probabilities: dict[frozenset[str], float]
     widening: float
 
@@ -51,6 +54,15 @@ class Ranking:
     def best(self) -> Fitted:
         """The most probable set."""
         return self.fitted[max(self.probabilities, key=lambda k: self.probabilities[k])]
+
+    def gain(self, key: frozenset[str], effect: str) -> float:
+        """Fall of the sum of squares by an effect of a set, in widened variances."""
+        return (self.fitted[key - {effect}].chi2 - self.fitted[key].chi2) / self.widening
+
+    def threshold(self, key: frozenset[str], effect: str, probability: float) -> float:
+        """Gain at which the set with the effect has `probability` against the one without."""
+        odds = self.log_posterior[key] - self.log_posterior[key - {effect}]
+        return self.gain(key, effect) + 2 * (float(np.log(probability / (1 - probability))) - odds)
 
     def share(self, effect: str) -> float:
         """Probability of all sets that hold an effect."""
@@ -80,44 +92,39 @@ def rank(
     Notes
     -----
     From the base on, effects are added to and taken from the three most probable sets until none of their
-    neighbours is left to be tried.
+    neighbours is left to be tried; in the best set each effect is also replaced by each other one.
     """
     tell = progress or (lambda share, text: None)
     fitted: dict[frozenset[str], Fitted] = {}
     most = 12 + 4 * len(effects)
 
     def add(structure: Structure, start: Mapping[str, float] | None) -> None:
-        fitted[structure.key] = _fit_with_exponent(loops, structure, start)
+        fitted[structure.key] = fit_with_exponent(loops, structure, start)
         tell(min(0.98, len(fitted) / most), " + ".join(structure.effects) or "linear spring")
 
     add(Structure(tuple(base)), None)
     while True:
         evidence, _ = _evidence(loops, fitted, base, effects, null_prior)
         leaders = sorted(fitted, key=lambda k: -evidence[k])[:_KEPT]
-        new = None
-        for key in leaders:
-            for effect in effects:
-                neighbour = key ^ {effect}
-                if neighbour not in fitted and new is None:
-                    model = fitted[key].structure
-                    changed = model.without(effect) if effect in key else model.plus(effect)
-                    new = (changed, _nearest(fitted, neighbour).values)
+        new = next((key for key in _around(leaders, effects) if key not in fitted), None)
         if new is None:
             break
-        add(*new)
-    evidence, widening = _evidence(loops, fitted, base, effects, null_prior)
-    top = max(evidence.values())
-    weights = {k: float(np.exp(v - top)) for k, v in evidence.items()}
+        near = _nearest(fitted, new)
+        order = [e for e in near.structure.effects if e in new]
+        add(Structure((*order, *(e for e in effects if e in new and e not in order))), near.values)
+    posterior, widening = _evidence(loops, fitted, base, effects, null_prior)
+    top = max(posterior.values())
+    weights = {k: float(np.exp(v - top)) for k, v in posterior.items()}
     total = sum(weights.values())
-    plain = {k: v - evidence[frozenset(base)] for k, v in evidence.items()}
-    prior = _prior(base, effects, null_prior)
+    prior, null = _prior(base, effects, null_prior), frozenset(base)
     return Ranking(
-        loops,
-        tuple(base),
-        fitted,
-        {k: float(v - prior(k) + prior(frozenset(base))) for k, v in plain.items()},
-        {k: w / total for k, w in sorted(weights.items(), key=lambda item: -item[1])},
-        widening,
+        loops=loops,
+        base=tuple(base),
+        fitted=fitted,
+        log_evidence={k: v - prior(k) - posterior[null] + prior(null) for k, v in posterior.items()},
+        log_posterior=posterior,
+        probabilities={k: w / total for k, w in sorted(weights.items(), key=lambda item: -item[1])},
+        widening=widening,
     )
 
 
@@ -143,7 +150,7 @@ def _correlation(residual: NDArray[np.float64]) -> float:
     return float(1 + 2 * np.sum(half[: ends[0] if len(ends) else len(half)]))
 
 
-def _fit_with_exponent(loops: LoopSet, structure: Structure, start: Mapping[str, float] | None) -> Fitted:
+def fit_with_exponent(loops: LoopSet, structure: Structure, start: Mapping[str, float] | None) -> Fitted:
     """The fit, with the exponent of the hysteresis freed where the loops ask for it clearly."""
     plain = Structure(structure.effects)
     found = fit(loops, plain, start, grid=start is None)
@@ -157,9 +164,21 @@ def _fit_with_exponent(loops: LoopSet, structure: Structure, start: Mapping[str,
     return freed if found.chi2 - freed.chi2 > _SHARPER * widening_of(freed, loops) else found
 
 
+def _around(leaders: Sequence[frozenset[str]], effects: Sequence[str]) -> Iterator[frozenset[str]]:
+    """Sets with one effect more or less than a leader, then those with one of the best set's replaced."""
+    for key in leaders:
+        for effect in effects:
+            yield key ^ {effect}
+    best = leaders[0]
+    for old in (e for e in effects if e in best):
+        for other in (e for e in effects if e not in best):
+            yield best - {old} | {other}
+
+
 def _nearest(fitted: Mapping[frozenset[str], Fitted], key: frozenset[str]) -> Fitted:
-    """The best fit that differs from a set by one effect."""
-    return min((f for k, f in fitted.items() if len(k ^ key) == 1), key=lambda f: f.chi2)
+    """The best fit among those that differ least from a set."""
+    least = min(len(k ^ key) for k in fitted)
+    return min((f for k, f in fitted.items() if len(k ^ key) == least), key=lambda f: f.chi2)
 
 
 def _prior(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from ema_pipeline.settings import Settings
@@ -25,6 +27,11 @@ class HysteresisSettings(Settings):
     )
     held_out_parts: int = Field(
         3, ge=2, le=10, description="parts into which the loops are dealt for held-out errors"
+    )
+    own_scales: Literal["auto", "yes", "no"] = Field(
+        "auto",
+        description="whether each loop has a force scale of its own, as tests at several tensions need; 'auto': "
+        "where loops of one frequency and amplitude differ",
     )
     significance: float = Field(
         2.0, gt=0, description="standard deviations from which a value counts as different from zero"

@@ -8,7 +8,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.hysteresis.model import CUBIC, DAMPING, FORCE, QUADRATIC, RHO, SIGMA, STIFFNESS, loop_force
+from ema_pipeline.hysteresis.model import (
+    CUBIC,
+    DAMPING,
+    FORCE,
+    GAP,
+    QUADRATIC,
+    RHO,
+    SIGMA,
+    STIFFNESS,
+    elements,
+    loop_force,
+)
+from ema_pipeline.mechanics.assembly import Damper, Spring
+from ema_pipeline.mechanics.laws import Nonlinear
 
 PRINTED: Mapping[str, float] = {
     STIFFNESS: 9.702e4,
@@ -20,6 +33,9 @@ PRINTED: Mapping[str, float] = {
     SIGMA: 0.169,
 }
 """Parameters as the source prints them (exponents as far as its text was recovered)."""
+
+_STEPS = 2000
+_CYCLES = 4
 
 
 def simulate_sine_test(
@@ -47,11 +63,53 @@ def simulate_sine_test(
     random = random or np.random.default_rng(0)
     count = round(cycles * sample_rate_hz / frequency_hz)
     phase = np.asarray(frequency_hz * np.arange(count) / sample_rate_hz, dtype=np.float64)
-    force = loop_force(values, np.array([0.0, 0.0, amplitude_m]), frequency_hz, phase)
+    force = steady_force(values, frequency_hz, amplitude_m, phase)
     displacement = amplitude_m * np.sin(2 * np.pi * phase)
     displacement += noise * amplitude_m * random.standard_normal(count)
     force += noise * 0.5 * np.ptp(force) * random.standard_normal(count)
     return displacement, force
+
+
+def steady_force(
+    values: Mapping[str, float], frequency_hz: float, amplitude_m: float, phase: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Steady force at phases of x = amplitude·sin, with free play too, N, (n_points,)."""
+    if not values.get(GAP):
+        return loop_force(values, np.array([0.0, 0.0, amplitude_m]), frequency_hz, phase)
+    grid = np.arange(_CYCLES * _STEPS) / _STEPS
+    force = _through_play(values, frequency_hz, amplitude_m * np.sin(2 * np.pi * grid))[-_STEPS:]
+    return np.interp(phase, grid[:_STEPS], force, period=1.0)
+
+
+def _through_play(
+    values: Mapping[str, float], frequency_hz: float, x: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Force step by step: contact is lost where the force would turn, and found again at the end of the play."""
+    parts, half, step = elements(values), 0.5 * values[GAP], 1 / (frequency_hz * _STEPS)
+    states = [getattr(one, "start", 0.0) for one in parts]
+    stretch, side = 0.0, 0.0
+    force = np.zeros(len(x))
+    for k, position in enumerate(x.tolist()):
+        if side == 0.0 and abs(position - stretch) >= half:
+            side = 1.0 if position > stretch else -1.0
+        wanted = position - side * half if side else stretch
+        total, after = 0.0, []
+        for one, state in zip(parts, states, strict=True):
+            rate = (wanted - stretch) / step
+            if isinstance(one, Nonlinear):
+                deviation, _, _, state = one.step(stretch, wanted, rate, state, step)
+                total += deviation + one.tangent_stiffness * wanted
+            elif isinstance(one, Damper):
+                total += one.coefficient * rate
+            elif isinstance(one, Spring):
+                total += one.stiffness * wanted
+            after.append(state)
+        if side and total * side < 0:
+            side = 0.0
+            continue
+        force[k] = total if side else 0.0
+        stretch, states = wanted, after
+    return force
 
 
 def write_sine_tests(

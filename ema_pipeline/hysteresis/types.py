@@ -130,6 +130,25 @@ class LoopFit:
 
 
 @dataclass(frozen=True)
+class LoopModel:
+    """A model of the ladder beside the measured loops.
+
+    Attributes
+    ----------
+    effects : tuple of str
+        Labels ``id@isolator`` beside the linear spring.
+    fits : tuple of LoopFit
+        One per loop.
+    scales : dict of str to float
+        Force scale of each loop, by its name; empty unless loops have scales of their own.
+    """
+
+    effects: tuple[str, ...]
+    fits: tuple[LoopFit, ...]
+    scales: dict[str, float]
+
+
+@dataclass(frozen=True)
 class IsolatorResult:
     """An identified isolator.
 
