@@ -6,6 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.dof import Dof
+
 VerdictWord = Literal["adequate", "effect", "ambiguous", "unknown_effect", "not_enough_data"]
 
 OUT_OF_TOLERANCE = "out_of_tolerance"
@@ -101,6 +106,9 @@ class Rung:
         Measured modes that the model does not explain.
     frf_error : float
         Of the FRFs around the modes, see `Candidate`.
+    misfit, heldout_misfit : tuple of float
+        Normalised time-domain misfit at each force level of the ladder, of hits that were fitted and of a level left
+        out of the fit; empty where hits at one level only were compared.
     """
 
     effects: tuple[str, ...]
@@ -112,6 +120,38 @@ class Rung:
     log_evidence: float
     unexplained: int
     frf_error: float = float("nan")
+    misfit: tuple[float, ...] = ()
+    heldout_misfit: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class TimeTrace:
+    """One signal after a hit, measured and simulated with the measured force, within the band of the modes.
+
+    Attributes
+    ----------
+    configuration, hit : str
+        The hit as ``file#number``.
+    force_n : float
+        Force level.
+    impact, sensor : Dof
+    quantity : str
+        What the sensor measures.
+    sample_rate_hz : float
+    measured, before, after : ndarray, (n_samples,)
+        SI; simulated by the base model and by the last rung.
+    """
+
+    configuration: str
+    hit: str
+    force_n: float
+    impact: Dof
+    sensor: Dof
+    quantity: str
+    sample_rate_hz: float
+    measured: NDArray[np.float64]
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -126,6 +166,12 @@ class Ladder:
         entry).
     note : str
         Why climbing stopped.
+    force_n : tuple of float
+        Force levels at which hits were simulated; empty where modes were compared.
+    hit_noise : float
+        Share of the measured amplitude that the simulation of a hit may miss; NaN where modes were compared.
+    traces : tuple of TimeTrace
+        Measured and simulated signals of the base model and of the last rung.
     """
 
     rungs: tuple[Rung, ...]
@@ -133,6 +179,9 @@ class Ladder:
     damping_noise: float
     shape_noise: float
     note: str
+    force_n: tuple[float, ...] = ()
+    hit_noise: float = float("nan")
+    traces: tuple[TimeTrace, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -161,7 +161,7 @@ def _modal(system: LinearSystem) -> _Modal:
     if not coupled and np.all(total < 2 * omega):
         decay = 0.5 * total
         damped = np.sqrt(omega**2 - decay**2)
-        return _Modal(-decay + 1j * damped, phi.T.astype(complex), phi / (1j * damped), flexibility)
+        return _Modal((-decay + 1j * damped).astype(complex), phi.T.astype(complex), (phi / (1j * damped)).astype(complex), flexibility)
     n = len(omega)
     a = np.zeros((2 * n, 2 * n))
     a[:n, n:] = np.eye(n)

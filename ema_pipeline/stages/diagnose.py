@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import cast
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
@@ -12,7 +12,12 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.stages.base import Progress, Run, code_fingerprint
 from ema_pipeline.stages.correlate import correlate
+from ema_pipeline.stages.level_case import level_case, level_tests, linear_part
 from ema_pipeline.stages.modes import measured_modes
+
+if TYPE_CHECKING:
+    from ema_pipeline.diagnose.levels.prepare import LevelTest
+    from ema_pipeline.diagnose.types import Diagnosis
 
 NAME = "diagnose"
 NEEDS = ("frf", "modal")
@@ -32,6 +37,8 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
     settings = cast(DiagnoseSettings, run.settings[NAME])
     model = run.require_model(NAME)
+    if tests := level_tests(run):
+        return {"diagnosis": by_hits(run, tests, progress), "on_top_of": run.info.effects}
     measured = measured_modes(run)
     frfs = {name: f for name in measured if (f := run.store.find("frf", name, "frfs", FrfSet)) is not None}
     limits, tell = own_thresholds(run, settings, model, measured, progress)
@@ -43,6 +50,51 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
         values = {name: size.value for name, size in top.parameters.items()}
         _, results["comparison_after"] = correlate(run, mended, values)
     return results
+
+
+def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnosis:
+    """The diagnosis where the answer depends on the force level: by the modes of one level, then by all hits.
+
+    Modes of a single level show what is missing at every level. The softest hits are nearest to a linear rig for
+    stiffness that changes with deflection, the hardest for friction.
+    """
+    from ema_pipeline.diagnose import diagnose
+    from ema_pipeline.diagnose.levels.diagnosis import diagnose_levels
+    from ema_pipeline.diagnose.levels.prepare import soft_and_hard
+
+    settings = cast(DiagnoseSettings, run.settings[NAME])
+    linear = linear_part(run)
+    found: list[Diagnosis] = []
+    for i, modes in enumerate(soft_and_hard(tests)):
+        tell = _part(progress, 0.15 * i, 0.15 * (i + 1))
+        found.append(diagnose(linear, modes, settings, run.library, tell))
+        if found[-1].verdict in ("adequate", "not_enough_data"):
+            break
+    best = min(found, key=lambda d: (_TRUSTED.index(d.verdict), d.ladder.rungs[-1].error))
+    missing = best.ladder.rungs[-1].effects if best.verdict == "effect" else ()
+    starts = [
+        {n: p.value for n, p in rung.parameters.items()}
+        for d in (best, *found)
+        for rung in d.ladder.rungs[::-1]
+    ]
+    case = level_case(run, tests, starts[:3])
+    return diagnose_levels(
+        case,
+        (*run.info.effects, *missing),
+        best,
+        " ".join(t.study.summary for t in tests if t.study.level_dependent),
+        failed_checks(run),
+        _part(progress, 0.3, 1.0),
+    )
+
+
+def _part(progress: Progress, low: float, high: float) -> Progress:
+    """Progress of a part of the work within the whole."""
+    return lambda share, text: progress(low + (high - low) * share, text)
+
+
+_TRUSTED = ("adequate", "not_enough_data", "effect", "ambiguous", "unknown_effect")
+"""Verdicts on the modes of one level, those first that speak for a level near to a linear rig."""
 
 
 def own_thresholds(

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.errors import EmaError
+from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.stages.base import Progress, Run
+from ema_pipeline.stages.level_case import all_tests, depends_on_level, level_case, linear_part
 from ema_pipeline.stages.modes import measured_modes
+
+if TYPE_CHECKING:
+    from ema_pipeline.diagnose.types import Ladder
 
 NAME = "ladder"
 NEEDS = ("modal",)
@@ -30,6 +35,39 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     if run.rig is None:
         raise EmaError(f"{run.store.folder}: a ladder needs a model; run again with --rig")
     settings = cast(DiagnoseSettings, run.settings["diagnose"])
+    if any(depends_on_level(run, label) for label in run.info.effects):
+        return {"ladder": by_hits(run, progress)}
     return {
         "ladder": make_ladder(run.rig, measured_modes(run), run.info.effects, settings, run.library, progress)
     }
+
+
+def by_hits(run: Run, progress: Progress) -> Ladder:
+    """The ladder of effects that depend on the force level, measured by simulating the hits.
+
+    Raises
+    ------
+    EmaError
+        For a table of modes, which has no hits.
+    """
+    from ema_pipeline.diagnose.levels.ladder import make_level_ladder
+    from ema_pipeline.diagnose.levels.prepare import soft_and_hard
+    from ema_pipeline.fit.map_fit import fit_rig
+
+    tests = all_tests(run)
+    if not tests:
+        label = next(x for x in run.info.effects if depends_on_level(run, x))
+        raise EmaError(
+            f"{run.store.folder}: '{label}' shows in hits only, and there are none; "
+            f"take it out with 'ema remove {run.store.folder} {label}'"
+        )
+    progress(0.0, "modes of single levels")
+    fits = [
+        fit_rig(
+            linear_part(run), modes, cast(FitSettings, run.settings["fit"]), None, lambda share, text: None
+        )
+        for modes in soft_and_hard(tests)
+    ]
+    starts = [{n: p.value for n, p in f.parameters.items()} for f in fits]
+    case = level_case(run, tests, starts)
+    return make_level_ladder(case, run.info.effects, lambda done, text: progress(0.1 + 0.9 * done, text))

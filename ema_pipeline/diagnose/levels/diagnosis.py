@@ -1,0 +1,334 @@
+"""Which effect makes a structure answer otherwise to hard hits than to soft ones? From hits to a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ema_pipeline.diagnose.explain import label_text, size_text
+from ema_pipeline.diagnose.hypotheses import NOTHING, describe
+from ema_pipeline.diagnose.levels import words
+from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
+from ema_pipeline.diagnose.levels.ladder import (
+    LevelErrors,
+    assemble,
+    climb,
+    error_of,
+    level_errors,
+    sizes_of,
+)
+from ema_pipeline.diagnose.levels.problem import NoiseFloor
+from ema_pipeline.diagnose.levels.search import LevelRanking, again, at_floor, own_floor, ranked
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, VerdictWord
+from ema_pipeline.threads import single_blas_thread
+
+Progress = Callable[[float, str], None]
+
+_HARDER = 2.0
+"""A next test is thought of with blows this much harder than the hardest."""
+
+
+@dataclass(frozen=True)
+class _Climbed:
+    """Models from the base upwards, and the rankings on top of each."""
+
+    models: list[Simulated]
+    rankings: list[LevelRanking]
+    floor: NoiseFloor
+    note: str
+
+
+def diagnose_levels(
+    case: LevelCase,
+    effects: Sequence[str],
+    linear: Diagnosis | None,
+    summary: str,
+    notes: Sequence[str],
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Find the effects that depend on the force level.
+
+    Parameters
+    ----------
+    case : LevelCase
+    effects : sequence of str
+        Effects of the model already, and those that the modes of one level show to be missing besides.
+    linear : Diagnosis, optional
+        What the modes of a single level say.
+    summary : str
+        What the study of the levels found.
+    notes : sequence of str
+        Remarks of earlier stages.
+    progress : callable, optional
+
+    Returns
+    -------
+    Diagnosis
+    """
+    tell = progress or (lambda share, text: None)
+    with single_blas_thread():
+        return _diagnose(case, tuple(effects), linear, summary, tuple(notes), tell)
+
+
+def _diagnose(
+    case: LevelCase,
+    effects: tuple[str, ...],
+    linear: Diagnosis | None,
+    summary: str,
+    notes: tuple[str, ...],
+    tell: Progress,
+) -> Diagnosis:
+    climbed = _climb(case, effects, tell)
+    first, base = climbed.rankings[0], climbed.rankings[0].base
+    forces = [float(f) for f in case.windows[0].force_n]
+    tell(0.8, "predicting held-out levels")
+    before = level_errors(case, base, climbed.floor)
+    members = _group(case, first)
+    ladder = assemble(case, climbed.models, climbed.floor, climbed.note, _part(tell, 0.82, 0.95))
+    candidates = _candidates(case, climbed, members, before, forces)
+    verdict, text = _verdict(case, climbed, members, ladder, summary)
+    claimed = _claims(linear)
+    if claimed and verdict in ("adequate", "effect"):
+        verdict = "effect"
+        text = f"{_claim_text(claimed)} {text}" if text else _claim_text(claimed)
+    group = verdict == "ambiguous"
+    return Diagnosis(
+        verdict=verdict,
+        summary=text,
+        null_probability=first.probabilities[NOTHING],
+        candidates=(*candidates, *claimed),
+        indistinguishable=(tuple(m.hypothesis.labels[-1] for m in members),) if group else (),
+        next_measurement=_next(case, members, climbed.floor) if group else _otherwise(verdict),
+        localisation=(),
+        probabilities=_by_last(first),
+        error=before.error,
+        heldout_error=before.heldout_error,
+        ladder=ladder,
+        notes=(*((summary,) if summary else ()), *(linear.notes if linear is not None else ()), *notes),
+    )
+
+
+def _climb(case: LevelCase, effects: tuple[str, ...], tell: Progress) -> _Climbed:
+    """Rank on the base model, lower the noise to what the best leaves, add what is claimed, and rank again."""
+    floor = case.floor
+    tell(0.0, "base model")
+    start = climb(case, effects, floor, _part(tell, 0.0, 0.1))
+    ranking = ranked(case, start[-1], floor, _part(tell, 0.1, 0.5))
+    best = min((ranking.base, *ranking.fitted), key=lambda m: m.evidence)
+    floor = own_floor(case, best)
+    ranking = at_floor(case, ranking, floor, _part(tell, 0.5, 0.6))
+    models, rankings, note = [ranking.base], [ranking], ""
+    while True:
+        top = _claimable(case, rankings[-1], floor)
+        if top is None:
+            note = "no further effect is supported by the data"
+            break
+        if len(models) > case.settings.most_rungs:
+            note = f"stopped after {case.settings.most_rungs} effects"
+            break
+        models.append(top)
+        further = ranked(case, top, floor, _part(tell, 0.6, 0.8))
+        rankings.append(further)
+    if effects:
+        lower = [again(case, m, floor) for m in start[:-1]]
+        models = [*lower, *models]
+    return _Climbed(models, rankings, floor, note)
+
+
+def _claimable(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor) -> Simulated | None:
+    """The most probable hypothesis where something is missing for sure and held-out levels agree."""
+    s = case.settings
+    if 1 - ranking.probabilities[NOTHING] < s.probability_least or not ranking.fitted:
+        return None
+    top = ranking.ordered()[0]
+    if ranking.gain(top) < s.levels.gain_least:
+        return None
+    before, after = (level_errors(case, m, floor).heldout_error for m in (ranking.base, top))
+    return top if not after >= before else None
+
+
+def _group(case: LevelCase, ranking: LevelRanking) -> list[Simulated]:
+    """The smallest set of hypotheses that holds `probability_least` of all that is not "nothing"."""
+    something = 1 - ranking.probabilities[NOTHING]
+    members: list[Simulated] = []
+    held = 0.0
+    for m in ranking.ordered():
+        if members and held >= case.settings.probability_least * something:
+            break
+        members.append(m)
+        held += ranking.probabilities[m.hypothesis.label]
+    return members
+
+
+def _by_last(ranking: LevelRanking) -> dict[str, float]:
+    """Probabilities by the label of the effect added last."""
+    names = {m.hypothesis.label: m.hypothesis.labels[-1] for m in ranking.fitted}
+    return {names.get(label, label): p for label, p in ranking.probabilities.items()}
+
+
+def _candidates(
+    case: LevelCase,
+    climbed: _Climbed,
+    members: Sequence[Simulated],
+    before: LevelErrors,
+    forces: Sequence[float],
+) -> tuple[Candidate, ...]:
+    ranking = climbed.rankings[0]
+    added = climbed.models[-1].hypothesis.labels
+    listed = ranking.ordered()
+    shown = listed[: case.settings.candidates]
+    shown += [m for m in listed if m not in shown and m.hypothesis.labels[-1] in added]
+    result = []
+    for m in shown:
+        label = m.hypothesis.labels[-1]
+        title, signs = describe(m.hypothesis, case.library)
+        full = any(m is x for x in members) or label in added
+        after = level_errors(case, m, climbed.floor, hold_out=full)
+        family, _, place = label.partition("@")
+        result.append(
+            Candidate(
+                effect=family,
+                at=place,
+                title=title,
+                probability=ranking.probabilities[m.hypothesis.label],
+                parameters=_own_sizes(case, m),
+                error_before=before.error,
+                error_after=after.error,
+                heldout_before=before.heldout_error,
+                heldout_error_after=after.heldout_error,
+                gain=ranking.gain(m),
+                threshold=case.settings.levels.gain_least,
+                log_evidence=ranking.log_evidence(m),
+                claimed=label in added,
+                why=words.why(signs, forces, before, after),
+            )
+        )
+    return tuple(result)
+
+
+def _own_sizes(case: LevelCase, m: Simulated) -> dict[str, EffectSize]:
+    """Sizes of the effect added last, by their own names."""
+    label = m.hypothesis.labels[-1]
+    own = [f"{label}.{p.name}" for p in case.parameters_of(label)]
+    return {
+        n.removeprefix(f"{label}."): v
+        for n, v in sizes_of(case, m, [n for n in own if n in m.values]).items()
+    }
+
+
+def _verdict(
+    case: LevelCase, climbed: _Climbed, members: Sequence[Simulated], ladder: Ladder, summary: str
+) -> tuple[VerdictWord, str]:
+    last = climbed.models[-1]
+    error = error_of(case, last)
+    known = climbed.rankings[0].base.hypothesis.labels
+    added = [x for x in last.hypothesis.labels if x not in known]
+    nonlinear = [x for x in last.hypothesis.labels if _depends(case, x)]
+    limit = case.settings.error_limit
+    if not error <= limit:
+        best = f" {label_text(added[0]).capitalize()} helps most but does not mend it." if added else ""
+        return "unknown_effect", (
+            f"The answer depends on the force level, and nothing in the library explains how (error {error:.3g}, "
+            f"{limit:g} is the limit).{best}"
+        )
+    if not nonlinear and len(members) > 1 and _mending(climbed, members):
+        return "ambiguous", (
+            f"The answer depends on the force level, and these explain it alike: "
+            f"{words.names([m.hypothesis.labels[-1] for m in members])}."
+        )
+    if not nonlinear:
+        return "unknown_effect", (
+            "The answer depends on the force level, but no effect of the library explains how better than chance."
+        )
+    if added and len(members) > 1:
+        return "ambiguous", (
+            f"Something is missing that depends on the force level, but these explain the data alike: "
+            f"{words.names([m.hypothesis.labels[-1] for m in members])}."
+        )
+    if not added:
+        return (
+            "adequate",
+            f"The model explains the hits at all levels (error {error:.2f}); nothing is missing.",
+        )
+    texts = [
+        f"{label_text(label)} ({size_text(_own_sizes(case, m))})"
+        for label, m in zip(added, climbed.models[-len(added) :], strict=True)
+    ]
+    rungs = ladder.rungs[-len(added) - 1], ladder.rungs[-1]
+    k = int(np.nanargmax(np.array(rungs[0].misfit)))
+    held = [r.heldout_misfit[k] if np.isfinite(r.heldout_misfit[k]) else r.misfit[k] for r in rungs]
+    return "effect", (
+        f"Missing: {' and '.join(texts)}. Simulated hits miss {100 * held[0]:.2g} % of the signals at "
+        f"{ladder.force_n[k]:.3g} N without it and {100 * held[1]:.2g} % with it, that level being left out of the fit."
+    )
+
+
+def _mending(climbed: _Climbed, members: Sequence[Simulated]) -> bool:
+    return climbed.rankings[0].probabilities[NOTHING] < 0.5 and bool(members)
+
+
+def _depends(case: LevelCase, label: str) -> bool:
+    from ema_pipeline.effects.library import shipped_effects
+
+    known = shipped_effects() if case.library is None else case.library
+    family = label.partition("@")[0]
+    return family in known and not known[family].linear
+
+
+def _claims(linear: Diagnosis | None) -> tuple[Candidate, ...]:
+    """What the modes of one level show to be missing, whatever the level."""
+    if linear is None or linear.verdict != "effect":
+        return ()
+    return tuple(c for c in linear.candidates if c.claimed)
+
+
+def _claim_text(claimed: Sequence[Candidate]) -> str:
+    texts = [f"{label_text(c.label)} ({size_text(c.parameters)})" for c in claimed]
+    return f"Missing at every level: {' and '.join(texts)}."
+
+
+def _otherwise(verdict: VerdictWord) -> str:
+    if verdict == "unknown_effect":
+        return (
+            "Hit at more levels between the softest and the hardest, and next to each bearing and mesh: the place "
+            "whose hits change most with the force is nearest to the effect."
+        )
+    return ""
+
+
+def _next(case: LevelCase, members: Sequence[Simulated], floor: NoiseFloor) -> str:
+    """The impact point at which blows of twice the force would tell the first two of a group apart."""
+    one, two = members[:2]
+    harder = replace(
+        case,
+        windows=tuple(
+            replace(w.only(w.level == w.level.max()), force=_HARDER * w.only(w.level == w.level.max()).force)
+            for w in case.windows
+        ),
+    )
+    first, second = (
+        p.simulate(p.space.point(m.values)[None])
+        for m in (one, two)
+        for p in [harder.problem(m.hypothesis, m.sizes)]
+    )
+    best, where = 0.0, ""
+    for w, a, b, weight in zip(harder.windows, first, second, harder.weights(floor), strict=True):
+        weight = replace(weight, measured=w.spectra(b[0], weight.fade_s))
+        r = weight.applied(w.spectra(a, weight.fade_s))[0]
+        z = np.sqrt(np.sum(np.abs(r) ** 2, axis=(1, 2))) / _HARDER
+        if z.max() > best:
+            best, where = float(z.max()), f"{w.impacts[int(np.argmax(z))]} ({w.configuration})"
+    pair = " from ".join(label_text(m.hypothesis.labels[-1]) for m in members[:2])
+    if best < 1:
+        return (
+            f"Blows of {_HARDER:g} times the force would not tell {pair} either; put sensors on both places."
+        )
+    force = _HARDER * float(case.windows[0].force_n[-1])
+    return f"Blows of {force:.0f} N on {where} would tell {pair}: expected difference {best:.1f} σ."
+
+
+def _part(tell: Progress, low: float, high: float) -> Progress:
+    """Progress of a part of the work within the whole."""
+    return lambda share, text: tell(low + (high - low) * share, text)
