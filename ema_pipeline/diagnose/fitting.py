@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.diagnose.frequencies import finer_grid, searched_starts
 from ema_pipeline.diagnose.hypotheses import Extra, Hypothesis, extras, make_rig, starting_points
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.library import Library
@@ -143,6 +144,8 @@ def fit_null(
 ) -> Fitted:
     """Fit of a base model, over the whole grid of starts."""
     problem = case.problem(hypothesis, fit)
+    if not any(e.has_shapes for e in problem.evidence):
+        problem = case.problem(hypothesis, finer_grid(fit))
     return judge(case, problem, hypothesis, search(problem, start))
 
 
@@ -221,6 +224,10 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
         # a start is worth following only where the effect mends something on the way
         promising = [o for o in starts if o.objective < base.latent - _PROMISE]
         candidates += [refine(problem, x) for x in _best_distinct(promising, 2)]
+    if dynamic and not any(e.has_shapes for e in problem.evidence):
+        rig = make_rig(case.rig, hypothesis, case.library, case.settings.parameter_range)
+        for values in searched_starts(rig, last, case.measured, fit, base.values):
+            candidates.append(refine(problem, space.point(values)))
     if not new:
         candidates.append(refine(problem, space.point(base.values)))
     elif not candidates or min(c.objective for c in candidates) > base.objective - _CLEAR_GAIN:
