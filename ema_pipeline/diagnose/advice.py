@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
+from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.explain import label_text
 from ema_pipeline.diagnose.fitting import Case, Fitted
 from ema_pipeline.diagnose.hypotheses import NOTHING
@@ -46,7 +49,7 @@ def next_measurement(
             "if not, put further sensors around the place named."
         )
     if verdict == "not_enough_data":
-        return "Measure mode shapes at every body, in every configuration of the rig."
+        return _what_lacks(case)
     if verdict == "adequate" and ranking.probabilities[NOTHING] < case.settings.probability_least:
         ordered = ranking.ordered()
         option = best_measurement(case, ordered[0], ranking.base, fit) if ordered else None
@@ -55,6 +58,34 @@ def next_measurement(
             expected = _expected(option, "it", "nothing missing")
             return f"{_capital(option.text)} would show whether {name} is there: {expected}."
     return ""
+
+
+def _what_lacks(case: Case) -> str:
+    """What a test would have to hold beside what it holds."""
+    lacking = []
+    for c, m in case.measured.items():
+        if m.shapes is None or not m.dofs:
+            lacking.append(f"measure mode shapes at every body ({c})")
+        elif bare := _bare_bodies(case, c, m):
+            lacking.append(f"put sensors on {', '.join(bare)} ({c})")
+        if not np.any(np.isfinite(m.frequency_std_hz)):
+            lacking.append(f"state the standard deviations of the frequencies ({c})")
+        if not np.any(np.isfinite(m.damping_ratio)):
+            lacking.append(f"measure damping ratios ({c})")
+    others = [c for c in case.rig.configurations if c not in case.measured]
+    lacking += [f"test in configuration {c}" for c in others]
+    return (
+        f"{_capital('; '.join(lacking))}."
+        if lacking
+        else "State the rig's parameters with narrower tolerances."
+    )
+
+
+def _bare_bodies(case: Case, configuration: str, m: MeasuredModes) -> list[str]:
+    """Bodies without a sensor."""
+    bodies = dict.fromkeys(d.rpartition(".")[0] for d in case.rig.system(configuration).dofs)
+    covered = {d.point.rpartition(".")[0] for d in m.dofs}
+    return [b for b in bodies if b not in covered]
 
 
 def _expected(option: Option, first: str, second: str) -> str:

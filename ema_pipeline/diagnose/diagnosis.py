@@ -20,7 +20,7 @@ from ema_pipeline.diagnose.ranking import Ranking
 from ema_pipeline.diagnose.screening import Screening, screen
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.thresholds import threshold
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder, Localisation
+from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE, Candidate, Diagnosis, Ladder, Localisation
 from ema_pipeline.diagnose.verdict import judge_data, mending, misfit, sizes, unexplained_notes
 from ema_pipeline.diagnose.witness import Witness, better_share, frf_lines
 from ema_pipeline.effects.library import Library
@@ -29,6 +29,9 @@ from ema_pipeline.rigs.types import Rig
 from ema_pipeline.threads import single_blas_thread
 
 Progress = Callable[[float, str], None]
+
+_NEAR_BOUND = 1.02
+_AS_GOOD = 0.9
 
 
 def diagnose(
@@ -164,51 +167,95 @@ def _candidates(
     witness: Witness,
     thresholds: Mapping[str, float] | None,
 ) -> tuple[Candidate, ...]:
-    ranking: Ranking = climbed.rankings[0]
+    """The claimed effects, each with what it brought on its rung, and what else was most probable alone."""
     added = climbed.top.hypothesis.labels
-    listed = ranking.ordered()
-    shown = listed[: case.settings.candidates]
-    # What was added on a higher rung, or mends the model, may be listed far down on the first.
+    first = climbed.rankings[0]
     alike = {f.hypothesis.label for f in members}
-    shown += [f for f in listed if f not in shown and f.hypothesis.label in (*added, *alike)]
-    before, frf_before = stick.error(ranking.base), witness.error(ranking.base)
-    result = []
-    for f in shown:
-        label = f.hypothesis.label
-        title, signs = describe(f.hypothesis, case.library)
-        heldout = float("nan")
-        if label in alike or label in added:
-            heldout = stick.heldout_error(f, held_out(case, f, stick.fit, case.settings.folds))
-        family, _, place = label.partition("@")
-        frf_after = witness.error(f)
-        better, impacts = better_share(frf_before, frf_after)
+    listed = [f for f in first.ordered() if f.hypothesis.label not in added]
+    kept = [f for f in listed if f.hypothesis.label in alike or not _at_its_bound(case, f)]
+    shown = kept[: max(case.settings.candidates - len(added), 1)]
+    shown += [f for f in listed if f not in shown and f.hypothesis.label in alike]
+    result: list[Candidate] = []
+    chance = 1.0
+    for rung, (below, model) in enumerate(zip(climbed.rankings, climbed.models[1:], strict=False), start=1):
+        chance *= below.probabilities[model.hypothesis.label]
+        before, after = ladder.rungs[rung - 1], ladder.rungs[rung]
+        made = _candidate(case, below, model, stick, witness, thresholds)
         result.append(
-            Candidate(
-                effect=family,
-                at=place,
-                title=title,
-                probability=ranking.probabilities[label],
-                parameters=sizes(case, f),
-                error_before=before,
-                error_after=stick.error(f),
-                heldout_before=ladder.rungs[0].heldout_error,
-                heldout_error_after=heldout,
-                gain=ranking.gain(f),
-                threshold=threshold(f.hypothesis.family, case.settings.gain_least, thresholds),
-                log_evidence=ranking.log_evidence(f),
-                claimed=label in added,
-                why=why(ranking.base, f, case.measured, signs),
-                frf_error_before=frf_before.error,
-                frf_error_after=frf_after.error,
-                frf_impacts_better=better,
-                frf_impacts=impacts,
+            replace(
+                made,
+                probability=chance,
+                # of the final model: what is added later bends what was fitted before
+                parameters=sizes(case, climbed.top, model.hypothesis.labels[-1]),
+                heldout_before=before.heldout_error,
+                heldout_error_after=after.heldout_error,
+                claimed=True,
             )
         )
-    return tuple(result)
+    for f in shown:
+        made = _candidate(case, first, f, stick, witness, thresholds)
+        heldout = float("nan")
+        if f.hypothesis.label in alike:
+            heldout = stick.heldout_error(f, held_out(case, f, stick.fit, case.settings.folds))
+        result.append(
+            replace(made, heldout_before=ladder.rungs[0].heldout_error, heldout_error_after=heldout)
+        )
+    return tuple(sorted(result, key=lambda c: -c.probability))
+
+
+def _candidate(
+    case: Case,
+    ranking: Ranking,
+    f: Fitted,
+    stick: Yardstick,
+    witness: Witness,
+    thresholds: Mapping[str, float] | None,
+) -> Candidate:
+    """A hypothesis beside the base model of its ranking; held-out data are left open."""
+    title, signs = describe(f.hypothesis, case.library)
+    family, _, place = f.hypothesis.labels[-1].partition("@")
+    before, after = witness.error(ranking.base), witness.error(f)
+    better, impacts = better_share(before, after)
+    return Candidate(
+        effect=family,
+        at=place,
+        title=title,
+        probability=ranking.probabilities[f.hypothesis.label],
+        parameters=sizes(case, f),
+        error_before=stick.error(ranking.base),
+        error_after=stick.error(f),
+        heldout_before=float("nan"),
+        heldout_error_after=float("nan"),
+        gain=ranking.gain(f),
+        threshold=threshold(f.hypothesis.family, case.settings.gain_least, thresholds),
+        log_evidence=ranking.log_evidence(f),
+        claimed=False,
+        why=why(ranking.base, f, case.measured, signs),
+        frf_error_before=before.error,
+        frf_error_after=after.error,
+        frf_impacts_better=better,
+        frf_impacts=impacts,
+    )
+
+
+def _at_its_bound(case: Case, f: Fitted) -> bool:
+    """True for a parameter out of tolerance that the data only push away: its bound is no estimate."""
+    if f.hypothesis.family != OUT_OF_TOLERANCE:
+        return False
+    p = case.problem(f.hypothesis, case.settings.fit).rig.parameters[f.hypothesis.place]
+    value = f.values.get(p.name, p.value)
+    return bool(value <= p.minimum * _NEAR_BOUND or value >= p.maximum / _NEAR_BOUND)
 
 
 def _where(localised: Sequence[Localisation]) -> str:
+    """Where the misfit sits, and what the data do not tell from it."""
     if not localised:
         return ""
-    first = localised[0]
-    return f" The misfit sits at {first.place} and acts like {first.acts_like}."
+    first, *rest = localised
+    also = [
+        x.place if x.acts_like == first.acts_like else f"{x.place} as {x.acts_like}"
+        for x in rest
+        if x.score > _AS_GOOD * first.score
+    ]
+    or_at = f" (or at {', or at '.join(also)}: these data hardly tell)" if also else ""
+    return f" The misfit sits at {first.place} and acts like {first.acts_like}{or_at}."

@@ -56,6 +56,8 @@ def screen(rig: Rig, measured: Mapping[str, MeasuredModes]) -> Screening:
         kept[c] = subset(m, inside)
         modes += int(np.sum(inside))
         shapes |= m.shapes is not None and bool(m.dofs)
+        if not np.any(np.isfinite(m.frequency_std_hz) & (m.frequency_std_hz > 0)):
+            notes.append(f"{c}: no standard deviations of the frequencies are stated, so they are assumed")
         if m.shapes is not None and len(m.references) == 1:
             notes.append(f"{c}: struck at one point only; of two equal modes one may be hidden")
     kept = {c: m for c, m in kept.items() if len(m)} or kept

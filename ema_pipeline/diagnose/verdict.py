@@ -20,6 +20,7 @@ _SPURIOUS = 2
 _WELL_DETERMINED = 0.03
 _ALIKE = 0.05
 _VISIBLE_SHARE = 0.25
+_STRAINED = 2.5
 
 
 def judge_data(
@@ -61,7 +62,8 @@ def judge_data(
         seen = visible_share(case, first)
         if seen < _VISIBLE_SHARE:
             return "not_enough_data", (
-                f"These data would show only {100 * seen:.0f} % of the effects in the library at a size to expect."
+                f"The model explains the data (error {ladder.rungs[-1].error:.2f}), but they would show only "
+                f"{100 * seen:.0f} % of the effects in the library at a size to expect."
             )
         p = first.probabilities[NOTHING]
         left = solid_unexplained(case, top)
@@ -72,9 +74,7 @@ def judge_data(
         )
     if len(members) > 1:
         return "ambiguous", f"Something is missing, but these explain the data alike: {names}."
-    texts = []
-    for label, model in zip(added, climbed.models[1:], strict=True):
-        texts.append(f"{label_text(label)} ({size_text(sizes(case, model))})")
+    texts = [f"{label_text(label)} ({size_text(sizes(case, top, label))})" for label in added]
     base, last = ladder.rungs[0], ladder.rungs[-1]
     return "effect", (
         f"Missing: {' and '.join(texts)}. Error {base.error:.3g} before, {last.error:.3g} after; "
@@ -88,10 +88,10 @@ def _chance(ranking: Ranking) -> str:
     return f" Or else a measured mode is not of the rig ({100 * p:.0f} %)." if p > _ALIKE else ""
 
 
-def sizes(case: Case, f: Fitted) -> dict[str, EffectSize]:
-    """Sizes of what the hypothesis added last, by their own names."""
+def sizes(case: Case, f: Fitted, label: str | None = None) -> dict[str, EffectSize]:
+    """Sizes of one of the hypothesis' effects, the last where none is named, by their own names."""
     units = {p.name: p.unit for p in case.problem(f.hypothesis, case.settings.fit).rig.parameters.values()}
-    last = f.hypothesis.labels[-1]
+    last = label or f.hypothesis.labels[-1]
     return {
         e.name.removeprefix(f"{last}."): EffectSize(f.values[e.name], f.std[e.name], units[e.name])
         for e in extras(case.rig, Hypothesis((last,)), case.library)
@@ -130,7 +130,10 @@ def solid_unexplained(case: Case, model: Fitted) -> list[str]:
                 found.append(f"{m.frequency_hz[r]:.1f} Hz ({c})")
                 continue
             largest = float(np.nanmax(np.abs(m.shapes[r])))
-            if not np.any(np.isfinite(m.shape_std[r])) or np.nanmedian(m.shape_std[r]) < _WELL_DETERMINED * largest:
+            if (
+                not np.any(np.isfinite(m.shape_std[r]))
+                or np.nanmedian(m.shape_std[r]) < _WELL_DETERMINED * largest
+            ):
                 found.append(f"{m.frequency_hz[r]:.1f} Hz ({c})")
     return found
 
@@ -147,7 +150,21 @@ def unexplained_notes(case: Case, top: Fitted) -> tuple[str, ...]:
     if top.missed:
         plural = "s" if top.missed > 1 else ""
         notes.append(f"{top.missed} mode{plural} that the best model has in the band not measured")
-    return tuple(notes)
+    return (*notes, *strained(case, top))
+
+
+def strained(case: Case, model: Fitted) -> list[str]:
+    """Parameters that a model's fit pushes far from their nominal values."""
+    rig = case.problem(model.hypothesis, case.settings.fit).rig
+    found = []
+    for name, value in model.values.items():
+        p = rig.parameters[name]
+        if p.free or p.tolerance <= 0 or p.value == 0:
+            continue
+        shift = (value - p.value) / abs(p.tolerance * p.value)
+        if abs(shift) > _STRAINED:
+            found.append(f"{name} is fitted {shift:+.1f} tolerances from its nominal value")
+    return found
 
 
 def visible_share(case: Case, ranking: Ranking) -> float:
