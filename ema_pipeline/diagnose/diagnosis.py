@@ -172,7 +172,9 @@ def _candidates(
     first = climbed.rankings[0]
     alike = {f.hypothesis.label for f in members}
     listed = [f for f in first.ordered() if f.hypothesis.label not in added]
-    kept = [f for f in listed if f.hypothesis.label in alike or not _at_its_bound(case, f)]
+    kept = [
+        f for f in listed if f.hypothesis.label in alike or (sizes(case, f) and not _at_its_bound(case, f))
+    ]
     shown = kept[: max(case.settings.candidates - len(added), 1)]
     shown += [f for f in listed if f not in shown and f.hypothesis.label in alike]
     result: list[Candidate] = []
