@@ -7,12 +7,14 @@ records (half-sine blow, anti-alias filter, noise on every channel), and turned 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.ingest.records import Record, ResponseChannel
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,45 @@ def simulate_hits(
         window = np.exp(-decay_rad_s * np.arange(n) / rate)
         force, resp = force * window, resp * window
     return Hits(force, resp, rate, pretrigger, float(sigma_f), sigma_y)
+
+
+def records_of(hits: Hits, dofs_out: list[int], dofs_in: list[int]) -> list[Record]:
+    """The hits as records of one hit each, as ingest hands them on; DOF k is called ``pk.z``."""
+    channels = tuple(ResponseChannel(f"a{k}", Dof(f"p{k}", "z"), "acceleration") for k in dofs_out)
+    return [
+        Record(
+            f"p{k}_{h}.h5",
+            Dof(f"p{k}", "z"),
+            hits.sample_rate_hz,
+            "hammer",
+            hits.force[i, h],
+            hits.responses[i, h],
+            channels,
+        )
+        for i, k in enumerate(dofs_in)
+        for h in range(hits.force.shape[1])
+    ]
+
+
+def write_raw_folder(folder: Path, records: list[Record], window_decay_rad_s: float = 0.0) -> None:
+    """Records of one impact and channel layout as HDF5 files, and the test.toml that describes them."""
+    import h5py
+
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = ["schema = 1", f"sample_rate_hz = {records[0].sample_rate_hz!r}"]
+    if window_decay_rad_s:
+        lines.append(f"exponential_window_rad_s = {window_decay_rad_s!r}")
+    lines += ["[[channels]]", 'name = "hammer"', 'quantity = "force"', 'unit = "N"']
+    for channel in records[0].channels:
+        lines += ["[[channels]]", f'name = "{channel.name}"', 'quantity = "acceleration"', 'unit = "m/s^2"']
+        lines.append(f'dof = "{channel.dof}"')
+    for record in records:
+        lines += ["[[records]]", f'file = "{record.file}"', f'impact = "{record.impact}"']
+        with h5py.File(folder / record.file, "w") as file:
+            file["hammer"] = record.force
+            for channel, samples in zip(record.channels, record.responses, strict=True):
+                file[channel.name] = samples
+    (folder / "test.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def h1(hits: Hits, dofs_out: list[int], dofs_in: list[int], f_max: float, decay_rad_s: float = 0.0) -> FrfSet:

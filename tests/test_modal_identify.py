@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
-from simulate_modal import TrueSystem, frf_set, h1, random_system, simulate_hits
+from simulate_modal import (
+    TrueSystem,
+    frf_set,
+    h1,
+    random_system,
+    records_of,
+    simulate_hits,
+    write_raw_folder,
+)
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.frf.estimate import estimate_frfs
+from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.ingest.description import read_description
+from ema_pipeline.ingest.load import load_records
+from ema_pipeline.ingest.quality import hits_of_test
+from ema_pipeline.ingest.records import cut_hit
+from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.modal.windowed import power_of
 
 
 def hammer_test(
@@ -195,6 +214,61 @@ def test_damping_added_by_an_exponential_window_is_taken_off() -> None:
     frfs = hammer_test(FIVE, list(range(8)), [0], record_s=2.0, decay_rad_s=2.0)
     model = identify(frfs, ModalSettings())
     assert dampings(model) == pytest.approx(FIVE.damping_ratio, rel=0.02)
+
+
+@pytest.mark.parametrize("by", ["analyser", "program"])
+def test_damping_under_an_exponential_window_is_right_whoever_put_it_on(by: str, tmp_path: Path) -> None:
+    """Records of 2 s that ring on, windows that end at 20 % and at 1 %."""
+    errors = []
+    for seed, decay in enumerate((0.8, 2.3)):
+        rng = np.random.default_rng(seed)
+        system = random_system(
+            rng, n_modes=5, n_dofs=6, low_hz=40, high_hz=360, min_spacing=0.05, damping=(0.001, 0.01)
+        )
+        hits = simulate_hits(
+            system, list(range(6)), [0, 2], f_max=400.0, record_s=2.0, n_hits=3, force_noise=0.005,
+            response_noise=0.005, rng=rng, decay_rad_s=decay if by == "analyser" else 0.0,
+        )  # fmt: skip
+        folder = tmp_path / str(seed)
+        records = records_of(hits, list(range(6)), [0, 2])
+        write_raw_folder(folder, records, decay if by == "analyser" else 0.0)
+        records = list(load_records(read_description(folder)))
+        owner = {r.file: r for r in records}
+        window = decay if by == "program" else "none"
+        frfs = estimate_frfs(
+            (cut_hit(owner[h.file], h) for h in hits_of_test(records)), FrfSettings(exponential_window=window)
+        )
+        assert frfs.response_decay_rad_s == pytest.approx(decay)
+        model = identify(frfs, ModalSettings())
+        assert frequencies(model) == pytest.approx(system.frequency_hz, rel=1e-4)
+        errors += list(np.abs(dampings(model) / system.damping_ratio - 1))
+    assert np.median(errors) < 0.005
+
+
+def test_noise_of_neighbouring_lines_under_a_window_correlates_as_the_fit_takes_it() -> None:
+    rng = np.random.default_rng(3)
+    n, rate, sigma = 1024, 512.0, 3.0
+    noise = rng.standard_normal((4000, n)) * np.exp(-sigma * np.arange(n) / rate)
+    lines = np.fft.rfft(noise)[:, 40:52] / np.sqrt(np.sum(np.exp(-2 * sigma * np.arange(n) / rate)))
+    omega = 2 * np.pi * np.arange(40, 52) * rate / n
+    data = FitData(
+        omega, np.zeros((1, 1, 12)), np.zeros((1, 1, 12)), np.ones((1, 1), bool), 2.0, False, sigma
+    )
+    factors = rng.standard_normal((3, 12)) + 1j * rng.standard_normal((3, 12))
+    drawn = np.real(factors @ lines.T)
+    assert 2 * np.cov(drawn) == pytest.approx(power_of(factors, data), rel=0.1, abs=0.1 * 24)
+
+
+def test_records_under_different_windows_are_not_averaged() -> None:
+    hits = simulate_hits(
+        FIVE, [0], [0], f_max=400.0, record_s=1.0, n_hits=2, force_noise=0.0, response_noise=0.0,
+        rng=np.random.default_rng(0),
+    )  # fmt: skip
+    one, other = records_of(hits, [0], [0])
+    other = replace(other, window_decay_rad_s=1.5)
+    found = [cut_hit(r, hits_of_test([r])[0]) for r in (one, other)]
+    with pytest.raises(EmaError, match=r"exponential window of 1.5 rad/s, 'p0_0.h5' with 0 rad/s"):
+        estimate_frfs(found)
 
 
 def test_frfs_that_were_not_measured_cost_no_modes_and_get_shapes_where_measured() -> None:

@@ -70,8 +70,8 @@ def estimate_frfs(hits: Iterable[HitSamples], settings: FrfSettings | None = Non
     Raises
     ------
     EmaError
-        Where there is no hit; where hits differ in length, sample rate, calibration or in the quantity of
-        one output; where two channels of a hit measure one DOF; where a force is zero throughout.
+        Where there is no hit; where hits differ in length, sample rate, calibration, exponential window or in
+        the quantity of one output; where two channels of a hit measure one DOF; where a force is zero throughout.
 
     References
     ----------
@@ -172,6 +172,11 @@ class _Total:
                 f"{where}: the hammer is calibrated in only one of this and '{first.hit.file}'; "
                 "state its sensitivity"
             )
+        if hit.window_decay_rad_s != first.window_decay_rad_s:
+            raise EmaError(
+                f"{where}: was recorded with an exponential window of {hit.window_decay_rad_s:g} rad/s, "
+                f"'{first.hit.file}' with {first.window_decay_rad_s:g} rad/s; put them into separate tests"
+            )
 
 
 def _accumulate(sheet: _Sheet, hit: HitSamples, windows: Windows, pool: ThreadPoolExecutor) -> None:
@@ -254,7 +259,7 @@ def _finish(total: _Total, first: HitSamples, settings: FrfSettings, pool: Threa
         hits=hits,
         estimator=settings.estimator,
         record_s=float(n_samples / rate),
-        response_decay_rad_s=decay_rate(settings, n_samples / rate),
+        response_decay_rad_s=decay_rate(settings, n_samples / rate) + first.window_decay_rad_s,
         delay_s=np.array([float(np.mean(total.delays[p])) for p in inputs]),
         band_hz=_band(forces, frequency, rate, settings.band_drop_db),
         force_calibrated=first.force_calibrated,

@@ -20,7 +20,7 @@ class FrfSettings(Settings):
     )
     exponential_window: Literal["none", "auto"] | Annotated[float, Field(ge=0)] = Field(
         default="none",
-        description="Decay rate of the window on force and responses, rad/s; auto: down to 1 % at the end",
+        description="Decay rate of a window to put on force and responses, rad/s; auto: down to 1 % at the end",
     )
     variance_dof: int = Field(
         default=16,

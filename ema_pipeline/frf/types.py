@@ -39,8 +39,9 @@ class FrfSet:
     record_s : float
         Length of the analysed record, s.
     response_decay_rad_s : float
-        Decay rate σ of the exponential window on force and responses; it has been added to the decay
-        of every pole and must be taken off again. 0 without such a window.
+        Decay rate σ of the exponential windows on force and responses, that of the records and that of the
+        settings together; it has been added to the decay of every pole and must be taken off again. 0 without
+        such a window.
     delay_s : ndarray, (n_inputs,)
         Mean time of the force peak after the start of the analysed record.
     band_hz : tuple of float

@@ -90,6 +90,11 @@ class _TestFile(Settings):
     sample_rate_hz: float | None = Field(
         default=None, gt=0, description="Required unless the record files carry it"
     )
+    exponential_window_rad_s: float = Field(
+        default=0.0,
+        ge=0,
+        description="Decay rate σ of the window exp(-σt) that the analyser has put on the records already",
+    )
     channels: tuple[ChannelDescription, ...] = Field(description="Channels of the record files")
     records: tuple[RecordDescription, ...] = Field(description="Record files")
 

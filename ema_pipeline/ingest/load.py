@@ -144,6 +144,7 @@ def load_record(test: TestDescription, entry: RecordDescription) -> Record:
         channels=tuple(channels),
         force_full_scale=hammer.full_scale,
         force_calibrated=not test.force.uncalibrated,
+        window_decay_rad_s=test.exponential_window_rad_s,
     )
 
 

@@ -62,6 +62,8 @@ class Record:
         Largest force that the input can carry, N; ``inf`` where not stated.
     force_calibrated : bool
         False where the hammer signal is deliberately left in volts: FRFs and shapes are then unscaled.
+    window_decay_rad_s : float
+        Decay rate of the exponential window that was on force and responses when they were recorded; 0 for none.
     """
 
     file: str
@@ -73,6 +75,7 @@ class Record:
     channels: tuple[ResponseChannel, ...]
     force_full_scale: float = float("inf")
     force_calibrated: bool = True
+    window_decay_rad_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -140,6 +143,8 @@ class HitSamples:
     channels : tuple of ResponseChannel
         One per row of `responses`; channels rejected in this hit are already left out.
     force_calibrated : bool
+    window_decay_rad_s : float
+        As in `Record`.
     """
 
     hit: Hit
@@ -148,6 +153,7 @@ class HitSamples:
     responses: Rows | NDArray[np.float64]
     channels: tuple[ResponseChannel, ...]
     force_calibrated: bool = True
+    window_decay_rad_s: float = 0.0
 
 
 def cut_hit(record: Record, hit: Hit) -> HitSamples:
@@ -160,6 +166,7 @@ def cut_hit(record: Record, hit: Hit) -> HitSamples:
         responses=CutRows(record.responses, keep, hit.start, hit.stop),
         channels=tuple(record.channels[i] for i in keep),
         force_calibrated=record.force_calibrated,
+        window_decay_rad_s=record.window_decay_rad_s,
     )
 
 

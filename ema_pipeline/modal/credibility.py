@@ -21,6 +21,7 @@ from ema_pipeline.modal.missed import left_over
 from ema_pipeline.modal.noise import Noise
 from ema_pipeline.modal.segment import SegmentFit
 from ema_pipeline.modal.uncertainty import evidence
+from ema_pipeline.modal.windowed import likeness
 
 Real = NDArray[np.float64]
 Votes = Callable[[Estimate], Real]
@@ -136,7 +137,7 @@ def _impossible(data: FitData, estimate: Estimate) -> NDArray[np.bool_]:
 def _strength_over_noise(data: FitData, fit: SegmentFit) -> Real:
     """Above 1 where noise cannot have made the candidate, and its damping is known well enough."""
     gain, threshold = significance(data, fit.noise, fit.estimate, fit.solution)
-    std = decay_std(fit.estimate, fit.solution)
+    std = decay_std(fit.estimate, fit.solution) * np.sqrt(likeness(-fit.estimate.poles.real, data))
     return np.asarray(np.minimum(gain / threshold, MAX_DAMPING_STD / np.maximum(std, 1e-9)))
 
 
@@ -227,7 +228,8 @@ def significance(
     """Growth of χ² without each mode, and the growth that noise alone may reach.
 
     Noise that all outputs share gives them one common chance to look like a mode, not one each; the limit
-    is raised by its share at the mode's frequency.
+    is raised by its share at the mode's frequency. Noise under an exponential window decays itself, which
+    makes it the more like a mode.
     """
     m = len(estimate.poles)
     if not m:
@@ -241,4 +243,5 @@ def significance(
     at = np.clip(np.searchsorted(data.omega, estimate.poles.imag), 0, len(data.omega) - 1)
     weight = noise.weight(data.measured)
     share = np.einsum("oil,oil->l", noise.common, weight)[at] / max(np.count_nonzero(data.measured), 1)
-    return gain, (1 - share) * independent + share * coherent
+    limit = (1 - share) * independent + share * coherent
+    return gain, limit * likeness(-estimate.poles.real, data)

@@ -38,6 +38,8 @@ class FitData:
         Mean time from hit to end of the record.
     transposed : bool
         True where rows are inputs and references are outputs.
+    window_rad_s : float
+        Decay rate of the exponential window under which all was measured, noise too; 0 for none.
     """
 
     omega: NDArray[np.float64]
@@ -46,6 +48,7 @@ class FitData:
     measured: NDArray[np.bool_]
     rest_s: float
     transposed: bool
+    window_rad_s: float = 0.0
 
     def lines(self, first: int, stop: int) -> FitData:
         """The same FRFs on lines ``first:stop``."""
@@ -57,6 +60,7 @@ class FitData:
             self.measured,
             self.rest_s,
             self.transposed,
+            self.window_rad_s,
         )
 
     def rows(self, rows: slice) -> FitData:
@@ -133,4 +137,4 @@ def arrange(frfs: FrfSet, band_hz: tuple[float, float]) -> FitData:
     transposed = acc.shape[0] < acc.shape[1]
     if transposed:
         acc, variance, measured = acc.swapaxes(0, 1), variance.swapaxes(0, 1), measured.T
-    return FitData(omega, acc, variance, measured, rest_s, transposed)
+    return FitData(omega, acc, variance, measured, rest_s, transposed, frfs.response_decay_rad_s)

@@ -17,6 +17,7 @@ from ema_pipeline.modal.fit import (
     weighted_grams,
 )
 from ema_pipeline.modal.noise import Noise
+from ema_pipeline.modal.windowed import power_of
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -67,11 +68,11 @@ def parameter_covariance(
             coefficients = z[o, i].copy()
             coefficients[: 2 * m] -= mix[i] @ eliminated[o]
             a = coefficients.T @ _projected(signal, residual, w) * w  # (n_par, n_lines)
-            meat += 0.5 * ((a * noise.own[o, i]) @ a.conj().T).real
+            meat += 0.5 * power_of(a.conj() * np.sqrt(noise.own[o, i]), data)
             size = np.abs(data.frf[o, i])
             phase = np.where(size > 0, data.frf[o, i] / np.maximum(size, 1e-300), 0.0)
             coherent += a.conj() * (np.sqrt(noise.common[o, i]) * phase)
-        meat += 0.5 * (coherent @ coherent.conj().T).real
+        meat += 0.5 * power_of(coherent, data)
     parameters = inverse @ meat @ inverse
     return np.asarray(0.5 * (parameters + parameters.T))
 
@@ -109,7 +110,7 @@ def shape_covariance(
             w = weight[o, i]
             if np.any(w):
                 x = mix[i].T @ _projected(columns, residual, w) * w
-                meat += 0.5 * ((x * variance[o, i]) @ x.conj().T).real
+                meat += 0.5 * power_of(x.conj() * np.sqrt(variance[o, i]), data)
         inverse = _inverse(solution.normal[o])
         out[o] = inverse @ meat @ inverse
     eliminated = _eliminated(estimate, solution)
