@@ -123,16 +123,15 @@ def run(
 
 
 def _print_summary(done: Run) -> None:
-    if done.info.kind == "hysteresis":
-        from ema_pipeline.hysteresis.summary import terminal_lines
-        from ema_pipeline.stages.results import isolators
-
-        for name, result in isolators(done).items():
-            _print("\n".join([name, *terminal_lines(result)]))
-        return
     from ema_pipeline.report import terminal
     from ema_pipeline.stages.results import load_results
 
+    if done.info.kind == "hysteresis":
+        from ema_pipeline.report.loops import run_screen
+        from ema_pipeline.stages.results import isolators
+
+        _print(run_screen(isolators(done), load_results(done), str(done.store.folder)))
+        return
     _print(terminal.run_summary(load_results(done), str(done.store.folder)))
 
 
@@ -191,8 +190,14 @@ def compare(out: Out) -> None:
     from ema_pipeline.stages.results import load_results
 
     with _progress(False) as show:
-        run, _ = run_on(out, ["correlate"], show=show)
+        run, _ = run_on(out, ["correlate", "ladder"] if _of_loops(out) else ["correlate"], show=show)
     run.require_model("compare")
+    if run.info.kind == "hysteresis":
+        from ema_pipeline.report.loops import comparison_screen
+        from ema_pipeline.stages.loop_ladder import loops_of, models_of
+
+        _print(comparison_screen(loops_of(run), models_of(run)))
+        return
     comparison = load_results(run).comparison
     assert comparison is not None  # the stage has just run
     _print(terminal.comparison_tables(comparison))
@@ -269,6 +274,12 @@ def ladder(out: Out) -> None:
     from ema_pipeline.pipeline import existing_run
 
     _print_ladder(existing_run(out))
+
+
+def _of_loops(out: Path) -> bool:
+    from ema_pipeline.pipeline import existing_run
+
+    return existing_run(out).info.kind == "hysteresis"
 
 
 def _print_ladder(run: Run) -> None:

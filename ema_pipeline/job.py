@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.dof import Dof
+from ema_pipeline.effects.isolators import isolators
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.ingest.description import Campaign, TestDescription, read_campaign
 from ema_pipeline.ingest.load import load_records
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
     from ema_pipeline.simulate.campaign import SimulatedCampaign
 
 DEFAULT_PIPELINE = "default"
+LOOPS_RIG = "isolator"
+"""Rig of force-displacement loops where none is named."""
 
 DescribeSource = Callable[[Path, str | None, str | None, Iterable[str]], RunInfo]
 """Checks what a run starts from; takes source, rig, pipeline and overrides."""
@@ -191,7 +194,7 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
     if len(kinds) > 1:
         raise EmaError(f"{raw}: holds hammer and hysteresis tests; run their folders one by one")
     if kinds == {"hysteresis"}:
-        return _describe_loops(campaign, pipeline, overrides)
+        return _describe_loops(campaign, rig, pipeline, overrides)
     source = rig or _rig_of(campaign)
     model = None if source is None else load_rig(source)
     names = tuple(_configuration(test, model) for test in campaign.tests)
@@ -207,12 +210,18 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
     return describe_run("hammer", raw, title, _rig_text(source), source or "", names, (), settings)
 
 
-def _describe_loops(campaign: Campaign, pipeline: str | None, overrides: Iterable[str]) -> RunInfo:
-    """Hysteresis tests: the isolator's model is identified from the loops themselves."""
+def _describe_loops(
+    campaign: Campaign, rig: str | None, pipeline: str | None, overrides: Iterable[str]
+) -> RunInfo:
+    """Hysteresis tests: the base model is the linear spring of an isolator, which the loops themselves determine."""
+    source = rig or _rig_of(campaign) or LOOPS_RIG
+    model = load_rig(source)
+    if not any(isolators(model.assembly(name)) for name in model.configurations):
+        raise EmaError(f"{source}: has no isolator that loops could be measured on; leave --rig out")
     names = tuple(test.configuration or "default" for test in campaign.tests)
     title = campaign.tests[0].title or campaign.root.resolve().name
     settings = load_pipeline(pipeline or DEFAULT_PIPELINE, overrides)
-    return describe_run("hysteresis", campaign.root, title, "", "", names, (), settings)
+    return describe_run("hysteresis", campaign.root, title, _rig_text(source), source, names, (), settings)
 
 
 def describe_modes(file: Path, rig: str | None, pipeline: str | None, overrides: Iterable[str]) -> RunInfo:

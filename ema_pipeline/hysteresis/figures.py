@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ema_pipeline.hysteresis.types import IsolatorResult, Loop, LoopFit
+from ema_pipeline.hysteresis.types import IsolatorResult, Loop, LoopFit, LoopModel
 from ema_pipeline.report.style import (
+    GREY,
     LINES,
     MARKERS,
     MEASURED,
@@ -38,6 +41,69 @@ def loops_figure(result: IsolatorResult) -> Figure:
         if k >= len(result.loops) - _COLUMNS:
             ax.set_xlabel("displacement, mm")
     return figure
+
+
+@styled
+def models_figure(loops: Sequence[Loop], models: Sequence[LoopModel]) -> Figure:
+    """Every measured loop with that of the linear spring and that of the last model."""
+    rows = -(-len(loops) // _COLUMNS)
+    figure = new_figure(2.15 * rows + 0.75)
+    grid = figure.add_gridspec(rows, _COLUMNS, hspace=0.55, wspace=0.3, **margins(figure, top=0.62))
+    for k, loop in enumerate(loops):
+        ax = figure.add_subplot(grid[k // _COLUMNS, k % _COLUMNS])
+        x = 1e3 * np.append(loop.displacement, loop.displacement[0])
+        ax.plot(x, np.append(loop.force, loop.force[0]), color=MEASURED, lw=1.8, alpha=0.55, label="measured")
+        for model, (colour, style, name) in zip(_ends(models), _MODELS, strict=False):
+            force = model.fits[k].force
+            ax.plot(x, np.append(force, force[0]), color=colour, ls=style, lw=0.9, label=name)
+        ax.set_title(_short(loop))
+        if k == 0:
+            handles, labels = ax.get_legend_handles_labels()
+            figure.legend(handles, labels, loc="upper center", ncols=3)
+        if k % _COLUMNS == 0:
+            ax.set_ylabel("force, N")
+        if k >= len(loops) - _COLUMNS:
+            ax.set_xlabel("displacement, mm")
+    return figure
+
+
+@styled
+def misfit_figure(loops: Sequence[Loop], models: Sequence[LoopModel]) -> Figure:
+    """What the linear spring and the last model leave of the force, over the way up and the way down."""
+    shown = _ends(models)
+    figure = new_figure(2.7)
+    grid = figure.add_gridspec(1, len(shown), wspace=0.22, **margins(figure))
+    for c, model in enumerate(shown):
+        ax = figure.add_subplot(grid[0, c])
+        for i, (loop, fit) in enumerate(zip(loops, model.fits, strict=True)):
+            half = 0.5 * float(np.ptp(loop.force))
+            order = np.argsort((loop.phase - loop.phase[int(np.argmin(loop.displacement))]) % 1.0)
+            left = 100 * (loop.force - fit.force)[order] / half
+            where = np.linspace(0.0, 1.0, len(left))
+            ax.plot(where, left, color=SERIES[i % len(SERIES)], ls=LINES[i % len(LINES)], lw=0.8)
+        ax.axhline(0.0, color="#444444", lw=0.6)
+        ax.axvline(0.5, color="#9a9a9a", lw=0.6, ls=":")
+        ax.set_xlim(0.0, 1.0)
+        ax.set_xticks([0.0, 0.25, 0.5, 0.75, 1.0], ["bottom", "up", "top", "down", "bottom"])
+        ax.set_title(_MODELS[c][2] if len(shown) > 1 else _MODELS[0][2])
+        if c == 0:
+            ax.set_ylabel("measured - model, % of force")
+    return figure
+
+
+_MODELS = ((GREY, "--", "linear spring"), (MODEL, "-", "last model of the ladder"))
+_LONG = 24
+
+
+def _ends(models: Sequence[LoopModel]) -> tuple[LoopModel, ...]:
+    """The first model and the last, once where they are the same."""
+    return tuple(models) if len(models) < 2 else (models[0], models[-1])
+
+
+def _short(loop: Loop) -> str:
+    name = loop.name.rsplit("/", 1)[-1].rsplit(".", 1)[0]
+    values = f"{loop.frequency_hz:.3g} Hz, {1e3 * loop.amplitude_m:.3g} mm"
+    return values if name in values or len(name) > _LONG else f"{name}\n{values}"
 
 
 def _draw(ax: Axes, loop: Loop, fit: LoopFit) -> None:

@@ -181,7 +181,7 @@ def ladder_table(ladder: Ladder) -> Table:
                     plain(rung.error, 3),
                     plain(rung.heldout_error, 3),
                     plain(rung.frf_error, 3) if math.isfinite(rung.frf_error) else "",
-                    str(rung.unexplained),
+                    str(rung.unexplained) if of_modes(ladder) else "",
                     plain(rung.log_evidence, 3),
                 )
             )
@@ -320,8 +320,15 @@ def heldout_words(found: Diagnosis) -> str:
     )
 
 
+def of_modes(ladder: Ladder) -> bool:
+    """True where the ladder is measured by modes, not by time histories or force loops."""
+    return ladder.frequency_noise > 0
+
+
 def noise_words(ladder: Ladder) -> str:
     """What σ holds beside the test's own scatter."""
+    if not of_modes(ladder):
+        return "σ: the scatter of the measured signals."
     return (
         f"σ: the test's own scatter and, beside it, {plain(100 * ladder.frequency_noise, 2)} % of frequency, "
         f"{plain(100 * ladder.damping_noise, 2)} % of damping, "

@@ -1,54 +1,297 @@
-"""summary.json, plots and report.html of hysteresis tests."""
+"""summary.json, plots, report.html and screens of hysteresis tests: the story of the loops."""
 
 from __future__ import annotations
 
 import base64
+import dataclasses
 import json
-from collections.abc import Mapping
+import shlex
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from ema_pipeline.hysteresis.figures import isolator_figures
+import numpy as np
+
 from ema_pipeline.hysteresis.summary import summary, terminal_lines
-from ema_pipeline.hysteresis.types import IsolatorResult
-from ema_pipeline.report import style
-from ema_pipeline.report.summary_files import SCHEMA, replace_file
+from ema_pipeline.hysteresis.types import Estimate, IsolatorResult, Loop, LoopModel
+from ema_pipeline.report import diagnosis, style, summary_files
+from ema_pipeline.report.numbers import format_value, plain, words
+from ema_pipeline.report.results import RunResults
+from ema_pipeline.report.tables import Row, Table
+
+SECTIONS = (
+    ("diagnosis", "What is missing"),
+    ("loops", "Loops, measured and modelled"),
+    ("parameters", "Parameters"),
+    ("loss", "Energy and loss factor"),
+    ("published", "The published steps"),
+    ("provenance", "Settings and provenance"),
+)
+_CAPTIONS = {
+    "models": "Measured loops, the linear spring, and the last model of the ladder",
+    "misfit": "What each model leaves of the force along the cycle, one line per loop",
+    "candidates": "Probability that an effect is part of the model, over all sets of effects",
+    "ladder": "Error rung by rung, on all loops and on loops held out",
+    "energy": "Energy per cycle over frequency, and the damper that its slope means; bars are two standard deviations",
+    "loss_factor": "Loss factor over amplitude and frequency; bars are two standard deviations",
+    "loops": "Measured loops and the published model, fitted by least squares to all of them",
+}
 
 
 def write_loops_report(
-    results: Mapping[str, IsolatorResult], title: str, provenance: Mapping[str, str], folder: Path
+    isolators: Mapping[str, IsolatorResult],
+    results: RunResults,
+    loops: Sequence[Loop],
+    models: Sequence[LoopModel],
+    folder: Path,
 ) -> None:
     """Write ``summary.json``, ``plots/`` and ``report.html`` into `folder`.
 
     Parameters
     ----------
-    results : mapping of configuration to IsolatorResult
-    title : str
-    provenance : mapping of str to str
+    isolators : mapping of configuration to IsolatorResult
+    results : RunResults
+        Diagnosis, ladder, settings and provenance.
+    loops : sequence of Loop
+        Of all configurations.
+    models : sequence of LoopModel
+        Of the ladder, the linear spring first; empty before it was climbed.
     folder : Path
     """
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    content = {
-        "schema": SCHEMA,
-        "title": title,
-        "rig": "isolator",
-        "configurations": {name: summary(result) for name, result in results.items()},
-    }
-    replace_file(folder / "summary.json", json.dumps(content, indent=2, ensure_ascii=False) + "\n")
-    plots = folder / "plots"
-    plots.mkdir(exist_ok=True)
-    tests = []
-    for name, result in results.items():
-        images = []
-        for figure_name, figure in isolator_figures(result).items():
-            picture = style.png(figure)
-            (plots / f"{name}_{figure_name}.png").write_bytes(picture)
-            (plots / f"{name}_{figure_name}.svg").write_bytes(style.svg(figure))
-            uri = f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
-            images.append({"name": figure_name, "uri": uri})
-        tests.append({"name": name, "text": "\n".join(terminal_lines(result)), "images": images})
+    content = summary_files.summary(results)
+    content["configurations"] = {name: summary(one) for name, one in isolators.items()}
+    text = json.dumps(summary_files.finite(content), indent=2, ensure_ascii=False)
+    summary_files.replace_file(folder / "summary.json", text + "\n")
     environment = Environment(
-        loader=PackageLoader("ema_pipeline.report", "templates"), autoescape=True, undefined=StrictUndefined
+        loader=PackageLoader("ema_pipeline.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    page = environment.get_template("loops.html.j2").render(title=title, tests=tests, provenance=provenance)
-    replace_file(folder / "report.html", page)
+    images = _images(isolators, results, loops, models, folder / "plots")
+    page = environment.get_template("loops.html.j2").render(
+        _context(isolators, results, loops, models) | {"images": images}
+    )
+    summary_files.replace_file(folder / "report.html", page)
+
+
+def run_screen(isolators: Mapping[str, IsolatorResult], results: RunResults, out: str) -> str:
+    """What a run found, for a terminal."""
+    lines = []
+    for name, one in isolators.items():
+        lines += [name, *terminal_lines(one)]
+    if results.diagnosis is not None:
+        added = results.ladder.rungs[-1].effects if results.ladder is not None else ()
+        lines += ["", diagnosis.compact(results.diagnosis), results.diagnosis.summary]
+        commands = diagnosis.next_commands(results.diagnosis, out, added)
+        lines += ["", "Next:", *(f"  {c}" for c in commands)] if commands else []
+        lines += [] if commands else ["", f"Next:\n  ema compare {shlex.quote(out)}"]
+    return "\n".join(lines)
+
+
+def comparison_screen(loops: Sequence[Loop], models: Sequence[LoopModel]) -> str:
+    """Where model and loops part, for a terminal."""
+    first, last = models[0], models[-1]
+    name = " + ".join(diagnosis.label_words(e) for e in last.effects) or "linear spring"
+    lines = [
+        f"Model: linear spring{f' + {name}' if last.effects else ''}",
+        f"{'loop':32s} {'misfit, % of force':>20s} {'energy model/measured':>24s}",
+    ]
+    for loop, a, b in zip(loops, first.fits, last.fits, strict=True):
+        misfit = f"{100 * a.misfit:.3g} -> {100 * b.misfit:.3g}" if last.effects else f"{100 * a.misfit:.3g}"
+        share = b.energy_j / loop.energy_j if loop.energy_j else float("nan")
+        lines.append(f"{loop.name[:32]:32s} {misfit:>20s} {share:>24.3f}")
+    if last.effects:
+        lines.append("misfit: root mean square over half the range of force, linear spring -> model")
+    return "\n".join(lines)
+
+
+def _context(
+    isolators: Mapping[str, IsolatorResult],
+    results: RunResults,
+    loops: Sequence[Loop],
+    models: Sequence[LoopModel],
+) -> dict[str, Any]:
+    found, ladder = results.diagnosis, results.shown_ladder
+    return {
+        "results": results,
+        "sections": SECTIONS,
+        "number": {name: k for k, (name, _) in enumerate(SECTIONS, start=1)},
+        "diagnosis": None if found is None else _diagnosis_context(results),
+        "sizes": _cards(results),
+        "ladder": None if ladder is None else diagnosis.ladder_table(ladder),
+        "ladder_note": "" if ladder is None else ladder.note,
+        "users_ladder": results.ladder is not None,
+        "loops_table": _loops_table(loops, models),
+        "tests": [
+            {
+                "name": name,
+                "parameters": _estimates_table(one.parameters),
+                "relaxation": _estimates_table(one.relaxation) if one.relaxation else None,
+                "energy": _energy_table(one) if one.energy else None,
+                "loss": _loss_table(one),
+                "flags": one.flags,
+                "notes": one.notes,
+            }
+            for name, one in isolators.items()
+        ],
+    }
+
+
+def _diagnosis_context(results: RunResults) -> dict[str, Any]:
+    found = results.diagnosis
+    assert found is not None
+    return {
+        "heading": diagnosis.heading(found),
+        "summary": found.summary,
+        "reasons": diagnosis.reasons(found),
+        "alike": diagnosis.group_words(found),
+        "next": found.next_measurement,
+        "candidates": diagnosis.candidates_table(found),
+        "localisation": diagnosis.localisation_table(found) if found.localisation else None,
+        "notes": found.notes,
+        "error": plain(found.error, 3),
+    }
+
+
+def _cards(results: RunResults) -> list[dict[str, str]]:
+    """Parameters of the last model, as they stand at the top of the page."""
+    ladder = results.shown_ladder
+    if ladder is None or not ladder.rungs:
+        return []
+    cards = []
+    for name, size in ladder.rungs[-1].parameters.items():
+        label, _, own = name.partition(".")
+        effect = label.partition("@")[0] if own else "spring"
+        title = (
+            words(effect) if words(own or name) in words(effect) else f"{words(effect)}: {words(own or name)}"
+        )
+        cards.append({"name": title, "value": format_value(size.value, size.std, _unit(size.unit))})
+    return cards
+
+
+def _loops_table(loops: Sequence[Loop], models: Sequence[LoopModel]) -> Table | None:
+    if not models:
+        return None
+    first, last = models[0], models[-1]
+    rows = []
+    for k, loop in enumerate(loops):
+        a, b = first.fits[k], last.fits[k]
+        scale = f"{last.scales[loop.name]:.3g}" if loop.name in last.scales else ""
+        rows.append(
+            Row(
+                (
+                    loop.name,
+                    f"{loop.frequency_hz:.4g}",
+                    f"{1e3 * loop.amplitude_m:.4g}",
+                    str(loop.cycles),
+                    format_value(loop.energy_j, loop.energy_std_j, "J"),
+                    plain(b.energy_j, 4),
+                    f"{100 * b.energy_error:+.2g}",
+                    f"{100 * a.misfit:.3g} → {100 * b.misfit:.3g}",
+                    scale,
+                ),
+                abs(b.energy_error) > _ENERGY,
+            )
+        )
+    head = (
+        "loop", "frequency, Hz", "amplitude, mm", "cycles", "energy per cycle", "model, J", "difference, %",
+        "misfit, % of force", "force scale",
+    )  # fmt: skip
+    kept = [c for c in range(len(head)) if any(r.cells[c] for r in rows)]
+    return Table(
+        tuple(head[c] for c in kept),
+        tuple(Row(tuple(r.cells[c] for c in kept), r.alert) for r in rows),
+        frozenset(k for k, c in enumerate(kept) if c in range(1, 9)),
+    )
+
+
+_ENERGY = 0.03
+
+
+def _estimates_table(estimates: Mapping[str, Estimate]) -> Table:
+    rows = [
+        Row(
+            (words(name), "–" if np.isnan(e.value) else format_value(e.value, e.std, _unit(e.unit)), e.note),
+            not e.identified,
+        )
+        for name, e in estimates.items()
+    ]
+    return Table(("parameter", "value (±1σ)", "remarks"), tuple(rows), frozenset({1}))
+
+
+def _energy_table(one: IsolatorResult) -> Table:
+    rows = [
+        Row(
+            (
+                f"{1e3 * line.amplitude_m:.3g}",
+                ", ".join(f"{f:.3g}" for f in line.frequency_hz),
+                format_value(line.damping.value, line.damping.std, "N·s/m"),
+                line.reason or "possible",
+            ),
+            not line.possible,
+        )
+        for line in one.energy
+    ]
+    return Table(("amplitude, mm", "frequencies, Hz", "damper", "remarks"), tuple(rows), frozenset({0, 2}))
+
+
+def _loss_table(one: IsolatorResult) -> Table:
+    rows = [
+        Row((p.name, f"{p.frequency_hz:.4g}", f"{1e3 * p.amplitude_m:.4g}", format_value(p.value, p.std, "")))
+        for p in one.loss
+    ]
+    return Table(
+        ("loop", "frequency, Hz", "amplitude, mm", "loss factor η"), tuple(rows), frozenset({1, 2, 3})
+    )
+
+
+def _unit(unit: str) -> str:
+    return "" if unit == "1" else unit
+
+
+def _images(
+    isolators: Mapping[str, IsolatorResult],
+    results: RunResults,
+    loops: Sequence[Loop],
+    models: Sequence[LoopModel],
+    plots: Path,
+) -> dict[str, dict[str, str]]:
+    """Figures by name, drawn into `plots` and embedded in the page."""
+    from ema_pipeline.hysteresis.figures import isolator_figures, misfit_figure, models_figure
+    from ema_pipeline.report.figures.diagnosis import candidate_probabilities, ladder_errors
+
+    drawn = {}
+    found, ladder = results.diagnosis, results.shown_ladder
+    if models:
+        drawn["models"] = partial(models_figure, loops, models)
+        drawn["misfit"] = partial(misfit_figure, loops, models)
+    if found is not None:
+        # Sets are listed one by one in summary.json; the picture shows effects.
+        alone = dataclasses.replace(found, probabilities={})
+        drawn["candidates"] = partial(
+            candidate_probabilities, alone, diagnosis.probability_threshold(results)
+        )
+    if ladder is not None and ladder.rungs:
+        drawn["ladder"] = partial(ladder_errors, ladder)
+    figures = {name: draw() for name, draw in drawn.items()}
+    for name, one in isolators.items():
+        figures |= {f"{name}_{kind}": figure for kind, figure in isolator_figures(one).items()}
+    plots.mkdir(exist_ok=True)
+    images = {}
+    for name, figure in figures.items():
+        picture = style.png(figure)
+        (plots / f"{name}.png").write_bytes(picture)
+        (plots / f"{name}.svg").write_bytes(style.svg(figure))
+        uri = f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
+        caption = _CAPTIONS.get(name) or _CAPTIONS[next(k for k in _CAPTIONS if name.endswith(f"_{k}"))]
+        images[name] = {
+            "uri": uri,
+            "caption": caption,
+            "half": "half" if name in ("candidates", "ladder") else "",
+        }
+    return images

@@ -37,7 +37,7 @@ MODE_COLUMNS = (
 
 def write_summary(results: RunResults, path: Path) -> None:
     """Write ``summary.json``; numbers that are not finite become null."""
-    replace_file(path, json.dumps(_finite(summary(results)), indent=2, ensure_ascii=False) + "\n")
+    replace_file(path, json.dumps(finite(summary(results)), indent=2, ensure_ascii=False) + "\n")
 
 
 def write_modes_csv(results: RunResults, path: Path) -> None:
@@ -209,12 +209,12 @@ def replace_file(path: Path, text: str) -> None:
         scratch.unlink(missing_ok=True)
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """The value with NaN and infinity replaced by None, which JSON can hold."""
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
+        return {k: finite(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
+        return [finite(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -208,12 +208,10 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
 def ladder_screen(ladder: Ladder) -> RenderableType:
     """Every model with its error on the data fitted and on data held out."""
     heads = ("model", "size (±1σ)", "error", "held out", "FRFs", "left", "evidence")
+    left = "left: measured modes that the model does not explain; " if diagnosis.of_modes(ladder) else ""
     parts: list[RenderableType] = [
         _rich(_renamed(diagnosis.ladder_table(ladder), heads), "Ladder of models"),
-        _line(
-            f"{_ERROR_WORDS}; left: measured modes that the model does not explain; evidence: logarithm, "
-            "against the base model"
-        ),
+        _line(f"{_ERROR_WORDS}; {left}evidence: logarithm, against the base model"),
         _line(diagnosis.noise_words(ladder)),
     ]
     if ladder.note:

@@ -10,6 +10,7 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.rigs.types import Rig
+from ema_pipeline.stages import loop_ladder
 from ema_pipeline.stages.base import Progress, Run, code_fingerprint
 from ema_pipeline.stages.correlate import correlate
 from ema_pipeline.stages.level_case import level_case, level_tests, linear_part
@@ -33,6 +34,8 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit every effect of the library on top of the model as it stands, and judge what the data support."""
+    if run.info.kind == "hysteresis":
+        return loop_ladder.diagnose_run(run, progress)
     from ema_pipeline.diagnose import diagnose
 
     settings = cast(DiagnoseSettings, run.settings[NAME])

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, cast
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.settings import FitSettings
+from ema_pipeline.stages import loop_ladder
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.level_case import all_tests, depends_on_level, level_case, linear_part
 from ema_pipeline.stages.modes import measured_modes
@@ -28,6 +29,8 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit the base model and every rung above it; without added effects there is no ladder to climb."""
+    if run.info.kind == "hysteresis":
+        return loop_ladder.climb_run(run, progress)
     from ema_pipeline.diagnose import make_ladder
 
     if not run.info.effects:

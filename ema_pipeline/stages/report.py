@@ -7,7 +7,8 @@ from typing import cast
 
 from ema_pipeline.report.settings import ReportSettings
 from ema_pipeline.stages.base import Progress, Run
-from ema_pipeline.stages.results import isolators, load_results, provenance
+from ema_pipeline.stages.loop_ladder import loops_of, models_of
+from ema_pipeline.stages.results import isolators, load_results
 
 NAME = "report"
 NEEDS: tuple[str, ...] = ()
@@ -32,7 +33,8 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     settings = cast(ReportSettings, run.settings[NAME])
     folder = run.store.folder
     if run.info.kind == "hysteresis":
-        write_loops_report(isolators(run), run.info.title, provenance(run), folder)
+        found = isolators(run)
+        write_loops_report(found, load_results(run), loops_of(run), models_of(run), folder)
         return {"files": OUTPUTS}
     results = load_results(run)
     write_summary(results, folder / "summary.json")

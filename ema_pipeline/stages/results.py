@@ -21,6 +21,7 @@ def load_results(run: Run) -> RunResults:
     fit = run.store.find("fit", ALL, "fit", FitResult)
     values = fitted_values(fit)
     configurations = []
+    loops = run.info.kind == "hysteresis"
     for name in run.info.configurations:
         modal = run.store.find("modal", name, "modal", ModalModel)
         configurations.append(
@@ -30,7 +31,7 @@ def load_results(run: Run) -> RunResults:
                 frfs=run.store.find("frf", name, "frfs", FrfSet),
                 modal=modal,
                 pairing=run.store.find("correlate", ALL, f"pairing {name}", Pairing),
-                system=None if run.model is None else run.model.system(name, values),
+                system=None if run.model is None or loops else run.model.system(name, values),
             )
         )
     return RunResults(
