@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from ema_pipeline.rigs import load_rig, model_modes
+from ema_pipeline import cli
+from ema_pipeline.effects.library import effect_library
+from ema_pipeline.effects.rig import rig_with_effects
+from ema_pipeline.mechanics import laws
+from ema_pipeline.mechanics.assembly import Damper, Gyroscopic, Mass, Nonlinear, Spring
+from ema_pipeline.mechanics.modes import complex_modes
+from ema_pipeline.mechanics.nonlinear import force_along
+from ema_pipeline.pipeline import existing_run
+from ema_pipeline.rigs import Rig, load_rig, model_modes
+from ema_pipeline.stages.results import load_results
 
 DOCS = Path(__file__).parent.parent / "docs"
 
@@ -35,8 +47,94 @@ def test_python_rig_of_the_page_on_rigs_runs() -> None:
 def test_effect_of_the_page_on_effects_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    effect, use = blocks("adding_an_effect.md", "python")
+    effect, use, _ = blocks("adding_an_effect.md", "python")
     (tmp_path / "oil_film.py").write_text(effect, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     exec(use, {"__name__": "example"})
     assert capsys.readouterr().out == "400000.0\n"
+
+
+def test_effect_of_the_page_is_diagnosed_and_laddered_by_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("oil_film.py").write_text(blocks("adding_an_effect.md", "python")[0], encoding="utf-8")
+    Path("rig.toml").write_text('base = "frame"\n[geometry]\nstoreys = 4\n', encoding="utf-8")
+    truth = {"stiffness": 1e5, "coefficient": 40.0}
+    library = effect_library(["oil_film.py"])
+    rig = rig_with_effects(load_rig("rig.toml"), [("oil_film@storey2", truth)], library)
+    Path("modes.toml").write_text(_table(rig, seed=0), encoding="utf-8")
+    stages = 'stages=["modal", "ladder", "fit", "correlate", "diagnose"]'
+
+    ema("run", "--modes", "modes.toml", "--rig", "rig.toml", "--out", "out", "--effect-file", "oil_film.py",
+        "--set", stages)  # fmt: skip
+    found = load_results(existing_run(Path("out"))).diagnosis
+    assert found is not None
+    first = found.candidates[0]
+    assert first.label == "oil_film@storey2"
+    assert first.probability > 0.9
+
+    ema("add", "out", "oil_film@storey2")  # the folder remembers the file
+    ladder = load_results(existing_run(Path("out"))).ladder
+    assert ladder is not None
+    base, added = ladder.rungs
+    assert added.effects == ("oil_film@storey2",)
+    assert added.heldout_error < 1.5 < base.heldout_error / 5
+    for name, value in truth.items():
+        size = added.parameters[f"oil_film@storey2.{name}"]
+        assert abs(size.value - value) < 3 * size.std
+
+
+def _table(rig: Rig, seed: int) -> str:
+    """Modes of a rig with noise, as a table."""
+    rng = np.random.default_rng(seed)
+    system = rig.system("default")
+    modes = complex_modes(system)
+    count = len(modes.poles)
+    f = modes.frequency_hz * (1 + 2e-4 * rng.standard_normal(count))
+    z = modes.damping_ratio * (1 + 0.02 * rng.standard_normal(count))
+    shape = modes.shapes / np.array([v[np.argmax(np.abs(v))] for v in modes.shapes.T])
+    shape = shape + 0.003 * (rng.standard_normal(shape.shape) + 1j * rng.standard_normal(shape.shape))
+    columns = {
+        "frequency_hz": f,
+        "frequency_std_hz": 2e-4 * f,
+        "damping_ratio": z,
+        "damping_std": 0.02 * z,
+        "shape": shape.real,
+        "shape_imag": shape.imag,
+    }
+    lines = [f"{name} = {values.tolist()}" for name, values in columns.items()]
+    return "\n".join(["[default]", f"dofs = {json.dumps(system.dofs)}", "shape_std = 0.003", *lines])
+
+
+def ema(*arguments: str) -> None:
+    done = CliRunner().invoke(cli.app, list(arguments))
+    assert done.exit_code == 0, (done.output, done.exception)
+
+
+def test_own_law_of_the_page_dissipates_as_drag_does(tmp_path: Path) -> None:
+    file = tmp_path / "drag.py"
+    file.write_text(blocks("adding_an_effect.md", "python")[2], encoding="utf-8")
+    library = effect_library([file])
+    base = load_rig("planetary").assembly("no_ring")
+    effect = library["drag"]
+    assert effect.edit(base, "sun", effect.values()) is base
+    (element, _) = effect.apply(base, "sun", {"coefficient": 30.0}).nonlinear
+    n, amplitude, f = 2048, 1e-3, 20.0
+    phase = 2 * np.pi * np.arange(n) / n
+    x, v = amplitude * np.sin(phase), amplitude * 2 * np.pi * f * np.cos(phase)
+    force = force_along((element,), x, v, 1 / (f * n))
+    # Energy per cycle 8/3·c·ω²·A³.
+    expected = 8 / 3 * 30.0 * (2 * np.pi * f) ** 2 * amplitude**3
+    assert float(np.mean(force * v)) / f == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_page_names_every_element() -> None:
+    page = (DOCS / "adding_an_effect.md").read_text(encoding="utf-8")
+    for kind in (Mass, Spring, Damper, Gyroscopic, *_kinds(Nonlinear)):
+        assert f"`{kind.__name__}(" in page, kind.__name__
+
+
+def _kinds(kind: type) -> list[type]:
+    direct: list[type] = [k for k in kind.__subclasses__() if k.__module__ == laws.__name__]
+    return [*direct, *(inner for k in direct for inner in _kinds(k))]
