@@ -204,6 +204,20 @@ def compare(out: Out) -> None:
 
 
 @app.command()
+def levels(out: Out, set_: Overrides = None) -> None:
+    """Show what moves with the force of the hits: frequency and damping of every mode by force level."""
+    from ema_pipeline.job import run_on
+    from ema_pipeline.report import terminal
+    from ema_pipeline.stages.results import load_results
+
+    with _progress(False) as show:
+        run, _ = run_on(out, ["levels", "report"], set_ or [], show)
+    for found in load_results(run).configurations:
+        if found.levels is not None and found.modal is not None:
+            _print(terminal.levels_tables(found.levels, found.modal, found.name))
+
+
+@app.command()
 def diagnose(
     out: Out,
     auto: Annotated[

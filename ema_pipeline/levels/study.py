@@ -303,12 +303,11 @@ def _at_levels(
         of = (level == k) & np.isfinite(single_std)
         if not of.any():
             continue
-        ratio = birge_ratio(single[of], single_std[of], sheet[of])
+        weight = single_std[of] ** -2.0
+        scatter = birge_ratio(single[of], single_std[of], sheet[of]) * float(weight.sum() ** -0.5)
         if np.isnan(values[k]):
-            weight = single_std[of] ** -2.0
-            values[k] = float(np.average(single[of], weights=weight))
-            stds[k] = float(weight.sum() ** -0.5)
-        stds[k] *= ratio
+            values[k], stds[k] = float(np.average(single[of], weights=weight)), scatter
+        stds[k] = max(float(stds[k]), scatter)
     return values, stds
 
 

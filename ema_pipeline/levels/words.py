@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -143,3 +145,25 @@ def with_uncertainty(value: float, std: float) -> str:
         return f"{value:.4g}"
     decimals = max(int(-np.floor(np.log10(std))), 0)
     return f"{value:.{decimals}f} ± {std:.{decimals}f}"
+
+
+def flagged(modal: ModalModel, study: LevelStudy) -> ModalModel:
+    """The modes with a remark where they move with the force, or are seen in hard hits of a nonlinear test only."""
+    modes = list(modal.modes)
+    for level in study.modes:
+        remark = move_text(study, level) or _only_hard(study, level)
+        if remark and level.mode < len(modes):
+            old = modes[level.mode]
+            modes[level.mode] = replace(old, flags=(*old.flags, remark))
+    return replace(modal, modes=tuple(modes))
+
+
+def _only_hard(study: LevelStudy, mode: ModeLevels) -> str:
+    if not study.level_dependent or len(study.levels) < 2 or mode.level_modes is None:
+        return ""
+    seen = np.flatnonzero(mode.level_modes >= 0)
+    if len(seen) and seen[0] == 0:
+        return ""
+    if not len(seen):
+        return "not found at any force level alone: likely made by mixing levels"
+    return f"not found in hits softer than {study.levels[seen[0]].force_n:.3g} N: weak, or made by the nonlinearity"

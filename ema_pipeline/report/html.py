@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ema_pipeline.report import diagnosis, summary, tables
+from ema_pipeline.report import diagnosis, levels, summary, tables
+from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.moving_gear import fill_of, moving_gears
 from ema_pipeline.report.numbers import format_value, slug, words
 from ema_pipeline.report.plots import Plot, Progress, render
@@ -19,6 +20,7 @@ SECTIONS = (
     ("diagnosis", "Diagnosis"),
     ("frf", "FRFs and coherence"),
     ("nyquist", "Nyquist circles"),
+    ("levels", "Does it depend on how hard you hit?"),
     ("stabilisation", "Stabilisation charts"),
     ("modes", "Modes"),
     ("pairing", "Pairing and MAC"),
@@ -84,7 +86,10 @@ def _context(results: RunResults, plots: Sequence[Plot]) -> dict[str, Any]:
         }
         for p in shown
     ]
-    sections = tuple((i, t) for i, t in SECTIONS if i != "diagnosis" or results.shown_ladder is not None)
+    absent = set() if results.shown_ladder is not None else {"diagnosis"}
+    if not any(has_to_say(c.levels) for c in results.configurations):
+        absent.add("levels")
+    sections = tuple((i, t) for i, t in SECTIONS if i not in absent)
     return {
         "results": results,
         "sections": sections,
@@ -158,6 +163,7 @@ def _configuration(c: ConfigurationResults) -> dict[str, Any]:
         "frfs": c.frfs,
         "averages": _averages(c),
         "pairing": c.pairing,
+        "levels": _levels(c),
         "modes": tables.modes_table(c.modal) if c.modal else None,
         "pairs": tables.pairs_table(c.pairing, c.modal) if c.pairing and c.modal else None,
         "unpaired": tables.unpaired_table(c.pairing) if c.pairing else None,
@@ -168,6 +174,17 @@ def _configuration(c: ConfigurationResults) -> dict[str, Any]:
         "verdicts": tables.verdicts_table(listed),
         "listed": len(listed),
         "checks": tables.failed_checks_table(c.frfs.verdicts) if c.frfs else None,
+    }
+
+
+def _levels(c: ConfigurationResults) -> dict[str, Any] | None:
+    if c.levels is None or c.modal is None or not has_to_say(c.levels):
+        return None
+    return {
+        "summary": c.levels.summary,
+        "frequency": levels.frequency_table(c.levels, c.modal) if c.levels.modes else None,
+        "damping": levels.damping_table(c.levels) if c.levels.modes else None,
+        "evidence": levels.evidence_table(c.levels) if c.levels.verdicts else None,
     }
 
 

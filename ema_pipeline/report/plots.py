@@ -10,12 +10,17 @@ from typing import Literal
 
 from matplotlib.figure import Figure
 
+from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report import style
 from ema_pipeline.report.diagnosis import probability_threshold
-from ema_pipeline.report.figures import comparison, diagnosis, fit, frf, mac, modes, nyquist, shapes
+from ema_pipeline.report.figures import comparison, diagnosis, fit, frf, levels, mac, modes, nyquist, shapes
+from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.numbers import slug
 from ema_pipeline.report.planetary import layout_of
 from ema_pipeline.report.results import ConfigurationResults, RunResults
+
+LEVEL_SHEETS = 8
+"""Modes that move with the force and get a sheet of their own."""
 
 Format = Literal["png", "svg"]
 Progress = Callable[[int, int, str], None]
@@ -204,6 +209,7 @@ def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:
             caption = f"Nyquist circles of mode {i + 1} at {mode.frequency_hz:.5g} Hz in its best FRFs"
             draw = partial(nyquist.nyquist_sheet, modal, i, calibrated)
             yield FigureSpec(f"{stem}_nyquist_{i + 1:02d}", "nyquist", name, caption, draw)
+    yield from _levels(configuration, modal, stem)
     if modal.chart.order.size or frfs is not None:
         yield FigureSpec(
             f"{stem}_stabilisation",
@@ -245,6 +251,29 @@ def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:
             partial(mac.pairing_mac_matrix, pairing, modal),
         )
     yield from _shapes(configuration, stem)
+
+
+def _levels(configuration: ConfigurationResults, modal: ModalModel, stem: str) -> Iterator[FigureSpec]:
+    study = configuration.levels
+    if study is None or not has_to_say(study):
+        return
+    if len(study.levels) > 1:
+        yield FigureSpec(
+            f"{stem}_levels",
+            "levels",
+            configuration.name,
+            "Change of every mode's frequency and damping with the force, from the softest level",
+            partial(levels.all_modes, study, modal),
+        )
+    moving = [k for k, m in enumerate(study.modes) if m.depends][:LEVEL_SHEETS]
+    for k in moving:
+        yield FigureSpec(
+            f"{stem}_levels_mode_{study.modes[k].mode + 1:02d}",
+            "levels",
+            configuration.name,
+            levels.caption(study, modal, k),
+            partial(levels.moving_mode, study, modal, k),
+        )
 
 
 def _shapes(configuration: ConfigurationResults, stem: str) -> Iterator[FigureSpec]:

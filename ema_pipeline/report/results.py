@@ -10,6 +10,7 @@ from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit
+from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
 
@@ -28,6 +29,8 @@ class ConfigurationResults:
     system : LinearSystem or None
         The model that `pairing` was made with; its `dofs` and `sensors` turn the model's shapes into
         what the sensors read. Without it only the measured shapes are drawn.
+    levels : LevelStudy or None
+        What moves with the force of the hits.
     """
 
     name: str
@@ -36,6 +39,7 @@ class ConfigurationResults:
     modal: ModalModel | None = None
     pairing: Pairing | None = None
     system: LinearSystem | None = None
+    levels: LevelStudy | None = None
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
 from ema_pipeline.report import diagnosis
+from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_CHI2
 from ema_pipeline.report.numbers import below, format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
@@ -22,6 +23,9 @@ def findings(results: RunResults) -> tuple[str, ...]:
     """What was measured and how well the model follows it, one sentence each."""
     lines = [] if results.diagnosis is None else [diagnosis.compact(results.diagnosis)]
     lines += [_measured(c) for c in results.configurations]
+    lines += [
+        f"{c.name}: {c.levels.summary}" for c in results.configurations if c.levels and has_to_say(c.levels)
+    ]
     if not lines:
         lines = ["Nothing has been analysed yet."]
     compared, fit = results.comparison, results.fit

@@ -14,6 +14,7 @@ from typing import Any
 
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder
 from ema_pipeline.fit.types import FitResult
+from ema_pipeline.report import levels
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 
 SCHEMA = 1
@@ -167,6 +168,8 @@ def _configuration(c: ConfigurationResults) -> dict[str, Any]:
     if c.pairing is not None:
         content["unpaired_model_modes"] = [asdict(u) for u in c.pairing.unpaired_model]
         content["unpaired_measured_modes"] = [asdict(u) for u in c.pairing.unpaired_measured]
+    if c.levels is not None:
+        content["levels"] = levels.summary_of(c.levels)
     content["records"] = {
         "used": len({h.file for h in c.hits if h.accepted}),
         "found": len({h.file for h in c.hits}),

@@ -19,8 +19,9 @@ from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
+from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.report import diagnosis, summary, tables
+from ema_pipeline.report import diagnosis, levels, summary, tables
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.results import RunResults
 
@@ -79,6 +80,20 @@ def modes_table(modal: ModalModel, title: str = "Modes") -> RenderableType:
         _line(f"mode {i}: {'; '.join(m.flags)}") for i, m in enumerate(modal.modes, start=1) if m.flags
     ]
     return Group(_rich(source, title), *remarks)
+
+
+def levels_tables(study: LevelStudy, modal: ModalModel, title: str = "") -> RenderableType:
+    """What moves with the force of the hits: the answer, then frequency and damping of every mode by level."""
+    parts: list[RenderableType] = [_heading(title)] if title else []
+    parts.append(_line(study.summary))
+    if study.modes:
+        parts += [_line(""), _rich(levels.frequency_table(study, modal), "Natural frequency by force level")]
+        parts += [_line(""), _rich(levels.damping_table(study), "Damping ratio by force level")]
+        parts.append(_line("p: probability of a trend as clear as this where nothing depends on the force."))
+    failed = [v for v in study.verdicts if not v.passes]
+    if failed:
+        parts += [_line(""), _line("Other signs:"), *(_line(f"! {v.message}") for v in failed)]
+    return Group(*parts)
 
 
 def pairing_table(pairing: Pairing, modal: ModalModel, title: str = "Pairs") -> RenderableType:
@@ -207,7 +222,7 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
 
 def ladder_screen(ladder: Ladder) -> RenderableType:
     """Every model with its error on the data fitted and on data held out."""
-    heads = ("model", "size (±1σ)", "error", "held out", "FRFs", "left", "evidence")
+    heads = ("model", "size (±1σ)", "error", "held out", "FRFs", "left")
     left = "left: measured modes that the model does not explain; " if diagnosis.of_modes(ladder) else ""
     parts: list[RenderableType] = [
         _rich(_renamed(diagnosis.ladder_table(ladder), heads), "Ladder of models"),

@@ -10,6 +10,8 @@ from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.hysteresis.types import IsolatorResult
 from ema_pipeline.ingest.records import Hit
+from ema_pipeline.levels.types import LevelStudy
+from ema_pipeline.levels.words import flagged
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.stages.base import Run
@@ -24,14 +26,16 @@ def load_results(run: Run) -> RunResults:
     loops = run.info.kind == "hysteresis"
     for name in run.info.configurations:
         modal = run.store.find("modal", name, "modal", ModalModel)
+        levels = run.store.find("levels", name, "study", LevelStudy)
         configurations.append(
             ConfigurationResults(
                 name=name,
                 hits=run.store.find("hits", name, "hits", tuple[Hit, ...]) or (),
                 frfs=run.store.find("frf", name, "frfs", FrfSet),
-                modal=modal,
+                modal=modal if modal is None or levels is None else flagged(modal, levels),
                 pairing=run.store.find("correlate", ALL, f"pairing {name}", Pairing),
                 system=None if run.model is None or loops else run.model.system(name, values),
+                levels=levels,
             )
         )
     return RunResults(
