@@ -57,13 +57,31 @@ class LevelCase:
 
     def problem(self, hypothesis: Hypothesis, sizes: Mapping[str, float] | None = None) -> TimeProblem:
         """The fit of a hypothesis; `sizes` are typical values of its effects' parameters."""
+        return TimeProblem(self._rig(hypothesis, sizes), self.windows, self._substeps())
+
+    def rough(self) -> LevelCase:
+        """Softest and hardest hits, short windows, long steps: enough to tell orders of magnitude."""
+        kept = [
+            w.only((w.level == w.level.min()) | (w.level == w.level.max())).shortened(_SHORT)
+            for w in self.windows
+        ]
+        return replace(self.coarse(), windows=tuple(kept))
+
+    def coarse(self) -> LevelCase:
+        """All hits, with longer steps."""
+        coarse = self.settings.levels.model_copy(update={"points_per_period": _COARSE})
+        return replace(self, settings=self.settings.model_copy(update={"levels": coarse}))
+
+    def _substeps(self) -> int:
+        rate = min(w.sample_rate_hz for w in self.windows)
+        return max(int(np.ceil(self.settings.levels.points_per_period * self.top_hz / rate)), 1)
+
+    def _rig(self, hypothesis: Hypothesis, sizes: Mapping[str, float] | None) -> Rig:
         rig = make_rig(self.rig, hypothesis, self.library, self.settings.parameter_range)
         for name, value in (sizes or {}).items():
             p = rig.parameters[name]
             rig = replace(rig, parameters={**rig.parameters, name: replace(p, value=value)})
-        rate = min(w.sample_rate_hz for w in self.windows)
-        substeps = int(np.ceil(self.settings.levels.points_per_period * self.top_hz / rate))
-        return TimeProblem(rig, self.windows, max(substeps, 1))
+        return rig
 
     @property
     def levels(self) -> tuple[int, ...]:
@@ -155,6 +173,8 @@ def judged(
 
 
 _DECADES = 4
+_SHORT = 0.4
+_COARSE = 3.0
 
 
 def size_grid(p: EffectParameter, first: bool) -> NDArray[np.float64]:

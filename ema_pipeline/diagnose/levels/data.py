@@ -97,23 +97,28 @@ class HitWindows:
         spectrum[..., ~self._lines()[0]] = 0
         return np.asarray(scipy.fft.irfft(spectrum, signals.shape[-1], axis=-1))
 
-    def sigma(self, fade_s: float, floor: float) -> NDArray[np.float64]:
-        """Standard uncertainty of each line, (n_hits, n_sensors, n_lines); infinite where a sensor is absent.
+    def sigma(
+        self, fade_s: float, floor: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Uncertainty of each line, measured amplitude around it, and share of its power that is no noise.
 
-        The sensors' noise, and shares of the measured amplitude around the line: `floor`, and the angle that
-        `_TIMING` of a sample between hammer and sensors makes.
+        The standard uncertainty, (n_hits, n_sensors, n_lines), is the sensors' noise, and shares of the measured
+        amplitude: `floor`, and the angle that `_TIMING` of a sample between hammer and sensors makes. It is
+        infinite, and the share 0, where a sensor is absent.
         """
         f = self.frequency_hz
-        shade = np.exp(-2 * self.time_s / fade_s)
-        noise = self.noise[..., None] ** 2 * np.sum(shade)
+        noise = self.noise[..., None] ** 2 * np.sum(np.exp(-2 * self.time_s / fade_s))
         share = floor**2 + (2 * np.pi * f * _TIMING / self.sample_rate_hz) ** 2
-        total = np.sqrt(noise + share * self.amplitude(fade_s) ** 2)
-        return np.where(self.present[..., None], total, np.inf)
+        power = _smoothed(f, np.abs(self.spectra(self.measured, fade_s)) ** 2)
+        total = np.sqrt(noise + share * power)
+        there = self.present[..., None]
+        signal = np.clip(1 - 2 * noise / np.maximum(power, 1e-300), 0.0, 1.0)
+        return np.where(there, total, np.inf), np.sqrt(power), np.where(there, signal, 0.0)
 
-    def amplitude(self, fade_s: float) -> NDArray[np.float64]:
-        """Measured amplitude around each line, (n_hits, n_sensors, n_lines)."""
-        power = np.abs(self.spectra(self.measured, fade_s)) ** 2
-        return np.sqrt(_smoothed(self.frequency_hz, power))
+    def shortened(self, share: float) -> HitWindows:
+        """The first part of the windows."""
+        n = int(share * self.force.shape[1])
+        return replace(self, force=self.force[:, :n], measured=self.measured[..., :n])
 
     def only(self, keep: NDArray[np.bool_]) -> HitWindows:
         """Some of the hits."""

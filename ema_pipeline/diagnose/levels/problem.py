@@ -91,6 +91,8 @@ class Whitening:
         Time constant of the exponential weight.
     scale : ndarray, (n_hits, n_sensors, n_lines)
         One over the standard uncertainty of what is not common to all levels; 0 where a sensor is absent.
+    worth : ndarray, (n_hits, n_sensors, n_lines)
+        Square root of the number of independent data that a line stands for.
     common : ndarray, (n_hits, n_sensors, n_lines)
         Direction, of length 1 over the hits of each impact point, of an error common to all levels.
     taken : ndarray, (n_points, n_sensors, n_lines)
@@ -102,6 +104,7 @@ class Whitening:
 
     fade_s: float
     scale: NDArray[np.float64]
+    worth: NDArray[np.float64]
     common: NDArray[np.complex128]
     taken: NDArray[np.float64]
     point: NDArray[np.int64]
@@ -114,7 +117,7 @@ class Whitening:
             at = np.flatnonzero(self.point == point)
             along = np.sum(self.common[at].conj() * r[:, at], axis=1) * self.taken[point]
             r[:, at] -= along[:, None] * self.common[at]
-        return r
+        return np.asarray(r * self.worth)
 
 
 @dataclass(frozen=True)
@@ -137,21 +140,22 @@ def whitenings(windows: Sequence[HitWindows], floor: NoiseFloor, data_per_mode: 
     """Weights where one mode in one hit is worth `data_per_mode` independent numbers.
 
     A line's real and imaginary part are worth numbers in proportion to 1/f, since a mode of given damping ratio
-    spreads over lines in proportion to its frequency. Signals fade out, so that the windows' ends leave no trace.
+    spreads over lines in proportion to its frequency, and to the share of their power that is no noise. Signals
+    fade out, so that the windows' ends leave no trace.
     """
     result = []
     for w in windows:
         fade = 0.5 * float(w.time_s[-1])
-        sigma = w.sigma(fade, floor.own)
-        even = 1 / w.frequency_hz
-        worth = data_per_mode * w.modes * len(w.names) * even / np.sum(np.isfinite(sigma) * even)
+        sigma, size, signal = w.sigma(fade, floor.own)
+        even = signal / w.frequency_hz
+        total = np.sum(even, axis=(1, 2), keepdims=True)
+        worth = data_per_mode * w.modes * even / np.maximum(total, 1e-300)
         measured = w.spectra(w.measured, fade)
         force = w.spectra(w.force, fade)
         known = {d: i for i, d in enumerate(dict.fromkeys(str(d) for d in w.impacts))}
         point = np.array([known[str(d)] for d in w.impacts], dtype=np.int64)
         common = np.zeros(measured.shape, dtype=complex)
         taken = np.zeros((len(known), *measured.shape[1:]))
-        size = w.amplitude(fade)
         for k in range(len(known)):
             at = np.flatnonzero(point == k)
             per_newton = np.sum(size[at], axis=0) / np.sum(np.abs(force[at]), axis=0)
@@ -159,8 +163,7 @@ def whitenings(windows: Sequence[HitWindows], floor: NoiseFloor, data_per_mode: 
             length = np.sqrt(np.sum(np.abs(u) ** 2, axis=0))
             common[at] = u / np.maximum(length, 1e-300)
             taken[k] = 1 - 1 / np.sqrt(1 + length**2)
-        scale = np.sqrt(worth) / sigma
-        result.append(Whitening(fade, scale, common, taken, point, measured))
+        result.append(Whitening(fade, 1 / sigma, np.sqrt(worth), common, taken, point, measured))
     return result
 
 
@@ -235,7 +238,7 @@ def fit(
         gradient = jacobian @ r + prior * x
         if most <= 0:
             break
-        ladder = damping * np.array([0.1, 1.0, 30.0, 1000.0])
+        ladder = damping * np.array([0.1, 10.0, 1000.0])
         scale = np.diag(normal).clip(1e-9)
         trials = np.array(
             [space.retract(x, -np.linalg.solve(normal + d * np.diag(scale), gradient)) for d in ladder]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
@@ -15,7 +16,9 @@ from ema_pipeline.diagnose.pool import spread
 
 Progress = Callable[[float, str], None]
 
-_FOLLOWED = 3
+_FOLLOWED = 2
+_HELPS = 0.5
+_NEAR = 0.005
 _STEPS = 10
 _AGAIN = 6
 
@@ -49,22 +52,23 @@ def fit_effect(case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: 
     base : Simulated
     floor : NoiseFloor
     """
-    weights = case.weights(floor)
     grids = [size_grid(p, i == 0) for i, p in enumerate(case.parameters_of(hypothesis.labels[-1]))]
     points = list(product(*grids))
-    rough = case.problem(hypothesis)
-    starts = (base.values, *case.starts)
-    tried: list[tuple[float, int, tuple[float, ...]]] = []
+    rough, coarse = case.rough(), case.coarse()
+    problem, weights = rough.problem(hypothesis), rough.weights(floor)
+    starts = _distinct_starts((base.values, *case.starts))
+    tried: list[_Tried] = []
     for k, start in enumerate(starts):
-        x = np.array([rough.space.point({**start, **sized(case, hypothesis, v)}) for v in points])
-        tried += [(float(o), k, v) for o, v in zip(objectives(rough, weights, x), points, strict=True)]
+        x = np.array([problem.space.point({**start, **sized(case, hypothesis, v)}) for v in points])
+        tried += [
+            _Tried(float(o), k, v) for o, v in zip(objectives(problem, weights, x), points, strict=True)
+        ]
+    weights = case.weights(floor)
     best: Simulated | None = None
-    for value, k, sizes_tried in _distinct(sorted(tried)):
-        if not np.isfinite(value):
-            continue
-        sizes = {**base.sizes, **sized(case, hypothesis, sizes_tried)}
-        problem = case.problem(hypothesis, sizes)
-        found = fit(problem, weights, problem.space.point({**starts[k], **sizes}), _STEPS)
+    for t in _worth_following(tried):
+        sizes = {**base.sizes, **sized(case, hypothesis, t.sizes)}
+        problem = coarse.problem(hypothesis, sizes)
+        found = fit(problem, weights, problem.space.point({**starts[t.start], **sizes}), _STEPS)
         model = judged(problem, hypothesis, sizes, found)
         if best is None or model.fit.objective < best.fit.objective:
             best = model
@@ -73,16 +77,44 @@ def fit_effect(case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: 
     return best
 
 
-def _distinct(
-    tried: Sequence[tuple[float, int, tuple[float, ...]]],
-) -> list[tuple[float, int, tuple[float, ...]]]:
-    """The lowest of the tried sizes that are no neighbours of each other."""
-    kept: list[tuple[float, int, tuple[float, ...]]] = []
-    for t in tried:
-        if all(abs(np.log(abs(t[2][0] / k[2][0]))) > 2 or t[2][0] * k[2][0] < 0 for k in kept):
+class _Tried(NamedTuple):
+    """A size that competed: its objective, the start that it went with, the sizes."""
+
+    objective: float
+    start: int
+    sizes: tuple[float, ...]
+
+
+def _worth_following(tried: Sequence[_Tried]) -> list[_Tried]:
+    """The lowest of the tried sizes, no neighbours of each other; only one where none helps.
+
+    A vanishing size is the base model: where the best is no better than the smallest, the largest size that does no
+    harm is as good a start as any.
+    """
+    finite = sorted(t for t in tried if np.isfinite(t.objective))
+    if not finite:
+        return []
+    smallest = min(finite, key=lambda t: abs(t.sizes[0]))
+    if finite[0].objective > smallest.objective - _HELPS:
+        harmless = [t for t in finite if t.objective < smallest.objective + _HELPS]
+        return [max(harmless, key=lambda t: abs(t.sizes[0]))]
+    kept: list[_Tried] = []
+    for t in finite:
+        apart = [abs(np.log(abs(t.sizes[0] / k.sizes[0]))) > 2 or t.sizes[0] * k.sizes[0] < 0 for k in kept]
+        if all(apart) and t.objective < smallest.objective:
             kept.append(t)
         if len(kept) == _FOLLOWED:
             break
+    return kept
+
+
+def _distinct_starts(starts: Sequence[Mapping[str, float]]) -> list[Mapping[str, float]]:
+    """Starts that differ by more than half a per cent somewhere."""
+    kept: list[Mapping[str, float]] = []
+    for s in starts:
+        near = [all(abs(s[n] - k[n]) <= _NEAR * abs(k[n]) for n in k if n in s) for k in kept]
+        if not any(near):
+            kept.append(s)
     return kept
 
 
