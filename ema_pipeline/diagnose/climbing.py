@@ -121,12 +121,13 @@ def claimable(
     if ranking.gain(top) < threshold(top.hypothesis.family, settings.gain_least, thresholds):
         return None, nothing
     stick = yardstick(case, fit, [ranking.base, *ranking.fitted])
-    before, after = (
-        stick.heldout_error(f, held_out(case, f, fit, settings.folds)) for f in (ranking.base, top)
-    )
+    unseen = [held_out(case, f, fit, settings.folds) for f in (ranking.base, top)]
     label = top.hypothesis.labels[-1]
-    if not after < before:
-        return None, f"{label} does not improve held-out data ({before:.3g} before, {after:.3g} after)"
+    if not stick.heldout_score(unseen[1]) < stick.heldout_score(unseen[0]):
+        before, after = (
+            stick.heldout_error(f, out) for f, out in zip((ranking.base, top), unseen, strict=True)
+        )
+        return None, f"{label} does not improve held-out data (error {before:.3g} before, {after:.3g} after)"
     without, with_it = witness.error(ranking.base), witness.error(top)
     if contradicts(without, with_it):
         return None, (

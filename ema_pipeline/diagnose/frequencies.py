@@ -17,8 +17,8 @@ from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.solve import FitProblem, search
 from ema_pipeline.rigs.base import ParametricRig
 
-_MULTIPLES = (0.1, 0.2, 0.5, 2.0, 5.0, 10.0)
-"""A slipped decimal point, a factor of two forgotten, and what lies between."""
+_MULTIPLES = (0.1, 0.3, 3.0, 10.0)
+"""A slipped decimal point, and what lies between."""
 _HELD = 0.1
 _PER_DECADE = 4
 

@@ -68,6 +68,15 @@ class Yardstick:
             self.prior_count,
         )  # fmt: skip
 
+    def heldout_score(self, out: HeldOut) -> float:
+        """-2 log of how probable the unseen data were, a lost mode counting as one of any shape anywhere.
+
+        Unlike the error it is not ruled by the mode that is predicted worst: where two effects are missing, the first
+        one mends some modes and leaves others as wrong as they were.
+        """
+        lost = np.where(np.isfinite(out.modes), out.modes, np.inf)
+        return float(np.sum(np.minimum(lost, self.outlier_cost)[self.counted]) + sum(out.parameters.values()))
+
 
 def yardstick(case: Case, fit: FitSettings, models: Sequence[Fitted]) -> Yardstick:
     """The yardstick for some models of one case, the base model first."""
