@@ -108,7 +108,7 @@ def candidates_table(found: Diagnosis) -> Table:
                 standing(found, c),
                 _change(c.error_before, c.error_after),
                 _change(c.heldout_before, c.heldout_error_after),
-                "see above" if c in told else c.why,
+                _why_words(c, c in told),
             ),
             _stands_out(found, c),
         )
@@ -130,6 +130,13 @@ def candidates_table(found: Diagnosis) -> Table:
     )
     head = ("effect", "where", "size (±1σ)", "probability", "data say", "error, σ", "held out, σ", "why")
     return Table(head, tuple(rows), frozenset({3, 5, 6}))
+
+
+def _why_words(c: Candidate, told: bool) -> str:
+    """Why a candidate is suspected; nothing where chance explains it."""
+    if told:
+        return "see above"
+    return c.why if c.gain >= c.threshold else ""
 
 
 def short_candidates_table(found: Diagnosis) -> Table:
@@ -287,20 +294,21 @@ def _place(limit: DetectionLimit) -> str:
 
 def heldout_table(found: Diagnosis) -> Table:
     """Every measured frequency beside its prediction by a fit that has not seen it."""
+    several = len({m.configuration for m in found.heldout_modes}) > 1
     rows = tuple(
         Row(
             (
-                m.configuration,
-                format_value(m.measured_hz, m.measured_std_hz, "Hz"),
-                format_value(m.predicted_hz, m.predicted_std_hz, "Hz") if m.predicted else "no such mode",
+                m.configuration if several else "",
+                format_value(m.measured_hz, m.measured_std_hz),
+                format_value(m.predicted_hz, m.predicted_std_hz) if m.predicted else "no such mode",
                 signed(m.z),
             ),
             not abs(m.z) <= FAR_SIGMA,
         )
         for m in found.heldout_modes
     )
-    return Table(("configuration", "measured (±1σ)", "predicted from the others (±1σ)", "difference, σ"), rows,
-                 frozenset({3}))  # fmt: skip
+    head = ("configuration" if several else "", "measured, Hz (±1σ)", "predicted, Hz (±1σ)", "differ, σ")
+    return Table(head, rows, frozenset({3}))
 
 
 def heldout_words(found: Diagnosis) -> str:

@@ -6,6 +6,7 @@ deserve a look start with ``!``.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 
@@ -222,11 +223,19 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
 
 def ladder_screen(ladder: Ladder) -> RenderableType:
     """Every model with its error on the data fitted and on data held out."""
-    heads = ("model", "size (±1σ)", "error", "held out", "FRFs", "left")
-    left = "left: measured modes that the model does not explain; " if diagnosis.of_modes(ladder) else ""
+    heads = ("model", "size (±1σ)", "error", "held out", "FRFs", "left", "evidence")
+    with_frfs = any(math.isfinite(r.frf_error) for r in ladder.rungs)
+    # both do not fit 80 columns; the report has both
+    shown = (0, 1, 2, 3, 4, 5) if with_frfs else (0, 1, 2, 3, 5, 6)
+    words_of = {
+        "FRFs": "FRFs: those around the modes, which were not fitted",
+        "left": "left: measured modes that the model does not explain" if diagnosis.of_modes(ladder) else "",
+        "evidence": "evidence: logarithm, against the base model",
+    }
+    told = [words_of[heads[k]] for k in shown if words_of.get(heads[k])]
     parts: list[RenderableType] = [
-        _rich(_renamed(diagnosis.ladder_table(ladder), heads), "Ladder of models"),
-        _line(f"{_ERROR_WORDS}; {left}evidence: logarithm, against the base model"),
+        _rich(_pick(_renamed(diagnosis.ladder_table(ladder), heads), shown), "Ladder of models"),
+        _line("; ".join([_ERROR_WORDS, *told])),
         _line(diagnosis.noise_words(ladder)),
     ]
     if ladder.note:
