@@ -135,6 +135,9 @@ def test_the_page_names_every_element() -> None:
         assert f"`{kind.__name__}(" in page, kind.__name__
 
 
-def _kinds(kind: type) -> list[type]:
-    direct: list[type] = [k for k in kind.__subclasses__() if k.__module__ == laws.__name__]
-    return [*direct, *(inner for k in direct for inner in _kinds(k))]
+def _kinds(kind: type) -> set[type]:
+    found: set[type] = set()
+    inner: type
+    for inner in kind.__subclasses__():
+        found |= {inner, *_kinds(inner)} if inner.__module__ == laws.__name__ else set()
+    return found

@@ -6,6 +6,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -18,14 +19,18 @@ from ema_pipeline.ingest.description import read_campaign
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import cut_hit
-from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.frf import accelerance
-from ema_pipeline.mechanics.harmonic import describing_function, harmonic_response
-from ema_pipeline.mechanics.laws import PartingSpring
 from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
-from ema_pipeline.report.style import LINES, SERIES, log_y, margins, new_figure, styled
+from ema_pipeline.report.style import GREY, LINES, SERIES, log_y, margins, new_figure, styled
+from ema_pipeline.reproduce.backlash import (
+    PRELOAD_M,
+    SWEEPS,
+    backlash_figure,
+    backlash_levels,
+    backlash_table,
+)
 from ema_pipeline.reproduce.types import Entry, Reproduction, Table
 from ema_pipeline.rigs import Rig, load_rig, model_modes
 from ema_pipeline.simulate import simulate_campaign
@@ -38,25 +43,25 @@ SOURCE = (
     "stiffness of the planetary gear above, so there is nothing printed to compare numbers with."
 )
 CRACK, LOSS = "mesh_stiffness_loss@sun-planet1", 0.3
-PRELOAD_M, GAP_M = 2e-6, 1e-4
-LEVELS_N = (2.0, 5.0, 8.0, 12.0, 20.0)
 
 
 def reproduce_gearbox() -> Reproduction:
     """Healthy and cracked set, recovery of the crack from raw hits, and backlash."""
     healthy = load_rig("gearbox")
     cracked = rig_with_effects(healthy, [(CRACK, {"fraction": LOSS})])
-    curves = backlash_curves(healthy)
-    tables = (_modes_table(healthy, cracked), _recovery_table(healthy), _backlash_table(curves))
+    swept = [backlash_levels(healthy, sweep) for sweep in SWEEPS]
+    tables = (_modes_table(healthy, cracked), _recovery_table(healthy), backlash_table(healthy, swept))
     figures = {
         "gearbox_frf": frf_figure(healthy, cracked),
-        "gearbox_backlash": backlash_figure(curves),
+        "gearbox_backlash": backlash_figure(healthy, swept),
     }
     captions = {
         "gearbox_frf": f"Healthy set and one with {100 * LOSS:.0f} % of the stiffness of one sun-planet "
         "mesh lost: "
-        "the crack lowers three modes and parts the pair at 1659 Hz",
-        "gearbox_backlash": "Backlash: the resonance falls as the force grows and the teeth of the sun part",
+        "the crack lowers three modes and parts the pair at 1659 Hz, so that the planets no longer move alike",
+        "gearbox_backlash": f"Backlash: resonances fall as the force grows and the meshes of the sun part past "
+        f"{1e6 * PRELOAD_M:g} µm; crosses: the frequency that the describing function of the meshes gives at the "
+        "largest deflection",
     }
     title = "Planetary gearbox in torsion: crack and backlash"
     return Reproduction("gearbox", title, SOURCE, tables, figures, captions)
@@ -121,85 +126,45 @@ def _recovery_table(healthy: Rig) -> Table:
     )
 
 
-Curve = tuple[float, NDArray[np.float64], NDArray[np.float64]]
-"""Force level N, frequencies Hz, and accelerance (m/s²)/N."""
-
-
-def loose(rig: Rig) -> Assembly:
-    """The gearbox with sun meshes that part past their preload."""
-    values = {"preload": PRELOAD_M, "gap": GAP_M}
-    return rig_with_effects(rig, [(f"mesh_backlash@sun-planet{n}", values) for n in (1, 2, 3)]).assembly(
-        "default"
-    )
-
-
-def backlash_curves(rig: Rig) -> list[Curve]:
-    """Accelerance of the sun at several force levels, swept down."""
-    assembly = loose(rig)
-    row = sensor_rows(assembly.system(), (Dof("sun", "u"),))
-    f = np.arange(940.0, 740.0, -2.5)
-    curves = []
-    for level in LEVELS_N:
-        response = harmonic_response(assembly, f, level, row, row[0], harmonics=5, samples=64)
-        gain = np.abs(response.displacement[0, 1]) * (2 * np.pi * f) ** 2 / level
-        curves.append((level, f, np.where(response.converged, gain, np.nan)))
-    return curves
-
-
-def _backlash_table(curves: list[Curve]) -> Table:
-    entries = [
-        Entry(f"resonance at {level:g} N", None, float(f[np.nanargmax(gain)]), "Hz")
-        for level, f, gain in curves
-    ]
-    mesh = PartingSpring("mesh", {}, 1.25e7, preload=-GAP_M / 2, gap=GAP_M)
-    for ratio in (1.5, 2.0, 4.0):
-        k = describing_function(mesh, ratio * GAP_M / 2, 100.0).real
-        exact = 1 - 2 / np.pi * (np.arcsin(1 / ratio) + np.sqrt(1 - ratio**-2) / ratio)
-        entries.append(Entry(f"k_eq/k at amplitude = {ratio:g}·b", exact, k / mesh.stiffness, "1"))
-    remark = (
-        "Resonances of the gearbox by harmonic balance, swept down; k_eq of one mesh in the middle of its "
-        "gap 2b "
-        "against the closed form of the describing function, 1 - 2/π·(asin(b/A) + b/A·√(1 - (b/A)²))."
-    )
-    title = "Backlash: apparent frequency and stiffness over the level"
-    return Table(title, "", tuple(entries), (remark,), "closed form")
-
-
 @styled
 def frf_figure(healthy: Rig, cracked: Rig) -> Figure:
-    """Accelerances of the healthy and the cracked set side by side."""
-    figure = new_figure(3.4)
-    grid = figure.add_gridspec(1, 2, wspace=0.1, **margins(figure))
+    """Accelerances of the healthy and the cracked set side by side, magnitude above phase."""
+    figure = new_figure(4.4)
+    grid = figure.add_gridspec(2, 2, wspace=0.1, hspace=0.12, height_ratios=(2, 1), **margins(figure))
     f = np.arange(500.0, 2200.0, 1.0)
-    first = None
-    for k, (title, rig) in enumerate((("healthy", healthy), ("one mesh cracked", cracked))):
-        system = rig.system("default")
-        ax = figure.add_subplot(grid[0, k], sharey=first)
-        first = first or ax
-        struck = sensor_rows(system, (Dof("sun", "u"),))
-        for i, dof in enumerate(("sun.u", "planet1.u", "planet2.u")):
-            h = np.abs(accelerance(system, f, sensor_rows(system, (Dof.parse(dof),)), struck)[0, 0])
-            ax.plot(f, h, color=SERIES[i], ls=LINES[i], label=f"{dof} / sun.u")
-        log_y(ax)
-        ax.set_title(title)
-        ax.set_xlabel("frequency, Hz")
+    before, after = _accelerances(healthy, f), _accelerances(cracked, f)
+    left: tuple[Axes, Axes] | None = None
+    for k, (title, curves) in enumerate((("healthy", before), ("one mesh cracked", after))):
+        magnitude = figure.add_subplot(grid[0, k], sharey=left[0] if left else None)
+        phase = figure.add_subplot(grid[1, k], sharex=magnitude, sharey=left[1] if left else None)
+        left = left or (magnitude, phase)
+        for i, (name, h) in enumerate(curves.items()):
+            magnitude.plot(f, np.abs(h), color=SERIES[i], ls=LINES[i], label=name)
+            phase.plot(f, np.rad2deg(np.unwrap(np.angle(h))), color=SERIES[i], ls=LINES[i])
+        if k == 1:
+            magnitude.plot(
+                f, np.abs(next(iter(before.values()))), color=GREY, lw=0.7, zorder=1, label="sun.u, healthy"
+            )
+        log_y(magnitude)
+        magnitude.set_title(title)
+        magnitude.legend(loc="lower right", fontsize=6)
+        magnitude.tick_params(labelbottom=False, labelleft=k == 0)
+        phase.tick_params(labelleft=k == 0)
+        phase.set_yticks([-360, -180, 0, 180])
+        phase.set_xlabel("frequency, Hz")
         if k == 0:
-            ax.set_ylabel("accelerance, (m/s²)/N")
-            ax.legend(loc="lower left")
-        else:
-            ax.tick_params(labelleft=False)
+            magnitude.set_ylabel("accelerance, (m/s²)/N")
+            phase.set_ylabel("phase, °")
     return figure
 
 
-@styled
-def backlash_figure(curves: list[Curve]) -> Figure:
-    """Resonance at several force levels."""
-    figure = new_figure(3.0)
-    ax = figure.add_subplot(figure.add_gridspec(1, 1, **margins(figure))[0, 0])
-    for i, (level, f, gain) in enumerate(curves):
-        ax.plot(f, gain, color=SERIES[i], ls=LINES[i], label=f"{level:g} N")
-    ax.set_xlabel("frequency, Hz")
-    ax.set_ylabel("accelerance of the sun, (m/s²)/N")
-    ax.set_title(f"Meshes of the sun part past {1e6 * PRELOAD_M:g} µm")
-    ax.legend(loc="upper left")
-    return figure
+def _accelerances(rig: Rig, frequency_hz: NDArray[np.float64]) -> dict[str, NDArray[np.complex128]]:
+    """Accelerance of the sun and two planets over a force on the sun, by name."""
+    system = rig.system("default")
+    struck = sensor_rows(system, (Dof("sun", "u"),))
+    return {
+        f"{dof} / sun.u": accelerance(system, frequency_hz, sensor_rows(system, (Dof.parse(dof),)), struck)[
+            0, 0
+        ]
+        for dof in ("sun.u", "planet1.u", "planet2.u")
+    }
