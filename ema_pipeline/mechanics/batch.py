@@ -27,7 +27,7 @@ ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 """Number of derivatives of each quantity that a sensor may measure."""
 
 _NO_FORCE = (0.0, 0.0, 0.0, 0.0)
-_SLOWEST_HZ = 0.2
+_SLOWEST_HZ = 1e-3
 """Rigid-body modes are held by springs so soft that a record of seconds does not see them."""
 
 
@@ -72,53 +72,91 @@ def batch_response(assemblies: Sequence[Assembly], blows: Blows, substeps: int) 
     EmaError
         For structural damping, and where the motion grows without bound.
     """
+    if any(e.law is None for a in assemblies for e in a.nonlinear):
+        return _one_by_one(assemblies, blows, substeps)
+    force, straight = _fine(blows.force, substeps)
+    orders = np.array([ORDERS[q] for q in blows.quantities])
+    result, direct = compiled_response(
+        assemblies, blows.sample_rate_hz, straight, blows.out_rows, orders, blows.in_rows, substeps
+    )
+    result += direct[..., None] * force[None, :, None, ::substeps]
+    return result
+
+
+def compiled_response(
+    assemblies: Sequence[Assembly],
+    sample_rate_hz: float,
+    force: NDArray[np.float64],
+    out_rows: NDArray[np.float64],
+    orders: NDArray[np.int64],
+    in_rows: NDArray[np.float64],
+    substeps: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Motion from rest under forces that run straight from step to step.
+
+    Parameters
+    ----------
+    assemblies : sequence of Assembly
+        All elements with a `Nonlinear.law`.
+    sample_rate_hz : float
+        Of the result.
+    force : ndarray, (n_blows, n_steps)
+        N, at `substeps` steps per sample.
+    out_rows, in_rows : ndarray, (n_outputs, n), (n_blows, n)
+    orders : ndarray of int, (n_outputs,)
+        Derivatives of each output: 0 for displacement, 2 for acceleration.
+    substeps : int
+
+    Returns
+    -------
+    motion : ndarray, (n_assemblies, n_blows, n_outputs, n_samples)
+        Without what a force gives an accelerometer at once.
+    direct : ndarray, (n_assemblies, n_blows, n_outputs)
+        That part, per newton.
+
+    Raises
+    ------
+    EmaError
+        For structural damping, and where the motion grows without bound.
+    """
     from ema_pipeline.mechanics.kernel import march  # compiles at its first use
 
     elements = {e.name: e for a in assemblies for e in a.nonlinear}
-    if any(e.law is None for e in elements.values()):
-        return _one_by_one(assemblies, blows, substeps)
     for assembly in assemblies:
         for element in assembly.nonlinear:
             check_element(element)
     modes = [_modal(a.system()) for a in assemblies]
-    m = len(elements)
-    size = max(len(p.poles) for p in modes)
-    count, hits = len(assemblies), len(blows.force)
+    m, size = len(elements), max(len(p.poles) for p in modes)
+    count, hits = len(assemblies), len(force)
     rows = element_rows(assemblies[0], list(elements.values()))
-    step = 1 / (blows.sample_rate_hz * substeps)
+    step = 1 / (sample_rate_hz * substeps)
 
     poles = np.zeros((count, size), dtype=complex)
     inputs = np.zeros((count, hits + m, size), dtype=complex)
-    outputs = np.zeros((count, len(blows.out_rows), size), dtype=complex)
+    outputs = np.zeros((count, len(out_rows), size), dtype=complex)
     stretch = np.zeros((count, 2 * m, size), dtype=complex)
-    direct = np.zeros((count, len(blows.out_rows), hits + m))
-    into = np.vstack([blows.in_rows, -rows])
-    order = np.array([ORDERS[q] for q in blows.quantities])
+    direct = np.zeros((count, len(out_rows), hits + m))
+    into = np.vstack([in_rows, -rows])
     laws = np.zeros((count, m, 4))
     for i, (assembly, p) in enumerate(zip(assemblies, modes, strict=True)):
         k = len(p.poles)
         poles[i, :k] = p.poles
         inputs[i, :, :k] = (p.left @ into.T).T
-        outputs[i, :, :k] = (blows.out_rows @ p.right) * p.poles ** order[:, None]
+        outputs[i, :, :k] = (out_rows @ p.right) * p.poles ** orders[:, None]
         stretch[i, :m, :k] = rows @ p.right
         stretch[i, m:, :k] = (rows @ p.right) * p.poles
-        direct[i] = np.where(order[:, None] == 2, blows.out_rows @ p.flexibility @ into.T, 0.0)
+        direct[i] = np.where(orders[:, None] == 2, out_rows @ p.flexibility @ into.T, 0.0)
         own = {e.name: e.law for e in assembly.nonlinear}
         for j, name in enumerate(elements):
             laws[i, j] = own.get(name) or _NO_FORCE
 
-    force, straight = _fine(blows.force, substeps)
-    result, failed = march(
-        laws, poles, inputs, stretch, outputs, direct[:, :, hits:], straight, step, substeps
-    )
+    result, failed = march(laws, poles, inputs, stretch, outputs, direct[:, :, hits:], force, step, substeps)
     if failed:
-        names = ", ".join(elements)
         raise EmaError(
-            f"no solution with {names}: the motion grows without bound, or the step of {step:.3g} s is too long"
+            f"no solution with {', '.join(elements)}: the motion grows without bound, or the step of "
+            f"{step:.3g} s is too long; check the elements' values, or give more substeps"
         )
-    result = result.swapaxes(2, 3)
-    result += direct[:, :, :hits].transpose(0, 2, 1)[..., None] * force[None, :, None, ::substeps]
-    return result
+    return result.swapaxes(2, 3), direct[:, :, :hits].swapaxes(1, 2)
 
 
 def _one_by_one(assemblies: Sequence[Assembly], blows: Blows, substeps: int) -> NDArray[np.float64]:
@@ -161,7 +199,12 @@ def _modal(system: LinearSystem) -> _Modal:
     if not coupled and np.all(total < 2 * omega):
         decay = 0.5 * total
         damped = np.sqrt(omega**2 - decay**2)
-        return _Modal((-decay + 1j * damped).astype(complex), phi.T.astype(complex), (phi / (1j * damped)).astype(complex), flexibility)
+        return _Modal(
+            (-decay + 1j * damped).astype(complex),
+            phi.T.astype(complex),
+            (phi / (1j * damped)).astype(complex),
+            flexibility,
+        )
     n = len(omega)
     a = np.zeros((2 * n, 2 * n))
     a[:n, n:] = np.eye(n)

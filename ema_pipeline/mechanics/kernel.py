@@ -72,7 +72,18 @@ def march(
     kept = (force.shape[1] - 1) // keep_every + 1
     result = np.zeros((len(poles), hits, kept, outputs.shape[1]))
     failed = _march(
-        laws, decay, begun, _halves(stretch), _halves(outputs), reach, seen, force, step, keep_every, result
+        laws,
+        decay,
+        begun,
+        ended,
+        _halves(stretch),
+        _halves(outputs),
+        reach,
+        seen,
+        force,
+        step,
+        keep_every,
+        result,
     )
     return result, bool(failed)
 
@@ -83,7 +94,7 @@ def _halves(rows: NDArray[np.complex128]) -> NDArray[np.float64]:
 
 
 @numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
-def _march(laws, decay, begun, stretch, outputs, reach, seen, force, step, keep_every, result):  # type: ignore[no-untyped-def]
+def _march(laws, decay, begun, ended, stretch, outputs, reach, seen, force, step, keep_every, result):  # type: ignore[no-untyped-def]
     count, size = decay.shape
     hits, steps = force.shape
     m = laws.shape[1]
@@ -93,12 +104,12 @@ def _march(laws, decay, begun, stretch, outputs, reach, seen, force, step, keep_
     for a in range(count):
         turn, fade = decay[a].imag.copy(), decay[a].real.copy()
         for h in range(hits):
-            y[:] = 0.0
             g[:] = 0.0
+            for p in range(size):  # z = 0
+                y[p] = -ended[a, h, p].real * force[h, 0]
+                y[size + p] = -ended[a, h, p].imag * force[h, 0]
             scale = 1e-9
             b_re, b_im = begun[a, h].real.copy(), begun[a, h].imag.copy()
-            for c in range(channels):
-                result[a, h, 0, c] = seen[a, c, h] * force[h, 0]
             for k in range(1, steps):
                 f = force[h, k - 1]
                 for p in range(size):

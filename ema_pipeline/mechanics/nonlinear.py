@@ -58,6 +58,10 @@ def nonlinear_response(
     implicitly by Newton steps on the stretches of the nonlinear elements alone, so the scheme stays stable
     for stiff elements and costs little beyond the linear response.
     """
+    forces = np.atleast_2d(np.asarray(forces, dtype=float))
+    at_rest = displacement is None and velocity is None
+    if at_rest and len(forces) == 1 and all(e.law is not None for e in assembly.nonlinear):
+        return _from_rest(assembly, sample_rate_hz, forces, out_rows, in_rows, substeps)
     system = assembly.system()
     if np.any(system.structural):
         raise EmaError(
@@ -73,7 +77,6 @@ def nonlinear_response(
     rate = sample_rate_hz * substeps
     transition, step, ramp = recursion(a, b, rate)
 
-    forces = np.atleast_2d(np.asarray(forces, dtype=float))
     fine = _interpolated(forces, substeps)
     stretch = np.zeros((2 * m, 2 * n))
     stretch[:m, :n] = stretch[m:, n:] = rows
@@ -96,6 +99,26 @@ def nonlinear_response(
         velocity=out_rows @ states[:, n:].T,
         acceleration=out_rows @ rates[:, n:].T,
     )
+
+
+def _from_rest(
+    assembly: Assembly,
+    sample_rate_hz: float,
+    forces: NDArray[np.float64],
+    out_rows: NDArray[np.float64],
+    in_rows: NDArray[np.float64],
+    substeps: int,
+) -> TimeResponse:
+    """The same for one force on elements without memory, in a compiled loop."""
+    from ema_pipeline.mechanics.batch import compiled_response
+
+    orders = np.repeat(np.arange(3), len(out_rows))
+    motion, direct = compiled_response(
+        [assembly], sample_rate_hz, _interpolated(forces, substeps), np.tile(out_rows, (3, 1)), orders, in_rows,
+        substeps,
+    )  # fmt: skip
+    both = motion[0, 0] + direct[0, 0][:, None] * forces
+    return TimeResponse(*both.reshape(3, len(out_rows), -1))
 
 
 def _march(
