@@ -194,9 +194,9 @@ def compare(out: Out) -> None:
     run.require_model("compare")
     if run.info.kind == "hysteresis":
         from ema_pipeline.report.loops import comparison_screen
-        from ema_pipeline.stages.loop_ladder import loops_of, models_of
+        from ema_pipeline.stages.loop_ladder import loops_of, own_models
 
-        _print(comparison_screen(loops_of(run), models_of(run)))
+        _print(comparison_screen(loops_of(run), own_models(run)))
         return
     comparison = load_results(run).comparison
     assert comparison is not None  # the stage has just run

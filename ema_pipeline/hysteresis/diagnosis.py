@@ -37,8 +37,8 @@ from ema_pipeline.hysteresis.visible import Limit, smallest_visible
 from ema_pipeline.threads import single_blas_thread
 
 NOTHING = "nothing"
-_ALIKE = 0.1
-_SAME_FIT = 1.0
+_ALIKE = 0.03
+_DOUBTFUL = 0.1
 _BLIND = 0.1
 
 Key = frozenset[str]
@@ -156,17 +156,13 @@ class _Judge:
         return float(sum(p for k, p in self.ranking.probabilities.items() if k & set(effects)))
 
     def _alike(self, key: Key, effect: str) -> tuple[str, ...]:
-        """Effects that would do as well in place of one."""
+        """Effects that would do nearly as well in place of one."""
         found = []
-        best = self.ranking.fitted[key]
         for other in PARAMETERS:
             swapped = key - {effect} | {other}
-            if other in key or swapped not in self.ranking.fitted:
-                continue
-            apart = (self.ranking.fitted[swapped].chi2 - best.chi2) / self.ranking.widening
-            odds = self.ranking.probabilities[swapped] / self.ranking.probabilities[key]
-            if odds > _ALIKE or apart < _SAME_FIT:
-                found.append(other)
+            if other not in key and swapped in self.ranking.fitted:
+                odds = self.ranking.probabilities[swapped] / self.ranking.probabilities[key]
+                found += [other] if odds > _ALIKE else []
         return tuple(found)
 
     def diagnosis(self, tell: Progress) -> tuple[Diagnosis, tuple[LoopModel, ...]]:
@@ -333,7 +329,7 @@ class _Judge:
             first, second = effect_ids(self.groups[0][:2])
             doubtful = (self.found, self.found - {first} | {second}, f"{first} from {second}")
         elif verdict in ("adequate", "effect"):
-            likely = [e for e in PARAMETERS if e not in self.found and self.ranking.share(e) > _ALIKE]
+            likely = [e for e in PARAMETERS if e not in self.found and self.ranking.share(e) > _DOUBTFUL]
             if likely and self.found | {likely[0]} in self.ranking.fitted:
                 doubtful = (self.found | {likely[0]}, self.found, f"whether {likely[0]} is there")
         pair = None if doubtful is None else (self.fitted(doubtful[0]), self.fitted(doubtful[1]), doubtful[2])

@@ -50,19 +50,29 @@ def missing_words(loops: LoopSet, model: LoopModel, error: float, limit: float) 
     """What the best model does not show, where it fails."""
     if error <= limit:
         return ()
-    return tuple(f"still missing: {text}" for text in failures(loops.loops, model.fits, model.fits, error))
+    play = any(e.startswith("backlash@") for e in model.effects)
+    words = failures(loops.loops, model.fits, model.fits, error, has_play=play, own_scales=bool(model.scales))
+    return tuple(f"still missing: {text}" for text in words)
 
 
 def limits_words(limits: Sequence[Limit]) -> tuple[str, ...]:
     """The smallest effects that the loops would show."""
     if not limits:
         return ()
+    shown = [one for one in limits if one.share <= 1]
+    hidden = [one.effect.replace("_", " ") for one in limits if one.share > 1]
+    texts = [f"beside what the model has, these loops cannot show {' or '.join(hidden)}"] if hidden else []
+    if not shown:
+        return tuple(texts)
     parts = [
         f"{one.effect.replace('_', ' ')} {one.size:.2g} {one.unit}{f' {one.note}' if one.note else ''} "
         f"({100 * one.share:.2g} % of the force)"
-        for one in limits
+        for one in shown
     ]
-    return (f"smallest further effects that these loops would show in 19 of 20 tests: {'; '.join(parts)}",)
+    return (
+        *texts,
+        f"smallest further effects that these loops would show in 19 of 20 tests: {'; '.join(parts)}",
+    )
 
 
 def next_loop(ranking: Ranking, verdict: str, pair: tuple[Fitted, Fitted, str] | None) -> str:

@@ -30,7 +30,7 @@ def loops_figure(result: IsolatorResult) -> Figure:
     """Every measured loop with the model's, by the one set of parameters."""
     rows = -(-len(result.loops) // _COLUMNS)
     figure = new_figure(2.1 * rows + 0.5)
-    grid = figure.add_gridspec(rows, _COLUMNS, hspace=0.6, wspace=0.3, **margins(figure))
+    grid = figure.add_gridspec(rows, _COLUMNS, hspace=0.6, wspace=0.34, **margins(figure, left=0.8))
     for k, (loop, fit) in enumerate(zip(result.loops, result.fits, strict=True)):
         ax = figure.add_subplot(grid[k // _COLUMNS, k % _COLUMNS])
         _draw(ax, loop, fit)
@@ -48,7 +48,9 @@ def models_figure(loops: Sequence[Loop], models: Sequence[LoopModel]) -> Figure:
     """Every measured loop with that of the linear spring and that of the last model."""
     rows = -(-len(loops) // _COLUMNS)
     figure = new_figure(2.15 * rows + 0.75)
-    grid = figure.add_gridspec(rows, _COLUMNS, hspace=0.55, wspace=0.3, **margins(figure, top=0.62))
+    grid = figure.add_gridspec(
+        rows, _COLUMNS, hspace=0.55, wspace=0.34, **margins(figure, left=0.8, top=0.62)
+    )
     for k, loop in enumerate(loops):
         ax = figure.add_subplot(grid[k // _COLUMNS, k % _COLUMNS])
         x = 1e3 * np.append(loop.displacement, loop.displacement[0])

@@ -45,10 +45,11 @@ relaxes much faster than the motion is a viscous damper, and is left to be calle
 _STARTS: Mapping[str, tuple[float, ...]] = {
     RHO: (0.2, 0.6, 2.0, 6.0, 30.0),
     SIGMA: (0.2, 0.5, 1.0),
-    EXPONENT: (1.0, 3.0),
+    EXPONENT: (1.0, 1.0, 3.0),
     TIME: (0.5, 1.0, 2.0, 10.0),
     GAP: (0.02, 0.08, 0.2, 0.45),
 }
+_TOGETHER = ((RHO, SIGMA), (EXPONENT,), (TIME,), (GAP,))
 SYSTEMATIC = 1.3
 """Mean square of the residuals, in variances of the noise, from which a model's misfit is not noise."""
 _TRIED = 2
@@ -268,16 +269,22 @@ def _scales(loops: LoopSet, structure: Structure, values: Mapping[str, float]) -
 def _shapes(
     loops: LoopSet, structure: Structure, start: Mapping[str, float], grid: bool, physical: bool
 ) -> list[dict[str, float]]:
-    """Most promising values of the shapes: those given, and the best of a grid."""
+    """Most promising values of the shapes: those given, and the best of a grid.
+
+    The shapes of one effect are varied together, those of the others stay: a grid over all would take minutes.
+    """
     names = structure.shapes
-    given = {n: start[n] for n in names if n in start}
-    options = [given] if len(given) == len(names) else []
-    if options and (not grid or not names):
+    begin = {n: start.get(n, _STARTS[n][len(_STARTS[n]) // 2] * loops.shape_unit(n)) for n in names}
+    options = [begin]
+    for together in _TOGETHER:
+        group = [n for n in together if n in names]
+        if group and (grid or any(n not in start for n in group)):
+            mesh = np.meshgrid(*(_STARTS[n] for n in group), indexing="ij")
+            for row in np.stack([m.ravel() for m in mesh], axis=1):
+                sought = {n: float(v) * loops.shape_unit(n) for n, v in zip(group, row, strict=True)}
+                options.append(begin | sought)
+    if len(options) == 1:
         return options
-    sought = [n for n in names if n not in given] or list(names)
-    mesh = np.meshgrid(*(_STARTS[n] for n in sought), indexing="ij")
-    for row in np.stack([m.ravel() for m in mesh], axis=1):
-        options.append(given | {n: float(v) * loops.shape_unit(n) for n, v in zip(sought, row, strict=True)})
     cost = [_linear(loops, structure, shape, physical)[1] for shape in options]
     return [options[i] for i in np.argsort(cost)[:_TRIED]]
 

@@ -153,10 +153,7 @@ def _correlation(residual: NDArray[np.float64]) -> float:
 def fit_with_exponent(loops: LoopSet, structure: Structure, start: Mapping[str, float] | None) -> Fitted:
     """The fit, with the exponent of the hysteresis freed where the loops ask for it clearly."""
     plain = Structure(structure.effects)
-    found = fit(loops, plain, start, grid=start is None)
-    if start is not None and plain.shapes and all(n in start for n in plain.shapes):
-        again = fit(loops, plain, {})
-        found = again if again.chi2 < found.chi2 else found
+    found = fit(loops, plain, start)
     if "hysteresis" not in structure.effects:
         return found
     begin = {**found.values, **({EXPONENT: start[EXPONENT]} if start and EXPONENT in start else {})}

@@ -17,12 +17,21 @@ ENERGY = 0.03
 """Error of the energy per cycle that is worth a word."""
 CHATTER = 0.05
 """Amplitude of a fast force oscillation, as a share of half the force range, that is worth a word."""
+SIDES = 0.08
+"""Offset of the loop's middle, as a share of half the force range, that is worth a word."""
+_MIDDLE = 0.3
 SLOWEST_CHATTER = 8
 """Harmonics of the drive from which an oscillation counts as fast."""
 
 
 def failures(
-    loops: Sequence[Loop], fits: Sequence[LoopFit], alone: Sequence[LoopFit], scale: float
+    loops: Sequence[Loop],
+    fits: Sequence[LoopFit],
+    alone: Sequence[LoopFit],
+    scale: float,
+    *,
+    has_play: bool = False,
+    own_scales: bool = False,
 ) -> tuple[str, ...]:
     """Sentences on what the model does not show, worst first.
 
@@ -32,17 +41,22 @@ def failures(
         Measured loops, their fits by one set of parameters, and by parameters of their own.
     scale : float
         Root-mean-square misfit in standard deviations.
+    has_play, own_scales : bool
+        Whether the model has play, and whether each loop has a force scale of its own.
     """
     words = []
     energy = [abs(fit.energy_error) for fit in fits]
     worst = int(np.argmax(energy))
     if energy[worst] > ENERGY:
+        scaled = ", each loop with a force scale of its own," if own_scales else ""
+        device = "" if own_scales else "the loops do not come from one and the same device, or "
         words.append(
-            f"one set of parameters misses the energy per cycle by up to {100 * energy[worst]:.2g} % "
-            f"({loops[worst].name}): the loops do not come from one and the same device, or its loss "
-            "depends on amplitude or frequency in a way that the model has not"
+            f"one set of parameters{scaled} misses the energy per cycle by up to {100 * energy[worst]:.2g} % "
+            f"({loops[worst].name}): {device}the loss depends on amplitude, frequency or setting in a way that "
+            "the model has not"
         )
-    words += _play(loops, alone)
+    words += _play(loops, alone, has_play)
+    words += _sides(loops, alone) if has_play else []
     words += _chatter(loops, alone)
     if scale > 2 and not words:
         at = int(np.argmax([fit.misfit for fit in fits]))
@@ -53,7 +67,7 @@ def failures(
     return tuple(words)
 
 
-def _play(loops: Sequence[Loop], alone: Sequence[LoopFit]) -> list[str]:
+def _play(loops: Sequence[Loop], alone: Sequence[LoopFit], has_play: bool) -> list[str]:
     """Travel at hardly any force after a reversal, which no Bouc-Wen loop has."""
     found = []
     for loop, fit in zip(loops, alone, strict=True):
@@ -64,10 +78,33 @@ def _play(loops: Sequence[Loop], alone: Sequence[LoopFit]) -> list[str]:
         return []
     low, high = (1e3 * f(t for t, _ in found) for f in (min, max))
     span = f"{low:.2g}" if f"{low:.2g}" == f"{high:.2g}" else f"{low:.2g} to {high:.2g}"
+    if has_play:
+        return [
+            f"the play is not one and the same: after a reversal {len(found)} of {len(loops)} loops move {span} mm "
+            "further at hardly any force than the model does"
+        ]
     return [
         f"after a reversal the device moves {span} mm further at hardly any force than the fitted loop does "
         f"({len(found)} of {len(loops)} loops): it has play (backlash), which a Bouc-Wen loop has not; "
         "the fit rounds it off into a softer unloading branch"
+    ]
+
+
+def _sides(loops: Sequence[Loop], fits: Sequence[LoopFit]) -> list[str]:
+    """Force that is larger one way than the other, about the level of the play."""
+    found = []
+    for loop, fit in zip(loops, fits, strict=True):
+        near = np.abs(loop.displacement) < _MIDDLE * loop.amplitude_m
+        up, down = loop.force[near & (loop.velocity > 0)], loop.force[near & (loop.velocity < 0)]
+        if len(up) and len(down):
+            middle = 0.5 * (float(np.median(up)) + float(np.median(down)))
+            found.append((abs(middle) / (0.5 * float(np.ptp(fit.force))), loop.name))
+    share, name = max(found, default=(0.0, ""))
+    if share < SIDES:
+        return []
+    return [
+        f"the force is larger one way than the other, by up to {100 * 2 * share:.2g} % of its size ({name}): a brake "
+        "that tightens itself one way, or an offset of the force channel; the model is alike both ways"
     ]
 
 

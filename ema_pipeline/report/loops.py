@@ -123,7 +123,7 @@ def _context(
         "number": {name: k for k, (name, _) in enumerate(SECTIONS, start=1)},
         "diagnosis": None if found is None else _diagnosis_context(results),
         "sizes": _cards(results),
-        "ladder": None if ladder is None else diagnosis.ladder_table(ladder),
+        "ladder": None if ladder is None else _filled(diagnosis.ladder_table(ladder)),
         "ladder_note": "" if ladder is None else ladder.note,
         "users_ladder": results.ladder is not None,
         "loops_table": _loops_table(loops, models),
@@ -202,11 +202,16 @@ def _loops_table(loops: Sequence[Loop], models: Sequence[LoopModel]) -> Table | 
         "loop", "frequency, Hz", "amplitude, mm", "cycles", "energy per cycle", "model, J", "difference, %",
         "misfit, % of force", "force scale",
     )  # fmt: skip
-    kept = [c for c in range(len(head)) if any(r.cells[c] for r in rows)]
+    return _filled(Table(head, tuple(rows), frozenset(range(1, 9))))
+
+
+def _filled(source: Table) -> Table:
+    """A table without its empty columns."""
+    kept = [c for c in range(len(source.head)) if any(r.cells[c] for r in source.rows)]
     return Table(
-        tuple(head[c] for c in kept),
-        tuple(Row(tuple(r.cells[c] for c in kept), r.alert) for r in rows),
-        frozenset(k for k, c in enumerate(kept) if c in range(1, 9)),
+        tuple(source.head[c] for c in kept),
+        tuple(Row(tuple(r.cells[c] for c in kept), r.alert) for r in source.rows),
+        frozenset(k for k, c in enumerate(kept) if c in source.numeric),
     )
 
 

@@ -48,6 +48,11 @@ def loop_settings(run: Run) -> HysteresisSettings:
     return settings
 
 
+def own_models(run: Run) -> tuple[LoopModel, ...]:
+    """The linear spring and every rung with the effects that the user added, the model as it stands last."""
+    return run.store.load("ladder", ALL, "models", tuple[LoopModel, ...])
+
+
 def models_of(run: Run) -> tuple[LoopModel, ...]:
     """Models of the user's own ladder or else of the diagnosis, the linear spring first; empty before either."""
     mine = run.store.find("ladder", ALL, "models", tuple[LoopModel, ...]) or ()
