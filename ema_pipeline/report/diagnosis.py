@@ -337,10 +337,35 @@ def noise_words(ladder: Ladder) -> str:
     """What σ holds beside the test's own scatter."""
     if not of_modes(ladder):
         return "σ: the scatter of the measured signals."
+    if ladder.force_n:
+        return f"{hits_words(ladder)} " + (
+            "Error: simulated against measured hits, in standard uncertainties: the sensors' noise, "
+            f"{plain(100 * ladder.hit_noise, 2)} % of the signal around each frequency, and an error of the linear "
+            "model that is alike at every force level. A linear model can therefore have an error of about 1 and "
+            "still miss much of the hard hits: look at the shares that are missed."
+        )
     return (
         f"σ: the test's own scatter and, beside it, {plain(100 * ladder.frequency_noise, 2)} % of frequency, "
         f"{plain(100 * ladder.damping_noise, 2)} % of damping, "
         f"{plain(100 * ladder.shape_noise, 2)} % of a shape's largest entry."
+    )
+
+
+def hits_words(ladder: Ladder) -> str:
+    """How the last rung's simulated hits fare against the base model's, in a sentence; empty without any."""
+    if not ladder.force_n or len(ladder.rungs) < 2:
+        return ""
+    first, last = ladder.rungs[0].heldout_misfit, ladder.rungs[-1].heldout_misfit
+    told = [
+        f"{plain(100 * b, 2)} → {plain(100 * a, 2)} % at {f:.3g} N"
+        for f, b, a in zip(ladder.force_n, first, last, strict=True)
+        if math.isfinite(a) and math.isfinite(b)
+    ]
+    if not told:
+        return ""
+    return (
+        "Each hit was simulated with its measured force. Share of the measured signals that is missed, each level "
+        f"being predicted by a fit to the others: {', '.join(told)}."
     )
 
 

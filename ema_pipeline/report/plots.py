@@ -10,10 +10,22 @@ from typing import Literal
 
 from matplotlib.figure import Figure
 
+from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report import style
 from ema_pipeline.report.diagnosis import probability_threshold
-from ema_pipeline.report.figures import comparison, diagnosis, fit, frf, levels, mac, modes, nyquist, shapes
+from ema_pipeline.report.figures import (
+    comparison,
+    diagnosis,
+    fit,
+    frf,
+    levels,
+    mac,
+    modes,
+    nyquist,
+    shapes,
+    traces,
+)
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.numbers import slug
 from ema_pipeline.report.planetary import layout_of
@@ -173,6 +185,28 @@ def _diagnosed(results: RunResults) -> Iterator[FigureSpec]:
             "",
             "Error of the models rung by rung, on the data fitted and on data held out",
             partial(diagnosis.ladder_errors, ladder),
+        )
+        yield from _simulated_hits(ladder)
+
+
+def _simulated_hits(ladder: Ladder) -> Iterator[FigureSpec]:
+    """Where hits at several force levels were simulated: what was missed, and signals."""
+    if not ladder.force_n:
+        return
+    yield FigureSpec(
+        "diagnosis_misfit",
+        "hits",
+        "",
+        "Share of the measured signals that simulated hits miss, by force level",
+        partial(traces.level_misfits, ladder),
+    )
+    for group in traces.trace_groups(ladder.traces):
+        yield FigureSpec(
+            f"diagnosis_hits_{slug(group[0].configuration)}",
+            "hits",
+            "",
+            traces.traces_caption(group),
+            partial(traces.hit_traces, group, ladder.rungs[-1].effects),
         )
 
 

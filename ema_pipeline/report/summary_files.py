@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Rung
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.report import levels
 from ema_pipeline.report.results import ConfigurationResults, RunResults
@@ -155,8 +155,20 @@ def _ladder(ladder: Ladder) -> list[dict[str, Any]]:
             "frf_error": r.frf_error,
             "parameters": _sizes(r.parameters),
         }
+        | _misfits(ladder, r)
         for r in ladder.rungs
     ]
+
+
+def _misfits(ladder: Ladder, rung: Rung) -> dict[str, Any]:
+    """Normalised time-domain misfit by force level, where hits were simulated."""
+    if not ladder.force_n:
+        return {}
+    return {
+        "force_n": list(ladder.force_n),
+        "misfit": list(rung.misfit),
+        "heldout_misfit": list(rung.heldout_misfit),
+    }
 
 
 def _sizes(sizes: Mapping[str, EffectSize]) -> dict[str, Any]:
