@@ -29,13 +29,14 @@ _SCALE_SHARE = 0.14
 
 @dataclass(frozen=True)
 class MovingBody:
-    """One body: which outline, its place at phase 0, its place at rest, and whether its turn is known."""
+    """One body: which outline, its place at phase 0 and at rest, whether its turn is known, length of its spoke."""
 
     kind: str
     outline_id: str
     transform: str
     rest: str
     turns: bool
+    spoke: float
 
 
 @dataclass(frozen=True)
@@ -132,6 +133,7 @@ def _drawing(stem: str, layout: GearLayout, moved: dict[str, Motion], scale: flo
                 place,
                 f"translate({_n(body.x):g} {_n(body.y):g})",
                 "u" not in motion.missing,
+                _n(0.85 * body.radius),
             )
         )
         u = complex(motion.u) * scale / body.radius * 180 / np.pi
