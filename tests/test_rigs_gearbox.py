@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ema_pipeline.diagnose import DiagnoseSettings, diagnose
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.effects.rig import rig_with_effects
@@ -15,9 +16,11 @@ from ema_pipeline.mechanics.harmonic import harmonic_response
 from ema_pipeline.mechanics.modes import complex_modes, normal_modes
 from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.report.planetary import Motion, missing_words, motions, torsional_layout
+from ema_pipeline.reproduce.gearbox import measure
 from ema_pipeline.rigs import load_rig, model_modes
 from ema_pipeline.rigs.gearbox import default_parameters, gearbox
 from ema_pipeline.rigs.planetary import planetary
+from ema_pipeline.simulate import simulate_campaign
 
 GEARBOX = load_rig("gearbox")
 
@@ -150,3 +153,19 @@ def test_isolator_is_one_mass_on_its_spring_and_takes_its_effects() -> None:
     hysteresis = rig_with_effects(rig, [("hysteresis@isolator", {"force": 133.25, "rho": 631.42})])
     (soft,) = model_modes(hysteresis, "default")
     assert soft.frequency_hz == pytest.approx(np.sqrt((9.702e4 + 133.25 * 631.42) / 2.0) / (2 * np.pi))
+
+
+def test_crack_and_damper_of_a_gearbox_are_found_one_after_the_other_from_raw_hits(tmp_path: Path) -> None:
+    crack, damper = "mesh_stiffness_loss@ring-planet3", "local_damper@carrier"
+    truth = [f"{crack}:fraction=0.25", f"{damper}:coefficient=200"]
+    simulate_campaign(tmp_path / "raw", GEARBOX, effects=truth, scatter=1.0, seed=5, format="hdf5")
+    found = diagnose(
+        GEARBOX, {"default": measure(tmp_path / "raw")}, DiagnoseSettings(processes=1, folds=3)
+    ).ladder
+    assert found is not None
+    assert [r.effects for r in found.rungs] == [(), (crack,), (crack, damper)]
+    base, _, both = found.rungs
+    assert both.error < 1.3 < base.error / 10
+    assert both.heldout_error < 2.0 < base.heldout_error / 10
+    for name, true in ((f"{crack}.fraction", 0.25), (f"{damper}.coefficient", 200.0)):
+        assert both.parameters[name].value == pytest.approx(true, rel=0.05)
