@@ -11,6 +11,15 @@ import pytest
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
+from ema_pipeline.mechanics.assembly import Gyroscopic
+from ema_pipeline.mechanics.laws import (
+    BoucWen,
+    DryFriction,
+    Maxwell,
+    Nonlinear,
+    PartingSpring,
+    PolynomialSpring,
+)
 from ema_pipeline.mechanics.modes import complex_modes
 from ema_pipeline.rigs import Rig, load_rig, model_modes
 from ema_pipeline.toml_lines import key_lines, line_of
@@ -114,6 +123,101 @@ def test_a_row_may_name_its_dofs_with_or_without_quotes(tmp_path: Path) -> None:
     assert plain != ELEMENTS
     rigs = [load_rig(write(tmp_path, text)) for text in (ELEMENTS, plain)]
     np.testing.assert_array_equal(rigs[0].system("free").damping, rigs[1].system("free").damping)
+
+
+ROTOR = """\
+name = "rotor on a mount"
+modal_damping_ratio = 0.0
+[parameters]
+hardening = { value = -1e10, unit = "N/m³", min = -1e12, tolerance = 0.2 }
+[[masses]]
+at = "rotor.x"
+value = 2.0
+[[masses]]
+at = "rotor.y"
+value = 2.0
+[[springs]]
+at = "rotor.x"
+value = 8e4
+loss_factor = 0.04
+[[springs]]
+at = "rotor.y"
+value = 8e4
+[[gyroscopic]]
+between = ["rotor.x", "rotor.y"]
+value = 30.0
+[[nonlinear]]
+law = "cubic"
+at = "rotor.x"
+value = "hardening"
+[[nonlinear]]
+law = "quadratic"
+at = "rotor.x"
+value = 1e7
+[[nonlinear]]
+law = "friction"
+at = "rotor.x"
+value = 2.0
+[[nonlinear]]
+law = "contact"
+at = "rotor.y"
+value = 1e4
+preload = 1e-5
+gap = 1e-4
+[[nonlinear]]
+name = "mesh pad"
+law = "hysteresis"
+at = "rotor.y"
+value = 100.0
+rho = 600.0
+sigma = 0.5
+[[nonlinear]]
+law = "relaxation"
+at = "rotor.y"
+value = 3e4
+time = 0.01
+"""
+
+
+def test_rig_from_scratch_may_hold_every_law_of_the_mechanics(tmp_path: Path) -> None:
+    rig = load_rig(write(tmp_path, ROTOR))
+    assembly = rig.assembly("default")
+    x, y = {"rotor.x": 1.0}, {"rotor.y": 1.0}
+    assert assembly.nonlinear == (
+        PolynomialSpring("nonlinear 1", x, cubic=-1e10),
+        PolynomialSpring("nonlinear 2", x, quadratic=1e7),
+        DryFriction("nonlinear 3", x, 2.0),
+        PartingSpring("nonlinear 4", y, 1e4, preload=1e-5, gap=1e-4),
+        BoucWen("mesh pad", y, 100.0, 600.0, 0.5),
+        Maxwell("nonlinear 6", y, 3e4, 0.01),
+    )
+    shipped = {k for k in Nonlinear.__subclasses__() if k.__module__ == Nonlinear.__module__}
+    assert {type(n) for n in assembly.nonlinear} == shipped
+    assert assembly.named("gyroscopic 1") == Gyroscopic("gyroscopic 1", x, y, 30.0)
+    system = rig.system("default")
+    np.testing.assert_allclose(np.diag(system.stiffness), [8e4, 8e4 + 1e4 + 6e4 + 3e4])
+    np.testing.assert_allclose(system.structural, [[0.04 * 8e4, 0], [0, 0]])
+    np.testing.assert_allclose(system.damping, [[0, 30.0], [-30.0, 0]])
+    assert set(rig.used("default")) == {"hardening", "modal_damping_ratio"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "words"),
+    [
+        ('law = "cubic"', 'law = "qubic"', 22, "nonlinear.0.law = 'qubic'"),
+        ('law = "cubic"', 'low = "cubic"', 21, "'nonlinear.0.law' is missing"),
+        ("preload = 1e-5\n", "", 33, "key 'preload' is missing"),
+        ("sigma = 0.5", 'sigma = "sigma"', 45, "sigma 'sigma' is no parameter"),
+        ("rho = 600.0", "rho = -600.0", 39, "'mesh pad': a Bouc-Wen element needs rho > 0"),
+        ("time = 0.01", "time = 0", 46, "a relaxation needs a time above 0 s"),
+        ('between = ["rotor.x", "rotor.y"]', 'at = "rotor.x"', 18, "key 'between' is missing"),
+        ("min = -1e12, ", "", 4, "'hardening' = -1e+10 N/m³ lies outside its bounds 0 … inf"),
+    ],
+)
+def test_mistakes_in_laws_name_file_line_and_key(
+    tmp_path: Path, old: str, new: str, line: int, words: str
+) -> None:
+    _expect(tmp_path, ROTOR, old, new, line, words)
 
 
 MISTAKES = [

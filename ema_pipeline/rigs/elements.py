@@ -1,88 +1,38 @@
-"""Rigs of the user's own: masses, springs and dampers listed in a rig file."""
+"""Rigs of the user's own: masses, springs, dampers and nonlinear elements listed in a rig file."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
-
-from pydantic import Field, field_validator
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError, did_you_mean
-from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Mass, Row, Spring, difference
+from ema_pipeline.mechanics.assembly import (
+    Assembly,
+    Damper,
+    Element,
+    Gyroscopic,
+    Mass,
+    Nonlinear,
+    Row,
+    Spring,
+    difference,
+)
+from ema_pipeline.mechanics.laws import (
+    BoucWen,
+    DryFriction,
+    Maxwell,
+    PartingSpring,
+    PolynomialSpring,
+    check_element,
+)
 from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.rigs.base import ParametricRig
-from ema_pipeline.rigs.entries import Mistake, ParameterEntry, merged
+from ema_pipeline.rigs.element_entries import ElementEntry, ElementRigFile, NonlinearEntry
+from ema_pipeline.rigs.entries import Mistake, merged
 from ema_pipeline.rigs.types import Parameter, Rig
-from ema_pipeline.settings import Settings
 from ema_pipeline.toml_lines import Location
-
-
-def _flat(row: Any) -> Any:
-    """``row = { top.x = 1.0 }`` is the same as ``row = { "top.x" = 1.0 }``."""
-    if not isinstance(row, dict):
-        return row
-    flat: dict[str, Any] = {}
-    for key, value in row.items():
-        inner = {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {key: value}
-        flat |= inner
-    return flat
-
-
-class ElementEntry(Settings):
-    """A mass, spring or damper at one DOF, between two, or along a row of coefficients."""
-
-    name: str | None = Field(None, description="name that effects and messages use")
-    at: str | None = Field(None, description="DOF, to ground: 'plate.x'")
-    between: tuple[str, str] | None = Field(None, description="two DOFs: ['plate.x', 'base.x']")
-    row: dict[str, float] | None = Field(None, description="coefficients of the stretch over DOFs")
-    value: float | str = Field(description="number in SI, or the name of a parameter")
-    configurations: tuple[str, ...] = Field((), description="only in these configurations; all if empty")
-
-    _flat_row = field_validator("row", mode="before")(_flat)
-
-    @field_validator("between", mode="before")
-    @classmethod
-    def _two(cls, given: object) -> object:
-        if given is not None and (not isinstance(given, list | tuple) or len(given) != 2):
-            raise ValueError("name two DOFs, e.g. ['plate.x', 'base.x']")
-        return given
-
-
-class SensorEntry(Settings):
-    """A sensor place that is no coordinate of its own."""
-
-    dof: str = Field(description="place, 'plate.corner'")
-    row: dict[str, float] = Field(description="coefficients of what the sensor reads over the coordinates")
-
-    _flat_row = field_validator("row", mode="before")(_flat)
-
-
-class ElementRigFile(Settings):
-    """A rig file from scratch: its coordinates are the DOFs of its masses."""
-
-    name: str = Field(min_length=1, description="name of the rig")
-    configurations: tuple[str, ...] = Field(("default",), min_length=1, description="configurations")
-    modal_damping_ratio: float = Field(
-        0.01, ge=0, lt=1, description="damping ratio of every mode, 30 % tolerance"
-    )
-    parameters: dict[str, ParameterEntry] = Field({}, description="values with unit and tolerance")
-    masses: tuple[ElementEntry, ...] = Field(min_length=1, description="masses, kg")
-    springs: tuple[ElementEntry, ...] = Field((), description="springs, N/m")
-    dampers: tuple[ElementEntry, ...] = Field((), description="viscous dampers, N·s/m")
-    sensors: tuple[SensorEntry, ...] = Field((), description="further sensor places")
-
-    def entries(self) -> Iterator[tuple[Location, ElementEntry]]:
-        """All elements with their places in the file."""
-        for section in ("masses", "springs", "dampers"):
-            for i, entry in enumerate(getattr(self, section)):
-                yield (section, i), entry
-
-    def present(self, entry: ElementEntry, configuration: str) -> bool:
-        """True where the element is there in this configuration."""
-        return configuration in (entry.configurations or self.configurations)
 
 
 def rig_from_elements(file: ElementRigFile) -> Rig:
@@ -120,7 +70,7 @@ def rig_from_elements(file: ElementRigFile) -> Rig:
         try:
             eigen_solution(rig.system(configuration))
         except EmaError as error:
-            raise Mistake(_suspect(file, parameters), str(error)) from None
+            raise Mistake(_suspect(file, parameters, str(error)), str(error)) from None
     return rig
 
 
@@ -149,15 +99,16 @@ def _sensors(file: ElementRigFile) -> dict[str, Row]:
 def _check_element(
     file: ElementRigFile, location: Location, entry: ElementEntry, parameters: Mapping[str, Parameter]
 ) -> None:
-    value = entry.value
-    if isinstance(value, str):
-        if value not in parameters:
+    for key, number in entry.numbers.items():
+        if isinstance(number, str) and number not in parameters:
             try:
-                hint = f"; write it without quotes: value = {float(value):g}"
+                hint = f"; write it without quotes: {key} = {float(number):g}"
             except ValueError:
-                hint = did_you_mean(value, parameters)
-            raise Mistake((*location, "value"), f"value '{value}' is no parameter{hint}")
-        value = parameters[value].value
+                hint = did_you_mean(number, parameters)
+            raise Mistake((*location, key), f"{key} '{number}' is no parameter{hint}")
+    if entry.lacks is not None:
+        raise Mistake(location, f"key '{entry.lacks}' is missing; add it")
+    value = parameters[entry.value].value if isinstance(entry.value, str) else entry.value
     if location[0] == "masses" and value <= 0:
         raise Mistake((*location, "value"), f"value = {value:g} kg: give a mass above 0")
     if location[0] == "dampers" and value < 0:
@@ -189,9 +140,11 @@ def _check_dofs(file: ElementRigFile, configuration: str, sensors: Mapping[str, 
                 raise Mistake((*where, key), f"dof '{dof}' has no mass{where_from}{did_you_mean(dof, dofs)}")
 
 
-def _suspect(file: ElementRigFile, parameters: Mapping[str, Parameter]) -> Location:
-    """The first negative spring, or all springs."""
+def _suspect(file: ElementRigFile, parameters: Mapping[str, Parameter], message: str) -> Location:
+    """The element that the message names, or the first negative spring, or all springs."""
     for where, entry in file.entries():
+        if where[0] == "nonlinear" and f"'{entry.name or f'nonlinear {int(where[1]) + 1}'}'" in message:
+            return where
         value = parameters[entry.value].value if isinstance(entry.value, str) else entry.value
         if where[0] == "springs" and value < 0:
             return (*where, "value")
@@ -201,25 +154,63 @@ def _suspect(file: ElementRigFile, parameters: Mapping[str, Parameter]) -> Locat
 def _uses(file: ElementRigFile, configuration: str, name: str) -> bool:
     if name == "modal_damping_ratio":
         return True
-    return any(entry.value == name and file.present(entry, configuration) for _, entry in file.entries())
+    return any(
+        name in entry.numbers.values() and file.present(entry, configuration) for _, entry in file.entries()
+    )
 
 
 def _build(file: ElementRigFile, configuration: str, values: Mapping[str, float]) -> Assembly:
     sensors = _sensors(file)
-    kinds = {"masses": ("mass", Mass), "springs": ("spring", Spring), "dampers": ("damper", Damper)}
     elements: list[Element] = []
     numbers: Counter[str] = Counter()
     dofs: dict[str, None] = {}
-    for where, e in file.entries():
-        if not file.present(e, configuration):
+    for where, entry in file.entries():
+        if not file.present(entry, configuration):
             continue
-        word, kind = kinds[str(where[0])]
-        numbers[word] += 1
-        row = _row(e, sensors, where)
-        value = values[e.value] if isinstance(e.value, str) else e.value
-        elements.append(kind(e.name or f"{word} {numbers[word]}", row, value))
-        dofs |= dict.fromkeys(row) if kind is Mass else {}
+        section = str(where[0])
+        numbers[section] += 1
+        element = _element(section, numbers[section], entry, _row(entry, sensors, where), values, sensors)
+        elements.append(element)
+        if isinstance(element, Mass):
+            dofs |= dict.fromkeys(element.row)
     return Assembly(tuple(dofs), tuple(elements), sensors, values["modal_damping_ratio"])
+
+
+def _element(
+    section: str,
+    number: int,
+    entry: ElementEntry,
+    row: Row,
+    values: Mapping[str, float],
+    sensors: Mapping[str, Row],
+) -> Element:
+    v = {key: values[x] if isinstance(x, str) else x for key, x in entry.numbers.items()}
+    words = {"masses": "mass", "springs": "spring", "dampers": "damper"}
+    name = entry.name or f"{words.get(section, section)} {number}"
+    if section == "masses":
+        return Mass(name, row, v["value"])
+    if section == "springs":
+        return Spring(name, row, v["value"], v["loss_factor"])
+    if section == "dampers":
+        return Damper(name, row, v["value"])
+    if section == "gyroscopic":
+        assert entry.between is not None
+        a, b = (_place(text, sensors, ()) for text in entry.between)
+        return Gyroscopic(name, a, b, v["value"])
+    assert isinstance(entry, NonlinearEntry)
+    element = _LAWS[entry.law](name, row, v)
+    check_element(element)
+    return element
+
+
+_LAWS: dict[str, Callable[[str, Row, Mapping[str, float]], Nonlinear]] = {
+    "quadratic": lambda name, row, v: PolynomialSpring(name, row, quadratic=v["value"]),
+    "cubic": lambda name, row, v: PolynomialSpring(name, row, cubic=v["value"]),
+    "friction": lambda name, row, v: DryFriction(name, row, v["value"], v["velocity"]),
+    "contact": lambda name, row, v: PartingSpring(name, row, v["value"], preload=v["preload"], gap=v["gap"]),
+    "hysteresis": lambda name, row, v: BoucWen(name, row, v["value"], v["rho"], v["sigma"], v["exponent"]),
+    "relaxation": lambda name, row, v: Maxwell(name, row, v["value"], v["time"]),
+}
 
 
 def _row(entry: ElementEntry, sensors: Mapping[str, Row], location: Location) -> Row:
@@ -233,21 +224,22 @@ def _row(entry: ElementEntry, sensors: Mapping[str, Row], location: Location) ->
         )
     if entry.row is not None:
         return dict(entry.row)
-
-    def place(text: str) -> Row:
-        dof = _parsed_dof(text, (*location, given[0]))
-        return {d: dof.sign * c for d, c in sensors.get(dof.point, {dof.point: 1.0}).items()}
-
+    here = (*location, given[0])
     if entry.at is not None:
-        return place(entry.at)
+        return _place(entry.at, sensors, here)
     assert entry.between is not None
-    row = difference(place(entry.between[0]), place(entry.between[1]))
+    row = difference(*(_place(text, sensors, here) for text in entry.between))
     if not any(row.values()):
         raise Mistake(
             (*location, "between"),
             f"between '{entry.between[0]}' and itself there is no stretch; name two places",
         )
     return row
+
+
+def _place(text: str, sensors: Mapping[str, Row], location: Location) -> Row:
+    dof = _parsed_dof(text, location)
+    return {d: dof.sign * c for d, c in sensors.get(dof.point, {dof.point: 1.0}).items()}
 
 
 def _parsed_dof(text: str, location: Location) -> Dof:

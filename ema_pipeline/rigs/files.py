@@ -13,7 +13,8 @@ from pydantic import Field, field_validator
 
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.rigs.base import RigKind
-from ema_pipeline.rigs.elements import ElementRigFile, rig_from_elements
+from ema_pipeline.rigs.element_entries import ElementRigFile
+from ema_pipeline.rigs.elements import rig_from_elements
 from ema_pipeline.rigs.entries import Mistake, ParameterEntry, merged, parsed
 from ema_pipeline.rigs.types import Parameter, Rig
 from ema_pipeline.settings import Settings

@@ -1,0 +1,146 @@
+"""How a rig file lists masses, springs, dampers and nonlinear elements."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from ema_pipeline.rigs.entries import ParameterEntry
+from ema_pipeline.settings import Settings
+from ema_pipeline.toml_lines import Location
+
+SECTIONS = ("masses", "springs", "dampers", "gyroscopic", "nonlinear")
+
+
+def _flat(row: Any) -> Any:
+    """``row = { top.x = 1.0 }`` is the same as ``row = { "top.x" = 1.0 }``."""
+    if not isinstance(row, dict):
+        return row
+    flat: dict[str, Any] = {}
+    for key, value in row.items():
+        inner = {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {key: value}
+        flat |= inner
+    return flat
+
+
+class ElementEntry(Settings):
+    """A mass, spring or damper at one DOF, between two, or along a row of coefficients."""
+
+    name: str | None = Field(None, description="name that effects and messages use")
+    at: str | None = Field(None, description="DOF, to ground: 'plate.x'")
+    between: tuple[str, str] | None = Field(None, description="two DOFs: ['plate.x', 'base.x']")
+    row: dict[str, float] | None = Field(None, description="coefficients of the stretch over DOFs")
+    value: float | str = Field(description="number in SI, or the name of a parameter")
+    configurations: tuple[str, ...] = Field((), description="only in these configurations; all if empty")
+
+    _flat_row = field_validator("row", mode="before")(_flat)
+
+    @field_validator("between", mode="before")
+    @classmethod
+    def _two(cls, given: object) -> object:
+        if given is not None and (not isinstance(given, list | tuple) or len(given) != 2):
+            raise ValueError("name two DOFs, e.g. ['plate.x', 'base.x']")
+        return given
+
+    @property
+    def numbers(self) -> dict[str, float | str]:
+        """All numbers, or the names of parameters in their places."""
+        return {"value": self.value}
+
+    @property
+    def lacks(self) -> str | None:
+        """A key that the element needs and does not have."""
+        return None
+
+
+class SpringEntry(ElementEntry):
+    """A spring, with loss where it is not lossless."""
+
+    loss_factor: float | str = Field(0.0, description="imaginary over real stiffness")
+
+    @property
+    def numbers(self) -> dict[str, float | str]:
+        """See `ElementEntry`."""
+        return {"value": self.value, "loss_factor": self.loss_factor}
+
+
+class GyroscopicEntry(ElementEntry):
+    """Lossless skew coupling of the two DOFs in `between`."""
+
+    @property
+    def lacks(self) -> str | None:
+        """See `ElementEntry`."""
+        return "between" if self.between is None else None
+
+
+Law = Literal["quadratic", "cubic", "friction", "contact", "hysteresis", "relaxation"]
+_NEEDS: dict[Law, tuple[str, ...]] = {
+    "quadratic": (),
+    "cubic": (),
+    "friction": (),
+    "contact": ("preload",),
+    "hysteresis": ("rho", "sigma"),
+    "relaxation": ("time",),
+}
+
+
+class NonlinearEntry(ElementEntry):
+    """An element with a law of `mechanics.laws`; `value` is its factor, stiffness or force."""
+
+    law: Law = Field(description="what its force follows")
+    velocity: float | str = Field(1e-3, description="friction: below it creeps, m/s")
+    preload: float | str | None = Field(None, description="contact: deflection past which it parts, m")
+    gap: float | str = Field(1e3, description="contact: way to its back, m")
+    rho: float | str | None = Field(None, description="hysteresis: 1/m")
+    sigma: float | str | None = Field(None, description="hysteresis: shape of the unloading branch")
+    exponent: float | str = Field(1.0, description="hysteresis: sharpness of the yield")
+    time: float | str | None = Field(None, description="relaxation: damper over spring, s")
+
+    @property
+    def numbers(self) -> dict[str, float | str]:
+        """See `ElementEntry`."""
+        keys = ("value", "velocity", "preload", "gap", "rho", "sigma", "exponent", "time")
+        return {k: v for k in keys if (v := getattr(self, k)) is not None}
+
+    @property
+    def lacks(self) -> str | None:
+        """See `ElementEntry`."""
+        return next((key for key in _NEEDS[self.law] if getattr(self, key) is None), None)
+
+
+class SensorEntry(Settings):
+    """A sensor place that is no coordinate of its own."""
+
+    dof: str = Field(description="place, 'plate.corner'")
+    row: dict[str, float] = Field(description="coefficients of what the sensor reads over the coordinates")
+
+    _flat_row = field_validator("row", mode="before")(_flat)
+
+
+class ElementRigFile(Settings):
+    """A rig file from scratch: its coordinates are the DOFs of its masses."""
+
+    name: str = Field(min_length=1, description="name of the rig")
+    configurations: tuple[str, ...] = Field(("default",), min_length=1, description="configurations")
+    modal_damping_ratio: float = Field(
+        0.01, ge=0, lt=1, description="damping ratio of every mode, 30 % tolerance"
+    )
+    parameters: dict[str, ParameterEntry] = Field({}, description="values with unit and tolerance")
+    masses: tuple[ElementEntry, ...] = Field(min_length=1, description="masses, kg")
+    springs: tuple[SpringEntry, ...] = Field((), description="springs, N/m")
+    dampers: tuple[ElementEntry, ...] = Field((), description="viscous dampers, N·s/m")
+    gyroscopic: tuple[GyroscopicEntry, ...] = Field((), description="skew couplings, N·s/m")
+    nonlinear: tuple[NonlinearEntry, ...] = Field((), description="elements with a law of their own")
+    sensors: tuple[SensorEntry, ...] = Field((), description="further sensor places")
+
+    def entries(self) -> Iterator[tuple[Location, ElementEntry]]:
+        """All elements with their places in the file."""
+        for section in SECTIONS:
+            for i, entry in enumerate(getattr(self, section)):
+                yield (section, i), entry
+
+    def present(self, entry: ElementEntry, configuration: str) -> bool:
+        """True where the element is there in this configuration."""
+        return configuration in (entry.configurations or self.configurations)
