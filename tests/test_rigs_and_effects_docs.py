@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from ema_pipeline.mechanics.modes import complex_modes
 from ema_pipeline.mechanics.nonlinear import force_along
 from ema_pipeline.pipeline import existing_run
 from ema_pipeline.rigs import Rig, load_rig, model_modes
+from ema_pipeline.rigs.element_entries import SECTIONS, Law
 from ema_pipeline.stages.results import load_results
 
 DOCS = Path(__file__).parent.parent / "docs"
@@ -37,6 +39,14 @@ def test_rig_files_of_the_page_on_rigs_load(tmp_path: Path, index: int) -> None:
     assert rig.name in ("my gearbox", "two blocks")
     for configuration in rig.configurations:
         assert model_modes(rig, configuration)
+
+
+def test_the_page_on_rigs_names_every_section_and_law() -> None:
+    page = (DOCS / "adding_a_rig.md").read_text(encoding="utf-8")
+    for section in SECTIONS:
+        assert f"[[{section}]]" in page
+    for law in get_args(Law):
+        assert f'"{law}"' in page
 
 
 def test_python_rig_of_the_page_on_rigs_runs() -> None:
