@@ -25,8 +25,11 @@ from ema_pipeline.ingest.description import read_description
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import cut_hit
+from ema_pipeline.modal import segment
 from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.fit import Estimate
 from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.polish import polish
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.modal.windowed import power_of
@@ -243,6 +246,75 @@ def test_damping_under_an_exponential_window_is_right_whoever_put_it_on(by: str,
         assert frequencies(model) == pytest.approx(system.frequency_hz, rel=1e-4)
         errors += list(np.abs(dampings(model) / system.damping_ratio - 1))
     assert np.median(errors) < 0.005
+
+
+def test_a_truncated_record_is_flagged_at_its_hits_and_at_the_modes_that_ring_on() -> None:
+    """A mode of damping ζ at f has exp(-2πfζT) left after a time T; 5 % is the limit for modes."""
+    rest = 4.0 - 20 / 256.0
+    zeta = -np.log([0.10, 0.02]) / (2 * np.pi * np.array([40.0, 77.0]) * rest)
+    system = TrueSystem(np.array([40.0, 77.0]), zeta, np.random.default_rng(4).standard_normal((2, 4)))
+    flags, passes = {}, {}
+    for record_s in (4.0, 12.0):
+        hits = simulate_hits(
+            system, [0, 1, 2, 3], [0], f_max=100.0, record_s=record_s, n_hits=2, force_noise=0.002,
+            response_noise=0.002, rng=np.random.default_rng(1),
+        )  # fmt: skip
+        records = records_of(hits, [0, 1, 2, 3], [0])
+        judged = hits_of_test(records)
+        passes[record_s] = {v.passes for h in judged for v in h.verdicts if v.check == "response decay"}
+        model = identify(
+            estimate_frfs(cut_hit(r, h) for r, h in zip(records, judged, strict=True)), ModalSettings()
+        )
+        flags[record_s] = [any("decays longer than the record" in f for f in m.flags) for m in model.modes]
+        assert dampings(model) == pytest.approx(system.damping_ratio, rel=0.02)
+    assert False in passes[4.0]
+    assert flags[4.0] == [True, False]
+    assert passes[12.0] == {True}
+    assert flags[12.0] == [False, False]
+
+
+def test_a_mode_that_the_polish_drives_away_is_kept_as_it_was_with_a_flag_and_a_wider_uncertainty(
+    five: ModalModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(data, weight, start, iterations, held):  # the third mode's damping falls below zero
+        estimate, solution = polish(data, weight, start, iterations, held)
+        gone = (np.abs(estimate.poles.imag / (2 * np.pi) - 120.0) < 1.0) & ~held
+        poles = np.where(gone, -estimate.poles.conj(), estimate.poles)
+        return Estimate(poles, estimate.participation), solution
+
+    monkeypatch.setattr(segment, "polish", failing)
+    model = identify(hammer_test(FIVE, list(range(8)), [0, 3]), ModalSettings())
+    assert frequencies(model) == pytest.approx(FIVE.frequency_hz, rel=1e-3)
+    assert ["polish failed" in "".join(m.flags) for m in model.modes] == [False, False, True, False, False]
+    kept, polished = model.modes[2], five.modes[2]
+    assert kept.damping_std > 2 * polished.damping_std
+    assert abs(kept.damping_ratio - 0.008) < 3 * kept.damping_std
+
+
+def test_what_the_polish_drives_away_and_the_frfs_do_not_show_is_no_mode(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(5)
+    frf = FIVE.accelerance(np.arange(1601) * 0.25, [0, 1, 2, 3], [0])
+    frf = frf + 0.01 * np.abs(frf).max() * (
+        rng.standard_normal(frf.shape) + 1j * rng.standard_normal(frf.shape)
+    )
+    frfs = frf_set(np.arange(1601) * 0.25, frf, [0, 1, 2, 3], [0], band_hz=(200.0, 290.0))
+
+    def failing(data, weight, start, iterations, held):
+        estimate, solution = polish(data, weight, start, iterations, held)
+        return Estimate(
+            np.where(held, estimate.poles, -estimate.poles.conj()), estimate.participation
+        ), solution
+
+    monkeypatch.setattr(segment, "polish", failing)
+    assert identify(frfs, ModalSettings(low_hz=200, high_hz=290)).modes == ()
+
+
+def test_without_polish_the_uncertainty_holds_the_bias_of_the_engine() -> None:
+    raw = identify(hammer_test(FIVE, list(range(8)), [0, 3]), ModalSettings(polish=False))
+    stds = np.array([m.damping_std for m in raw.modes])
+    assert np.all(np.abs(dampings(raw) - FIVE.damping_ratio) < 4 * stds)
 
 
 def test_noise_of_neighbouring_lines_under_a_window_correlates_as_the_fit_takes_it() -> None:

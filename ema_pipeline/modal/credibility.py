@@ -19,7 +19,7 @@ from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, LinearSolution, newton_step, synthesis
 from ema_pipeline.modal.missed import left_over
 from ema_pipeline.modal.noise import Noise
-from ema_pipeline.modal.segment import SegmentFit
+from ema_pipeline.modal.segment import SegmentFit, impossible
 from ema_pipeline.modal.uncertainty import evidence
 from ema_pipeline.modal.windowed import likeness
 
@@ -32,8 +32,6 @@ FALSE_ALARM = 1e-6
 
 MAX_DAMPING_STD = 0.35
 """A pole whose damping is not known to this share is not told from noise."""
-
-MAX_DAMPING_RATIO = 0.2
 
 MIN_VOTES = 0.3
 """Share of model orders that must show a mode, unless the FRFs show it plainly or the noise is known."""
@@ -79,7 +77,7 @@ ECHO_MAC = 0.6
 
 def significant(data: FitData, fit: SegmentFit) -> NDArray[np.bool_]:
     """Candidates to drop from a first guess: impossible ones, else those that noise alone could make."""
-    out = _impossible(data, fit.estimate)
+    out = impossible(data, fit.estimate)
     return out if out.any() else _next(_strength_over_noise(data, fit))
 
 
@@ -95,7 +93,7 @@ def credible(data: FitData, fit: SegmentFit, hits: Noise | None, votes: Votes) -
     votes : callable
     """
     estimate, solution = fit.estimate, fit.solution
-    out = _impossible(data, estimate)
+    out = impossible(data, estimate)
     if out.any():
         return out
     explained = np.zeros(len(out), dtype=bool)
@@ -105,14 +103,28 @@ def credible(data: FitData, fit: SegmentFit, hits: Noise | None, votes: Votes) -
     if out.any():
         return out
     zeta = -estimate.poles.real / np.abs(estimate.poles)
-    plain = np.where(zeta > PLAIN_DAMPING, 0.0, visibility(data, estimate, solution) / PLAIN)
+    plain = _plainness(data, estimate, solution)
     distance = np.abs(estimate.poles[:, None] - estimate.poles[None]) + np.diag(np.full(len(zeta), np.inf))
     twin = distance.min(axis=1) < COINCIDENT * -estimate.poles.real
     needed = np.where((zeta > PLAIN_DAMPING) | twin, SURE_VOTES, MIN_VOTES)
-    support = np.maximum(votes(estimate) / needed, np.where(twin, 0.0, plain))
+    share = votes(estimate)
+    support = np.maximum(share / needed, np.where(twin, 0.0, plain))
     support = np.where(_incoherent(solution), 0.0, support)
     support = np.where(explained, np.maximum(support, 1.0), support)
+    # where the polish finds no place for a mode, it is one only if most orders and the FRFs show it plainly
+    support = np.where(fit.held, np.minimum(plain, share / SURE_VOTES), support)
     return _next(np.minimum(_strength_over_noise(data, fit), support))
+
+
+def evident(data: FitData, estimate: Estimate, solution: LinearSolution, votes: Votes) -> NDArray[np.bool_]:
+    """Modes that most orders and the FRFs show plainly."""
+    return np.asarray((_plainness(data, estimate, solution) >= 1) & (votes(estimate) >= SURE_VOTES))
+
+
+def _plainness(data: FitData, estimate: Estimate, solution: LinearSolution) -> Real:
+    """Above 1 where the FRFs show a mode plainly; 0 for what only shapes a background."""
+    zeta = -estimate.poles.real / np.abs(estimate.poles)
+    return np.where(zeta > PLAIN_DAMPING, 0.0, visibility(data, estimate, solution) / PLAIN)
 
 
 def _incoherent(solution: LinearSolution) -> NDArray[np.bool_]:
@@ -127,18 +139,15 @@ def _next(score: Real) -> NDArray[np.bool_]:
     return np.asarray((score < 1) & (score <= max(HOPELESS, float(score.min()))))
 
 
-def _impossible(data: FitData, estimate: Estimate) -> NDArray[np.bool_]:
-    poles = estimate.poles
-    zeta = -poles.real / np.abs(poles)
-    outside = (poles.imag < data.omega[0]) | (poles.imag > data.omega[-1])
-    return np.asarray((poles.real >= 0) | (zeta > MAX_DAMPING_RATIO) | outside)
-
-
 def _strength_over_noise(data: FitData, fit: SegmentFit) -> Real:
-    """Above 1 where noise cannot have made the candidate, and its damping is known well enough."""
+    """Above 1 where noise cannot have made the candidate, and its damping is known well enough.
+
+    The damping of a mode that the polish could not place is not known, and said to be so.
+    """
     gain, threshold = significance(data, fit.noise, fit.estimate, fit.solution)
     std = decay_std(fit.estimate, fit.solution) * np.sqrt(likeness(-fit.estimate.poles.real, data))
-    return np.asarray(np.minimum(gain / threshold, MAX_DAMPING_STD / np.maximum(std, 1e-9)))
+    known = np.where(fit.held, np.inf, MAX_DAMPING_STD / np.maximum(std, 1e-9))
+    return np.asarray(np.minimum(gain / threshold, known))
 
 
 def _size(estimate: Estimate, solution: LinearSolution) -> Real:

@@ -42,6 +42,12 @@ Real = NDArray[np.float64]
 POLISH_ITERATIONS = 25
 """Enough for every case seen; the polish stops when it has converged."""
 
+RINGS_ON = 0.05
+"""Share of a mode that may be left at the end of the record: three time constants have passed."""
+
+UNPOLISHED = "polish failed: pole as the model orders give it, with a wider uncertainty"
+RESTLESS = "polish has not come to rest: what is left to go is in the uncertainty"
+
 
 def identify(frfs: FrfSet, settings: ModalSettings, progress: Progress | None = None) -> ModalModel:
     """Identify the modes that the FRFs show, with uncertainties.
@@ -144,6 +150,11 @@ def _model(
             settings.engine,
             float(stability[k]),
             float(scaled.scale_std[k]),
+            [
+                *_record_flags(float(np.exp(modes.poles[j].real * data.rest_s))),
+                *([UNPOLISHED] if modes.held[j] else []),
+                *([RESTLESS] if settings.polish and modes.restless[j] and not modes.held[j] else []),
+            ],
         )
         for k, j in enumerate(order)
     )
@@ -171,12 +182,12 @@ def _mode(
     method: str,
     stability: float,
     scale_std: float,
+    flags: list[str],
 ) -> Mode:
     size = abs(pole)
     along = np.array([pole.real, pole.imag]) / size
     zeta = -pole.real / size
     across = np.array([-1.0 / size + pole.real**2 / size**3, pole.real * pole.imag / size**3])
-    flags = []
     if np.isfinite(scale_std) and scale_std > 0.1:
         flags.append(f"scale uncertain by {100 * scale_std:.0f} %: the driving point lies near a node")
     if zeta <= 0:
@@ -194,6 +205,15 @@ def _mode(
         stability=stability,
         flags=tuple(flags),
     )
+
+
+def _record_flags(left: float) -> list[str]:
+    """What is left of a mode at the end of the record, over its start, said where that is too much."""
+    if left <= RINGS_ON:
+        return []
+    return [
+        f"decays longer than the record ({100 * left:.2g} % left at its end): damping relies on the leakage model"
+    ]
 
 
 def _chart(charts: list[PoleSet], poles: Complex, decay: float) -> tuple[StabilisationChart, Real]:

@@ -9,6 +9,8 @@ from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import (
     Estimate,
     LinearSolution,
+    Step,
+    free_participations,
     moved,
     newton_step,
     normalised,
@@ -27,7 +29,11 @@ hundredths of their standard deviation."""
 
 
 def polish(
-    data: FitData, weight: Real, start: Estimate, iterations: int = MAX_ITERATIONS
+    data: FitData,
+    weight: Real,
+    start: Estimate,
+    iterations: int = MAX_ITERATIONS,
+    held: NDArray[np.bool_] | None = None,
 ) -> tuple[Estimate, LinearSolution]:
     """Levenberg–Marquardt on poles and participations, shapes and residual terms eliminated.
 
@@ -38,6 +44,8 @@ def polish(
         One over variance; 0 where not measured.
     start : Estimate
     iterations : int
+    held : ndarray of bool, (n_modes,), optional
+        Modes whose poles and participations stay as they are.
 
     Returns
     -------
@@ -49,6 +57,8 @@ def polish(
     damping = 1e-3
     for _ in range(iterations):
         step = newton_step(estimate, solution)
+        if held is not None:
+            step = _without(step, estimate, held)
         diagonal = np.diag(step.information).copy()
         diagonal = np.where(diagonal > 0, diagonal, 1.0)
         scale = 1 / np.sqrt(diagonal)
@@ -57,10 +67,13 @@ def polish(
         for _ in range(6):
             scaled = step.information * scale[:, None] * scale[None]
             scaled[np.diag_indices_from(scaled)] += damping
-            change = scale * np.linalg.lstsq(scaled, scale * step.gradient, rcond=1e-13)[0]
-            change = _limited(estimate, change)
-            trial = moved(estimate, change)
-            trial_solution = solve_linear(data, weight, trial)
+            try:
+                change = scale * np.linalg.lstsq(scaled, scale * step.gradient, rcond=1e-13)[0]
+                change = _limited(estimate, change)
+                trial = moved(estimate, change)
+                trial_solution = solve_linear(data, weight, trial)
+            except np.linalg.LinAlgError:  # a step too far: a shorter one may do
+                trial_solution = solution
             if trial_solution.cost < solution.cost:
                 accepted = True
                 break
@@ -77,6 +90,15 @@ def polish(
             estimate = Estimate(estimate.poles, pivoted)
             solution = solve_linear(data, weight, estimate)
     return estimate, solution
+
+
+def _without(step: Step, estimate: Estimate, held: NDArray[np.bool_]) -> Step:
+    """Normal equations in which the parameters of some modes do not move."""
+    modes = [r for r, _ in free_participations(estimate)]
+    fixed = np.repeat(np.concatenate([held, held[modes]]), 2)
+    information, gradient = step.information.copy(), np.where(fixed, 0.0, step.gradient)
+    information[fixed] = information[:, fixed] = 0.0
+    return Step(information, gradient)
 
 
 def _limited(estimate: Estimate, change: Real) -> Real:

@@ -26,6 +26,9 @@ Real = NDArray[np.float64]
 ROUGH = 4
 """Iterations of the polish while there is still something to drop."""
 
+MAX_DAMPING_RATIO = 0.2
+"""A pole with more is no mode."""
+
 
 @dataclass(frozen=True)
 class SegmentFit:
@@ -36,15 +39,21 @@ class SegmentFit:
     estimate : Estimate
     solution : LinearSolution
     noise : Noise
+    held : ndarray of bool, (n_modes,)
+        Modes that the polish would have driven away: they stay where they were before it.
     """
 
     estimate: Estimate
     solution: LinearSolution
     noise: Noise
+    held: NDArray[np.bool_]
 
 
 Judge = Callable[[FitData, SegmentFit], NDArray[np.bool_]]
 """Tells which modes of a fit to drop now."""
+
+Evident = Callable[[FitData, Estimate, LinearSolution], NDArray[np.bool_]]
+"""Tells which modes are there beyond doubt."""
 
 
 def fit_segment(
@@ -54,8 +63,12 @@ def fit_segment(
     candidates: Estimate,
     judge: Judge,
     iterations: int,
+    evident: Evident | None = None,
 ) -> SegmentFit:
     """Polish the candidates of a sub-band until the judge drops none.
+
+    What the polish drives to where no mode can be (no damping, too much of it, out of the band) is dropped, but
+    for evident modes: they are put back and held there while the others move on.
 
     Parameters
     ----------
@@ -68,23 +81,48 @@ def fit_segment(
     judge : callable
     iterations : int
         Of the polish; 0 keeps the engine's poles.
+    evident : callable, optional
+        Tells which modes are beyond doubt, whatever the polish makes of them; none where left out.
     """
     estimate = Estimate(candidates.poles, normalised(candidates.participation))
     noise = start
+    held = np.zeros(len(estimate.poles), dtype=bool)
     budget = min(iterations, ROUGH)
     while True:
         weight = noise.weight(data.measured)
-        estimate, solution = polish(data, weight, estimate, budget)
+        before = estimate
+        estimate, solution = polish(data, weight, before, budget, held)
+        lost = impossible(data, estimate) & ~impossible(data, before)
+        if evident is not None and lost.any():
+            back = _put_back(estimate, before, lost)
+            lost &= evident(data, back, solve_linear(data, weight, back))
+            if lost.any():
+                estimate, held = _put_back(estimate, before, lost), held | lost
+                continue
         noise = measured_noise(data, hits, estimate, solution, weight)
         solution = solve_linear(data, noise.weight(data.measured), estimate)
-        fit = SegmentFit(estimate, solution, noise)
+        fit = SegmentFit(estimate, solution, noise, held)
         drop = judge(data, fit) if len(estimate.poles) else np.zeros(0, dtype=bool)
         if drop.any():
-            estimate, budget = estimate.take(~drop), min(iterations, ROUGH)
+            estimate, held, budget = estimate.take(~drop), held[~drop], min(iterations, ROUGH)
         elif budget == iterations or not len(estimate.poles):
             return fit
         else:  # all stand: converge and judge once more
             budget = iterations
+
+
+def impossible(data: FitData, estimate: Estimate) -> NDArray[np.bool_]:
+    """Poles that are no modes of the lines analysed, whatever the data say."""
+    poles = estimate.poles
+    zeta = -poles.real / np.abs(poles)
+    outside = (poles.imag < data.omega[0]) | (poles.imag > data.omega[-1])
+    return np.asarray((poles.real >= 0) | (zeta > MAX_DAMPING_RATIO) | outside)
+
+
+def _put_back(estimate: Estimate, before: Estimate, lost: NDArray[np.bool_]) -> Estimate:
+    """The modes as polished, but the lost ones as they were before."""
+    participation = np.where(lost[:, None], before.participation, estimate.participation)
+    return Estimate(np.where(lost, before.poles, estimate.poles), normalised(participation))
 
 
 def measured_noise(

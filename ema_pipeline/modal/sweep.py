@@ -17,6 +17,7 @@ from ema_pipeline.modal.credibility import (
     PLAIN_DAMPING,
     SURE_VOTES,
     credible,
+    evident,
     significant,
 )
 from ema_pipeline.modal.data import FitData
@@ -26,10 +27,13 @@ from ema_pipeline.modal.noise import NoiseLaw
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.segment import SegmentFit, fit_segment, measured_noise
 from ema_pipeline.modal.selection import link, votes
-from ema_pipeline.modal.uncertainty import parameter_covariance, shape_covariance
+from ema_pipeline.modal.uncertainty import left_to_go, parameter_covariance, shape_covariance
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
+
+AT_REST = 4.0
+"""Squared step left to go, in standard deviations, below which a pole is in its place."""
 
 ROUNDS = 2
 """How often a sub-band is searched for missed modes."""
@@ -65,6 +69,10 @@ class FittedModes:
         Covariance of (Re s, Im s).
     shapes, shape_stds : (n_modes, n_rows)
     participation, participation_stds : (n_modes, n_references)
+    held : ndarray of bool, (n_modes,)
+        True where the polish has found no place for a mode: its pole is the one that the model orders give.
+    restless : ndarray of bool, (n_modes,)
+        True where the fit has not come to rest.
     """
 
     poles: Complex
@@ -73,6 +81,8 @@ class FittedModes:
     shape_stds: Real
     participation: Complex
     participation_stds: Real
+    held: NDArray[np.bool_]
+    restless: NDArray[np.bool_]
 
 
 def whole(data: FitData, noise: NoiseLaw, from_hits: bool) -> Window:
@@ -164,6 +174,8 @@ def refined(
         np.zeros((0, n_rows)),
         np.zeros((0, n_ref), complex),
         np.zeros((0, n_ref)),
+        np.zeros(0, dtype=bool),
+        np.zeros(0, dtype=bool),
     )
     return FittedModes(
         *(np.concatenate([getattr(p, f.name) for p in [empty, *parts]]) for f in fields(FittedModes))
@@ -195,10 +207,11 @@ def _fit_part(
     """Sure modes first, then weak and missed ones on top."""
     small, hits = few.data, few.hits
     judge = partial(credible, hits=hits, votes=voters)
-    fit = fit_segment(small, hits, few.noise, sure, judge, iterations)
+    fitted = partial(fit_segment, judge=judge, iterations=iterations, evident=partial(evident, votes=voters))
+    fit = fitted(small, hits, few.noise, sure)
     free = _apart(weak, fit.estimate)
     if free.any():
-        more = fit_segment(small, hits, fit.noise, fit.estimate.joined(weak.take(free)), judge, iterations)
+        more = fitted(small, hits, fit.noise, fit.estimate.joined(weak.take(free)))
         if _holds(more.estimate, fit.estimate):
             fit = more
     for _ in range(ROUNDS if hits is not None else 0):
@@ -207,7 +220,7 @@ def _fit_part(
         extra = extra.take(_apart(extra, fit.estimate))
         if not len(extra.poles):
             break
-        more = fit_segment(small, hits, fit.noise, fit.estimate.joined(extra), judge, iterations)
+        more = fitted(small, hits, fit.noise, fit.estimate.joined(extra))
         if not _holds(more.estimate, fit.estimate) or len(more.estimate.poles) <= len(fit.estimate.poles):
             break
         fit = more
@@ -246,13 +259,18 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand) -> Fitt
     else:
         shapes, stds = _shapes_and_stds(few, fit, parameters)
     core = np.flatnonzero(between(estimate.poles, part.low, part.high))
+    pole_cov = np.array([parameters[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] for r in core]).reshape(-1, 2, 2)
+    rest = left_to_go(estimate, fit.solution)[core]
+    far = np.einsum("ra,rab,rb->r", rest, np.linalg.pinv(pole_cov), rest)
     return FittedModes(
         poles=estimate.poles[core],
-        pole_cov=np.array([parameters[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] for r in core]).reshape(-1, 2, 2),
+        pole_cov=pole_cov + rest[:, :, None] * rest[:, None, :],
         shapes=shapes.T[core],
         shape_stds=stds.T[core],
         participation=estimate.participation[core],
         participation_stds=_participation_stds(estimate, parameters)[core],
+        held=fit.held[core],
+        restless=far > AT_REST,
     )
 
 
@@ -264,7 +282,8 @@ def _linear_fit(window: Window, estimate: Estimate) -> tuple[FitData, SegmentFit
         weight = noise.weight(data.measured)
         solution = solve_linear(data, weight, estimate)
         noise = measured_noise(data, local.hits, estimate, solution, weight)
-    return data, SegmentFit(estimate, solve_linear(data, noise.weight(data.measured), estimate), noise)
+    solution = solve_linear(data, noise.weight(data.measured), estimate)
+    return data, SegmentFit(estimate, solution, noise, np.zeros(len(estimate.poles), dtype=bool))
 
 
 def _shapes_and_stds(data: FitData, fit: SegmentFit, parameters: Real) -> tuple[Complex, Real]:

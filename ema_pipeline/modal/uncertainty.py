@@ -77,6 +77,16 @@ def parameter_covariance(
     return np.asarray(0.5 * (parameters + parameters.T))
 
 
+def left_to_go(estimate: Estimate, solution: LinearSolution) -> Real:
+    """Step (Re s, Im s) that each pole would still take to the best fit, (n_modes, 2).
+
+    About nothing after a polish that has converged; for poles that are not polished, or not placed by it, the
+    size of their bias.
+    """
+    step = newton_step(estimate, solution)
+    return (_inverse(step.information) @ step.gradient)[: 2 * len(estimate.poles)].reshape(-1, 2)
+
+
 def shape_covariance(
     data: FitData,
     weight: Real,
