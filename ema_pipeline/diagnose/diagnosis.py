@@ -13,7 +13,7 @@ from ema_pipeline.diagnose.explain import why
 from ema_pipeline.diagnose.fitting import Case, Fitted
 from ema_pipeline.diagnose.heldout import held_out
 from ema_pipeline.diagnose.hypotheses import NOTHING, describe
-from ema_pipeline.diagnose.ladder import Yardstick, assemble_ladder, yardstick
+from ema_pipeline.diagnose.ladder import Yardstick, assemble_ladder, with_frfs, yardstick
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.predict import predict_left_out
 from ema_pipeline.diagnose.ranking import Ranking
@@ -103,13 +103,7 @@ def _diagnose(
     ladder = assemble_ladder(
         case, climbed.models, climbed.level, climbed.note, part(tell, 0.85, 0.93), first.fitted
     )
-    ladder = replace(
-        ladder,
-        rungs=tuple(
-            replace(r, frf_error=witness.error(m).error)
-            for r, m in zip(ladder.rungs, climbed.models, strict=True)
-        ),
-    )
+    ladder = with_frfs(ladder, climbed.models, witness)
     stick = yardstick(case, fit, [*climbed.models, *first.fitted])
     members = _alike(case, climbed, ladder, stick, witness)
     tell(0.93, "predicting held-out data")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,12 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.noise import NoiseLevel, estimate_noise
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung
+from ema_pipeline.diagnose.witness import Witness, frf_lines
 from ema_pipeline.effects.library import Library
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.solve import Optimum
+from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.threads import single_blas_thread
 
@@ -117,6 +119,7 @@ def make_ladder(
     settings: DiagnoseSettings | None = None,
     library: Library | None = None,
     progress: Progress | None = None,
+    frfs: Mapping[str, FrfSet] | None = None,
 ) -> Ladder:
     """The ladder that adds `effects` one after the other.
 
@@ -130,6 +133,8 @@ def make_ladder(
     settings : DiagnoseSettings, optional
     library : mapping of id to Effect, optional
     progress : callable, optional
+    frfs : mapping of configuration to FrfSet, optional
+        A second witness, see `diagnose.witness`.
 
     Returns
     -------
@@ -152,7 +157,8 @@ def make_ladder(
         tell(0.6, "noise level")
         fit = level.applied(case.settings.fit)
         final = [refit(case, f.hypothesis, fit, f.values) for f in plain]
-        return assemble_ladder(case, final, level, "", tell)
+        witness = Witness(case, frf_lines(frfs or {}, case.measured))
+        return with_frfs(assemble_ladder(case, final, level, "", tell), final, witness)
 
 
 def fitted_rungs(case: Case, effects: Sequence[str], fit: FitSettings, tell: Progress) -> list[Fitted]:
@@ -176,3 +182,9 @@ def assemble_ladder(
         tell(0.6 + 0.4 * i / len(models), "predicting held-out data")
         rungs.append(make_rung(case, stick, models[0], m, case.settings.folds))
     return Ladder(tuple(rungs), level.frequency, level.damping, level.shape, note)
+
+
+def with_frfs(ladder: Ladder, models: Sequence[Fitted], witness: Witness) -> Ladder:
+    """The ladder with what the FRFs say of each of its models."""
+    rungs = zip(ladder.rungs, models, strict=True)
+    return replace(ladder, rungs=tuple(replace(r, frf_error=witness.error(m).error) for r, m in rungs))

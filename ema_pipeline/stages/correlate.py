@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.fit.types import FitResult
-from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.stages.base import Progress, Run
-from ema_pipeline.stages.modes import measured_modes
+from ema_pipeline.stages.modes import measured_frfs, measured_modes
 from ema_pipeline.stages.results import fitted_values
 from ema_pipeline.store import ALL
 
@@ -43,6 +42,4 @@ def correlate(run: Run, rig: Rig, values: Mapping[str, float]) -> tuple[dict[str
     settings = cast("CorrelateSettings", run.settings[NAME])
     measured = measured_modes(run)
     pairings = {name: pair_rig(rig, name, values, measured[name], settings.pairing) for name in measured}
-    found = {name: run.store.find("frf", name, "frfs", FrfSet) for name in measured}
-    frfs = {name: f for name, f in found.items() if f is not None}
-    return pairings, compare(rig, values, measured, frfs, pairings, settings.compare)
+    return pairings, compare(rig, values, measured, measured_frfs(run), pairings, settings.compare)

@@ -14,7 +14,7 @@ from ema_pipeline.stages import loop_ladder
 from ema_pipeline.stages.base import Progress, Run, code_fingerprint
 from ema_pipeline.stages.correlate import correlate
 from ema_pipeline.stages.level_case import level_case, level_tests, linear_part
-from ema_pipeline.stages.modes import measured_modes
+from ema_pipeline.stages.modes import measured_frfs, measured_modes
 
 if TYPE_CHECKING:
     from ema_pipeline.diagnose.levels.prepare import LevelTest
@@ -43,9 +43,10 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     if tests := level_tests(run):
         return {"diagnosis": by_hits(run, tests, progress), "on_top_of": run.info.effects}
     measured = measured_modes(run)
-    frfs = {name: f for name in measured if (f := run.store.find("frf", name, "frfs", FrfSet)) is not None}
     limits, tell = own_thresholds(run, settings, model, measured, progress)
-    found = diagnose(model, measured, settings, run.library, tell, failed_checks(run), limits, frfs)
+    found = diagnose(
+        model, measured, settings, run.library, tell, failed_checks(run), limits, measured_frfs(run)
+    )
     results: dict[str, object] = {"diagnosis": found, "on_top_of": run.info.effects}
     top = found.ladder.rungs[-1]
     if top.effects:

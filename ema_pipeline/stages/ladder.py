@@ -10,7 +10,7 @@ from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.stages import loop_ladder
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.level_case import all_tests, depends_on_level, level_case, linear_part
-from ema_pipeline.stages.modes import measured_modes
+from ema_pipeline.stages.modes import measured_frfs, measured_modes
 
 if TYPE_CHECKING:
     from ema_pipeline.diagnose.types import Ladder
@@ -41,7 +41,15 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     if any(depends_on_level(run, label) for label in run.info.effects):
         return {"ladder": by_hits(run, progress)}
     return {
-        "ladder": make_ladder(run.rig, measured_modes(run), run.info.effects, settings, run.library, progress)
+        "ladder": make_ladder(
+            run.rig,
+            measured_modes(run),
+            run.info.effects,
+            settings,
+            run.library,
+            progress,
+            measured_frfs(run),
+        )
     }
 
 
