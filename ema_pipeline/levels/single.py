@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
+from scipy.ndimage import uniform_filter1d
 
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
@@ -40,6 +41,17 @@ SMOOTH_TERMS = 3
 UNKNOWN = 0.3
 """A hit whose pole is not known to this share of the decay rate tells nothing of the mode: the differences are
 only small ones in a hit that excites it."""
+
+
+CLEAR_FORCE = 100.0
+"""Force power over the hammer's noise, below which the FRF of a single hit is biased."""
+
+
+DEAF = 1e-300
+"""Stands for the power of a line with hardly any force."""
+
+SMOOTH_LINES = 9
+"""Lines over which the power of the force is averaged."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +95,9 @@ class Window:
 
 @dataclass(frozen=True)
 class _Hit:
-    """What is kept of one hit: accelerance and power of the force in each window, the force at each mode."""
+    """What is kept of one hit: accelerance and power of the force in each window; at each mode, the force and
+    whether it is clear of the hammer's noise.
+    """
 
     name: str
     force_n: float
@@ -91,6 +105,7 @@ class _Hit:
     frf: tuple[Complex, ...]
     power: tuple[Real, ...]
     impulse: Complex
+    heard: NDArray[np.bool_]
     calibrated: bool
 
 
@@ -140,6 +155,7 @@ def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSe
                             poles[m], seen[m], float(np.mean([h.rest_s for h in members])))  # fmt: skip
             pole[np.ix_(index, m)] = solved.poles
             known = solved.std < -UNKNOWN * poles[m].real
+            known &= np.array([h.heard[m] for h in members])
             std[np.ix_(index, m)] = np.where(known, solved.std, np.inf)
             if members[0].calibrated:
                 impulse = np.array([np.abs(h.impulse[m]) for h in members])
@@ -191,19 +207,14 @@ def participations(omega: Real, frf: Complex, poles: Complex, shapes: Complex, r
     complex ndarray, (n_modes,)
         Residue over shape.
     """
-    smooth = _smooth(len(omega))
     u, _ = pole_functions(omega, poles, rest_s)
-    return _least_squares(shapes.T[:, :, None] * _rough(u, smooth), _rough(frf, smooth))
+    weight = np.ones((len(frf), len(omega)))
+    return _least_squares(*_whitened(shapes.T[:, :, None] * u, frf, weight, _smooth(len(omega))))
 
 
 def _smooth(n_lines: int) -> Real:
     """Orthonormal polynomials over the lines of a window, (n_terms, n_lines)."""
     return np.asarray(np.linalg.qr(np.vander(np.linspace(-1, 1, n_lines), SMOOTH_TERMS))[0].T)
-
-
-def _rough(values: Complex, smooth: Real) -> Complex:
-    """Values over lines without the polynomial that far modes make."""
-    return np.asarray(values - (values @ smooth.T) @ smooth)
 
 
 def _spectra(
@@ -212,16 +223,23 @@ def _spectra(
     """Cut what the windows need out of one hit."""
     prepared = Windows(hit, settings)
     force = np.asarray(rfft(prepared.force(hit.force))) / hit.sample_rate_hz
-    power = tuple(np.maximum(np.abs(force[w.lines]) ** 2, 1e-300) for w in windows)
     line = np.clip(np.rint(frequency_hz * one.record_s).astype(int), 0, len(force) - 1)
+    # differences of neighbouring samples: the pulse is short, and drift does not count
+    noise = np.median(np.abs(np.diff(hit.force))) / (0.6745 * np.sqrt(2)) / hit.sample_rate_hz
+    # smoothed, so that a line's noise has no part in its own weight: that would bias the fit
+    power = uniform_filter1d(np.abs(force) ** 2, SMOOTH_LINES, mode="nearest")
+    clear = CLEAR_FORCE * noise**2 * hit.force.size
+    heard = power[line] > clear
+    power = np.where(power > clear, power, DEAF)
     acc = one.accelerance()[:, 0]
     return _Hit(
         f"{hit.hit.file}#{hit.hit.number}",
         abs(hit.hit.peak_force),
         max(one.record_s - float(one.delay_s[0]), 0.5 * one.record_s),
         tuple(acc[:, w.lines].copy() for w in windows),
-        power,
+        tuple(power[w.lines] for w in windows),
         force[line],
+        heard,
         hit.force_calibrated,
     )
 
@@ -254,65 +272,87 @@ def _solve(
     data = np.array(frfs)
     n_hits, n_out, n_lines = data.shape
     m = len(poles)
-    mean = np.einsum("hl,hol->ol", power / power.sum(axis=0), data)
+    total = power.sum(axis=0)
+    mean = np.einsum("hl,hol->ol", power / total, data)
     smooth = _smooth(n_lines)
     u, du = pole_functions(omega, poles, rest_s)
-    u, du = _rough(u, smooth), _rough(du, smooth)
-    difference = _rough(data - mean, smooth)
+    difference = data - mean
     level = np.median(np.abs(difference) ** 2 * power[:, None], axis=(0, 2))
-    level = np.maximum(level, 1e-24 * np.max(np.abs(mean) ** 2) * power.max())
+    level = np.maximum(level, 1e-24 * np.max(np.abs(mean) ** 2 * total) / n_hits)
     scale = np.broadcast_to(1 / np.sqrt(level[:, None]), (n_out, n_lines))  # for unit force power
     root = np.sqrt(power)[:, None]
 
     along = shapes.T[:, :, None] * u  # (n_outputs, n_modes, n_lines)
-    start = _least_squares(along * scale[:, None], _rough(mean, smooth) * scale)
+    start = _least_squares(*_whitened(along, mean, scale * np.sqrt(total), smooth))
     columns = np.concatenate([shapes.T[:, :, None] * start[:, None] * du, along], axis=1)
     if n_hits == 1:
         return _Solved(poles[None], np.full((1, m), np.inf), start[None])
+    # a line that only one hit heard tells nothing of its noise
+    heard = np.count_nonzero(power > DEAF, axis=0)
+    free = max(1.0 - (2 * m / n_out + SMOOTH_TERMS) / n_lines, 0.2) * np.maximum(heard - 1, 1)
     for _ in range(2):
-        solution = np.array(
-            [
-                _least_squares(columns * (scale * r)[:, None], d * scale * r)
-                for d, r in zip(difference, root, strict=True)
-            ]
-        )
-        left = difference - np.einsum("hc,ocl->hol", solution, columns)
-        free = max(1.0 - (2 * m / n_out + SMOOTH_TERMS) / n_lines, 0.2) * (n_hits - 1)
-        left_power = np.einsum("hl,hol->ol", power, np.abs(left) ** 2) / free
+        solution = np.empty((n_hits, 2 * m), dtype=np.complex128)
+        left_power = np.zeros((n_out, n_lines))
+        for h in range(n_hits):
+            white, rest = _whitened(columns, difference[h], scale * root[h], smooth)
+            solution[h] = _least_squares(white, rest)
+            left_power += np.abs(rest - np.einsum("c,ocl->ol", solution[h], white)) ** 2
+        left_power = np.where(heard > 1, left_power / scale**2 / free, np.nan)
         model = fit_noise(
             left_power[:, None], mean[:, None], np.ones((n_out, 1), dtype=bool), inputs_are_rows=False
         )
         scale = 1 / np.sqrt(model.variance[:, 0])
+    own = model.own[:, 0] * scale**2
+    common = np.sqrt(model.common[:, 0]) * scale * mean / np.maximum(np.abs(mean), 1e-300)
     std = np.array(
-        [
-            _deviations(columns, scale * r, model.own[:, 0] / r**2, model.common[:, 0] / r**2, mean)[:m]
-            for r in root
-        ]
+        [_deviations(_whitened(columns, mean, scale * r, smooth)[0], own, common)[:m] for r in root]
     )
     return _Solved(poles + solution[:, :m], std, start + solution[:, m:])
 
 
+def _whitened(columns: Complex, data: Complex, weight: Real, smooth: Real) -> tuple[Complex, Complex]:
+    """Columns and data at unit noise, without the polynomial that far modes make.
+
+    Parameters
+    ----------
+    columns : complex ndarray, (n_outputs, n_columns, n_lines)
+    data : complex ndarray, (n_outputs, n_lines)
+    weight : ndarray, (n_outputs, n_lines)
+        One over the standard deviation of the noise.
+    smooth : ndarray, (n_terms, n_lines)
+    """
+    basis = np.linalg.qr((smooth * weight[:, None] / weight.max(axis=1)[:, None, None]).swapaxes(1, 2))[0]
+    white, rest = columns * weight[:, None], data * weight
+    white = white - np.matmul(np.matmul(white, basis), basis.swapaxes(1, 2))
+    rest = rest - np.matmul(np.matmul(rest[:, None], basis), basis.swapaxes(1, 2))[:, 0]
+    return white, rest
+
+
 def _least_squares(columns: Complex, data: Complex) -> Complex:
     """Coefficients of columns (n_outputs, n_columns, n_lines) in data (n_outputs, n_lines)."""
-    gram, right = _normal(columns, data)
-    size = 1 / np.sqrt(np.maximum(gram.diagonal().real, 1e-300))
-    scaled = gram * size[:, None] * size
-    return np.asarray(size * np.linalg.lstsq(scaled, size * right, rcond=1e-10)[0])
-
-
-def _normal(columns: Complex, data: Complex) -> tuple[Complex, Complex]:
     flat = columns.swapaxes(0, 1).reshape(columns.shape[1], -1)
-    return flat.conj() @ flat.T, flat.conj() @ data.ravel()
+    gram, right = flat.conj() @ flat.T, flat.conj() @ data.ravel()
+    size = 1 / np.sqrt(np.maximum(gram.diagonal().real, 1e-300))
+    return np.asarray(size * np.linalg.lstsq(gram * size[:, None] * size, size * right, rcond=1e-10)[0])
 
 
-def _deviations(columns: Complex, scale: Real, own: Real, common: Real, mean: Complex) -> Real:
-    """Standard deviations of the coefficients' parts, noise that all outputs have in common included."""
-    weighted = columns * scale[:, None]
-    gram, _ = _normal(weighted, np.zeros(weighted.shape[::2], complex))
+def _deviations(white: Complex, own: Real, common: Complex) -> Real:
+    """Standard deviations of the coefficients' parts, noise that all outputs have in common included.
+
+    Parameters
+    ----------
+    white : complex ndarray, (n_outputs, n_columns, n_lines)
+        Columns at unit noise.
+    own : ndarray, (n_outputs, n_lines)
+        Share of the noise's variance that is the output's own.
+    common : complex ndarray, (n_outputs, n_lines)
+        Amplitude of the noise that all outputs have in common.
+    """
+    flat = white.swapaxes(0, 1).reshape(white.shape[1], -1)
+    gram = flat.conj() @ flat.T
     size = 1 / np.sqrt(np.maximum(gram.diagonal().real, 1e-300))
     inverse = size[:, None] * np.linalg.pinv(gram * size[:, None] * size, rcond=1e-12, hermitian=True) * size
-    estimator = np.einsum("cd,odl->col", inverse, weighted.conj() * scale[:, None], optimize=True)
-    phase = mean / np.maximum(np.abs(mean), 1e-300)
-    together = np.einsum("col,ol->cl", estimator, np.sqrt(common) * phase)
+    estimator = np.einsum("cd,odl->col", inverse, white.conj(), optimize=True)
+    together = np.einsum("col,ol->cl", estimator, common)
     variance = np.einsum("col,ol->c", np.abs(estimator) ** 2, own) + np.sum(np.abs(together) ** 2, axis=1)
-    return np.sqrt(variance / 2)
+    return np.asarray(np.sqrt(variance / 2))

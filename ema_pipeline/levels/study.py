@@ -63,6 +63,7 @@ def study_levels(
         Levels from the FRFs of their hits alone; whether a mode moves is decided on single hits, see
         `single.single_hits` and `trend.trends`.
     """
+    from ema_pipeline.levels.signs import signs
     from ema_pipeline.levels.sort import sort_levels
     from ema_pipeline.levels.words import one_level, several_levels
 
@@ -93,7 +94,8 @@ def study_levels(
     progress(0.9, "decays of single hits")
     curves = _decays(modal, base, hits, frfs)
     depends = bool(p_value < settings.false_alarm)
-    study = LevelStudy(tuple(levels), frfs.inputs, modes, curves, (), depends, p_value, "")
+    verdicts = signs(levels, frfs, _only(modal, base)) if len(base) else ()
+    study = LevelStudy(tuple(levels), frfs.inputs, modes, curves, verdicts, depends, p_value, "")
     return replace(study, summary=several_levels(study, modal, settings))
 
 

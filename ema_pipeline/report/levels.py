@@ -51,12 +51,11 @@ def damping_table(study: LevelStudy) -> Table:
 
 
 def evidence_table(study: LevelStudy) -> Table:
-    """What other signs say: homogeneity of FRFs, coherence, circles."""
+    """Other signs that were seen: FRFs that differ between levels, coherence dips, distorted circles."""
     rows = tuple(
-        Row(
-            (v.check, v.channel, plain(v.value, 3), plain(v.limit, 3), v.message or "none seen"), not v.passes
-        )
+        Row((v.check, v.channel, plain(v.value, 3), plain(v.limit, 3), v.message), True)
         for v in study.verdicts
+        if not v.passes
     )
     return Table(("sign", "where", "value", "limit", "in words"), rows, frozenset({2, 3}))
 
