@@ -53,7 +53,7 @@ _TOGETHER = ((RHO, SIGMA), (EXPONENT,), (TIME,), (GAP,))
 SYSTEMATIC = 1.3
 """Mean square of the residuals, in variances of the noise, from which a model's misfit is not noise."""
 _TRIED = 2
-_ACTIVE_SETS = 6
+_ACTIVE_SETS = 3
 _CERTAIN = 1e8
 
 

@@ -45,6 +45,8 @@ _ROW = {"isolator.x": 1.0}
 POINTS = 512
 """Points per cycle at which the elements are run through."""
 _ROUNDS = 3
+_HARMONICS = 12
+"""Of a stretch with play, by which the damper of a Maxwell branch follows it; it hardly sees higher ones."""
 
 
 def elements(values: Mapping[str, float]) -> tuple[Element, ...]:
@@ -203,15 +205,22 @@ class Motion:
         return [fourier(loop.phase, len(loop.series) // 2) for loop in self.loops]
 
     def _relaxed(self, stretch: NDArray[np.float64], time: float) -> NDArray[np.float64]:
-        """Force of a Maxwell branch of stiffness 1 N/m along periodic stretches, (n_points,)."""
-        grid = np.arange(POINTS) / POINTS
+        """Force of a Maxwell branch of stiffness 1 N/m along periodic stretches: stretch less that of its damper."""
         found = np.empty(len(stretch))
-        for loop, part in zip(self.loops, self.parts, strict=True):
-            spectrum = np.fft.rfft(np.interp(grid, loop.phase, stretch[part], period=1.0))
-            jwt = 2j * np.pi * time * loop.frequency_hz * np.arange(len(spectrum))
-            force = np.fft.irfft(spectrum * jwt / (1 + jwt), POINTS)
-            found[part] = np.interp(loop.phase, grid, force, period=1.0)
+        order = np.arange(1, _HARMONICS + 1)
+        for loop, part, (basis, inverse) in zip(self.loops, self.parts, self._harmonics, strict=True):
+            series = inverse @ stretch[part]
+            late = (series[1 : _HARMONICS + 1] - 1j * series[_HARMONICS + 1 :]) / (
+                1 + 2j * np.pi * time * loop.frequency_hz * order
+            )
+            found[part] = stretch[part] - basis @ np.concatenate([series[:1], late.real, -late.imag])
         return found
+
+    @cached_property
+    def _harmonics(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        """Fourier series at each loop's points, and its least-squares inverse."""
+        bases = [fourier(loop.phase, _HARMONICS) for loop in self.loops]
+        return [(basis, np.linalg.pinv(basis)) for basis in bases]
 
 
 def _touching(
