@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.frequencies import finer_grid, searched_starts
 from ema_pipeline.diagnose.hypotheses import Extra, Hypothesis, extras, make_rig, starting_points
+from ema_pipeline.diagnose.scan import scanned
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.library import Library
 from ema_pipeline.fit.latent import LatentObjective
@@ -177,22 +178,26 @@ class Ground:
     latent : float
         Its latent-shape objective at the end of the annealing; infinite where the model holds: then all modes
         are where they belong, the way to any optimum is short, and nothing has to be annealed.
+    lost : bool
+        True where it leaves measured modes unexplained.
     """
 
     values: dict[str, float]
     objective: float
     latent: float
+    lost: bool
 
 
 def ground(case: Case, base: Fitted, fit: FitSettings) -> Ground:
     """Prepare a base model for the hypotheses on top of it."""
+    lost = not np.all(base.explained)
     if holds(base):
-        return Ground(base.values, base.objective, np.inf)
+        return Ground(base.values, base.objective, np.inf, lost)
     problem = case.problem(base.hypothesis, fit)
     x = problem.space.point(base.values)
     nominal = np.where(problem.space.has_prior, 0.0, x)
     latent = min(_descend_rungs(problem, start).objective for start in (x, nominal))
-    return Ground(base.values, base.objective, latent)
+    return Ground(base.values, base.objective, latent, lost)
 
 
 def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: Ground) -> Fitted:
@@ -224,6 +229,8 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
         # a start is worth following only where the effect mends something on the way
         promising = [o for o in starts if o.objective < base.latent - _PROMISE]
         candidates += [refine(problem, x) for x in _best_distinct(promising, 2)]
+    if base.lost:
+        candidates += [settle(problem, x) for x in scanned(problem, base.values, moved)]
     if dynamic and not any(e.has_shapes for e in problem.evidence):
         rig = make_rig(case.rig, hypothesis, case.library, case.settings.parameter_range)
         for values in searched_starts(rig, last, case.measured, fit, base.values):

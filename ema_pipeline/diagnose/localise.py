@@ -10,6 +10,7 @@ by h·|v·φ|²/(2ω²) when hysteretic.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -21,7 +22,6 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.types import Localisation
 from ema_pipeline.fit.evidence import Dataset
 from ema_pipeline.fit.latent import LatentObjective
-from ema_pipeline.fit.matrices import Derivatives
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.solve import FitProblem
 
@@ -91,10 +91,10 @@ def _dynamic(
         v = _vectors(e, rows)
         outer = v[:, :, None] * v[:, None, :]
         zero_k, zero_m = np.zeros_like(outer), np.zeros_like(outer[singles])
-        elements = Derivatives(
-            np.concatenate([by.mass, zero_k, outer[singles]]),
-            np.concatenate([by.stiffness, outer, zero_m]),
-            np.zeros(total),
+        elements = replace(
+            by,
+            mass=np.concatenate([by.mass, zero_k, outer[singles]]),
+            stiffness=np.concatenate([by.stiffness, outer, zero_m]),
         )
         # Far modes are held at a bounded weight: one wild mode must not say all.
         part, slope = solved.terms(e, elements, 1 / (1 + solved.costs / e.counts))

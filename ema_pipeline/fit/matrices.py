@@ -25,10 +25,12 @@ _STEP = 1e-4
 
 @dataclass(frozen=True)
 class Derivatives:
-    """By the coordinates at one point: mass, stiffness (P, n, n) and the modal damping ratio (P,)."""
+    """By the coordinates at one point: the matrices (P, n, n) and the modal damping ratio (P,)."""
 
     mass: NDArray[np.float64]
     stiffness: NDArray[np.float64]
+    damping: NDArray[np.float64]
+    structural: NDArray[np.float64]
     modal_damping_ratio: NDArray[np.float64]
 
 
@@ -213,8 +215,8 @@ class MatrixFamily:
                 by_value[i] = (there - base) / (h[i] * slopes[i])
         n = self.size
         by_x = by_value * slopes[:, None]
-        blocks = by_x[:, : 2 * n * n].reshape(len(x), 2, n, n)
-        return Derivatives(blocks[:, 0], blocks[:, 1], by_x[:, -1])
+        blocks = by_x[:, : 4 * n * n].reshape(len(x), 4, n, n)
+        return Derivatives(blocks[:, 0], blocks[:, 1], blocks[:, 2], blocks[:, 3], by_x[:, -1])
 
 
 def _flat(system: LinearSystem) -> NDArray[np.float64]:
