@@ -211,8 +211,8 @@ def _modal(system: LinearSystem) -> _Modal:
     a[n:, :n] = -np.diag(omega**2)
     a[n:, n:] = -(viscous + np.diag(own))
     poles, vectors = np.linalg.eig(a)
-    left = np.linalg.inv(vectors)[:, n:] @ phi.T
-    right = phi @ vectors[:n]
+    left = np.asarray(np.linalg.inv(vectors)[:, n:] @ phi.T, dtype=complex)
+    right = np.asarray(phi @ vectors[:n], dtype=complex)
     keep = poles.imag >= 0
     twice = np.where(poles.imag > 0, 2.0, 1.0)
     return _Modal(poles[keep].astype(complex), left[keep], (right * twice)[:, keep], flexibility)

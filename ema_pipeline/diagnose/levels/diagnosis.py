@@ -22,6 +22,7 @@ from ema_pipeline.diagnose.levels.ladder import (
 from ema_pipeline.diagnose.levels.problem import NoiseFloor
 from ema_pipeline.diagnose.levels.search import LevelRanking, again, at_floor, own_floor, ranked
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, VerdictWord
+from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.threads import single_blas_thread
 
 Progress = Callable[[float, str], None]
@@ -233,7 +234,7 @@ def _verdict(
             f"The answer depends on the force level, and nothing in the library explains how (error {error:.3g}, "
             f"{limit:g} is the limit).{best}"
         )
-    if not nonlinear and len(members) > 1 and _mending(climbed, members):
+    if not nonlinear and len(members) > 1 and _mending(case, climbed, members):
         return "ambiguous", (
             f"The answer depends on the force level, and these explain it alike: "
             f"{words.names([m.hypothesis.labels[-1] for m in members])}."
@@ -265,13 +266,14 @@ def _verdict(
     )
 
 
-def _mending(climbed: _Climbed, members: Sequence[Simulated]) -> bool:
-    return climbed.rankings[0].probabilities[NOTHING] < 0.5 and bool(members)
+def _mending(case: LevelCase, climbed: _Climbed, members: Sequence[Simulated]) -> bool:
+    """True where something of the library helps for sure, though it cannot be told what."""
+    ranking, s = climbed.rankings[0], case.settings
+    sure = 1 - ranking.probabilities[NOTHING] >= s.probability_least
+    return sure and ranking.gain(members[0]) >= s.levels.gain_least
 
 
 def _depends(case: LevelCase, label: str) -> bool:
-    from ema_pipeline.effects.library import shipped_effects
-
     known = shipped_effects() if case.library is None else case.library
     family = label.partition("@")[0]
     return family in known and not known[family].linear

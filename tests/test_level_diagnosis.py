@@ -1,0 +1,251 @@
+"""Effects that depend on the force level: compiled responses, and their diagnosis from simulated hits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ema_pipeline import codec
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.levels.case import LevelCase
+from ema_pipeline.diagnose.levels.data import HitWindows
+from ema_pipeline.diagnose.levels.diagnosis import diagnose_levels
+from ema_pipeline.diagnose.levels.ladder import make_level_ladder
+from ema_pipeline.diagnose.levels.problem import NoiseFloor, hit_misfits, whitenings
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.dof import Dof
+from ema_pipeline.effects.library import get_effect, shipped_effects
+from ema_pipeline.errors import EmaError
+from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
+from ema_pipeline.mechanics.batch import Blows, batch_response
+from ema_pipeline.mechanics.laws import BoucWen, DryFriction, Nonlinear, PartingSpring, PolynomialSpring
+from ema_pipeline.mechanics.nonlinear import nonlinear_response
+from ema_pipeline.rigs.base import ParametricRig
+from ema_pipeline.rigs.types import Parameter
+
+RATE = 2048.0
+LEVELS = np.array([30.0, 100.0, 300.0])
+TRUE = {"mass": 1.005, "bearing": 3.9e5, "link": 2.1e5, "modal_damping_ratio": 0.012}
+
+
+def _build(configuration: str, values: dict[str, float]) -> Assembly:
+    """Two bodies in the plane, hub on a bearing and rim on the hub."""
+    elements: list[Mass | Spring | Damper] = []
+    for axis, factor in (("x", 1.0), ("y", 1.15)):
+        hub, rim = f"hub.{axis}", f"rim.{axis}"
+        elements += [
+            Mass(f"hub mass {axis}", {hub: 1.0}, values["mass"]),
+            Mass(f"rim mass {axis}", {rim: 1.0}, 0.5),
+            Spring(f"hub bearing {axis}", {hub: 1.0}, factor * values["bearing"]),
+            Spring(f"rim bearing {axis}", {rim: 1.0}, 1e4),
+            Spring(f"link {axis}", {hub: 1.0, rim: -1.0}, values["link"]),
+        ]
+    return Assembly(("hub.x", "hub.y", "rim.x", "rim.y"), tuple(elements), {}, values["modal_damping_ratio"])
+
+
+RIG = ParametricRig(
+    "two bodies",
+    ("test",),
+    {
+        "mass": Parameter("mass", 1.0, "kg", 0.01),
+        "bearing": Parameter("bearing", 4e5, "N/m", 0.1),
+        "link": Parameter("link", 2e5, "N/m", 0.1),
+        "modal_damping_ratio": Parameter("modal_damping_ratio", 0.01, "1", 0.3),
+    },
+    _build,
+)
+
+
+def pulse(n: int, peak: float, width_s: float = 2e-3) -> np.ndarray:
+    t = np.arange(n) / RATE - 4e-3
+    return np.where(np.abs(t) < width_s / 2, peak * np.cos(np.pi * t / width_s) ** 2, 0.0)
+
+
+def plain(
+    assembly: Assembly, force: np.ndarray, into: np.ndarray, out: np.ndarray, substeps: int
+) -> np.ndarray:
+    """The general integrator, which knows nothing of the compiled loop: a given state keeps it from there."""
+    rest = np.zeros(len(assembly.dofs))
+    return nonlinear_response(
+        assembly, RATE, force[None], out, into[None], substeps=substeps, displacement=rest, velocity=rest
+    ).acceleration
+
+
+@pytest.mark.parametrize(
+    "element",
+    [
+        PolynomialSpring("cubic", {"hub.x": 1.0}, cubic=3e11),
+        PolynomialSpring("quadratic", {"hub.x": 1.0}, quadratic=-1e8),
+        DryFriction("friction", {"hub.x": 1.0}, 4.0),
+        PartingSpring("contact", {"hub.x": 1.0, "rim.x": -1.0}, 2e5, 0.0, 1e-5, 1e-3),
+    ],
+    ids=lambda e: e.name,
+)
+def test_the_compiled_loop_agrees_with_the_general_integrator(element: Nonlinear) -> None:
+    assembly = RIG.assembly("test", TRUE).add(element)
+    force = pulse(500, 150.0)
+    out, into = np.eye(4), np.array([1.0, 0.0, 0.0, 0.0])
+    compiled = nonlinear_response(assembly, RATE, force[None], out, into[None], substeps=4)
+    expected = plain(assembly, force, into, out, 4)
+    assert np.std(compiled.acceleration - expected) < 1e-6 * np.std(expected)
+
+
+def test_many_models_and_blows_at_once_are_each_as_alone() -> None:
+    models = [
+        RIG.assembly("test", TRUE).add(PolynomialSpring("cubic", {"hub.x": 1.0}, cubic=k))
+        for k in (-1e9, 2e11, 6e11)
+    ]
+    models.append(RIG.assembly("test", TRUE))
+    force = np.stack([pulse(400, p) for p in (30.0, 200.0)])
+    rows = np.eye(4)
+    blows = Blows(
+        RATE, force, rows[[0, 2]], rows, ("acceleration", "velocity", "displacement", "acceleration")
+    )
+    together = batch_response(models, blows, 3)
+    for i, model in enumerate(models):
+        for j in range(2):
+            one = Blows(RATE, force[j : j + 1], rows[[0, 2]][j : j + 1], rows, blows.quantities)
+            np.testing.assert_allclose(
+                together[i, j], batch_response([model], one, 3)[0, 0], rtol=1e-9, atol=1e-12
+            )
+
+
+def test_elements_with_a_memory_go_through_the_general_integrator() -> None:
+    model = RIG.assembly("test", TRUE).add(BoucWen("loop", {"hub.x": 1.0}, 3.0, 5e4, 0.6))
+    force = pulse(300, 60.0)
+    blows = Blows(RATE, force[None], np.eye(4)[:1], np.eye(4), ("acceleration",) * 4)
+    expected = plain(model, force, np.eye(4)[0], np.eye(4), 2)
+    np.testing.assert_allclose(batch_response([model], blows, 2)[0, 0], expected, rtol=1e-8, atol=1e-9)
+
+
+def test_motion_without_bound_is_an_error_of_one_line() -> None:
+    model = RIG.assembly("test", TRUE).add(PolynomialSpring("soft", {"hub.x": 1.0}, cubic=-1e16))
+    blows = Blows(RATE, pulse(400, 300.0)[None], np.eye(4)[:1], np.eye(4), ("acceleration",) * 4)
+    with pytest.raises(EmaError, match="soft") as raised:
+        batch_response([model], blows, 1)
+    assert "\n" not in str(raised.value)
+
+
+def test_asymmetric_bearing_drifts_towards_its_soft_side() -> None:
+    effect = get_effect("bearing_quadratic")
+    soft = effect.apply(RIG.assembly("test", TRUE), "hub", {"stiffness": 1e9})
+    x = nonlinear_response(soft, RATE, pulse(800, 200.0)[None], np.eye(4)[:1], np.eye(4)[:1], substeps=8)
+    assert np.mean(x.displacement) < -1e-6  # the force K2·x² pushes one way whatever the sign of x
+    assert not effect.linear
+
+
+def windows(*elements: Nonlinear, noise: float = 0.002, seed: int = 1) -> HitWindows:
+    """Hits at three levels on two points, from the general integrator, with noise."""
+    random = np.random.default_rng(seed)
+    assembly = RIG.assembly("test", TRUE).add(*elements)
+    n, rows = 600, np.eye(4)
+    force, measured, level, points = [], [], [], []
+    for point, dof in ((0, Dof("hub", "x")), (3, Dof("rim", "y"))):
+        for k, peak in enumerate(LEVELS):
+            f = pulse(n, peak * random.uniform(0.9, 1.1))
+            force.append(f)
+            measured.append(plain(assembly, f, rows[point], rows, 4))
+            level.append(k)
+            points.append(dof)
+    signals = np.array(measured)
+    return HitWindows(
+        configuration="test",
+        names=tuple(f"hit{i}#0" for i in range(len(level))),
+        level=np.array(level),
+        force_n=LEVELS,
+        impacts=tuple(points),
+        sensors=tuple(Dof.parse(d) for d in assembly.dofs),
+        quantities=("acceleration",) * 4,
+        sample_rate_hz=RATE,
+        force=np.array(force),
+        measured=signals + noise * random.standard_normal(signals.shape),
+        present=np.ones((len(level), 4), dtype=bool),
+        noise=np.full((len(level), 4), noise),
+        band_hz=(30.0, 500.0),
+        modes=4,
+    )
+
+
+def case_of(w: HitWindows) -> LevelCase:
+    settings = DiagnoseSettings(processes=1)
+    only = {
+        k: v
+        for k, v in shipped_effects().items()
+        if k in ("bearing_cubic", "bearing_quadratic", "dry_friction")
+    }
+    return LevelCase(RIG, (w,), settings, only, ({**TRUE, "mass": 1.0},), 140.0)
+
+
+TRUTHS = {
+    "bearing_cubic@hub": (
+        [PolynomialSpring(f"c{a}", {f"hub.{a}": 1.0}, cubic=2e11) for a in "xy"], "stiffness", 2e11,
+    ),
+    "dry_friction@rim": ([DryFriction(f"f{a}", {f"rim.{a}": 1.0}, 1.5) for a in "xy"], "force", 1.5),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("label", list(TRUTHS))
+def test_the_effect_its_place_and_its_size_are_found(label: str) -> None:
+    elements, parameter, true = TRUTHS[label]
+    found = diagnose_levels(case_of(windows(*elements)), (), None, "", ())
+    assert found.verdict == "effect", found.summary
+    assert found.candidates[0].label == label
+    assert found.candidates[0].probability >= 0.9
+    assert found.candidates[0].parameters[parameter].value == pytest.approx(true, rel=0.1)
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+    first, last = found.ladder.rungs
+    worst = int(np.nanargmax(first.heldout_misfit))
+    assert last.heldout_misfit[worst] < 0.5 * first.heldout_misfit[worst]
+    assert last.heldout_error < first.heldout_error
+
+
+def test_linear_hits_make_no_effect_probable() -> None:
+    found = diagnose_levels(case_of(windows()), (), None, "", ())
+    assert not any(c.claimed for c in found.candidates)
+    assert found.verdict not in ("effect", "ambiguous")
+    assert found.null_probability > 0.4  # effects too small to be seen stay possible
+
+
+def test_a_model_that_has_the_effect_already_lacks_nothing() -> None:
+    elements = TRUTHS["bearing_cubic@hub"][0]
+    found = diagnose_levels(case_of(windows(*elements)), ("bearing_cubic@hub",), None, "", ())
+    assert found.verdict == "adequate", found.summary
+
+
+def test_a_ladder_of_hits_survives_the_store(tmp_path) -> None:
+    import h5py
+
+    elements = TRUTHS["bearing_cubic@hub"][0]
+    ladder = make_level_ladder(case_of(windows(*elements)), ("bearing_cubic@hub",), lambda share, text: None)
+    assert [r.effects for r in ladder.rungs] == [(), ("bearing_cubic@hub",)]
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        codec.write(file, "ladder", ladder)
+        back = codec.read(file, "ladder", Ladder)
+    assert back.rungs[1].misfit == ladder.rungs[1].misfit
+    assert {t.force_n for t in back.traces} == set(LEVELS)
+    assert Diagnosis is not None
+
+
+def test_an_error_alike_at_all_levels_weighs_little_and_one_at_one_level_weighs_much() -> None:
+    w = windows(noise=1e-6)
+    floor = NoiseFloor(0.003, 0.1)
+    (weight,) = whitenings([w], floor, 2.0)
+    lines = w.spectra(w.measured, weight.fade_s)
+    alike = weight.applied(1.05 * lines[None])
+    single = lines.copy()
+    single[2] *= 1.05
+    one = weight.applied(single[None])
+    assert np.sum(np.abs(one) ** 2) > 20 * np.sum(np.abs(alike) ** 2)
+
+
+def test_misfit_is_the_missed_share_of_the_signal() -> None:
+    w = windows(noise=0.0)
+    np.testing.assert_allclose(hit_misfits(w, 0.9 * w.measured), 0.1, rtol=1e-9)
+
+
+def test_hypotheses_are_the_effects_that_are_not_linear_at_every_place() -> None:
+    from ema_pipeline.diagnose.levels.case import level_hypotheses
+
+    labels = {h.label for h in level_hypotheses(case_of(windows()), Hypothesis())}
+    assert {"bearing_cubic@hub", "bearing_cubic@rim", "dry_friction@hub", "bearing_quadratic@rim"} <= labels
