@@ -31,6 +31,7 @@ _PROMISE = 3.0
 _STALE = 1.0
 _WIDENED = (30.0, 5.0)
 _HOLDS = 4.0
+_INSIDE = 0.01
 
 
 @dataclass(frozen=True)
@@ -371,8 +372,10 @@ def _occam(
 
     Parameters with a tolerance have a standard normal prior in their coordinate; logarithms are spread evenly
     between their bounds; sizes of effects follow a Cauchy distribution about null (half of one where they have
-    one sign), which leaves room for effects larger than expected. So does the logarithm of a parameter out of its
-    tolerance, in units of that tolerance: a weighed mass is less often off by a factor than a bearing's stiffness.
+    one sign), which leaves room for effects larger than expected. The logarithm of a parameter out of its
+    tolerance has such tails as well, in units of that tolerance (a weighed mass is less often off by a factor than a
+    bearing's stiffness), and a density that vanishes at the nominal value (V. E. Johnson, D. Rossell, J. R. Stat.
+    Soc. B 72 (2010) 143-170).
     """
     space = problem.space
     total = 0.0
@@ -384,9 +387,10 @@ def _occam(
             continue
         e = by_name.get(c.parameter.name)
         if c.kind == "log" and e is not None and e.scale > 0:
-            z = (float(found.x[i]) - np.log(e.null)) / e.scale
-            total += 2 * np.log(np.pi * e.scale * (1 + z**2))
-            hessian[i, i] += 2 / (e.scale**2 * (1 + z**2))
+            z2 = ((float(found.x[i]) - np.log(e.null)) / e.scale) ** 2
+            # nothing at the nominal value itself: inside the tolerance it is the base model that speaks
+            total += 2 * np.log(0.5 * np.pi * e.scale * (1 + z2) ** 2 / max(z2, _INSIDE))
+            hessian[i, i] += 2 / (e.scale**2 * (1 + z2))
             continue
         if c.kind == "log" or e is None or e.scale == 0:
             width = space.high[i] - space.low[i]
