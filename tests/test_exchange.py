@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -24,8 +25,10 @@ from ema_pipeline.exchange import (
     write_table,
     write_uff,
 )
+from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.ingest.records import Record, ResponseChannel
+from ema_pipeline.ingest.load import load_records
+from ema_pipeline.ingest.records import Record, ResponseChannel, cut_hit
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
 
 N_LINES = 33
@@ -190,8 +193,8 @@ def test_shapes_come_back_as_dataset_55_real_and_complex_to_1e_6(tmp_path: Path)
     assert [s["mode"] for s in strict] == [p["mode_n"] for p in peer] == [1, 1, 2, 2]
     for k, mode in enumerate(modal.modes):
         normal, complex_ = strict[2 * k], strict[2 * k + 1]
-        assert normal["head"] == [1, 2, 3, 8, 2, 3]
-        assert complex_["head"] == [1, 3, 3, 8, 5, 3]
+        assert normal["head"] == [1, 2, 2, 8, 2, 3]
+        assert complex_["head"] == [1, 3, 2, 8, 5, 3]
         expected = [mode.frequency_hz, 1.0, mode.damping_ratio, 0.0]
         np.testing.assert_allclose(normal["reals"], expected, rtol=1e-6)
         assert peer[2 * k]["freq"] == pytest.approx(mode.frequency_hz, rel=1e-6)
@@ -209,6 +212,33 @@ def test_shapes_come_back_as_dataset_55_real_and_complex_to_1e_6(tmp_path: Path)
             theirs = peer[2 * k + 1]
             at = list(theirs["node_nums"]).index(node)
             assert theirs[f"r{direction}"][at] == pytest.approx(value, rel=2e-6)
+
+
+def test_the_reader_of_sdynpy_gives_the_same_frfs_shapes_and_lines(tmp_path: Path) -> None:
+    """A second reader that shares no code with pyuff; it holds every field against the specification."""
+    peer = pytest.importorskip("sdynpy.fileio.sdynpy_uff", reason="SDynPy is not installed")
+    frfs, modal = frf_set(), modal_model()
+    path = tmp_path / "out.uff"
+    table = write_uff(path, frfs, modal, GEOMETRY)
+    found = peer.readuff(str(path))
+    expected = [(o, i, kind) for o in range(5) for i in range(2) for kind in (4, 6)]
+    expected = [e for e in expected if e[:2] != (4, 1) and e != (3, 0, 6)]
+    for (o, i, kind), function in zip(expected, found[58], strict=True):
+        values = frfs.frf[o, i] if kind == 4 else frfs.coherence[o, i]
+        assert function.function_type == kind
+        np.testing.assert_allclose(function.ordinate, values, rtol=1e-11)
+        np.testing.assert_allclose(function.abscissa, frfs.frequency_hz, rtol=1e-6)
+        response = (function.response_node, function.response_direction)
+        reference = (function.reference_node, function.reference_direction)
+        assert (response, reference) == (table.dofs[DOFS[o].point], table.dofs[DOFS[i].point])
+    for k, mode in enumerate(modal.modes):
+        complex_ = found[55][2 * k + 1]
+        assert complex(*complex_.real_data[:2]) == pytest.approx(mode.pole, rel=1e-6)
+        for dof, value in zip(DOFS, mode.shape, strict=True):
+            node, direction = table.dofs[dof.point]
+            if np.isfinite(value) and direction <= 3:
+                assert complex_.node_data_dictionary[node][direction - 1] == pytest.approx(value, rel=1e-6)
+    assert len(found[82]) == 1
 
 
 def test_unscaled_shapes_have_no_modal_mass(tmp_path: Path) -> None:
@@ -279,7 +309,7 @@ def test_tables_of_modes_and_shapes_come_back_from_csv(tmp_path: Path) -> None:
 
 def test_no_modes_still_give_a_table_with_its_header(tmp_path: Path) -> None:
     write_table(tmp_path / "modes.csv", [])
-    assert (tmp_path / "modes.csv").read_text().startswith("configuration,index,frequency_hz")
+    assert (tmp_path / "modes.csv").read_text().startswith("configuration,mode,frequency_hz")
 
 
 def test_frfs_come_back_from_csv(tmp_path: Path) -> None:
@@ -321,6 +351,21 @@ def test_a_record_comes_back_through_sep005_and_passes_its_validator() -> None:
     assert after.sample_rate_hz == before.sample_rate_hz
     np.testing.assert_array_equal(after.force, before.force)
     np.testing.assert_array_equal(after.responses, before.responses)
+
+
+def test_the_pages_example_of_sep005_gives_the_frfs_of_the_records_themselves(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    root = Path(__file__).resolve().parents[1]
+    monkeypatch.chdir(root)
+    page = root / "docs" / "method_measurement.md"
+    (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.S)
+    found: dict[str, Any] = {}
+    exec(compile(code, str(page), "exec"), found)
+    records = {r.file: r for r in load_records(found["test"])}
+    direct = estimate_frfs(cut_hit(records[h.file], h) for h in found["hits"])
+    assert found["frfs"].outputs == direct.outputs
+    np.testing.assert_array_equal(found["frfs"].frf, direct.frf)
 
 
 def test_sep005_units_become_si_and_time_gives_the_rate() -> None:

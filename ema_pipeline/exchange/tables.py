@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from ema_pipeline.correlate.types import Pairing
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.types import ModalModel
 
-Row = dict[str, str | int | float]
+Row = dict[str, str | int | float | None]
 
 MODES_COLUMNS = (
     "configuration",
-    "index",
+    "mode",
     "frequency_hz",
     "frequency_std_hz",
     "damping_ratio",
@@ -24,17 +26,26 @@ MODES_COLUMNS = (
     "mpc",
     "stability",
     "method",
+    "model_mode",
+    "model_frequency_hz",
+    "mac",
+    "family",
     "flags",
 )
 """Columns of modes.csv."""
 
 
-def modes_table(modal: ModalModel, configuration: str = "") -> list[Row]:
-    """One row per mode, with the columns of `MODES_COLUMNS`; flags are joined by ``"; "``."""
+def modes_table(modal: ModalModel, configuration: str = "", pairing: Pairing | None = None) -> list[Row]:
+    """One row per mode, with the columns of `MODES_COLUMNS`; flags are joined by ``"; "``.
+
+    Modes are numbered from 1, those of the model from 0; what is said of the model is None where `pairing` has
+    no partner.
+    """
+    pairs = {} if pairing is None else {p.measured: p for p in pairing.pairs}
     return [
         {
             "configuration": configuration,
-            "index": index,
+            "mode": index + 1,
             "frequency_hz": mode.frequency_hz,
             "frequency_std_hz": mode.frequency_std_hz,
             "damping_ratio": mode.damping_ratio,
@@ -42,6 +53,10 @@ def modes_table(modal: ModalModel, configuration: str = "") -> list[Row]:
             "mpc": mode.mpc,
             "stability": mode.stability,
             "method": mode.method,
+            "model_mode": pairs[index].model if index in pairs else None,
+            "model_frequency_hz": pairs[index].model_frequency_hz if index in pairs else None,
+            "mac": pairs[index].mac if index in pairs else None,
+            "family": pairs[index].family if index in pairs else None,
             "flags": "; ".join(mode.flags),
         }
         for index, mode in enumerate(modal.modes)
@@ -52,7 +67,7 @@ def shapes_table(modal: ModalModel, configuration: str = "") -> list[Row]:
     """One row per mode: its entry at every DOF as real and imaginary part, ``"sun.x re"``, ``"sun.x im"``."""
     rows: list[Row] = []
     for index, mode in enumerate(modal.modes):
-        row: Row = {"configuration": configuration, "index": index, "frequency_hz": mode.frequency_hz}
+        row: Row = {"configuration": configuration, "mode": index + 1, "frequency_hz": mode.frequency_hz}
         for dof, value in zip(modal.dofs, mode.shape, strict=True):
             row[f"{dof.point} re"] = float(value.real)
             row[f"{dof.point} im"] = float(value.imag)
@@ -61,21 +76,30 @@ def shapes_table(modal: ModalModel, configuration: str = "") -> list[Row]:
 
 
 def write_table(path: Path | str, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write rows as CSV; a column that only some rows have is empty in the others, and so is NaN.
+    """Write rows as CSV, as `csv_text`.
 
     Raises
     ------
     EmaError
         If the file cannot be written.
     """
-    columns = list(dict.fromkeys(name for row in rows for name in row)) or list(MODES_COLUMNS)
     try:
-        with Path(path).open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, columns, restval="", lineterminator="\n")
-            writer.writeheader()
-            writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in rows)
+        Path(path).write_text(csv_text(rows), encoding="utf-8", newline="")
     except OSError as error:
         raise _unwritable(path, error) from None
+
+
+def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
+    """Rows as CSV; a column that only some rows have is empty in the others, and so are None and NaN.
+
+    Without rows, the header of the table of modes.
+    """
+    columns = list(dict.fromkeys(name for row in rows for name in row)) or list(MODES_COLUMNS)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({k: "" if v != v else v for k, v in row.items()} for row in rows)
+    return text.getvalue()
 
 
 def write_frf_csv(path: Path | str, frfs: FrfSet) -> None:

@@ -177,7 +177,8 @@ def _axis(kind: int, label: str, unit: str) -> str:
 
 def _normal_mode(modal: ModalModel, mode: Mode, number: int, table: NodeTable) -> Iterator[str]:
     yield from _mode_head(modal, mode, number)
-    yield _integers(1, 2, 3, 8, 2, 3)  # structural, normal mode, 3-DOF, displacement, real, values per node
+    # structural, normal mode, 3-DOF translation, displacement, real, values per node
+    yield _integers(1, 2, 2, 8, 2, 3)
     yield _integers(2, 4, REAL_SHAPES, number)
     yield _reals(mode.frequency_hz, 1.0 if modal.scaled else 0.0, mode.damping_ratio, 0.0)
     shape, _ = real_shape(mode.shape)
@@ -188,7 +189,7 @@ def _normal_mode(modal: ModalModel, mode: Mode, number: int, table: NodeTable) -
 
 def _complex_mode(modal: ModalModel, mode: Mode, number: int, table: NodeTable) -> Iterator[str]:
     yield from _mode_head(modal, mode, number)
-    yield _integers(1, 3, 3, 8, 5, 3)  # as above, but complex eigenvalue and complex values
+    yield _integers(1, 3, 2, 8, 5, 3)  # as above, but complex eigenvalue and complex values
     yield _integers(2, 6, COMPLEX_SHAPES, number)
     # residue = φφᵀ/(modal A)
     modal_a = 2j * mode.pole.imag if modal.scaled else 0j

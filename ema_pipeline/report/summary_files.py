@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 import os
@@ -13,27 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Rung
+from ema_pipeline.exchange.tables import csv_text, modes_table
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.report import levels
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 
 SCHEMA = 1
-
-MODE_COLUMNS = (
-    "configuration",
-    "mode",
-    "frequency_hz",
-    "frequency_std_hz",
-    "damping_ratio",
-    "damping_std",
-    "mpc",
-    "method",
-    "model_mode",
-    "model_frequency_hz",
-    "mac",
-    "family",
-    "flags",
-)
 
 
 def write_summary(results: RunResults, path: Path) -> None:
@@ -43,14 +26,13 @@ def write_summary(results: RunResults, path: Path) -> None:
 
 def write_modes_csv(results: RunResults, path: Path) -> None:
     """Write ``modes.csv``: one row per measured mode."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(MODE_COLUMNS)
-    for c in results.configurations:
-        for number, mode in enumerate(_modes(c), 1):
-            row = {**mode, "configuration": c.name, "mode": number, "flags": "; ".join(mode["flags"])}
-            writer.writerow(["" if row[k] is None else row[k] for k in MODE_COLUMNS])
-    replace_file(path, text.getvalue())
+    rows = [
+        row
+        for c in results.configurations
+        if c.modal is not None
+        for row in modes_table(c.modal, c.name, c.pairing)
+    ]
+    replace_file(path, csv_text(rows))
 
 
 def summary(results: RunResults) -> dict[str, Any]:
@@ -192,26 +174,14 @@ def _configuration(c: ConfigurationResults) -> dict[str, Any]:
 
 
 def _modes(c: ConfigurationResults) -> list[dict[str, Any]]:
-    pairs = {} if c.pairing is None else {p.measured: p for p in c.pairing.pairs}
-    modes = []
-    for index, mode in enumerate(() if c.modal is None else c.modal.modes):
-        pair = pairs.get(index)
-        modes.append(
-            {
-                "frequency_hz": mode.frequency_hz,
-                "frequency_std_hz": mode.frequency_std_hz,
-                "damping_ratio": mode.damping_ratio,
-                "damping_std": mode.damping_std,
-                "method": mode.method,
-                "mpc": mode.mpc,
-                "flags": list(mode.flags),
-                "model_mode": None if pair is None else pair.model,
-                "model_frequency_hz": None if pair is None else pair.model_frequency_hz,
-                "mac": None if pair is None else pair.mac,
-                "family": None if pair is None else pair.family,
-            }
-        )
-    return modes
+    """Rows of the table of modes, with the flags one by one."""
+    if c.modal is None:
+        return []
+    rows = modes_table(c.modal, c.name, c.pairing)
+    return [
+        {k: v for k, v in row.items() if k not in ("configuration", "mode")} | {"flags": list(mode.flags)}
+        for row, mode in zip(rows, c.modal.modes, strict=True)
+    ]
 
 
 def replace_file(path: Path, text: str) -> None:
