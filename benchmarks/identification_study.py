@@ -68,8 +68,8 @@ def crlb_decay(
     Σ 2|Q|²·σ²/v·Σ|P⊥ (jω − s)⁻²|², P⊥ taking out the residue.
     """
     omega = 2 * np.pi * frfs.frequency_hz[1:]
-    n = hits.force.shape[-1]
-    force2 = np.mean(np.abs(np.fft.rfft(hits.force)) ** 2, axis=1)[:, 1:]  # (in, f)
+    n = round(frfs.record_s * hits.sample_rate_hz)  # undecayed records may have been trimmed
+    force2 = np.mean(np.abs(np.fft.rfft(hits.force[..., :n])) ** 2, axis=1)[:, 1:]  # (in, f)
     n_hits = hits.force.shape[1]
     truth = system.accelerance(frfs.frequency_hz[1:], dofs_out, dofs_in)
     v = (hits.response_noise[:, None, None] ** 2 * n + np.abs(truth) ** 2 * hits.force_noise**2 * n) / (
