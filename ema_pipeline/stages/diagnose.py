@@ -76,6 +76,8 @@ def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnos
             break
     best = min(found, key=lambda d: (_TRUSTED.index(d.verdict), d.ladder.rungs[-1].error))
     missing = best.ladder.rungs[-1].effects if best.verdict == "effect" else ()
+    if not all(_seen(d, missing) for d in found):
+        missing = ()
     starts = [
         {n: p.value for n, p in rung.parameters.items()}
         for d in (best, *found)
@@ -85,11 +87,20 @@ def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnos
     return diagnose_levels(
         case,
         (*run.info.effects, *missing),
-        best,
+        best if missing else None,
         " ".join(t.study.summary for t in tests if t.study.level_dependent),
         failed_checks(run),
         _part(progress, 0.3, 1.0),
     )
+
+
+def _seen(found: Diagnosis, labels: Sequence[str]) -> bool:
+    """True where a diagnosis knows all these effects as likely: what is missing at every level shows at every level."""
+    likely = {c.label for c in found.candidates[:_LIKELY] if c.gain > c.threshold}
+    return set(labels) <= likely | {c.label for c in found.candidates if c.claimed}
+
+
+_LIKELY = 3
 
 
 def _part(progress: Progress, low: float, high: float) -> Progress:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.stages.base import Run
 from ema_pipeline.stages.hits import stored_records
@@ -60,6 +62,18 @@ def linear_part(run: Run) -> Rig:
     settings = cast(DiagnoseSettings, run.settings["diagnose"])
     kept = tuple(x for x in run.info.effects if not depends_on_level(run, x))
     return make_rig(run.rig, Hypothesis(kept), run.library, settings.parameter_range)
+
+
+def with_sizes_of(run: Run, rig: Rig, values: Mapping[str, float]) -> Rig:
+    """The rig with the sizes of effects that only hits show held at those that a ladder of hits found."""
+    held = {
+        n: replace(p, value=values[n], free=False, tolerance=0.0)
+        for n, p in rig.parameters.items()
+        if n in values and n.rpartition(".")[0] in run.info.effects and depends_on_level(run, n)
+    }
+    if not held or not isinstance(rig, ParametricRig):
+        return rig
+    return replace(rig, parameters={**rig.parameters, **held})
 
 
 def depends_on_level(run: Run, label: str) -> bool:
