@@ -365,13 +365,14 @@ def _harder(case: Case, sides: tuple[_Side, _Side]) -> list[Option]:
     for e in sides[0].problem.evidence:
         m = case.measured[e.measured.configuration]
         count = len(m)
-        difference = np.abs(sides[1].costs - sides[0].costs)[start : start + count]
+        both = [s.costs[start : start + count] for s in sides]
         start += count
+        usable = np.isfinite(both[0]) & np.isfinite(both[1])
+        difference = np.abs(np.where(usable, both[1], 0.0) - np.where(usable, both[0], 0.0))
         scatter = np.nan_to_num(m.frequency_std_hz / m.frequency_hz)
         fixed = e.relative_std**2 - np.minimum(scatter**2, e.relative_std**2)
         ratio = e.relative_std**2 / np.maximum(fixed + (scatter / _HARDER) ** 2, 1e-300)
-        usable = np.isfinite(difference) & (scatter > 0)
-        more = np.where(usable, np.where(usable, difference, 0.0) * ratio, 0.0)
+        more = np.where(scatter > 0, difference * ratio, 0.0)
         gained += float(np.sum(more))
         if more.size and float(np.max(more)) > best:
             best = float(np.max(more))
