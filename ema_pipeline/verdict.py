@@ -42,3 +42,22 @@ class Verdict:
     consequence: Consequence
     channel: str = ""
     message: str = ""
+
+
+def judged(
+    check: str,
+    value: float,
+    limit: float,
+    passes: bool,
+    clause: str,
+    consequence: Consequence,
+    fault: str,
+    *,
+    channel: str = "",
+    unit: str = "1",
+) -> Verdict:
+    """Verdict whose message is the fault where the check fails, and empty where it passes."""
+    message = "" if passes else fault
+    return Verdict(
+        check, float(value), float(limit), unit, bool(passes), clause, consequence, channel, message
+    )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.verdict import Verdict
+from ema_pipeline.verdict import Verdict, judged
 
 COHERENCE = "ISO 7626-5, coherence function"
 DRIVING_POINT = "ISO 7626-5, driving-point measurement"
@@ -90,32 +92,17 @@ def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict
         enough = n >= HITS_FOR_COHERENCE
         good = not enough or coherence >= settings.minimum_coherence
         steady = scatter <= settings.repeatability
-        few = "" if enough else f"two hits are too few to judge coherence by ({coherence:.3f})"
+        low = f"coherence of {name} is {coherence:.3f} where its FRF is largest"
+        least = settings.minimum_coherence
+        judgement = judged("coherence", coherence, least, good, COHERENCE, "warn", low, channel=name)
+        if not enough:
+            few = f"two hits are too few to judge coherence by ({coherence:.3f})"
+            judgement = replace(judgement, message=few)
+        loose = f"single hits of {name} scatter by {scatter:.0%}: strike one spot, one way"
+        most = settings.repeatability
         verdicts += [
-            Verdict(
-                check="coherence",
-                value=coherence,
-                limit=settings.minimum_coherence,
-                unit="1",
-                passes=good,
-                clause=COHERENCE,
-                consequence="warn",
-                channel=name,
-                message=few if good else f"coherence of {name} is {coherence:.3f} where its FRF is largest",
-            ),
-            Verdict(
-                check="repeatability",
-                value=scatter,
-                limit=settings.repeatability,
-                unit="1",
-                passes=steady,
-                clause=REPEATABILITY,
-                consequence="warn",
-                channel=name,
-                message=""
-                if steady
-                else f"single hits of {name} scatter by {scatter:.0%}: strike one spot, one way",
-            ),
+            judgement,
+            judged("repeatability", scatter, most, steady, REPEATABILITY, "warn", loose, channel=name),
         ]
     return verdicts
 
@@ -163,27 +150,14 @@ def _driving_points(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[
         # Squares: resonances decide, not the noise between them.
         total = float(np.sum(loss**2))
         wrong = float(np.sum(loss[loss < 0] ** 2)) / total if total > 0 else 0.0
-        passes = wrong <= settings.negative_driving_point
-        reversed_sign = wrong > 0.5
+        if wrong > 0.5:
+            what = "point the wrong way; sensor or hammer is reversed, put '-' before its dof"
+        else:
+            what = "differ in sign; hammer and sensor are not at one point"
+        fault, limit = f"driving point {output}: resonances {what}", settings.negative_driving_point
+        name, passes = f"{output} over {output}", wrong <= limit
         verdicts.append(
-            Verdict(
-                check="driving point",
-                value=wrong,
-                limit=settings.negative_driving_point,
-                unit="1",
-                passes=passes,
-                clause=DRIVING_POINT,
-                consequence="warn",
-                channel=f"{output} over {output}",
-                message=""
-                if passes
-                else f"driving point {output}: resonances "
-                + (
-                    "point the wrong way; sensor or hammer is reversed, put '-' before its dof"
-                    if reversed_sign
-                    else "differ in sign; hammer and sensor are not at one point"
-                ),
-            )
+            judged("driving point", wrong, limit, passes, DRIVING_POINT, "warn", fault, channel=name)
         )
     return verdicts
 
@@ -212,21 +186,13 @@ def _reciprocity(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Ver
             difference = float(np.sqrt(beyond) / size) if size > 0 else 0.0
             passes = difference <= settings.reciprocity
             name = f"{frfs.outputs[o1]} and {frfs.outputs[o2]}"
+            fault = (
+                f"FRFs between {name} differ by {difference:.0%} with the direction: sign, calibration, "
+                "position or a nonlinearity"
+            )
+            limit = settings.reciprocity
             verdicts.append(
-                Verdict(
-                    check="reciprocity",
-                    value=difference,
-                    limit=settings.reciprocity,
-                    unit="1",
-                    passes=passes,
-                    clause=RECIPROCITY,
-                    consequence="warn",
-                    channel=name,
-                    message=""
-                    if passes
-                    else f"FRFs between {name} differ by {difference:.0%} with the direction: sign, "
-                    "calibration, position or a nonlinearity",
-                )
+                judged("reciprocity", difference, limit, passes, RECIPROCITY, "warn", fault, channel=name)
             )
     return verdicts
 

@@ -15,7 +15,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.pulse import find_pulse, noise_of
 from ema_pipeline.ingest.records import Hit, Record
-from ema_pipeline.verdict import Verdict
+from ema_pipeline.verdict import judged
 
 LONGEST_PULSE_S = 0.03
 """What lasts longer is drift, not a blow."""
@@ -228,14 +228,6 @@ def _fast_length_below(length: int) -> int:
 def _with_length(hit: Hit, start: int, room: int, length: int, rate: float) -> Hit:
     if room >= length:
         return replace(hit, start=start, stop=start + length)
-    verdict = Verdict(
-        check="hit length",
-        value=float(room / rate),
-        limit=float(length / rate),
-        unit="s",
-        passes=False,
-        clause="",
-        consequence="reject_hit",
-        message=f"only {room / rate:.3g} s to the next hit or the end, the test uses {length / rate:.3g} s",
-    )
+    fault = f"only {room / rate:.3g} s to the next hit or the end, the test uses {length / rate:.3g} s"
+    verdict = judged("hit length", room / rate, length / rate, False, "", "reject_hit", fault, unit="s")
     return replace(hit, start=start, verdicts=(*hit.verdicts, verdict))

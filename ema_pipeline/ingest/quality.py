@@ -15,7 +15,7 @@ from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.hits import align_hits, find_hits, trim_hits
 from ema_pipeline.ingest.pulse import Pulse, find_pulse, find_second_impact, noise_of, step_of
 from ema_pipeline.ingest.records import Hit, Record, ResponseChannel
-from ema_pipeline.verdict import Consequence, Verdict
+from ema_pipeline.verdict import Consequence, Verdict, judged
 
 DOUBLE_HIT = "ISO 7626-5, avoidance of double impacts"
 OVERLOAD = "ISO 7626-5, overload of the measuring channels"
@@ -71,17 +71,8 @@ def hits_of_test(records: Sequence[Record], settings: HitSettings | None = None)
 
 def _silent_hit(record: Record, reason: str, settings: HitSettings) -> Hit:
     """A record without a blow, as a hit that is left out."""
-    verdict = Verdict(
-        check="force level",
-        value=0.0,
-        limit=settings.trigger_noise,
-        unit="1",
-        passes=False,
-        clause="",
-        consequence="reject_hit",
-        channel=record.force_name,
-        message=reason.removeprefix(f"{record.file}: "),
-    )
+    fault, name = reason.removeprefix(f"{record.file}: "), record.force_name
+    verdict = judged("force level", 0.0, settings.trigger_noise, False, "", "reject_hit", fault, channel=name)
     return Hit(record.file, 0, record.impact, 0, record.force.size, 0, 0.0, (verdict,))
 
 
@@ -150,18 +141,8 @@ def _double_hit(force: NDArray[np.float64], pulse: Pulse, rate: float, settings:
     second = find_second_impact(force, pulse, rate, settings.double_hit)
     passes = second.ratio < settings.double_hit
     when = "after" if second.delay_s > 0 else "before"
-    return Verdict(
-        check="double hit",
-        value=float(second.ratio),
-        limit=settings.double_hit,
-        unit="1",
-        passes=passes,
-        clause=DOUBLE_HIT,
-        consequence="reject_hit",
-        message=""
-        if passes
-        else f"second impact of {second.ratio:.0%} {abs(second.delay_s) * 1e3:.1f} ms {when} the peak",
-    )
+    fault = f"second impact of {second.ratio:.0%} {abs(second.delay_s) * 1e3:.1f} ms {when} the peak"
+    return judged("double hit", second.ratio, settings.double_hit, passes, DOUBLE_HIT, "reject_hit", fault)
 
 
 def _overload(
@@ -177,52 +158,23 @@ def _overload(
     share = largest / full_scale if np.isfinite(full_scale) else 0.0
     passes = share < settings.overload
     at = int(np.argmax(np.abs(samples)))
-    return Verdict(
-        check="overload",
-        value=float(share),
-        limit=settings.overload,
-        unit="1",
-        passes=passes,
-        clause=OVERLOAD,
-        consequence=consequence,
-        channel=name,
-        message=""
-        if passes
-        else f"overload on {name}: {share:.1%} of full scale {(at - peak) / rate:+.4g} s from the blow",
-    )
+    fault = f"overload on {name}: {share:.1%} of full scale {(at - peak) / rate:+.4g} s from the blow"
+    return judged("overload", share, settings.overload, passes, OVERLOAD, consequence, fault, channel=name)
 
 
 def _flat_top(samples: NDArray[np.float64], name: str, consequence: Consequence) -> Verdict:
     share = flat_top_share(samples)
     passes = share < FLAT_TOP_LIMIT
-    return Verdict(
-        check="clipping",
-        value=float(share),
-        limit=FLAT_TOP_LIMIT,
-        unit="1",
-        passes=passes,
-        clause=OVERLOAD,
-        consequence=consequence,
-        channel=name,
-        message="" if passes else f"{name} is clipped: its tops are flat; use a lower gain or hit softer",
-    )
+    fault = f"{name} is clipped: its tops are flat; use a lower gain or hit softer"
+    return judged("clipping", share, FLAT_TOP_LIMIT, passes, OVERLOAD, consequence, fault, channel=name)
 
 
 def _force_level(force: NDArray[np.float64], pulse: Pulse, name: str, settings: HitSettings) -> Verdict:
     noise = noise_of(force)
     ratio = min(pulse.height / noise, 1e12) if noise > 0 else 1e12
     passes = ratio >= settings.trigger_noise
-    return Verdict(
-        check="force level",
-        value=float(ratio),
-        limit=settings.trigger_noise,
-        unit="1",
-        passes=passes,
-        clause="",
-        consequence="reject_hit",
-        channel=name,
-        message="" if passes else f"{name} does not stand out of its noise: {ratio:.1f} times",
-    )
+    fault = f"{name} does not stand out of its noise: {ratio:.1f} times"
+    return judged("force level", ratio, settings.trigger_noise, passes, "", "reject_hit", fault, channel=name)
 
 
 def _force_spectrum(
@@ -230,21 +182,10 @@ def _force_spectrum(
 ) -> Verdict:
     band, top_db = usable_band_hz(force, pulse, rate, settings.force_drop_db)
     wanted = rate * BAND_OVER_RATE
+    drop = f"{settings.force_drop_db:.0f} dB up to {band:.4g} Hz"
+    fault = f"force within {drop}; {top_db:.0f} dB at {wanted:.4g} Hz"
     passes = band >= wanted
-    return Verdict(
-        check="force spectrum",
-        value=float(band),
-        limit=float(wanted),
-        unit="Hz",
-        passes=passes,
-        clause=SPECTRUM,
-        consequence="warn",
-        channel=name,
-        message=""
-        if passes
-        else f"force within {settings.force_drop_db:.0f} dB up to {band:.4g} Hz; "
-        f"{top_db:.0f} dB at {wanted:.4g} Hz",
-    )
+    return judged("force spectrum", band, wanted, passes, SPECTRUM, "warn", fault, channel=name, unit="Hz")
 
 
 def _check_response(
@@ -279,27 +220,16 @@ def _dead_channel(name: str, samples: NDArray[np.float64], pulse: Pulse, rest: i
     hum = _hum_share(samples, rate) if silent else 0.0
     only_hum = hum > HUM_ONLY
     passes = spans > 1.5 and not only_hum
-    if passes:
-        message = ""
-    elif only_hum:
-        message = (
+    if only_hum:
+        fault = (
             f"{name} carries mains hum only ({hum:.1%} of its power) and no answer to the blow: cable open?"
         )
     elif spans == 0:
-        message = f"{name} is constant at {samples[0]:.3g}: sensor or cable dead"
+        fault = f"{name} is constant at {samples[0]:.3g}: sensor or cable dead"
     else:
-        message = f"{name} flickers by one converter step only: sensor or cable dead"
-    return Verdict(
-        check="dead channel",
-        value=0.0 if only_hum else min(spans, 1e12),
-        limit=1.5,
-        unit="1",
-        passes=passes,
-        clause="",
-        consequence="reject_channel",
-        channel=name,
-        message=message,
-    )
+        fault = f"{name} flickers by one converter step only: sensor or cable dead"
+    value = 0.0 if only_hum else min(spans, 1e12)
+    return judged("dead channel", value, 1.5, passes, "", "reject_channel", fault, channel=name)
 
 
 HUM_ONLY = 0.98
@@ -363,15 +293,6 @@ def _decay(
     # Scatter of an rms over n samples is rms/√(2n): less than three times that is no response.
     silent = left < quiet * np.sqrt(3 / np.sqrt(2 * length)) * 1.5 or largest < 3 * quiet
     ratio = 0.0 if silent or largest == 0 else left / largest
-    passes = ratio <= settings.residual_response
-    return Verdict(
-        check="response decay",
-        value=float(ratio),
-        limit=settings.residual_response,
-        unit="1",
-        passes=passes,
-        clause=DECAY,
-        consequence="warn",
-        channel=name,
-        message="" if passes else f"{name} still at {ratio:.1%} of its largest at the end: record longer",
-    )
+    limit = settings.residual_response
+    fault = f"{name} still at {ratio:.1%} of its largest at the end: record longer"
+    return judged("response decay", ratio, limit, ratio <= limit, DECAY, "warn", fault, channel=name)

@@ -12,7 +12,10 @@ from ema_pipeline.dof import Dof
 
 @dataclass(frozen=True)
 class CircleFit:
-    """Nyquist circle of one mode in one FRF (mobility plane, residual of other modes not removed).
+    """Nyquist circle of one mode in one FRF (mobility plane).
+
+    The circles of the next mode below and above are taken off its points where that makes them rounder, unless the
+    settings say otherwise; what farther modes add shifts the circle as a whole.
 
     Attributes
     ----------
@@ -20,7 +23,7 @@ class CircleFit:
     frequency_hz : ndarray, (n_points,)
         Lines used.
     points : complex ndarray, (n_points,)
-        The FRF at these lines, mobility, (m/s)/N.
+        The FRF at these lines, mobility, (m/s)/N, neighbours taken off.
     centre : complex
         Centre of the fitted circle.
     radius : float
