@@ -13,7 +13,7 @@ from ema_pipeline.diagnose.levels.diagnosis import diagnose_levels
 from ema_pipeline.diagnose.levels.ladder import make_level_ladder
 from ema_pipeline.diagnose.levels.problem import NoiseFloor, hit_misfits, whitenings
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import get_effect, shipped_effects
 from ema_pipeline.errors import EmaError
@@ -224,7 +224,6 @@ def test_a_ladder_of_hits_survives_the_store(tmp_path) -> None:
         back = codec.read(file, "ladder", Ladder)
     assert back.rungs[1].misfit == ladder.rungs[1].misfit
     assert {t.force_n for t in back.traces} == set(LEVELS)
-    assert Diagnosis is not None
 
 
 def test_an_error_alike_at_all_levels_weighs_little_and_one_at_one_level_weighs_much() -> None:

@@ -335,8 +335,6 @@ def of_modes(ladder: Ladder) -> bool:
 
 def noise_words(ladder: Ladder) -> str:
     """What σ holds beside the test's own scatter."""
-    if not of_modes(ladder):
-        return "σ: the scatter of the measured signals."
     if ladder.force_n:
         return f"{hits_words(ladder)} " + (
             "Error: simulated against measured hits, in standard uncertainties: the sensors' noise, "
@@ -344,6 +342,8 @@ def noise_words(ladder: Ladder) -> str:
             "model that is alike at every force level. A linear model can therefore have an error of about 1 and "
             "still miss much of the hard hits: look at the shares that are missed."
         )
+    if not of_modes(ladder):
+        return "σ: the scatter of the measured signals."
     return (
         f"σ: the test's own scatter and, beside it, {plain(100 * ladder.frequency_noise, 2)} % of frequency, "
         f"{plain(100 * ladder.damping_noise, 2)} % of damping, "
