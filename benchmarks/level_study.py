@@ -1,9 +1,10 @@
 """How often linear structures are called level-dependent, and how small a change with the force is found.
 
-    python benchmarks/level_study.py --linear 100 --moving 60 [--rigs 12] [--seed 0]
+    python benchmarks/level_study.py --linear 100 --one-level 100 --moving 60 [--rigs 12] [--seed 0]
 
 Linear cases: random modal systems (3 to 9 modes, some close pairs), 2 to 4 levels, 1 to 4 hits per level, 1 to 4
 points, noise from 0.003 to 3 % of the softest hits' responses, noise on the hammer, hands that scatter by 5 to 20 %.
+One level: the same with the softest level alone, judged by decays.
 Moving cases: the same, with one mode's frequency or damping moving with the square of the force (each hit stays
 linear, so that its change is known exactly). Rigs: planetary campaigns of `ema simulate`, one half linear, one
 half with a cubic spring, dry friction or backlash.
@@ -12,109 +13,29 @@ half with a cubic spring, dry friction or backlash.
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import scipy.fft
-from numpy.typing import NDArray
 
-from ema_pipeline.dof import Dof
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from simulate_levels import hits_of, random_case
+
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.ingest.description import read_campaign
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.quality import hits_of_test
-from ema_pipeline.ingest.records import Hit, HitSamples, ResponseChannel, cut_hit
+from ema_pipeline.ingest.records import HitSamples, cut_hit
 from ema_pipeline.levels import LevelSettings, LevelStudy, study_levels
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.simulate import simulate_campaign
-from ema_pipeline.simulate.hammer import ForceHistory, Pulse, anti_alias
-
-Real = NDArray[np.float64]
-RATE_HZ = 2048.0
-SAMPLES = 4096
-TRIGGER_S = 0.05
-
-
-@dataclass(frozen=True)
-class Case:
-    """A modal system and how it is struck; `mode` moves by `shift` (relative) from the softest to the hardest."""
-
-    frequency_hz: Real
-    damping: Real
-    shapes: Real
-    n_points: int
-    forces_n: Real
-    hits_per_level: int
-    noise: float
-    hammer_noise: float
-    hand: float
-    mode: int = 0
-    frequency_shift: float = 0.0
-    damping_shift: float = 0.0
-
-
-def random_case(rng: np.random.Generator) -> Case:
-    """A linear case."""
-    n = int(rng.integers(3, 10))
-    frequency = np.sort(rng.uniform(40, 650, n))
-    for k in range(1, n):
-        frequency[k] = max(frequency[k], frequency[k - 1] * (1 + rng.choice([0.008, 0.03, 0.05])))
-    n_out = int(rng.integers(4, 13))
-    levels = int(rng.integers(2, 5))
-    return Case(
-        frequency,
-        np.exp(rng.uniform(np.log(0.003), np.log(0.02), n)),
-        rng.normal(size=(n, n_out)),
-        int(rng.integers(1, 5)),
-        20.0 * rng.uniform(2.0, 3.5) ** np.arange(levels),
-        int(rng.integers(1, 5)),
-        float(np.exp(rng.uniform(np.log(3e-5), np.log(0.03)))),
-        float(np.exp(rng.uniform(np.log(1e-5), np.log(1e-3)))),
-        float(rng.uniform(0.05, 0.2)),
-    )
-
-
-def hits_of(case: Case, rng: np.random.Generator) -> list[HitSamples]:
-    """Records of every hit; noise is in proportion to the responses to the softest hits."""
-    period = int(scipy.fft.next_fast_len(8 * SAMPLES, real=True))
-    axis = np.fft.rfftfreq(period, 1 / RATE_HZ)
-    gain = RATE_HZ * anti_alias(axis, RATE_HZ)
-    clean = []
-    top = float(case.forces_n.max())
-    for point in range(case.n_points):
-        for level in case.forces_n:
-            for _ in range(case.hits_per_level):
-                peak = level * np.exp(case.hand * rng.normal())
-                # harder blows are shorter (Hertz)
-                pulse = Pulse(TRIGGER_S, peak, 2.2e-3 * (level / top) ** -0.1)
-                spectrum = gain * ForceHistory((pulse,), RATE_HZ, SAMPLES).spectrum(axis)
-                moved = (peak / top) ** 2
-                frequency, damping = case.frequency_hz.copy(), case.damping.copy()
-                frequency[case.mode] *= 1 + case.frequency_shift * moved
-                damping[case.mode] *= 1 + case.damping_shift * moved
-                w, wr = 2 * np.pi * axis, 2 * np.pi * frequency[:, None]
-                transfer = -(w**2) / (wr**2 - w**2 + 2j * damping[:, None] * wr * w)
-                frf = (case.shapes * case.shapes[:, [point]]).T @ transfer
-                force = scipy.fft.irfft(spectrum, period)[:SAMPLES]
-                clean.append((point, level, force, scipy.fft.irfft(frf * spectrum, period)[:, :SAMPLES]))
-    soft = np.mean([np.std(y, axis=1) for _, level, _, y in clean if level == case.forces_n[0]], axis=0)
-    out = []
-    for number, (point, _, force, responses) in enumerate(clean):
-        noisy = force + case.hammer_noise * case.forces_n[0] * rng.normal(size=SAMPLES)
-        records = responses + case.noise * soft[:, None] * rng.normal(size=responses.shape)
-        channels = tuple(
-            ResponseChannel(f"a{i}", Dof(f"p{i}", "z"), "acceleration") for i in range(len(soft))
-        )
-        peak = int(np.argmax(noisy))
-        hit = Hit(f"h{number}.csv", 0, Dof(f"p{point}", "z"), 0, SAMPLES, peak, float(noisy[peak]))
-        out.append(HitSamples(hit, RATE_HZ, noisy, records, channels))
-    return out
 
 
 def studied(hits: list[HitSamples]) -> LevelStudy:
@@ -126,11 +47,13 @@ def studied(hits: list[HitSamples]) -> LevelStudy:
     )
 
 
-def linear_cases(count: int, rng: np.random.Generator) -> None:
+def linear_cases(count: int, rng: np.random.Generator, one_level: bool) -> None:
     """Print the share of linear systems that are called level-dependent."""
     wrong, known, p_values = 0, 0, []
     for number in range(count):
         case = random_case(rng)
+        if one_level:
+            case = replace(case, forces_n=case.forces_n[:1])
         study = studied(hits_of(case, rng))
         wrong += study.level_dependent
         if np.isfinite(study.p_value):
@@ -139,8 +62,10 @@ def linear_cases(count: int, rng: np.random.Generator) -> None:
         if study.level_dependent:
             print(f"  case {number}: p = {study.p_value:.2g}, {study.summary}", flush=True)
     p = np.array(p_values)
+    kind = "one level" if one_level else "several levels"
     print(
-        f"linear: {wrong} of {count} called level-dependent ({known} could be told), p below 0.01, 0.05, 0.2 in "
+        f"linear, {kind}: {wrong} of {count} called level-dependent ({known} could be told), p below 0.01, 0.05 "
+        "and 0.2 in "
         f"{np.mean(p < 0.01):.1%}, {np.mean(p < 0.05):.1%}, {np.mean(p < 0.2):.1%}",
         flush=True,
     )
@@ -220,12 +145,16 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--linear", type=int, default=100)
+    parser.add_argument("--one-level", type=int, default=0)
     parser.add_argument("--moving", type=int, default=60)
     parser.add_argument("--rigs", type=int, default=0)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args()
     start = time.perf_counter()
-    linear_cases(given.linear, np.random.default_rng(given.seed))
+    if given.linear:
+        linear_cases(given.linear, np.random.default_rng(given.seed), one_level=False)
+    if given.one_level:
+        linear_cases(given.one_level, np.random.default_rng(given.seed + 3), one_level=True)
     if given.moving:
         moving_cases(given.moving, np.random.default_rng(given.seed + 1))
     if given.rigs:

@@ -33,7 +33,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Hits = Callable[[], Iterable[HitSamples]]
 
-BANDWIDTHS = 10.0
+BANDWIDTHS = 25.0
 """Width (1 sigma) of the Gaussian filter, in half-power half-widths of the mode; at least `FEWEST_LINES`."""
 
 FEWEST_LINES = 4.0
@@ -63,6 +63,9 @@ LEFT_OVER = 0.005
 
 CUT = 5.0
 """The filter's reach in its width."""
+
+FILTERED = 0.02
+"""Error of frequency and decay rate that modes which were not identified make, in decay rates of the mode."""
 
 HITS_PER_MODE = 2
 
@@ -158,8 +161,8 @@ def _of_hit(
     outputs = [places[c.dof.point] for c in hit.channels]
     spectra = np.array([np.asarray(rfft(np.asarray(hit.responses[k]))) for k in range(len(outputs))])
     spectra *= np.array([float(c.dof.sign) for c in hit.channels])[:, None]
-    for row, c in zip(spectra, hit.channels, strict=True):
-        row *= (2j * np.pi * axis) ** power[c.quantity]
+    quantity_power = np.array([power[c.quantity] for c in hit.channels])
+    spectra *= (2j * np.pi * axis) ** quantity_power[:, None]
     force = np.asarray(rfft(hit.force)) * hit.hit.impact.sign
     start_s = (hit.hit.peak - hit.hit.start) / rate
     curves = []
@@ -179,7 +182,10 @@ def _of_hit(
         others = (share @ u + other_share @ mirrored) * force[lines] - mine
         signal = weight @ spectra[:, lines] - others
         band = _Band(axis[lines], lines.start, n, rate, centre, width)
-        table = _read(band, signal, others, signal - mine, start_s)
+        scatter = (frfs.variance[outputs, i] * frfs.hits[outputs, i, None])[:, lines]
+        scatter *= (2 * np.pi * axis[lines]) ** (2 * quantity_power[:, None])
+        noise = band.noise(np.abs(weight) ** 2 @ scatter * np.abs(force[lines]) ** 2, signal - mine)
+        table = _read(band, signal, LEFT_OVER * others, noise, start_s, -FILTERED * pole.real)
         if table is not None:
             best = float(np.abs(residues[task.mode, task.sensor, i]))
             amplitude = table[0] * 2 * best / abs(pole) ** 2
@@ -224,35 +230,49 @@ class _Band:
         full[self.first : self.first + len(spectrum)] = spectrum * self.gain
         return np.asarray(ifft(full))
 
-    def noise(self, left: Complex) -> float:
-        """Standard deviation of the filtered signal: what no mode explains in the last third of the record.
+    def noise(self, power: Real, left: Complex) -> float:
+        """Standard deviation of the filtered signal.
 
-        Errors of the fit have decayed by then, and what a blow starts outside the band is long over.
+        Parameters
+        ----------
+        power : ndarray, (n_lines,)
+            Noise power of the lines from the scatter over hits; NaN where there is none.
+        left : complex ndarray, (n_lines,)
+            What no mode explains; taken in its place, in the last third of the record, where errors of the fit
+            have decayed.
         """
+        if np.isfinite(power).all():
+            return float(np.sqrt(np.median(power) * np.sum(self.gain**2))) / self.n
         end = self.n - int(SETTLED / (2 * np.pi * self.width) * self.rate_hz)
-        return float(np.sqrt(np.mean(np.abs(self.analytic(left)[2 * self.n // 3 : max(end, 1)]) ** 2)))
+        return float(np.sqrt(np.mean(np.abs(self.analytic(left)[2 * self.n // 3 : end]) ** 2)))
 
 
-def _read(band: _Band, signal: Complex, others: Complex, left: Complex, start_s: float) -> Real | None:
+def _read(
+    band: _Band, signal: Complex, others: Complex, noise: float, start_s: float, floor: float
+) -> Real | None:
     """Amplitude, frequency, its std, damping and its std in stretches of the decay; None where too short.
 
     Parameters
     ----------
     band : _Band
-    signal, others, left : complex ndarray, (n_lines,)
-        Spectrum of the mode, of the other modes that were taken off, and of what no mode explains.
+    signal, others : complex ndarray, (n_lines,)
+        Spectrum of the mode, and of what may be left of the other modes that were taken off.
+    noise : float
+        Standard deviation of the filtered signal.
     start_s : float
         Time of the hit.
+    floor : float
+        Systematic error of a slope, rad/s.
 
     Returns
     -------
     ndarray, (5, n_stretches)
     """
-    g, o = band.analytic(signal), band.analytic(others)
+    g = band.analytic(signal)
+    wrong = np.abs(np.gradient(band.analytic(others) / np.where(g == 0, 1.0, g)))
     settle = SETTLED / (2 * np.pi * band.width)
     if settle * band.rate_hz > band.n / 6:
         return None
-    noise = band.noise(left)
     # one independent sample per equivalent noise bandwidth
     step = max(int(band.rate_hz / (OVERSAMPLING * band.width * np.sqrt(np.pi))), 1)
     place = np.arange(int((start_s + settle) * band.rate_hz), int(band.n - settle * band.rate_hz), step)
@@ -264,7 +284,7 @@ def _read(band: _Band, signal: Complex, others: Complex, left: Complex, start_s:
     place, amplitude = place[:stop], amplitude[:stop]
     time_s = place / band.rate_hz
     phase = np.unwrap(np.angle(g))[place]
-    wrong = LEFT_OVER * band.rate_hz * np.abs(np.gradient(o / np.where(g == 0, 1.0, g)))[place]
+    wrong = band.rate_hz * wrong[place]
     edges = np.round(np.linspace(0, stop, min(stop // FEWEST_SAMPLES, STRETCHES) + 1)).astype(int)
     rows = []
     for a, b in itertools.pairwise(edges):
@@ -272,7 +292,7 @@ def _read(band: _Band, signal: Complex, others: Complex, left: Complex, start_s:
         weight = 2 * (amplitude[part] / noise) ** 2 / OVERSAMPLING  # of phase and of ln(amplitude)
         frequency, slope_std = _slope(time_s[part], phase[part], weight)
         rate, _ = _slope(time_s[part], np.log(amplitude[part]), weight)
-        std = float(np.hypot(slope_std, np.sqrt(np.mean(wrong[part] ** 2))))
+        std = float(np.sqrt(slope_std**2 + np.mean(wrong[part] ** 2) + floor**2))
         s = complex(rate, frequency)
         mean = float(np.exp(np.average(np.log(amplitude[part]), weights=weight)))
         rows.append((mean, abs(s) / (2 * np.pi), std / (2 * np.pi), -s.real / abs(s), std / abs(s)))

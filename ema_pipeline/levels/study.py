@@ -236,11 +236,13 @@ def _from_decays(
 ) -> tuple[tuple[ModeLevels, ...], tuple[DecayCurve, ...], float]:
     """What the decays after hits of one level tell: the modes with their tests, the curves, and the p value."""
     from ema_pipeline.levels.decay import decay_trends
+    from ema_pipeline.levels.tracks import doubles
     from ema_pipeline.levels.trend import holm
     from ema_pipeline.levels.words import trend_words
 
     n = len(modal.modes)
-    chosen = np.flatnonzero(np.array([m.stability for m in modal.modes]) >= TRUSTED_VOTES)
+    votes = np.array([m.stability for m in modal.modes])
+    chosen = np.flatnonzero((votes >= TRUSTED_VOTES) & ~doubles(modal))
     curves = _decays(modal, chosen, hits, frfs)
     frequency, damping = decay_trends(curves, tuple(range(n)))
     adjusted = holm(np.array([t.p for t in (*frequency, *damping)]))

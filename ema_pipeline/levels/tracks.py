@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.modal.assurance import mac
-from ema_pipeline.modal.credibility import ECHO_MAC, ECHO_REACH
+from ema_pipeline.modal.credibility import ECHO_MAC, ECHO_REACH, SAME_RESPONSE
 from ema_pipeline.modal.types import ModalModel, Mode
 
 Real = NDArray[np.float64]
@@ -21,6 +21,8 @@ SHIFT = 0.1
 
 DOUBT = 0.3
 """A mode that no model order voted for counts this much less: it is likely an echo of another."""
+
+FEWEST_SENSORS = 3
 
 FARTHEST = 1.0
 """Distance beyond which two modes are not the same."""
@@ -111,13 +113,29 @@ def _shapes(model: ModalModel, dofs: tuple[Dof, ...]) -> NDArray[np.complex128]:
     return np.array([m.shape[columns] for m in model.modes])
 
 
-def echoes(modal: ModalModel, sure: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def doubles(modal: ModalModel) -> NDArray[np.bool_]:
+    """Modes that look like, and lie beside, one that is known better, (n_modes,): most likely its echo.
+
+    Only for three or more sensors; fewer do not tell two modes apart.
+    """
+    out = np.zeros(len(modal.modes), dtype=bool)
+    if len(modal.outputs) < FEWEST_SENSORS:
+        return out
+    known = np.array([m.frequency_std_hz / abs(m.pole.real) for m in modal.modes])
+    sure = np.zeros(len(modal.modes), dtype=bool)
+    for k in np.argsort(known):
+        out[k] = echoes(modal, sure, SAME_RESPONSE)[k]
+        sure[k] = not out[k]
+    return out
+
+
+def echoes(modal: ModalModel, sure: NDArray[np.bool_], least_mac: float = ECHO_MAC) -> NDArray[np.bool_]:
     """Modes that look like, and lie beside, a sure one, (n_modes,).
 
     A fit mends the misfit that a mode leaves whose frequency moves with the level by further poles beside it.
     """
     poles = np.array([m.pole for m in modal.modes])
     shapes = np.array([m.shape for m in modal.modes])
-    alike = np.nan_to_num(mac(shapes, shapes)) > ECHO_MAC
+    alike = np.nan_to_num(mac(shapes, shapes)) > least_mac
     near = np.abs(poles[:, None] - poles[None]) < ECHO_REACH * np.abs(poles.real)[None]
     return np.asarray(~sure & (alike & near & sure[None]).any(axis=1))
