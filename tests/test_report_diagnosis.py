@@ -18,15 +18,17 @@ from rich.console import Console
 
 from ema_pipeline.diagnose.types import (
     Candidate,
+    DetectionLimit,
     Diagnosis,
     EffectSize,
+    HeldOutMode,
     Ladder,
     Localisation,
     Rung,
     VerdictWord,
 )
 from ema_pipeline.fit.types import ErrorSweep
-from ema_pipeline.report import diagnosis, summary, terminal
+from ema_pipeline.report import diagnosis, summary, tables, terminal
 from ema_pipeline.report.figures.diagnosis import ladder_errors, where_it_fails
 from ema_pipeline.report.html import report_html
 from ema_pipeline.report.numbers import below
@@ -464,3 +466,89 @@ def test_summary_json_before_a_diagnosis_has_neither(base: RunResults, tmp_path:
     write_summary(base, tmp_path / "summary.json")
     content = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert not {"diagnosis", "ladder"} & set(content)
+
+
+# second witness, detection limits, left-out modes
+
+
+def test_what_the_frfs_say_is_one_sentence_and_nothing_without_frfs() -> None:
+    plain = candidate(CRACK, 0.97, 1.02, 1.05)
+    assert diagnosis.frf_words(plain) == ""
+    seen = replace(plain, frf_error_before=10.75, frf_error_after=1.572, frf_impacts_better=9, frf_impacts=9)
+    assert diagnosis.frf_words(seen) == (
+        "FRFs around the modes, which were not fitted: 10.8 σ off without it, 1.57 σ with it; nearer at 9 of 9 "
+        "impact points."
+    )
+    told = replace(found("effect"), candidates=(replace(seen, claimed=True),))
+    assert diagnosis.frf_words(seen) in diagnosis.reasons(told)[0]
+
+
+LIMITS = (
+    DetectionLimit("mesh_stiffness_loss@sun-planet1", "fraction", 0.021, "1"),
+    DetectionLimit("mesh_stiffness_loss@ring-planet1", "fraction", math.inf, "1"),
+    DetectionLimit("shaft_torsion@sun", "stiffness", 8210.0, "N/m"),
+    DetectionLimit("out_of_tolerance@sun_mass", "sun_mass", 0.07, "1"),
+)
+
+
+def test_detection_limits_are_told_by_effect_with_best_and_worst_place() -> None:
+    d = replace(found("adequate"), detection_limits=LIMITS)
+    assert diagnosis.detection_words(d) == (
+        "These data would show, nine times in ten and at the best place: mesh stiffness loss ≥ 2.1 %, "
+        "shaft torsion ≥ 8.2 kN/m."
+    )
+    rows = [r.cells for r in diagnosis.detection_table(d).rows]
+    assert rows[0] == ("mesh stiffness loss", "fraction", "2.1 % (sun-planet1)", "no size (ring-planet1)")
+    assert rows[2] == ("out of tolerance", "deviation", "7.0 % (sun mass)", "")
+    assert "mesh stiffness loss ≥ 2.1 %" in flowing(printed(terminal.diagnosis_screen(d)))
+    assert diagnosis.detection_words(found("adequate")) == ""
+
+
+def test_modes_predicted_from_the_others_stand_beside_the_measured_ones() -> None:
+    modes = (
+        HeldOutMode("default", 5.529, 0.055, 5.518, 0.069),
+        HeldOutMode("default", 9.0, 0.09, math.nan, math.nan),
+        HeldOutMode("default", 2.748, 0.027, 3.1, 0.04),
+    )
+    d = replace(found("effect"), heldout_modes=modes)
+    rows = diagnosis.heldout_table(d).rows
+    assert rows[0].cells == ("", "5.529 ± 0.055", "5.518 ± 0.069", "+0.1")
+    assert rows[1].cells[2] == "no such mode"
+    # (2.748 - 3.1)/√(0.027² + 0.04²) = -7.3
+    assert rows[2].cells[3] == "−7.3"
+    assert [r.alert for r in rows] == [False, True, True]
+    assert diagnosis.heldout_words(d).startswith("1 of 3 frequencies are predicted within 3σ")
+    assert "predicted, Hz" in printed(terminal.diagnosis_screen(d))
+
+
+def test_summary_holds_what_the_data_would_show_and_what_the_frfs_say(
+    run: RunResults, tmp_path: Path
+) -> None:
+    assert run.diagnosis is not None
+    d = replace(run.diagnosis, detection_limits=LIMITS)
+    write_summary(replace(run, diagnosis=d), tmp_path / "summary.json")
+    content = json.loads((tmp_path / "summary.json").read_text())["diagnosis"]
+    assert content["detection_limits"][0]["size"] == 0.021
+    assert content["detection_limits"][1]["size"] is None  # JSON has no infinity
+    assert content["candidates"][0]["frf_error_after"] is None
+    assert content["thresholds_from"] == "shipped with the program"
+
+
+def test_ladder_shows_frfs_where_there_are_any_and_evidence_where_not() -> None:
+    ladder = found("effect").ladder
+    assert "evidence" in printed(terminal.ladder_screen(ladder))
+    with_frfs = replace(ladder, rungs=tuple(replace(r, frf_error=1.6) for r in ladder.rungs))
+    shown = printed(terminal.ladder_screen(with_frfs))
+    assert "FRFs" in shown
+    assert "1.60" in shown
+
+
+def test_values_of_a_model_that_fails_are_not_called_identified(run: RunResults) -> None:
+    assert run.fit is not None
+    (first, *_) = (p for p in run.fit.parameters.values() if p.identified)
+    assert summary.identified_words(first, replace(run.fit, chi2_per_dof=1.1)) == "identified by the data"
+    failing = replace(run.fit, chi2_per_dof=40.0)
+    assert "identified" not in summary.identified_words(first, failing)
+    states = {r.cells[5] for r in tables.parameters_table(failing).rows}
+    assert "identified" not in states
+    assert "if the model held" in states
