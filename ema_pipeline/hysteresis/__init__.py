@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING
 from ema_pipeline.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from ema_pipeline.hysteresis.diagnosis import diagnose_loops
     from ema_pipeline.hysteresis.identify import identify_isolator
+    from ema_pipeline.hysteresis.ladder import make_loop_ladder
     from ema_pipeline.hysteresis.loops import measure_loop
     from ema_pipeline.hysteresis.settings import HysteresisSettings
     from ema_pipeline.hysteresis.stage import analyse_hysteresis
@@ -14,7 +16,9 @@ else:
     __getattr__ = lazy_names(
         __name__,
         {
+            "diagnose_loops": "diagnosis",
             "identify_isolator": "identify",
+            "make_loop_ladder": "ladder",
             "measure_loop": "loops",
             "HysteresisSettings": "settings",
             "analyse_hysteresis": "stage",
@@ -28,6 +32,8 @@ __all__ = [
     "IsolatorResult",
     "Loop",
     "analyse_hysteresis",
+    "diagnose_loops",
     "identify_isolator",
+    "make_loop_ladder",
     "measure_loop",
 ]

@@ -15,6 +15,7 @@ from ema_pipeline.report.style import (
     MARKERS,
     MEASURED,
     MODEL,
+    SECOND,
     SERIES,
     margins,
     new_figure,
@@ -23,17 +24,32 @@ from ema_pipeline.report.style import (
 )
 
 _COLUMNS = 3
+_ENERGY = 0.03
 
 
 @styled
 def loops_figure(result: IsolatorResult) -> Figure:
-    """Every measured loop with the model's, by the one set of parameters."""
+    """Every measured loop with the published model's, by one set of parameters.
+
+    Where that misses the energy of some loop, also by parameters of each loop's own.
+    """
+    one_set = all(abs(fit.energy_error) < _ENERGY for fit in result.fits)
     rows = -(-len(result.loops) // _COLUMNS)
     figure = new_figure(2.1 * rows + 0.5)
     grid = figure.add_gridspec(rows, _COLUMNS, hspace=0.6, wspace=0.34, **margins(figure, left=0.8))
     for k, (loop, fit) in enumerate(zip(result.loops, result.fits, strict=True)):
         ax = figure.add_subplot(grid[k // _COLUMNS, k % _COLUMNS])
         _draw(ax, loop, fit)
+        if not one_set:
+            x, force = 1e3 * loop.displacement, result.alone[k].force
+            ax.plot(
+                np.append(x, x[0]),
+                np.append(force, force[0]),
+                color=SECOND,
+                ls="-.",
+                lw=0.9,
+                label="by itself",
+            )
         if k == 0:
             ax.legend(loc="upper left")
         if k % _COLUMNS == 0:

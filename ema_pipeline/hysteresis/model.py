@@ -220,7 +220,7 @@ class Motion:
     def _harmonics(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
         """Fourier series at each loop's points, and its least-squares inverse."""
         bases = [fourier(loop.phase, _HARMONICS) for loop in self.loops]
-        return [(basis, np.linalg.pinv(basis)) for basis in bases]
+        return [(basis, np.asarray(np.linalg.pinv(basis), dtype=np.float64)) for basis in bases]
 
 
 def _touching(

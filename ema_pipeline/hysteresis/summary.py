@@ -9,8 +9,8 @@ from ema_pipeline.hysteresis.types import Estimate, IsolatorResult
 
 
 def terminal_lines(result: IsolatorResult) -> list[str]:
-    """Parameters, dampers, loss factors, ladder, what cannot be, and where the model fails."""
-    lines = [f"{len(result.loops)} loops; parameters by least squares on all of them:"]
+    """Parameters, dampers, loss factors, what cannot be, and where the published model fails."""
+    lines = [f"{len(result.loops)} loops; parameters of the published model by least squares on all of them:"]
     lines += [f"  {_line(name, e)}" for name, e in result.parameters.items()]
     if result.relaxation:
         lines.append("with a relaxation (Maxwell branch) instead of a negative damper:")
@@ -22,11 +22,14 @@ def terminal_lines(result: IsolatorResult) -> list[str]:
             f"energy over frequency at {1e3 * line.amplitude_m:.3g} mm: "
             f"c = {c.value:.4g} ± {c.std:.2g} N·s/m{verdict}"
         )
-    lines.append("loop, energy per cycle measured and modelled, loss factor:")
-    for loop, fit, loss in zip(result.loops, result.fits, result.loss, strict=True):
+    lines.append(
+        "loop, energy per cycle measured, by one set of parameters, by parameters of its own; loss factor:"
+    )
+    each = zip(result.loops, result.fits, result.alone, result.loss, strict=True)
+    for loop, fit, alone, loss in each:
         lines.append(
             f"  {loop.name}: {loop.energy_j:.4g} ± {loop.energy_std_j:.2g} J, {fit.energy_j:.4g} J, "
-            f"η = {loss.value:.3g} ± {loss.std:.2g}"
+            f"{alone.energy_j:.4g} J; η = {loss.value:.3g} ± {loss.std:.2g}"
         )
     lines += [f"! {flag}" for flag in result.flags]
     lines += [f"- {note}" for note in result.notes]
@@ -61,10 +64,14 @@ def summary(result: IsolatorResult) -> dict[str, Any]:
                 "energy_std_j": loop.energy_std_j,
                 "model_energy_j": fit.energy_j,
                 "misfit": fit.misfit,
+                "own_energy_j": alone.energy_j,
+                "own_misfit": alone.misfit,
                 "loss_factor": _known(loss.value),
                 "loss_factor_std": _known(loss.std),
             }
-            for loop, fit, loss in zip(result.loops, result.fits, result.loss, strict=True)
+            for loop, fit, alone, loss in zip(
+                result.loops, result.fits, result.alone, result.loss, strict=True
+            )
         ],
         "energy": [
             {
