@@ -15,6 +15,9 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.exchange.tables import write_table
 from ema_pipeline.fit.map_fit import fit_rig
+from ema_pipeline.fit.types import FitResult
+from ema_pipeline.report import summary
+from ema_pipeline.report.results import RunResults
 from ema_pipeline.rigs import Rig, load_rig, model_modes
 
 TABLE = """\
@@ -151,6 +154,10 @@ def frame_modes(folder: Path, data: dict[str, Any], storeys: list[int], rig: Rig
     return read_mode_table(table(folder, "\n".join(lines)), rig)
 
 
+def results(fit: FitResult) -> RunResults:
+    return RunResults(title="frame", rig="frame", fit=fit)
+
+
 def errors(rig: Rig, measured: MeasuredModes, values: dict[str, float] | None = None) -> np.ndarray:
     model = [m.frequency_hz for m in model_modes(rig, "default", values)]
     return np.array(model[: len(measured)]) / measured.frequency_hz - 1
@@ -165,6 +172,9 @@ def test_four_storey_frame_is_mended_by_fitting_its_stiffnesses(test_data: Path,
     fit = fit_rig(rig, measured)
     assert np.max(np.abs(errors(rig, measured["default"], fit.values()))) < 0.1 * np.max(np.abs(nominal))
     assert all(p.identified for n, p in fit.parameters.items() if n.endswith("_stiffness"))
+    (told,) = (line for line in summary.findings(results(fit)) if "the data narrow" in line)
+    assert told.count("stiffness") == 4
+    assert "storey4 stiffness 2.560 ± 0.061 kN/m" in told
 
 
 def test_eighteen_stiffnesses_are_not_identified_by_three_modes(test_data: Path, tmp_path: Path) -> None:
@@ -179,3 +189,6 @@ def test_eighteen_stiffnesses_are_not_identified_by_three_modes(test_data: Path,
     for p in stiffnesses.values():
         assert not p.identified
         assert "tolerance determines it" in p.note
+    (told,) = (line for line in summary.findings(results(fit)) if "the data narrow" in line)
+    assert "stiffness" not in told
+    assert "the other 36 are not identified one by one" in told

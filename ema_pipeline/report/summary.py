@@ -16,6 +16,9 @@ from ema_pipeline.report.results import ConfigurationResults, RunResults
 SAME_KIND = 2
 """Cautions of one kind that are written out; the rest is counted."""
 
+TOLD = 6
+"""Narrowed parameters that are named."""
+
 _DOF_OR_NUMBER = re.compile(r"-?\b[A-Za-z]\w*\.[a-z]\w*|[\d.]*\d")
 
 
@@ -34,6 +37,7 @@ def findings(results: RunResults) -> tuple[str, ...]:
             f"The fit uses {fit.data_count} data; χ² per degree of freedom is {plain(fit.chi2_per_dof, 3)}, "
             f"the error function ε is {plain(fit.frequency_error, 3)}."
         )
+        lines += _narrowed(fit)
     if compared is not None and math.isfinite(compared.error):
         size = plain(compared.error, 3)
         if compared.error <= 1.5:
@@ -54,6 +58,23 @@ def stiffnesses(fit: FitResult) -> tuple[ParameterEstimate, ...]:
     """The parameters that a reader wants first: the free ones, or else the mesh stiffnesses."""
     free = tuple(p for p in fit.parameters.values() if p.free)
     return free or tuple(p for p in fit.parameters.values() if "mesh_stiffness" in p.name)
+
+
+def _narrowed(fit: FitResult) -> list[str]:
+    """Where no parameter is free: which of those with tolerances the data say something of."""
+    known = [p for p in fit.parameters.values() if math.isfinite(p.prior_std)]
+    if stiffnesses(fit) or not known:
+        return []
+    told = sorted((p for p in known if p.identified), key=lambda p: p.std / p.prior_std)
+    if not told:
+        return [
+            f"The {len(known)} parameters are not identified one by one by these data: their tolerances decide."
+        ]
+    named = ", ".join(f"{words(p.name)} {format_value(p.value, p.std, p.unit)}" for p in told[:TOLD])
+    more = f" and {len(told) - TOLD} more" if len(told) > TOLD else ""
+    left = len(known) - len(told)
+    rest = f"; the other {left} are not identified one by one, their tolerances decide" if left else ""
+    return [f"Of {len(known)} parameters with tolerances the data narrow {named}{more}{rest}."]
 
 
 def fails(fit: FitResult) -> bool:
@@ -133,7 +154,7 @@ def _cautions_of(c: ConfigurationResults) -> list[str]:
             lines.append("the hammer is not calibrated: FRFs and shapes have no absolute scale")
         lines += [v.message or f"{v.check} fails" for v in c.frfs.verdicts if not v.passes][:5]
     if c.modal is not None:
-        if not c.modal.scaled:
+        if not c.modal.scaled and c.modal.dofs:
             lines.append(f"shapes are not mass-normalised: {c.modal.scaling_note or 'no driving point'}")
         lines += c.modal.notes
     if c.pairing is not None:
