@@ -43,6 +43,11 @@ UNKNOWN = 0.3
 only small ones in a hit that excites it."""
 
 
+CURVED = 0.02
+"""Change of a pole, in decay rates, above which the change is linearised anew."""
+
+STEPS = 3
+
 CLEAR_FORCE = 100.0
 """Force power over the hammer's noise, below which the FRF of a single hit is biased."""
 
@@ -307,7 +312,42 @@ def _solve(
     std = np.array(
         [_deviations(_whitened(columns, mean, scale * r, smooth)[0], own, common)[:m] for r in root]
     )
+    large = (std < -UNKNOWN * poles.real) & (np.abs(solution[:, :m]) > -CURVED * poles.real)
+    for h in np.flatnonzero(large.any(axis=1)).tolist():
+        better = _refined(
+            omega, poles, shapes, rest_s, start, solution[h], difference[h], scale * root[h], smooth
+        )
+        both = np.tile(large[h], 2)  # what the hit hardly tells of may have gone astray
+        solution[h, both] = better[both]
     return _Solved(poles + solution[:, :m], std, start + solution[:, m:])
+
+
+def _refined(
+    omega: Real,
+    poles: Complex,
+    shapes: Complex,
+    rest_s: float,
+    start: Complex,
+    change: Complex,
+    difference: Complex,
+    weight: Real,
+    smooth: Real,
+) -> Complex:
+    """Change of poles and participations of one hit, linearised anew where the last step ended."""
+    m = len(poles)
+    before = start[:, None] * pole_functions(omega, poles, rest_s)[0]
+    for _ in range(STEPS):
+        now = start + change[m:]
+        u, du = pole_functions(omega, poles + change[:m], rest_s)
+        left = difference - shapes.T @ (now[:, None] * u - before)
+        columns = np.concatenate(
+            [shapes.T[:, :, None] * (now[:, None] * du), shapes.T[:, :, None] * u], axis=1
+        )
+        step = _least_squares(*_whitened(columns, left, weight, smooth))
+        if np.any(np.abs(step[:m]) > -poles.real):
+            break
+        change = change + step
+    return change
 
 
 def _whitened(columns: Complex, data: Complex, weight: Real, smooth: Real) -> tuple[Complex, Complex]:
