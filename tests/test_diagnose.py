@@ -15,7 +15,13 @@ from ema_pipeline import codec
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
 from ema_pipeline.diagnose import DiagnoseSettings, Diagnosis, diagnose, make_ladder
 from ema_pipeline.diagnose.fitting import Case, fit_hypothesis, fit_null, ground
-from ema_pipeline.diagnose.hypotheses import Hypothesis, prior_probabilities, single_hypotheses
+from ema_pipeline.diagnose.hypotheses import (
+    Hypothesis,
+    extras,
+    prior_probabilities,
+    single_hypotheses,
+)
+from ema_pipeline.diagnose.scan import scanned
 from ema_pipeline.diagnose.separate import options
 from ema_pipeline.diagnose.thresholds import from_null_gains
 from ema_pipeline.dof import Dof
@@ -25,6 +31,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.modes import normal_modes
 from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
 from ema_pipeline.rigs import load_rig
+from ema_pipeline.rigs.base import model_modes
 
 RIG = load_rig("planetary")
 BODIES = ("carrier", "sun", "planet1", "planet2")
@@ -197,6 +204,29 @@ def test_a_richer_model_never_fits_worse() -> None:
     for label in (CRACK, TORSION, "planet_bearing_mistune@planet2"):
         f = fit_hypothesis(case, Hypothesis((label,)), SETTINGS.fit, below)
         assert f.objective <= null.objective + 0.01
+
+
+def test_sizes_that_bring_lost_modes_back_are_found_without_a_fit_and_none_where_none_is_lost() -> None:
+    library = {"hysteretic_damping": shipped_effects()["hysteretic_damping"]}
+    label = "hysteretic_damping@sun-planet"
+    (loss,) = extras(RIG, Hypothesis((label,)), library)
+
+    def sizes(measured: Mapping[str, MeasuredModes]) -> list[float]:
+        case = Case(RIG, measured, SETTINGS, library)
+        base = fit_null(case, Hypothesis(), SETTINGS.fit, None)
+        problem = case.problem(Hypothesis((label,)), SETTINGS.fit)
+        start = ground(case, base, SETTINGS.fit).annealed or base.values
+        return [problem.space.named(x)[loss.name] for x in scanned(problem, start, [loss])]
+
+    healthy = measure({}, seed=8)
+    assert sizes(healthy) == []
+    damped = rig_with_effects(RIG, [(label, {"loss_factor": 0.06})])
+    values = {n: 1e7 if p.free else p.value for n, p in RIG.parameters.items()} | {loss.name: 0.06}
+    exact = {round(m.frequency_hz, 1): m.damping_ratio for m in model_modes(damped, "no_ring", values)}
+    m = healthy["no_ring"]
+    ratio = np.array([min(exact.items(), key=lambda f: abs(f[0] - hz))[1] for hz in m.frequency_hz])
+    lossy = {"no_ring": replace(m, damping_ratio=ratio, damping_std=0.03 * ratio)}
+    assert sizes(lossy)[0] == pytest.approx(0.06, rel=0.5)
 
 
 def test_a_further_measurement_separates_two_effects_but_not_one_from_itself() -> None:

@@ -23,7 +23,7 @@ from ema_pipeline.fit.error_function import (
 from ema_pipeline.fit.latent import LatentObjective
 from ema_pipeline.fit.map_fit import fit_rig
 from ema_pipeline.fit.settings import FitSettings
-from ema_pipeline.fit.solve import FitProblem
+from ema_pipeline.fit.solve import FitProblem, prepare
 from ema_pipeline.fit.space import make_space
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.mechanics.modes import normal_modes
@@ -294,6 +294,62 @@ def test_the_latent_gradient_agrees_with_finite_differences() -> None:
     )
     # the size a_r of the latent shape is held in the analytic gradient, hence not to the last digit
     assert np.linalg.norm(gradient - numeric) < 0.05 * np.linalg.norm(numeric)
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        "mesh_stiffness_loss@sun-planet1",
+        "bearing_anisotropy@sun",
+        "local_damper@sun",
+        "hysteretic_damping@ring",
+    ],
+)
+def test_terms_of_the_paired_residuals_agree_with_central_differences(effect: str) -> None:
+    """Real and complex modes; matrices that are polynomials of the parameters and others."""
+    rng = np.random.default_rng(15)
+    rig = rig_with_effects(RIG, [effect])
+    measured = {"with_ring": simulate(RIG, "with_ring", draw(rng, (7, 7)), rng)}
+    problem = FitProblem(rig, measured, FAST)
+    x = problem.space.point({SUN_PLANET: 1e7, RING_PLANET: 1e7}) + 0.03 * rng.normal(
+        size=len(problem.space.names)
+    )
+    x = np.clip(x, problem.space.low + 1e-3, problem.space.high - 1e-3)
+    objective = problem.exact(problem.assignments(x))
+    normal, gradient = objective.normal_equations(x, np.ones(problem.counts.size))
+    step = 1e-5
+    points = np.vstack([x + step * np.eye(x.size), x - step * np.eye(x.size), x[None]])
+    r = objective.residuals(points)[0].reshape(len(points), -1)
+    jacobian = (r[: x.size] - r[x.size : -1]) / (2 * step)
+    assert np.linalg.norm(gradient - jacobian @ r[-1]) < 3e-3 * np.linalg.norm(gradient)
+    # Kaufman's projection leaves out what is of the order of the residual
+    assert np.linalg.norm(normal - jacobian @ jacobian.T) < 0.03 * np.linalg.norm(normal)
+
+
+@pytest.mark.parametrize(
+    "effect", ["sensor_mass@all", "planet_bearing_mistune@planet2", "flexible_support@ring"]
+)
+def test_matrices_that_build_on_those_of_a_poorer_model_equal_those_that_the_rig_builds(effect: str) -> None:
+    rng = np.random.default_rng(16)
+    measured = {"with_ring": simulate(RIG, "with_ring", draw(rng, (7, 7)), rng)}
+    cracked = rig_with_effects(RIG, ["mesh_stiffness_loss@sun-planet1"])
+    rig = rig_with_effects(RIG, ["mesh_stiffness_loss@sun-planet1", effect])
+    family = prepare(rig, measured, prepare(cracked, measured))["with_ring"]
+    space = family.space
+    assert family.polynomial
+    x = np.clip(space.point() + rng.normal(size=len(space.names)), space.low, space.high)
+    system = rig.system("with_ring", space.named(x))
+    built = family.at(x[None])
+    assert np.allclose(built.stiffness[0], system.stiffness, rtol=1e-9, atol=1e-2)
+    assert np.allclose(built.mass[0], system.mass, rtol=1e-9, atol=1e-12)
+    # over fewer parameters: the others at their nominal values
+    fewer = make_space([p for n, p in rig.parameters.items() if n != "carrier_mass"])
+    y = fewer.point(space.named(x))
+    part = family.over(fewer).at(y[None])
+    assert np.allclose(
+        part.stiffness[0], rig.system("with_ring", fewer.named(y)).stiffness, rtol=1e-9, atol=1e-2
+    )
+    assert np.allclose(part.mass[0], rig.system("with_ring", fewer.named(y)).mass, rtol=1e-9, atol=1e-12)
 
 
 def test_polynomial_matrices_equal_those_that_the_rig_builds_also_with_a_product_of_parameters() -> None:

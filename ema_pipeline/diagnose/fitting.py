@@ -180,24 +180,29 @@ class Ground:
         are where they belong, the way to any optimum is short, and nothing has to be annealed.
     lost : bool
         True where it leaves measured modes unexplained.
+    annealed : dict of str to float
+        Where the annealing ended: values that no mode was given up for, damping left aside. Empty where
+        nothing was annealed.
     """
 
     values: dict[str, float]
     objective: float
     latent: float
     lost: bool
+    annealed: dict[str, float]
 
 
 def ground(case: Case, base: Fitted, fit: FitSettings) -> Ground:
     """Prepare a base model for the hypotheses on top of it."""
     lost = not np.all(base.explained)
     if holds(base):
-        return Ground(base.values, base.objective, np.inf, lost)
+        return Ground(base.values, base.objective, np.inf, lost, {})
     problem = case.problem(base.hypothesis, fit)
     x = problem.space.point(base.values)
     nominal = np.where(problem.space.has_prior, 0.0, x)
-    latent = min(_descend_rungs(problem, start).objective for start in (x, nominal))
-    return Ground(base.values, base.objective, latent, lost)
+    starts = (x, nominal, problem.space.point())
+    best = min((_descend_rungs(problem, start) for start in starts), key=lambda o: o.objective)
+    return Ground(base.values, base.objective, best.objective, lost, problem.space.named(best.x))
 
 
 def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: Ground) -> Fitted:
@@ -231,6 +236,8 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
         candidates += [refine(problem, x) for x in _best_distinct(promising, 2)]
     if base.lost:
         candidates += [settle(problem, x) for x in scanned(problem, base.values, moved)]
+    if base.lost and base.annealed:
+        candidates += [settle(problem, x) for x in scanned(problem, base.annealed, moved, 1)]
     if dynamic and not any(e.has_shapes for e in problem.evidence):
         rig = make_rig(case.rig, hypothesis, case.library, case.settings.parameter_range)
         for values in searched_starts(rig, last, case.measured, fit, base.values):

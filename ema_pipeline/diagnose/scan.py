@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from ema_pipeline.diagnose.hypotheses import Extra
 from ema_pipeline.fit.solve import FitProblem
 
-_WIDENED = 30.0
+_WIDENED, _DAMPING_WIDENED = 30.0, 5.0
+"""Damping ratios are known to a few per cent only: widened thirty times, they would say nothing."""
 _REACH = 300.0
 """Sizes are tried from a start over to a start times this much, in steps of a factor of two or so."""
 _SINGLE, _SEVERAL = 17, 6
@@ -101,8 +102,10 @@ def _cost(
     problem: FitProblem, base: Mapping[str, float], moved: Sequence[Extra], sizes: tuple[float, ...]
 ) -> float:
     x = _point(problem, base, moved, sizes)
+    damping_only = all(problem.damping_only[problem.space.names.index(e.name)] for e in moved)
+    mixture = problem.mixture(_DAMPING_WIDENED if damping_only else _WIDENED)
     costs = problem.exact(problem.assignments(x)).costs(x)
-    return float(np.sum(problem.mixture(_WIDENED).robust(costs)))
+    return float(np.sum(mixture.robust(costs)))
 
 
 def _near(a: tuple[float, ...], b: tuple[float, ...]) -> bool:

@@ -148,21 +148,26 @@ class MatrixFamily:
     def _differ(
         self, a: NDArray[np.float64], b: NDArray[np.float64], steps: NDArray[np.float64]
     ) -> NDArray[np.bool_]:
-        change = np.max(np.abs(a - b), axis=1, initial=0.0) * np.abs(steps)
-        return np.asarray(change > _EXACT * self._size())
+        change = np.abs(a - b) * np.abs(steps)[:, None]
+        return np.any(change > _EXACT * self._size(a, steps), axis=1)
 
-    def _size(self) -> float:
-        return float(np.max(np.abs(self._build(self.origin)), initial=1.0))
+    def _size(self, slopes: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Largest entry of the matrix that each entry belongs to: below a share of it all is rounding."""
+        largest = np.max(np.abs(slopes) * np.abs(steps)[:, None], axis=0, initial=0.0)
+        largest = np.maximum(largest, np.abs(self._build(self.origin)))
+        blocks = largest[:-1].reshape(4, -1).max(axis=1)
+        return np.append(np.repeat(blocks, self.size**2), largest[-1])
 
     def _add_products(self, slopes: NDArray[np.float64], steps: NDArray[np.float64]) -> None:
-        base, size = self._build(self.origin), self._size()
+        base, least = self._build(self.origin), _EXACT * self._size(slopes, steps)
         pairs, products = [], []
         for i, j in combinations(np.flatnonzero(self.interacting).tolist(), 2):
             both = self._build(_moved(_moved(self.origin, i, steps), j, steps))
-            term = (both - base - slopes[i] * steps[i] - slopes[j] * steps[j]) / (steps[i] * steps[j])
-            if np.max(np.abs(term)) * abs(steps[i] * steps[j]) > _EXACT * size:
+            change = both - base - slopes[i] * steps[i] - slopes[j] * steps[j]
+            change[np.abs(change) <= least] = 0.0
+            if np.any(change):
                 pairs.append((i, j))
-                products.append(term)
+                products.append(change / (steps[i] * steps[j]))
         self.pairs = np.array(pairs, dtype=int).reshape(-1, 2)
         self.coefficients = np.vstack([base[None], slopes, np.reshape(products, (-1, base.size))])
         self.polynomial = self._holds(steps)
@@ -171,10 +176,8 @@ class MatrixFamily:
         """Is the polynomial what the rig builds, at points that it was not made from?"""
         count = np.arange(len(steps))
         checks = [self.origin + 0.61 * steps * np.cos(count + s) ** 2 for s in (0.0, 1.0)]
-        return all(
-            np.max(np.abs(self._polynomial(v[None])[0] - self._build(v))) <= 1e3 * _EXACT * self._size()
-            for v in checks
-        )
+        most = 1e3 * _EXACT * self._size(self.coefficients[1 : 1 + len(steps)], steps)
+        return all(np.all(np.abs(self._polynomial(v[None])[0] - self._build(v)) <= most) for v in checks)
 
     def _relevant(self, steps: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Parameters that this configuration depends on."""
