@@ -4,7 +4,7 @@
 
 A hammer test of one impact point is simulated into a temporary raw folder; then `ema run` goes over it as far as the
 FRFs, as far as the modes, and to the end, each in a process of its own. What counts is the largest resident size of
-the process, less that of a process that imports the package and ends. Half-way house: less that of the same run on
+the process, less that of a process that imports the package and ends. The second figure is less that of the same run on
 two channels of 4096 samples, so that the libraries that a run loads do not count either.
 The size of the FRFs is that of their complex values; coherence and variance, which are kept too, have as much again.
 """
@@ -16,6 +16,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +34,14 @@ STAGES = {
 }
 F_MAX_HZ = 800.0
 RUN = "import sys; from ema_pipeline.cli import main; sys.argv[0] = 'ema'; sys.exit(main())"
+LAUNCH = """
+import os, subprocess, sys
+process = subprocess.Popen(sys.argv[1:], stdout=subprocess.DEVNULL)
+_, status, usage = os.wait4(process.pid, 0)
+print(usage.ru_maxrss)
+sys.exit(os.waitstatus_to_exitcode(status))
+"""
+"""A small process in between: a process counts what the one that started it had at that moment as its own."""
 
 
 def write_raw(folder: Path, channels: int, hits: int, samples: int) -> None:
@@ -63,12 +72,11 @@ def write_raw(folder: Path, channels: int, hits: int, samples: int) -> None:
 def peak_bytes(code: str, *arguments: str) -> int:
     """Largest resident size of a Python process, bytes."""
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    process = subprocess.Popen([sys.executable, "-c", code, *arguments], env=environment)
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise SystemExit(f"{' '.join(arguments) or code} ended with {process.returncode}")
-    return usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    command = [sys.executable, "-S", "-c", LAUNCH, sys.executable, "-c", code, *arguments]
+    ended = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=False)
+    if ended.returncode:
+        raise SystemExit(f"{' '.join(arguments) or code} ended with {ended.returncode}")
+    return int(ended.stdout) * (1 if sys.platform == "darwin" else 1024)
 
 
 @dataclass(frozen=True)
@@ -81,10 +89,9 @@ class Peak:
     over_small_run: float
 
 
-def measure(channels: int, hits: int, samples: int) -> list[Peak]:
+def measure(channels: int, hits: int, samples: int) -> Iterator[Peak]:
     """Peaks of the runs over more and more stages."""
     size = 16 * channels * (samples // 2 + 1)
-    out = []
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         write_raw(folder / "raw", channels, hits, samples)
@@ -100,8 +107,7 @@ def measure(channels: int, hits: int, samples: int) -> list[Peak]:
                 )
                 for raw in ("small", "raw")
             ]  # fmt: skip
-            out.append(Peak(name, peaks[1] / 1e6, (peaks[1] - bare) / size, (peaks[1] - peaks[0]) / size))
-    return out
+            yield Peak(name, peaks[1] / 1e6, (peaks[1] - bare) / size, (peaks[1] - peaks[0]) / size)
 
 
 def main() -> None:
@@ -119,7 +125,8 @@ def main() -> None:
     for peak in measure(given.channels, given.hits, given.samples):
         print(
             f"{peak.stages}: {peak.peak_mb:.0f} MB, {peak.over_import:.2f} x FRFs above the bare import, "
-            f"{peak.over_small_run:.2f} x above a run of two channels"
+            f"{peak.over_small_run:.2f} x above a run of two channels",
+            flush=True,
         )
 
 
