@@ -16,7 +16,6 @@ from scipy.optimize import linear_sum_assignment
 
 from ema_pipeline.correlate.residuals import Matrices, modal_basis
 from ema_pipeline.diagnose.fitting import Case, Fitted
-from ema_pipeline.diagnose.hypotheses import make_rig
 from ema_pipeline.fit.evidence import Dataset
 from ema_pipeline.fit.map_fit import posterior_covariance
 from ema_pipeline.fit.matrices import MatrixFamily
@@ -142,8 +141,7 @@ def options(case: Case, a: Fitted, b: Fitted, fit: FitSettings) -> list[Option]:
 
 
 def _side(case: Case, fitted: Fitted, fit: FitSettings) -> _Side:
-    rig = make_rig(case.rig, fitted.hypothesis, case.library, case.settings.parameter_range)
-    problem = FitProblem(rig, case.measured, fit)
+    problem = case.problem(fitted.hypothesis, fit)
     x = problem.space.point(fitted.values)
     optimum = Optimum(x, fitted.objective, fitted.costs, fitted.inlier, "")
     return _Side(problem, x, posterior_covariance(problem, optimum, 1.0), fitted.costs)
