@@ -168,7 +168,9 @@ def judged(
     for i, name in enumerate(space.names):
         if name in sizes:
             cost -= np.log(covariance[i, i])
-    std = {n: float(np.sqrt(max(covariance[i, i], 0)) * slopes[i]) for i, n in enumerate(space.names)}
+    # what the data say, without the prior of the sizes, is the uncertainty that is told
+    told = np.linalg.inv(found.hessian + 1e-9 * np.eye(len(space.names)))
+    std = {n: float(np.sqrt(max(told[i, i], 0.0)) * slopes[i]) for i, n in enumerate(space.names)}
     return Simulated(hypothesis, dict(sizes), found, std, float(found.objective + cost))
 
 

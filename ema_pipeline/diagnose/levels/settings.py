@@ -19,7 +19,7 @@ class LevelDiagnosisSettings(Settings):
         default=24, ge=2, description="Hits that are simulated in each configuration, at most."
     )
     points_per_period: float = Field(
-        default=8.0, ge=4, description="Steps of the integration per period of the highest mode."
+        default=12.0, ge=4, description="Steps of the integration per period of the highest mode."
     )
     noise_start: float = Field(
         default=0.03,
