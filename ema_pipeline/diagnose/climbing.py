@@ -86,6 +86,11 @@ def climb(case: Case, witness: Witness, thresholds: Mapping[str, float] | None, 
         claim, note = claimable(case, rankings[-1], fit, witness, thresholds)
         if claim is None:
             break
+        if len(models) > 1 and not _told_apart(rankings[-1], claim, settings.probability_least):
+            note = (
+                f"{claim.hypothesis.labels[-1]} or others like it may be missing too: too small to tell which"
+            )
+            break
         if len(models) > settings.most_rungs:
             note = f"stopped after {settings.most_rungs} effects"
             break
@@ -96,6 +101,12 @@ def climb(case: Case, witness: Witness, thresholds: Mapping[str, float] | None, 
         rankings.append(rank(case, claim, rest, fit, told))
         models[-1] = rankings[-1].base
     return Climb(models, rankings, level, note)
+
+
+def _told_apart(ranking: Ranking, claim: Fitted, least: float) -> bool:
+    """True where a further effect is told from its rivals, or a model that fails needs it anyway."""
+    something = 1 - ranking.probabilities[NOTHING]
+    return not holds(ranking.base) or ranking.probabilities[claim.hypothesis.label] >= least * something
 
 
 def claimable(
