@@ -246,3 +246,24 @@ def test_commands_and_report_tell_the_story_of_the_loops(tmp_path: Path) -> None
     assert "linear spring + " not in ema("compare", str(out))
     refused = CliRunner().invoke(app, ["add", str(out), "viscous_dampin@isolator"])
     assert isinstance(refused.exception, EmaError)
+
+
+def test_play_of_the_spring_alone_is_told_from_play_of_the_whole_isolator() -> None:
+    random, data = np.random.default_rng(4), []
+    for f in (10.0, 16.0):
+        for amplitude in (1e-3, 2e-3):
+            phase = f * np.arange(round(20 * 5120 / f)) / 5120
+            x, v = (
+                amplitude * np.sin(2 * np.pi * phase),
+                2 * np.pi * f * amplitude * np.cos(2 * np.pi * phase),
+            )
+            force = 9e4 * (x - np.clip(x, -1e-4, 1e-4)) + 40.0 * v
+            force += 0.005 * np.ptp(force) * random.standard_normal(len(x))
+            x = x + 0.01 * amplitude * random.standard_normal(len(x))
+            data.append(measure_loop(x, force, 5120.0, f, amplitude))
+    found, _ = diagnose_loops(data)
+    top = found.ladder.rungs[-1]
+    assert set(top.effects) == {"backlash@isolator", "viscous_damping@isolator"}
+    assert top.parameters["backlash@isolator.gap"].value == pytest.approx(2e-4, rel=0.02)
+    assert top.error == pytest.approx(1.0, abs=0.12)
+    assert any("spring alone" in note for note in found.notes)

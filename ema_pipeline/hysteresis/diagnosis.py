@@ -14,6 +14,7 @@ from ema_pipeline.hysteresis.explain import (
     limits_words,
     missing_words,
     next_loop,
+    play_words,
     scales_words,
     where_it_falls,
 )
@@ -189,6 +190,7 @@ class _Judge:
             ladder=ladder,
             notes=(
                 *scales_words(self.loops, models[-1]),
+                *play_words(models[-1]),
                 *missing_words(self.loops, drawn[-1], ladder.rungs[-1].error, self.settings.error_limit),
                 *limits_words(limits),
             ),

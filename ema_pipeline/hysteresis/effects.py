@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.hysteresis.model import (
@@ -16,6 +16,7 @@ from ema_pipeline.hysteresis.model import (
     RELAXATION,
     RHO,
     SIGMA,
+    SPRING_GAP,
     STIFFNESS,
     TIME,
 )
@@ -35,6 +36,9 @@ PARAMETERS: Mapping[str, Mapping[str, str]] = {
 LINEAR = (STIFFNESS, QUADRATIC, CUBIC, DAMPING, FORCE, RELAXATION)
 """Parameters that enter the force linearly, in the order of their columns."""
 
+DISSIPATIVE = ("viscous_damping", "hysteresis", "relaxation")
+"""Effects beside which it matters whether the spring alone has free play."""
+
 NEVER_NEGATIVE = (DAMPING, FORCE, RELAXATION)
 """Negative ones would give energy out every cycle."""
 
@@ -49,10 +53,13 @@ class Structure:
         Ids, in the order in which they were added.
     free_exponent : bool
         True where the exponent of the Bouc-Wen model is fitted, else it is 1.
+    spring_play : bool
+        True where free play is that of the spring alone, else the whole isolator has it.
     """
 
     effects: tuple[str, ...] = ()
     free_exponent: bool = False
+    spring_play: bool = False
 
     @property
     def key(self) -> frozenset[str]:
@@ -69,16 +76,19 @@ class Structure:
     def shapes(self) -> tuple[str, ...]:
         """Parameters that do not enter linearly."""
         names = [name for e in self.effects for name in PARAMETERS[e].values() if name not in LINEAR]
+        if self.spring_play:
+            names = [SPRING_GAP if n == GAP else n for n in names]
         return tuple(n for n in names if n != EXPONENT or self.free_exponent)
 
     def plus(self, effect: str) -> Structure:
         """With one more effect."""
-        return Structure((*self.effects, effect), self.free_exponent)
+        return replace(self, effects=(*self.effects, effect))
 
     def without(self, effect: str) -> Structure:
         """With one effect less."""
         rest = tuple(e for e in self.effects if e != effect)
-        return Structure(rest, self.free_exponent and "hysteresis" in rest)
+        exponent = self.free_exponent and "hysteresis" in rest
+        return Structure(rest, exponent, self.spring_play and "backlash" in rest)
 
 
 def effect_ids(labels: Iterable[str]) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ema_pipeline.hysteresis.effects import DISSIPATIVE
 from ema_pipeline.hysteresis.fitting import Fitted, LoopSet
 from ema_pipeline.hysteresis.search import Ranking
 from ema_pipeline.hysteresis.types import LoopModel
@@ -44,6 +45,15 @@ def scales_words(loops: LoopSet, fitted: Fitted) -> tuple[str, ...]:
         f"settings (e.g. tensions): each has a force scale of its own, over a range of 1 : {ratio:.2g} ({text}); "
         "loops held out get only their scale and offset from their own data",
     )
+
+
+def play_words(fitted: Fitted) -> tuple[str, ...]:
+    """Whose play it is."""
+    if "backlash" not in fitted.structure.effects or not set(fitted.structure.effects) & set(DISSIPATIVE):
+        return ()
+    if fitted.structure.spring_play:
+        return ("the free play is that of the spring alone: damping goes on while the spring is idle",)
+    return ("the free play is that of the whole isolator: nothing damps while it is run through",)
 
 
 def missing_words(loops: LoopSet, model: LoopModel, error: float, limit: float) -> tuple[str, ...]:

@@ -23,10 +23,12 @@ from ema_pipeline.hysteresis.model import (
     EXPONENT,
     FORCE,
     GAP,
+    GAPS,
     QUADRATIC,
     RELAXATION,
     RHO,
     SIGMA,
+    SPRING_GAP,
     STIFFNESS,
     TIME,
     Motion,
@@ -39,6 +41,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     EXPONENT: (1.0, 20.0),
     TIME: (0.3, 100.0),
     GAP: (0.0, 0.95),
+    SPRING_GAP: (0.0, 0.95),
 }
 """Of ρ·X for the largest loop, σ, n, τ·ω, and of the play over the way of the smallest loop. A Maxwell branch that
 relaxes much faster than the motion is a viscous damper, and is left to be called one."""
@@ -48,8 +51,9 @@ _STARTS: Mapping[str, tuple[float, ...]] = {
     EXPONENT: (1.0, 1.0, 3.0),
     TIME: (0.5, 1.0, 2.0, 10.0),
     GAP: (0.02, 0.08, 0.2, 0.45),
+    SPRING_GAP: (0.02, 0.08, 0.2, 0.45),
 }
-_TOGETHER = ((RHO, SIGMA), (EXPONENT,), (TIME,), (GAP,))
+_TOGETHER = ((RHO, SIGMA), (EXPONENT,), (TIME,), GAPS)
 SYSTEMATIC = 1.3
 """Mean square of the residuals, in variances of the noise, from which a model's misfit is not noise."""
 _TRIED = 2
@@ -119,7 +123,9 @@ class LoopSet:
 
     def shape_unit(self, name: str) -> float:
         """Unit in which `RANGES` counts a parameter."""
-        return {RHO: 1 / self.amplitude_m, TIME: 1 / self.omega, GAP: self.least_span_m}.get(name, 1.0)
+        if name in GAPS:
+            return self.least_span_m
+        return {RHO: 1 / self.amplitude_m, TIME: 1 / self.omega}.get(name, 1.0)
 
     def whitened(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Forces in standard deviations and freed of offsets, (n_points, m)."""
@@ -149,7 +155,7 @@ class LoopSet:
         return each @ scales, columns, each
 
     def _column(self, term: str, values: Mapping[str, float]) -> NDArray[np.float64]:
-        if term in self._known:
+        if term in self._known and not (SPRING_GAP in values and term != DAMPING):
             return self._known[term]
         return self.whitened(self.motion.column(term, values)[:, None])[:, 0]
 
@@ -196,7 +202,7 @@ class Fitted:
 
     def reordered(self, effects: tuple[str, ...]) -> Fitted:
         """The same fit with its effects named in another order."""
-        structure = Structure(effects, self.structure.free_exponent)
+        structure = replace(self.structure, effects=effects)
         old, new = self.names, (*structure.terms, *structure.shapes)
         columns = [*(old.index(n) for n in new), *range(len(old), self.jacobian.shape[1])]
         return replace(self, structure=structure, jacobian=self.jacobian[:, columns])
@@ -327,7 +333,7 @@ class _Coordinates:
         low = [0.0 if physical and t in NEVER_NEGATIVE else -np.inf for t in self.terms]
         high = [np.inf] * len(low)
         for name in self.shapes:
-            ends = RANGES[name] if name == GAP else np.log(RANGES[name])
+            ends = RANGES[name] if name in GAPS else np.log(RANGES[name])
             low.append(float(ends[0]))
             high.append(float(ends[1]))
         self.low = np.array(low + [1e-3] * len(self.free))
@@ -344,19 +350,19 @@ class _Coordinates:
         n, m = len(self.terms), len(self.shapes)
         values = {t: float(v) * self.loops.units[t] for t, v in zip(self.terms, theta[:n], strict=True)}
         for name, v in zip(self.shapes, theta[n : n + m], strict=True):
-            values[name] = (float(v) if name == GAP else float(np.exp(v))) * self.loops.shape_unit(name)
+            values[name] = (float(v) if name in GAPS else float(np.exp(v))) * self.loops.shape_unit(name)
         scales = np.ones(len(self.loops.loops))
         scales[self.free] = theta[n + m :]
         return values, scales
 
     def by_value(self, values: Mapping[str, float]) -> NDArray[np.float64]:
         """Slopes of the parameters by the coordinates."""
-        shapes = [self.loops.shape_unit(n) if n == GAP else values[n] for n in self.shapes]
+        shapes = [self.loops.shape_unit(n) if n in GAPS else values[n] for n in self.shapes]
         return np.array([*(self.loops.units[t] for t in self.terms), *shapes, *np.ones(len(self.free))])
 
     @staticmethod
     def _inner(name: str, value: float) -> float:
-        return value if name == GAP else float(np.log(max(value, 1e-12)))
+        return value if name in GAPS else float(np.log(max(value, 1e-12)))
 
 
 def _refine(loops: LoopSet, structure: Structure, shape: Mapping[str, float], physical: bool) -> Fitted:

@@ -12,8 +12,8 @@ from ema_pipeline.hysteresis.effects import PARAMETERS, Structure, effect_ids, l
 from ema_pipeline.hysteresis.fitting import Fitted, LoopSet, loop_set
 from ema_pipeline.hysteresis.heldout import folds, heldout_error, settings_differ
 from ema_pipeline.hysteresis.identify import loop_fits
-from ema_pipeline.hysteresis.model import STIFFNESS, UNITS
-from ema_pipeline.hysteresis.search import fit_with_exponent, log_evidence, widening_of
+from ema_pipeline.hysteresis.model import SPRING_GAP, STIFFNESS, UNITS
+from ema_pipeline.hysteresis.search import fit_variants, log_evidence, widening_of
 from ema_pipeline.hysteresis.settings import HysteresisSettings
 from ema_pipeline.hysteresis.types import Loop, LoopModel
 from ema_pipeline.threads import single_blas_thread
@@ -82,7 +82,7 @@ def make_loop_ladder(
         for count in range(len(ids) + 1):
             tell(0.5 * count / (len(ids) + 1), f"fitting {ids[count - 1] if count else 'the linear spring'}")
             start = models[-1].values if models else None
-            models.append(fit_with_exponent(cases, Structure(ids[:count]), start))
+            models.append(fit_variants(cases, Structure(ids[:count]), start))
         ladder = assemble(
             cases, models, widening_of(models[-1], cases), folds_of(cases, settings), "", tell, start=0.5
         )
@@ -144,7 +144,10 @@ def known_sizes(fitted: Fitted, widening: float) -> dict[str, EffectSize]:
 
 def effect_sizes(known: dict[str, EffectSize], effect: str) -> dict[str, EffectSize]:
     """Sizes of one effect, by its own names of its parameters."""
-    return {own: known[name] for own, name in PARAMETERS[effect].items() if name in known}
+    found = {own: known[name] for own, name in PARAMETERS[effect].items() if name in known}
+    if effect == "backlash" and SPRING_GAP in known:
+        found["gap"] = known[SPRING_GAP]
+    return found
 
 
 def loop_model(loops: LoopSet, fitted: Fitted) -> LoopModel:

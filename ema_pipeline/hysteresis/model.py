@@ -2,7 +2,7 @@
 
 Force = K1 x + K2 x² + K3 x³ + c ẋ + k_w w(ρ, σ, n; x) + relaxation(τ; x) + an offset per loop. With free play
 the elements see the motion less the play: where the force would change its sign, it stays at zero until the
-play has been run through.
+play has been run through. Or only the spring has the play, and the others go on beside it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from ema_pipeline.mechanics.nonlinear import force_along, steady_deviation
 STIFFNESS, QUADRATIC, CUBIC = "stiffness", "quadratic_stiffness", "cubic_stiffness"
 DAMPING, FORCE, RELAXATION = "viscous_damping", "hysteresis_force", "relaxation_stiffness"
 RHO, SIGMA, TIME = "hysteresis_rho", "hysteresis_sigma", "relaxation_time"
-EXPONENT, GAP = "hysteresis_exponent", "backlash_gap"
+EXPONENT, GAP, SPRING_GAP = "hysteresis_exponent", "backlash_gap", "backlash_gap_of_spring"
+GAPS = (GAP, SPRING_GAP)
+"""Free play of the whole isolator, and free play of its spring alone."""
 UNITS = {
     STIFFNESS: "N/m",
     QUADRATIC: "N/m²",
@@ -37,6 +39,7 @@ UNITS = {
     EXPONENT: "1",
     TIME: "s",
     GAP: "m",
+    SPRING_GAP: "m",
 }
 Terms = tuple[str, ...]
 """Names of linear parameters, in the order of their columns."""
@@ -44,6 +47,7 @@ Terms = tuple[str, ...]
 _ROW = {"isolator.x": 1.0}
 POINTS = 512
 """Points per cycle at which the elements are run through."""
+_POWERS = {STIFFNESS: 1, QUADRATIC: 2, CUBIC: 3}
 _ROUNDS = 3
 _HARMONICS = 12
 """Of a stretch with play, by which the damper of a Maxwell branch follows it; it hardly sees higher ones."""
@@ -148,6 +152,9 @@ class Motion:
             return self._hysteresis(values, self.way, self.span)
         if term == RELAXATION:
             return self._relaxation(values[TIME])
+        if SPRING_GAP in values and term in _POWERS:
+            half = 0.5 * values[SPRING_GAP]
+            return np.asarray((self.x - np.clip(self.x, -half, half)) ** _POWERS[term])
         return self._fixed[term]
 
     def _hysteresis(
@@ -165,15 +172,14 @@ class Motion:
         gaps: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """Slopes by the terms while one of the contacts carries, (n_points, n_terms)."""
-        powers = {STIFFNESS: 1, QUADRATIC: 2, CUBIC: 3}
         columns = np.zeros((len(stretch), len(terms)))
         for j, term in enumerate(terms):
             if term == FORCE:
                 columns[:, j] = self._hysteresis(values, way, self.span - gaps)
             elif term == DAMPING:
                 columns[:, j] = self.velocity
-            elif term in powers:
-                columns[:, j] = stretch ** powers[term]
+            elif term in _POWERS:
+                columns[:, j] = stretch ** _POWERS[term]
         return columns
 
     def _held(

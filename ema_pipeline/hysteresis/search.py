@@ -7,14 +7,14 @@ the most probable ones are fitted in full, and evidence is Laplace's, with prior
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.hysteresis.effects import PARAMETERS, Structure
+from ema_pipeline.hysteresis.effects import DISSIPATIVE, PARAMETERS, Structure
 from ema_pipeline.hysteresis.fitting import RANGES, SYSTEMATIC, Fitted, LoopSet, fit
-from ema_pipeline.hysteresis.model import EXPONENT, GAP, STIFFNESS
+from ema_pipeline.hysteresis.model import EXPONENT, GAP, GAPS, SPRING_GAP, STIFFNESS
 
 Progress = Callable[[float, str], None]
 
@@ -99,7 +99,7 @@ def rank(
     most = 12 + 4 * len(effects)
 
     def add(structure: Structure, start: Mapping[str, float] | None) -> None:
-        fitted[structure.key] = fit_with_exponent(loops, structure, start)
+        fitted[structure.key] = fit_variants(loops, structure, start)
         tell(min(0.98, len(fitted) / most), " + ".join(structure.effects) or "linear spring")
 
     add(Structure(tuple(base)), None)
@@ -150,15 +150,24 @@ def _correlation(residual: NDArray[np.float64]) -> float:
     return float(1 + 2 * np.sum(half[: ends[0] if len(ends) else len(half)]))
 
 
-def fit_with_exponent(loops: LoopSet, structure: Structure, start: Mapping[str, float] | None) -> Fitted:
-    """The fit, with the exponent of the hysteresis freed where the loops ask for it clearly."""
-    plain = Structure(structure.effects)
-    found = fit(loops, plain, start)
-    if "hysteresis" not in structure.effects:
-        return found
-    begin = {**found.values, **({EXPONENT: start[EXPONENT]} if start and EXPONENT in start else {})}
-    freed = fit(loops, Structure(structure.effects, True), begin, grid=False)
-    return freed if found.chi2 - freed.chi2 > _SHARPER * widening_of(freed, loops) else found
+def fit_variants(loops: LoopSet, structure: Structure, start: Mapping[str, float] | None) -> Fitted:
+    """The fit, with another kind of play or a free exponent of the hysteresis where the loops ask for it clearly."""
+    effects, begin = structure.effects, dict(start or {})
+    if SPRING_GAP in begin:
+        begin.setdefault(GAP, begin[SPRING_GAP])
+    best = fit(loops, Structure(effects), begin)
+    if "backlash" in effects and set(effects) & set(DISSIPATIVE):
+        begin.setdefault(SPRING_GAP, best.values[GAP])
+        best = _clearly_better(loops, best, fit(loops, Structure(effects, spring_play=True), begin))
+    if "hysteresis" in effects:
+        sharp = replace(best.structure, free_exponent=True)
+        known = {EXPONENT: begin[EXPONENT]} if EXPONENT in begin else {}
+        best = _clearly_better(loops, best, fit(loops, sharp, best.values | known, grid=False))
+    return best
+
+
+def _clearly_better(loops: LoopSet, plain: Fitted, other: Fitted) -> Fitted:
+    return other if plain.chi2 - other.chi2 > _SHARPER * widening_of(other, loops) else plain
 
 
 def _around(leaders: Sequence[frozenset[str]], effects: Sequence[str]) -> Iterator[frozenset[str]]:
@@ -221,7 +230,7 @@ def log_evidence(loops: LoopSet, fitted: Fitted, widening: float) -> float:
     for k, name in enumerate(names):
         if name in RANGES:
             low, high = RANGES[name]
-            width = high - low if name == GAP else float(np.log(high / low))
+            width = high - low if name in GAPS else float(np.log(high / low))
             curvature[k, k] += 12 / width**2  # a range is never wider than the prior's
             value -= float(np.log(width))
         elif name != STIFFNESS:
@@ -235,7 +244,7 @@ def log_evidence(loops: LoopSet, fitted: Fitted, widening: float) -> float:
 def _unit(loops: LoopSet, fitted: Fitted, name: str) -> float:
     if name in loops.units:
         return loops.units[name]
-    return loops.shape_unit(name) if name == GAP else fitted.values[name]
+    return loops.shape_unit(name) if name in GAPS else fitted.values[name]
 
 
 def all_effects() -> tuple[str, ...]:
