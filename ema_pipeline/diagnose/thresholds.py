@@ -2,8 +2,8 @@
 
 Theory gives no fixed threshold: a family may try several places, several starts and bounds, and the outlier
 mixture is not quadratic. So the numbers come from simulation: rigs drawn from their tolerances with no effect are
-measured, diagnosed, and the largest gain of each family is noted (`benchmarks/diagnosis_study.py --null`).
-`from_null_gains` makes such a table for another rig.
+measured, diagnosed, and the largest gain of each family is noted. `from_null_gains` makes such a table;
+`diagnose.bootstrap` simulates the nulls of a given test.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ GAIN_BY_FAMILY: Mapping[str, float] = {
     "sensor_mass": 8.0,
     "shaft_coupling": 10.0,
 }
-"""Largest gain of -2 log posterior seen in 45 simulated tests with nothing missing (seeds 5 and 77 of the study;
-planets differ by 0.1 %, frequencies ±0.1 %, 5 % of modes missed, 3 % spurious); flexible supports: an estimate from
-the χ² tail. For families that are not listed the settings' `gain_least` stands."""
+"""Largest gain of -2 log posterior seen in 45 simulated sets of modes with nothing missing (planets differ by 0.1 %,
+frequencies ±0.1 %, 5 % of modes missed, 3 % spurious); flexible supports: an estimate from the χ² tail. For families
+that are not listed the settings' `gain_least` stands."""
 
 
 def threshold(family: str, least: float, calibrated: Mapping[str, float] | None = None) -> float:
