@@ -88,7 +88,15 @@ def levels_tables(study: LevelStudy, modal: ModalModel, title: str = "") -> Rend
     parts: list[RenderableType] = [_heading(title)] if title else []
     parts.append(_line(study.summary))
     if study.modes:
-        parts += [_line(""), _rich(levels.frequency_table(study, modal), "Natural frequency by force level")]
+        table = levels.frequency_table(study, modal)
+        last = len(table.head) - 1
+        parts += [_line(""), _rich(_pick(table, range(last)), "Natural frequency by force level")]
+        remarks: dict[str, list[str]] = {}
+        for row in table.rows:
+            remarks.setdefault(row.cells[last], []).append(row.cells[0])
+        for remark, alike in remarks.items():
+            if remark:
+                parts.append(_line(f"{'mode' if len(alike) == 1 else 'modes'} {', '.join(alike)}: {remark}"))
         parts += [_line(""), _rich(levels.damping_table(study), "Damping ratio by force level")]
         parts.append(_line("p: probability of a trend as clear as this where nothing depends on the force."))
     failed = [v for v in study.verdicts if not v.passes]
