@@ -35,8 +35,8 @@ def loops_figure(result: IsolatorResult) -> Figure:
     """
     one_set = all(abs(fit.energy_error) < _ENERGY for fit in result.fits)
     rows = -(-len(result.loops) // _COLUMNS)
-    figure = new_figure(2.1 * rows + 0.5)
-    grid = figure.add_gridspec(rows, _COLUMNS, hspace=0.6, wspace=0.34, **margins(figure, left=0.8))
+    figure = new_figure(2.15 * rows + 0.75)
+    grid = figure.add_gridspec(rows, _COLUMNS, hspace=0.6, wspace=0.34, **margins(figure, left=0.8, top=0.62))
     for k, (loop, fit) in enumerate(zip(result.loops, result.fits, strict=True)):
         ax = figure.add_subplot(grid[k // _COLUMNS, k % _COLUMNS])
         _draw(ax, loop, fit)
@@ -51,7 +51,7 @@ def loops_figure(result: IsolatorResult) -> Figure:
                 label="by itself",
             )
         if k == 0:
-            ax.legend(loc="upper left")
+            figure.legend(*ax.get_legend_handles_labels(), loc="upper center", ncols=3)
         if k % _COLUMNS == 0:
             ax.set_ylabel("force, N")
         if k >= len(result.loops) - _COLUMNS:
@@ -90,7 +90,7 @@ def misfit_figure(loops: Sequence[Loop], models: Sequence[LoopModel]) -> Figure:
     """What the linear spring and the last model leave of the force, over the way up and the way down."""
     shown = _ends(models)
     figure = new_figure(2.7)
-    grid = figure.add_gridspec(1, len(shown), wspace=0.22, **margins(figure))
+    grid = figure.add_gridspec(1, len(shown), wspace=0.22, **margins(figure, right=0.3))
     for c, model in enumerate(shown):
         ax = figure.add_subplot(grid[0, c])
         for i, (loop, fit) in enumerate(zip(loops, model.fits, strict=True)):
@@ -128,7 +128,7 @@ def _draw(ax: Axes, loop: Loop, fit: LoopFit) -> None:
     x = 1e3 * np.append(loop.displacement, loop.displacement[0])
     ax.plot(x, np.append(loop.force, loop.force[0]), color=MEASURED, label="measured")
     ax.plot(x, np.append(fit.force, fit.force[0]), color=MODEL, ls="--", label="model")
-    ax.set_title(f"{loop.frequency_hz:.3g} Hz, {1e3 * loop.amplitude_m:.3g} mm")
+    ax.set_title(_short(loop))
 
 
 @styled
