@@ -13,6 +13,7 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.isolators import isolators
 from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.hysteresis.effects import effect_ids
 from ema_pipeline.ingest.description import Campaign, TestDescription, read_campaign
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Hit
@@ -146,6 +147,8 @@ def change_effects(
         )
         run = new_run(store, info)
         run.require_model("add")  # refuses unknown effects and places before anything is written
+        if info.kind == "hysteresis":
+            effect_ids(info.effects)
         save_info(store, info)
         run_stages(run, ("ladder", "fit", "correlate", "report"), show)
     return run
