@@ -22,8 +22,8 @@ GENERIC = ("spring", "mass", "damper")
 
 NOTHING = "nothing"
 _SMALL = 1e-3
-_OUT = 10.0
-"""Tolerances by which a parameter that is out of them is typically off: a gross error, not a tail of the tolerance."""
+_OUT = 3.0
+"""Tolerances beyond which a parameter counts as out of them."""
 
 
 @dataclass(frozen=True)

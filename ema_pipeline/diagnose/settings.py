@@ -31,7 +31,7 @@ class DiagnoseSettings(Settings):
         default=0.5, gt=0, lt=1, description="Prior probability that nothing is missing."
     )
     parameter_prior: float = Field(
-        default=0.2,
+        default=0.1,
         ge=0,
         lt=1,
         description="Share of the rest that goes to parameters out of tolerance; effects share what is left.",
