@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=20, help="simulated systems per row of accuracy")
     given = parser.parse_args()
     with single_blas_thread():
-        print("\n".join(f"- {line}" for line in surroundings()), "\n")
+        print("\n".join(f"- {line}" for line in surroundings()), end="\n\n")
         print(row(*HEAD))
         print(row("---", "---", "---", "---"))
         for cells in chain(speed(given.turns), accuracy(given.cases)):
