@@ -189,3 +189,16 @@ def test_the_carriers_cubic_spring_shows_at_the_carriers_mode_alone(test_data: P
     assert moved
     assert all(158 < f < 163 for f in moved)
     assert all("hardening" in m.trend for m in study.modes if m.depends and "damping" not in m.trend)
+
+
+def test_a_roving_hammer_without_a_driving_point_can_be_studied_too() -> None:
+    hits = hits_of(replace(LINEAR, n_points=3), np.random.default_rng(9))
+    # one sensor away from the points that are struck: shapes are known at the points only
+    roving = [replace(h, responses=h.responses[3:], channels=h.channels[3:]) for h in hits]
+    frfs = estimate_frfs(roving)
+    modal = identify(frfs, ModalSettings())
+    assert frfs.outputs[0] not in modal.dofs
+    found = single_hits(lambda: roving, modal, frfs, FrfSettings())
+    z = (found.frequency_hz - np.array([m.frequency_hz for m in modal.modes])) / found.frequency_std_hz
+    assert np.isfinite(z).any()
+    assert np.abs(z[np.isfinite(z)]).max() < 6

@@ -23,7 +23,7 @@ from scipy.fft import ifft, rfft
 
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import HitSamples
-from ema_pipeline.levels.single import participations, windows_about
+from ema_pipeline.levels.single import output_shapes, participations, windows_about
 from ema_pipeline.levels.trend import Samples, Trend, trends
 from ema_pipeline.levels.types import DecayCurve
 from ema_pipeline.modal.basis import pole_functions
@@ -58,13 +58,13 @@ FLOOR = 6.0
 DEEPEST = 0.01
 """The decay is followed down to this share of its start: what is left of neighbours shows below."""
 
-LEFT_OVER = 0.005
+LEFT_OVER = 0.02
 """Share of the other modes' response that is taken to be left over after they were taken off."""
 
 CUT = 5.0
 """The filter's reach in its width."""
 
-FILTERED = 0.02
+FILTERED = 0.05
 """Error of frequency and decay rate that modes which were not identified make, in decay rates of the mode."""
 
 HITS_PER_MODE = 2
@@ -115,8 +115,7 @@ def decays(hits: Hits, frfs: FrfSet, modal: ModalModel) -> tuple[DecayCurve, ...
 def _residues(frfs: FrfSet, modal: ModalModel, poles: Complex) -> Complex:
     """Accelerance residues of every mode, fitted to the FRFs with the shapes given."""
     n_out, n_in = len(frfs.outputs), len(frfs.inputs)
-    places = {d.point: k for k, d in enumerate(modal.dofs)}
-    shapes = np.array([m.shape for m in modal.modes])[:, [places[d.point] for d in frfs.outputs]]
+    shapes = output_shapes(frfs, modal)
     out = np.zeros((len(poles), n_out, n_in), dtype=np.complex128)
     accelerance = frfs.accelerance()
     for window in windows_about(poles, frfs.frequency_hz):
@@ -126,7 +125,7 @@ def _residues(frfs: FrfSet, modal: ModalModel, poles: Complex) -> Complex:
             seen = np.flatnonzero(frfs.hits[:, i] > 0)
             if not len(seen):
                 continue
-            shape = np.nan_to_num(shapes[np.ix_(m, seen)])
+            shape = shapes[np.ix_(m, seen)]
             rest = frfs.record_s - float(frfs.delay_s[i])
             parts = participations(omega, accelerance[seen, i][:, window.lines], poles[m], shape, rest)
             out[m[:, None], seen[None], i] = shape * parts[:, None]

@@ -144,15 +144,15 @@ def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSe
     pole, std = np.tile(poles, (count, 1)), np.full(shape, np.inf)
     amplitude = np.full(shape, np.nan)
     places = [d.point for d in frfs.inputs]
-    dofs = [d.point for d in modal.dofs]
-    shapes = np.array([m.shape for m in modal.modes]).reshape(len(poles), len(dofs))
+    dofs = [d.point for d in frfs.outputs]
+    shapes = output_shapes(frfs, modal)
     for number, ((struck, outputs), found) in enumerate(sheets.items()):
         index = np.array([i for i, _ in found])
         members = [h for _, h in found]
         for i, h in found:
             names[i], force[i] = h.name, h.force_n
         point[index], sheet[index] = places.index(struck), number
-        seen = np.nan_to_num(shapes[:, [dofs.index(o) for o in outputs]])
+        seen = shapes[:, [dofs.index(o) for o in outputs]]
         for k, window in enumerate(windows):
             omega = 2 * np.pi * frfs.frequency_hz[window.lines]
             m = window.modes
@@ -191,6 +191,28 @@ def windows_about(poles: Complex, frequency_hz: Real) -> tuple[Window, ...]:
         else:
             parts.append((first, stop, [int(r)]))
     return tuple(Window(slice(a, b), np.array(m, dtype=np.int64)) for a, b, m in parts)
+
+
+def output_shapes(frfs: FrfSet, modal: ModalModel) -> Complex:
+    """Shapes at the outputs, (n_modes, n_outputs); fitted to the FRFs where the modal model lacks them.
+
+    It lacks them for a roving hammer without a driving point, whose shapes are those of the impact points.
+    """
+    places = {d.point: k for k, d in enumerate(modal.dofs)}
+    if all(d.point in places for d in frfs.outputs):
+        return np.nan_to_num(
+            np.array([m.shape for m in modal.modes])[:, [places[d.point] for d in frfs.outputs]]
+        )
+    poles = np.array([m.pole for m in modal.modes], dtype=np.complex128) - frfs.response_decay_rad_s
+    residues = np.zeros((len(poles), len(frfs.outputs), len(frfs.inputs)), dtype=np.complex128)
+    accelerance = frfs.accelerance()
+    for window in windows_about(poles, frfs.frequency_hz):
+        omega, m = 2 * np.pi * frfs.frequency_hz[window.lines], window.modes
+        for o, i in np.argwhere(frfs.hits > 0):
+            frf = accelerance[o, i, window.lines][None]
+            rest = frfs.record_s - float(frfs.delay_s[i])
+            residues[m, o, i] = participations(omega, frf, poles[m], np.ones((len(m), 1), complex), rest)
+    return np.array([np.linalg.svd(r)[0][:, 0] for r in residues])
 
 
 def participations(omega: Real, frf: Complex, poles: Complex, shapes: Complex, rest_s: float) -> Complex:

@@ -30,6 +30,11 @@ TRUSTED_VOTES = 0.3
 """Share of model orders that must show a mode which the softest hits do not show."""
 
 
+PLAIN_CHANGE = 0.1
+"""Least change over a decay, in half-power half-widths or of the damping ratio, that is claimed from hits of one
+level: smaller ones can be errors of the neighbours that were taken off."""
+
+
 def study_levels(
     hits: Hits,
     frfs: FrfSet,
@@ -236,7 +241,7 @@ def _from_decays(
 ) -> tuple[tuple[ModeLevels, ...], tuple[DecayCurve, ...], float]:
     """What the decays after hits of one level tell: the modes with their tests, the curves, and the p value."""
     from ema_pipeline.levels.decay import decay_trends
-    from ema_pipeline.levels.tracks import doubles
+    from ema_pipeline.levels.tracks import doubles, separated
     from ema_pipeline.levels.trend import holm
     from ema_pipeline.levels.words import trend_words
 
@@ -244,8 +249,17 @@ def _from_decays(
     votes = np.array([m.stability for m in modal.modes])
     chosen = np.flatnonzero((votes >= TRUSTED_VOTES) & ~doubles(modal))
     curves = _decays(modal, chosen, hits, frfs)
-    frequency, damping = decay_trends(curves, tuple(range(n)))
+    alone = separated(modal)
+    read = tuple(c for c in curves if alone[c.mode])
+    frequency, damping = decay_trends(read, tuple(range(n)))
     adjusted = holm(np.array([t.p for t in (*frequency, *damping)]))
+    change = np.zeros(2 * n)
+    for c in read:
+        span = float(np.log(c.amplitude_m.max() / c.amplitude_m.min()))
+        mode = modal.modes[c.mode]
+        change[c.mode] = abs(frequency[c.mode].slope) * span / (mode.frequency_hz * abs(mode.damping_ratio))
+        change[c.mode + n] = abs(damping[c.mode].slope) * span / abs(mode.damping_ratio)
+    adjusted = np.where(np.isfinite(adjusted) & (change < PLAIN_CHANGE), 1.0, adjusted)
     moves = np.nan_to_num(adjusted, nan=1.0) < settings.false_alarm
     modes = tuple(
         ModeLevels(

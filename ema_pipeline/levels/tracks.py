@@ -24,6 +24,9 @@ DOUBT = 0.3
 
 FEWEST_SENSORS = 3
 
+APART = 20.0
+"""Distance of a mode that stands alone, in half-power half-widths: errors of a neighbour make curves bend."""
+
 FARTHEST = 1.0
 """Distance beyond which two modes are not the same."""
 
@@ -127,6 +130,16 @@ def doubles(modal: ModalModel) -> NDArray[np.bool_]:
         out[k] = echoes(modal, sure, SAME_RESPONSE)[k]
         sure[k] = not out[k]
     return out
+
+
+def separated(modal: ModalModel) -> NDArray[np.bool_]:
+    """Modes whose neighbours are `APART` half-power half-widths away, doubles aside, (n_modes,)."""
+    poles = np.array([m.pole for m in modal.modes])
+    distance = np.abs(poles[:, None] - poles[None])
+    distance[:, doubles(modal)] = np.inf
+    np.fill_diagonal(distance, np.inf)
+    half = np.abs(poles.real)
+    return np.asarray((distance > APART * np.maximum(half[:, None], half[None])).all(axis=1))
 
 
 def echoes(modal: ModalModel, sure: NDArray[np.bool_], least_mac: float = ECHO_MAC) -> NDArray[np.bool_]:

@@ -41,9 +41,7 @@ def one_level(study: LevelStudy, modal: ModalModel) -> str:
             f"{modal.modes[m.mode].frequency_hz:.4g} Hz ({m.trend} with amplitude)" for m in moving[:3]
         )
         more = f" and {len(moving) - 3} more" if len(moving) > 3 else ""
-        return (
-            f"{about}, but modes move while they decay: {names}{more}. The structure is not linear. {advice}"
-        )
+        return f"{about}, but modes move while they decay: {names}{more}. The structure is likely not linear. {advice}"
     if tested:
         return (
             f"{about}: their FRFs cannot tell whether anything depends on the force. The decays of {len(tested)} of "
