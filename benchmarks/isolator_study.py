@@ -167,8 +167,8 @@ def draw(cases: list[dict], path: Path) -> None:
         ax.set_xscale("log")
         ax.set_yticks(range(len(names)), [n.replace("_", " ") for n in names])
         ax.set_xlabel("size of the hidden effect over the smallest that the diagnosis promises to show")
-        ax.set_title(f"{len(cases)} isolators with hidden effects")
-        ax.legend(loc="upper right")
+        ax.set_title(f"{len(cases)} isolators with hidden effects", loc="left")
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
         return fig
 
     path.write_bytes(png(figure()))
