@@ -112,7 +112,8 @@ def moving_cases(count: int, rng: np.random.Generator) -> None:
 
 
 RIG_EFFECTS = (
-    "bearing_cubic@carrier:8e11", "bearing_cubic@sun:5e11", "dry_friction@carrier:2.0", "dry_friction@sun:2.0",
+    "bearing_cubic@carrier:stiffness=8e11", "dry_friction@carrier:force=2.0", "bearing_cubic@sun:stiffness=5e11",
+    "dry_friction@sun:force=2.0",
 )  # fmt: skip
 
 
