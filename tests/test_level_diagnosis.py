@@ -248,3 +248,20 @@ def test_hypotheses_are_the_effects_that_are_not_linear_at_every_place() -> None
 
     labels = {h.label for h in level_hypotheses(case_of(windows()), Hypothesis())}
     assert {"bearing_cubic@hub", "bearing_cubic@rim", "dry_friction@hub", "bearing_quadratic@rim"} <= labels
+
+
+def test_a_false_alarm_of_the_levels_leaves_the_diagnosis_to_the_modes(tmp_path) -> None:
+    from dataclasses import replace
+
+    from ema_pipeline.stages.base import Run, RunInfo
+    from ema_pipeline.stages.diagnose import linear_after_all
+    from ema_pipeline.store import Store
+
+    info = RunInfo("hammer", "", "", "planetary", "planetary", ("no_ring",), (), "", {})
+    run = Run(Store(tmp_path), info, {"diagnose": DiagnoseSettings()})
+    chance = diagnose_levels(case_of(windows()), (), None, "", ())
+    assert linear_after_all(run, chance)
+    assert not linear_after_all(run, replace(chance, error=1.3))
+    top = replace(chance.ladder.rungs[-1], effects=("bearing_cubic@carrier",))
+    moving = replace(chance, ladder=replace(chance.ladder, rungs=(*chance.ladder.rungs, top)))
+    assert not linear_after_all(run, moving)

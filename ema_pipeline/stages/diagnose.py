@@ -13,7 +13,7 @@ from ema_pipeline.rigs.types import Rig
 from ema_pipeline.stages import loop_ladder
 from ema_pipeline.stages.base import Progress, Run, code_fingerprint
 from ema_pipeline.stages.correlate import correlate
-from ema_pipeline.stages.level_case import level_case, level_tests, linear_part
+from ema_pipeline.stages.level_case import depends_on_level, level_case, level_tests, linear_part
 from ema_pipeline.stages.modes import measured_frfs, measured_modes
 
 if TYPE_CHECKING:
@@ -41,7 +41,9 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     settings = cast(DiagnoseSettings, run.settings[NAME])
     model = run.require_model(NAME)
     if tests := level_tests(run):
-        return {"diagnosis": by_hits(run, tests, progress), "on_top_of": run.info.effects}
+        of_hits = by_hits(run, tests, progress)
+        if not linear_after_all(run, of_hits):
+            return {"diagnosis": of_hits, "on_top_of": run.info.effects}
     measured = measured_modes(run)
     limits, tell = own_thresholds(run, settings, model, measured, progress)
     found = diagnose(
@@ -54,6 +56,16 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
         values = {name: size.value for name, size in top.parameters.items()}
         _, results["comparison_after"] = correlate(run, mended, values)
     return results
+
+
+def linear_after_all(run: Run, found: Diagnosis) -> bool:
+    """True where a linear model explains the hits of all levels as well as any model could.
+
+    What the study of the levels saw was then chance, and all hits may be averaged as ever.
+    """
+    least = cast(DiagnoseSettings, run.settings[NAME]).levels.noise_least
+    exact = found.ladder.hit_noise <= least and found.error <= 1.0
+    return exact and not any(depends_on_level(run, x) for x in found.ladder.rungs[-1].effects)
 
 
 def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnosis:
