@@ -46,12 +46,13 @@ def outcome(line: Line) -> str:
 
 
 def stated_limit(line: Line, twin: Line | None) -> float | None:
-    """True size over the least that the tool says the twin's data would show; None where it says nothing."""
-    if twin is None:
-        return None
+    """True size over the least that the tool says the twin's data would show; None where it says nothing.
+
+    Where the twin was not run, by what it says of the test itself.
+    """
     truth = labels(line)[0]
     for name, value in sizes(line).items():
-        limit = twin.get("limits", {}).get(f"{truth}.{name}")
+        limit = (twin or line).get("limits", {}).get(f"{truth}.{name}")
         if limit is not None:
             return float(value / limit)
     return None

@@ -48,8 +48,10 @@ def scanned(
         The most likely first.
     """
     axes = [_axis(problem, e, _SINGLE if len(moved) == 1 else _SEVERAL) for e in moved]
-    absent = tuple(_smallest(axis, e) for axis, e in zip(axes, moved, strict=True))
-    least = _cost(problem, base, moved, absent) - _PROMISE
+    least = np.inf
+    if any(e.scale > 0 for e in moved):
+        absent = tuple(_smallest(axis, e) for axis, e in zip(axes, moved, strict=True))
+        least = _cost(problem, base, moved, absent) - _PROMISE
     tried = [(_cost(problem, base, moved, v), v) for v in list(product(*axes))[:_MOST]]
     chosen: list[tuple[float, ...]] = []
     for cost, sizes in sorted(tried, key=lambda t: t[0]):

@@ -13,7 +13,6 @@ from ema_pipeline.fit.solve import FitProblem, Optimum
 
 _VISIBLE = 0.02
 _INSIDE = 0.01
-_FREE = 1e-3
 
 
 def occam(
@@ -60,15 +59,17 @@ def mixing_volume(problem: FitProblem, found: Optimum) -> float:
 
     Modes that nearly coincide may exchange their shapes (see `correlate.residuals`). A model that puts a further
     mode beside a measured one thereby gets a free shape to fit noise with. Integrated over the mixing amplitudes,
-    this freedom costs log det(1 + BᴴB/d²), once for the real and once for the imaginary parts.
+    this freedom costs log det(1 + BᴴB/d²), once for the real and once for the imaginary parts. Modes that coincide may
+    turn into each other wholly, but not become larger than they are: their amplitudes are of the size of the mode's
+    own, or every split of a pair, however small, would seem a gain.
     """
     total, start = 0.0, 0
-    x = found.x
+    x, mixing = found.x, problem.settings.mode_mixing
     for e, pairs, modes in zip(problem.evidence, problem.assignments(x), problem.modes(x), strict=True):
         has = np.flatnonzero(pairs >= 0)
         share = found.inlier[start : start + pairs.size][has]
         start += pairs.size
-        fit = shape_fit(e, pairs, modes, problem.settings.mode_mixing)
+        fit = shape_fit(e, pairs, modes, mixing)
         if fit is None:
             continue
         b = fit.weighted[0]
@@ -76,7 +77,8 @@ def mixing_volume(problem: FitProblem, found: Optimum) -> float:
         own = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-30)
         # the mode's own shape is no freedom: its scale is fixed by the comparison
         b = b - own[:, :, None] * (own.conj()[:, None, :] @ b)
-        b = b / np.maximum(np.abs(fit.penalty[0]), _FREE)[:, None, :]
+        whole = fit.price[0] * mixing * modes.omega[0, pairs[has]] ** 2
+        b = b / np.maximum(np.abs(fit.penalty[0]), whole[:, None])[:, None, :]
         # det(1 + BᴴB) = det(1 + BBᴴ), of the size of the sensors
         _, logdet = np.linalg.slogdet(np.eye(b.shape[1]) + b @ b.conj().swapaxes(1, 2))
         total += (2.0 if np.any(e.shapes.imag) else 1.0) * float(share @ logdet)
