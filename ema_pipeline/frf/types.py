@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from ema_pipeline.dof import Dof
 from ema_pipeline.verdict import Verdict
 
+ALL_LINES = slice(None)
+
 
 @dataclass(frozen=True)
 class FrfSet:
@@ -70,9 +72,9 @@ class FrfSet:
     sensor_mass_kg: NDArray[np.float64]
     verdicts: tuple[Verdict, ...] = ()
 
-    def accelerance(self) -> NDArray[np.complex128]:
+    def accelerance(self, lines: slice = ALL_LINES) -> NDArray[np.complex128]:
         """All FRFs as acceleration over force, (m/s²)/N, shape (n_outputs, n_inputs, n_lines)."""
         power = {"acceleration": 0, "velocity": 1, "displacement": 2}
-        jw = 2j * np.pi * self.frequency_hz
+        jw = 2j * np.pi * self.frequency_hz[lines]
         factors = np.stack([jw ** power[q] for q in self.quantities])
-        return np.asarray(self.frf * factors[:, None, :])
+        return np.asarray(self.frf[..., lines] * factors[:, None, :])

@@ -78,7 +78,7 @@ def study_levels(
     place = sort_levels([p for p, _, _ in found], force.tolist(), settings.level_ratio)
     n_levels = int(place.max()) + 1
     if n_levels == 1:
-        level = ForceLevel(float(np.median(force)), names, frfs)
+        level = ForceLevel(float(np.median(force)), names)
         progress(0.2, "decays of single hits")
         modes, curves, p_value = _from_decays(modal, hits, frfs, settings)
         depends = bool(p_value < settings.false_alarm)

@@ -23,8 +23,8 @@ class ForceLevel:
         Median of the peak forces.
     hits : tuple of str
         ``file#number`` of every accepted hit of this level.
-    frfs : FrfSet
-        Averaged over the hits of this level alone.
+    own_frfs : FrfSet or None
+        Averaged over the hits of this level alone; None for the only level, whose FRFs are the configuration's.
     modal : ModalModel or None
         Identified from `frfs` alone, without circle fits; None where all hits are of one level. The softest
         level's is the closest to the linear structure.
@@ -32,8 +32,15 @@ class ForceLevel:
 
     force_n: float
     hits: tuple[str, ...]
-    frfs: FrfSet
+    own_frfs: FrfSet | None = None
     modal: ModalModel | None = None
+
+    @property
+    def frfs(self) -> FrfSet:
+        """FRFs of one level of several."""
+        if self.own_frfs is None:
+            raise ValueError("the only level has no FRFs of its own: take those of the configuration")
+        return self.own_frfs
 
 
 @dataclass(frozen=True)

@@ -199,7 +199,7 @@ def _frfs(left: Axes, right: Axes, study: LevelStudy, modal: ModalModel, mode: M
         if o is None or i is None or not f.hits[o, i]:
             continue
         lines = _lines(f.frequency_hz, pole.frequency_hz, pole.frequency_hz * pole.damping_ratio)
-        acceleration = f.accelerance()[o, i, lines]
+        acceleration = f.accelerance(lines)[o, i]
         mobility = acceleration / (2j * np.pi * f.frequency_hz[lines])
         colour, marker, line = level_style(k)
         label = f"{level.force_n:.3g} N"
@@ -237,7 +237,7 @@ def _most_different(study: LevelStudy, frequency_hz: float, half_hz: float) -> t
     """Output and input of the FRF that differs most, over its own size, between softest and hardest level."""
     soft, hard = study.levels[0].frfs, study.levels[-1].frfs
     lines = _lines(soft.frequency_hz, frequency_hz, half_hz)
-    a, b = (np.nan_to_num(f.accelerance()[..., lines]) for f in (soft, hard))
+    a, b = (np.nan_to_num(f.accelerance(lines)) for f in (soft, hard))
     best, score = None, 0.0
     for o, output in enumerate(soft.outputs):
         for i, source in enumerate(soft.inputs):
