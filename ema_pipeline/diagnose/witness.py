@@ -96,9 +96,9 @@ def frf_lines(frfs: Mapping[str, FrfSet], measured: Mapping[str, MeasuredModes])
         size = np.abs(h) ** 2
         factor = size / np.maximum(np.abs(picked.frf) ** 2, 1e-300)
         # the scatter of two or three hits is itself too uncertain to be used line by line
-        scatter = np.nanmean(np.nan_to_num(picked.variance) * factor, axis=2, keepdims=True)
+        scatter = np.mean(np.nan_to_num(picked.variance * factor), axis=2, keepdims=True)
         level = np.nanmean(size, axis=0, keepdims=True)
-        variance = np.nan_to_num(scatter) + _FLOOR**2 * size + _BACKGROUND**2 * level
+        variance = scatter + _FLOOR**2 * size + _BACKGROUND**2 * level
         found.append(FrfLines(configuration, picked, h, variance))
     return tuple(found)
 
