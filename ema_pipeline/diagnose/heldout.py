@@ -51,33 +51,91 @@ def held_out(case: Case, fitted: Fitted, fit: FitSettings, folds: int) -> HeldOu
         Parts; modes are dealt out in turn over all configurations, so that each part spans all frequencies.
     """
     full = case.problem(fitted.hypothesis, fit)
-    owners = np.concatenate([np.arange(len(e.measured)) for e in full.evidence])
-    modes = np.full(owners.size, np.inf)
+    total = sum(len(e.measured) for e in full.evidence)
+    modes = np.full(total, np.inf)
     parameters: dict[str, float] = {}
     priors = [c.parameter.name for c in full.space.coordinates if c.kind == "prior"]
-    number = np.arange(owners.size) % folds
+    number = np.arange(total) % folds
     for fold in range(folds):
         out = number == fold
         loose = [n for i, n in enumerate(priors) if i % folds == fold]
-        kept = _without(case, full, out)
-        if not any(len(m) for m in kept.values()):
+        part = fit_without(case, fitted, full, out, loose)
+        if part is None:
             continue
-        part = case.problem(fitted.hypothesis, fit, kept, dict.fromkeys(loose, _LOOSE))
-        found = refine(part, part.space.point(fitted.values))
-        # a model that fails has turned data into outliers: without them it would know too little to be wrong
-        trusting = replace(found, inlier=np.ones_like(found.inlier))
-        covariance = posterior_covariance(part, trusting, 1.0)
-        values = {**fitted.values, **part.space.named(found.x)}
         for n in loose:
-            if n not in part.space.names:
+            if n not in part.problem.space.names:
                 continue
-            i = part.space.names.index(n)
-            c = part.space.coordinates[i]
+            i = part.problem.space.names.index(n)
             # In units of the tolerance that was widened: prediction against nominal value.
-            shift, spread = found.x[i] * _LOOSE, np.sqrt(covariance[i, i]) * _LOOSE
-            parameters[n] = float(shift**2 / (1 + spread**2)) if c.kind == "prior" else 0.0
-        modes[out] = _predicted(full, part, values, covariance, out)
+            shift, spread = part.x[i] * _LOOSE, np.sqrt(part.covariance[i, i]) * _LOOSE
+            known = part.problem.space.coordinates[i].kind == "prior"
+            parameters[n] = float(shift**2 / (1 + spread**2)) if known else 0.0
+        modes[out] = _predicted(full, part, out)
     return HeldOut(modes, parameters)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A fit that has not seen some of the modes.
+
+    Attributes
+    ----------
+    problem : FitProblem
+        Of the modes that it has seen.
+    x : ndarray, (P,)
+        Its optimum.
+    values : dict of str to float
+        All parameters there.
+    covariance : ndarray, (P, P)
+        Of the coordinates.
+    """
+
+    problem: FitProblem
+    x: NDArray[np.float64]
+    values: dict[str, float]
+    covariance: NDArray[np.float64]
+
+    def spread_in(self, full: FitProblem, x: NDArray[np.float64]) -> tuple[list[int], NDArray[np.float64]]:
+        """Coordinates of the fit to all modes that the part has as well, and the part's covariance in them."""
+        own = [i for i, n in enumerate(self.problem.space.names) if n in full.space.names]
+        at = [full.space.names.index(self.problem.space.names[i]) for i in own]
+        # A step in the part's coordinate is another one in the full space where a tolerance was widened.
+        ratio = np.array(
+            [
+                self.problem.space.coordinates[i].slope(float(x[j]))
+                / full.space.coordinates[j].slope(float(x[j]))
+                for i, j in zip(own, at, strict=True)
+            ]
+        )
+        return at, self.covariance[np.ix_(own, own)] * np.outer(ratio, ratio)
+
+
+def fit_without(
+    case: Case, fitted: Fitted, full: FitProblem, out: NDArray[np.bool_], loose: Sequence[str] = ()
+) -> Part | None:
+    """Fit again without some of the modes; None where no mode is left.
+
+    Parameters
+    ----------
+    case : Case
+    fitted : Fitted
+        Optimum from which the refit starts.
+    full : FitProblem
+        The fit to all modes.
+    out : bool ndarray, (R,)
+        The modes left out.
+    loose : sequence of str, optional
+        Parameters whose nominal values are left out as well: their tolerances are widened.
+    """
+    kept = _without(case, full, out)
+    if not any(len(m) for m in kept.values()):
+        return None
+    problem = case.problem(fitted.hypothesis, full.settings, kept, dict.fromkeys(loose, _LOOSE))
+    found = refine(problem, problem.space.point(fitted.values))
+    # a model that fails has turned data into outliers: without them it would know too little to be wrong
+    trusting = replace(found, inlier=np.ones_like(found.inlier))
+    covariance = posterior_covariance(problem, trusting, 1.0)
+    return Part(problem, found.x, {**fitted.values, **problem.space.named(found.x)}, covariance)
 
 
 def _without(case: Case, full: FitProblem, out: NDArray[np.bool_]) -> dict[str, MeasuredModes]:
@@ -103,26 +161,11 @@ def subset(m: MeasuredModes, keep: NDArray[np.bool_]) -> MeasuredModes:
     )
 
 
-def _predicted(
-    full: FitProblem,
-    part: FitProblem,
-    values: dict[str, float],
-    covariance: NDArray[np.float64],
-    out: NDArray[np.bool_],
-) -> NDArray[np.float64]:
+def _predicted(full: FitProblem, part: Part, out: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Squared residual of each held-out mode in units of datum's and prediction's uncertainty together."""
-    x = full.space.point(values)
+    x = full.space.point(part.values)
     pairs = full.assignments(x)
-    at = [full.space.names.index(n) for n in part.space.names if n in full.space.names]
-    own = [i for i, n in enumerate(part.space.names) if n in full.space.names]
-    # A step in the part's coordinate is another one in the full space where a tolerance was widened.
-    ratio = np.array(
-        [
-            part.space.coordinates[i].slope(float(x[j])) / full.space.coordinates[j].slope(float(x[j]))
-            for i, j in zip(own, at, strict=True)
-        ]
-    )
-    c = covariance[np.ix_(own, own)] * np.outer(ratio, ratio)
+    at, c = part.spread_in(full, x)
     steps = np.zeros((len(at), x.size))
     steps[np.arange(len(at)), at] = _STEP
     points = np.vstack([x[None], x + steps, x - steps])
@@ -161,8 +204,3 @@ def error_of(
     total = float(np.sum(with_partner[counted])) + prior_squares
     size = float(np.sum(counts[counted])) + prior_count
     return float(np.sqrt(total / size)) if size else float("nan")
-
-
-def squares_sum(parts: Sequence[float]) -> float:
-    """Sum of finite parts."""
-    return float(sum(p for p in parts if np.isfinite(p)))

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.fitting import Case, Fitted
-from ema_pipeline.diagnose.heldout import subset
+from ema_pipeline.diagnose.heldout import Part, fit_without
 from ema_pipeline.diagnose.types import HeldOutMode
-from ema_pipeline.fit.map_fit import posterior_covariance
 from ema_pipeline.fit.settings import FitSettings
-from ema_pipeline.fit.solve import FitProblem, refine
+from ema_pipeline.fit.solve import FitProblem
 
 _ONE_BY_ONE = 8
 _STEP = 1e-4
@@ -36,35 +33,18 @@ def predict_left_out(case: Case, fitted: Fitted, fit: FitSettings) -> tuple[Held
     number = np.arange(total) % folds
     found: list[HeldOutMode | None] = [None] * total
     for fold in range(folds):
-        kept, start = {}, 0
-        for e in full.evidence:
-            m = case.measured[e.measured.configuration]
-            kept[m.configuration] = subset(m, number[start : start + len(m)] != fold)
-            start += len(m)
-        if not any(len(m) for m in kept.values()):
+        out = number == fold
+        part = fit_without(case, fitted, full, out)
+        if part is None:
             continue
-        part = case.problem(fitted.hypothesis, fit, kept)
-        optimum = refine(part, part.space.point(fitted.values))
-        # what a failing model has turned into outliers speaks as well
-        trusting = replace(optimum, inlier=np.ones_like(optimum.inlier))
-        covariance = posterior_covariance(part, trusting, 1.0)
-        values = {**fitted.values, **part.space.named(optimum.x)}
-        for r, mode in _predicted(full, part, values, covariance, number == fold):
+        for r, mode in _predicted(full, part, out):
             found[r] = mode
     return tuple(m for m in found if m is not None)
 
 
-def _predicted(
-    full: FitProblem,
-    part: FitProblem,
-    values: dict[str, float],
-    covariance: NDArray[np.float64],
-    out: NDArray[np.bool_],
-) -> list[tuple[int, HeldOutMode]]:
-    x = full.space.point(values)
-    own = [i for i, n in enumerate(part.space.names) if n in full.space.names]
-    at = [full.space.names.index(part.space.names[i]) for i in own]
-    c = covariance[np.ix_(own, own)]
+def _predicted(full: FitProblem, part: Part, out: NDArray[np.bool_]) -> list[tuple[int, HeldOutMode]]:
+    x = full.space.point(part.values)
+    at, c = part.spread_in(full, x)
     result, start = [], 0
     for e, pairs in zip(full.evidence, full.assignments(x), strict=True):
         f = full.model_omega(e, x) / (2 * np.pi)

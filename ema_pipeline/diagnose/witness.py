@@ -178,19 +178,6 @@ class Witness:
         return contradicts(self.error(first), self.error(other), _FAR_WORSE)
 
 
-def frf_witness(
-    rig_before: Rig,
-    values_before: Mapping[str, float],
-    rig_after: Rig,
-    values_after: Mapping[str, float],
-    frfs: Mapping[str, FrfSet],
-    measured: Mapping[str, MeasuredModes],
-) -> tuple[FrfError, FrfError]:
-    """FRF errors of two models, say without and with an effect, at their fitted parameters."""
-    lines = frf_lines(frfs, measured)
-    return frf_error(rig_before, values_before, lines), frf_error(rig_after, values_after, lines)
-
-
 def contradicts(before: FrfError, after: FrfError, worse: float = _WORSE) -> bool:
     """True where a model's FRFs are further off than another's, overall by a factor and at most impact points."""
     if not worse * before.error < after.error:
