@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.hysteresis.effects import DISSIPATIVE, PARAMETERS, Structure
+from ema_pipeline.hysteresis.effects import DISSIPATIVE, Structure
 from ema_pipeline.hysteresis.fitting import RANGES, SYSTEMATIC, Fitted, LoopSet, fit
 from ema_pipeline.hysteresis.model import EXPONENT, GAP, GAPS, SPRING_GAP, STIFFNESS
 
@@ -245,8 +245,3 @@ def _unit(loops: LoopSet, fitted: Fitted, name: str) -> float:
     if name in loops.units:
         return loops.units[name]
     return loops.shape_unit(name) if name in GAPS else fitted.values[name]
-
-
-def all_effects() -> tuple[str, ...]:
-    """Every effect that a loop can show."""
-    return tuple(PARAMETERS)

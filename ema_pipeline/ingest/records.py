@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,9 +166,3 @@ def cut_hit(record: Record, hit: Hit) -> HitSamples:
         force_calibrated=record.force_calibrated,
         window_decay_rad_s=record.window_decay_rad_s,
     )
-
-
-class HitSource(Protocol):
-    """Anything that can hand out accepted hits one after the other, e.g. the store."""
-
-    def __iter__(self) -> Iterator[HitSamples]: ...
