@@ -68,7 +68,7 @@ def _limits(case: Case, f: Fitted, steps: float) -> list[DetectionLimit]:
         if e.scale == 0 or e.name not in f.std:
             continue
         p = parameters[e.name]
-        size = steps * f.std[e.name]
+        size = max(steps * f.std[e.name], e.slight)
         room = max(p.maximum - e.null, e.null - p.minimum)
         found.append(
             DetectionLimit(

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.frequencies import finer_grid, searched_starts
 from ema_pipeline.diagnose.hypotheses import Extra, Hypothesis, extras, make_rig, starting_points
-from ema_pipeline.diagnose.scan import scanned
+from ema_pipeline.diagnose.scan import likeliest, scanned
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.tuned import tuned_sizes
 from ema_pipeline.diagnose.weighing import lonely_cost, missed_modes, mixing_volume, occam
 from ema_pipeline.effects.library import Library
 from ema_pipeline.fit.latent import LatentObjective
@@ -178,8 +179,8 @@ class Ground:
     latent : float
         Its latent-shape objective at the end of the annealing; infinite where the model holds: then all modes
         are where they belong, the way to any optimum is short, and nothing has to be annealed.
-    lost : bool
-        True where it leaves measured modes unexplained.
+    unexplained : tuple of (str, float)
+        Configuration and frequency, Hz, of the measured modes that it does not have.
     annealed : dict of str to float
         Where the annealing ended: values that no mode was given up for, damping left aside. Empty where
         nothing was annealed.
@@ -188,13 +189,19 @@ class Ground:
     values: dict[str, float]
     objective: float
     latent: float
-    lost: bool
+    unexplained: tuple[tuple[str, float], ...]
     annealed: dict[str, float]
+
+    @property
+    def lost(self) -> bool:
+        """True where it leaves measured modes unexplained."""
+        return bool(self.unexplained)
 
 
 def ground(case: Case, base: Fitted, fit: FitSettings) -> Ground:
     """Prepare a base model for the hypotheses on top of it."""
-    lost = not np.all(base.explained)
+    every = [(c, float(f)) for c, m in case.measured.items() for f in m.frequency_hz]
+    lost = tuple(at for at, there in zip(every, base.explained, strict=True) if not there)
     if holds(base):
         return Ground(base.values, base.objective, np.inf, lost, {})
     problem = case.problem(base.hypothesis, fit)
@@ -238,8 +245,11 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
         candidates += [settle(problem, x) for x in scanned(problem, base.values, moved)]
     if base.lost and base.annealed:
         candidates += [settle(problem, x) for x in scanned(problem, base.annealed, moved, 1)]
+    rig = make_rig(case.rig, hypothesis, case.library, case.settings.parameter_range)
+    if new and base.lost:
+        tuned = tuned_sizes(rig, moved, base.values, base.unexplained)
+        candidates += [settle(problem, x) for x in likeliest(problem, base.values, moved, tuned)]
     if dynamic and not any(e.has_shapes for e in problem.evidence):
-        rig = make_rig(case.rig, hypothesis, case.library, case.settings.parameter_range)
         for values in searched_starts(rig, last, case.measured, fit, base.values):
             candidates.append(refine(problem, space.point(values)))
     if not new:

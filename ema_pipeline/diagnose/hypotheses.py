@@ -21,6 +21,8 @@ GENERIC = ("spring", "mass", "damper")
 """Effects that only say where and how: used to localise, not to compete with named physics."""
 
 NOTHING = "nothing"
+SLIGHT = 0.01
+"""Share of the size to expect below which an effect is a difference between parts made to one drawing."""
 _SMALL = 1e-3
 _OUT = 3.0
 """Tolerances beyond which a parameter counts as out of them."""
@@ -83,6 +85,8 @@ class Extra:
         Size to expect; 0 for a quantity spread evenly over its range. Of the logarithm for a parameter out of its
         tolerance.
     one_sided : bool
+    slight : float
+        Size below which it is not worth a claim; 0 where there is none.
     """
 
     name: str
@@ -90,6 +94,7 @@ class Extra:
     null: float
     scale: float
     one_sided: bool
+    slight: float = 0.0
 
 
 def make_rig(rig: Rig, hypothesis: Hypothesis, library: Library | None, span: float) -> ParametricRig:
@@ -124,7 +129,9 @@ def extras(rig: Rig, hypothesis: Hypothesis, library: Library | None) -> tuple[E
             found.append(Extra(place, (0.3 * v, 3 * v), v, scale, False))
             continue
         for p in known[family].parameters:
-            found.append(Extra(f"{label}.{p.name}", _starts(p), p.null, _scale(p), p.minimum >= p.null))
+            scale = _scale(p)
+            slight = SLIGHT * scale
+            found.append(Extra(f"{label}.{p.name}", _starts(p), p.null, scale, p.minimum >= p.null, slight))
     return tuple(found)
 
 

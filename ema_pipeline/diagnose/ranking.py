@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, follow, ground, refit
-from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, prior_probabilities
+from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, follow, ground, holds, refit
+from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, prior_probabilities
 from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE
 from ema_pipeline.fit.settings import FitSettings
 
 Progress = Callable[[float, str], None]
@@ -163,7 +164,11 @@ def _never_worse(f: Fitted, base: Fitted) -> Fitted:
 
 
 def probabilities(case: Case, base: Fitted, fitted: Sequence[Fitted]) -> dict[str, float]:
-    """Posterior probabilities of the hypotheses and of ``"nothing"`` (more)."""
+    """Posterior probabilities of the hypotheses and of ``"nothing"`` (more).
+
+    An effect so slight that parts made to one drawing differ by as much is no missing physics: on top of a model that
+    holds, its probability goes to ``"nothing"``.
+    """
     settings = case.settings
     prior = prior_probabilities([f.hypothesis for f in fitted], settings.null_prior, settings.parameter_prior)
     evidence = {NOTHING: base.evidence} | {f.hypothesis.label: f.evidence for f in fitted}
@@ -171,4 +176,21 @@ def probabilities(case: Case, base: Fitted, fitted: Sequence[Fitted]) -> dict[st
     top = max(logs.values())
     weights = {label: float(np.exp(v - top)) for label, v in logs.items()}
     total = sum(weights.values())
-    return {label: w / total for label, w in weights.items()}
+    shares = {label: w / total for label, w in weights.items()}
+    if holds(base):
+        for f in fitted:
+            if slight(case, f):
+                shares[NOTHING] += shares[f.hypothesis.label]
+                shares[f.hypothesis.label] = 0.0
+    return shares
+
+
+def slight(case: Case, f: Fitted) -> bool:
+    """True for an effect added last all of whose sizes are below what is worth a claim."""
+    label = f.hypothesis.labels[-1]
+    if f.hypothesis.family == OUT_OF_TOLERANCE:
+        return False
+    sizes = [
+        e for e in extras(case.rig, Hypothesis((label,)), case.library) if e.slight > 0 and e.name in f.values
+    ]
+    return bool(sizes) and all(abs(f.values[e.name] - e.null) < e.slight for e in sizes)

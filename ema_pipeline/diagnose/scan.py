@@ -62,6 +62,37 @@ def scanned(
     return [_point(problem, base, moved, _finer(problem, base, moved, sizes)) for sizes in chosen]
 
 
+def likeliest(
+    problem: FitProblem,
+    base: Mapping[str, float],
+    moved: Sequence[Extra],
+    sizes: Sequence[Mapping[str, float]],
+    count: int = 3,
+) -> list[NDArray[np.float64]]:
+    """The most likely of given sizes at the values of a poorer model, all uncertainties widened.
+
+    Parameters
+    ----------
+    problem, base, moved
+        As for `scanned`.
+    sizes : sequence of mapping of parameter to value
+    count : int
+        How many, of which no two are neighbours.
+
+    Returns
+    -------
+    list of ndarray, (P,)
+        The most likely first.
+    """
+    tried = [tuple(s[e.name] for e in moved) for s in sizes]
+    costs = [_cost(problem, base, moved, v) for v in tried]
+    chosen: list[tuple[float, ...]] = []
+    for i in np.argsort(costs, kind="stable"):
+        if len(chosen) < count and all(not _near(tried[i], other) for other in chosen):
+            chosen.append(tried[i])
+    return [_point(problem, base, moved, v) for v in chosen]
+
+
 def _smallest(axis: Sequence[float], e: Extra) -> float:
     """The size next to null; of a quantity without one any."""
     return min(axis, key=lambda v: abs(v - e.null)) if e.scale > 0 else axis[0]

@@ -11,8 +11,9 @@ from ema_pipeline.diagnose.explain import label_text, size_text
 from ema_pipeline.diagnose.fitting import Case, Fitted
 from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras
 from ema_pipeline.diagnose.ladder import Yardstick
-from ema_pipeline.diagnose.ranking import Ranking
+from ema_pipeline.diagnose.ranking import Ranking, slight
 from ema_pipeline.diagnose.screening import Screening
+from ema_pipeline.diagnose.thresholds import threshold
 from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE, EffectSize, Ladder, VerdictWord
 
 _SPURIOUS = 2
@@ -70,7 +71,7 @@ def judge_data(
         odd = f" Not explained, perhaps not of the rig: {', '.join(left)}." if left else ""
         return "adequate", (
             f"The model explains the data (error {ladder.rungs[-1].error:.2f}); "
-            f"nothing is missing ({100 * p:.0f} %).{odd}"
+            f"nothing is missing ({100 * p:.0f} %).{odd}{_slight_text(case, first)}"
         )
     if len(members) > 1:
         return "ambiguous", f"Something is missing, but these explain the data alike: {names}."
@@ -79,6 +80,22 @@ def judge_data(
     return "effect", (
         f"Missing: {' and '.join(texts)}. Error {base.error:.3g} before, {last.error:.3g} after; "
         f"on held-out data {base.heldout_error:.3g} and {last.heldout_error:.3g}."
+    )
+
+
+def _slight_text(case: Case, ranking: Ranking) -> str:
+    """The best explanation that is too small to count, where the data show it; empty where there is none."""
+    shown = [
+        f
+        for f in ranking.fitted
+        if slight(case, f) and ranking.gain(f) > threshold(f.hypothesis.family, case.settings.gain_least)
+    ]
+    if not shown:
+        return ""
+    best = min(shown, key=lambda f: f.evidence)
+    return (
+        f" It would fit still better with {label_text(best.hypothesis.label)} "
+        f"({size_text(sizes(case, best))}): as small as parts made to one drawing differ."
     )
 
 
