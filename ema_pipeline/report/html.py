@@ -11,6 +11,7 @@ from ema_pipeline.report import diagnosis, levels, summary, tables
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.moving_gear import fill_of, moving_gears
 from ema_pipeline.report.numbers import format_value, slug, words
+from ema_pipeline.report.pages import page_templates
 from ema_pipeline.report.plots import Plot, Progress, render
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 
@@ -59,15 +60,7 @@ def write_report(
 
 def report_html(results: RunResults, plots: Sequence[Plot]) -> str:
     """The report's text, with `plots` embedded."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    environment = Environment(
-        loader=PackageLoader("ema_pipeline.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = page_templates()
     environment.filters["slug"] = slug
     environment.filters["words"] = words
     return environment.get_template("report.html.j2").render(_context(results, plots))

@@ -17,6 +17,7 @@ from ema_pipeline.hysteresis.summary import summary, terminal_lines
 from ema_pipeline.hysteresis.types import Estimate, IsolatorResult, Loop, LoopModel
 from ema_pipeline.report import diagnosis, style, summary_files
 from ema_pipeline.report.numbers import format_value, plain, words
+from ema_pipeline.report.pages import page_templates
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.tables import Row, Table
 
@@ -60,22 +61,15 @@ def write_loops_report(
         Of the ladder, the linear spring first; empty before it was climbed.
     folder : Path
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     content = summary_files.summary(results)
     content["configurations"] = {name: summary(one) for name, one in isolators.items()}
     text = json.dumps(summary_files.finite(content), indent=2, ensure_ascii=False)
     summary_files.replace_file(folder / "summary.json", text + "\n")
-    environment = Environment(
-        loader=PackageLoader("ema_pipeline.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     images = _images(isolators, results, loops, models, folder / "plots")
-    page = environment.get_template("loops.html.j2").render(
-        _context(isolators, results, loops, models) | {"images": images}
+    page = (
+        page_templates()
+        .get_template("loops.html.j2")
+        .render(_context(isolators, results, loops, models) | {"images": images})
     )
     summary_files.replace_file(folder / "report.html", page)
 

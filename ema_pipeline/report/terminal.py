@@ -16,9 +16,8 @@ from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from ema_pipeline.correlate.types import Comparison, Pairing
+from ema_pipeline.correlate.types import Comparison
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
-from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.modal.types import ModalModel
@@ -102,41 +101,6 @@ def levels_tables(study: LevelStudy, modal: ModalModel, title: str = "") -> Rend
     failed = [v for v in study.verdicts if not v.passes]
     if failed:
         parts += [_line(""), _line("Other signs:"), *(_line(f"! {v.message}") for v in failed)]
-    return Group(*parts)
-
-
-def pairing_table(pairing: Pairing, modal: ModalModel, title: str = "Pairs") -> RenderableType:
-    """Pairs with deviation and MAC, and below them the modes without a partner."""
-    pairs = _pick(tables.pairs_table(pairing, modal), (0, 1, 3, 4, 5, 6, 7))
-    pairs = _renamed(pairs, ("mode", "measured, Hz", "model, Hz", "diff, %", "MAC", "family", "remarks"))
-    parts: list[RenderableType] = [_rich(pairs, title)]
-    lone = tables.unpaired_table(pairing)
-    if lone.rows:
-        parts.append(_rich(lone, "Without a partner"))
-    return Group(*parts)
-
-
-def fit_summary(fit: FitResult) -> RenderableType:
-    """Fitted parameters with their uncertainty and what the data say of each, and the fit's quality."""
-    source = tables.parameters_table(fit)
-    heads = ("parameter", "fitted", "nominal", "shift", "data say")
-    parts: list[RenderableType] = [
-        _rich(_renamed(_pick(source, (0, 1, 3, 4, 5)), heads), "Fitted parameters (±1σ)")
-    ]
-    parts += [_line(f"{words(p.name)}: {p.note}") for p in fit.parameters.values() if p.note]
-    parts += [
-        _line(
-            f"{words(s.parameter)}, {s.configuration}, {s.mode_count} modes: "
-            f"{_sweep_words(s.identified, s.minimum, s.note)}"
-        )
-        for s in fit.sweeps
-    ]
-    parts.append(
-        _line(
-            f"{fit.data_count} data, chi²/dof {plain(fit.chi2_per_dof, 3)}, "
-            f"rms difference {plain(fit.error, 3)} σ, ε {plain(fit.frequency_error, 3)}; {fit.stop_reason}"
-        )
-    )
     return Group(*parts)
 
 
@@ -301,12 +265,6 @@ class Safe:
 def _to_ascii(text: str) -> str:
     text = re.sub(r"(?<=\w)σ", " σ", text)  # 3σ reads 3 sigma
     return text.translate(_ASCII).encode("ascii", "replace").decode("ascii")
-
-
-def _sweep_words(identified: bool, minimum: float, note: str) -> str:
-    if identified:
-        return f"minimum of ε at {format_value(minimum, float('nan'), 'N/m')}"
-    return f"not identified ({note})" if note else "not identified"
 
 
 def _heading(text: str) -> Safe:
