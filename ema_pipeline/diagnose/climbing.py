@@ -131,7 +131,7 @@ def claimable(
     top = ranking.ordered()[0]
     if ranking.gain(top) < threshold(top.hypothesis.family, settings.gain_least, thresholds):
         return None, nothing
-    stick = yardstick(case, fit, [ranking.base, *ranking.fitted])
+    stick = yardstick(case, fit, ranking.worthwhile())
     unseen = [held_out(case, f, fit, settings.folds) for f in (ranking.base, top)]
     label = top.hypothesis.labels[-1]
     if not stick.heldout_score(unseen[1]) < stick.heldout_score(unseen[0]):

@@ -36,7 +36,7 @@ class Yardstick:
     fit : FitSettings
         At the noise level.
     counted : ndarray of bool, (R,)
-        Measured modes that at least one model explains.
+        Measured modes that at least one model explains that is worth a look.
     outlier_cost : ndarray, (R,)
         What a mode without partner counts at least.
     prior_count : int

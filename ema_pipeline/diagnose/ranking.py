@@ -43,6 +43,10 @@ class Ranking:
         """The most probable first."""
         return sorted(self.fitted, key=lambda f: -self.probabilities[f.hypothesis.label])
 
+    def worthwhile(self) -> list[Fitted]:
+        """The base model, and what is better supported than it before prior odds count."""
+        return [self.base, *(f for f in self.fitted if f.evidence < self.base.evidence)]
+
     def gain(self, f: Fitted) -> float:
         """Fall of -2 log posterior, the mixing of near modes integrated out."""
         return self.base.objective + self.base.volume - f.objective - f.volume

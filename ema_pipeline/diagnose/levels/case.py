@@ -59,6 +59,12 @@ class LevelCase:
         """The fit of a hypothesis; `sizes` are typical values of its effects' parameters."""
         return TimeProblem(self._rig(hypothesis, sizes), self.windows, self._substeps())
 
+    def beginning(self, share: float) -> LevelCase:
+        """The first part of all windows."""
+        if share == 1.0:
+            return self
+        return replace(self, windows=tuple(w.shortened(share) for w in self.windows))
+
     def rough(self) -> LevelCase:
         """Softest and hardest hits, short windows, long steps: enough to tell orders of magnitude."""
         kept = [

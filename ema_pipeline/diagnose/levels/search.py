@@ -19,18 +19,47 @@ Progress = Callable[[float, str], None]
 _FOLLOWED = 2
 _HELPS = 0.5
 _NEAR = 0.005
-_STEPS = 10
 _AGAIN = 6
+_GROWING = ((0.1, 10), (0.3, 8), (1.0, 8))
+"""Shares of the windows, and steps on each: what is far off in frequency has no slope towards the optimum in long ones."""
+_POLISHED = 3
+_MOST_STEPS = 25
 
 
 def fit_base(
     case: LevelCase, hypothesis: Hypothesis, floor: NoiseFloor, sizes: Mapping[str, float]
 ) -> Simulated:
     """The best fit of a model from all of the case's starts."""
-    problem = case.problem(hypothesis, sizes)
-    weights = case.weights(floor)
-    found = [fit(problem, weights, problem.space.point({**s, **sizes}), _STEPS) for s in case.starts]
-    return judged(problem, hypothesis, sizes, min(found, key=lambda f: f.objective))
+    found = [follow(case, hypothesis, sizes, s, floor) for s in case.starts]
+    return again(case, min(found, key=lambda f: f.fit.objective), floor, _MOST_STEPS)
+
+
+def follow(
+    case: LevelCase,
+    hypothesis: Hypothesis,
+    sizes: Mapping[str, float],
+    values: Mapping[str, float],
+    floor: NoiseFloor,
+) -> Simulated:
+    """A fit that begins on the first part of the windows and follows the optimum as they grow.
+
+    Parameters
+    ----------
+    case : LevelCase
+    hypothesis : Hypothesis
+    sizes : mapping of str to float
+        Typical values of its effects' parameters.
+    values : mapping of str to float
+        Where the fit begins; `sizes` count where both have a parameter.
+    floor : NoiseFloor
+    """
+    now = {**values, **sizes}
+    for share, steps in _GROWING:
+        part = case.beginning(share)
+        problem = part.problem(hypothesis, sizes)
+        found = fit(problem, part.weights(floor), problem.space.point(now), steps)
+        now = found.values
+    return judged(problem, hypothesis, sizes, found)
 
 
 def again(case: LevelCase, model: Simulated, floor: NoiseFloor, steps: int = _AGAIN) -> Simulated:
@@ -63,13 +92,10 @@ def fit_effect(case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: 
         tried += [
             _Tried(float(o), k, v) for o, v in zip(objectives(problem, weights, x), points, strict=True)
         ]
-    weights = case.weights(floor)
     best: Simulated | None = None
     for t in _worth_following(tried):
         sizes = {**base.sizes, **sized(case, hypothesis, t.sizes)}
-        problem = coarse.problem(hypothesis, sizes)
-        found = fit(problem, weights, problem.space.point({**starts[t.start], **sizes}), _STEPS)
-        model = judged(problem, hypothesis, sizes, found)
+        model = follow(coarse, hypothesis, sizes, starts[t.start], floor)
         if best is None or model.fit.objective < best.fit.objective:
             best = model
     if best is None:
@@ -186,8 +212,25 @@ def ranked(case: LevelCase, base: Simulated, floor: NoiseFloor, tell: Progress) 
     fitted = []
     for f in spread(lambda h: fit_effect(case, h, base, floor), hypotheses, case.settings.processes):
         fitted.append(f)
-        tell(len(fitted) / len(hypotheses), f.hypothesis.labels[-1])
-    return LevelRanking(case, base, fitted)
+        tell(0.9 * len(fitted) / len(hypotheses), f.hypothesis.labels[-1])
+    return polished(case, LevelRanking(case, base, fitted), floor)
+
+
+def polished(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor) -> LevelRanking:
+    """The same with the best fits followed to the end, and the base model from where they led as well.
+
+    What a hypothesis gained by another rig alone, the base model gains too.
+    """
+    ordered = ranking.ordered()
+    best = [again(case, m, floor, _MOST_STEPS) for m in ordered[:_POLISHED]]
+    base = ranking.base
+    if best:
+        top = min(best, key=lambda m: m.fit.objective)
+        problem = case.problem(base.hypothesis, base.sizes)
+        found = fit(problem, case.weights(floor), problem.space.point(top.values), _MOST_STEPS)
+        if found.objective < base.fit.objective:
+            base = judged(problem, base.hypothesis, base.sizes, found)
+    return LevelRanking(case, base, [*best, *ordered[_POLISHED:]])
 
 
 def at_floor(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor, tell: Progress) -> LevelRanking:
