@@ -9,6 +9,7 @@ import time
 import tomllib
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -249,10 +250,14 @@ class Keys:
             )
         return key
 
+    @cached_property
+    def _in_store(self) -> frozenset[str]:
+        """Stages that the store held at first: no stage but those to be run can join them."""
+        return frozenset(name for name, _ in self._run.store.provenance())
+
     def _compute(self, name: str, configuration: str) -> str:
         stage, run = stage_module(name), self._run
-        stored = {name for name, _ in run.store.provenance()}
-        present = [o for o in getattr(stage, "USES", ()) if o in self._names or o in stored]
+        present = [o for o in getattr(stage, "USES", ()) if o in self._names or o in self._in_store]
         needed = [
             self(other, c)
             for other in (*stage.NEEDS, *present)
