@@ -342,7 +342,5 @@ def decay_trends(
             (amplitude / amplitude.max()) ** 2,
         )
 
-    return (
-        trends([of(m, "frequency_hz") for m in modes]),
-        trends([of(m, "damping_ratio") for m in modes]),
-    )
+    found = trends([of(m, "frequency_hz") for m in modes] + [of(m, "damping_ratio") for m in modes])
+    return found[: len(modes)], found[len(modes) :]

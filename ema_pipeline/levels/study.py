@@ -18,7 +18,7 @@ from ema_pipeline.modal.settings import ModalSettings
 if TYPE_CHECKING:
     from ema_pipeline.ingest.records import HitSamples
     from ema_pipeline.levels.single import HitPoles
-    from ema_pipeline.levels.trend import Trend
+    from ema_pipeline.levels.trend import Samples
     from ema_pipeline.modal.types import ModalModel
 
 Progress = Callable[[float, str], None]
@@ -168,7 +168,7 @@ def _tested(
 ) -> tuple[tuple[ModeLevels, ...], float]:
     """The modes with their tests, and the p value of all tests together."""
     from ema_pipeline.levels.single import single_hits
-    from ema_pipeline.levels.trend import holm, samples, shifts, trends
+    from ema_pipeline.levels.trend import clearest, combined, samples, shifts, trends
     from ema_pipeline.levels.words import trend_words
 
     if not len(base):
@@ -176,19 +176,21 @@ def _tested(
     found = single_hits(hits, _only(modal, base), frfs, frf_settings)
     level = np.array([place[name] for name in found.names], dtype=np.int64)
 
-    def tests(values: Real, stds: Real) -> tuple[Trend, ...]:
-        excitation = _excitation(found)
-        return trends(
-            [
-                samples(values[:, r], stds[:, r], found.sheet, level, found.force_n, excitation[:, r])
-                for r in range(len(base))
-            ]
-        )
+    excitation = _excitation(found)
 
-    frequency = tests(found.frequency_hz, found.frequency_std_hz)
-    damping = tests(found.damping_ratio, found.damping_std)
-    adjusted = holm(np.array([t.p for t in (*frequency, *damping)]))
-    moves = np.nan_to_num(adjusted, nan=1.0) < settings.false_alarm
+    def given(values: Real, stds: Real) -> list[Samples]:
+        return [
+            samples(values[:, r], stds[:, r], found.sheet, level, found.force_n, excitation[:, r])
+            for r in range(len(base))
+        ]
+
+    tests = trends(
+        given(found.frequency_hz, found.frequency_std_hz) + given(found.damping_ratio, found.damping_std)
+    )
+    frequency, damping = tests[: len(base)], tests[len(base) :]
+    p_values = np.array([t.p for t in tests])
+    p_value = combined(p_values)
+    moves = clearest(p_values, settings.false_alarm) & (p_value < settings.false_alarm)
     out = list(modes)
     for r, k in enumerate(base):
         both = bool(moves[r]), bool(moves[r + len(base)])
@@ -210,7 +212,6 @@ def _tested(
             damping_shift=damping_shift[0],
             damping_shift_std=damping_shift[1],
         )
-    p_value = float(np.nanmin(adjusted)) if np.isfinite(adjusted).any() else float("nan")
     return tuple(out), p_value
 
 
@@ -242,7 +243,7 @@ def _from_decays(
     """What the decays after hits of one level tell: the modes with their tests, the curves, and the p value."""
     from ema_pipeline.levels.decay import decay_trends
     from ema_pipeline.levels.tracks import doubles, separated
-    from ema_pipeline.levels.trend import holm
+    from ema_pipeline.levels.trend import clearest, combined
     from ema_pipeline.levels.words import trend_words
 
     n = len(modal.modes)
@@ -252,15 +253,16 @@ def _from_decays(
     alone = separated(modal)
     read = tuple(c for c in curves if alone[c.mode])
     frequency, damping = decay_trends(read, tuple(range(n)))
-    adjusted = holm(np.array([t.p for t in (*frequency, *damping)]))
+    p_values = np.array([t.p for t in (*frequency, *damping)])
     change = np.zeros(2 * n)
     for c in read:
         span = float(np.log(c.amplitude_m.max() / c.amplitude_m.min()))
         mode = modal.modes[c.mode]
         change[c.mode] = abs(frequency[c.mode].slope) * span / (mode.frequency_hz * abs(mode.damping_ratio))
         change[c.mode + n] = abs(damping[c.mode].slope) * span / abs(mode.damping_ratio)
-    adjusted = np.where(np.isfinite(adjusted) & (change < PLAIN_CHANGE), 1.0, adjusted)
-    moves = np.nan_to_num(adjusted, nan=1.0) < settings.false_alarm
+    p_values = np.where(np.isfinite(p_values) & (change < PLAIN_CHANGE), 1.0, p_values)
+    p_value = combined(p_values)
+    moves = clearest(p_values, settings.false_alarm) & (p_value < settings.false_alarm)
     modes = tuple(
         ModeLevels(
             mode=k,
@@ -277,7 +279,7 @@ def _from_decays(
         )
         for k, mode in enumerate(modal.modes)
     )
-    return modes, curves, float(np.nanmin(adjusted)) if np.isfinite(adjusted).any() else float("nan")
+    return modes, curves, p_value
 
 
 def _excitation(found: HitPoles) -> Real:

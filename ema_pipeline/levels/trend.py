@@ -1,29 +1,29 @@
 """Does a quantity measured in single hits move with their force? A test that holds what it promises.
 
 Every point has a mean of its own, so that points struck with different forces do not count. The noise of each hit
-is known; what hits of one point and level scatter beyond it (an unsteady hand, a slow drift) is estimated and
-added, and with few hits the uncertainty of that estimate makes the test stricter.
+is known; what hits scatter beyond it about smooth curves over the force is estimated and added, see `scatter`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.stats import chi2
+from scipy.stats import f as fisher
 from scipy.stats import t as student
+
+from ema_pipeline.levels.scatter import NOTHING_USUAL, Scatter, Usual, usual_scatter
 
 Real = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 PRIOR_DOF = 4.0
-"""Degrees of freedom that the noise known from the FRFs counts for in the scatter of the hits."""
+"""Degrees of freedom that the noise known from the FRFs counts for in the scatter of few hits of a level."""
 
-AT_ODDS = 0.2
-"""Chance of the observed scatter from noise alone, below which the noise known from the FRFs counts for nothing."""
+LARGEST = 0.99
+"""Larger p values count as this: a single one near 1 would undo all others in the Cauchy combination."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,16 @@ class Samples:
     cell: Integers
     log_force: Real
     amplitude: Real
+
+    @property
+    def square(self) -> Real:
+        """Square of the force over the largest one."""
+        return np.asarray(np.exp(2 * (self.log_force - self.log_force.max())))
+
+    @property
+    def repeated(self) -> bool:
+        """True where some hits share point and force."""
+        return len(self.values) > int(self.cell.max(initial=-1)) + 1
 
 
 @dataclass(frozen=True)
@@ -107,112 +117,107 @@ def trends(modes: Sequence[Samples]) -> tuple[Trend, ...]:
     Parameters
     ----------
     modes : sequence of Samples
-        Of all modes of the structure.
+        Frequencies and damping ratios of all modes of the structure: together they tell how much hits scatter.
 
     Notes
     -----
-    Two trends are tried, with ln(force) and with the square of the amplitude (a cubic spring's law), each held
-    against two kinds of scatter: within cells, which supposes nothing of the law, and about a straight line per
-    sheet, which is not widened by the forces' scatter within a level. The smallest p of the four is multiplied
-    by four. Scatter of n hits with ν degrees of freedom counts like this: with w = 1/(σ² + τ²), τ² so that
-    chi-square equals ν (Paule & Mandel [1]_), the slope's t value is referred to Student's distribution with
-    ν + `PRIOR_DOF` degrees of freedom, its variance scaled by a weighted mean of the observed scatter and 1
-    (moderated as in [2]_), never below 1. Where the hits of this mode, or of all modes together, scatter by more
-    than their noise, the noise counts for nothing, and ν alone remains.
+    Hits scatter about curves of two terms, ln(force) and force squared, one curve per sheet, where there are three
+    levels with repeated hits, about straight lines otherwise. That supposes little of the law, and hits of one level
+    that differ in force do not count as scatter. The scatter is shrunk towards what is usual among all modes
+    (`scatter.usual_scatter`), and its variance added to the noise's. Against it four trends are held: with the square
+    of the mode's amplitude (a cubic spring's law), with ln(force), with the force squared, and with slopes of every
+    sheet's own; the degrees of freedom are those of the scatter and of what is usual together. Their p values are
+    combined with `combined`, which holds for any dependence between them. Hits that were never repeated do not tell
+    noise from scatter: there nothing is usual.
+    """
+    scatters = [_scatters(s) for s in modes]
+    usual = tuple(usual_scatter(s[kind] for s in scatters if s) for kind in range(2))
+    return tuple(_trend(given, found, usual) for given, found in zip(modes, scatters, strict=True))
+
+
+_Pair = tuple[Scatter, Scatter]
+_Terms = tuple[Real, ...]
+
+
+def _scatters(given: Samples) -> _Pair | None:
+    """Scatter of the hits where the force squared acts, and where its logarithm does; None for too few hits."""
+    if not len(given.values):
+        return None
+    square, log = given.square, given.log_force
+    levels = max(len(set(given.cell[given.sheet == s])) for s in set(given.sheet.tolist()))
+    kinds: list[tuple[_Terms, _Terms, bool]] = [((square,), (log,), False), ((square,), (log,), True)]
+    if levels > 2 and given.repeated:
+        kinds.insert(0, ((square, log), (square, log), False))
+    for of_square, of_log, shared in kinds:
+        pair = _scatter(given, of_square, shared), _scatter(given, of_log, shared)
+        if min(s.dof for s in pair) > 0:
+            return pair
+    return None
+
+
+def _scatter(given: Samples, terms: tuple[Real, ...], shared: bool) -> Scatter:
+    return Scatter(given.values, given.variance, given.sheet, terms, shared)
+
+
+def _trend(given: Samples, scatters: _Pair | None, usual: tuple[Usual, ...]) -> Trend:
+    """All trends of one mode held against its scatter."""
+    if scatters is None:
+        return NOTHING
+    known = usual if given.repeated else (NOTHING_USUAL,) * 2
+    extra = [s.extra(u) for s, u in zip(scatters, known, strict=True)]
+    dof = [s.dof + u.dof for s, u in zip(scatters, known, strict=True)]
+    tries = [
+        _slope(given, given.amplitude, extra[0], dof[0]),
+        _slope(given, given.square, extra[0], dof[0]),
+        _slope(given, given.log_force, extra[1], dof[1]),
+    ]
+    common = min((t for t in tries if np.isfinite(t[0])), default=(float("nan"), float("nan")))
+    chances = [p for p, _ in tries]
+    if not scatters[0].shared and len(np.unique(given.sheet)) > 1:
+        chances.append(_own_slopes(given, given.square, extra[0], dof[0]))
+    return Trend(combined(np.array(chances)), common[1], float(np.sqrt(extra[0])))
+
+
+def _slope(given: Samples, regressor: Real, extra: float, dof: float) -> tuple[float, float]:
+    """Two-sided p value of a slope that all sheets share, and the slope per ln(force)."""
+    weight = 1.0 / (given.variance + extra)
+    across = _centred(regressor, weight, given.sheet)
+    strength = float(np.sum(weight * across**2))
+    if strength <= 0:
+        return float("nan"), float("nan")
+    beta = float(np.sum(weight * across * given.values)) / strength
+    force = _centred(given.log_force, weight, given.sheet)
+    per_log = beta * float(np.sum(weight * across * force) / np.sum(weight * force**2))
+    return 2 * float(student.sf(abs(beta) * np.sqrt(strength), dof)), per_log
+
+
+def _own_slopes(given: Samples, regressor: Real, extra: float, dof: float) -> float:
+    """P value of slopes of every sheet's own."""
+    weight = 1.0 / (given.variance + extra)
+    across = _centred(regressor, weight, given.sheet)
+    moved = np.bincount(given.sheet, weight * across * given.values)
+    strength = np.bincount(given.sheet, weight * across**2)
+    told = strength > 0
+    if not told.any():
+        return float("nan")
+    return float(fisher.sf(np.mean(moved[told] ** 2 / strength[told]), int(told.sum()), dof))
+
+
+def combined(p_values: Real) -> float:
+    """One p value for several tests that may depend on each other in any way; NaN where none is known.
 
     References
     ----------
-    .. [1] R. C. Paule and J. Mandel, "Consensus values and weighting factors", J. Res. Natl. Bur. Stand. 87,
-       1982.
-    .. [2] G. K. Smyth, "Linear models and empirical Bayes methods for assessing differential expression",
-       Stat. Appl. Genet. Mol. Biol. 3(1), 2004.
+    Y. Liu and J. Xie, "Cauchy combination test: a powerful test with analytic p-value calculation under arbitrary
+    dependency structures", J. Am. Stat. Assoc. 115, 2020.
     """
-    tries = [_tries(s) for s in modes]
-    noise_holds = True
-    for kind in range(max((len(t) for t in tries), default=0)):
-        alike = [t[kind] for t in tries if len(t) > kind]
-        chance = chi2.sf(sum(t.noise_only for t in alike), sum(t.dof for t in alike))
-        noise_holds = noise_holds and bool(chance > AT_ODDS / 4)
-    return tuple(_best(t, noise_holds) for t in tries)
-
-
-def _tries(given: Samples) -> list[_Try]:
-    """The lines and scatters that the hits of one mode suffice for."""
-    if not len(given.values):
-        return []
-    n, sheets, cells = len(given.values), int(given.sheet.max()) + 1, int(given.cell.max()) + 1
-    kinds: list[tuple[Callable[[Samples, Real, Real], Real], int]] = [
-        (_about_cells, n - cells),
-        (_about_lines, n - 2 * sheets),
-    ]
-    kinds = [k for k in kinds if k[1] > 0] or [(_about_one_slope, n - sheets - 1)]
-    regressors = (given.amplitude, given.log_force)
-    return [_Try(given, x, about, dof) for about, dof in kinds if dof > 0 for x in regressors]
-
-
-def _about_cells(given: Samples, regressor: Real, weight: Real) -> Real:
-    return _centred(given.values, weight, given.cell)
-
-
-def _about_lines(given: Samples, regressor: Real, weight: Real) -> Real:
-    y, x = (_centred(v, weight, given.sheet) for v in (given.values, regressor))
-    strength = np.maximum(np.bincount(given.sheet, weight * x * x), 1e-300)
-    return np.asarray(y - (np.bincount(given.sheet, weight * x * y) / strength)[given.sheet] * x)
-
-
-def _about_one_slope(given: Samples, regressor: Real, weight: Real) -> Real:
-    y, x = (_centred(v, weight, given.sheet) for v in (given.values, regressor))
-    return np.asarray(y - x * np.sum(weight * x * y) / max(float(np.sum(weight * x * x)), 1e-300))
-
-
-class _Try:
-    """A straight line in one regressor, and the scatter that it is held against."""
-
-    def __init__(
-        self, given: Samples, regressor: Real, about: Callable[[Samples, Real, Real], Real], dof: int
-    ) -> None:
-        self._given, self._regressor, self._about, self.dof = given, regressor, about, dof
-        self.noise_only = self._chi_square(0.0)
-        self.extra = self._extra()
-
-    def result(self, noise_holds: bool) -> tuple[float, float]:
-        """Two-sided p value and slope per ln(force)."""
-        given = self._given
-        weight = 1.0 / (given.variance + self.extra)
-        across = _centred(self._regressor, weight, given.sheet)
-        strength = float(np.sum(weight * across**2))
-        if strength <= 0:
-            return float("nan"), float("nan")
-        repeated = self._about is not _about_one_slope
-        explained = noise_holds and repeated and chi2.sf(self.noise_only, self.dof) > AT_ODDS
-        prior = PRIOR_DOF if explained else 0.0
-        scale = max((prior + self._chi_square(self.extra)) / (prior + self.dof), 1.0)
-        beta = float(np.sum(weight * across * given.values)) / strength
-        p = 2 * float(student.sf(abs(beta) * np.sqrt(strength / scale), prior + self.dof))
-        force = _centred(given.log_force, weight, given.sheet)
-        return p, beta * float(np.sum(weight * across * force) / np.sum(weight * force**2))
-
-    def _chi_square(self, extra: float) -> float:
-        weight = 1.0 / (self._given.variance + extra)
-        return float(np.sum(weight * self._about(self._given, self._regressor, weight) ** 2))
-
-    def _extra(self) -> float:
-        """Variance to add to every hit so that chi-square about the scatter's centre equals its dof."""
-        if self.noise_only <= self.dof:
-            return 0.0
-        top = float(np.ptp(self._given.values)) ** 2 + float(self._given.variance.max())
-        while self._chi_square(top) > self.dof:
-            top *= 10
-        return float(brentq(lambda extra: self._chi_square(extra) - self.dof, 0.0, top, rtol=1e-4))
-
-
-def _best(tries: list[_Try], noise_holds: bool) -> Trend:
-    results = [(*t.result(noise_holds), t.extra) for t in tries]
-    known = [r for r in results if np.isfinite(r[0])]
-    if not known:
-        return NOTHING
-    p, slope, extra = min(known)
-    return Trend(min(1.0, len(tries) * p), slope, float(np.sqrt(extra)))
+    p = p_values[np.isfinite(p_values)]
+    if not len(p):
+        return float("nan")
+    p = np.clip(p, 1e-300, LARGEST)
+    # 1/tan without the loss of digits near 0 that tan(π(1/2 - p)) has
+    total = float(np.mean(1.0 / np.tan(np.pi * p)))
+    return float(np.arctan2(1.0, total) / np.pi)
 
 
 def birge_ratio(values: Real, stds: Real, groups: Integers) -> float:
@@ -265,6 +270,17 @@ def holm(p_values: Real) -> Real:
     out = np.full(len(p_values), np.nan)
     out[order] = np.minimum(np.maximum.accumulate(p_values[order] * np.arange(len(order), 0, -1)), 1.0)
     return out
+
+
+def clearest(p_values: Real, false_alarm: float) -> NDArray[np.bool_]:
+    """Which of many quantities move, where it is known that something does, (n_tests,).
+
+    Those that Holm's correction names at this rate; where it names none, the one with the least p value.
+    """
+    moves = np.nan_to_num(holm(p_values), nan=1.0) < false_alarm
+    if np.isfinite(p_values).any():
+        moves[int(np.nanargmin(p_values))] = True
+    return moves
 
 
 def _dummies(groups: Integers) -> Real:
