@@ -254,6 +254,7 @@ def add(
     out: Out,
     effect: Annotated[list[str], typer.Argument(metavar="EFFECT@PLACE", help="See 'ema effects'.")],
     effect_file: EffectFiles = None,
+    set_: Overrides = None,
     quiet: Quiet = False,
 ) -> None:
     """Add a physical effect to the model, refit, and show the error before and after."""
@@ -261,7 +262,7 @@ def add(
     from ema_pipeline.pipeline import existing_run
 
     with _progress(quiet) as show:
-        changes = with_effect_files(existing_run(out).effect_files, effect_file or [], [])
+        changes = with_effect_files(existing_run(out).effect_files, effect_file or [], set_ or [])
         run = change_effects(out, adding(effect), changes, show)
     if not quiet:
         _print_ladder(run)
@@ -408,6 +409,7 @@ def simulate(
         list[str] | None,
         typer.Option("--effect", "-e", metavar="ID@PLACE:NAME=VALUE", help="Hidden effect and its size."),
     ] = None,
+    effect_file: EffectFiles = None,
     value: Annotated[
         list[str] | None, typer.Option("--value", metavar="NAME=VALUE", help="True value of a parameter.")
     ] = None,
@@ -429,6 +431,7 @@ def simulate(
         rig,
         configurations=configuration or [],
         effects=effect or [],
+        effect_files=effect_file or [],
         values=value or [],
         sensors=sensor or [],
         impacts=impact or [],

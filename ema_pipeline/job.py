@@ -406,12 +406,14 @@ def simulate_raw(
     *,
     configurations: list[str],
     effects: list[str],
+    effect_files: list[str],
     values: list[str],
     sensors: list[str],
     impacts: list[str],
     settings: list[str],
 ) -> SimulatedCampaign:
     """Simulate a campaign; values and settings are given as ``"name=value"``."""
+    from ema_pipeline.effects.library import effect_library
     from ema_pipeline.simulate.campaign import simulate_campaign
 
     return simulate_campaign(
@@ -422,6 +424,7 @@ def simulate_raw(
         values=_named_values(values, "--value"),
         sensors=sensors,
         impacts=impacts,
+        library=effect_library(effect_files),
         **_named_values(settings, "--set"),
     )
 

@@ -18,6 +18,7 @@ import pyuff
 
 from ema_pipeline import cli
 from ema_pipeline.hysteresis.simulate import PRINTED, write_sine_tests
+from ema_pipeline.pipeline import existing_run
 from ema_pipeline.simulate import simulate_campaign
 
 STAGES = 'stages=["ingest", "hits", "frf", "modal", "ladder", "fit", "correlate", "report"]'
@@ -152,14 +153,15 @@ def test_compare_shows_each_mode_with_its_difference(
         assert f"{int(mode['frequency_hz'])}." in out
 
 
-def test_an_effect_is_added_and_removed_and_the_ladder_shows_what_it_brought(
+def test_an_effect_is_added_under_a_changed_setting_and_removed_and_the_ladder_shows_what_it_brought(
     results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "copy"
     shutil.copytree(results, out)
     effect = "shaft_torsion@carrier"
-    code, text, _ = ema(capsys, "add", out, effect, "--quiet")
+    code, text, _ = ema(capsys, "add", out, effect, "--set", "diagnose.folds=3", "--quiet")
     assert (code, text) == (0, "")
+    assert json.loads(existing_run(out).info.pipeline)["diagnose"]["folds"] == 3
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert [rung["effects"] for rung in summary["ladder"]] == [[], [effect]]
     assert summary["ladder"][1]["error"] <= summary["ladder"][0]["error"] + 1e-6

@@ -95,6 +95,21 @@ def test_effect_of_the_page_is_diagnosed_and_laddered_by_its_file(
         assert abs(size.value - value) < 3 * size.std
 
 
+def test_a_test_is_simulated_with_the_effect_of_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("oil_film.py").write_text(blocks("adding_an_effect.md", "python")[0], encoding="utf-8")
+    sized = ("--effect", "oil_film@sun:stiffness=3e7,coefficient=20")
+    test = ("--configuration", "no_ring", "--impact", "sun.x", "--sensor", "sun.x", "--set", "duration_s=1.0")
+    ema("simulate", "plain", *test)
+    ema("simulate", "filmed", *sized, "--effect-file", "oil_film.py", *test)
+    truth = {n: json.loads(Path(n, "truth.json").read_text(encoding="utf-8")) for n in ("plain", "filmed")}
+    assert truth["filmed"]["values"]["oil_film@sun.stiffness"] == 3e7
+    f = {n: [m["frequency_hz"] for m in t["configurations"]["no_ring"]["modes"]] for n, t in truth.items()}
+    assert max(b / a for a, b in zip(f["plain"], f["filmed"], strict=True) if a > 1) > 1.001
+
+
 def _table(rig: Rig, seed: int) -> str:
     """Modes of a rig with noise, as a table."""
     rng = np.random.default_rng(seed)
