@@ -14,14 +14,29 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
     if values["force"] == 0.0:
         return assembly
     return assembly.add(
-        *(DryFriction(f"{place} friction {a}", {f"{place}.{a}": 1.0}, values["force"]) for a in "xy")
+        *(
+            DryFriction(f"{place} friction {a}", {f"{place}.{a}": 1.0}, values["force"], values["velocity"])
+            for a in "xy"
+        )
     )
 
 
 EFFECT = Effect(
     id="dry_friction",
     title="Coulomb friction of a body against ground",
-    parameters=(EffectParameter("force", "N", 0.0, 2.0, 10.0, 0.0, 1e5, "friction force in x and in y"),),
+    parameters=(
+        EffectParameter("force", "N", 0.0, 2.0, 10.0, 0.0, 1e5, "Coulomb force in x and in y"),
+        EffectParameter(
+            "velocity",
+            "m/s",
+            1e-3,
+            1e-3,
+            1e-2,
+            1e-6,
+            1.0,
+            "rate at which it has reached three quarters of that",
+        ),
+    ),
     find_places=bodies_with_bearings,
     edit=_edit,
     signs="damping falls as the hammer's force grows; distorted circles at low force",

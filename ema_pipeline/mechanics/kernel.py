@@ -8,9 +8,12 @@ from numpy.typing import NDArray
 
 from ema_pipeline.mechanics.laws import LAWS
 
-_polynomial, _friction, _parting = (numba.njit(law, inline="always") for law in LAWS)
+_polynomial, _, _parting = (numba.njit(law, inline="always") for law in LAWS)
 
 _NEWTON = 60
+_RINGING = 3.0
+"""A step over which friction would take this many times the speed that it meets rings at half its strength, and less."""
+
 _TOLERANCE = 1e-8
 _WILD = 1e30
 """A force, N, that no structure has."""
@@ -87,6 +90,28 @@ def _halves(rows: NDArray[np.complex128]) -> NDArray[np.float64]:
     return np.concatenate([rows.real, -rows.imag], axis=2)
 
 
+@numba.njit(inline="always")
+def _gripped(free, own, limit, velocity):  # type: ignore[no-untyped-def]
+    """Friction at the end of a step that would end at the rate `free` without it and `own` less per newton.
+
+    In u = rate/velocity the equation is velocity·u - own·limit·tanh(u) = free, with own < 0: its left side rises and
+    bends downwards for u > 0, so that Newton steps from 0 never pass the root.
+    """
+    if limit == 0.0:
+        return 0.0
+    resolved = max(velocity, -own * limit / _RINGING)
+    stop = -own * limit
+    aim = abs(free)
+    u, hold = 0.0, 0.0
+    for _ in range(_NEWTON):
+        error = aim - resolved * u - stop * hold
+        if not error > _TOLERANCE * _TOLERANCE * aim:
+            break
+        u += error / (resolved + stop * (1.0 - hold * hold))
+        hold = np.tanh(u)
+    return limit * hold if free > 0.0 else -limit * hold
+
+
 @numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
 def _march(laws, decay, begun, ended, stretch, outputs, reach, seen, force, step, keep_every, result):  # type: ignore[no-untyped-def]
     count, size = decay.shape
@@ -132,15 +157,19 @@ def _march(laws, decay, begun, ended, stretch, outputs, reach, seen, force, step
                             vj += reach[a, m + j, hits + i] * g[i]
                         kind = laws[a, j, 0]
                         n1, n2, n3 = laws[a, j, 1], laws[a, j, 2], laws[a, j, 3]
-                        if kind == 0.0:
-                            found, by_d, by_v = _polynomial(dj, vj, n1, n2, n3)
-                        elif kind == 1.0:
-                            found, by_d, by_v = _friction(dj, vj, n1, n2, n3)
+                        if kind == 1.0:
+                            own = reach[a, m + j, hits + j]
+                            found = _gripped(vj - own * g[j], own, n1, n2)
+                            error = found - g[j]
+                            g[j] = found
                         else:
-                            found, by_d, by_v = _parting(dj, vj, n1, n2, n3)
-                        error = found - g[j]
-                        slope = by_d * reach[a, j, hits + j] + by_v * reach[a, m + j, hits + j]
-                        g[j] += error / max(1.0 - slope, 0.1)
+                            if kind == 0.0:
+                                found, by_d, by_v = _polynomial(dj, vj, n1, n2, n3)
+                            else:
+                                found, by_d, by_v = _parting(dj, vj, n1, n2, n3)
+                            error = found - g[j]
+                            slope = by_d * reach[a, j, hits + j] + by_v * reach[a, m + j, hits + j]
+                            g[j] += error / max(1.0 - slope, 0.1)
                         scale = max(scale, abs(found))
                         worst = max(worst, abs(error))
                     if not worst > _TOLERANCE * scale:

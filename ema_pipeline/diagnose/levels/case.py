@@ -181,7 +181,7 @@ def judged(
 
 
 _DECADES = 4
-_SHORT = 0.4
+_SHORT = 0.3
 _COARSE = 3.0
 
 

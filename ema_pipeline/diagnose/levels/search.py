@@ -22,7 +22,7 @@ _NEAR = 0.005
 _AGAIN = 6
 _GROWING = ((0.1, 10), (0.3, 8), (1.0, 8))
 """Shares of the windows, and steps on each: what is far off in frequency has no slope towards the optimum in long ones."""
-_POLISHED = 3
+_POLISHED = 2
 _MOST_STEPS = 25
 
 
@@ -30,8 +30,10 @@ def fit_base(
     case: LevelCase, hypothesis: Hypothesis, floor: NoiseFloor, sizes: Mapping[str, float]
 ) -> Simulated:
     """The best fit of a model from all of the case's starts."""
-    found = [follow(case, hypothesis, sizes, s, floor) for s in case.starts]
-    return again(case, min(found, key=lambda f: f.fit.objective), floor, _MOST_STEPS)
+    coarse = case.coarse()
+    found = [follow(coarse, hypothesis, sizes, s, floor) for s in _distinct_starts(case.starts)]
+    best = again(coarse, min(found, key=lambda f: f.fit.objective), floor, _MOST_STEPS)
+    return again(case, best, floor, _MOST_STEPS)
 
 
 def follow(
@@ -222,7 +224,8 @@ def polished(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor) -> Level
     What a hypothesis gained by another rig alone, the base model gains too.
     """
     ordered = ranking.ordered()
-    best = [again(case, m, floor, _MOST_STEPS) for m in ordered[:_POLISHED]]
+    coarse = case.coarse()
+    best = [again(case, again(coarse, m, floor, _MOST_STEPS), floor) for m in ordered[:_POLISHED]]
     base = ranking.base
     if best:
         top = min(best, key=lambda m: m.fit.objective)
