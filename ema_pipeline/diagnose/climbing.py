@@ -12,7 +12,7 @@ from ema_pipeline.diagnose.ladder import noise_of, yardstick
 from ema_pipeline.diagnose.noise import NoiseLevel, floors
 from ema_pipeline.diagnose.ranking import Ranking, rank, sharpen
 from ema_pipeline.diagnose.thresholds import threshold
-from ema_pipeline.diagnose.witness import Witness, contradicts
+from ema_pipeline.diagnose.witness import Witness
 from ema_pipeline.fit.settings import FitSettings
 
 Progress = Callable[[float, str], None]
@@ -140,7 +140,7 @@ def claimable(
         )
         return None, f"{label} does not improve held-out data (error {before:.3g} before, {after:.3g} after)"
     without, with_it = witness.error(ranking.base), witness.error(top)
-    if contradicts(without, with_it):
+    if witness.rejects(without, top, stick.error(top) <= settings.error_limit):
         return None, (
             f"the FRFs contradict {label}: error {without.error:.3g} before, {with_it.error:.3g} after"
         )

@@ -12,15 +12,22 @@ from ema_pipeline.diagnose.detection import detection_limits
 from ema_pipeline.diagnose.explain import why
 from ema_pipeline.diagnose.fitting import Case, Fitted
 from ema_pipeline.diagnose.heldout import held_out
-from ema_pipeline.diagnose.hypotheses import NOTHING, describe
+from ema_pipeline.diagnose.hypotheses import NOTHING, describe, same_physics
 from ema_pipeline.diagnose.ladder import Yardstick, assemble_ladder, with_frfs, yardstick
-from ema_pipeline.diagnose.localise import localise
+from ema_pipeline.diagnose.localise import extra_coordinates, localise
 from ema_pipeline.diagnose.predict import predict_left_out
 from ema_pipeline.diagnose.ranking import Ranking
 from ema_pipeline.diagnose.screening import Screening, screen
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.thresholds import threshold
-from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE, Candidate, Diagnosis, Ladder, Localisation
+from ema_pipeline.diagnose.types import (
+    OUT_OF_TOLERANCE,
+    Candidate,
+    Diagnosis,
+    Ladder,
+    Localisation,
+    VerdictWord,
+)
 from ema_pipeline.diagnose.verdict import judge_data, mending, misfit, sizes, unexplained_notes
 from ema_pipeline.diagnose.witness import Witness, better_share, frf_lines
 from ema_pipeline.effects.library import Library
@@ -109,13 +116,10 @@ def _diagnose(
     tell(0.93, "predicting held-out data")
     candidates = _candidates(case, climbed, members, ladder, stick, witness, thresholds)
     verdict, summary = judge_data(case, screening, climbed, members, ladder)
-    groups: tuple[tuple[str, ...], ...] = ()
-    if verdict == "ambiguous":
-        labels = [f.hypothesis.label for f in members]
-        groups = (tuple(labels if len(labels) > 1 else [*labels, NOTHING]),)
+    groups = _groups(case, climbed, members, verdict)
     localised: tuple[Localisation, ...] = ()
     if verdict == "unknown_effect":
-        localised = localise(case, top.hypothesis, fit, top.values)
+        localised = (*extra_coordinates(case, top), *localise(case, top.hypothesis, fit, top.values))
         summary += _where(localised)
     tell(0.97, "next measurement")
     adequate = not misfit(case, top, ladder.rungs[-1].error)
@@ -140,6 +144,23 @@ def _diagnose(
     return found
 
 
+def _groups(
+    case: Case, climbed: Climb, members: Sequence[Fitted], verdict: VerdictWord
+) -> tuple[tuple[str, ...], ...]:
+    """What the data cannot tell apart: rivals, and names for the same change of the matrices."""
+    if verdict == "ambiguous":
+        labels = [x for f in members for x in (f.hypothesis.label, *_same(case, f))]
+        return (tuple(labels if len(labels) > 1 else [*labels, NOTHING]),)
+    claimed = [(m.hypothesis.labels[-1], *_same(case, m)) for m in climbed.models[1:]]
+    return tuple(labels for labels in claimed if len(labels) > 1)
+
+
+def _same(case: Case, f: Fitted) -> tuple[str, ...]:
+    found = list(sizes(case, f).values())
+    size = found[0].value if found else 0.0
+    return same_physics(case.rig, list(case.measured), case.library, f.hypothesis, size)
+
+
 def _alike(case: Case, climbed: Climb, ladder: Ladder, stick: Yardstick, witness: Witness) -> list[Fitted]:
     """What explains the data alike: rivals of the first claim; where nothing is claimed, what would mend a model
     that fails."""
@@ -148,7 +169,7 @@ def _alike(case: Case, climbed: Climb, ladder: Ladder, stick: Yardstick, witness
     if misfit(case, climbed.top, ladder.rungs[-1].error):
         found = mending(case, climbed.rankings[0], stick)
         base = witness.error(climbed.top)
-        return [f for f in found if not witness.worse(base, f)]
+        return [f for f in found if not witness.rejects(base, f, True)]
     return group(case, climbed.rankings[0], witness)[:1]
 
 

@@ -201,6 +201,48 @@ def single_hypotheses(
     return chosen
 
 
+def same_physics(
+    rig: Rig, configurations: Sequence[str], library: Library | None, hypothesis: Hypothesis, size: float
+) -> tuple[str, ...]:
+    """Other labels for what a hypothesis adds last: they change all matrices alike, so no measurement in these
+    configurations parts them.
+
+    Parameters
+    ----------
+    rig, configurations, library
+        As for `single_hypotheses`.
+    hypothesis : Hypothesis
+    size : float
+        Of its (only) parameter: effects whose own size would then have a forbidden sign are not the same.
+    """
+    known = shipped_effects() if library is None else library
+    if hypothesis.family not in known:
+        return ()
+    last = hypothesis.labels[-1]
+    made = rig_with_effects(rig, Hypothesis(hypothesis.labels[:-1]).effects, library)
+    effect = known[hypothesis.family]
+    own = _direction(made, configurations, effect, hypothesis.place)
+    if own is None or not own.size:
+        return ()
+    sign = np.sign(size - effect.parameters[0].null)
+    found = []
+    for other_id, other in sorted(known.items()):
+        if other_id in GENERIC or not other.linear:
+            continue
+        for place in dict.fromkeys(p for c in configurations for p in other.find_places(made.assembly(c))):
+            label = f"{other_id}@{place}"
+            if label == last or label in hypothesis.labels:
+                continue
+            direction = _direction(made, configurations, other, place)
+            if direction is None or not _alike(own, direction):
+                continue
+            p = other.parameters[0]
+            wanted = sign * np.sign(own @ direction) * np.sign(p.start - p.null)
+            if wanted > 0 or p.minimum < p.null:
+                found.append(label)
+    return tuple(found)
+
+
 def _direction(
     rig: Rig, configurations: Sequence[str], effect: Effect, place: str
 ) -> NDArray[np.float64] | None:

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.residuals import modal_basis
-from ema_pipeline.diagnose.fitting import Case
+from ema_pipeline.diagnose.fitting import Case, Fitted
 from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.stray import strong_unexplained
 from ema_pipeline.diagnose.types import Localisation
 from ema_pipeline.fit.evidence import Dataset
 from ema_pipeline.fit.latent import LatentObjective
@@ -26,6 +27,7 @@ from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.solve import FitProblem
 
 _LOOSE_TAU = 0.02
+EXTRA = "a degree of freedom of its own"
 
 
 def localise(
@@ -51,6 +53,18 @@ def localise(
     found = _dynamic(problem, x, rows) + _damping(problem, x, rows)
     found.sort(key=lambda item: -item.score)
     return tuple(found[:most])
+
+
+def extra_coordinates(case: Case, model: Fitted) -> tuple[Localisation, ...]:
+    """Where a test shows more modes than the model has: something there moves by itself.
+
+    A mode that the model has and the test has not is one that was moved, and speaks against it.
+    """
+    stray = strong_unexplained(case, model)
+    if len(stray) <= model.missed:
+        return ()
+    outlier = float(np.max(case.problem(model.hypothesis, case.settings.fit).mixture().outlier_cost))
+    return tuple(Localisation(m.place, EXTRA, m.frequency_hz, outlier) for m in stray)
 
 
 def _rows(dofs: list[str]) -> dict[str, dict[str, float]]:

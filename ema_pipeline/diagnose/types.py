@@ -193,9 +193,10 @@ class Localisation:
     place : str
         DOF, or two DOFs joined by ``-``.
     acts_like : str
-        ``"stiffness"``, ``"mass"``, ``"viscous damping"`` or ``"hysteretic damping"``.
+        ``"stiffness"``, ``"mass"``, ``"viscous damping"``, ``"hysteretic damping"`` or ``"a degree of freedom of its
+        own"``.
     size : float
-        Of the element that would mend it best, N/m, kg, N·s/m.
+        Of the element that would mend it best, N/m, kg, N·s/m; of a degree of freedom its frequency, Hz.
     score : float
         Fall of the sum of squares that it promises to first order.
     """

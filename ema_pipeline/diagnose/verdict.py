@@ -9,19 +9,17 @@ import numpy as np
 from ema_pipeline.diagnose.climbing import Climb
 from ema_pipeline.diagnose.explain import label_text, size_text
 from ema_pipeline.diagnose.fitting import Case, Fitted
-from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, make_rig
+from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras
 from ema_pipeline.diagnose.ladder import Yardstick
 from ema_pipeline.diagnose.ranking import Ranking, slight
 from ema_pipeline.diagnose.screening import Screening
+from ema_pipeline.diagnose.stray import strong_unexplained
 from ema_pipeline.diagnose.thresholds import threshold
 from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE, EffectSize, Ladder, VerdictWord
-from ema_pipeline.mechanics.modes import normal_modes
 
 _SPURIOUS = 2
 """Well-determined modes without counterpart that may still be of the foundation, or spurious."""
 _WELL_DETERMINED = 0.03
-_STRONG = 0.1
-"""Share of the rig's own modes' largest amplitude, mass-normalised."""
 _ALIKE = 0.05
 _VISIBLE_SHARE = 0.25
 _STRAINED = 2.5
@@ -126,8 +124,9 @@ def misfit(case: Case, model: Fitted, error: float) -> str:
         return f"error {error:.3g}, {settings.error_limit:g} is the limit"
     strong = strong_unexplained(case, model)
     if strong:
-        has = "modes have" if len(strong) > 1 else "mode has"
-        return f"the measured {has} no counterpart in it: {', '.join(strong)}"
+        at = ", ".join(f"{m.frequency_hz:.1f} Hz ({m.configuration})" for m in strong)
+        modes = "modes measured at {} have" if len(strong) > 1 else "mode measured at {} has"
+        return f"the {modes.format(at)} no counterpart in it"
     solid = solid_unexplained(case, model)
     if len(solid) > _SPURIOUS or np.mean(~model.explained) > settings.unexplained_limit:
         return f"{int(np.sum(~model.explained))} measured modes have no counterpart in it"
@@ -158,31 +157,6 @@ def solid_unexplained(case: Case, model: Fitted) -> list[str]:
                 not np.any(np.isfinite(m.shape_std[r]))
                 or np.nanmedian(m.shape_std[r]) < _WELL_DETERMINED * largest
             ):
-                found.append(f"{m.frequency_hz[r]:.1f} Hz ({c})")
-    return found
-
-
-def strong_unexplained(case: Case, model: Fitted) -> list[str]:
-    """Unexplained modes that move the rig about as much as its own modes do, and are not next to one of them.
-
-    A mode of the foundation is hardly seen in mass-normalised shapes of the rig. Two modes closer than a half-width may
-    have been measured as one: such a mode fits neither and is no sign of anything missing.
-    """
-    rig = make_rig(case.rig, model.hypothesis, case.library, case.settings.parameter_range)
-    found, start = [], 0
-    for c, m in case.measured.items():
-        explained = model.explained[start : start + len(m)]
-        start += len(m)
-        if m.shapes is None or m.shape_std is None or not m.scaled or not np.any(explained):
-            continue
-        size = np.nanmax(np.abs(m.shapes), axis=1)
-        least = _STRONG * float(np.median(size[explained]))
-        known = {n: v for n, v in model.values.items() if n in rig.parameters}
-        own, _ = normal_modes(rig.system(c, known))
-        for r in np.flatnonzero(~explained & (size > least)):
-            width = m.frequency_hz[r] * m.damping_ratio[r]
-            clear = np.nanmedian(m.shape_std[r]) < _WELL_DETERMINED * size[r]
-            if clear and np.min(np.abs(own - m.frequency_hz[r])) > width:
                 found.append(f"{m.frequency_hz[r]:.1f} Hz ({c})")
     return found
 

@@ -29,6 +29,8 @@ _BACKGROUND = 0.01
 _DAMPING = 0.01
 _WORSE = 1.05
 _FAR_WORSE = 1.25
+_FAR_OFF = 2.5
+_FOLLOWS = 0.7
 
 
 @dataclass(frozen=True)
@@ -169,9 +171,12 @@ class Witness:
         rig = make_rig(case.rig, fitted.hypothesis, case.library, case.settings.parameter_range)
         return frf_error(rig, fitted.values, self.lines)
 
-    def worse(self, base: FrfError, fitted: Fitted) -> bool:
-        """True where the FRFs contradict what a hypothesis adds."""
-        return contradicts(base, self.error(fitted))
+    def rejects(self, base: FrfError, fitted: Fitted, explains_modes: bool) -> bool:
+        """True where the FRFs contradict a hypothesis, or it explains all modes and leaves the FRFs as wrong as
+        they were: then its added freedom met the frequencies by other means than the rig does."""
+        found = self.error(fitted)
+        unmoved = found.error > max(_FAR_OFF, _FOLLOWS * base.error)
+        return contradicts(base, found) or (explains_modes and unmoved)
 
     def prefers(self, first: Fitted, other: Fitted) -> bool:
         """True where the FRFs speak clearly for one of two hypotheses that the modes do not tell apart."""

@@ -56,7 +56,7 @@ def claimed(found: Diagnosis) -> tuple[Candidate, ...]:
 def leading(found: Diagnosis) -> tuple[Candidate, ...]:
     """What a reader should hear of: the group that fits alike, the claimed candidates, or the best one."""
     alike = {label for group in found.indistinguishable for label in group}
-    if alike:
+    if alike and found.verdict == "ambiguous":
         return tuple(c for c in found.candidates if c.label in alike)
     return claimed(found) or found.candidates[:1]
 
@@ -83,7 +83,8 @@ def probability_words(p: float) -> str:
 
 def standing(found: Diagnosis, candidate: Candidate) -> str:
     """What the data say of a candidate, in a word or two."""
-    if any(candidate.label in group for group in found.indistinguishable):
+    grouped = any(candidate.label in group for group in found.indistinguishable)
+    if grouped and found.verdict == "ambiguous":
         return "fits alike"
     if candidate.claimed:
         return "best, not enough" if found.verdict == "unknown_effect" else "supported"
@@ -376,6 +377,7 @@ def localisation_table(found: Diagnosis) -> Table:
         "mass": "kg",
         "viscous damping": "N·s/m",
         "hysteretic damping": "N/m",
+        "a degree of freedom of its own": "Hz",
     }
     rows = tuple(
         Row(
@@ -393,9 +395,13 @@ def localisation_table(found: Diagnosis) -> Table:
 
 def group_words(found: Diagnosis) -> tuple[str, ...]:
     """One sentence per group that the data cannot tell apart."""
+    said = (
+        "The same change of the model under several names"
+        if found.verdict == "effect"
+        else "These data cannot tell apart"
+    )
     return tuple(
-        f"These data cannot tell apart: {'; '.join(label_words(label) for label in group)}."
-        for group in found.indistinguishable
+        f"{said}: {'; '.join(label_words(label) for label in group)}." for group in found.indistinguishable
     )
 
 
