@@ -1,0 +1,72 @@
+"""Raw folders: drafted, checked, simulated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ema_pipeline.commands.options import EffectFiles, Quiet, Raw
+from ema_pipeline.commands.screen import show
+
+
+def check(raw: Raw) -> None:
+    """Judge every hit of a raw folder: value, limit and clause of each check."""
+    from ema_pipeline.job import check_raw
+    from ema_pipeline.report import terminal
+
+    for name, hits in check_raw(raw).items():
+        show(terminal.verdict_table(hits, name))
+        show(terminal.hits_table(hits, name))
+
+
+def init(raw: Raw) -> None:
+    """Draft test.toml from what the record files say."""
+    from ema_pipeline.ingest.draft import write_drafts
+
+    for path in write_drafts(raw):
+        show(f"Wrote {path}; look for the lines marked CHECK, then: ema check {raw}")
+
+
+def simulate(
+    out: Annotated[Path, typer.Argument(metavar="RAW", help="Folder to write.")],
+    rig: Annotated[str, typer.Option("--rig", "-r", metavar="RIG", help="Rig, or a rig file.")] = "planetary",
+    configuration: Annotated[
+        list[str] | None, typer.Option("--configuration", "-c", help="Configuration; all if left out.")
+    ] = None,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option("--effect", "-e", metavar="ID@PLACE:NAME=VALUE", help="Hidden effect and its size."),
+    ] = None,
+    effect_file: EffectFiles = None,
+    value: Annotated[
+        list[str] | None, typer.Option("--value", metavar="NAME=VALUE", help="True value of a parameter.")
+    ] = None,
+    sensor: Annotated[list[str] | None, typer.Option("--sensor", help="DOF of a sensor.")] = None,
+    impact: Annotated[list[str] | None, typer.Option("--impact", help="DOF that is struck.")] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Setting of the test, e.g. sample_rate_hz=25600."),
+    ] = None,
+    format_: Annotated[str, typer.Option("--format", help="uff, csv, hdf5, mat, wav or tdms.")] = "uff",
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a hammer test of a rig and write it as a raw folder."""
+    from ema_pipeline.job import simulate_raw
+
+    made = simulate_raw(
+        out,
+        rig,
+        configurations=configuration or [],
+        effects=effect or [],
+        effect_files=effect_file or [],
+        values=value or [],
+        sensors=sensor or [],
+        impacts=impact or [],
+        settings=[*(set_ or []), f"format={format_}", f"seed={seed}"],
+    )
+    if not quiet:
+        where = ", ".join(made.configurations)
+        show(f"Wrote {made.records} records ({where}) to {out}; the truth is in {out / 'truth.json'}")
