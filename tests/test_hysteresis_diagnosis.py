@@ -16,9 +16,10 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.hysteresis.branches import LimitCycle
 from ema_pipeline.hysteresis.diagnosis import diagnose_loops
 from ema_pipeline.hysteresis.effects import Structure
-from ema_pipeline.hysteresis.fitting import LoopSet, fit, predict
+from ema_pipeline.hysteresis.fitting import fit, predict
 from ema_pipeline.hysteresis.heldout import folds, settings_differ
 from ema_pipeline.hysteresis.ladder import make_loop_ladder
+from ema_pipeline.hysteresis.loop_set import LoopSet
 from ema_pipeline.hysteresis.loops import measure_loop, share_noise
 from ema_pipeline.hysteresis.model import Motion, loop_force
 from ema_pipeline.hysteresis.simulate import simulate_sine_test, steady_force, write_sine_tests

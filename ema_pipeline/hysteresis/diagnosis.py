@@ -18,7 +18,7 @@ from ema_pipeline.hysteresis.explain import (
     scales_words,
     where_it_falls,
 )
-from ema_pipeline.hysteresis.fitting import Fitted, LoopSet
+from ema_pipeline.hysteresis.fitting import Fitted
 from ema_pipeline.hysteresis.heldout import heldout_error
 from ema_pipeline.hysteresis.ladder import (
     Progress,
@@ -30,6 +30,7 @@ from ema_pipeline.hysteresis.ladder import (
     loop_model,
     together,
 )
+from ema_pipeline.hysteresis.loop_set import LoopSet
 from ema_pipeline.hysteresis.regions import regions
 from ema_pipeline.hysteresis.search import Ranking, rank
 from ema_pipeline.hysteresis.settings import HysteresisSettings

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ema_pipeline.hysteresis.effects import DISSIPATIVE
-from ema_pipeline.hysteresis.fitting import Fitted, LoopSet
+from ema_pipeline.hysteresis.fitting import Fitted
+from ema_pipeline.hysteresis.loop_set import LoopSet
 from ema_pipeline.hysteresis.search import Ranking
 from ema_pipeline.hysteresis.types import LoopModel
 from ema_pipeline.hysteresis.visible import Limit, best_loop

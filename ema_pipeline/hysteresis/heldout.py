@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 
 from ema_pipeline.hysteresis.closed_form import SAME_AMPLITUDE
-from ema_pipeline.hysteresis.fitting import Fitted, LoopSet, fit, predict
+from ema_pipeline.hysteresis.fitting import Fitted, fit, predict
+from ema_pipeline.hysteresis.loop_set import LoopSet
 from ema_pipeline.hysteresis.types import Loop
 
 SAME_FREQUENCY = 0.02

@@ -16,7 +16,8 @@ from ema_pipeline.hysteresis.closed_form import (
     hysteresis_force,
 )
 from ema_pipeline.hysteresis.effects import Structure
-from ema_pipeline.hysteresis.fitting import Fitted, LoopSet, fit, loop_set
+from ema_pipeline.hysteresis.fitting import Fitted, fit, loop_set
+from ema_pipeline.hysteresis.loop_set import LoopSet
 from ema_pipeline.hysteresis.model import CUBIC, DAMPING, FORCE, RELAXATION, RHO, STIFFNESS, UNITS
 from ema_pipeline.hysteresis.search import widening_of
 from ema_pipeline.hysteresis.settings import HysteresisSettings

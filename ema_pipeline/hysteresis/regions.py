@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ema_pipeline.diagnose.types import Localisation
-from ema_pipeline.hysteresis.fitting import Fitted, LoopSet
+from ema_pipeline.hysteresis.fitting import Fitted
+from ema_pipeline.hysteresis.loop_set import LoopSet
 
 _THIRDS = ("first", "middle", "last")
 _LISTED = 3

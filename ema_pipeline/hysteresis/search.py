@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.hysteresis.effects import DISSIPATIVE, Structure
-from ema_pipeline.hysteresis.fitting import RANGES, SYSTEMATIC, Fitted, LoopSet, fit
+from ema_pipeline.hysteresis.fitting import RANGES, SYSTEMATIC, Fitted, fit
+from ema_pipeline.hysteresis.loop_set import LoopSet
 from ema_pipeline.hysteresis.model import EXPONENT, GAP, GAPS, SPRING_GAP, STIFFNESS
 
 Progress = Callable[[float, str], None]

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.hysteresis.effects import LINEAR, PARAMETERS
-from ema_pipeline.hysteresis.fitting import Fitted, LoopSet, fit
+from ema_pipeline.hysteresis.fitting import Fitted, fit
 from ema_pipeline.hysteresis.fourier import fourier, fourier_slope
+from ema_pipeline.hysteresis.loop_set import LoopSet
 from ema_pipeline.hysteresis.model import EXPONENT, GAP, RHO, SIGMA, TIME, UNITS, Motion
 from ema_pipeline.hysteresis.types import Loop
 
