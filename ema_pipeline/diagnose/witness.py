@@ -184,8 +184,11 @@ class Witness:
 
 
 def contradicts(before: FrfError, after: FrfError, worse: float = _WORSE) -> bool:
-    """True where a model's FRFs are further off than another's, overall by a factor and at most impact points."""
-    if not worse * before.error < after.error:
+    """True where a model's FRFs are further off than another's, overall by a factor and at most impact points.
+
+    What lies within the uncertainty is no contradiction.
+    """
+    if not worse * max(before.error, 1.0) < after.error:
         return False
     better, shared = better_share(before, after)
     return better < 0.5 * shared
