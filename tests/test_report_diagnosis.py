@@ -28,7 +28,7 @@ from ema_pipeline.diagnose.types import (
     VerdictWord,
 )
 from ema_pipeline.fit.types import ErrorSweep
-from ema_pipeline.report import diagnosis, summary, tables, terminal
+from ema_pipeline.report import diagnosis, diagnosis_tables, summary, tables, terminal
 from ema_pipeline.report.figures.diagnosis import ladder_errors, where_it_fails
 from ema_pipeline.report.html import report_html
 from ema_pipeline.report.numbers import below
@@ -184,7 +184,7 @@ def test_commands_add_what_is_claimed_and_leave_out_what_is_in_the_model() -> No
 
 def test_rung_says_what_it_adds_with_its_size_and_not_the_rigs_parameters() -> None:
     two = Ladder((rung((), 3, 3, 0), rung((CRACK,), 2, 2, 0), rung((CRACK, OTHER), 1, 1, 0)), 0, 0, 0, "")
-    rows = diagnosis.ladder_table(two).rows
+    rows = diagnosis_tables.ladder_table(two).rows
     assert [r.cells[0] for r in rows] == [
         "base model",
         "+ mesh stiffness loss at sun-planet1",
@@ -196,7 +196,7 @@ def test_rung_says_what_it_adds_with_its_size_and_not_the_rigs_parameters() -> N
 def test_size_of_a_parameter_out_of_tolerance_is_found_under_the_parameters_name() -> None:
     label = "out_of_tolerance@sun_bearing_stiffness"
     ladder = Ladder((rung((), 3, 3, 0), rung((label,), 1, 1, 0)), 0, 0, 0, "")
-    cells = diagnosis.ladder_table(ladder).rows[1].cells
+    cells = diagnosis_tables.ladder_table(ladder).rows[1].cells
     assert cells[0] == "+ parameter sun bearing stiffness out of tolerance"
     assert cells[1] == "sun bearing stiffness 2.00 ± 0.10 MN/m"
 
@@ -497,7 +497,7 @@ def test_detection_limits_are_told_by_effect_with_best_and_worst_place() -> None
         "These data would show, nine times in ten and at the best place: mesh stiffness loss ≥ 2.1 %, "
         "shaft torsion ≥ 8.2 kN/m."
     )
-    rows = [r.cells for r in diagnosis.detection_table(d).rows]
+    rows = [r.cells for r in diagnosis_tables.detection_table(d).rows]
     assert rows[0] == ("mesh stiffness loss", "fraction", "2.1 % (sun-planet1)", "no size (ring-planet1)")
     assert rows[2] == ("out of tolerance", "deviation", "7.0 % (sun mass)", "")
     assert "mesh stiffness loss ≥ 2.1 %" in flowing(printed(terminal.diagnosis_screen(d)))
@@ -511,7 +511,7 @@ def test_modes_predicted_from_the_others_stand_beside_the_measured_ones() -> Non
         HeldOutMode("default", 2.748, 0.027, 3.1, 0.04),
     )
     d = replace(found("effect"), heldout_modes=modes)
-    rows = diagnosis.heldout_table(d).rows
+    rows = diagnosis_tables.heldout_table(d).rows
     assert rows[0].cells == ("", "5.529 ± 0.055", "5.518 ± 0.069", "+0.1")
     assert rows[1].cells[2] == "no such mode"
     # (2.748 - 3.1)/√(0.027² + 0.04²) = -7.3

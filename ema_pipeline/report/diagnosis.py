@@ -1,4 +1,4 @@
-"""The diagnosis and the ladder in words and tables, for the report and for the terminal."""
+"""The diagnosis and the ladder in words, for the report and for the terminal."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from ema_pipeline.diagnose.types import (
     Ladder,
 )
 from ema_pipeline.report.limits import FAR_SIGMA
-from ema_pipeline.report.numbers import format_value, plain, prefixed, signed, words
+from ema_pipeline.report.numbers import format_value, plain, prefixed, words
 from ema_pipeline.report.results import RunResults
-from ema_pipeline.report.tables import Row, Table
 
 NOTHING = "nothing"
 _COUNTS = {2: "Two", 3: "Three", 4: "Four", 5: "Five", 6: "Six"}
@@ -93,112 +92,6 @@ def standing(found: Diagnosis, candidate: Candidate) -> str:
     return "less likely"
 
 
-def candidates_table(found: Diagnosis) -> Table:
-    """One row per candidate, and last what stays where nothing is missing.
-
-    `reasons` holds why the leading ones were suspected.
-    """
-    told = leading(found) if reasons(found) else ()
-    rows = [
-        Row(
-            (
-                words(c.effect),
-                words(c.at),
-                size_words(c.parameters),
-                probability_words(c.probability),
-                standing(found, c),
-                _change(c.error_before, c.error_after),
-                _change(c.heldout_before, c.heldout_error_after),
-                _why_words(c, c in told),
-            ),
-            _stands_out(found, c),
-        )
-        for c in found.candidates
-    ]
-    rows.append(
-        Row(
-            (
-                "nothing missing",
-                "",
-                "",
-                probability_words(found.null_probability),
-                "",
-                plain(found.error, 3),
-                plain(found.heldout_error, 3),
-                "The model as it is.",
-            ),
-        )
-    )
-    head = ("effect", "where", "size (±1σ)", "probability", "data say", "error, σ", "held out, σ", "why")
-    return Table(head, tuple(rows), frozenset({3, 5, 6}))
-
-
-def _why_words(c: Candidate, told: bool) -> str:
-    """Why a candidate is suspected; nothing where chance explains it."""
-    if told:
-        return "see above"
-    return c.why if c.gain >= c.threshold else ""
-
-
-def short_candidates_table(found: Diagnosis) -> Table:
-    """The candidates as they fit 80 columns: errors after adding each."""
-    rows = [
-        Row(
-            (
-                label_words(c.label),
-                size_words(c.parameters, ";\n"),
-                probability_words(c.probability),
-                plain(c.error_after, 3),
-                plain(c.heldout_error_after, 3),
-            ),
-            _stands_out(found, c),
-        )
-        for c in found.candidates
-    ]
-    rows.append(
-        Row(
-            (
-                "nothing missing",
-                "",
-                probability_words(found.null_probability),
-                plain(found.error, 3),
-                plain(found.heldout_error, 3),
-            ),
-        )
-    )
-    return Table(
-        ("if this is added", "size (±1σ)", "probable", "error", "held out"),
-        tuple(rows),
-        frozenset({2, 3, 4}),
-    )
-
-
-def ladder_table(ladder: Ladder) -> Table:
-    """One row per model from the base model upwards, each with what it adds to the one before.
-
-    The column of FRFs is empty where there are none.
-    """
-    rows: list[Row] = []
-    before: tuple[str, ...] = ()
-    for rung in ladder.rungs:
-        rows.append(
-            Row(
-                (
-                    rung_words(before, rung.effects),
-                    size_words(_own_sizes(before, rung.effects, rung.parameters), ";\n"),
-                    plain(rung.error, 3),
-                    plain(rung.heldout_error, 3),
-                    plain(rung.frf_error, 3) if math.isfinite(rung.frf_error) else "",
-                    str(rung.unexplained) if of_modes(ladder) else "",
-                    plain(rung.log_evidence, 3),
-                )
-            )
-        )
-        before = rung.effects
-    head = ("model", "size (±1σ)", "error, σ", "held out, σ", "FRFs, σ", "modes left", "ln evidence")
-    return Table(head, tuple(rows), frozenset({2, 3, 4, 5, 6}))
-
-
 def rung_words(before: Sequence[str], effects: Sequence[str]) -> str:
     """What a rung adds, e.g. ``+ mesh stiffness loss at sun-planet1``."""
     if not effects:
@@ -242,8 +135,8 @@ def frf_words(c: Candidate) -> str:
 def detection_words(found: Diagnosis) -> str:
     """What these data would show, in one sentence; empty where that is not known."""
     shown = [
-        f"{words(effect)} ≥ {_limit_words(sizes[0])}"
-        for effect, sizes in _limits_by_effect(found).items()
+        f"{words(effect)} ≥ {limit_words(sizes[0])}"
+        for effect, sizes in limits_by_effect(found).items()
         if effect != OUT_OF_TOLERANCE and math.isfinite(sizes[0].size)
     ]
     if not shown:
@@ -251,27 +144,7 @@ def detection_words(found: Diagnosis) -> str:
     return f"These data would show, nine times in ten and at the best place: {', '.join(shown)}."
 
 
-def detection_table(found: Diagnosis) -> Table:
-    """Least size of every effect that these data would show, at the best and at the worst place."""
-    rows = []
-    for effect, limits in _limits_by_effect(found).items():
-        best, worst = limits[0], limits[-1]
-        rows.append(
-            Row(
-                (
-                    words(effect),
-                    words(best.parameter) if effect != OUT_OF_TOLERANCE else "deviation",
-                    f"{_limit_words(best)} ({_place(best)})",
-                    f"{_limit_words(worst)} ({_place(worst)})" if len(limits) > 1 else "",
-                )
-            )
-        )
-    return Table(
-        ("effect", "size", "seen from (best place)", "seen from (worst place)"), tuple(rows), frozenset()
-    )
-
-
-def _limits_by_effect(found: Diagnosis) -> dict[str, list[DetectionLimit]]:
+def limits_by_effect(found: Diagnosis) -> dict[str, list[DetectionLimit]]:
     """Limits of each effect, the smallest first."""
     grouped: dict[str, list[DetectionLimit]] = {}
     for limit in found.detection_limits:
@@ -280,36 +153,14 @@ def _limits_by_effect(found: Diagnosis) -> dict[str, list[DetectionLimit]]:
     return {effect: sorted(limits, key=lambda x: x.size) for effect, limits in grouped.items()}
 
 
-def _limit_words(limit: DetectionLimit) -> str:
+def limit_words(limit: DetectionLimit) -> str:
+    """The size of a detection limit: in percent, or with its unit."""
     if not math.isfinite(limit.size):
         return "no size"
     if limit.unit in ("", "1"):
         return f"{plain(100 * limit.size, 2)} %"
     scale, unit = prefixed(limit.size, limit.unit)
     return f"{plain(scale * limit.size, 2)} {unit}"
-
-
-def _place(limit: DetectionLimit) -> str:
-    return words(limit.label.rpartition("@")[2])
-
-
-def heldout_table(found: Diagnosis) -> Table:
-    """Every measured frequency beside its prediction by a fit that has not seen it."""
-    several = len({m.configuration for m in found.heldout_modes}) > 1
-    rows = tuple(
-        Row(
-            (
-                m.configuration if several else "",
-                format_value(m.measured_hz, m.measured_std_hz),
-                format_value(m.predicted_hz, m.predicted_std_hz) if m.predicted else "no such mode",
-                signed(m.z),
-            ),
-            not abs(m.z) <= FAR_SIGMA,
-        )
-        for m in found.heldout_modes
-    )
-    head = ("configuration" if several else "", "measured, Hz (±1σ)", "predicted, Hz (±1σ)", "differ, σ")
-    return Table(head, rows, frozenset({3}))
 
 
 def heldout_words(found: Diagnosis) -> str:
@@ -368,29 +219,6 @@ def hits_words(ladder: Ladder) -> str:
         "Each hit was simulated with its measured force. Share of the measured signals that is missed, each level "
         f"being predicted by a fit to the others: {', '.join(told)}."
     )
-
-
-def localisation_table(found: Diagnosis) -> Table:
-    """Where the misfit sits and how it acts, best first."""
-    units = {
-        "stiffness": "N/m",
-        "mass": "kg",
-        "viscous damping": "N·s/m",
-        "hysteretic damping": "N/m",
-        "a degree of freedom of its own": "Hz",
-    }
-    rows = tuple(
-        Row(
-            (
-                place.place,
-                place.acts_like,
-                format_value(place.size, math.nan, units.get(place.acts_like, "")),
-                plain(place.score, 3),
-            )
-        )
-        for place in found.localisation
-    )
-    return Table(("where", "acts like", "size", "χ² it takes away"), rows, frozenset({2, 3}))
 
 
 def group_words(found: Diagnosis) -> tuple[str, ...]:
@@ -463,32 +291,6 @@ def probability_threshold(results: RunResults) -> float:
         return float(text)
     except ValueError:
         return default
-
-
-def _stands_out(found: Diagnosis, c: Candidate) -> bool:
-    return c.claimed or any(c.label in group for group in found.indistinguishable)
-
-
-def _change(before: float, after: float) -> str:
-    """``3.10 → 1.02``; a dash where there is nothing after."""
-    return f"{plain(before, 3)} → {plain(after, 3)}" if math.isfinite(after) else "–"
-
-
-def _own_sizes(
-    before: Sequence[str], effects: Sequence[str], parameters: Mapping[str, EffectSize]
-) -> dict[str, EffectSize]:
-    """Sizes of what this rung adds, by their own names."""
-    own: dict[str, EffectSize] = {}
-    for label in effects:
-        if label in before:
-            continue
-        _, _, place = label.partition("@")
-        for name, size in parameters.items():
-            if name.startswith(f"{label}."):
-                own[name.removeprefix(f"{label}.")] = size
-            elif label == f"out_of_tolerance@{name}":
-                own[place] = size
-    return own
 
 
 def _capital(text: str) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from ema_pipeline.report import diagnosis, levels, summary, tables
+from ema_pipeline.report import diagnosis, diagnosis_tables, levels, summary, tables
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.moving_gear import fill_of, moving_gears
 from ema_pipeline.report.numbers import format_value, slug, words
@@ -121,14 +121,14 @@ def _diagnosis(results: RunResults) -> dict[str, Any] | None:
     return {
         "heading": diagnosis.heading(found),
         "summary": found.summary,
-        "candidates": diagnosis.candidates_table(found),
+        "candidates": diagnosis_tables.candidates_table(found),
         "reasons": diagnosis.reasons(found),
         "unexplained": diagnosis.unexplained_words(found.ladder),
         "alike": diagnosis.group_words(found),
         "next": found.next_measurement,
-        "localisation": diagnosis.localisation_table(found) if found.localisation else None,
+        "localisation": diagnosis_tables.localisation_table(found) if found.localisation else None,
         "heldout": diagnosis.heldout_words(found),
-        "detection": diagnosis.detection_table(found) if found.detection_limits else None,
+        "detection": diagnosis_tables.detection_table(found) if found.detection_limits else None,
         "notes": found.notes,
     }
 
@@ -138,7 +138,7 @@ def _ladder(results: RunResults) -> dict[str, Any] | None:
     if ladder is None or not ladder.rungs:
         return None
     return {
-        "table": diagnosis.ladder_table(ladder),
+        "table": diagnosis_tables.ladder_table(ladder),
         "noise": diagnosis.noise_words(ladder),
         "note": ladder.note,
         "users": results.ladder is not None,

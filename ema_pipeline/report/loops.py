@@ -15,7 +15,7 @@ import numpy as np
 
 from ema_pipeline.hysteresis.summary import summary, terminal_lines
 from ema_pipeline.hysteresis.types import Estimate, IsolatorResult, Loop, LoopModel
-from ema_pipeline.report import diagnosis, style, summary_files
+from ema_pipeline.report import diagnosis, diagnosis_tables, style, summary_files
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.pages import page_templates
 from ema_pipeline.report.results import RunResults
@@ -118,7 +118,7 @@ def _context(
         "number": {name: k for k, (name, _) in enumerate(SECTIONS, start=1)},
         "diagnosis": None if found is None else _diagnosis_context(results),
         "sizes": _cards(results),
-        "ladder": None if ladder is None else _filled(diagnosis.ladder_table(ladder)),
+        "ladder": None if ladder is None else _filled(diagnosis_tables.ladder_table(ladder)),
         "ladder_note": "" if ladder is None else ladder.note,
         "users_ladder": results.ladder is not None,
         "loops_table": _loops_table(loops, models),
@@ -147,8 +147,8 @@ def _diagnosis_context(results: RunResults) -> dict[str, Any]:
         "reasons": diagnosis.reasons(found),
         "alike": diagnosis.group_words(found),
         "next": found.next_measurement,
-        "candidates": diagnosis.candidates_table(found),
-        "localisation": diagnosis.localisation_table(found) if found.localisation else None,
+        "candidates": diagnosis_tables.candidates_table(found),
+        "localisation": diagnosis_tables.localisation_table(found) if found.localisation else None,
         "notes": found.notes,
         "error": plain(found.error, 3),
     }

@@ -21,7 +21,7 @@ from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.report import diagnosis, levels, summary, tables
+from ema_pipeline.report import diagnosis, diagnosis_tables, levels, summary, tables
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.results import RunResults
 
@@ -167,7 +167,7 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
     """
     parts: list[RenderableType] = [_heading(diagnosis.heading(found)), _line(found.summary)]
     if found.candidates:
-        parts += [_line(""), _rich(diagnosis.short_candidates_table(found), "What may be missing")]
+        parts += [_line(""), _rich(diagnosis_tables.short_candidates_table(found), "What may be missing")]
         parts.append(_line(_ERROR_WORDS))
     for text in diagnosis.reasons(found):
         parts += [_line(""), _line(text)]
@@ -176,11 +176,14 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
     if found.indistinguishable:
         parts += [_line(""), *(_line(f"! {text}") for text in diagnosis.group_words(found))]
     if found.localisation:
-        parts += [_line(""), _rich(diagnosis.localisation_table(found), "Where the misfit sits")]
+        parts += [_line(""), _rich(diagnosis_tables.localisation_table(found), "Where the misfit sits")]
     if found.next_measurement:
         parts += [_line(""), _line(f"Measure next: {found.next_measurement}")]
     if 0 < len(found.heldout_modes) <= _HELD_OUT_SHOWN:
-        parts += [_line(""), _rich(diagnosis.heldout_table(found), "Each mode predicted from the others")]
+        parts += [
+            _line(""),
+            _rich(diagnosis_tables.heldout_table(found), "Each mode predicted from the others"),
+        ]
     elif told := diagnosis.heldout_words(found):
         parts += [_line(""), _line(told)]
     if shown := diagnosis.detection_words(found):
@@ -206,7 +209,7 @@ def ladder_screen(ladder: Ladder) -> RenderableType:
     }
     told = [words_of[heads[k]] for k in shown if words_of.get(heads[k])]
     parts: list[RenderableType] = [
-        _rich(_pick(_renamed(diagnosis.ladder_table(ladder), heads), shown), "Ladder of models"),
+        _rich(_pick(_renamed(diagnosis_tables.ladder_table(ladder), heads), shown), "Ladder of models"),
         _line("; ".join([_ERROR_WORDS, *told])),
         _line(diagnosis.noise_words(ladder)),
     ]

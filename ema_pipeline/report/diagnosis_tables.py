@@ -1,0 +1,228 @@
+"""The diagnosis and the ladder in tables, for the report and for the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from ema_pipeline.diagnose.types import (
+    OUT_OF_TOLERANCE,
+    Candidate,
+    DetectionLimit,
+    Diagnosis,
+    EffectSize,
+    Ladder,
+)
+from ema_pipeline.report.diagnosis import (
+    label_words,
+    leading,
+    limit_words,
+    limits_by_effect,
+    of_modes,
+    probability_words,
+    reasons,
+    rung_words,
+    size_words,
+    standing,
+)
+from ema_pipeline.report.limits import FAR_SIGMA
+from ema_pipeline.report.numbers import format_value, plain, signed, words
+from ema_pipeline.report.tables import Row, Table
+
+
+def candidates_table(found: Diagnosis) -> Table:
+    """One row per candidate, and last what stays where nothing is missing.
+
+    `reasons` holds why the leading ones were suspected.
+    """
+    told = leading(found) if reasons(found) else ()
+    rows = [
+        Row(
+            (
+                words(c.effect),
+                words(c.at),
+                size_words(c.parameters),
+                probability_words(c.probability),
+                standing(found, c),
+                _change(c.error_before, c.error_after),
+                _change(c.heldout_before, c.heldout_error_after),
+                _why_words(c, c in told),
+            ),
+            _stands_out(found, c),
+        )
+        for c in found.candidates
+    ]
+    rows.append(
+        Row(
+            (
+                "nothing missing",
+                "",
+                "",
+                probability_words(found.null_probability),
+                "",
+                plain(found.error, 3),
+                plain(found.heldout_error, 3),
+                "The model as it is.",
+            ),
+        )
+    )
+    head = ("effect", "where", "size (±1σ)", "probability", "data say", "error, σ", "held out, σ", "why")
+    return Table(head, tuple(rows), frozenset({3, 5, 6}))
+
+
+def _why_words(c: Candidate, told: bool) -> str:
+    """Why a candidate is suspected; nothing where chance explains it."""
+    if told:
+        return "see above"
+    return c.why if c.gain >= c.threshold else ""
+
+
+def short_candidates_table(found: Diagnosis) -> Table:
+    """The candidates as they fit 80 columns: errors after adding each."""
+    rows = [
+        Row(
+            (
+                label_words(c.label),
+                size_words(c.parameters, ";\n"),
+                probability_words(c.probability),
+                plain(c.error_after, 3),
+                plain(c.heldout_error_after, 3),
+            ),
+            _stands_out(found, c),
+        )
+        for c in found.candidates
+    ]
+    rows.append(
+        Row(
+            (
+                "nothing missing",
+                "",
+                probability_words(found.null_probability),
+                plain(found.error, 3),
+                plain(found.heldout_error, 3),
+            ),
+        )
+    )
+    return Table(
+        ("if this is added", "size (±1σ)", "probable", "error", "held out"),
+        tuple(rows),
+        frozenset({2, 3, 4}),
+    )
+
+
+def ladder_table(ladder: Ladder) -> Table:
+    """One row per model from the base model upwards, each with what it adds to the one before.
+
+    The column of FRFs is empty where there are none.
+    """
+    rows: list[Row] = []
+    before: tuple[str, ...] = ()
+    for rung in ladder.rungs:
+        rows.append(
+            Row(
+                (
+                    rung_words(before, rung.effects),
+                    size_words(_own_sizes(before, rung.effects, rung.parameters), ";\n"),
+                    plain(rung.error, 3),
+                    plain(rung.heldout_error, 3),
+                    plain(rung.frf_error, 3) if math.isfinite(rung.frf_error) else "",
+                    str(rung.unexplained) if of_modes(ladder) else "",
+                    plain(rung.log_evidence, 3),
+                )
+            )
+        )
+        before = rung.effects
+    head = ("model", "size (±1σ)", "error, σ", "held out, σ", "FRFs, σ", "modes left", "ln evidence")
+    return Table(head, tuple(rows), frozenset({2, 3, 4, 5, 6}))
+
+
+def detection_table(found: Diagnosis) -> Table:
+    """Least size of every effect that these data would show, at the best and at the worst place."""
+    rows = []
+    for effect, limits in limits_by_effect(found).items():
+        best, worst = limits[0], limits[-1]
+        rows.append(
+            Row(
+                (
+                    words(effect),
+                    words(best.parameter) if effect != OUT_OF_TOLERANCE else "deviation",
+                    f"{limit_words(best)} ({_place(best)})",
+                    f"{limit_words(worst)} ({_place(worst)})" if len(limits) > 1 else "",
+                )
+            )
+        )
+    return Table(
+        ("effect", "size", "seen from (best place)", "seen from (worst place)"), tuple(rows), frozenset()
+    )
+
+
+def _place(limit: DetectionLimit) -> str:
+    return words(limit.label.rpartition("@")[2])
+
+
+def heldout_table(found: Diagnosis) -> Table:
+    """Every measured frequency beside its prediction by a fit that has not seen it."""
+    several = len({m.configuration for m in found.heldout_modes}) > 1
+    rows = tuple(
+        Row(
+            (
+                m.configuration if several else "",
+                format_value(m.measured_hz, m.measured_std_hz),
+                format_value(m.predicted_hz, m.predicted_std_hz) if m.predicted else "no such mode",
+                signed(m.z),
+            ),
+            not abs(m.z) <= FAR_SIGMA,
+        )
+        for m in found.heldout_modes
+    )
+    head = ("configuration" if several else "", "measured, Hz (±1σ)", "predicted, Hz (±1σ)", "differ, σ")
+    return Table(head, rows, frozenset({3}))
+
+
+def localisation_table(found: Diagnosis) -> Table:
+    """Where the misfit sits and how it acts, best first."""
+    units = {
+        "stiffness": "N/m",
+        "mass": "kg",
+        "viscous damping": "N·s/m",
+        "hysteretic damping": "N/m",
+        "a degree of freedom of its own": "Hz",
+    }
+    rows = tuple(
+        Row(
+            (
+                place.place,
+                place.acts_like,
+                format_value(place.size, math.nan, units.get(place.acts_like, "")),
+                plain(place.score, 3),
+            )
+        )
+        for place in found.localisation
+    )
+    return Table(("where", "acts like", "size", "χ² it takes away"), rows, frozenset({2, 3}))
+
+
+def _stands_out(found: Diagnosis, c: Candidate) -> bool:
+    return c.claimed or any(c.label in group for group in found.indistinguishable)
+
+
+def _change(before: float, after: float) -> str:
+    """``3.10 → 1.02``; a dash where there is nothing after."""
+    return f"{plain(before, 3)} → {plain(after, 3)}" if math.isfinite(after) else "–"
+
+
+def _own_sizes(
+    before: Sequence[str], effects: Sequence[str], parameters: Mapping[str, EffectSize]
+) -> dict[str, EffectSize]:
+    """Sizes of what this rung adds, by their own names."""
+    own: dict[str, EffectSize] = {}
+    for label in effects:
+        if label in before:
+            continue
+        _, _, place = label.partition("@")
+        for name, size in parameters.items():
+            if name.startswith(f"{label}."):
+                own[name.removeprefix(f"{label}.")] = size
+            elif label == f"out_of_tolerance@{name}":
+                own[place] = size
+    return own
