@@ -341,18 +341,17 @@ def export_results(out: Path, folder: Path) -> list[Path]:
     """
     from ema_pipeline.exchange.tables import shapes_table, write_frf_csv, write_table
     from ema_pipeline.exchange.uff import write_uff
-    from ema_pipeline.frf.types import FrfSet
-    from ema_pipeline.modal.types import ModalModel
+    from ema_pipeline.stages.modes import measured_frfs, modes_of_structure
 
     run = existing_run(out)
+    measured = measured_frfs(run)
     written = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise EmaError(f"{folder}: cannot be written ({error.strerror}); name another folder") from None
     for name in run.info.configurations:
-        modal = run.store.load("modal", name, "modal", ModalModel)
-        frfs = run.store.find("frf", name, "frfs", FrfSet)
+        modal, frfs = modes_of_structure(run, name), measured.get(name)
         files = [folder / f"{name}.uff", folder / f"{name}_shapes.csv", folder / f"{name}_frfs.csv"]
         write_uff(files[0], frfs, modal)
         write_table(files[1], shapes_table(modal, name))

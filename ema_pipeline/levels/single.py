@@ -48,6 +48,9 @@ CURVED = 0.02
 
 STEPS = 3
 
+PLAIN = 2.0
+"""Response of a mode over the largest misfit of a mean of hits, above which the mean tells its pole."""
+
 CLEAR_FORCE = 100.0
 """Force power over the hammer's noise, below which the FRF of a single hit is biased."""
 
@@ -314,6 +317,13 @@ def _solve(
     columns = np.concatenate([shapes.T[:, :, None] * start[:, None] * du, along], axis=1)
     if n_hits == 1:
         return _Solved(poles[None], np.full((1, m), np.inf), start[None])
+    moved = _of_mean(omega, poles, shapes, rest_s, start, mean, scale * np.sqrt(total), smooth)
+    if np.any(np.abs(moved - poles) > -CURVED * poles.real):
+        poles = moved
+        u, du = pole_functions(omega, poles, rest_s)
+        along = shapes.T[:, :, None] * u
+        start = _least_squares(*_whitened(along, mean, scale * np.sqrt(total), smooth))
+        columns = np.concatenate([shapes.T[:, :, None] * start[:, None] * du, along], axis=1)
     # a line that only one hit heard tells nothing of its noise
     heard = np.count_nonzero(power > DEAF, axis=0)
     free = max(1.0 - (2 * m / n_out + SMOOTH_TERMS) / n_lines, 0.2) * np.maximum(heard - 1, 1)
@@ -342,6 +352,29 @@ def _solve(
         both = np.tile(large[h], 2)  # what the hit hardly tells of may have gone astray
         solution[h, both] = better[both]
     return _Solved(poles + solution[:, :m], std, start + solution[:, m:])
+
+
+def _of_mean(
+    omega: Real,
+    poles: Complex,
+    shapes: Complex,
+    rest_s: float,
+    start: Complex,
+    mean: Complex,
+    weight: Real,
+    smooth: Real,
+) -> Complex:
+    """Poles of the mean over a sheet's hits, where the given ones are those of other hits.
+
+    Differences from the mean are linearised about its own poles, or their curvature would pass for a change. Modes
+    that the mean hardly tells of keep theirs.
+    """
+    m = len(poles)
+    u, _ = pole_functions(omega, poles, rest_s)
+    left = mean - shapes.T @ (start[:, None] * u)
+    change = _refined(omega, poles, shapes, rest_s, start, np.zeros(2 * m, complex), left, weight, smooth)[:m]
+    strong = np.max(np.abs(start[:, None] * u), axis=1) > PLAIN * np.max(np.abs(left))
+    return np.where(strong & (np.abs(change) < -UNKNOWN * poles.real), poles + change, poles)
 
 
 def _refined(

@@ -66,8 +66,11 @@ def study_levels(
     -------
     LevelStudy
         Levels from the FRFs of their hits alone; whether a mode moves is decided on single hits, see
-        `single.single_hits` and `trend.trends`.
+        `single.single_hits` and `trend.trends`. Where something moves, the modes are those of the level nearest to
+        the linear structure, see `linear`, less what the nonlinearity made, see `harmonics`.
     """
+    from ema_pipeline.levels.harmonics import without_products
+    from ema_pipeline.levels.linear import linear_level
     from ema_pipeline.levels.signs import signs
     from ema_pipeline.levels.sort import sort_levels
     from ema_pipeline.levels.words import one_level, several_levels
@@ -85,22 +88,33 @@ def study_levels(
         study = LevelStudy((level,), frfs.inputs, modes, curves, (), depends, p_value, "")
         return replace(study, summary=one_level(study, modal))
 
-    levels = []
+    levels: tuple[ForceLevel, ...] = ()
     for k in range(n_levels):
         level_force = float(np.median(force[place == k]))
         progress(0.7 * k / n_levels, f"modes at {level_force:.3g} N")
         chosen = tuple(n for n, p in zip(names, place, strict=True) if p == k)
-        levels.append(_level(hits, chosen, level_force, frf_settings, modal_settings))
+        levels += (_level(hits, chosen, level_force, frf_settings, modal_settings),)
     progress(0.7, "modes of single hits")
-    modes = _modes(modal, levels, len(frfs.inputs))
-    base = _trusted(modal, modes)
     level_of = dict(zip(names, place.tolist(), strict=True))
-    modes, p_value = _tested(modes, base, modal, hits, frfs, frf_settings, level_of, settings)
-    progress(0.9, "decays of single hits")
-    curves = _decays(modal, base, hits, frfs)
+
+    def tested(model: ModalModel) -> tuple[tuple[ModeLevels, ...], float]:
+        return _tested(model, levels, hits, frfs, frf_settings, level_of, settings)
+
+    modes, p_value = tested(modal)
     depends = bool(p_value < settings.false_alarm)
+    linear: int | None = None
+    products: tuple[str, ...] = ()
+    if depends and (linear := linear_level(levels, modes, frfs)) is not None:
+        levels, products = without_products(levels, modes, modal)
+        modal = levels[linear].modal or modal
+        modes, _ = tested(modal)
+    elif not depends:
+        modes = tuple(replace(m, depends=False, trend="") for m in modes)
+    progress(0.9, "decays of single hits")
+    base = _trusted(modal, modes)
+    curves = _decays(modal, base, hits, frfs)
     verdicts = signs(levels, frfs, _only(modal, base)) if len(base) else ()
-    study = LevelStudy(tuple(levels), frfs.inputs, modes, curves, verdicts, depends, p_value, "")
+    study = LevelStudy(levels, frfs.inputs, modes, curves, verdicts, depends, p_value, "", linear, products)
     return replace(study, summary=several_levels(study, modal, settings))
 
 
@@ -121,7 +135,7 @@ def _level(
     return ForceLevel(force_n, chosen, frfs, identify(frfs, modal_settings))
 
 
-def _modes(modal: ModalModel, levels: list[ForceLevel], n_inputs: int) -> tuple[ModeLevels, ...]:
+def _modes(modal: ModalModel, levels: Sequence[ForceLevel], n_inputs: int) -> tuple[ModeLevels, ...]:
     """Every mode of the configuration at every level."""
     from ema_pipeline.levels.tracks import assign, follow, mode_at
 
@@ -157,25 +171,25 @@ def _modes(modal: ModalModel, levels: list[ForceLevel], n_inputs: int) -> tuple[
 
 
 def _tested(
-    modes: tuple[ModeLevels, ...],
-    base: Integers,
     modal: ModalModel,
+    levels: Sequence[ForceLevel],
     hits: Hits,
     frfs: FrfSet,
     frf_settings: FrfSettings,
     place: dict[str, int],
     settings: LevelSettings,
 ) -> tuple[tuple[ModeLevels, ...], float]:
-    """The modes with their tests, and the p value of all tests together."""
+    """The modes of a model with their tests, those that move if any does, and the p value of all tests together."""
     from ema_pipeline.levels.single import single_hits
     from ema_pipeline.levels.trend import clearest, combined, samples, shifts, trends
     from ema_pipeline.levels.words import trend_words
 
+    modes = _modes(modal, levels, len(frfs.inputs))
+    base = _trusted(modal, modes)
     if not len(base):
         return modes, float("nan")
     found = single_hits(hits, _only(modal, base), frfs, frf_settings)
     level = np.array([place[name] for name in found.names], dtype=np.int64)
-
     excitation = _excitation(found)
 
     def given(values: Real, stds: Real) -> list[Samples]:
@@ -189,8 +203,7 @@ def _tested(
     )
     frequency, damping = tests[: len(base)], tests[len(base) :]
     p_values = np.array([t.p for t in tests])
-    p_value = combined(p_values)
-    moves = clearest(p_values, settings.false_alarm) & (p_value < settings.false_alarm)
+    moves = clearest(p_values, settings.false_alarm)
     out = list(modes)
     for r, k in enumerate(base):
         both = bool(moves[r]), bool(moves[r + len(base)])
@@ -212,7 +225,7 @@ def _tested(
             damping_shift=damping_shift[0],
             damping_shift_std=damping_shift[1],
         )
-    return tuple(out), p_value
+    return tuple(out), combined(p_values)
 
 
 def _trusted(modal: ModalModel, modes: Sequence[ModeLevels]) -> Integers:

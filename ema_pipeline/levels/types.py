@@ -50,7 +50,7 @@ class ModeLevels:
     Attributes
     ----------
     mode : int
-        Index into the modes of the configuration's `ModalModel`.
+        Index into the modes of the configuration's `ModalModel`, see `LevelStudy.linear_level`.
     frequency_hz, frequency_std_hz, damping_ratio, damping_std : ndarray, (n_levels,)
         NaN where the mode could not be followed to a level.
     amplitude_m : ndarray, (n_levels, n_impacts)
@@ -134,6 +134,11 @@ class LevelStudy:
         Probability of data as level-dependent as these from a linear structure; NaN where it cannot be known.
     summary : str
         One or two plain sentences; with one level only, what cannot be known.
+    linear_level : int or None
+        Level nearest to the linear structure, where the answer depends on the level: its modes are those of the
+        configuration, and `modes` counts them. None: the modes of all hits together.
+    products : tuple of str
+        Poles that the nonlinearity makes at multiples and sums of frequencies, left out of all levels' modes.
     """
 
     levels: tuple[ForceLevel, ...]
@@ -144,3 +149,5 @@ class LevelStudy:
     level_dependent: bool
     p_value: float
     summary: str
+    linear_level: int | None = None
+    products: tuple[str, ...] = ()

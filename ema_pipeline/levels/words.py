@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.levels.linear import linear_words
 from ema_pipeline.levels.settings import LevelSettings
 from ema_pipeline.levels.types import LevelStudy, ModeLevels
 from ema_pipeline.modal.types import ModalModel
@@ -70,7 +71,11 @@ def several_levels(study: LevelStudy, modal: ModalModel, settings: LevelSettings
         )
     words = "; ".join(f"mode {m.mode + 1}: {move_text(study, m)}" for m in moving[:3])
     more = f"; and {len(moving) - 3} more" if len(moving) > 3 else ""
-    return f"The structure is not linear: {len(moving)} of {len(tested)} modes move with the force. {words}{more}."
+    linear = linear_words(study)
+    return (
+        f"The structure is not linear: {len(moving)} of {len(tested)} modes move with the force. {words}{more}."
+        + (f" {linear}" if linear else "")
+    )
 
 
 def forces_text(study: LevelStudy) -> str:

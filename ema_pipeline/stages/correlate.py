@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 NAME = "correlate"
 NEEDS = ("frf", "modal", "fit")
+USES = ("levels",)
 PER_CONFIGURATION = False
 NEEDS_RIG = True
 

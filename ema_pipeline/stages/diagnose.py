@@ -61,7 +61,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 def linear_after_all(run: Run, found: Diagnosis) -> bool:
     """True where a linear model explains the hits of all levels as well as any model could.
 
-    What the study of the levels saw was then chance, and all hits may be averaged as ever.
+    What the study of the levels saw was then chance, and the modes of its level are as good as any.
     """
     least = cast(DiagnoseSettings, run.settings[NAME]).levels.noise_least
     exact = found.ladder.hit_noise <= least and found.error <= 1.0

@@ -13,6 +13,7 @@ from ema_pipeline.store import ALL
 
 NAME = "fit"
 NEEDS = ("modal", "ladder")
+USES = ("levels",)
 PER_CONFIGURATION = False
 NEEDS_RIG = True
 

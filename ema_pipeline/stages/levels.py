@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.frf.settings import FrfSettings
@@ -11,8 +12,10 @@ from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.hits import accepted_hits
+from ema_pipeline.stages.modes import level_study
 
 if TYPE_CHECKING:
+    from ema_pipeline.modal.circle.settings import CircleSettings
     from ema_pipeline.pipeline import ModalStageSettings
 
 NAME = "levels"
@@ -33,19 +36,33 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     frfs = run.store.load("frf", configuration, "frfs", FrfSet)
     modal = run.store.load("modal", configuration, "modal", ModalModel)
     settings = cast(LevelSettings, run.settings[NAME])
+    modal_settings = cast("ModalStageSettings", run.settings["modal"])
     study = study_levels(
         lambda: accepted_hits(run.store, configuration),
         frfs,
         modal,
         settings,
         cast(FrfSettings, run.settings["frf"]),
-        cast("ModalStageSettings", run.settings["modal"]).identify,
+        modal_settings.identify,
         progress,
     )
-    return {"study": study}
+    return {"study": with_circles(study, modal_settings.circle)}
+
+
+def with_circles(study: LevelStudy, settings: CircleSettings) -> LevelStudy:
+    """The study with circle fits beside the modes of the level that stands for the linear structure."""
+    from ema_pipeline.modal.circle import attach_circles
+
+    if study.linear_level is None:
+        return study
+    levels = list(study.levels)
+    level = levels[study.linear_level]
+    if level.modal is not None:
+        levels[study.linear_level] = replace(level, modal=attach_circles(level.frfs, level.modal, settings))
+    return replace(study, levels=tuple(levels))
 
 
 def level_studies(run: Run) -> dict[str, LevelStudy]:
     """The studies of all configurations that have one; none for a table of modes."""
-    found = {name: run.store.find(NAME, name, "study", LevelStudy) for name in run.info.configurations}
+    found = {name: level_study(run, name) for name in run.info.configurations}
     return {name: study for name, study in found.items() if study is not None}

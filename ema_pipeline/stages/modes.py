@@ -4,19 +4,34 @@ from __future__ import annotations
 
 from ema_pipeline.correlate.measured import MeasuredModes, from_modal_model
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.levels.linear import structure, structure_frfs
+from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.stages.base import Run
 
 
+def modes_of_structure(run: Run, configuration: str) -> ModalModel:
+    """The modes of a configuration as a linear structure.
+
+    Those of all hits, or those of one force level where the answer depends on the level.
+    """
+    modal = run.store.load("modal", configuration, "modal", ModalModel)
+    return structure(modal, level_study(run, configuration))
+
+
 def measured_modes(run: Run) -> dict[str, MeasuredModes]:
-    """Measured modes of every configuration."""
-    return {
-        name: from_modal_model(run.store.load("modal", name, "modal", ModalModel), name)
-        for name in run.info.configurations
-    }
+    """Measured modes of every configuration, as a linear structure."""
+    return {name: from_modal_model(modes_of_structure(run, name), name) for name in run.info.configurations}
 
 
 def measured_frfs(run: Run) -> dict[str, FrfSet]:
-    """FRFs of every configuration that has them; none for a table of modes."""
+    """FRFs that the modes belong to, of every configuration that has them; none for a table of modes."""
     found = {name: run.store.find("frf", name, "frfs", FrfSet) for name in run.info.configurations}
-    return {name: frfs for name, frfs in found.items() if frfs is not None}
+    return {
+        name: structure_frfs(frfs, level_study(run, name)) for name, frfs in found.items() if frfs is not None
+    }
+
+
+def level_study(run: Run, configuration: str) -> LevelStudy | None:
+    """What moves with the force of the hits; None where that was not looked at."""
+    return run.store.find("levels", configuration, "study", LevelStudy)

@@ -7,14 +7,14 @@ import json
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
-from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.hysteresis.types import IsolatorResult
 from ema_pipeline.ingest.records import Hit
-from ema_pipeline.levels.types import LevelStudy
+from ema_pipeline.levels.linear import structure
 from ema_pipeline.levels.words import flagged
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.stages.base import Run
+from ema_pipeline.stages.modes import level_study, measured_frfs
 from ema_pipeline.store import ALL
 
 
@@ -24,15 +24,15 @@ def load_results(run: Run) -> RunResults:
     values = fitted_values(fit)
     configurations = []
     loops = run.info.kind == "hysteresis"
+    frfs = measured_frfs(run)
     for name in run.info.configurations:
-        modal = run.store.find("modal", name, "modal", ModalModel)
-        levels = run.store.find("levels", name, "study", LevelStudy)
+        modal, levels = run.store.find("modal", name, "modal", ModalModel), level_study(run, name)
         configurations.append(
             ConfigurationResults(
                 name=name,
                 hits=run.store.find("hits", name, "hits", tuple[Hit, ...]) or (),
-                frfs=run.store.find("frf", name, "frfs", FrfSet),
-                modal=modal if modal is None or levels is None else flagged(modal, levels),
+                frfs=frfs.get(name),
+                modal=modal if modal is None or levels is None else flagged(structure(modal, levels), levels),
                 pairing=run.store.find("correlate", ALL, f"pairing {name}", Pairing),
                 system=None if run.model is None or loops else run.model.system(name, values),
                 levels=levels,

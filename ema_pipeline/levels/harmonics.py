@@ -1,0 +1,138 @@
+"""Poles that a nonlinearity makes at multiples and sums of the frequencies of modes: no modes of the structure.
+
+A spring that is not linear answers a mode of frequency f with forces at 2f and 3f, and two modes with forces at
+their sums and differences. Each decays like the product of the motions that make it, so that an identification
+takes it for a mode. It grows with the square or the cube of the force, and softer hits do not show it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.levels.tracks import follow
+from ema_pipeline.levels.types import ForceLevel, ModeLevels
+from ema_pipeline.modal.types import ModalModel, Mode
+
+REACH = 3.0
+"""Distance from the exact multiple or sum in half-power half-widths of what is made there: the frequencies move
+while they decay."""
+
+GROWTH = 1.5
+"""Power of the force, above which a response grows like no mode: 1 for a mode, 2 and 3 for what it makes."""
+
+_PRODUCTS = ((2, 0), (3, 0), (1, 1), (1, -1), (2, 1), (2, -1), (1, 2), (-1, 2))
+"""Multiples of the frequencies of two modes that springs with squares and cubes make."""
+
+
+def product_of(mode: Mode, parents: Sequence[Mode]) -> str:
+    """Which multiple or sum of the parents' frequencies a pole lies at, ``"3 × 163.4 Hz"``; empty for none."""
+    best, words = REACH, ""
+    for (a, b), (first, second) in itertools.product(
+        _PRODUCTS, itertools.combinations_with_replacement(parents, 2)
+    ):
+        if (b == 0) != (first is second):
+            continue
+        hz = a * first.frequency_hz + b * second.frequency_hz
+        half = abs(a) * _half_width(first) + abs(b) * _half_width(second)
+        distance = abs(mode.frequency_hz - hz) / half
+        if hz > 0 and distance < best:
+            best, words = distance, _text(a, first) + (_text(b, second, sign=True) if b else "") + " Hz"
+    return words
+
+
+def without_products(
+    levels: Sequence[ForceLevel], modes: Sequence[ModeLevels], modal: ModalModel
+) -> tuple[tuple[ForceLevel, ...], tuple[str, ...]]:
+    """The modes of every level less what the moving ones make.
+
+    Parameters
+    ----------
+    levels : sequence of ForceLevel
+        Two or more, from the softest up.
+    modes : sequence of ModeLevels
+        What moves; the nonlinearity acts there.
+    modal : ModalModel
+        That `modes` counts.
+
+    Returns
+    -------
+    levels : tuple of ForceLevel
+        Without poles at multiples and sums of moving frequencies that the softest hits do not show, or that grow
+        with the force like no mode.
+    products : tuple of str
+        What was left out, ``"489.9 Hz (3 × 163.4 Hz)"``.
+    """
+    force = np.array([level.force_n for level in levels])
+    soft = {
+        m.mode: int(m.level_modes[0]) for m in modes if m.level_modes is not None and m.level_modes[0] >= 0
+    }
+    grown = {soft[m.mode] for m in modes if m.mode in soft and growth(m.amplitude_m, force) > GROWTH}
+    moving = [m for m in modes if m.depends and m.mode in soft and soft[m.mode] not in grown]
+    parents = [modal.modes[m.mode] for m in moving]
+    models = [level.modal for level in levels if level.modal is not None]
+    drop: list[set[int]] = [set() for _ in models]
+    found: dict[str, Mode] = {}
+    for track in follow(models):
+        if track[0] >= 0 and int(track[0]) not in grown:
+            continue
+        for k in np.flatnonzero(track >= 0).tolist():
+            mode = models[k].modes[track[k]]
+            words = product_of(mode, parents)
+            if words:
+                drop[k].add(int(track[k]))
+                found[words] = mode  # that of the hardest hits
+    kept = tuple(
+        replace(level, modal=without(model, gone))
+        for level, model, gone in zip(levels, models, drop, strict=True)
+    )
+    by_frequency = sorted(found.items(), key=lambda item: item[1].frequency_hz)
+    return kept, tuple(f"{mode.frequency_hz:.4g} Hz ({words})" for words, mode in by_frequency)
+
+
+def growth(amplitude_m: NDArray[np.float64], force_n: NDArray[np.float64]) -> float:
+    """Power of the force with which a mode grows from the softest to the hardest hits, where it answers most.
+
+    Parameters
+    ----------
+    amplitude_m : ndarray, (n_levels, n_inputs)
+    force_n : ndarray, (n_levels,)
+
+    Returns
+    -------
+    float
+        NaN where unknown.
+    """
+    if not np.isfinite(amplitude_m[-1]).any():
+        return float("nan")
+    at = int(np.nanargmax(amplitude_m[-1]))
+    soft, hard = float(amplitude_m[0, at]), float(amplitude_m[-1, at])
+    if not (np.isfinite(soft) and soft > 0 and hard > 0):
+        return float("nan")
+    return float(np.log(hard / soft) / np.log(force_n[-1] / force_n[0]))
+
+
+def without(modal: ModalModel, gone: set[int]) -> ModalModel:
+    """The model less some of its modes."""
+    if not gone:
+        return modal
+    kept = [k for k in range(len(modal.modes)) if k not in gone]
+    number = np.full(len(modal.modes) + 1, -1, dtype=np.int64)  # the last entry is for poles without a mode
+    number[kept] = np.arange(len(kept))
+    chart = replace(modal.chart, selected=number[modal.chart.selected])
+    return replace(modal, modes=tuple(modal.modes[k] for k in kept), chart=chart)
+
+
+def _half_width(mode: Mode) -> float:
+    return abs(mode.pole.real) / (2 * np.pi)
+
+
+def _text(factor: int, mode: Mode, sign: bool = False) -> str:
+    size = f"{mode.frequency_hz:.4g}" if abs(factor) == 1 else f"{abs(factor)} × {mode.frequency_hz:.4g}"
+    if sign:
+        return f" {'+' if factor > 0 else '−'} {size}"
+    return size if factor > 0 else f"−{size}"
