@@ -8,7 +8,7 @@ from test_diagnose import BODIES, CRACK, FEW, RIG, SETTINGS, measure, true_syste
 
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
 from ema_pipeline.diagnose import diagnose
-from ema_pipeline.diagnose.witness import FrfError, contradicts, frf_error, frf_lines
+from ema_pipeline.diagnose.witness import FrfError, Witness, contradicts, frf_error, frf_lines
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.frf.types import FrfSet
@@ -100,7 +100,7 @@ def test_frfs_confirm_a_claim_and_what_they_contradict_is_not_claimed(
     assert first.frf_error_after < 0.5 * first.frf_error_before
     assert first.frf_impacts_better == first.frf_impacts == 2
     assert mended.ladder.rungs[1].frf_error == first.frf_error_after
-    monkeypatch.setattr("ema_pipeline.diagnose.climbing.contradicts", lambda before, after: True)
+    monkeypatch.setattr(Witness, "rejects", lambda self, base, fitted, explains_modes: True)
     doubted = diagnose(RIG, measured, SETTINGS, LIBRARY, frfs=seen)
     assert not any(c.claimed for c in doubted.candidates)
     assert doubted.verdict != "effect"
