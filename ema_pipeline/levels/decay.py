@@ -23,7 +23,8 @@ from scipy.fft import ifft, rfft
 
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import HitSamples
-from ema_pipeline.levels.single import output_shapes, participations, windows_about
+from ema_pipeline.levels.differences import participations
+from ema_pipeline.levels.single import output_shapes, windows_about
 from ema_pipeline.levels.trend import Samples, Trend, trends
 from ema_pipeline.levels.types import DecayCurve
 from ema_pipeline.modal.basis import pole_functions

@@ -180,7 +180,7 @@ def _tested(
     settings: LevelSettings,
 ) -> tuple[tuple[ModeLevels, ...], float]:
     """The modes of a model with their tests, those that move if any does, and the p value of all tests together."""
-    from ema_pipeline.levels.single import single_hits
+    from ema_pipeline.levels.single import excitation, single_hits
     from ema_pipeline.levels.trend import clearest, combined, samples, shifts, trends
     from ema_pipeline.levels.words import trend_words
 
@@ -190,11 +190,11 @@ def _tested(
         return modes, float("nan")
     found = single_hits(hits, _only(modal, base), frfs, frf_settings)
     level = np.array([place[name] for name in found.names], dtype=np.int64)
-    excitation = _excitation(found)
+    relative = excitation(found)
 
     def given(values: Real, stds: Real) -> list[Samples]:
         return [
-            samples(values[:, r], stds[:, r], found.sheet, level, found.force_n, excitation[:, r])
+            samples(values[:, r], stds[:, r], found.sheet, level, found.force_n, relative[:, r])
             for r in range(len(base))
         ]
 
@@ -293,17 +293,6 @@ def _from_decays(
         for k, mode in enumerate(modal.modes)
     )
     return modes, curves, p_value
-
-
-def _excitation(found: HitPoles) -> Real:
-    """Amplitude per force at each hit's point, (n_hits, n_modes): the median over the point's hits."""
-    ratio = found.amplitude_m / found.force_n[:, None]
-    if not np.isfinite(ratio).any():  # uncalibrated hammer
-        return np.ones(ratio.shape)
-    out = np.zeros(ratio.shape)
-    for p in np.unique(found.point):
-        out[found.point == p] = np.nanmedian(ratio[found.point == p], axis=0)
-    return out
 
 
 def _with_scatter(mode: ModeLevels, found: HitPoles, level: Integers, r: int) -> ModeLevels:
