@@ -185,7 +185,7 @@ def _mode_differences(
     out = []
     for p in pairing.pairs:
         r, k = p.measured, p.model
-        shape_data = e.counts[r] - 1 - (e.damping_weight[r] > 0)
+        shape_data = e.shape_counts[r]
         out.append(
             ModeDifference(
                 configuration=m.configuration,
@@ -201,7 +201,7 @@ def _mode_differences(
                 model_damping_ratio=float(model.damping_ratio[0, k]),
                 damping_z=float(-residual[r, 1]) if e.damping_weight[r] > 0 else float("nan"),
                 mac=p.mac,
-                shape_z=float(np.sqrt(np.sum(residual[r, 2:] ** 2) / shape_data))
+                shape_z=float(np.sqrt(np.sum(residual[r, 2:-1] ** 2) / shape_data))
                 if shape_data > 0
                 else float("nan"),
             )

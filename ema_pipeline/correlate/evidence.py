@@ -12,6 +12,12 @@ from ema_pipeline.correlate.pairing import sensor_rows
 from ema_pipeline.correlate.settings import UncertaintySettings
 from ema_pipeline.mechanics.system import LinearSystem
 
+_ALONE = 2.0
+"""Half-power half-widths to the next mode."""
+_OVERLAPPING = 4.0
+"""By how much the size is less certain where modes overlap."""
+_DAMPING = 0.01
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -32,6 +38,9 @@ class Evidence:
         0 where not measured.
     shape_weight : ndarray, (R, n_dofs)
         1/std; 0 where not measured.
+    log_size, size_weight : ndarray, (R,)
+        Natural logarithm of what the shapes were divided by, and 1/std of it where shapes are mass-normalised; 0
+        where not.
     counts : ndarray, (R,)
         Number of real data of each mode, one scale factor per shape taken off.
     """
@@ -44,11 +53,18 @@ class Evidence:
     damping_weight: NDArray[np.float64]
     shapes: NDArray[np.complex128]
     shape_weight: NDArray[np.float64]
+    log_size: NDArray[np.float64]
+    size_weight: NDArray[np.float64]
     counts: NDArray[np.float64]
 
     @property
     def has_shapes(self) -> bool:
         return bool(np.any(self.shape_weight > 0))
+
+    @property
+    def shape_counts(self) -> NDArray[np.float64]:
+        """Number of real data of each shape, its size left aside, (R,)."""
+        return self.counts - 1.0 - (self.damping_weight > 0) - (self.size_weight > 0)
 
     def outlier_cost(self, scale: float) -> NDArray[np.float64]:
         """-2 log likelihood of a mode of any shape anywhere in the band, relative to a perfect fit, (R,).
@@ -77,6 +93,7 @@ def gather(measured: MeasuredModes, system: LinearSystem, settings: UncertaintyS
         shapes = np.zeros((len(m), 0), dtype=complex)
         weight = np.zeros((len(m), 0))
         shape_counts = np.zeros(len(m))
+        log_size, size_weight = np.zeros(len(m)), np.zeros(len(m))
     else:
         valid = np.isfinite(m.shapes)
         shapes = np.where(valid, m.shapes, 0.0)
@@ -86,6 +103,8 @@ def gather(measured: MeasuredModes, system: LinearSystem, settings: UncertaintyS
         # One complex scale factor is free; a table of real shapes carries no information on phase.
         parts = 1.0 if not np.any(shapes.imag) else 2.0
         shape_counts = parts * np.maximum(valid.sum(axis=1) - 1, 0)
+        log_size = np.log(size[:, 0])
+        size_weight = _size_weight(m, settings, weight)
     return Evidence(
         measured=m,
         rows=rows,
@@ -95,5 +114,26 @@ def gather(measured: MeasuredModes, system: LinearSystem, settings: UncertaintyS
         damping_weight=damping_weight,
         shapes=np.asarray(shapes, dtype=complex),
         shape_weight=weight,
-        counts=1.0 + known + shape_counts,
+        log_size=log_size,
+        size_weight=size_weight,
+        counts=1.0 + known + shape_counts + (size_weight > 0),
     )
+
+
+def _size_weight(
+    m: MeasuredModes, settings: UncertaintySettings, weight: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """1/std of the logarithm of the size of mass-normalised shapes; 0 where it is not known.
+
+    Modes that overlap share their residues: what one of them has too much the other lacks.
+    """
+    if not m.scaled or settings.scale_floor <= 0:
+        return np.zeros(len(m))
+    known = np.where(weight > 0, weight, np.nan)
+    scatter = np.array([1 / np.nanmedian(w) if np.any(w > 0) else np.inf for w in known])
+    f = m.frequency_hz
+    width = _ALONE * f * np.nan_to_num(m.damping_ratio, nan=_DAMPING)
+    apart = np.abs(f[:, None] - f[None, :]) + np.where(np.eye(len(m), dtype=bool), np.inf, 0.0)
+    overlaps = np.min(apart, axis=1, initial=np.inf) < width
+    floor = np.where(overlaps, _OVERLAPPING * settings.scale_floor, settings.scale_floor)
+    return np.asarray(1 / np.hypot(floor, scatter))

@@ -18,6 +18,8 @@ from ema_pipeline.correlate.evidence import Evidence
 from ema_pipeline.mechanics.system import LinearSystem
 
 _FAINT = 0.1
+_FAR = 5.0
+"""Logarithm of a size that is wrong beyond all comparison."""
 
 
 @dataclass(frozen=True)
@@ -207,8 +209,8 @@ def mode_residuals(e: Evidence, pairs: NDArray[np.int64], modes: Modes, mixing: 
     Returns
     -------
     ndarray, (B, R, m)
-        Columns: frequency, damping ratio, shape (n_dofs real parts, n_dofs imaginary parts), mixing. Zero for
-        modes without partner.
+        Columns: frequency, damping ratio, shape (n_dofs real parts, n_dofs imaginary parts), mixing, size of a
+        mass-normalised shape. Zero for modes without partner.
     """
     return residuals_of(e, pairs, modes, shape_fit(e, pairs, modes, mixing))
 
@@ -226,7 +228,18 @@ def residuals_of(
         misfit = (fit.weighted @ fit.amplitudes[..., None])[..., 0] - e.shapes[has] * e.shape_weight[has]
         mixed = (fit.penalty * fit.amplitudes) @ modes.directions.swapaxes(-1, -2)
         columns += [misfit.real, misfit.imag, mixed.real, mixed.imag]
+        columns += [size_residuals(e, has, fit)[..., None]]
     part = np.concatenate(columns, axis=2)
     out = np.zeros((len(modes.omega), pairs.size, part.shape[2]))
     out[:, has] = part
     return out
+
+
+def size_residuals(e: Evidence, has: NDArray[np.int64], fit: ShapeFit) -> NDArray[np.float64]:
+    """Logarithm of measured over modelled size of mass-normalised shapes over its standard uncertainty, (B, R).
+
+    Modes of the model have unit modal mass, and so has a mixture of them with amplitudes of unit length.
+    """
+    length = np.linalg.norm(fit.amplitudes, axis=-1)
+    logarithm = np.log(np.maximum(length, 1e-300)) + e.log_size[has]
+    return np.asarray(np.clip(logarithm, -_FAR, _FAR) * e.size_weight[has])

@@ -35,6 +35,12 @@ class UncertaintySettings(Settings):
         "accelerometer "
         "sensitivity is known to 1-2 % (ISO 16063-21), and a mounting angle off by 1 degree gives 1.7 %.",
     )
+    scale_floor: float = Field(
+        default=0.05,
+        ge=0,
+        description="Relative standard uncertainty of a mass-normalised shape's size that no averaging removes: "
+        "sensitivities of hammer and accelerometer, 3 % together (ISO 16063-21), and the angle of the blow.",
+    )
     frequency_std_assumed: float = Field(
         default=0.01,
         gt=0,

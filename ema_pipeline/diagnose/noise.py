@@ -70,9 +70,9 @@ def estimate_noise(problem: FitProblem, found: Optimum, least: float) -> NoiseLe
         inlier = found.inlier[start : start + p.size]
         start += p.size
         use = (p >= 0) & (inlier > 0.5)
-        squares += [np.sum(r[0, use, 0] ** 2), np.sum(r[0, use, 1] ** 2), np.sum(r[0, use, 2:] ** 2)]
+        squares += [np.sum(r[0, use, 0] ** 2), np.sum(r[0, use, 1] ** 2), np.sum(r[0, use, 2:-1] ** 2)]
         with_damping = (e.damping_weight > 0) & use
-        counts += [use.sum(), with_damping.sum(), np.sum(e.counts[use] - 1 - (e.damping_weight[use] > 0))]
+        counts += [use.sum(), with_damping.sum(), np.sum(e.shape_counts[use])]
     fitted = min(len(problem.space.names) - 1, counts[0] / 2)
     dof = counts - [fitted, min(1.0, counts[1] / 2), 0.0]
     level = np.sqrt(squares / np.maximum(dof, 1.0))

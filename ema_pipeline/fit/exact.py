@@ -15,6 +15,7 @@ from ema_pipeline.correlate.residuals import (
     observable_modes,
     residuals_of,
     shape_fit,
+    size_residuals,
     visibility,
 )
 from ema_pipeline.fit.damped import neighbouring_modes
@@ -141,10 +142,17 @@ def _undamped_terms(
         return normal, gradient
 
     mixed, change = fit.penalty[0] * fit.amplitudes[0], fit.price[0][:, None] * fit.amplitudes[0]
-    relative = _amplitude_slopes(e.rows @ phi, basis.eigenvalues[0], k, stiffness, mass) - slopes / own
+    at_sensors = e.rows @ phi
+    seen = np.sum(at_sensors**2, axis=0)
+    growth = _amplitude_slopes(at_sensors, basis.eigenvalues[0], k, stiffness, mass)
+    size = -growth * e.size_weight[has]
+    faint = seen[k] < visibility(at_sensors)[k]
+    relative = np.where(faint, 0.0, growth) - slopes / own
     moved = change @ stiffness - (change * own[:, None] + 0.5 * mixed) @ mass
     moved += relative[:, :, None] * mixed - slopes[:, :, None] * change
     part, slope = projected_terms(moved, mixed, fit.penalty[0], fit.normal[0], w)
+    part += (size * w) @ size.T
+    slope += size @ (w * size_residuals(e, has, fit)[0])
     return normal + part, gradient + slope
 
 
@@ -157,8 +165,7 @@ def _amplitude_slopes(
 ) -> NDArray[np.float64]:
     """Derivatives of the logarithm of the motion of modes `k` at the sensors, (P, R).
 
-    Modes that coincide turn into each other at no price; they are left out. A mode whose motion is below the
-    least that counts has 0.
+    Modes that coincide turn into each other at no price; they are left out.
     """
     own = eigenvalues[k]
     gap = own[:, None] - eigenvalues[None, :]
@@ -168,5 +175,4 @@ def _amplitude_slopes(
     change = np.sum(coupling * inverse * gram, axis=2)
     size = gram[np.arange(k.size), k]
     own_mass = 0.5 * mass[:, k, k] * size
-    faint = size < visibility(at_sensors)[k]
-    return np.asarray(np.where(faint, 0.0, (change - own_mass) / np.where(faint, 1.0, size)))
+    return np.asarray((change - own_mass) / np.maximum(size, 1e-300))
