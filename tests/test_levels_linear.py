@@ -127,8 +127,8 @@ def test_products_of_two_modes_are_told_by_their_frequencies(
 ) -> None:
     _, modal, _ = hardening
     a, b = at(100.0, modal.modes[0]), at(170.0, modal.modes[0])
-    assert product_of(at(470.5, a), [a, b]) == ""
-    assert product_of(at(440.1, a), [a, b]) == "100 + 2 × 170 Hz" or product_of(at(440.1, a), [a, b])
+    assert product_of(at(800.0, a), [a, b]) == ""
+    assert product_of(at(440.1, a), [a, b]) == "100 + 2 × 170 Hz"
     assert product_of(at(200.3, a), [a, b]) == "2 × 100 Hz"
     assert product_of(at(270.2, a), [a, b]) == "100 + 170 Hz"
     assert product_of(at(270.2, a), [a]) == ""

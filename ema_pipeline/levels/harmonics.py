@@ -18,7 +18,7 @@ from ema_pipeline.levels.tracks import follow
 from ema_pipeline.levels.types import ForceLevel, ModeLevels
 from ema_pipeline.modal.types import ModalModel, Mode
 
-REACH = 3.0
+REACH = 1.5
 """Distance from the exact multiple or sum in half-power half-widths of what is made there: the frequencies move
 while they decay."""
 

@@ -92,6 +92,8 @@ def _rubs(modes: Sequence[ModeLevels]) -> bool:
     """True where damping falls with the force by more than frequencies move: friction, not a spring."""
     loss, move = 0.0, 0.0
     for m in modes:
+        if m.level_modes is None or m.level_modes[0] < 0:
+            continue  # what the softest hits do not show may be no mode
         if "damping falls" in m.trend:
             loss -= _change(m.damping_ratio, m.damping_shift)
         if "hardening" in m.trend or "softening" in m.trend:

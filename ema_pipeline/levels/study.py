@@ -105,7 +105,10 @@ def study_levels(
     linear: int | None = None
     products: tuple[str, ...] = ()
     if depends and (linear := linear_level(levels, modes, frfs)) is not None:
-        levels, products = without_products(levels, modes, modal)
+        if (
+            linear == 0
+        ):  # friction makes poles of all kinds: there the softest hits do not tell which are modes
+            levels, products = without_products(levels, modes, modal)
         modal = levels[linear].modal or modal
         modes, _ = tested(modal)
     elif not depends:
