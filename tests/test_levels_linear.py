@@ -69,6 +69,8 @@ def test_a_stiffening_structure_is_that_of_its_softest_hits(
     assert abs(averaged.frequency_hz - 130.0) > 0.2
     assert [m.depends for m in study.modes] == [False, True, False]
     assert "softest hits alone (2" in study.summary
+    assert study.modes[1].trend == "hardening"
+    assert study.modes[1].frequency_hz[2] - study.modes[1].frequency_hz[0] == pytest.approx(1.3, rel=0.15)
 
 
 def test_a_structure_that_rubs_is_that_of_its_hardest_hits() -> None:

@@ -30,6 +30,10 @@ TRUSTED_VOTES = 0.3
 """Share of model orders that must show a mode which the softest hits do not show."""
 
 
+FAR = 0.5
+"""Change of a frequency, in half-power half-widths, beyond which hits are no small change from their mean: they
+tell that it moves, the levels' own FRFs tell how far, and nothing is claimed of the damping."""
+
 PLAIN_CHANGE = 0.1
 """Least change over a decay, in half-power half-widths or of the damping ratio, that is claimed from hits of one
 level: smaller ones can be errors of the neighbours that were taken off."""
@@ -210,25 +214,44 @@ def _tested(
     out = list(modes)
     for r, k in enumerate(base):
         both = bool(moves[r]), bool(moves[r + len(base)])
+        slope, far = frequency[r].slope, _far(modes[k])
         shift = shifts(
             found.frequency_hz[:, r], found.frequency_std_hz[:, r], found.sheet, level, frequency[r]
         )
         damping_shift = shifts(
             found.damping_ratio[:, r], found.damping_std[:, r], found.sheet, level, damping[r]
         )
+        if far:
+            both, slope = (any(both), False), far
+            shift = _differences(modes[k].frequency_hz, modes[k].frequency_std_hz)
+            damping_shift = _differences(modes[k].damping_ratio, modes[k].damping_std)
         out[k] = replace(
-            _with_scatter(modes[k], found, level, r),
+            modes[k] if far else _with_scatter(modes[k], found, level, r),
             amplitude_m=_amplitudes(found, level, r, modes[k].amplitude_m.shape),
             frequency_p=frequency[r].p,
             damping_p=damping[r].p,
             depends=any(both),
-            trend=trend_words(both[0], frequency[r].slope, both[1], damping[r].slope),
+            trend=trend_words(both[0], slope, both[1], damping[r].slope),
             frequency_shift_hz=shift[0],
             frequency_shift_std_hz=shift[1],
             damping_shift=damping_shift[0],
             damping_shift_std=damping_shift[1],
         )
     return tuple(out), combined(p_values)
+
+
+def _far(mode: ModeLevels) -> float:
+    """Change of the frequency, as the levels' own FRFs show it, where that is too far for single hits; 0 elsewhere."""
+    change = float(mode.frequency_hz[-1] - mode.frequency_hz[0])
+    half_width = float(mode.frequency_hz[0] * mode.damping_ratio[0])
+    return change if abs(change) > FAR * half_width else 0.0  # NaN is not
+
+
+def _differences(values: Real, stds: Real) -> tuple[Real, Real]:
+    """Differences from the softest level, and their standard deviations."""
+    std = np.hypot(stds, stds[0])
+    std[0] = 0.0
+    return values - values[0], std
 
 
 def _trusted(modal: ModalModel, modes: Sequence[ModeLevels]) -> Integers:

@@ -68,7 +68,8 @@ class ModeLevels:
     level_modes : ndarray of int, (n_levels,), or None
         Index into the modes of each level's own `ModalModel`; -1 where the mode was not found there.
     frequency_shift_hz, frequency_shift_std_hz, damping_shift, damping_shift_std : ndarray, (n_levels,), or None
-        Difference from the softest level in single hits, each compared with hits on its own point alone.
+        Difference from the softest level in single hits, each compared with hits on its own point alone; of the
+        levels' own FRFs where a frequency moves by more than half a half-width.
     """
 
     mode: int
