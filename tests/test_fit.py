@@ -309,7 +309,8 @@ def test_terms_of_the_paired_residuals_agree_with_central_differences(effect: st
     """Real and complex modes; matrices that are polynomials of the parameters and others."""
     rng = np.random.default_rng(15)
     rig = rig_with_effects(RIG, [effect])
-    measured = {"with_ring": simulate(RIG, "with_ring", draw(rng, (7, 7)), rng)}
+    scaled = replace(simulate(RIG, "with_ring", draw(rng, (7, 7)), rng), scaled=True)
+    measured = {"with_ring": scaled}
     problem = FitProblem(rig, measured, FAST)
     x = problem.space.point({SUN_PLANET: 1e7, RING_PLANET: 1e7}) + 0.03 * rng.normal(
         size=len(problem.space.names)
