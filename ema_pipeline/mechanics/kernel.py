@@ -12,7 +12,7 @@ _polynomial, _, _parting = (numba.njit(law, inline="always") for law in LAWS)
 
 _NEWTON = 60
 _RINGING = 3.0
-"""A step over which friction would take this many times the speed that it meets rings at half its strength, and less."""
+"""Friction that takes this many times the rate within a step rings from step to step, at half its strength."""
 
 _TOLERANCE = 1e-8
 _WILD = 1e30

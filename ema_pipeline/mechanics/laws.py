@@ -159,7 +159,8 @@ class DryFriction(Nonlinear):
     """Coulomb force limit·tanh(δ̇/velocity).
 
     The sign function is regularised: below `velocity`, m/s, the element acts like a viscous damper of
-    limit/velocity, so it creeps where true friction sticks. It gives nothing to the linear system: its
+    limit/velocity, so it creeps where true friction sticks. The compiled loop takes a `velocity` no finer than
+    its steps resolve. It gives nothing to the linear system: its
     equivalent damper 4·limit/(π·ω·amplitude) vanishes for large motions, and that limit is the base model.
     """
 

@@ -65,6 +65,10 @@ class LevelCase:
             return self
         return replace(self, windows=tuple(w.shortened(share) for w in self.windows))
 
+    def softer(self) -> LevelCase:
+        """Without the hits of the hardest level, after which parts strike most often."""
+        return self.without_level(self.levels[-1]) if len(self.levels) > 1 else self
+
     def rough(self) -> LevelCase:
         """Softest and hardest hits, short windows, long steps: enough to tell orders of magnitude."""
         kept = [
@@ -185,13 +189,9 @@ _SHORT = 0.3
 _COARSE = 3.0
 
 
-def size_grid(p: EffectParameter, first: bool) -> NDArray[np.float64]:
-    """Values of a parameter to start a fit from: the first one over `_DECADES` to either side of its start and of both
-    signs, further ones at two sizes."""
-    if not first:
-        return np.array([p.start, 0.1 * p.start])
-    count = 4 * _DECADES + 1
-    sizes = abs(p.start) * np.logspace(-_DECADES, _DECADES, count)
+def size_grid(p: EffectParameter, per_decade: int) -> NDArray[np.float64]:
+    """Values of an effect's first parameter to start a fit from: `_DECADES` to either side of its start, both signs."""
+    sizes = abs(p.start) * np.logspace(-_DECADES, _DECADES, 2 * _DECADES * per_decade + 1)
     grid = np.concatenate([sizes, -sizes]) if p.minimum < 0 else sizes
     return np.asarray(grid[(grid >= p.minimum) & (grid <= p.maximum)])
 

@@ -16,11 +16,17 @@ from ema_pipeline.ingest.records import Hit, Record
 _BEFORE_S = 0.004
 """Taken before the peak of the force: the pulse's flank and the filter's ringing."""
 
+_LEAST_S = 0.02
+"""A window holds the pulse and what comes of it."""
+
 _QUIET_S = 0.05
 """The stretch before that which tells offset and noise."""
 
 _TIMING = 0.05
 """Samples by which hammer and sensors, or the simulation's steps, may be apart in time."""
+
+_SPILT = 0.2
+"""Share of what the simulation misses, on average over the sensors, that shows in a sensor which hardly moves."""
 
 _SMOOTHED = 0.08
 """Share of a frequency over which the measured power is averaged for the weights."""
@@ -103,21 +109,32 @@ class HitWindows:
         """Uncertainty of each line, measured amplitude around it, and share of its power that is no noise.
 
         The standard uncertainty, (n_hits, n_sensors, n_lines), is the sensors' noise, and shares of the measured
-        amplitude: `floor`, and the angle that `_TIMING` of a sample between hammer and sensors makes. It is
-        infinite, and the share 0, where a sensor is absent.
+        amplitude: `floor`, and the angle that `_TIMING` of a sample between hammer and sensors makes. A sensor that
+        symmetry keeps still gets `_SPILT` of the `floor` of the others: a force between bodies that is a little off
+        moves it at once. The uncertainty is infinite, and the share 0, where a sensor is absent.
         """
         f = self.frequency_hz
         noise = self.noise[..., None] ** 2 * np.sum(np.exp(-2 * self.time_s / fade_s))
         share = floor**2 + (2 * np.pi * f * _TIMING / self.sample_rate_hz) ** 2
         power = _smoothed(f, np.abs(self.spectra(self.measured, fade_s)) ** 2)
-        total = np.sqrt(noise + share * power)
+        total = np.sqrt(noise + share * power + (_SPILT * floor) ** 2 * self._alike(power))
         there = self.present[..., None]
         signal = np.clip(1 - 2 * noise / np.maximum(power, 1e-300), 0.0, 1.0)
         return np.where(there, total, np.inf), np.sqrt(power), np.where(there, signal, 0.0)
 
+    def _alike(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Mean power over all sensors of each sensor's quantity, like `power`."""
+        mean = np.zeros_like(power)
+        for quantity in set(self.quantities):
+            at = [i for i, q in enumerate(self.quantities) if q == quantity]
+            count = np.maximum(self.present[:, at].sum(axis=1), 1)[:, None, None]
+            mean[:, at] = (power * self.present[..., None])[:, at].sum(axis=1, keepdims=True) / count
+        return mean
+
     def shortened(self, share: float) -> HitWindows:
-        """The first part of the windows."""
-        n = int(share * self.force.shape[1])
+        """The first part of the windows, `_LEAST_S` of it at least."""
+        least = round(_LEAST_S * self.sample_rate_hz)
+        n = min(max(int(share * self.force.shape[1]), least), self.force.shape[1])
         return replace(self, force=self.force[:, :n], measured=self.measured[..., :n])
 
     def only(self, keep: NDArray[np.bool_]) -> HitWindows:

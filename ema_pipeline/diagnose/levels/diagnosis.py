@@ -20,12 +20,25 @@ from ema_pipeline.diagnose.levels.ladder import (
     sizes_of,
 )
 from ema_pipeline.diagnose.levels.problem import NoiseFloor
-from ema_pipeline.diagnose.levels.search import LevelRanking, again, at_floor, own_floor, ranked
+from ema_pipeline.diagnose.levels.search import (
+    LevelRanking,
+    again,
+    at_floor,
+    own_floor,
+    ranked,
+    ranked_linear,
+)
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, VerdictWord
 from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.threads import single_blas_thread
 
 Progress = Callable[[float, str], None]
+
+_SHORTER = (0.4, 0.16)
+"""Shares of the windows that are tried where no model holds in all of them."""
+
+_FINER = 0.7
+"""The floor of the noise is lowered where a further effect leaves less than this share of it."""
 
 _HARDER = 2.0
 """A next test is thought of with blows this much harder than the hardest."""
@@ -33,8 +46,9 @@ _HARDER = 2.0
 
 @dataclass(frozen=True)
 class _Climbed:
-    """Models from the base upwards, and the rankings on top of each."""
+    """Models from the base upwards, the rankings on top of each, and the windows that they were fitted to."""
 
+    case: LevelCase
     models: list[Simulated]
     rankings: list[LevelRanking]
     floor: NoiseFloor
@@ -82,6 +96,7 @@ def _diagnose(
     tell: Progress,
 ) -> Diagnosis:
     climbed = _climb(case, effects, tell)
+    shortened, case = climbed.case is not case, climbed.case
     first, base = climbed.rankings[0], climbed.rankings[0].base
     forces = [float(f) for f in case.windows[0].force_n]
     tell(0.8, "predicting held-out levels")
@@ -107,35 +122,79 @@ def _diagnose(
         error=before.error,
         heldout_error=before.heldout_error,
         ladder=ladder,
-        notes=(*((summary,) if summary else ()), *(linear.notes if linear is not None else ()), *notes),
+        notes=(
+            *((summary,) if summary else ()),
+            *(linear.notes if linear is not None else ()),
+            *_short(case, shortened),
+            *notes,
+        ),
     )
 
 
 def _climb(case: LevelCase, effects: tuple[str, ...], tell: Progress) -> _Climbed:
+    """Add what is claimed, one effect after the other; on the first part of the windows where nothing holds in all.
+
+    Teeth that part often, and friction that sticks, move so sensitively that the true model loses the measured motion
+    in time.
+    """
+    whole = _climb_windows(case, effects, tell)
+    if _holds(whole):
+        return whole
+    for share in _SHORTER:
+        part = _climb_windows(case.beginning(share), effects, tell)
+        if _holds(part):
+            return part
+    return whole
+
+
+def _holds(climbed: _Climbed) -> bool:
+    """True where the last model's error is within the limit."""
+    case = climbed.case
+    return error_of(case, climbed.models[-1]) <= case.settings.error_limit
+
+
+def _climb_windows(case: LevelCase, effects: tuple[str, ...], tell: Progress) -> _Climbed:
     """Rank on the base model, lower the noise to what the best leaves, add what is claimed, and rank again."""
     floor = case.floor
     tell(0.0, "base model")
     start = climb(case, effects, floor, _part(tell, 0.0, 0.1))
-    ranking = ranked(case, start[-1], floor, _part(tell, 0.1, 0.5))
-    best = min((ranking.base, *ranking.fitted), key=lambda m: m.evidence)
-    floor = own_floor(case, best)
-    ranking = at_floor(case, ranking, floor, _part(tell, 0.5, 0.6))
-    models, rankings, note = [ranking.base], [ranking], ""
+    rankings = [ranked(case, start[-1], floor, _part(tell, 0.1, 0.5))]
+    floor = own_floor(case, _best(rankings[0]))
+    rankings[0] = at_floor(case, rankings[0], floor, _part(tell, 0.5, 0.6))
+    told = _part(tell, 0.6, 0.8)
     while True:
         top = _claimable(case, rankings[-1], floor)
+        linear = top is None and error_of(case, rankings[-1].base) > case.settings.error_limit
+        if linear:
+            # what depends on the level cannot mend it alone: something else may be missing at every level
+            rankings[-1] = _with(case, rankings[-1], ranked_linear(case, rankings[-1].base, floor, told))
+            top = _claimable(case, rankings[-1], floor)
         if top is None:
             note = "no further effect is supported by the data"
             break
-        if len(models) > case.settings.most_rungs:
+        if len(rankings) > case.settings.most_rungs:
             note = f"stopped after {case.settings.most_rungs} effects"
             break
-        models.append(top)
-        further = ranked(case, top, floor, _part(tell, 0.6, 0.8))
-        rankings.append(further)
+        rankings.append(ranked(case, top, floor, told))
+        finer = own_floor(case, _best(rankings[-1]))
+        if finer.own < _FINER * floor.own:
+            floor = finer
+            rankings = [at_floor(case, r, floor, told) for r in rankings]
+    models = [r.base for r in rankings]
     if effects:
-        lower = [again(case, m, floor) for m in start[:-1]]
-        models = [*lower, *models]
-    return _Climbed(models, rankings, floor, note)
+        models = [*(again(case, m, floor) for m in start[:-1]), *models]
+    return _Climbed(case, models, rankings, floor, note)
+
+
+def _best(ranking: LevelRanking) -> Simulated:
+    """The model of the largest evidence."""
+    return min((ranking.base, *ranking.fitted), key=lambda m: m.evidence)
+
+
+def _with(case: LevelCase, one: LevelRanking, other: LevelRanking) -> LevelRanking:
+    """Both rankings of the same base model as one."""
+    base = min(one.base, other.base, key=lambda m: m.fit.objective)
+    return LevelRanking(case, base, [*one.fitted, *other.fitted])
 
 
 def _claimable(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor) -> Simulated | None:
@@ -194,7 +253,7 @@ def _candidates(
                 at=place,
                 title=title,
                 probability=ranking.probabilities[m.hypothesis.label],
-                parameters=_own_sizes(case, m),
+                parameters=_own_sizes(case, m, climbed.floor),
                 error_before=before.error,
                 error_after=after.error,
                 heldout_before=before.heldout_error,
@@ -209,13 +268,13 @@ def _candidates(
     return tuple(result)
 
 
-def _own_sizes(case: LevelCase, m: Simulated) -> dict[str, EffectSize]:
+def _own_sizes(case: LevelCase, m: Simulated, floor: NoiseFloor) -> dict[str, EffectSize]:
     """Sizes of the effect added last, by their own names."""
     label = m.hypothesis.labels[-1]
     own = [f"{label}.{p.name}" for p in case.parameters_of(label)]
     return {
         n.removeprefix(f"{label}."): v
-        for n, v in sizes_of(case, m, [n for n in own if n in m.values]).items()
+        for n, v in sizes_of(case, m, floor, [n for n in own if n in m.values]).items()
     }
 
 
@@ -254,12 +313,13 @@ def _verdict(
             f"The model explains the hits at all levels (error {error:.2f}); nothing is missing.",
         )
     texts = [
-        f"{label_text(label)} ({size_text(_own_sizes(case, m))})"
+        f"{label_text(label)} ({size_text(_own_sizes(case, m, climbed.floor))})"
         for label, m in zip(added, climbed.models[-len(added) :], strict=True)
     ]
     rungs = ladder.rungs[-len(added) - 1], ladder.rungs[-1]
-    k = int(np.nanargmax(np.array(rungs[0].misfit)))
-    held = [r.heldout_misfit[k] if np.isfinite(r.heldout_misfit[k]) else r.misfit[k] for r in rungs]
+    both = [np.where(np.isfinite(r.heldout_misfit), r.heldout_misfit, r.misfit) for r in rungs]
+    k = int(np.nanargmax(both[0] - both[1]))
+    held = [float(b[k]) for b in both]
     return "effect", (
         f"Missing: {' and '.join(texts)}. Simulated hits miss {100 * held[0]:.2g} % of the signals at "
         f"{ladder.force_n[k]:.3g} N without it and {100 * held[1]:.2g} % with it, that level being left out of the fit."
@@ -277,6 +337,17 @@ def _depends(case: LevelCase, label: str) -> bool:
     known = shipped_effects() if case.library is None else case.library
     family = label.partition("@")[0]
     return family in known and not known[family].linear
+
+
+def _short(case: LevelCase, shortened: bool) -> tuple[str, ...]:
+    """A remark where only the first part of the windows was compared."""
+    if not shortened:
+        return ()
+    length = max(float(w.time_s[-1]) for w in case.windows)
+    return (
+        f"Only the first {1e3 * length:.0f} ms of each hit are compared: in longer windows no model follows the "
+        "measured motion, as where parts strike or stick.",
+    )
 
 
 def _claims(linear: Diagnosis | None) -> tuple[Candidate, ...]:

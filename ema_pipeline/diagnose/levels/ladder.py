@@ -8,16 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.diagnose.hypotheses import Hypothesis, extras, starting_points
-from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, judged
-from ema_pipeline.diagnose.levels.problem import NoiseFloor, fit, hit_misfits, objectives, weighted
-from ema_pipeline.diagnose.levels.search import again, fit_base, fit_effect, own_floor
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
+from ema_pipeline.diagnose.levels.problem import NoiseFloor, hit_misfits, weighted
+from ema_pipeline.diagnose.levels.search import again, fit_base, fit_effect, fit_linear, own_floor
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung, TimeTrace
 from ema_pipeline.effects.library import shipped_effects
+from ema_pipeline.errors import EmaError
 
 Progress = Callable[[float, str], None]
 
 _HELD_OUT_STEPS = 3
+_FOLLOWED_STEPS = 15
 _TRACE_SENSORS = 1
 
 
@@ -82,14 +84,26 @@ def _level_misfits(case: LevelCase, model: Simulated) -> NDArray[np.float64]:
     return np.array([np.sqrt(np.mean(s)) if s else np.nan for s in squares])
 
 
-def sizes_of(case: LevelCase, model: Simulated, names: Sequence[str] | None = None) -> dict[str, EffectSize]:
-    """Fitted parameters with their uncertainties."""
+def sizes_of(
+    case: LevelCase, model: Simulated, floor: NoiseFloor, names: Sequence[str] | None = None
+) -> dict[str, EffectSize]:
+    """Fitted parameters with their uncertainties.
+
+    What even this model misses is no noise that averages out over hits and lines: the size of an effect is known no
+    better than to that share.
+    """
     units = {n: p.unit for n, p in case.problem(model.hypothesis, model.sizes).rig.parameters.items()}
     chosen = model.values if names is None else names
-    return {n: EffectSize(float(model.values[n]), float(model.std[n]), units[n]) for n in chosen}
+    missed = {n: floor.own * abs(model.values[n]) for n in model.sizes}
+    return {
+        n: EffectSize(float(model.values[n]), float(np.hypot(model.std[n], missed.get(n, 0.0))), units[n])
+        for n in chosen
+    }
 
 
-def make_rung(case: LevelCase, base: Simulated, model: Simulated, errors: LevelErrors) -> Rung:
+def make_rung(
+    case: LevelCase, base: Simulated, model: Simulated, errors: LevelErrors, floor: NoiseFloor
+) -> Rung:
     """A rung of the ladder."""
     return Rung(
         effects=model.hypothesis.labels,
@@ -97,7 +111,7 @@ def make_rung(case: LevelCase, base: Simulated, model: Simulated, errors: LevelE
         heldout_error=errors.heldout_error,
         chi2=model.fit.objective,
         objective=model.fit.objective,
-        parameters=sizes_of(case, model),
+        parameters=sizes_of(case, model, floor),
         log_evidence=float(0.5 * (base.evidence - model.evidence)),
         unexplained=0,
         misfit=tuple(float(v) for v in errors.misfit),
@@ -113,24 +127,16 @@ def climb(case: LevelCase, effects: Sequence[str], floor: NoiseFloor, tell: Prog
         tell(i / len(effects), f"fitting {label}")
         hypothesis = models[-1].hypothesis.plus(label)
         effect = known.get(label.partition("@")[0])
-        follow = _fit_linear if effect is None or effect.linear else fit_effect
-        models.append(follow(case, hypothesis, models[-1], floor))
+        if effect is None or effect.linear:
+            found = fit_linear(case, hypothesis, models[-1], floor)
+            if found is None:
+                raise EmaError(
+                    f"'{label}' has no time response, so hits cannot be simulated with it: take it out"
+                )
+        else:
+            found = fit_effect(case, hypothesis, models[-1], floor)
+        models.append(again(case, found, floor, _FOLLOWED_STEPS))
     return models
-
-
-def _fit_linear(case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: NoiseFloor) -> Simulated:
-    """Fit with one more effect that does not depend on the level, from the starts of modes and of its own."""
-    problem, weights = case.problem(hypothesis, base.sizes), case.weights(floor)
-    points = [
-        {**s, **base.sizes, **p}
-        for s in (base.values, *case.starts)
-        for p in starting_points(extras(case.rig, hypothesis, case.library))
-    ]
-    points += [{**base.values, **s} for s in case.starts]
-    x = np.array([problem.space.point(p) for p in points])
-    order = np.argsort(objectives(problem, weights, x))[:3]
-    found = [fit(problem, weights, x[k], 12) for k in order]
-    return judged(problem, hypothesis, base.sizes, min(found, key=lambda f: f.objective))
 
 
 def assemble(
@@ -140,7 +146,7 @@ def assemble(
     rungs = []
     for i, m in enumerate(models):
         tell(i / len(models), "predicting held-out levels")
-        rungs.append(make_rung(case, models[0], m, level_errors(case, m, floor)))
+        rungs.append(make_rung(case, models[0], m, level_errors(case, m, floor), floor))
     return Ladder(
         rungs=tuple(rungs),
         frequency_noise=float("nan"),

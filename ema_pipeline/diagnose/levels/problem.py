@@ -226,13 +226,22 @@ def fit(
         Steps at most.
     tolerance : float
         Ends where a step lowers the objective by less than this and a thousandth.
+
+    Returns
+    -------
+    TimeFit
+        With an infinite objective where the motion has no solution at the start.
     """
     space = problem.space
     prior = space.has_prior.astype(float)
     x = np.clip(np.asarray(start, dtype=float), space.low, space.high)
-    damping = 1e-3
+    damping, value = 1e-3, np.inf
+    normal = np.eye(x.size)
     while True:
-        r, jacobian = _linearised(problem, weights, x)
+        try:
+            r, jacobian = _linearised(problem, weights, x)
+        except EmaError:  # on the edge of what has a solution
+            break
         value = float(r @ r) + float(prior @ x**2)
         normal = jacobian @ jacobian.T + np.diag(prior)
         gradient = jacobian @ r + prior * x

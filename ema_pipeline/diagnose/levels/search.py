@@ -9,7 +9,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy.optimize
 
-from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, prior_probabilities
+from ema_pipeline.diagnose.hypotheses import (
+    NOTHING,
+    Hypothesis,
+    extras,
+    prior_probabilities,
+    single_hypotheses,
+    starting_points,
+)
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, judged, level_hypotheses, size_grid, sized
 from ema_pipeline.diagnose.levels.problem import NoiseFloor, fit, objectives, weighted
 from ema_pipeline.diagnose.pool import spread
@@ -18,10 +25,15 @@ Progress = Callable[[float, str], None]
 
 _FOLLOWED = 2
 _HELPS = 0.5
+_APART = 0.3
 _NEAR = 0.005
 _AGAIN = 6
-_GROWING = ((0.1, 10), (0.3, 8), (1.0, 8))
-"""Shares of the windows, and steps on each: what is far off in frequency has no slope towards the optimum in long ones."""
+_GROWING = (0.05, 0.15)
+"""Shares of the windows: far from the right frequencies, or where parts strike, long ones have no slope to follow."""
+_STEPS = 8
+_NEIGHBOURS = (1.0, 0.9, 0.93, 0.96, 0.98, 1.02, 1.04, 1.07, 1.1)
+_DENSE, _SPARSE = 10, 2
+"""Sizes per decade that compete in short windows after softer hits, and in longer ones after all."""
 _POLISHED = 2
 _MOST_STEPS = 25
 
@@ -30,9 +42,8 @@ def fit_base(
     case: LevelCase, hypothesis: Hypothesis, floor: NoiseFloor, sizes: Mapping[str, float]
 ) -> Simulated:
     """The best fit of a model from all of the case's starts."""
-    coarse = case.coarse()
-    found = [follow(coarse, hypothesis, sizes, s, floor) for s in _distinct_starts(case.starts)]
-    best = again(coarse, min(found, key=lambda f: f.fit.objective), floor, _MOST_STEPS)
+    found = [follow(case, hypothesis, sizes, {**s, **sizes}, floor) for s in _distinct_starts(case.starts)]
+    best = again(case.coarse(), min(found, key=lambda f: f.fit.objective), floor, _MOST_STEPS)
     return again(case, best, floor, _MOST_STEPS)
 
 
@@ -43,7 +54,9 @@ def follow(
     values: Mapping[str, float],
     floor: NoiseFloor,
 ) -> Simulated:
-    """A fit that begins on the first part of the windows and follows the optimum as they grow.
+    """A fit that begins on the first part of the windows after softer hits and follows the optimum as they grow.
+
+    Where parts strike there are many optima side by side, so that neighbouring sizes are tried at every stage.
 
     Parameters
     ----------
@@ -52,14 +65,20 @@ def follow(
     sizes : mapping of str to float
         Typical values of its effects' parameters.
     values : mapping of str to float
-        Where the fit begins; `sizes` count where both have a parameter.
+        Where the fit begins.
     floor : NoiseFloor
     """
-    now = {**values, **sizes}
-    for share, steps in _GROWING:
-        part = case.beginning(share)
-        problem = part.problem(hypothesis, sizes)
-        found = fit(problem, part.weights(floor), problem.space.point(now), steps)
+    last = hypothesis.labels[-1] if hypothesis.labels else ""
+    first = [n for n in sizes if n.rpartition(".")[0] == last][:1]
+    soft = case.softer().beginning(_GROWING[-1])
+    now = dict(values)
+    for part in (soft, *(case.beginning(share) for share in _GROWING), case.coarse()):
+        problem, weights = part.problem(hypothesis, sizes), part.weights(floor)
+        x = np.array([problem.space.point(now)])
+        for name in first:
+            x = np.array([problem.space.point({**now, name: now[name] * k}) for k in _NEIGHBOURS])
+            x = x[[np.argmin(objectives(problem, weights, x))]]
+        found = fit(problem, weights, x[0], _STEPS)
         now = found.values
     return judged(problem, hypothesis, sizes, found)
 
@@ -83,26 +102,60 @@ def fit_effect(case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: 
     base : Simulated
     floor : NoiseFloor
     """
-    grids = [size_grid(p, i == 0) for i, p in enumerate(case.parameters_of(hypothesis.labels[-1]))]
-    points = list(product(*grids))
-    rough, coarse = case.rough(), case.coarse()
-    problem, weights = rough.problem(hypothesis), rough.weights(floor)
     starts = _distinct_starts((base.values, *case.starts))
-    tried: list[_Tried] = []
-    for k, start in enumerate(starts):
-        x = np.array([problem.space.point({**start, **sized(case, hypothesis, v)}) for v in points])
-        tried += [
-            _Tried(float(o), k, v) for o, v in zip(objectives(problem, weights, x), points, strict=True)
-        ]
+    most = NoiseFloor(case.settings.levels.noise_most, floor.common)
+    chosen = [
+        *_competing(case.softer().beginning(_GROWING[-1]), hypothesis, base, starts, most, _DENSE),
+        *_competing(case.rough(), hypothesis, base, starts, floor, _SPARSE),
+    ]
     best: Simulated | None = None
-    for t in _worth_following(tried):
-        sizes = {**base.sizes, **sized(case, hypothesis, t.sizes)}
-        model = follow(coarse, hypothesis, sizes, starts[t.start], floor)
+    for t in chosen:
+        own = sized(case, hypothesis, t.sizes)
+        begin = {**base.values, **starts[t.start], **own}
+        model = follow(case, hypothesis, {**base.sizes, **own}, begin, floor)
         if best is None or model.fit.objective < best.fit.objective:
             best = model
     if best is None:
         raise AssertionError(f"no size of {hypothesis.label} can be simulated")
     return best
+
+
+def _competing(
+    case: LevelCase,
+    hypothesis: Hypothesis,
+    base: Simulated,
+    starts: Sequence[Mapping[str, float]],
+    floor: NoiseFloor,
+    per_decade: int,
+) -> list[_Tried]:
+    """Sizes of the effect added last that are worth following, from all starts of the other parameters."""
+    first, *others = case.parameters_of(hypothesis.labels[-1])
+    points = list(product(size_grid(first, per_decade), *((p.start, 0.1 * p.start) for p in others)))
+    problem, weights = case.problem(hypothesis), case.weights(floor)
+    tried: list[_Tried] = []
+    for k, start in enumerate(starts):
+        named = [{**base.values, **start, **sized(case, hypothesis, v)} for v in points]
+        x = np.array([problem.space.point(values) for values in named])
+        tried += [
+            _Tried(float(o), k, v) for o, v in zip(objectives(problem, weights, x), points, strict=True)
+        ]
+    return _worth_following(tried, first.null)
+
+
+def fit_linear(
+    case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: NoiseFloor
+) -> Simulated | None:
+    """Fit with one more effect that does not depend on the level, or None for one that has no time response."""
+    brief = case.beginning(_GROWING[0])
+    problem, weights = brief.problem(hypothesis, base.sizes), brief.weights(floor)
+    added = starting_points(extras(case.rig, hypothesis, case.library))
+    starts = [{**base.values, **s, **p} for s in _distinct_starts((base.values, *case.starts)) for p in added]
+    tried = objectives(problem, weights, np.array([problem.space.point(s) for s in starts]))
+    if not np.any(np.isfinite(tried)):
+        return None
+    order = [int(k) for k in np.argsort(tried)[:_FOLLOWED] if np.isfinite(tried[k])]
+    found = [follow(case, hypothesis, base.sizes, starts[k], floor) for k in order]
+    return min(found, key=lambda f: f.fit.objective)
 
 
 class _Tried(NamedTuple):
@@ -113,23 +166,26 @@ class _Tried(NamedTuple):
     sizes: tuple[float, ...]
 
 
-def _worth_following(tried: Sequence[_Tried]) -> list[_Tried]:
+def _worth_following(tried: Sequence[_Tried], null: float) -> list[_Tried]:
     """The lowest of the tried sizes, no neighbours of each other; only one where none helps.
 
-    A vanishing size is the base model: where the best is no better than the smallest, the largest size that does no
+    The size nearest to `null` is the base model: where the best is no better, the size furthest from it that does no
     harm is as good a start as any.
     """
-    finite = sorted(t for t in tried if np.isfinite(t.objective))
+    finite = sorted((t for t in tried if np.isfinite(t.objective)), key=lambda t: round(t.objective, 3))
     if not finite:
         return []
-    smallest = min(finite, key=lambda t: abs(t.sizes[0]))
-    if finite[0].objective > smallest.objective - _HELPS:
-        harmless = [t for t in finite if t.objective < smallest.objective + _HELPS]
-        return [max(harmless, key=lambda t: abs(t.sizes[0]))]
+    strength = -1.0 if np.isinf(null) else 1.0
+    absent = min(finite, key=lambda t: strength * abs(t.sizes[0]))
+    if finite[0].objective > absent.objective - _HELPS:
+        harmless = [t for t in finite if t.objective < absent.objective + _HELPS]
+        return [max(harmless, key=lambda t: strength * abs(t.sizes[0]))]
     kept: list[_Tried] = []
     for t in finite:
-        apart = [abs(np.log(abs(t.sizes[0] / k.sizes[0]))) > 2 or t.sizes[0] * k.sizes[0] < 0 for k in kept]
-        if all(apart) and t.objective < smallest.objective:
+        apart = [
+            abs(np.log(abs(t.sizes[0] / k.sizes[0]))) > _APART or t.sizes[0] * k.sizes[0] < 0 for k in kept
+        ]
+        if all(apart) and t.objective < absent.objective:
             kept.append(t)
         if len(kept) == _FOLLOWED:
             break
@@ -168,7 +224,7 @@ def own_floor(case: LevelCase, model: Simulated) -> NoiseFloor:
 
 
 class LevelRanking:
-    """A base model and every hypothesis on top of it, all at one floor of the noise.
+    """A base model and hypotheses on top of it, all at one floor of the noise.
 
     Attributes
     ----------
@@ -209,13 +265,32 @@ class LevelRanking:
 
 
 def ranked(case: LevelCase, base: Simulated, floor: NoiseFloor, tell: Progress) -> LevelRanking:
-    """Fits of all hypotheses on top of a base model at one floor."""
+    """Fits of all hypotheses that depend on the level on top of a base model at one floor."""
     hypotheses = level_hypotheses(case, base.hypothesis)
-    fitted = []
-    for f in spread(lambda h: fit_effect(case, h, base, floor), hypotheses, case.settings.processes):
-        fitted.append(f)
-        tell(0.9 * len(fitted) / len(hypotheses), f.hypothesis.labels[-1])
+    fitted = _each(lambda h: fit_effect(case, h, base, floor), hypotheses, case, tell)
     return polished(case, LevelRanking(case, base, fitted), floor)
+
+
+def ranked_linear(case: LevelCase, base: Simulated, floor: NoiseFloor, tell: Progress) -> LevelRanking:
+    """The same of the effects that do not depend on the level."""
+    configurations = [w.configuration for w in case.windows]
+    hypotheses = single_hypotheses(case.rig, configurations, case.library, base.hypothesis, parameters=False)
+    fitted = _each(lambda h: fit_linear(case, h, base, floor), hypotheses, case, tell)
+    return polished(case, LevelRanking(case, base, fitted), floor)
+
+
+def _each(
+    job: Callable[[Hypothesis], Simulated | None],
+    hypotheses: Sequence[Hypothesis],
+    case: LevelCase,
+    tell: Progress,
+) -> list[Simulated]:
+    found = []
+    for k, f in enumerate(spread(job, hypotheses, case.settings.processes)):
+        tell(0.9 * (k + 1) / len(hypotheses), hypotheses[k].labels[-1])
+        if f is not None:
+            found.append(f)
+    return found
 
 
 def polished(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor) -> LevelRanking:
