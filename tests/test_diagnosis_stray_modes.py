@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_diagnose import BODIES, RIG, SETTINGS, measure
 
-from ema_pipeline.correlate.evidence import gather
+from ema_pipeline.correlate.evidence import gather, size_factor
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.residuals import matrices, mode_residuals, observable_modes
 from ema_pipeline.correlate.settings import UncertaintySettings
@@ -17,6 +17,7 @@ from ema_pipeline.diagnose import Diagnosis, diagnose
 from ema_pipeline.diagnose.fitting import Case, Fitted, fit_null
 from ema_pipeline.diagnose.hypotheses import Hypothesis, extras, make_rig, same_physics
 from ema_pipeline.diagnose.ranking import probabilities, slight
+from ema_pipeline.diagnose.screening import screen
 from ema_pipeline.diagnose.tuned import tuned_sizes
 from ema_pipeline.diagnose.witness import FrfError, Witness
 from ema_pipeline.dof import Dof
@@ -167,3 +168,17 @@ def test_the_size_of_mass_normalised_shapes_is_a_datum_with_the_accuracy_of_the_
         # modes that overlap are known four times worse
         np.testing.assert_allclose(e.size_weight[~alone], 5.0, rtol=0.05)
     assert not np.any(gather(replace(m, scaled=False), system, settings).size_weight)
+
+
+def test_a_wrong_sensitivity_is_named_and_no_physics_is_read_from_it() -> None:
+    m = on_a_support(noise=1e-6)
+    assert m.shapes is not None
+    assert m.shape_std is not None
+    nominal = RIG.system("no_ring")
+    assert size_factor(m, nominal) == pytest.approx(1.0, abs=0.05)
+    louder = replace(m, shapes=2 * m.shapes, shape_std=2 * m.shape_std)
+    assert size_factor(louder, nominal) == pytest.approx(2.0, abs=0.1)
+    assert not np.any(gather(louder, nominal, UncertaintySettings()).size_weight)
+    (note,) = [n for n in screen(RIG, {"no_ring": louder}).notes if "sensitivities" in n]
+    assert "2.0" in note
+    assert not any("sensitivities" in n for n in screen(RIG, {"no_ring": m}).notes)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ema_pipeline.correlate.measured import MeasuredModes, with_floors
 from ema_pipeline.correlate.pairing import sensor_rows
 from ema_pipeline.correlate.settings import UncertaintySettings
+from ema_pipeline.mechanics.modes import normal_modes
 from ema_pipeline.mechanics.system import LinearSystem
 
 _ALONE = 2.0
@@ -17,6 +18,9 @@ _ALONE = 2.0
 _OVERLAPPING = 4.0
 """By how much the size is less certain where modes overlap."""
 _DAMPING = 0.01
+CALIBRATED = 0.2
+"""Logarithm of a common factor beyond which sizes of shapes are not used."""
+_ALIKE, _FEW = 0.9, 3
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,9 @@ def gather(measured: MeasuredModes, system: LinearSystem, settings: UncertaintyS
         parts = 1.0 if not np.any(shapes.imag) else 2.0
         shape_counts = parts * np.maximum(valid.sum(axis=1) - 1, 0)
         log_size = np.log(size[:, 0])
-        size_weight = _size_weight(m, settings, weight)
+        factor = size_factor(m, system)
+        trusted = m.scaled and bool(abs(np.log(factor)) < CALIBRATED)
+        size_weight = _size_weight(m, settings, weight) if trusted else np.zeros(len(m))
     return Evidence(
         measured=m,
         rows=rows,
@@ -120,6 +126,29 @@ def gather(measured: MeasuredModes, system: LinearSystem, settings: UncertaintyS
     )
 
 
+def size_factor(m: MeasuredModes, system: LinearSystem) -> float:
+    """Median of measured over modelled size of mass-normalised shapes that look alike; 1 where fewer than three do.
+
+    Far from 1 a sensitivity is wrong, or the blows were not where they are said to be: a common factor is no physics
+    of the rig.
+    """
+    if m.shapes is None or not m.dofs or not m.scaled:
+        return 1.0
+    _, phi = normal_modes(system)
+    model = (sensor_rows(system, m) @ phi).T
+    ratios = []
+    for y in m.shapes:
+        valid = np.isfinite(y)
+        power = np.sum(np.abs(model[:, valid]) ** 2, axis=1)
+        product = np.abs(model[:, valid] @ y[valid].conj())
+        own = float(np.sum(np.abs(y[valid]) ** 2))
+        alike = product**2 / np.maximum(power * own, 1e-300)
+        best = int(np.argmax(alike))
+        if alike[best] > _ALIKE:
+            ratios.append(product[best] / power[best])
+    return float(np.median(ratios)) if len(ratios) >= _FEW else 1.0
+
+
 def _size_weight(
     m: MeasuredModes, settings: UncertaintySettings, weight: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -127,7 +156,7 @@ def _size_weight(
 
     Modes that overlap share their residues: what one of them has too much the other lacks.
     """
-    if not m.scaled or settings.scale_floor <= 0:
+    if settings.scale_floor <= 0:
         return np.zeros(len(m))
     known = np.where(weight > 0, weight, np.nan)
     scatter = np.array([1 / np.nanmedian(w) if np.any(w > 0) else np.inf for w in known])

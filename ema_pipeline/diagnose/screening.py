@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ema_pipeline.correlate.evidence import CALIBRATED, size_factor
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.heldout import subset
 from ema_pipeline.mechanics.modes import normal_modes
@@ -58,6 +59,12 @@ def screen(rig: Rig, measured: Mapping[str, MeasuredModes]) -> Screening:
         shapes |= m.shapes is not None and bool(m.dofs)
         if not np.any(np.isfinite(m.frequency_std_hz) & (m.frequency_std_hz > 0)):
             notes.append(f"{c}: no standard deviations of the frequencies are stated, so they are assumed")
+        factor = size_factor(m, rig.system(c))
+        if abs(np.log(factor)) > CALIBRATED:
+            notes.append(
+                f"{c}: mass-normalised shapes are {factor:.2f} times as large as the model's, so their sizes are not "
+                "used; check the sensitivities of hammer and accelerometers"
+            )
         if m.shapes is not None and len(m.references) == 1:
             notes.append(f"{c}: struck at one point only; of two equal modes one may be hidden")
     kept = {c: m for c, m in kept.items() if len(m)} or kept
