@@ -14,7 +14,7 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.residuals import matrices, mode_residuals, observable_modes
 from ema_pipeline.correlate.settings import UncertaintySettings
 from ema_pipeline.diagnose import Diagnosis, diagnose
-from ema_pipeline.diagnose.fitting import Case, Fitted, fit_null
+from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, fit_null, ground
 from ema_pipeline.diagnose.hypotheses import Hypothesis, extras, make_rig, same_physics
 from ema_pipeline.diagnose.ranking import probabilities, slight
 from ema_pipeline.diagnose.screening import screen
@@ -25,6 +25,7 @@ from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.mechanics.modes import normal_modes
 from ema_pipeline.mechanics.system import sensor_rows
+from ema_pipeline.rigs.planetary import planetary
 
 SUPPORT = "flexible_support@carrier"
 MASS, STIFFNESS = 1.858, 1.472e7
@@ -114,6 +115,41 @@ def test_two_names_of_one_change_are_told_and_a_mass_taken_away_is_no_sensor() -
     assert same_physics(RIG, ["no_ring"], None, sensor, 0.02) == ("planet_mass_mistune@planet1",)
     assert same_physics(RIG, ["no_ring"], None, Hypothesis(("shaft_torsion@sun",)), 1e5) == ()
     assert same_physics(RIG, ["no_ring"], None, Hypothesis(("out_of_tolerance@sun_mass",)), 1.0) == ()
+
+
+def test_a_damper_that_only_one_pair_of_modes_feels_is_found_although_that_pair_was_given_up() -> None:
+    rng = np.random.default_rng(6)
+    label = "local_damper@carrier"
+    rig = planetary(3)
+    values = {n: 1.2e7 if p.free else p.value * (1 + 0.6 * p.tolerance) for n, p in rig.parameters.items()}
+    values |= {"modal_damping_ratio": 0.0038, f"{label}.coefficient": 10.74}
+    system = rig_with_effects(rig, [label]).system("with_ring", values)
+    modes = observable_modes(matrices(system))
+    f = modes.omega[0] / (2 * np.pi)
+    inside = (f > 5) & (f < 2000)
+    f, zeta = f[inside], modes.damping_ratio[0][inside]
+    bodies = ("carrier", "ring", "sun", "planet1", "planet2", "planet3")
+    dofs = tuple(Dof(b, d) for b in bodies for d in ("x", "y", "u"))
+    shapes = (sensor_rows(system, dofs) @ modes.shapes[0][:, inside]).T
+    std = 1e-3 * np.abs(shapes).max(axis=1, keepdims=True) * np.ones(shapes.shape)
+    measured = MeasuredModes(
+        configuration="with_ring",
+        frequency_hz=f * (1 + 3e-6 * rng.normal(size=f.size)),
+        frequency_std_hz=3e-6 * f,
+        damping_ratio=zeta * (1 + 1e-3 * rng.normal(size=f.size)),
+        damping_std=1e-3 * zeta,
+        shapes=shapes + std * rng.normal(size=shapes.shape),
+        shape_std=std,
+        dofs=dofs,
+        band_hz=(5.0, 2000.0),
+    )
+    library = {"local_damper": shipped_effects()["local_damper"]}
+    case = Case(rig, {"with_ring": measured}, SETTINGS, library)
+    null = fit_null(case, Hypothesis(), SETTINGS.fit, None)
+    assert not np.all(null.explained)
+    found = fit_hypothesis(case, Hypothesis((label,)), SETTINGS.fit, ground(case, null, SETTINGS.fit))
+    assert np.all(found.explained)
+    assert found.values[f"{label}.coefficient"] == pytest.approx(10.74, rel=0.05)
 
 
 def test_an_effect_below_a_hundredth_of_the_size_to_expect_counts_as_nothing_missing() -> None:

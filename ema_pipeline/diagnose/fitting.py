@@ -184,6 +184,9 @@ class Ground:
     annealed : dict of str to float
         Where the annealing ended: values that no mode was given up for, damping left aside. Empty where
         nothing was annealed.
+    undamped : dict of str to float
+        Optimum with the damping ratios left out, where modes are unexplained: those whose damping alone is wrong have
+        their frequencies there. Empty where none are.
     """
 
     values: dict[str, float]
@@ -191,6 +194,7 @@ class Ground:
     latent: float
     unexplained: tuple[tuple[str, float], ...]
     annealed: dict[str, float]
+    undamped: dict[str, float]
 
     @property
     def lost(self) -> bool:
@@ -202,14 +206,26 @@ def ground(case: Case, base: Fitted, fit: FitSettings) -> Ground:
     """Prepare a base model for the hypotheses on top of it."""
     every = [(c, float(f)) for c, m in case.measured.items() for f in m.frequency_hz]
     lost = tuple(at for at, there in zip(every, base.explained, strict=True) if not there)
+    undamped = _undamped(case, base, fit) if lost else {}
     if holds(base):
-        return Ground(base.values, base.objective, np.inf, lost, {})
+        return Ground(base.values, base.objective, np.inf, lost, {}, undamped)
     problem = case.problem(base.hypothesis, fit)
     x = problem.space.point(base.values)
     nominal = np.where(problem.space.has_prior, 0.0, x)
     starts = (x, nominal, problem.space.point())
     best = min((_descend_rungs(problem, start) for start in starts), key=lambda o: o.objective)
-    return Ground(base.values, base.objective, best.objective, lost, problem.space.named(best.x))
+    return Ground(base.values, base.objective, best.objective, lost, problem.space.named(best.x), undamped)
+
+
+def _undamped(case: Case, base: Fitted, fit: FitSettings) -> dict[str, float]:
+    problem = case.problem(base.hypothesis, fit.model_copy(update={"damping": False}))
+    found = settle(problem, problem.space.point(base.values))
+    return {**base.values, **problem.space.named(found.x), **_damping_values(problem, base)}
+
+
+def _damping_values(problem: FitProblem, base: Fitted) -> dict[str, float]:
+    names = zip(problem.space.names, problem.damping_only, strict=True)
+    return {n: base.values[n] for n, damping in names if damping and n in base.values}
 
 
 def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: Ground) -> Fitted:
@@ -245,6 +261,8 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
         candidates += [settle(problem, x) for x in scanned(problem, base.values, moved)]
     if base.lost and base.annealed:
         candidates += [settle(problem, x) for x in scanned(problem, base.annealed, moved, 1)]
+    if base.undamped and not dynamic:
+        candidates += [settle(problem, x) for x in scanned(problem, base.undamped, moved)]
     rig = make_rig(case.rig, hypothesis, case.library, case.settings.parameter_range)
     if new and base.lost:
         tuned = tuned_sizes(rig, moved, base.values, base.unexplained)
