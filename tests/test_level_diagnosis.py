@@ -265,3 +265,39 @@ def test_a_false_alarm_of_the_levels_leaves_the_diagnosis_to_the_modes(tmp_path)
     top = replace(chance.ladder.rungs[-1], effects=("bearing_cubic@carrier",))
     moving = replace(chance, ladder=replace(chance.ladder, rungs=(*chance.ladder.rungs, top)))
     assert not linear_after_all(run, moving)
+
+
+def test_friction_finer_than_a_step_stops_the_motion_without_ringing() -> None:
+    """A mass on a spring, let go by a blow, under F·sign(v): stops where |k·x| < F and stays."""
+    k, m, limit = 4e5, 1.0, 40.0
+    assembly = Assembly(
+        ("p.x",),
+        (
+            Mass("m", {"p.x": 1.0}, m),
+            Spring("k", {"p.x": 1.0}, k),
+            DryFriction("f", {"p.x": 1.0}, limit, 1e-6),
+        ),
+        {},
+        1e-4,
+    )
+    force = pulse(400, 300.0)
+    one = np.ones((1, 1))
+    blows = Blows(RATE, force[None], one, np.ones((2, 1)), ("displacement", "velocity"))
+    x, v = batch_response([assembly], blows, 8)[0, 0]
+    peaks = [abs(x[i]) for i in range(1, 399) if v[i - 1] * v[i] < 0 and abs(x[i]) > limit / k]
+    falls = -np.diff(peaks)[1:3]
+    np.testing.assert_allclose(falls, 2 * limit / k, rtol=0.1)  # per half swing
+    assert np.max(np.abs(v[300:])) < 1e-3 * np.max(np.abs(v))
+    assert np.all(np.abs(x[300:]) <= 1.01 * limit / k)
+
+
+def test_friction_of_any_transition_is_told_with_its_force() -> None:
+    w = windows(*(DryFriction(f"f{a}", {f"rim.{a}": 1.0}, 1.5, 1e-4) for a in "xy"))
+    found = diagnose_levels(case_of(w), (), None, "", ())
+    assert found.verdict == "effect", found.summary
+    size = found.candidates[0].parameters["force"]
+    assert found.candidates[0].label == "dry_friction@rim"
+    assert size.value == pytest.approx(1.5, rel=0.15)
+    assert abs(size.value - 1.5) < 3 * size.std
+    limits = {x.label: x.size for x in found.detection_limits}
+    assert 0 < limits["dry_friction@rim"] < 1.5

@@ -14,7 +14,7 @@ from ema_pipeline.diagnose.levels.problem import NoiseFloor, TimeFit, TimeProble
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.base import EffectParameter
 from ema_pipeline.effects.library import Library, shipped_effects
-from ema_pipeline.rigs.types import Rig
+from ema_pipeline.rigs.types import Parameter, Rig
 
 
 @dataclass(frozen=True)
@@ -169,8 +169,7 @@ def judged(
     for i, (name, c) in enumerate(zip(space.names, space.coordinates, strict=True)):
         if name not in sizes:
             continue
-        signs = 2 if c.low < 0 else 1
-        width = signs * 2 * _DECADES * np.log(10)
+        width = prior_width(c.parameter)
         unit = max(abs(found.values[name]) / slopes[i], 1e-6)  # one e-fold, in the coordinate
         hessian[i, i] += 1 / (width * unit) ** 2
         cost += 2 * np.log(width * unit / np.sqrt(2 * np.pi))
@@ -182,6 +181,11 @@ def judged(
     told = np.linalg.inv(found.hessian + 1e-9 * np.eye(len(space.names)))
     std = {n: float(np.sqrt(max(told[i, i], 0.0)) * slopes[i]) for i, n in enumerate(space.names)}
     return Simulated(hypothesis, dict(sizes), found, std, float(found.objective + cost))
+
+
+def prior_width(p: Parameter | EffectParameter) -> float:
+    """Range of a size beforehand, in e-folds; both signs together."""
+    return float((2 if p.minimum < 0 else 1) * 2 * _DECADES * np.log(10))
 
 
 _DECADES = 4

@@ -11,6 +11,7 @@ from ema_pipeline.diagnose.explain import label_text, size_text
 from ema_pipeline.diagnose.hypotheses import NOTHING, describe
 from ema_pipeline.diagnose.levels import words
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
+from ema_pipeline.diagnose.levels.detection import detection_limits
 from ema_pipeline.diagnose.levels.ladder import (
     LevelErrors,
     assemble,
@@ -28,7 +29,7 @@ from ema_pipeline.diagnose.levels.search import (
     ranked,
     ranked_linear,
 )
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, VerdictWord
+from ema_pipeline.diagnose.types import Candidate, DetectionLimit, Diagnosis, EffectSize, Ladder, VerdictWord
 from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.threads import single_blas_thread
 
@@ -122,6 +123,7 @@ def _diagnose(
         error=before.error,
         heldout_error=before.heldout_error,
         ladder=ladder,
+        detection_limits=_limits(climbed) if verdict != "unknown_effect" else (),
         notes=(
             *((summary,) if summary else ()),
             *(linear.notes if linear is not None else ()),
@@ -337,6 +339,13 @@ def _depends(case: LevelCase, label: str) -> bool:
     known = shipped_effects() if case.library is None else case.library
     family = label.partition("@")[0]
     return family in known and not known[family].linear
+
+
+def _limits(climbed: _Climbed) -> tuple[DetectionLimit, ...]:
+    """What these hits would show of the effects that depend on the level."""
+    case, first = climbed.case, climbed.rankings[0]
+    nonlinear = [m.hypothesis for m in first.fitted if _depends(case, m.hypothesis.labels[-1])]
+    return detection_limits(case, nonlinear, climbed.models[-1], climbed.floor)
 
 
 def _short(case: LevelCase, shortened: bool) -> tuple[str, ...]:

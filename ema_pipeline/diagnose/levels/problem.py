@@ -239,7 +239,7 @@ def fit(
     normal = np.eye(x.size)
     while True:
         try:
-            r, jacobian = _linearised(problem, weights, x)
+            r, jacobian = linearised(problem, weights, x)
         except EmaError:  # on the edge of what has a solution
             break
         value = float(r @ r) + float(prior @ x**2)
@@ -266,7 +266,7 @@ def fit(
     return TimeFit(x, space.named(x), value, value - float(prior @ x**2), normal)
 
 
-def _linearised(
+def linearised(
     problem: TimeProblem, weights: Sequence[Whitening], x: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Residual (n,) and Jacobian (P, n) by forward differences that stay inside the bounds."""
