@@ -166,8 +166,7 @@ def _climb_windows(case: LevelCase, effects: tuple[str, ...], tell: Progress) ->
     told = _part(tell, 0.6, 0.8)
     while True:
         top = _claimable(case, rankings[-1], floor)
-        linear = top is None and error_of(case, rankings[-1].base) > case.settings.error_limit
-        if linear:
+        if top is None and floor.own >= case.settings.levels.noise_most:
             # what depends on the level cannot mend it alone: something else may be missing at every level
             rankings[-1] = _with(case, rankings[-1], ranked_linear(case, rankings[-1].base, floor, told))
             top = _claimable(case, rankings[-1], floor)

@@ -288,7 +288,7 @@ def _each(
     found = []
     for k, f in enumerate(spread(job, hypotheses, case.settings.processes)):
         tell(0.9 * (k + 1) / len(hypotheses), hypotheses[k].labels[-1])
-        if f is not None:
+        if f is not None and np.isfinite(f.fit.objective):
             found.append(f)
     return found
 
@@ -308,14 +308,16 @@ def polished(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor) -> Level
         found = fit(problem, case.weights(floor), problem.space.point(top.values), _MOST_STEPS)
         if found.objective < base.fit.objective:
             base = judged(problem, base.hypothesis, base.sizes, found)
-    return LevelRanking(case, base, [*best, *ordered[_POLISHED:]])
+    return LevelRanking(
+        case, base, [*(m for m in best if np.isfinite(m.fit.objective)), *ordered[_POLISHED:]]
+    )
 
 
 def at_floor(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor, tell: Progress) -> LevelRanking:
-    """The same ranking at another floor, every fit from its own optimum."""
+    """The same ranking at another floor, every fit from its own optimum; those without a solution left out."""
     models = [ranking.base, *ranking.fitted]
     fitted = []
     for f in spread(lambda m: again(case, m, floor), models, case.settings.processes):
         fitted.append(f)
         tell(len(fitted) / len(models), f.hypothesis.label)
-    return LevelRanking(case, fitted[0], fitted[1:])
+    return LevelRanking(case, fitted[0], [m for m in fitted[1:] if np.isfinite(m.fit.objective)])
