@@ -17,6 +17,8 @@ from ema_pipeline.fit.settings import FitSettings
 
 Progress = Callable[[float, str], None]
 
+NOT_SUPPORTED = "no further effect is supported by the data"
+
 
 @dataclass(frozen=True)
 class Climb:
@@ -30,12 +32,20 @@ class Climb:
     level : NoiseLevel
     note : str
         Why climbing stopped.
+    refuted : bool
+        True where held-out data or FRFs spoke against what the modes asked for next.
     """
 
     models: list[Fitted]
     rankings: list[Ranking]
     level: NoiseLevel
     note: str
+    refuted: bool = False
+
+    @property
+    def explaining(self) -> list[Fitted]:
+        """The models, and hypotheses that may explain modes which these do not: none where the best was refuted."""
+        return [*self.models, *([] if self.refuted else self.rankings[0].worthwhile())]
 
     @property
     def top(self) -> Fitted:
@@ -81,10 +91,11 @@ def climb(case: Case, witness: Witness, thresholds: Mapping[str, float] | None, 
     settings = case.settings
     ranking, level = first_ranking(case, part(tell, 0.0, 0.8))
     fit = level.applied(settings.fit)
-    models, rankings = [ranking.base], [ranking]
+    models, rankings, refuted = [ranking.base], [ranking], False
     while True:
         claim, note = claimable(case, rankings[-1], fit, witness, thresholds)
         if claim is None:
+            refuted = note != NOT_SUPPORTED
             break
         if len(models) > 1 and not _told_apart(rankings[-1], claim, settings.probability_least):
             note = (
@@ -100,7 +111,7 @@ def climb(case: Case, witness: Witness, thresholds: Mapping[str, float] | None, 
         told(0.0, f"on top of {claim.hypothesis.label}")
         rankings.append(rank(case, claim, rest, fit, told))
         models[-1] = rankings[-1].base
-    return Climb(models, rankings, level, note)
+    return Climb(models, rankings, level, note, refuted)
 
 
 def _told_apart(ranking: Ranking, claim: Fitted, least: float) -> bool:
@@ -125,12 +136,11 @@ def claimable(
         Why nothing is claimed.
     """
     settings = case.settings
-    nothing = "no further effect is supported by the data"
     if 1 - ranking.probabilities[NOTHING] < settings.probability_least or not ranking.fitted:
-        return None, nothing
+        return None, NOT_SUPPORTED
     top = ranking.ordered()[0]
     if ranking.gain(top) < threshold(top.hypothesis.family, settings.gain_least, thresholds):
-        return None, nothing
+        return None, NOT_SUPPORTED
     stick = yardstick(case, fit, ranking.worthwhile())
     unseen = [held_out(case, f, fit, settings.folds) for f in (ranking.base, top)]
     label = top.hypothesis.labels[-1]

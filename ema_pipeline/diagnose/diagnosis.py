@@ -108,10 +108,10 @@ def _diagnose(
     first, top = climbed.rankings[0], climbed.top
     fit = climbed.level.applied(case.settings.fit)
     ladder = assemble_ladder(
-        case, climbed.models, climbed.level, climbed.note, part(tell, 0.85, 0.93), first.worthwhile()
+        case, climbed.models, climbed.level, climbed.note, part(tell, 0.85, 0.93), climbed.explaining
     )
     ladder = with_frfs(ladder, climbed.models, witness)
-    stick = yardstick(case, fit, [*climbed.models, *first.worthwhile()])
+    stick = yardstick(case, fit, climbed.explaining)
     members = _alike(case, climbed, ladder, stick, witness)
     tell(0.93, "predicting held-out data")
     candidates = _candidates(case, climbed, members, ladder, stick, witness, thresholds)

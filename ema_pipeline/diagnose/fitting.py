@@ -30,7 +30,7 @@ _CLEAR_GAIN = 30.0
 _NEAR = 20.0
 _PROMISE = 3.0
 _STALE = 1.0
-_WIDENED = (30.0, 5.0)
+_WIDE, _WIDENED = 300.0, (30.0, 5.0)
 _HOLDS = 4.0
 
 
@@ -148,7 +148,10 @@ def fit_null(
     problem = case.problem(hypothesis, fit)
     if not any(e.has_shapes for e in problem.evidence):
         problem = case.problem(hypothesis, finer_grid(fit))
-    return judge(case, problem, hypothesis, search(problem, start))
+    found = search(problem, start)
+    if np.any(found.inlier < 0.5) and np.any(found.inlier > 0.5):
+        found = min((found, settle(problem, found.x)), key=lambda o: o.objective)
+    return judge(case, problem, hypothesis, found)
 
 
 def refit(case: Case, hypothesis: Hypothesis, fit: FitSettings, start: Mapping[str, float]) -> Fitted:
@@ -343,8 +346,20 @@ def _near_null(
 
 
 def settle(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
-    """Refine, uncertainties at first widened, so that modes which are off by some do not let go at once."""
-    for scale in _WIDENED:
+    """Refine, uncertainties at first widened, so that modes which are off by some do not let go at once.
+
+    Where modes were lost all the same, a parameter that only they know may be off by its tolerance: once more, then,
+    with uncertainties wide enough for that.
+    """
+    found = _narrowed(problem, x, _WIDENED)
+    if np.all(found.inlier > 0.5):
+        return found
+    again = _narrowed(problem, found.x, (_WIDE, *_WIDENED))
+    return min((found, again), key=lambda o: o.objective)
+
+
+def _narrowed(problem: FitProblem, x: NDArray[np.float64], scales: Sequence[float]) -> Optimum:
+    for scale in scales:
         pairs = problem.assignments(x)
         x = descend(problem.exact(pairs), problem.space, x, problem.mixture(scale), 4).x
     return refine(problem, x)
