@@ -260,12 +260,12 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
         # a start is worth following only where the effect mends something on the way
         promising = [o for o in starts if o.objective < base.latent - _PROMISE]
         candidates += [refine(problem, x) for x in _best_distinct(promising, 2)]
-    if base.lost:
-        candidates += [settle(problem, x) for x in scanned(problem, base.values, moved)]
-    if base.lost and base.annealed:
-        candidates += [settle(problem, x) for x in scanned(problem, base.annealed, moved, 1)]
-    if base.undamped and not dynamic:
+    if base.lost and not dynamic:
         candidates += [settle(problem, x) for x in scanned(problem, base.undamped, moved)]
+    elif base.lost:
+        candidates += [settle(problem, x) for x in scanned(problem, base.values, moved)]
+        if base.annealed:
+            candidates += [settle(problem, x) for x in scanned(problem, base.annealed, moved, 1)]
     rig = make_rig(case.rig, hypothesis, case.library, case.settings.parameter_range)
     if new and base.lost:
         tuned = tuned_sizes(rig, moved, base.values, base.unexplained)
