@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from ema_pipeline.diagnose.fitting import Case, Fitted, fit_null, holds, refit
 from ema_pipeline.diagnose.heldout import held_out
-from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, single_hypotheses
+from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, single_hypotheses
 from ema_pipeline.diagnose.ladder import noise_of, yardstick
 from ema_pipeline.diagnose.noise import NoiseLevel, floors
 from ema_pipeline.diagnose.ranking import Ranking, rank, sharpen
@@ -17,6 +19,7 @@ from ema_pipeline.fit.settings import FitSettings
 
 Progress = Callable[[float, str], None]
 
+_NEAR_BOUND = 1.02
 NOT_SUPPORTED = "no further effect is supported by the data"
 
 
@@ -144,6 +147,8 @@ def claimable(
     stick = yardstick(case, fit, ranking.worthwhile())
     unseen = [held_out(case, f, fit, settings.folds) for f in (ranking.base, top)]
     label = top.hypothesis.labels[-1]
+    if bound := at_bound(case, top):
+        return None, f"{label} would have to be as large as is thought possible ({bound})"
     if not stick.heldout_score(unseen[1]) < stick.heldout_score(unseen[0]):
         before, after = (
             stick.heldout_error(f, out) for f, out in zip((ranking.base, top), unseen, strict=True)
@@ -155,6 +160,22 @@ def claimable(
             f"the FRFs contradict {label}: error {without.error:.3g} before, {with_it.error:.3g} after"
         )
     return top, ""
+
+
+def at_bound(case: Case, f: Fitted) -> str:
+    """What an effect's fit pushes to the end of the range in which it makes sense; empty where nothing is.
+
+    Data that only push a size away do not estimate it.
+    """
+    last = f.hypothesis.labels[-1]
+    parameters = case.problem(f.hypothesis, case.settings.fit).rig.parameters
+    for e in extras(case.rig, Hypothesis((last,)), case.library):
+        p, value = parameters[e.name], f.values.get(e.name)
+        if value is None or p.unit == "deg" or p.minimum <= 0 or not np.isfinite(p.maximum):
+            continue
+        if value <= _NEAR_BOUND * p.minimum or value >= p.maximum / _NEAR_BOUND:
+            return f"{e.name.removeprefix(f'{last}.')} {value:.3g} {p.unit}"
+    return ""
 
 
 def group(case: Case, ranking: Ranking, witness: Witness) -> list[Fitted]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.advice import next_measurement
-from ema_pipeline.diagnose.climbing import Climb, climb, group, part
+from ema_pipeline.diagnose.climbing import Climb, at_bound, climb, group, part
 from ema_pipeline.diagnose.detection import detection_limits
 from ema_pipeline.diagnose.explain import why
 from ema_pipeline.diagnose.fitting import Case, Fitted
@@ -21,7 +21,6 @@ from ema_pipeline.diagnose.screening import Screening, screen
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.thresholds import threshold
 from ema_pipeline.diagnose.types import (
-    OUT_OF_TOLERANCE,
     Candidate,
     Diagnosis,
     Ladder,
@@ -37,7 +36,6 @@ from ema_pipeline.threads import single_blas_thread
 
 Progress = Callable[[float, str], None]
 
-_NEAR_BOUND = 1.02
 _AS_GOOD = 0.9
 
 
@@ -187,9 +185,7 @@ def _candidates(
     first = climbed.rankings[0]
     alike = {f.hypothesis.label for f in members}
     listed = [f for f in first.ordered() if f.hypothesis.label not in added]
-    kept = [
-        f for f in listed if f.hypothesis.label in alike or (sizes(case, f) and not _at_its_bound(case, f))
-    ]
+    kept = [f for f in listed if f.hypothesis.label in alike or (sizes(case, f) and not at_bound(case, f))]
     shown = kept[: max(case.settings.candidates - len(added), 1)]
     shown += [f for f in listed if f not in shown and f.hypothesis.label in alike]
     result: list[Candidate] = []
@@ -253,15 +249,6 @@ def _candidate(
         frf_impacts_better=better,
         frf_impacts=impacts,
     )
-
-
-def _at_its_bound(case: Case, f: Fitted) -> bool:
-    """True for a parameter out of tolerance that the data only push away: its bound is no estimate."""
-    if f.hypothesis.family != OUT_OF_TOLERANCE:
-        return False
-    p = case.problem(f.hypothesis, case.settings.fit).rig.parameters[f.hypothesis.place]
-    value = f.values.get(p.name, p.value)
-    return bool(value <= p.minimum * _NEAR_BOUND or value >= p.maximum / _NEAR_BOUND)
 
 
 def _where(localised: Sequence[Localisation]) -> str:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ema_pipeline.correlate.evidence import CALIBRATED, size_factor
 from ema_pipeline.correlate.measured import MeasuredModes
@@ -54,6 +55,11 @@ def screen(rig: Rig, measured: Mapping[str, MeasuredModes]) -> Screening:
         if not np.all(inside):
             which = ", ".join(f"{f:.0f}" for f in m.frequency_hz[~inside])
             notes.append(f"{c}: beyond the model's reach and left out: {which} Hz")
+        blurred = inside & _not_separated(m)
+        if np.any(blurred):
+            which = ", ".join(f"{f:.1f}" for f in m.frequency_hz[blurred])
+            notes.append(f"{c}: not told apart from a neighbour and left out: {which} Hz")
+            inside &= ~blurred
         kept[c] = subset(m, inside)
         modes += int(np.sum(inside))
         shapes |= m.shapes is not None and bool(m.dofs)
@@ -81,6 +87,18 @@ def screen(rig: Rig, measured: Mapping[str, MeasuredModes]) -> Screening:
     elif not shapes:
         notes.append("frequencies only: effects that shapes would tell apart may look alike")
     return Screening(kept, tuple(notes), too_few)
+
+
+def _not_separated(m: MeasuredModes) -> NDArray[np.bool_]:
+    """Modes within a half-width of another one whose shapes are known to no better than their own size."""
+    if m.shapes is None or m.shape_std is None or not m.dofs or len(m) < 2:
+        return np.zeros(len(m), dtype=bool)
+    with np.errstate(invalid="ignore"):
+        size = np.nanmax(np.abs(m.shapes), axis=1)
+        unknown = np.nanmedian(m.shape_std, axis=1) > size
+    apart = np.abs(m.frequency_hz[:, None] - m.frequency_hz[None, :])
+    np.fill_diagonal(apart, np.inf)
+    return np.asarray(unknown & (np.min(apart, axis=1) < m.frequency_hz * np.nan_to_num(m.damping_ratio)))
 
 
 def _reach(rig: Rig, configuration: str) -> float:

@@ -89,7 +89,9 @@ def _slight_text(case: Case, ranking: Ranking) -> str:
     shown = [
         f
         for f in ranking.fitted
-        if slight(case, f) and ranking.gain(f) > threshold(f.hypothesis.family, case.settings.gain_least)
+        if slight(case, f)
+        and ranking.gain(f) > threshold(f.hypothesis.family, case.settings.gain_least)
+        and any(abs(s.value) > 2 * s.std for s in sizes(case, f).values())
     ]
     if not shown:
         return ""
