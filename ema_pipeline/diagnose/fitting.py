@@ -21,7 +21,7 @@ from ema_pipeline.fit.latent import LatentObjective
 from ema_pipeline.fit.map_fit import posterior_covariance
 from ema_pipeline.fit.matrices import MatrixFamily
 from ema_pipeline.fit.settings import FitSettings
-from ema_pipeline.fit.solve import FitProblem, Optimum, descend, prepare, refine, search
+from ema_pipeline.fit.solve import FitProblem, Mixture, Optimum, descend, prepare, refine, search
 from ema_pipeline.fit.space import Space
 from ema_pipeline.rigs.types import Rig
 
@@ -30,8 +30,10 @@ _CLEAR_GAIN = 30.0
 _NEAR = 20.0
 _PROMISE = 3.0
 _STALE = 1.0
-_WIDE, _WIDENED = 300.0, (30.0, 5.0)
+_WIDE, _WIDENED = 3e-2, (3e-3, 5e-4)
+"""Relative errors of frequency that widened uncertainties allow, whatever the noise level."""
 _HOLDS = 4.0
+_FINEST = 1e-6
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,12 @@ def fit_null(
 def refit(case: Case, hypothesis: Hypothesis, fit: FitSettings, start: Mapping[str, float]) -> Fitted:
     """Fit from one starting point."""
     problem = case.problem(hypothesis, fit)
-    return judge(case, problem, hypothesis, honest(problem, settle(problem, problem.space.point(start))))
+    x = problem.space.point(start)
+    straight = honest(problem, refine(problem, x))
+    if np.all(straight.inlier > 0.5):
+        return judge(case, problem, hypothesis, straight)
+    found = min((straight, honest(problem, settle(problem, x))), key=lambda o: o.objective)
+    return judge(case, problem, hypothesis, found)
 
 
 def follow(case: Case, fitted: Fitted, fit: FitSettings) -> Fitted:
@@ -358,18 +365,23 @@ def settle(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
     return min((found, again), key=lambda o: o.objective)
 
 
-def _narrowed(problem: FitProblem, x: NDArray[np.float64], scales: Sequence[float]) -> Optimum:
-    for scale in scales:
+def _narrowed(problem: FitProblem, x: NDArray[np.float64], errors: Sequence[float]) -> Optimum:
+    for error in errors:
         pairs = problem.assignments(x)
-        x = descend(problem.exact(pairs), problem.space, x, problem.mixture(scale), 4).x
+        x = descend(problem.exact(pairs), problem.space, x, _allowing(problem, error), 4).x
     return refine(problem, x)
+
+
+def _allowing(problem: FitProblem, error: float) -> Mixture:
+    """All uncertainties widened by what a relative error of frequency needs."""
+    return problem.mixture(max(error / max(problem.settings.frequency_floor, _FINEST), 1.0))
 
 
 def _first_steps(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
     found = None
-    for scale in (_WIDENED[0], 1.0):
+    for mixture in (_allowing(problem, _WIDENED[0]), problem.mixture()):
         pairs = problem.assignments(x)
-        found = descend(problem.exact(pairs), problem.space, x, problem.mixture(scale), 3)
+        found = descend(problem.exact(pairs), problem.space, x, mixture, 3)
         x = found.x
     assert found is not None
     return found

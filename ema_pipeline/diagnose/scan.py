@@ -6,6 +6,7 @@ pull. With uncertainties widened they do, and the most likely size at the base m
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import product
 
@@ -15,11 +16,11 @@ from numpy.typing import NDArray
 from ema_pipeline.diagnose.hypotheses import Extra
 from ema_pipeline.fit.solve import FitProblem
 
-_WIDENED, _DAMPING_WIDENED = 30.0, 5.0
-"""Damping ratios are known to a few per cent only: widened thirty times, they would say nothing."""
+_FREQUENCY, _DAMPING = 3e-3, 0.15
+"""Relative errors of frequency and damping that the widened uncertainties allow, whatever the noise level."""
 _REACH = 300.0
 """Sizes are tried from a start over to a start times this much, in steps of a factor of two or so."""
-_SINGLE, _SEVERAL = 17, 6
+_SINGLE = 17
 _FINER = (0.6, 0.8, 1.25, 1.6)
 _MOST = 80
 _PROMISE = 3.0
@@ -47,7 +48,9 @@ def scanned(
     list of ndarray, (P,)
         The most likely first.
     """
-    axes = [_axis(problem, e, _SINGLE if len(moved) == 1 else _SEVERAL) for e in moved]
+    given = math.prod(len(e.starts) for e in moved if e.scale == 0)
+    count_each = max(min(_SINGLE, int((_MOST / given) ** (1 / max(sum(e.scale > 0 for e in moved), 1)))), 3)
+    axes = [_axis(problem, e, count_each) for e in moved]
     least = np.inf
     if any(e.scale > 0 for e in moved):
         absent = tuple(_smallest(axis, e) for axis, e in zip(axes, moved, strict=True))
@@ -136,7 +139,9 @@ def _cost(
 ) -> float:
     x = _point(problem, base, moved, sizes)
     damping_only = all(problem.damping_only[problem.space.names.index(e.name)] for e in moved)
-    mixture = problem.mixture(_DAMPING_WIDENED if damping_only else _WIDENED)
+    s = problem.settings
+    widened = (_DAMPING, s.damping_floor) if damping_only else (_FREQUENCY, s.frequency_floor)
+    mixture = problem.mixture(max(widened[0] / max(widened[1], 1e-6), 1.0))
     costs = problem.exact(problem.assignments(x)).costs(x)
     return float(np.sum(mixture.robust(costs)))
 
