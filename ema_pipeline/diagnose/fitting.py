@@ -34,6 +34,7 @@ _WIDE, _WIDENED = 3e-2, (3e-3, 5e-4)
 """Relative errors of frequency that widened uncertainties allow, whatever the noise level."""
 _HOLDS = 4.0
 _FINEST = 1e-6
+_SHARES = (0.05, 0.3)
 
 
 @dataclass(frozen=True)
@@ -273,6 +274,8 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
         candidates += [settle(problem, x) for x in scanned(problem, base.values, moved)]
         if base.annealed:
             candidates += [settle(problem, x) for x in scanned(problem, base.annealed, moved, 1)]
+    if base.lost and dynamic and not np.isfinite(base.latent):
+        candidates += [settle(problem, space.point({**base.values, **p})) for p in _one_sided_points(moved)]
     rig = make_rig(case.rig, hypothesis, case.library, case.settings.parameter_range)
     if new and base.lost:
         tuned = tuned_sizes(rig, moved, base.values, base.unexplained)
@@ -319,6 +322,21 @@ def _best_distinct(found: Sequence[Optimum], count: int) -> list[NDArray[np.floa
         if len(kept) == count:
             break
     return kept
+
+
+def _one_sided_points(moved: Sequence[Extra]) -> list[dict[str, float]]:
+    """Sizes of effects of one sign, small shares of clearly visible ones.
+
+    Where a spring is stiffer one way, the base model has made it stiffer both ways: no scan at its values shows
+    what a fit of all parameters does.
+    """
+    sized = [e for e in moved if e.scale > 0 and e.one_sided]
+    return [
+        {**point, **{e.name: e.null + share * (point[e.name] - e.null) for e in sized}}
+        for point in starting_points(moved)
+        for share in _SHARES
+        if sized
+    ]
 
 
 def _null_corners(moved: Sequence[Extra], space: Space) -> list[dict[str, float]]:
