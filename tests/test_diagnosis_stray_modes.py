@@ -204,6 +204,9 @@ def test_the_size_of_mass_normalised_shapes_is_a_datum_with_the_accuracy_of_the_
         # modes that overlap are known four times worse
         np.testing.assert_allclose(e.size_weight[~alone], 5.0, rtol=0.05)
     assert not np.any(gather(replace(m, scaled=False), system, settings).size_weight)
+    turning = m.shapes.astype(complex)
+    turning[0, 1::2] *= 1j
+    assert gather(replace(m, shapes=turning), system, settings).size_weight[0] < 5
 
 
 def test_a_wrong_sensitivity_is_named_and_no_physics_is_read_from_it() -> None:

@@ -110,7 +110,7 @@ def gather(measured: MeasuredModes, system: LinearSystem, settings: UncertaintyS
         log_size = np.log(size[:, 0])
         factor = size_factor(m, system)
         trusted = m.scaled and bool(abs(np.log(factor)) < CALIBRATED)
-        size_weight = _size_weight(m, settings, weight) if trusted else np.zeros(len(m))
+        size_weight = _size_weight(m, settings, shapes, weight) if trusted else np.zeros(len(m))
     return Evidence(
         measured=m,
         rows=rows,
@@ -150,11 +150,15 @@ def size_factor(m: MeasuredModes, system: LinearSystem) -> float:
 
 
 def _size_weight(
-    m: MeasuredModes, settings: UncertaintySettings, weight: NDArray[np.float64]
+    m: MeasuredModes,
+    settings: UncertaintySettings,
+    shapes: NDArray[np.complex128],
+    weight: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """1/std of the logarithm of the size of mass-normalised shapes; 0 where it is not known.
 
-    Modes that overlap share their residues: what one of them has too much the other lacks.
+    Modes that overlap share their residues: what one of them has too much the other lacks. A mode whose points move out
+    of phase has no one size: its modal mass is complex, and with gyroscopic forces its left shape is another one.
     """
     if settings.scale_floor <= 0:
         return np.zeros(len(m))
@@ -165,4 +169,6 @@ def _size_weight(
     apart = np.abs(f[:, None] - f[None, :]) + np.where(np.eye(len(m), dtype=bool), np.inf, 0.0)
     overlaps = np.min(apart, axis=1, initial=np.inf) < width
     floor = np.where(overlaps, _OVERLAPPING * settings.scale_floor, settings.scale_floor)
-    return np.asarray(1 / np.hypot(floor, scatter))
+    power = np.maximum(np.sum(np.abs(shapes) ** 2, axis=1), 1e-300)
+    out_of_phase = 1 - np.abs(np.sum(shapes**2, axis=1)) / power
+    return np.asarray(1 / np.sqrt(floor**2 + scatter**2 + out_of_phase**2))
