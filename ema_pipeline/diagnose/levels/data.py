@@ -134,7 +134,7 @@ class HitWindows:
     def shortened(self, share: float) -> HitWindows:
         """The first part of the windows, `_LEAST_S` of it at least."""
         least = round(_LEAST_S * self.sample_rate_hz)
-        n = min(max(int(share * self.force.shape[1]), least), self.force.shape[1])
+        n = _quick_length(min(max(int(share * self.force.shape[1]), least), self.force.shape[1]))
         return replace(self, force=self.force[:, :n], measured=self.measured[..., :n])
 
     def only(self, keep: NDArray[np.bool_]) -> HitWindows:
@@ -150,6 +150,11 @@ class HitWindows:
             present=self.present[keep],
             noise=self.noise[keep],
         )
+
+
+def _quick_length(samples: int) -> int:
+    """The longest window of at most so many samples whose spectra are quickly found."""
+    return int(scipy.fft.prev_fast_len(samples, real=True))
 
 
 def _smoothed(f: NDArray[np.float64], power: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -201,7 +206,7 @@ def hit_windows(
             taken.add(key)
             chosen.append(_window(record, hit, levels[name], length_s))
     rate = chosen[0].record.sample_rate_hz
-    length = min(w.force.size for w in chosen)
+    length = _quick_length(min(w.force.size for w in chosen))
     sensors = tuple(dict.fromkeys((str(c.dof), c.quantity) for w in chosen for c in w.record.channels))
     at = {s: i for i, s in enumerate(sensors)}
     measured = np.zeros((len(chosen), len(sensors), length))

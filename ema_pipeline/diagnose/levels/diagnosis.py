@@ -123,7 +123,7 @@ def _diagnose(
         error=before.error,
         heldout_error=before.heldout_error,
         ladder=ladder,
-        detection_limits=_limits(climbed) if verdict != "unknown_effect" else (),
+        detection_limits=_limits(climbed) if _holds(climbed) else (),
         notes=(
             *((summary,) if summary else ()),
             *(linear.notes if linear is not None else ()),

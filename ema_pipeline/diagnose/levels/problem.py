@@ -112,12 +112,15 @@ class Whitening:
 
     def applied(self, simulated: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Weighted differences for simulated lines (B, n_hits, n_sensors, n_lines)."""
-        r = (simulated - self.measured) * self.scale
-        for point in range(len(self.taken)):
-            at = np.flatnonzero(self.point == point)
-            along = np.sum(self.common[at].conj() * r[:, at], axis=1) * self.taken[point]
-            r[:, at] -= along[:, None] * self.common[at]
-        return np.asarray(r * self.worth)
+        r = simulated - self.measured  # changed in place: it is large
+        r *= self.scale
+        for point, taken in enumerate(self.taken):
+            hits = [(r[:, i], self.common[i]) for i in np.flatnonzero(self.point == point)]
+            along = sum(own * common.conj() for own, common in hits) * taken
+            for own, common in hits:
+                own -= along * common
+        r *= self.worth
+        return np.asarray(r)
 
 
 @dataclass(frozen=True)

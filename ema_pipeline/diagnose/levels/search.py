@@ -18,7 +18,7 @@ from ema_pipeline.diagnose.hypotheses import (
     starting_points,
 )
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, judged, level_hypotheses, size_grid, sized
-from ema_pipeline.diagnose.levels.problem import NoiseFloor, fit, objectives, weighted
+from ema_pipeline.diagnose.levels.problem import NoiseFloor, TimeFit, fit, objectives, weighted
 from ema_pipeline.diagnose.pool import spread
 
 Progress = Callable[[float, str], None]
@@ -27,7 +27,10 @@ _FOLLOWED = 2
 _HELPS = 0.5
 _APART = 0.3
 _NEAR = 0.005
+_ALIKE = 0.02
 _AGAIN = 6
+_HOPELESS = 100.0
+"""A fit whose -2 log evidence is worse than the best one's by this is not followed as the floor of the noise moves."""
 _GROWING = (0.05, 0.15)
 """Shares of the windows: far from the right frequencies, or where parts strike, long ones have no slope to follow."""
 _STEPS = 8
@@ -42,45 +45,75 @@ def fit_base(
     case: LevelCase, hypothesis: Hypothesis, floor: NoiseFloor, sizes: Mapping[str, float]
 ) -> Simulated:
     """The best fit of a model from all of the case's starts."""
-    found = [follow(case, hypothesis, sizes, {**s, **sizes}, floor) for s in _distinct_starts(case.starts)]
-    best = again(case.coarse(), min(found, key=lambda f: f.fit.objective), floor, _MOST_STEPS)
+    begun = [(sizes, {**s, **sizes}) for s in _distinct_starts(case.starts)]
+    best = again(case.coarse(), follow(case, hypothesis, begun, floor), floor, _MOST_STEPS)
     return again(case, best, floor, _MOST_STEPS)
 
 
 def follow(
     case: LevelCase,
     hypothesis: Hypothesis,
-    sizes: Mapping[str, float],
-    values: Mapping[str, float],
+    begun: Sequence[tuple[Mapping[str, float], Mapping[str, float]]],
     floor: NoiseFloor,
 ) -> Simulated:
-    """A fit that begins on the first part of the windows after softer hits and follows the optimum as they grow.
+    """The best of fits that begin on the first part of the windows after softer hits and follow it as they grow.
 
-    Where parts strike there are many optima side by side, so that neighbouring sizes are tried at every stage.
+    Fits that have met by then are followed to the end once.
 
     Parameters
     ----------
     case : LevelCase
     hypothesis : Hypothesis
-    sizes : mapping of str to float
-        Typical values of its effects' parameters.
-    values : mapping of str to float
-        Where the fit begins.
+    begun : sequence of (mapping of str to float, mapping of str to float)
+        Typical values of the effects' parameters, and all values where a fit begins.
     floor : NoiseFloor
     """
     last = hypothesis.labels[-1] if hypothesis.labels else ""
-    first = [n for n in sizes if n.rpartition(".")[0] == last][:1]
-    soft = case.softer().beginning(_GROWING[-1])
-    now = dict(values)
-    for part in (soft, *(case.beginning(share) for share in _GROWING), case.coarse()):
-        problem, weights = part.problem(hypothesis, sizes), part.weights(floor)
-        x = np.array([problem.space.point(now)])
-        for name in first:
-            x = np.array([problem.space.point({**now, name: now[name] * k}) for k in _NEIGHBOURS])
-            x = x[[np.argmin(objectives(problem, weights, x))]]
-        found = fit(problem, weights, x[0], _STEPS)
-        now = found.values
-    return judged(problem, hypothesis, sizes, found)
+    parts = (case.softer().beginning(_GROWING[-1]), *(case.beginning(share) for share in _GROWING))
+    grown: list[tuple[Mapping[str, float], TimeFit]] = []
+    for sizes, values in begun:
+        now = values
+        for part in parts:
+            found = _stage(part, hypothesis, sizes, now, floor)
+            now = found.values
+        own = [n for n in sizes if n.rpartition(".")[0] == last][:1]
+        if not any(_met(found, other, own) for _, other in grown):
+            grown.append((sizes, found))
+    whole = case.coarse()
+    ends = [
+        judged(
+            whole.problem(hypothesis, sizes),
+            hypothesis,
+            sizes,
+            _stage(whole, hypothesis, sizes, found.values, floor),
+        )
+        for sizes, found in grown
+    ]
+    return min(ends, key=lambda m: m.fit.objective)
+
+
+def _met(one: TimeFit, other: TimeFit, own: Sequence[str]) -> bool:
+    """True for fits of the same windows that ended at one place."""
+    apart = abs(one.objective - other.objective)
+    near = all(abs(one.values[n] - other.values[n]) <= _ALIKE * abs(other.values[n]) for n in own)
+    return near and apart <= _ALIKE * (1 + min(one.objective, other.objective))
+
+
+def _stage(
+    case: LevelCase,
+    hypothesis: Hypothesis,
+    sizes: Mapping[str, float],
+    values: Mapping[str, float],
+    floor: NoiseFloor,
+) -> TimeFit:
+    """A fit from the best of neighbouring sizes: where parts strike there are many optima side by side."""
+    last = hypothesis.labels[-1] if hypothesis.labels else ""
+    problem, weights = case.problem(hypothesis, sizes), case.weights(floor)
+    x = np.array([problem.space.point(values)])
+    for name in [n for n in sizes if n.rpartition(".")[0] == last][:1]:
+        x = np.array([problem.space.point({**values, name: values[name] * k}) for k in _NEIGHBOURS])
+        x = x[[np.argmin(objectives(problem, weights, x))]]
+    return fit(problem, weights, x[0], _STEPS)
 
 
 def again(case: LevelCase, model: Simulated, floor: NoiseFloor, steps: int = _AGAIN) -> Simulated:
@@ -108,16 +141,13 @@ def fit_effect(case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: 
         *_competing(case.softer().beginning(_GROWING[-1]), hypothesis, base, starts, most, _DENSE),
         *_competing(case.rough(), hypothesis, base, starts, floor, _SPARSE),
     ]
-    best: Simulated | None = None
+    begun = []
     for t in chosen:
         own = sized(case, hypothesis, t.sizes)
-        begin = {**base.values, **starts[t.start], **own}
-        model = follow(case, hypothesis, {**base.sizes, **own}, begin, floor)
-        if best is None or model.fit.objective < best.fit.objective:
-            best = model
-    if best is None:
+        begun.append(({**base.sizes, **own}, {**base.values, **starts[t.start], **own}))
+    if not begun:
         raise AssertionError(f"no size of {hypothesis.label} can be simulated")
-    return best
+    return follow(case, hypothesis, begun, floor)
 
 
 def _competing(
@@ -154,8 +184,7 @@ def fit_linear(
     if not np.any(np.isfinite(tried)):
         return None
     order = [int(k) for k in np.argsort(tried)[:_FOLLOWED] if np.isfinite(tried[k])]
-    found = [follow(case, hypothesis, base.sizes, starts[k], floor) for k in order]
-    return min(found, key=lambda f: f.fit.objective)
+    return follow(case, hypothesis, [(base.sizes, starts[k]) for k in order], floor)
 
 
 class _Tried(NamedTuple):
@@ -314,10 +343,18 @@ def polished(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor) -> Level
 
 
 def at_floor(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor, tell: Progress) -> LevelRanking:
-    """The same ranking at another floor, every fit from its own optimum; those without a solution left out."""
+    """The same ranking at another floor, every fit from its own optimum; those without a solution left out.
+
+    Those that cannot come back are judged where they are.
+    """
     models = [ranking.base, *ranking.fitted]
+    least = min(m.evidence for m in models) + _HOPELESS
+
+    def job(m: Simulated) -> Simulated:
+        return again(case, m, floor, _AGAIN if m is ranking.base or m.evidence < least else 0)
+
     fitted = []
-    for f in spread(lambda m: again(case, m, floor), models, case.settings.processes):
+    for f in spread(job, models, case.settings.processes):
         fitted.append(f)
         tell(len(fitted) / len(models), f.hypothesis.label)
     return LevelRanking(case, fitted[0], [m for m in fitted[1:] if np.isfinite(m.fit.objective)])
