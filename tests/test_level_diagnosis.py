@@ -205,6 +205,8 @@ def test_linear_hits_make_no_effect_probable() -> None:
     assert not any(c.claimed for c in found.candidates)
     assert found.verdict not in ("effect", "ambiguous")
     assert found.null_probability > 0.4  # effects too small to be seen stay possible
+    limits = {x.label: x.size for x in found.detection_limits}
+    assert 0 < limits["bearing_cubic@hub"] < 2e11  # what the other tests hide would have been seen
 
 
 def test_a_model_that_has_the_effect_already_lacks_nothing() -> None:
@@ -236,6 +238,25 @@ def test_an_error_alike_at_all_levels_weighs_little_and_one_at_one_level_weighs_
     single[2] *= 1.05
     one = weight.applied(single[None])
     assert np.sum(np.abs(one) ** 2) > 20 * np.sum(np.abs(alike) ** 2)
+
+
+def test_weighing_is_by_the_inverse_of_the_covariance_of_both_errors() -> None:
+    w = windows()
+    floor = NoiseFloor(0.01, 0.1)
+    (weight,) = whitenings([w], floor, 2.0)
+    simulated = 1.02 * w.spectra(np.roll(w.measured, 1, axis=-1), weight.fade_s)
+    sigma, size, _ = w.sigma(weight.fade_s, floor.own)
+    at = [i for i, d in enumerate(w.impacts) if str(d) == str(w.impacts[0])]
+    force = w.spectra(w.force, weight.fade_s)
+    sensor, line = np.unravel_index(np.argmax(weight.worth[at].min(axis=0)), weight.worth.shape[1:])
+    own = sigma[at, sensor, line]
+    per_newton = size[at, sensor, line].sum() / np.abs(force[at, line]).sum()
+    common = floor.common * per_newton * force[at, line]
+    covariance = np.diag(own**2) + np.outer(common, common.conj())
+    difference = (simulated - weight.measured)[at, sensor, line]
+    expected = (difference.conj() @ np.linalg.solve(covariance, difference)).real
+    got = weight.applied(simulated[None])[0][at, sensor, line] / weight.worth[at, sensor, line]
+    assert np.sum(np.abs(got) ** 2) == pytest.approx(expected, rel=1e-9)
 
 
 def test_misfit_is_the_missed_share_of_the_signal() -> None:
