@@ -231,6 +231,9 @@ def ground(case: Case, base: Fitted, fit: FitSettings) -> Ground:
 def _undamped(case: Case, base: Fitted, fit: FitSettings) -> dict[str, float]:
     problem = case.problem(base.hypothesis, fit.model_copy(update={"damping": False}))
     found = settle(problem, problem.space.point(base.values))
+    if np.any(found.inlier < 0.5):
+        # what only the lost modes know may be anywhere: a mesh that no other mode strains
+        found = min((found, search(problem, base.values)), key=lambda o: o.objective)
     return {**base.values, **problem.space.named(found.x), **_damping_values(problem, base)}
 
 
