@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.diagnose.descents import best_distinct, descend_rungs, first_steps, honest, settle
 from ema_pipeline.diagnose.frequencies import finer_grid, searched_starts
 from ema_pipeline.diagnose.hypotheses import Extra, Hypothesis, extras, make_rig, starting_points
 from ema_pipeline.diagnose.scan import likeliest, scanned
@@ -17,23 +18,17 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.tuned import tuned_sizes
 from ema_pipeline.diagnose.weighing import lonely_cost, missed_modes, mixing_volume, occam
 from ema_pipeline.effects.library import Library
-from ema_pipeline.fit.latent import LatentObjective
 from ema_pipeline.fit.map_fit import posterior_covariance
 from ema_pipeline.fit.matrices import MatrixFamily
 from ema_pipeline.fit.settings import FitSettings
-from ema_pipeline.fit.solve import FitProblem, Mixture, Optimum, descend, prepare, refine, search
+from ema_pipeline.fit.solve import FitProblem, Optimum, prepare, refine, search
 from ema_pipeline.fit.space import Space
 from ema_pipeline.rigs.types import Rig
 
-_TAU_RUNGS = (0.1, 0.02, 0.004)
 _CLEAR_GAIN = 30.0
 _NEAR = 20.0
 _PROMISE = 3.0
-_STALE = 1.0
-_WIDE, _WIDENED = 3e-2, (3e-3, 5e-4)
-"""Relative errors of frequency that widened uncertainties allow, whatever the noise level."""
 _HOLDS = 4.0
-_FINEST = 1e-6
 _SHARES = (0.05, 0.3)
 
 
@@ -224,7 +219,7 @@ def ground(case: Case, base: Fitted, fit: FitSettings) -> Ground:
     x = problem.space.point(base.values)
     nominal = np.where(problem.space.has_prior, 0.0, x)
     starts = (x, nominal, problem.space.point())
-    best = min((_descend_rungs(problem, start) for start in starts), key=lambda o: o.objective)
+    best = min((descend_rungs(problem, start) for start in starts), key=lambda o: o.objective)
     return Ground(base.values, base.objective, best.objective, lost, problem.space.named(best.x), undamped)
 
 
@@ -267,10 +262,10 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
         for point in starting_points(moved):
             # from the nominal values: those of a failing base model are bent by what it is missing
             start = np.where(space.has_prior, 0.0, space.point({**base.values, **point}))
-            starts.append(_descend_rungs(problem, start))
+            starts.append(descend_rungs(problem, start))
         # a start is worth following only where the effect mends something on the way
         promising = [o for o in starts if o.objective < base.latent - _PROMISE]
-        candidates += [refine(problem, x) for x in _best_distinct(promising, 2)]
+        candidates += [refine(problem, x) for x in best_distinct(promising, 2)]
     if base.lost and not dynamic:
         candidates += [settle(problem, x) for x in scanned(problem, base.undamped, moved)]
     elif base.lost:
@@ -294,37 +289,10 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
             for point in _null_corners(moved, space)
         ]
         if len(near) > 1:
-            near = _best_distinct([_first_steps(problem, x) for x in near], 2)
+            near = best_distinct([first_steps(problem, x) for x in near], 2)
         candidates += [refine(problem, x) for x in near]
     best = min((honest(problem, o) for o in candidates), key=lambda o: o.objective)
     return judge(case, problem, hypothesis, best)
-
-
-def honest(problem: FitProblem, found: Optimum) -> Optimum:
-    """The optimum with the pairs that its own parameters give.
-
-    A fit with held pairs may drive a mode that it is paired with out of the sensors' sight, where mixed with its
-    neighbours it fits anything. Paired anew there, the measured mode has lost its partner and shows it.
-    """
-    objective = problem.exact(problem.assignments(found.x))
-    costs = objective.costs(found.x)
-    mixture = problem.mixture()
-    prior = problem.space.has_prior
-    value = float(np.sum(mixture.robust(costs)) + np.sum(found.x[prior] ** 2))
-    if value <= found.objective + _STALE:
-        return found
-    return replace(found, objective=value, costs=costs, inlier=mixture.inlier(costs))
-
-
-def _best_distinct(found: Sequence[Optimum], count: int) -> list[NDArray[np.float64]]:
-    """Points of the lowest optima that differ by more than a tolerance somewhere."""
-    kept: list[NDArray[np.float64]] = []
-    for o in sorted(found, key=lambda o: o.objective):
-        if all(np.max(np.abs(o.x - k)) > 0.5 for k in kept):
-            kept.append(o.x)
-        if len(kept) == count:
-            break
-    return kept
 
 
 def _one_sided_points(moved: Sequence[Extra]) -> list[dict[str, float]]:
@@ -371,51 +339,6 @@ def _near_null(
             break
         share *= 0.2
     return x
-
-
-def settle(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
-    """Refine, uncertainties at first widened, so that modes which are off by some do not let go at once.
-
-    Where modes were lost all the same, a parameter that only they know may be off by its tolerance: once more, then,
-    with uncertainties wide enough for that.
-    """
-    found = _narrowed(problem, x, _WIDENED)
-    if np.all(found.inlier > 0.5):
-        return found
-    again = _narrowed(problem, found.x, (_WIDE, *_WIDENED))
-    return min((found, again), key=lambda o: o.objective)
-
-
-def _narrowed(problem: FitProblem, x: NDArray[np.float64], errors: Sequence[float]) -> Optimum:
-    for error in errors:
-        pairs = problem.assignments(x)
-        x = descend(problem.exact(pairs), problem.space, x, _allowing(problem, error), 4).x
-    return refine(problem, x)
-
-
-def _allowing(problem: FitProblem, error: float) -> Mixture:
-    """All uncertainties widened by what a relative error of frequency needs."""
-    return problem.mixture(max(error / max(problem.settings.frequency_floor, _FINEST), 1.0))
-
-
-def _first_steps(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
-    found = None
-    for mixture in (_allowing(problem, _WIDENED[0]), problem.mixture()):
-        pairs = problem.assignments(x)
-        found = descend(problem.exact(pairs), problem.space, x, mixture, 3)
-        x = found.x
-    assert found is not None
-    return found
-
-
-def _descend_rungs(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
-    mixture = problem.mixture()
-    found = None
-    for tau in _TAU_RUNGS:
-        found = descend(LatentObjective(problem.evidence, tau), problem.space, x, mixture, 6)
-        x = found.x
-    assert found is not None
-    return found
 
 
 def judge(case: Case, problem: FitProblem, hypothesis: Hypothesis, found: Optimum) -> Fitted:
