@@ -18,6 +18,14 @@ _WIDE, _WIDENED = 3e-2, (3e-3, 5e-4)
 _FINEST = 1e-6
 
 
+def straight(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
+    """Refine as it stands; settle too where modes are lost on the way."""
+    found = honest(problem, refine(problem, x))
+    if np.all(found.inlier > 0.5):
+        return found
+    return min((found, honest(problem, settle(problem, x))), key=lambda o: o.objective)
+
+
 def settle(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
     """Refine, uncertainties at first widened, so that modes which are off by some do not let go at once.
 

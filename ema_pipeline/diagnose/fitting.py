@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
-from ema_pipeline.diagnose.descents import best_distinct, descend_rungs, first_steps, honest, settle
+from ema_pipeline.diagnose.descents import best_distinct, descend_rungs, first_steps, honest, settle, straight
 from ema_pipeline.diagnose.frequencies import finer_grid, searched_starts
 from ema_pipeline.diagnose.hypotheses import Extra, Hypothesis, extras, make_rig, starting_points
 from ema_pipeline.diagnose.scan import likeliest, scanned
@@ -155,12 +155,7 @@ def fit_null(
 def refit(case: Case, hypothesis: Hypothesis, fit: FitSettings, start: Mapping[str, float]) -> Fitted:
     """Fit from one starting point."""
     problem = case.problem(hypothesis, fit)
-    x = problem.space.point(start)
-    straight = honest(problem, refine(problem, x))
-    if np.all(straight.inlier > 0.5):
-        return judge(case, problem, hypothesis, straight)
-    found = min((straight, honest(problem, settle(problem, x))), key=lambda o: o.objective)
-    return judge(case, problem, hypothesis, found)
+    return judge(case, problem, hypothesis, straight(problem, problem.space.point(start)))
 
 
 def follow(case: Case, fitted: Fitted, fit: FitSettings) -> Fitted:
@@ -265,10 +260,11 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
             starts.append(descend_rungs(problem, start))
         # a start is worth following only where the effect mends something on the way
         promising = [o for o in starts if o.objective < base.latent - _PROMISE]
-        candidates += [refine(problem, x) for x in best_distinct(promising, 2)]
-    if base.lost and not dynamic:
-        candidates += [settle(problem, x) for x in scanned(problem, base.undamped, moved)]
-    elif base.lost:
+        candidates += [straight(problem, x) for x in best_distinct(promising, 2)]
+    if base.lost:
+        if not dynamic:
+            candidates += [settle(problem, x) for x in scanned(problem, base.undamped, moved)]
+        # strong gyroscopic coupling moves frequencies too
         candidates += [settle(problem, x) for x in scanned(problem, base.values, moved)]
         if base.annealed:
             candidates += [settle(problem, x) for x in scanned(problem, base.annealed, moved, 1)]
