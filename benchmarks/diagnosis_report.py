@@ -100,7 +100,8 @@ def _effects(single: list[Line], twins: dict[int, Line]) -> list[str]:
         told = Counter(outcome(line) for line in above)
         found = told["right"] + told["group"] + told["right and more"]
         smallest = min(
-            (min(sizes(line).values()) for line in own if outcome(line) in ("right", "group")), default=np.nan
+            (next(iter(sizes(line).values())) for line in own if outcome(line) in ("right", "group")),
+            default=np.nan,
         )
         wrong = sum(outcome(line) == "wrong" for line in own)
         out.append(
