@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from simulate_levels import Case, hits_of
+from test_levels import LINEAR
 
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
@@ -24,17 +25,7 @@ from ema_pipeline.stages.base import Run
 from ema_pipeline.stages.levels import with_circles
 from ema_pipeline.stages.modes import measured_frfs, measured_modes
 
-CASE = Case(
-    frequency_hz=np.array([80.0, 130.0, 215.0]),
-    damping=np.array([0.008, 0.006, 0.01]),
-    shapes=np.array([[1.0, 0.6, -0.4, 0.8], [0.7, -1.0, 0.5, 0.3], [-0.5, 0.8, 1.0, 0.6]]),
-    n_points=2,
-    forces_n=np.array([20.0, 60.0, 180.0]),
-    hits_per_level=2,
-    noise=1e-3,
-    hammer_noise=1e-4,
-    hand=0.1,
-)
+CASE = replace(LINEAR, noise=1e-3)
 
 
 def studied(case: Case, seed: int) -> tuple[LevelStudy, ModalModel, FrfSet]:

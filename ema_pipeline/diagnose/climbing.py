@@ -9,7 +9,7 @@ import numpy as np
 
 from ema_pipeline.diagnose.fitting import Case, Fitted, fit_null, holds, refit
 from ema_pipeline.diagnose.heldout import held_out
-from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, single_hypotheses
+from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, make_rig, single_hypotheses
 from ema_pipeline.diagnose.ladder import noise_of, yardstick
 from ema_pipeline.diagnose.noise import NoiseLevel, floors
 from ema_pipeline.diagnose.ranking import Ranking, rank, sharpen
@@ -168,7 +168,7 @@ def at_bound(case: Case, f: Fitted) -> str:
     Data that only push a size away do not estimate it.
     """
     last = f.hypothesis.labels[-1]
-    parameters = case.problem(f.hypothesis, case.settings.fit).rig.parameters
+    parameters = make_rig(case.rig, f.hypothesis, case.library, case.settings.parameter_range).parameters
     for e in extras(case.rig, Hypothesis((last,)), case.library):
         p, value = parameters[e.name], f.values.get(e.name)
         if value is None or p.unit == "deg" or p.minimum <= 0 or not np.isfinite(p.maximum):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -176,22 +176,17 @@ def single_hypotheses(
     made = rig_with_effects(rig, base.effects, library)
     directions: list[NDArray[np.float64]] = []
     chosen: list[Hypothesis] = []
-    for effect_id in sorted(known):
-        effect = known[effect_id]
-        if effect_id in GENERIC or not effect.linear:
+    for effect_id, place in _named_physics(made, configurations, known):
+        label = f"{effect_id}@{place}"
+        if label in base.labels:
             continue
-        places = dict.fromkeys(p for c in configurations for p in effect.find_places(made.assembly(c)))
-        for place in places:
-            label = f"{effect_id}@{place}"
-            if label in base.labels:
-                continue
-            direction = _direction(made, configurations, effect, place)
-            if direction is None:
-                continue
-            if direction.size and any(_alike(direction, d) for d in directions):
-                continue
-            directions.append(direction)
-            chosen.append(base.plus(label))
+        direction = _direction(made, configurations, known[effect_id], place)
+        if direction is None:
+            continue
+        if direction.size and any(_alike(direction, d) for d in directions):
+            continue
+        directions.append(direction)
+        chosen.append(base.plus(label))
     if parameters:
         used = {n for c in configurations for n in rig.used(c)}
         for name, p in rig.parameters.items():
@@ -218,7 +213,6 @@ def same_physics(
     known = shipped_effects() if library is None else library
     if hypothesis.family not in known:
         return ()
-    last = hypothesis.labels[-1]
     made = rig_with_effects(rig, Hypothesis(hypothesis.labels[:-1]).effects, library)
     effect = known[hypothesis.family]
     own = _direction(made, configurations, effect, hypothesis.place)
@@ -226,21 +220,29 @@ def same_physics(
         return ()
     sign = np.sign(size - effect.parameters[0].null)
     found = []
-    for other_id, other in sorted(known.items()):
-        if other_id in GENERIC or not other.linear:
+    for other_id, place in _named_physics(made, configurations, known):
+        label = f"{other_id}@{place}"
+        if label in hypothesis.labels:
             continue
-        for place in dict.fromkeys(p for c in configurations for p in other.find_places(made.assembly(c))):
-            label = f"{other_id}@{place}"
-            if label == last or label in hypothesis.labels:
-                continue
-            direction = _direction(made, configurations, other, place)
-            if direction is None or not _alike(own, direction):
-                continue
-            p = other.parameters[0]
-            wanted = sign * np.sign(own @ direction) * np.sign(p.start - p.null)
-            if wanted > 0 or p.minimum < p.null:
-                found.append(label)
+        direction = _direction(made, configurations, known[other_id], place)
+        if direction is None or not _alike(own, direction):
+            continue
+        p = known[other_id].parameters[0]
+        wanted = sign * np.sign(own @ direction) * np.sign(p.start - p.null)
+        if wanted > 0 or p.minimum < p.null:
+            found.append(label)
     return tuple(found)
+
+
+def _named_physics(rig: Rig, configurations: Sequence[str], known: Library) -> Iterator[tuple[str, str]]:
+    """Id of every linear effect but the generic ones, and every place that it has in these configurations."""
+    for effect_id in sorted(known):
+        effect = known[effect_id]
+        if effect_id not in GENERIC and effect.linear:
+            for place in dict.fromkeys(
+                p for c in configurations for p in effect.find_places(rig.assembly(c))
+            ):
+                yield effect_id, place
 
 
 def _direction(

@@ -20,14 +20,13 @@ from ema_pipeline.correlate.residuals import modal_basis
 from ema_pipeline.diagnose.fitting import Case, Fitted
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.stray import strong_unexplained
-from ema_pipeline.diagnose.types import Localisation
+from ema_pipeline.diagnose.types import EXTRA_COORDINATE, Localisation
 from ema_pipeline.fit.evidence import Dataset
 from ema_pipeline.fit.latent import LatentObjective
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.solve import FitProblem
 
 _LOOSE_TAU = 0.02
-EXTRA = "a degree of freedom of its own"
 
 
 def localise(
@@ -64,7 +63,7 @@ def extra_coordinates(case: Case, model: Fitted) -> tuple[Localisation, ...]:
     if len(stray) <= model.missed:
         return ()
     outlier = float(np.max(case.problem(model.hypothesis, case.settings.fit).mixture().outlier_cost))
-    return tuple(Localisation(m.place, EXTRA, m.frequency_hz, outlier) for m in stray)
+    return tuple(Localisation(m.place, EXTRA_COORDINATE, m.frequency_hz, outlier) for m in stray)
 
 
 def _rows(dofs: list[str]) -> dict[str, dict[str, float]]:

@@ -56,12 +56,7 @@ def scanned(
         absent = tuple(_smallest(axis, e) for axis, e in zip(axes, moved, strict=True))
         least = _cost(problem, base, moved, absent) - _PROMISE
     tried = [(_cost(problem, base, moved, v), v) for v in list(product(*axes))[:_MOST]]
-    chosen: list[tuple[float, ...]] = []
-    for cost, sizes in sorted(tried, key=lambda t: t[0]):
-        if len(chosen) == count or cost > least:
-            break
-        if all(not _near(sizes, other) for other in chosen):
-            chosen.append(sizes)
+    chosen = _apart([(cost, sizes) for cost, sizes in tried if cost <= least], count)
     return [_point(problem, base, moved, _finer(problem, base, moved, sizes)) for sizes in chosen]
 
 
@@ -87,13 +82,20 @@ def likeliest(
     list of ndarray, (P,)
         The most likely first.
     """
-    tried = [tuple(s[e.name] for e in moved) for s in sizes]
-    costs = [_cost(problem, base, moved, v) for v in tried]
+    points = [tuple(s[e.name] for e in moved) for s in sizes]
+    tried = [(_cost(problem, base, moved, v), v) for v in points]
+    return [_point(problem, base, moved, v) for v in _apart(tried, count)]
+
+
+def _apart(tried: Sequence[tuple[float, tuple[float, ...]]], count: int) -> list[tuple[float, ...]]:
+    """Sizes of the lowest costs of which no two are neighbours."""
     chosen: list[tuple[float, ...]] = []
-    for i in np.argsort(costs, kind="stable"):
-        if len(chosen) < count and all(not _near(tried[i], other) for other in chosen):
-            chosen.append(tried[i])
-    return [_point(problem, base, moved, v) for v in chosen]
+    for _, sizes in sorted(tried, key=lambda t: t[0]):
+        if len(chosen) == count:
+            break
+        if all(not _near(sizes, other) for other in chosen):
+            chosen.append(sizes)
+    return chosen
 
 
 def _smallest(axis: Sequence[float], e: Extra) -> float:

@@ -56,3 +56,22 @@ def strong_unexplained(case: Case, model: Fitted) -> list[StrayMode]:
                 place = m.dofs[int(np.nanargmax(np.abs(m.shapes[r])))].point
                 found.append(StrayMode(c, float(m.frequency_hz[r]), place))
     return found
+
+
+def solid_unexplained(case: Case, model: Fitted) -> list[str]:
+    """Measured modes with well-determined shapes that a model does not explain."""
+    found, start = [], 0
+    for c, m in case.measured.items():
+        left = ~model.explained[start : start + len(m)]
+        start += len(m)
+        for r in np.flatnonzero(left):
+            if m.shapes is None or m.shape_std is None:
+                found.append(f"{m.frequency_hz[r]:.1f} Hz ({c})")
+                continue
+            largest = float(np.nanmax(np.abs(m.shapes[r])))
+            if (
+                not np.any(np.isfinite(m.shape_std[r]))
+                or np.nanmedian(m.shape_std[r]) < _WELL_DETERMINED * largest
+            ):
+                found.append(f"{m.frequency_hz[r]:.1f} Hz ({c})")
+    return found

@@ -15,6 +15,8 @@ VerdictWord = Literal["adequate", "effect", "ambiguous", "unknown_effect", "not_
 
 OUT_OF_TOLERANCE = "out_of_tolerance"
 """Stands where an effect's id stands for a parameter that the data put outside its tolerance."""
+EXTRA_COORDINATE = "a degree of freedom of its own"
+"""What a misfit acts like where a test shows more modes than the model has."""
 
 
 @dataclass(frozen=True)

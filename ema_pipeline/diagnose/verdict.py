@@ -9,17 +9,16 @@ import numpy as np
 from ema_pipeline.diagnose.climbing import Climb
 from ema_pipeline.diagnose.explain import label_text, size_text
 from ema_pipeline.diagnose.fitting import Case, Fitted
-from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras
+from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, make_rig
 from ema_pipeline.diagnose.ladder import Yardstick
 from ema_pipeline.diagnose.ranking import Ranking, slight
 from ema_pipeline.diagnose.screening import Screening
-from ema_pipeline.diagnose.stray import strong_unexplained
+from ema_pipeline.diagnose.stray import solid_unexplained, strong_unexplained
 from ema_pipeline.diagnose.thresholds import threshold
 from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE, EffectSize, Ladder, VerdictWord
 
 _SPURIOUS = 2
 """Well-determined modes without counterpart that may still be of the foundation, or spurious."""
-_WELL_DETERMINED = 0.03
 _ALIKE = 0.05
 _VISIBLE_SHARE = 0.25
 _STRAINED = 2.5
@@ -110,7 +109,8 @@ def _chance(ranking: Ranking) -> str:
 
 def sizes(case: Case, f: Fitted, label: str | None = None) -> dict[str, EffectSize]:
     """Sizes of one of the hypothesis' effects, the last where none is named, by their own names."""
-    units = {p.name: p.unit for p in case.problem(f.hypothesis, case.settings.fit).rig.parameters.values()}
+    rig = make_rig(case.rig, f.hypothesis, case.library, case.settings.parameter_range)
+    units = {p.name: p.unit for p in rig.parameters.values()}
     last = label or f.hypothesis.labels[-1]
     return {
         e.name.removeprefix(f"{last}."): EffectSize(f.values[e.name], f.std[e.name], units[e.name])
@@ -142,25 +142,6 @@ def mending(case: Case, ranking: Ranking, stick: Yardstick) -> list[Fitted]:
         return []
     least = _ALIKE * ranking.probabilities[found[0].hypothesis.label]
     return [f for f in found if ranking.probabilities[f.hypothesis.label] >= least]
-
-
-def solid_unexplained(case: Case, model: Fitted) -> list[str]:
-    """Measured modes with well-determined shapes that a model does not explain."""
-    found, start = [], 0
-    for c, m in case.measured.items():
-        left = ~model.explained[start : start + len(m)]
-        start += len(m)
-        for r in np.flatnonzero(left):
-            if m.shapes is None or m.shape_std is None:
-                found.append(f"{m.frequency_hz[r]:.1f} Hz ({c})")
-                continue
-            largest = float(np.nanmax(np.abs(m.shapes[r])))
-            if (
-                not np.any(np.isfinite(m.shape_std[r]))
-                or np.nanmedian(m.shape_std[r]) < _WELL_DETERMINED * largest
-            ):
-                found.append(f"{m.frequency_hz[r]:.1f} Hz ({c})")
-    return found
 
 
 def unexplained_notes(case: Case, top: Fitted) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from ema_pipeline.diagnose.types import (
+    EXTRA_COORDINATE,
     OUT_OF_TOLERANCE,
     Candidate,
     DetectionLimit,
@@ -186,7 +187,7 @@ def localisation_table(found: Diagnosis) -> Table:
         "mass": "kg",
         "viscous damping": "N·s/m",
         "hysteretic damping": "N/m",
-        "a degree of freedom of its own": "Hz",
+        EXTRA_COORDINATE: "Hz",
     }
     rows = tuple(
         Row(
