@@ -133,10 +133,13 @@ class Fitted:
 
 def holds(fitted: Fitted) -> bool:
     """True where a model explains all modes but one (which may be spurious) about as well as data can tell."""
-    explained = fitted.explained
-    squares = float(np.sum(fitted.costs[explained])) + fitted.prior_cost
-    few = int(np.sum(~explained)) <= 1
-    return few and squares < _HOLDS * float(np.sum(fitted.counts))
+    return int(np.sum(~fitted.explained)) <= 1 and near(fitted)
+
+
+def near(fitted: Fitted) -> bool:
+    """True where a model comes about as near as data can tell to the modes that it explains."""
+    squares = float(np.sum(fitted.costs[fitted.explained])) + fitted.prior_cost
+    return squares < _HOLDS * float(np.sum(fitted.counts))
 
 
 def fit_null(

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, follow, ground, holds, refit
+from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, follow, ground, holds, near, refit
 from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, prior_probabilities
 from ema_pipeline.diagnose.pool import spread
 from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE
@@ -171,7 +171,7 @@ def probabilities(case: Case, base: Fitted, fitted: Sequence[Fitted]) -> dict[st
     """Posterior probabilities of the hypotheses and of ``"nothing"`` (more).
 
     An effect so slight that parts made to one drawing differ by as much is no missing physics: on top of a model that
-    holds, its probability goes to ``"nothing"``.
+    holds, or whose unexplained modes it does not explain either, its probability goes to ``"nothing"``.
     """
     settings = case.settings
     prior = prior_probabilities([f.hypothesis for f in fitted], settings.null_prior, settings.parameter_prior)
@@ -181,11 +181,11 @@ def probabilities(case: Case, base: Fitted, fitted: Sequence[Fitted]) -> dict[st
     weights = {label: float(np.exp(v - top)) for label, v in logs.items()}
     total = sum(weights.values())
     shares = {label: w / total for label, w in weights.items()}
-    if holds(base):
-        for f in fitted:
-            if slight(case, f):
-                shares[NOTHING] += shares[f.hypothesis.label]
-                shares[f.hypothesis.label] = 0.0
+    for f in fitted if near(base) else ():
+        idle = int(np.sum(f.explained)) <= int(np.sum(base.explained))
+        if (idle or holds(base)) and slight(case, f):
+            shares[NOTHING] += shares[f.hypothesis.label]
+            shares[f.hypothesis.label] = 0.0
     return shares
 
 

@@ -13,6 +13,8 @@ from ema_pipeline.fit.solve import FitProblem, Optimum
 
 _VISIBLE = 0.02
 _INSIDE = 0.01
+_DEPENDENT = 1e-3
+"""Singular value below which directions of coinciding modes count as one."""
 
 
 def occam(
@@ -72,17 +74,37 @@ def mixing_volume(problem: FitProblem, found: Optimum) -> float:
         fit = shape_fit(e, pairs, modes, mixing)
         if fit is None:
             continue
-        b = fit.weighted[0]
-        own = b[np.arange(has.size), :, pairs[has]]
+        whole = fit.price[0] * mixing * modes.omega[0, pairs[has]] ** 2
+        alike = np.abs(fit.penalty[0]) <= whole[:, None]
+        b = _orthonormal_alike(fit.weighted[0], modes.directions[0], alike)
+        own = (fit.weighted[0] @ (fit.amplitudes[0] * alike)[:, :, None])[..., 0]
         own = own / np.maximum(np.linalg.norm(own, axis=1, keepdims=True), 1e-30)
         # the mode's own shape is no freedom: its scale is fixed by the comparison
         b = b - own[:, :, None] * (own.conj()[:, None, :] @ b)
-        whole = fit.price[0] * mixing * modes.omega[0, pairs[has]] ** 2
         b = b / np.maximum(np.abs(fit.penalty[0]), whole[:, None])[:, None, :]
         # det(1 + BᴴB) = det(1 + BBᴴ), of the size of the sensors
         _, logdet = np.linalg.slogdet(np.eye(b.shape[1]) + b @ b.conj().swapaxes(1, 2))
         total += (2.0 if np.any(e.shapes.imag) else 1.0) * float(share @ logdet)
     return total
+
+
+def _orthonormal_alike(
+    shapes: NDArray[np.float64] | NDArray[np.complex128],
+    directions: NDArray[np.float64] | NDArray[np.complex128],
+    alike: NDArray[np.bool_],
+) -> NDArray[np.float64] | NDArray[np.complex128]:
+    """Shapes (R, m, n) with an orthonormal basis for the modes that coincide with each measured one.
+
+    The solver of a damped system returns any basis of these, and no volume may depend on which.
+    """
+    if not np.iscomplexobj(directions):
+        return shapes
+    made = shapes.copy()
+    for r in np.flatnonzero(np.sum(alike, axis=1) > 1):
+        _, s, vh = np.linalg.svd(directions[:, alike[r]], full_matrices=False)
+        turned = (vh.conj().T / np.maximum(s, _DEPENDENT)) @ vh
+        made[r][:, alike[r]] = shapes[r][:, alike[r]] @ turned
+    return made
 
 
 def lonely_cost(problem: FitProblem, x: NDArray[np.float64]) -> NDArray[np.float64]:
