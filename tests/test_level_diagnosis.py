@@ -18,7 +18,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import get_effect, shipped_effects
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
-from ema_pipeline.mechanics.batch import Blows, batch_response
+from ema_pipeline.mechanics.batch import Blows, batch_lines, batch_response
 from ema_pipeline.mechanics.laws import BoucWen, DryFriction, Nonlinear, PartingSpring, PolynomialSpring
 from ema_pipeline.mechanics.nonlinear import nonlinear_response
 from ema_pipeline.rigs.base import ParametricRig
@@ -109,6 +109,31 @@ def test_many_models_and_blows_at_once_are_each_as_alone() -> None:
             np.testing.assert_allclose(
                 together[i, j], batch_response([model], one, 3)[0, 0], rtol=1e-9, atol=1e-12
             )
+
+
+@pytest.mark.parametrize("substeps", [1, 3])
+def test_lines_in_closed_form_are_those_of_the_simulated_signals(substeps: int) -> None:
+    base = RIG.assembly("test", TRUE)
+    models = [
+        base,
+        base.add(
+            PolynomialSpring("cubic", {"hub.x": 1.0}, cubic=2e11), DryFriction("f", {"rim.x": 1.0}, 0.4)
+        ),
+        base.add(PartingSpring("contact", {"hub.x": 1.0, "rim.x": -1.0}, 2e5, 0.0, 2e-6, 1e-5)),
+    ]
+    force = np.stack([pulse(601, p) for p in (30.0, 200.0)])
+    rows = np.array([[1.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0]])
+    blows = Blows(RATE, force, np.eye(4)[[2, 0]], rows, ("acceleration", "velocity", "displacement"))
+    fade, lines = 0.3 * 601 / RATE, np.array([3, 4, 50, 299])
+    signals = batch_response(models, blows, substeps)
+    time = np.arange(601) / RATE
+    expected = np.fft.rfft(signals * np.exp(-time / fade))[..., lines]
+    got = batch_lines(models, blows, substeps, fade, lines)
+    scale = np.abs(expected).max(axis=-1, keepdims=True)
+    assert np.all(np.abs(got - expected) <= 1e-7 * scale)
+    memory = [base.add(BoucWen("loop", {"hub.x": 1.0}, 3.0, 5e4, 0.6))]
+    slow = np.fft.rfft(batch_response(memory, blows, substeps) * np.exp(-time / fade))[..., lines]
+    np.testing.assert_allclose(batch_lines(memory, blows, substeps, fade, lines), slow, rtol=1e-9)
 
 
 def test_elements_with_a_memory_go_through_the_general_integrator() -> None:
@@ -232,7 +257,7 @@ def test_an_error_alike_at_all_levels_weighs_little_and_one_at_one_level_weighs_
     w = windows(noise=1e-6)
     floor = NoiseFloor(0.003, 0.1)
     (weight,) = whitenings([w], floor, 2.0)
-    lines = w.spectra(w.measured, weight.fade_s)
+    lines = w.spectra(w.measured)
     alike = weight.applied(1.05 * lines[None])
     single = lines.copy()
     single[2] *= 1.05
@@ -244,10 +269,10 @@ def test_weighing_is_by_the_inverse_of_the_covariance_of_both_errors() -> None:
     w = windows()
     floor = NoiseFloor(0.01, 0.1)
     (weight,) = whitenings([w], floor, 2.0)
-    simulated = 1.02 * w.spectra(np.roll(w.measured, 1, axis=-1), weight.fade_s)
-    sigma, size, _ = w.sigma(weight.fade_s, floor.own)
+    simulated = 1.02 * w.spectra(np.roll(w.measured, 1, axis=-1))
+    sigma, size, _ = w.sigma(floor.own)
     at = [i for i, d in enumerate(w.impacts) if str(d) == str(w.impacts[0])]
-    force = w.spectra(w.force, weight.fade_s)
+    force = w.spectra(w.force)
     sensor, line = np.unravel_index(np.argmax(weight.worth[at].min(axis=0)), weight.worth.shape[1:])
     own = sigma[at, sensor, line]
     per_newton = size[at, sensor, line].sum() / np.abs(force[at, line]).sum()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,30 @@ _WILD = 1e30
 """A force, N, that no structure has."""
 
 
+class Marched(NamedTuple):
+    """What `march` gives.
+
+    Attributes
+    ----------
+    motion : ndarray, (A, n_blows, n_kept, n_outputs)
+    forces : ndarray, (A, n_blows, m, n_steps)
+        Of the elements; without steps where they were not asked for.
+    last : ndarray, (A, n_blows, 2P)
+        Real and imaginary parts of y = z - Γ₁f at the last step.
+    begun, ended : complex ndarray, (A, n_blows + m, P)
+        Γ₀ + EΓ₁ and Γ₁: what a force at the start of a step and one at its end add to y and to z.
+    failed : bool
+        True where no solution was found at some step.
+    """
+
+    motion: NDArray[np.float64]
+    forces: NDArray[np.float64]
+    last: NDArray[np.float64]
+    begun: NDArray[np.complex128]
+    ended: NDArray[np.complex128]
+    failed: bool
+
+
 def march(
     laws: NDArray[np.float64],
     poles: NDArray[np.complex128],
@@ -29,8 +55,9 @@ def march(
     force: NDArray[np.float64],
     step: float,
     keep_every: int,
-) -> tuple[NDArray[np.float64], bool]:
-    """What the sensors read, but for what the blow itself gives an accelerometer; and whether it failed.
+    trace: bool = False,
+) -> Marched:
+    """Motion from rest, as the sensors read it but for what the blow itself gives an accelerometer.
 
     Parameters
     ----------
@@ -74,15 +101,18 @@ def march(
     reach = np.einsum("asp,acp->asc", stretch, ended).real
     seen = np.einsum("aop,acp->aoc", outputs, ended).real
     seen[:, :, hits:] += direct
-    kept = (force.shape[1] - 1) // keep_every + 1
+    steps = force.shape[1]
+    kept = (steps - 1) // keep_every + 1
     result = np.zeros((len(poles), hits, kept, outputs.shape[1]))
+    forces = np.zeros((len(poles), hits, laws.shape[1], steps if trace else 0))
+    last = np.zeros((len(poles), hits, 2 * poles.shape[1]))
     # one memory layout, so that one compiled loop serves all
     numbers = (
         laws, decay, begun, ended, _halves(stretch), _halves(outputs), reach, seen, force,
     )  # fmt: skip
     same = [np.ascontiguousarray(a) for a in numbers]
-    failed = _march(*same, step, keep_every, result)  # type: ignore[call-arg]
-    return result, bool(failed)
+    failed = _march(*same, step, keep_every, result, forces, last)  # type: ignore[call-arg]
+    return Marched(result, forces, last, begun, ended, bool(failed))
 
 
 def _halves(rows: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -113,15 +143,19 @@ def _gripped(free, own, limit, velocity):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
-def _march(laws, decay, begun, ended, stretch, outputs, reach, seen, force, step, keep_every, result):  # type: ignore[no-untyped-def]
+def _march(  # type: ignore[no-untyped-def]
+    laws, decay, begun, ended, stretch, outputs, reach, seen, force, step, keep_every, result, forces, last
+):
     count, size = decay.shape
     hits, steps = force.shape
     m = laws.shape[1]
     channels = outputs.shape[1]
+    trace = forces.shape[3] > 0
     y = np.zeros(2 * size)
     g, d, v = np.zeros(m), np.zeros(m), np.zeros(m)
     for a in range(count):
         turn, fade = decay[a].imag.copy(), decay[a].real.copy()
+        push_re, push_im = begun[a, hits:].real.copy(), begun[a, hits:].imag.copy()
         for h in range(hits):
             g[:] = 0.0
             for p in range(size):  # z = 0
@@ -138,14 +172,17 @@ def _march(laws, decay, begun, ended, stretch, outputs, reach, seen, force, step
                 for j in range(m):
                     if g[j] != 0.0:
                         for p in range(size):
-                            y[p] += begun[a, hits + j, p].real * g[j]
-                            y[size + p] += begun[a, hits + j, p].imag * g[j]
+                            y[p] += push_re[j, p] * g[j]
+                            y[size + p] += push_im[j, p] * g[j]
                 f = force[h, k]
                 for j in range(m):
                     dj, vj = reach[a, j, h] * f, reach[a, m + j, h] * f
-                    for p in range(2 * size):
-                        dj += stretch[a, j, p] * y[p]
-                        vj += stretch[a, m + j, p] * y[p]
+                    if laws[a, j, 0] == 1.0:  # the only law that asks for the rate, and not for the stretch
+                        for p in range(2 * size):
+                            vj += stretch[a, m + j, p] * y[p]
+                    else:
+                        for p in range(2 * size):
+                            dj += stretch[a, j, p] * y[p]
                     d[j], v[j] = dj, vj
                 worst = 0.0
                 for _ in range(_NEWTON):
@@ -176,7 +213,10 @@ def _march(laws, decay, begun, ended, stretch, outputs, reach, seen, force, step
                         break
                 if not (worst <= 1e-4 * scale and scale < _WILD):
                     return True
-                if k % keep_every == 0:
+                if trace:
+                    for j in range(m):
+                        forces[a, h, j, k] = g[j]
+                if channels and k % keep_every == 0:
                     at = k // keep_every
                     for c in range(channels):
                         s = seen[a, c, h] * f
@@ -185,4 +225,55 @@ def _march(laws, decay, begun, ended, stretch, outputs, reach, seen, force, step
                         for p in range(2 * size):
                             s += outputs[a, c, p] * y[p]
                         result[a, h, at, c] = s
+            last[a, h] = y
     return False
+
+
+@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+def _add_product(re, im, a_re, a_im, b_re, b_im):  # type: ignore[no-untyped-def]
+    """Add the products of two arrays of complex numbers."""
+    for n in range(re.size):
+        re[n] += a_re[n] * b_re[n] - a_im[n] * b_im[n]
+        im[n] += a_re[n] * b_im[n] + a_im[n] * b_re[n]
+
+
+@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+def drive(free, transfer, of_blows, of_elements, point, direct, at_once, result):  # type: ignore[no-untyped-def]
+    """Lines at the outputs: what is free, and transfer functions times the lines of the forces.
+
+    Parameters
+    ----------
+    free : complex ndarray, (n_outputs, n_blows, n_lines)
+    transfer : complex ndarray, (n_outputs, n_phases, n_points + m, n_lines)
+        From a force at each phase of a sample, first of the blows' points, then of the elements.
+    of_blows : complex ndarray, (n_phases, n_blows, n_lines)
+    of_elements : complex ndarray, (n_phases, n_blows, m, n_lines)
+    point : ndarray of int, (n_blows,)
+    direct : ndarray, (n_outputs, n_blows)
+    at_once : complex ndarray, (n_blows, n_lines)
+        Lines of the blows, to be multiplied with `direct`.
+    result : complex ndarray, (n_blows, n_outputs, n_lines)
+        Overwritten.
+    """
+    hits, channels, count = result.shape
+    phases, m = of_elements.shape[0], of_elements.shape[2]
+    points = transfer.shape[2] - m
+    re, im = np.empty(count), np.empty(count)
+    # halves of their own are what a processor's vectors take
+    by_re, by_im = transfer.real.copy(), transfer.imag.copy()
+    blow_re, blow_im = of_blows.real.copy(), of_blows.imag.copy()
+    own_re, own_im = of_elements.real.copy(), of_elements.imag.copy()
+    for h in range(hits):
+        for o in range(channels):
+            for n in range(count):
+                re[n] = free[o, h, n].real + direct[o, h] * at_once[h, n].real
+                im[n] = free[o, h, n].imag + direct[o, h] * at_once[h, n].imag
+            for j in range(phases):
+                _add_product(
+                    re, im, by_re[o, j, point[h]], by_im[o, j, point[h]], blow_re[j, h], blow_im[j, h]
+                )
+                for i in range(m):
+                    k = points + i
+                    _add_product(re, im, by_re[o, j, k], by_im[o, j, k], own_re[j, h, i], own_im[j, h, i])
+            for n in range(count):
+                result[h, o, n] = complex(re[n], im[n])

@@ -84,28 +84,32 @@ class HitWindows:
     @property
     def frequency_hz(self) -> NDArray[np.float64]:
         """Lines inside the band, (n_lines,)."""
-        return np.asarray(self._lines()[1])
+        return np.asarray(self.lines * self.sample_rate_hz / self.force.shape[1])
 
-    def _lines(self) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    @property
+    def lines(self) -> NDArray[np.int64]:
+        """Numbers of the spectrum's lines inside the band, (n_lines,)."""
         f = scipy.fft.rfftfreq(self.force.shape[1], 1 / self.sample_rate_hz)
-        inside = (f >= self.band_hz[0]) & (f <= self.band_hz[1])
-        return inside, f[inside]
+        return np.flatnonzero((f >= self.band_hz[0]) & (f <= self.band_hz[1]))
 
-    def spectra(self, signals: NDArray[np.float64], fade_s: float) -> NDArray[np.complex128]:
+    @property
+    def fade_s(self) -> float:
+        """Time constant of the exponential weight that lets signals fade out, so that their ends leave no trace."""
+        return 0.5 * float(self.time_s[-1])
+
+    def spectra(self, signals: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Spectra inside the band of signals (..., n_samples) that are weighted with exp(-t/fade_s)."""
-        inside = self._lines()[0]
-        shade = np.exp(-self.time_s / fade_s)
-        return np.asarray(scipy.fft.rfft(signals * shade, axis=-1)[..., inside])
+        shade = np.exp(-self.time_s / self.fade_s)
+        return np.asarray(scipy.fft.rfft(signals * shade, axis=-1)[..., self.lines])
 
     def in_band(self, signals: NDArray[np.float64]) -> NDArray[np.float64]:
         """The signals' part inside the band, (..., n_samples)."""
-        spectrum = scipy.fft.rfft(signals, axis=-1)
-        spectrum[..., ~self._lines()[0]] = 0
+        whole = scipy.fft.rfft(signals, axis=-1)
+        spectrum = np.zeros_like(whole)
+        spectrum[..., self.lines] = whole[..., self.lines]
         return np.asarray(scipy.fft.irfft(spectrum, signals.shape[-1], axis=-1))
 
-    def sigma(
-        self, fade_s: float, floor: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def sigma(self, floor: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Uncertainty of each line, measured amplitude around it, and share of its power that is no noise.
 
         The standard uncertainty, (n_hits, n_sensors, n_lines), is the sensors' noise, and shares of the measured
@@ -114,9 +118,9 @@ class HitWindows:
         moves it at once. The uncertainty is infinite, and the share 0, where a sensor is absent.
         """
         f = self.frequency_hz
-        noise = self.noise[..., None] ** 2 * np.sum(np.exp(-2 * self.time_s / fade_s))
+        noise = self.noise[..., None] ** 2 * np.sum(np.exp(-2 * self.time_s / self.fade_s))
         share = floor**2 + (2 * np.pi * f * _TIMING / self.sample_rate_hz) ** 2
-        power = _smoothed(f, np.abs(self.spectra(self.measured, fade_s)) ** 2)
+        power = _smoothed(f, np.abs(self.spectra(self.measured)) ** 2)
         total = np.sqrt(noise + share * power + (_SPILT * floor) ** 2 * self._alike(power))
         there = self.present[..., None]
         signal = np.clip(1 - 2 * noise / np.maximum(power, 1e-300), 0.0, 1.0)

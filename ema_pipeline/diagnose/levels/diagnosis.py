@@ -390,14 +390,13 @@ def _next(case: LevelCase, members: Sequence[Simulated], floor: NoiseFloor) -> s
         ),
     )
     first, second = (
-        p.simulate(p.space.point(m.values)[None])
+        p.lines(p.space.point(m.values)[None])
         for m in (one, two)
         for p in [harder.problem(m.hypothesis, m.sizes)]
     )
     best, where = 0.0, ""
     for w, a, b, weight in zip(harder.windows, first, second, harder.weights(floor), strict=True):
-        weight = replace(weight, measured=w.spectra(b[0], weight.fade_s))
-        r = weight.applied(w.spectra(a, weight.fade_s))[0]
+        r = replace(weight, measured=b[0]).applied(a)[0]
         z = np.sqrt(np.sum(np.abs(r) ** 2, axis=(1, 2))) / _HARDER
         if z.max() > best:
             best, where = float(z.max()), f"{w.impacts[int(np.argmax(z))]} ({w.configuration})"

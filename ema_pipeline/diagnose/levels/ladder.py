@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
-from ema_pipeline.diagnose.levels.problem import NoiseFloor, hit_misfits, weighted
+from ema_pipeline.diagnose.levels.problem import NoiseFloor, hit_misfits, residuals
 from ema_pipeline.diagnose.levels.search import again, fit_base, fit_effect, fit_linear, own_floor
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung, TimeTrace
 from ema_pipeline.effects.library import shipped_effects
@@ -68,8 +68,7 @@ def level_errors(case: LevelCase, model: Simulated, floor: NoiseFloor, hold_out:
 
 def _squares(case: LevelCase, model: Simulated, floor: NoiseFloor) -> float:
     problem = case.problem(model.hypothesis, model.sizes)
-    simulated = problem.simulate(problem.space.point(model.values)[None])
-    r = weighted(case.windows, case.weights(floor), simulated)[0]
+    r = residuals(problem, case.weights(floor), problem.space.point(model.values)[None])[0]
     return float(r @ r)
 
 

@@ -24,7 +24,7 @@ from ema_pipeline.diagnose.levels.data import HitWindows
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.space import Space, make_space
 from ema_pipeline.mechanics.assembly import Assembly
-from ema_pipeline.mechanics.batch import Blows, batch_response
+from ema_pipeline.mechanics.batch import Blows, batch_lines, batch_response
 from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.rigs.types import Rig
 
@@ -61,21 +61,36 @@ class TimeProblem:
         EmaError
             Where the motion of a model grows without bound.
         """
-        result = []
-        for w in self.windows:
-            assemblies = [self._assembly(w, x) for x in points]
-            system = assemblies[0].system()
-            blows = Blows(
-                w.sample_rate_hz, w.force, sensor_rows(system, w.impacts),
-                sensor_rows(system, w.sensors), w.quantities,
-            )  # fmt: skip
-            step = max(1, _CHUNK // len(w.names))
-            parts = [
-                batch_response(assemblies[i : i + step], blows, self.substeps)
-                for i in range(0, len(assemblies), step)
-            ]
-            result.append(np.concatenate(parts))
-        return result
+        return [
+            np.concatenate([batch_response(some, blows, self.substeps) for some in parts])
+            for w in self.windows
+            for blows, parts in [self._parts(w, points)]
+        ]
+
+    def lines(self, points: NDArray[np.float64]) -> list[NDArray[np.complex128]]:
+        """The spectra of that as `HitWindows.spectra` gives them, (B, n_hits, n_sensors, n_lines), much faster.
+
+        Raises
+        ------
+        EmaError
+            Where the motion of a model grows without bound.
+        """
+        return [
+            np.concatenate([batch_lines(some, blows, self.substeps, w.fade_s, w.lines) for some in parts])
+            for w in self.windows
+            for blows, parts in [self._parts(w, points)]
+        ]
+
+    def _parts(self, w: HitWindows, points: NDArray[np.float64]) -> tuple[Blows, list[list[Assembly]]]:
+        """Blows and models of one configuration, the models in parts."""
+        assemblies = [self._assembly(w, x) for x in points]
+        system = assemblies[0].system()
+        blows = Blows(
+            w.sample_rate_hz, w.force, sensor_rows(system, w.impacts), sensor_rows(system, w.sensors),
+            w.quantities,
+        )  # fmt: skip
+        step = max(1, _CHUNK // len(w.names))
+        return blows, [assemblies[i : i + step] for i in range(0, len(assemblies), step)]
 
     def _assembly(self, w: HitWindows, x: NDArray[np.float64]) -> Assembly:
         return self.rig.assembly(w.configuration, self.space.named(x))
@@ -87,8 +102,6 @@ class Whitening:
 
     Attributes
     ----------
-    fade_s : float
-        Time constant of the exponential weight.
     scale : ndarray, (n_hits, n_sensors, n_lines)
         One over the standard uncertainty of what is not common to all levels; 0 where a sensor is absent.
     worth : ndarray, (n_hits, n_sensors, n_lines)
@@ -102,7 +115,6 @@ class Whitening:
     measured : ndarray, (n_hits, n_sensors, n_lines)
     """
 
-    fade_s: float
     scale: NDArray[np.float64]
     worth: NDArray[np.float64]
     common: NDArray[np.complex128]
@@ -143,18 +155,16 @@ def whitenings(windows: Sequence[HitWindows], floor: NoiseFloor, data_per_mode: 
     """Weights where one mode in one hit is worth `data_per_mode` independent numbers.
 
     A line's real and imaginary part are worth numbers in proportion to 1/f, since a mode of given damping ratio
-    spreads over lines in proportion to its frequency, and to the share of their power that is no noise. Signals
-    fade out, so that the windows' ends leave no trace.
+    spreads over lines in proportion to its frequency, and to the share of their power that is no noise.
     """
     result = []
     for w in windows:
-        fade = 0.5 * float(w.time_s[-1])
-        sigma, size, signal = w.sigma(fade, floor.own)
+        sigma, size, signal = w.sigma(floor.own)
         even = signal / w.frequency_hz
         total = np.sum(even, axis=(1, 2), keepdims=True)
         worth = data_per_mode * w.modes * even / np.maximum(total, 1e-300)
-        measured = w.spectra(w.measured, fade)
-        force = w.spectra(w.force, fade)
+        measured = w.spectra(w.measured)
+        force = w.spectra(w.force)
         known = {d: i for i, d in enumerate(dict.fromkeys(str(d) for d in w.impacts))}
         point = np.array([known[str(d)] for d in w.impacts], dtype=np.int64)
         common = np.zeros(measured.shape, dtype=complex)
@@ -166,26 +176,23 @@ def whitenings(windows: Sequence[HitWindows], floor: NoiseFloor, data_per_mode: 
             length = np.sqrt(np.sum(np.abs(u) ** 2, axis=0))
             common[at] = u / np.maximum(length, 1e-300)
             taken[k] = 1 - 1 / np.sqrt(1 + length**2)
-        result.append(Whitening(fade, 1 / sigma, np.sqrt(worth), common, taken, point, measured))
+        result.append(Whitening(1 / sigma, np.sqrt(worth), common, taken, point, measured))
     return result
 
 
 def residuals(
     problem: TimeProblem, weights: Sequence[Whitening], points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Weighted differences of measured and simulated lines, real and imaginary, (B, n)."""
-    return weighted(problem.windows, weights, problem.simulate(points))
+    """Weighted differences of measured and simulated lines, real and imaginary in turn, (B, n)."""
+    return weighted(weights, problem.lines(points))
 
 
-def weighted(
-    windows: Sequence[HitWindows], weights: Sequence[Whitening], simulated: Sequence[NDArray[np.float64]]
-) -> NDArray[np.float64]:
-    """The same for simulated signals."""
+def weighted(weights: Sequence[Whitening], lines: Sequence[NDArray[np.complex128]]) -> NDArray[np.float64]:
+    """The same for simulated lines."""
     parts = []
-    for w, weight, signals in zip(windows, weights, simulated, strict=True):
-        flat = weight.applied(w.spectra(signals, weight.fade_s)).reshape(len(signals), -1)
-        parts += [flat.real, flat.imag]
-    return np.concatenate(parts, axis=1)
+    for weight, simulated in zip(weights, lines, strict=True):
+        parts.append(weight.applied(simulated).reshape(len(simulated), -1).view(np.float64))
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
 
 @dataclass(frozen=True)

@@ -236,11 +236,11 @@ def own_floor(case: LevelCase, model: Simulated) -> NoiseFloor:
     s = case.settings.levels
     problem = case.problem(model.hypothesis, model.sizes)
     x = problem.space.point(model.values)[None]
-    simulated = problem.simulate(x)
+    lines = problem.lines(x)
 
     def excess(log_own: float) -> float:
         floor = NoiseFloor(float(np.exp(log_own)), s.common_error)
-        r = weighted(case.windows, case.weights(floor), simulated)[0]
+        r = weighted(case.weights(floor), lines)[0]
         return float(r @ r) - case.data
 
     low, high = np.log(s.noise_least), np.log(s.noise_most)
