@@ -167,7 +167,9 @@ def _calibration(lines: list[Line]) -> list[str]:
     for low, high in SURE:
         own = [x for x in lines if x["candidates"] and low <= x["candidates"][0]["probability"] < high]
         if own:
-            hits = sum(bool(x["truth"]) and x["candidates"][0]["label"] == labels(x)[0] for x in own)
+            hits = sum(
+                bool(x["truth"]) and labels(x)[0] in _meant(x, x["candidates"][0]["label"]) for x in own
+            )
             said = float(np.mean([x["candidates"][0]["probability"] for x in own]))
             out.append(
                 f"  {low:.2f}–{min(high, 1.0):.2f}: said {said:.2f} on average, right in {share(hits, own)};"
@@ -194,9 +196,15 @@ def _body_named(line: Line) -> bool:
     )
 
 
+def _meant(line: Line, label: str) -> set[str]:
+    """A claimed effect with those that are named as the same change under other names."""
+    groups = line["groups"] if line["verdict"] == "effect" else []
+    return {label}.union(*(g for g in groups if label in g))
+
+
 def _pairs(pairs: list[Line]) -> list[str]:
-    both = [x for x in pairs if set(labels(x)) <= set(x["claimed"])]
-    none_wrong = [x for x in pairs if set(x["claimed"]) <= set(labels(x))]
+    both = [x for x in pairs if all(any(t in _meant(x, c) for c in x["claimed"]) for t in labels(x))]
+    none_wrong = [x for x in pairs if all(_meant(x, c) & set(labels(x)) for c in x["claimed"])]
     return [
         f"* Two effects at once: both found in {share(both, pairs)}, none wrong added in {share(none_wrong, pairs)}."
     ]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ema_pipeline.diagnose.climbing import Climb
+from ema_pipeline.diagnose.climbing import Climb, at_bound
 from ema_pipeline.diagnose.explain import label_text, size_text
 from ema_pipeline.diagnose.fitting import Case, Fitted
 from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, make_rig
@@ -136,8 +136,8 @@ def misfit(case: Case, model: Fitted, error: float) -> str:
 
 
 def mending(case: Case, ranking: Ranking, stick: Yardstick) -> list[Fitted]:
-    """Hypotheses that alone make the model hold, and are not far less probable than the best of them."""
-    found = [f for f in ranking.ordered() if not misfit(case, f, stick.error(f))]
+    """Hypotheses that alone make the model hold, at a size that can be, not far less probable than the best of them."""
+    found = [f for f in ranking.ordered() if not misfit(case, f, stick.error(f)) and not at_bound(case, f)]
     if not found:
         return []
     least = _ALIKE * ranking.probabilities[found[0].hypothesis.label]
