@@ -18,7 +18,8 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import get_effect, shipped_effects
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
-from ema_pipeline.mechanics.batch import Blows, batch_lines, batch_response
+from ema_pipeline.mechanics.batch import Blows, batch_response
+from ema_pipeline.mechanics.batch_lines import batch_lines
 from ema_pipeline.mechanics.laws import BoucWen, DryFriction, Nonlinear, PartingSpring, PolynomialSpring
 from ema_pipeline.mechanics.nonlinear import nonlinear_response
 from ema_pipeline.rigs.base import ParametricRig

@@ -77,8 +77,8 @@ def batch_response(assemblies: Sequence[Assembly], blows: Blows, substeps: int) 
         For structural damping, and where the motion grows without bound.
     """
     if any(e.law is None for a in assemblies for e in a.nonlinear):
-        return _one_by_one(assemblies, blows, substeps)
-    force, straight = _fine(blows.force, substeps)
+        return one_by_one(assemblies, blows, substeps)
+    force, straight = fine_force(blows.force, substeps)
     orders = np.array([ORDERS[q] for q in blows.quantities])
     result, direct = compiled_response(
         assemblies, blows.sample_rate_hz, straight, blows.out_rows, orders, blows.in_rows, substeps
@@ -123,126 +123,13 @@ def compiled_response(
     EmaError
         For structural damping, and where the motion grows without bound.
     """
-    batch = _prepared(assemblies, out_rows, orders, in_rows)
-    found = _marched(batch, batch.outputs, force, 1 / (sample_rate_hz * substeps), substeps)
+    batch = prepared(assemblies, out_rows, orders, in_rows)
+    found = marched(batch, batch.outputs, force, 1 / (sample_rate_hz * substeps), substeps)
     return found.motion.swapaxes(2, 3), batch.direct[:, :, : len(force)].swapaxes(1, 2)
 
 
-def batch_lines(
-    assemblies: Sequence[Assembly],
-    blows: Blows,
-    substeps: int,
-    fade_s: float,
-    lines: NDArray[np.int64],
-) -> NDArray[np.complex128]:
-    """Lines of the spectra of what `batch_response` gives, (n_assemblies, n_blows, n_outputs, n_lines).
-
-    Line n of a signal x is the sum of x(t)·exp(-t/fade_s - 2πint/T) over the samples of a record of length T. Only the
-    elements' forces and the states at the end of the record are found by going through time: the rest is the response
-    of a linear system to known forces, which has a closed form at every line.
-
-    Parameters
-    ----------
-    assemblies : sequence of Assembly
-    blows : Blows
-    substeps : int
-    fade_s : float
-    lines : ndarray of int, (n_lines,)
-
-    Raises
-    ------
-    EmaError
-        As `batch_response`.
-
-    Notes
-    -----
-    For one mode y₊ = Ey + Bu from step to step, with u the forces at a step's start (`mechanics.kernel.march`). With s
-    steps per sample, Q = exp(-Δ/fade_s - 2πin/N) for N samples Δ apart and Uⱼ the lines of the forces j steps after
-    each sample but the last, the sum of yQᵏ over the samples is
-
-        (y₀ - Eˢ·y_last·Qᴺ + Q·Σⱼ Eˢ⁻¹⁻ʲ·B·Uⱼ) / (1 - EˢQ).
-
-    Elements with a memory take the way through `batch_response`.
-    """
-    samples = blows.force.shape[1]
-    step = 1 / (blows.sample_rate_hz * substeps)
-    shade = np.exp(-np.arange(samples) / (blows.sample_rate_hz * fade_s))
-
-    def at_lines(signals: NDArray[np.float64]) -> NDArray[np.complex128]:
-        return np.asarray(scipy.fft.rfft(signals * shade, axis=-1)[..., lines])
-
-    if any(e.law is None for a in assemblies for e in a.nonlinear):
-        return at_lines(_one_by_one(assemblies, blows, substeps))
-    from ema_pipeline.mechanics.kernel import drive  # compiles at its first use
-
-    _, straight = _fine(blows.force, substeps)
-    orders = np.array([ORDERS[q] for q in blows.quantities])
-    points, at = np.unique(blows.in_rows, axis=0, return_inverse=True)
-    at = at.reshape(-1)
-    batch = _prepared(assemblies, blows.out_rows, orders, blows.in_rows)
-    found = _marched(batch, batch.outputs[:, :0], straight, step, substeps, trace=True)
-
-    turn = np.exp(-1 / (blows.sample_rate_hz * fade_s) - 2j * np.pi * lines / samples)
-    end = float(np.exp(-samples / (blows.sample_rate_hz * fade_s)))
-
-    def at_phases(forces: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Lines, one sample late, of forces j steps after each sample but the last: (substeps, ..., n_lines)."""
-        phases = np.zeros((substeps, *forces.shape[:-1], samples))
-        for j in range(substeps):
-            phases[j, ..., :-1] = forces[..., j::substeps][..., : samples - 1]
-        return at_lines(phases) * turn
-
-    hits, count, channels = len(straight), len(lines), len(blows.out_rows)
-    of_blows, at_once = at_phases(straight), at_lines(blows.force)
-    powers = np.arange(substeps)[::-1]
-    first_hit = np.array([np.flatnonzero(at == k)[0] for k in range(len(points))])
-    result = np.empty((len(assemblies), hits, channels, count), dtype=complex)
-    for a in range(len(assemblies)):
-        decay = np.exp(batch.poles[a] * step)
-        whole = decay**substeps
-        # a mode and its conjugate together, real coefficients before two functions of the frequency, and a third one
-        # for what the last sample adds
-        below = 1 - 2 * whole.real[:, None] * turn + np.abs(whole[:, None]) ** 2 * turn**2
-        functions = np.concatenate(
-            [(1 - whole.real[:, None] * turn) / below, whole.imag[:, None] * turn / below, 1 / turn[None]]
-        )
-        outputs, begun, ended = batch.outputs[a], found.begun[a], found.ended[a]
-        direct = batch.direct[a].copy()
-        direct[:, :hits] = 0
-        instant = (outputs @ ended.T).real + direct
-        forces = found.forces[a]
-        states = found.last[a].reshape(hits, 2, -1)
-        rest = -ended[:hits] * straight[:, :1] - end * whole * (states[:, 0] + 1j * states[:, 1])
-        last = instant[:, :hits] * straight[:, -1] + instant[:, hits:] @ forces[..., -1].T
-        free = _over(outputs, rest, functions, end * last)
-        inputs = np.concatenate([first_hit, np.arange(hits, len(begun))])
-        into = (begun[inputs] * decay ** powers[:, None, None]).reshape(-1, len(decay))
-        now = np.zeros((channels, substeps, len(inputs)))
-        now[:, 0] = instant[:, inputs]
-        transfer = _over(outputs, into, functions, now.reshape(channels, -1))
-        transfer = transfer.reshape(channels, substeps, len(inputs), count)
-        drive(free, transfer, of_blows, at_phases(forces), at, batch.direct[a][:, :hits], at_once, result[a])
-    return result
-
-
-def _over(
-    outputs: NDArray[np.complex128],
-    inputs: NDArray[np.complex128],
-    functions: NDArray[np.complex128],
-    instant: NDArray[np.float64],
-) -> NDArray[np.complex128]:
-    """Lines at outputs (n_outputs, P) of modes that inputs (n, P) move, (n_outputs, n, n_lines).
-
-    `functions`, (2P + 1, n_lines), go with real and imaginary parts of outputs·inputs, and with `instant`.
-    """
-    product = outputs[:, None] * inputs
-    share = np.concatenate([product.real, -product.imag, instant[..., None]], axis=2)
-    flat = share.reshape(-1, share.shape[2]) @ functions.view(np.float64)
-    return np.asarray(flat.view(np.complex128).reshape(*share.shape[:2], -1))
-
-
 @dataclass(frozen=True)
-class _Batch:
+class Batch:
     """Modes of many assemblies, filled up with nothing to one size.
 
     Attributes
@@ -267,12 +154,13 @@ class _Batch:
     direct: NDArray[np.float64]
 
 
-def _prepared(
+def prepared(
     assemblies: Sequence[Assembly],
     out_rows: NDArray[np.float64],
     orders: NDArray[np.int64],
     in_rows: NDArray[np.float64],
-) -> _Batch:
+) -> Batch:
+    """Modes of assemblies with the same coordinates, and what blows and elements do to them."""
     elements = {e.name: e for a in assemblies for e in a.nonlinear}
     for assembly in assemblies:
         for element in assembly.nonlinear:
@@ -299,11 +187,11 @@ def _prepared(
         own = {e.name: e.law for e in assembly.nonlinear}
         for j, name in enumerate(elements):
             laws[i, j] = own.get(name) or _NO_FORCE
-    return _Batch(tuple(elements), laws, poles, inputs, stretch, outputs, direct)
+    return Batch(tuple(elements), laws, poles, inputs, stretch, outputs, direct)
 
 
-def _marched(
-    batch: _Batch,
+def marched(
+    batch: Batch,
     outputs: NDArray[np.complex128],
     force: NDArray[np.float64],
     step: float,
@@ -325,7 +213,7 @@ def _marched(
     return found
 
 
-def _one_by_one(assemblies: Sequence[Assembly], blows: Blows, substeps: int) -> NDArray[np.float64]:
+def one_by_one(assemblies: Sequence[Assembly], blows: Blows, substeps: int) -> NDArray[np.float64]:
     """The same for elements with a memory or a law of their own."""
     order = [ORDERS[q] for q in blows.quantities]
     result = []
@@ -384,7 +272,7 @@ def _modal(system: LinearSystem) -> _Modal:
     return _Modal(poles[keep].astype(complex), left[keep], (right * twice)[:, keep], flexibility)
 
 
-def _fine(force: NDArray[np.float64], substeps: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def fine_force(force: NDArray[np.float64], substeps: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The force at the steps, and the values whose straight connections act on slow motions as it does.
 
     Straight lines between steps weaken what happens at frequency f by sinc²(f·step).

@@ -24,7 +24,8 @@ from ema_pipeline.diagnose.levels.data import HitWindows
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.space import Space, make_space
 from ema_pipeline.mechanics.assembly import Assembly
-from ema_pipeline.mechanics.batch import Blows, batch_lines, batch_response
+from ema_pipeline.mechanics.batch import Blows, batch_response
+from ema_pipeline.mechanics.batch_lines import batch_lines
 from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.rigs.types import Rig
 
