@@ -254,7 +254,9 @@ def _candidates(
                 at=place,
                 title=title,
                 probability=ranking.probabilities[m.hypothesis.label],
-                parameters=_own_sizes(case, m, climbed.floor),
+                parameters=_own_sizes(
+                    case, climbed.models[-1] if label in added else m, climbed.floor, label
+                ),
                 error_before=before.error,
                 error_after=after.error,
                 heldout_before=before.heldout_error,
@@ -269,9 +271,8 @@ def _candidates(
     return tuple(result)
 
 
-def _own_sizes(case: LevelCase, m: Simulated, floor: NoiseFloor) -> dict[str, EffectSize]:
-    """Sizes of the effect added last, by their own names."""
-    label = m.hypothesis.labels[-1]
+def _own_sizes(case: LevelCase, m: Simulated, floor: NoiseFloor, label: str) -> dict[str, EffectSize]:
+    """Sizes of one effect of a model, by their own names."""
     own = [f"{label}.{p.name}" for p in case.parameters_of(label)]
     return {
         n.removeprefix(f"{label}."): v
@@ -314,8 +315,7 @@ def _verdict(
             f"The model explains the hits at all levels (error {error:.2f}); nothing is missing.",
         )
     texts = [
-        f"{label_text(label)} ({size_text(_own_sizes(case, m, climbed.floor))})"
-        for label, m in zip(added, climbed.models[-len(added) :], strict=True)
+        f"{label_text(label)} ({size_text(_own_sizes(case, last, climbed.floor, label))})" for label in added
     ]
     rungs = ladder.rungs[-len(added) - 1], ladder.rungs[-1]
     both = [np.where(np.isfinite(r.heldout_misfit), r.heldout_misfit, r.misfit) for r in rungs]
