@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose import DiagnoseSettings
 from ema_pipeline.diagnose.fitting import Case, fit_null
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.weighing import mixing_volume
+from ema_pipeline.diagnose.weighing import missed_modes, mixing_volume
 from ema_pipeline.dof import Dof
 from ema_pipeline.fit.solve import Optimum
 from ema_pipeline.mechanics.modes import normal_modes
@@ -75,3 +77,36 @@ def test_damping_that_does_nothing_leaves_the_volume_of_free_mixing_as_it_was(
     assert plain > 50
     damped = volume(Hypothesis((label,)), {**base.values, f"{label}.{size}": 1e-7})
     assert damped == pytest.approx(plain, abs=0.5)
+
+
+def test_motions_that_hardly_ring_are_no_modes_that_a_test_misses() -> None:
+    one = modes()
+    last = replace(
+        one,
+        **{
+            n: getattr(one, n)[-1:]
+            for n in (
+                "frequency_hz",
+                "frequency_std_hz",
+                "damping_ratio",
+                "damping_std",
+                "shapes",
+                "shape_std",
+            )
+        },
+    )
+    case = Case(RIG, {"no_ring": last}, SETTINGS)
+    label = "local_damper@carrier"
+    problem = case.problem(Hypothesis((label,)), SETTINGS.fit)
+    values = {n: 1e7 if p.free else p.value for n, p in RIG.parameters.items()}
+    counts = []
+    for size in (0.0, 500.0):
+        x = problem.space.point({**values, f"{label}.coefficient": size})
+        found = problem.modes(x)[0]
+        counts.append(missed_modes(problem, x))
+        rings = np.abs(found.damping_ratio[0]) < 0.2
+        hz = found.omega[0] / (2 * np.pi)
+        dull = int(np.sum(~rings & (hz > 5) & (hz < 1900)))
+        assert (dull > 0) == (size > 0)
+    assert counts[0] > 10
+    assert counts[1] <= counts[0] - dull

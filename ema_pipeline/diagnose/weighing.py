@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ema_pipeline.correlate.residuals import shape_fit
 from ema_pipeline.diagnose.hypotheses import Extra
 from ema_pipeline.fit.solve import FitProblem, Optimum
+from ema_pipeline.modal.segment import MAX_DAMPING_RATIO
 
 _VISIBLE = 0.02
 _INSIDE = 0.01
@@ -123,7 +124,10 @@ def lonely_cost(problem: FitProblem, x: NDArray[np.float64]) -> NDArray[np.float
 
 
 def missed_modes(problem: FitProblem, x: NDArray[np.float64]) -> int:
-    """Model modes inside the band, moving sensors and struck points, that no measured mode is paired with."""
+    """Model modes inside the band, moving sensors and struck points, that no measured mode is paired with.
+
+    Motions that hardly ring, rigid bodies on dampers among them, are none that an identification could give.
+    """
     count = 0
     for e, pairs, modes in zip(problem.evidence, problem.assignments(x), problem.modes(x), strict=True):
         m = e.measured
@@ -136,6 +140,7 @@ def missed_modes(problem: FitProblem, x: NDArray[np.float64]) -> int:
         struck = np.max(at[points], axis=0) if points else seen
         inside = (f > 1.1 * max(m.band_hz[0], 1.0)) & (f < m.band_hz[1] / 1.05)
         shows = (seen > _VISIBLE * np.max(seen)) & (struck > _VISIBLE * np.max(struck))
+        shows &= np.abs(modes.damping_ratio[0]) < MAX_DAMPING_RATIO
         free = np.ones(f.size, dtype=bool)
         free[pairs[pairs >= 0]] = False
         count += int(np.sum(inside & shows & free))
