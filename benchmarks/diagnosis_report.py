@@ -177,6 +177,12 @@ def _calibration(lines: list[Line]) -> list[str]:
     return out
 
 
+def _first_right(line: Line) -> bool:
+    first = line["candidates"][0]["label"]
+    names = _meant(line, first) if line["verdict"] == "effect" else {first}
+    return bool(line["truth"]) and labels(line)[0] in names
+
+
 def _removed(removed: list[Line]) -> list[str]:
     honest = [x for x in removed if x["verdict"] in ("unknown_effect", "ambiguous")]
     confident = [x for x in removed if x["verdict"] == "effect"]
@@ -197,9 +203,8 @@ def _body_named(line: Line) -> bool:
 
 
 def _meant(line: Line, label: str) -> set[str]:
-    """A claimed effect with those that are named as the same change under other names."""
-    groups = line["groups"] if line["verdict"] == "effect" else []
-    return {label}.union(*(g for g in groups if label in g))
+    """A claimed effect with those that are named beside it: other names of one change, or rivals."""
+    return {label}.union(*(g for g in line["groups"] if label in g))
 
 
 def _pairs(pairs: list[Line]) -> list[str]:

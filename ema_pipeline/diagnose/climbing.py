@@ -195,6 +195,18 @@ def group(case: Case, ranking: Ranking, witness: Witness) -> list[Fitted]:
     return members
 
 
+def rivals(case: Case, climbed: Climb, witness: Witness) -> tuple[int, list[Fitted]]:
+    """The first rung whose claim the data do not tell from others, from 0, and all that explain them alike there.
+
+    Where every claim stands alone, the first rung and its claim.
+    """
+    for rung, ranking in enumerate(climbed.rankings[: len(climbed.models) - 1]):
+        found = group(case, ranking, witness)
+        if len(found) > 1:
+            return rung, found
+    return 0, group(case, climbed.rankings[0], witness)
+
+
 def part(tell: Progress, low: float, high: float) -> Progress:
     """Progress of a part of the work within the whole."""
     return lambda share, text: tell(low + (high - low) * share, text)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.advice import next_measurement
-from ema_pipeline.diagnose.climbing import Climb, at_bound, climb, group, part
+from ema_pipeline.diagnose.climbing import Climb, at_bound, climb, group, part, rivals
 from ema_pipeline.diagnose.detection import detection_limits
 from ema_pipeline.diagnose.explain import why
 from ema_pipeline.diagnose.fitting import Case, Fitted
@@ -110,10 +110,10 @@ def _diagnose(
     )
     ladder = with_frfs(ladder, climbed.models, witness)
     stick = yardstick(case, fit, climbed.explaining)
-    members = _alike(case, climbed, ladder, stick, witness)
+    rung, members = _alike(case, climbed, ladder, stick, witness)
     tell(0.93, "predicting held-out data")
-    candidates = _candidates(case, climbed, members, ladder, stick, witness, thresholds)
-    verdict, summary = judge_data(case, screening, climbed, members, ladder)
+    candidates = _candidates(case, climbed, rung, members, ladder, stick, witness, thresholds)
+    verdict, summary = judge_data(case, screening, climbed, rung, members, ladder)
     groups = _groups(case, climbed, members, verdict)
     localised: tuple[Localisation, ...] = ()
     if verdict == "unknown_effect":
@@ -127,7 +127,7 @@ def _diagnose(
         null_probability=first.probabilities[NOTHING],
         candidates=candidates,
         indistinguishable=groups,
-        next_measurement=next_measurement(case, verdict, first, members, fit),
+        next_measurement=next_measurement(case, verdict, climbed.rankings[rung], members, fit),
         localisation=localised,
         probabilities=first.probabilities,
         error=ladder.rungs[0].error,
@@ -147,7 +147,7 @@ def _groups(
 ) -> tuple[tuple[str, ...], ...]:
     """What the data cannot tell apart: rivals, and names for the same change of the matrices."""
     if verdict == "ambiguous":
-        labels = [x for f in members for x in (f.hypothesis.label, *_same(case, f))]
+        labels = [x for f in members for x in (f.hypothesis.labels[-1], *_same(case, f))]
         return (tuple(labels if len(labels) > 1 else [*labels, NOTHING]),)
     claimed = [(m.hypothesis.labels[-1], *_same(case, m)) for m in climbed.models[1:]]
     return tuple(labels for labels in claimed if len(labels) > 1)
@@ -159,21 +159,24 @@ def _same(case: Case, f: Fitted) -> tuple[str, ...]:
     return same_physics(case.rig, list(case.measured), case.library, f.hypothesis, size)
 
 
-def _alike(case: Case, climbed: Climb, ladder: Ladder, stick: Yardstick, witness: Witness) -> list[Fitted]:
-    """What explains the data alike: rivals of the first claim; where nothing is claimed, what would mend a model
-    that fails."""
+def _alike(
+    case: Case, climbed: Climb, ladder: Ladder, stick: Yardstick, witness: Witness
+) -> tuple[int, list[Fitted]]:
+    """What explains the data alike and on which rung, from 0: rivals of a claim; where nothing is claimed, what would
+    mend a model that fails."""
     if len(climbed.models) > 1:
-        return group(case, climbed.rankings[0], witness)
+        return rivals(case, climbed, witness)
     if misfit(case, climbed.top, ladder.rungs[-1].error):
         found = mending(case, climbed.rankings[0], stick)
         base = witness.error(climbed.top)
-        return [f for f in found if not witness.rejects(base, f, True)]
-    return group(case, climbed.rankings[0], witness)[:1]
+        return 0, [f for f in found if not witness.rejects(base, f, True)]
+    return 0, group(case, climbed.rankings[0], witness)[:1]
 
 
 def _candidates(
     case: Case,
     climbed: Climb,
+    undecided: int,
     members: Sequence[Fitted],
     ladder: Ladder,
     stick: Yardstick,
@@ -183,7 +186,7 @@ def _candidates(
     """The claimed effects, each with what it brought on its rung, and what else was most probable alone."""
     added = climbed.top.hypothesis.labels
     first = climbed.rankings[0]
-    alike = {f.hypothesis.label for f in members}
+    alike = {f.hypothesis.label for f in members} if undecided == 0 else set()
     listed = [f for f in first.ordered() if f.hypothesis.label not in added]
     kept = [f for f in listed if f.hypothesis.label in alike or (sizes(case, f) and not at_bound(case, f))]
     shown = kept[: max(case.settings.candidates - len(added), 1)]
@@ -205,6 +208,12 @@ def _candidates(
                 claimed=True,
             )
         )
+        if undecided == rung - 1 > 0:
+            others = [f for f in members if f.hypothesis.label != model.hypothesis.label]
+            share = chance / below.probabilities[model.hypothesis.label]
+            for f in others:
+                rival = _candidate(case, below, f, stick, witness, thresholds)
+                result.append(replace(rival, probability=share * rival.probability))
     for f in shown:
         made = _candidate(case, first, f, stick, witness, thresholds)
         heldout = float("nan")

@@ -28,6 +28,7 @@ def judge_data(
     case: Case,
     screening: Screening,
     climbed: Climb,
+    rung: int,
     members: Sequence[Fitted],
     ladder: Ladder,
 ) -> tuple[VerdictWord, str]:
@@ -38,6 +39,8 @@ def judge_data(
     case : Case
     screening : Screening
     climbed : Climb
+    rung : int
+        From 0, the rung on which `members` are rivals.
     members : sequence of Fitted
         What explains the data alike, the most probable first.
     ladder : Ladder
@@ -48,7 +51,7 @@ def judge_data(
     added = top.hypothesis.labels
     if screening.too_few:
         return "not_enough_data", screening.too_few
-    names = ", ".join(label_text(f.hypothesis.label) for f in members)
+    names = ", ".join(label_text(f.hypothesis.labels[-1]) for f in members)
     if wrong and not added and len(members) > 1:
         return (
             "ambiguous",
@@ -73,9 +76,13 @@ def judge_data(
             f"The model explains the data (error {ladder.rungs[-1].error:.2f}); "
             f"nothing is missing ({100 * p:.0f} %).{odd}{_slight_text(case, first)}"
         )
-    if len(members) > 1:
-        return "ambiguous", f"Something is missing, but these explain the data alike: {names}."
     texts = [f"{label_text(label)} ({size_text(sizes(case, top, label))})" for label in added]
+    if len(members) > 1:
+        sure = f"Missing: {' and '.join(texts[:rung])}. " if rung else ""
+        return (
+            "ambiguous",
+            f"{sure}Something {'else ' * (rung > 0)}is missing, but these explain the data alike: {names}.",
+        )
     base, last = ladder.rungs[0], ladder.rungs[-1]
     return "effect", (
         f"Missing: {' and '.join(texts)}. Error {base.error:.3g} before, {last.error:.3g} after; "
