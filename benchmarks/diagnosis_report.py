@@ -88,7 +88,7 @@ def share(part: Sequence[object] | int, whole: Sequence[object] | int) -> str:
 
 def _effects(single: list[Line], twins: dict[int, Line]) -> list[str]:
     out = [
-        "| effect | cases | above the stated limit | of these found (in a group) | wrong | missed, unknown | "
+        "| effect | cases | above the stated limit | of these found (in a group) | wrong claims | missed, unknown | "
         "smallest found |",
         "|---|---|---|---|---|---|---|",
     ]
@@ -103,7 +103,7 @@ def _effects(single: list[Line], twins: dict[int, Line]) -> list[str]:
             (next(iter(sizes(line).values())) for line in own if outcome(line) in ("right", "group")),
             default=np.nan,
         )
-        wrong = sum(outcome(line) == "wrong" for line in own)
+        wrong = sum(line["verdict"] == "effect" and bool(_wrong(line)) for line in own)
         out.append(
             f"| `{family}` | {len(own)} | {len(above)} | {found} ({told['group']}) | {wrong} | "
             f"{told['missed']}, {told['unknown']} | {smallest:.3g} |"
@@ -167,9 +167,7 @@ def _calibration(lines: list[Line]) -> list[str]:
     for low, high in SURE:
         own = [x for x in lines if x["candidates"] and low <= x["candidates"][0]["probability"] < high]
         if own:
-            hits = sum(
-                bool(x["truth"]) and labels(x)[0] in _meant(x, x["candidates"][0]["label"]) for x in own
-            )
+            hits = sum(_first_right(x) for x in own)
             said = float(np.mean([x["candidates"][0]["probability"] for x in own]))
             out.append(
                 f"  {low:.2f}–{min(high, 1.0):.2f}: said {said:.2f} on average, right in {share(hits, own)};"
@@ -202,6 +200,11 @@ def _body_named(line: Line) -> bool:
     )
 
 
+def _wrong(line: Line) -> list[str]:
+    """Claims that name no true effect, nor stand in a stated group with one."""
+    return [c for c in line["claimed"] if not _meant(line, c) & set(labels(line))]
+
+
 def _meant(line: Line, label: str) -> set[str]:
     """A claimed effect with those that are named beside it: other names of one change, or rivals."""
     return {label}.union(*(g for g in line["groups"] if label in g))
@@ -209,7 +212,7 @@ def _meant(line: Line, label: str) -> set[str]:
 
 def _pairs(pairs: list[Line]) -> list[str]:
     both = [x for x in pairs if all(any(t in _meant(x, c) for c in x["claimed"]) for t in labels(x))]
-    none_wrong = [x for x in pairs if all(_meant(x, c) & set(labels(x)) for c in x["claimed"])]
+    none_wrong = [x for x in pairs if not _wrong(x)]
     return [
         f"* Two effects at once: both found in {share(both, pairs)}, none wrong added in {share(none_wrong, pairs)}."
     ]
