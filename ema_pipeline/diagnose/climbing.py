@@ -100,7 +100,7 @@ def climb(case: Case, witness: Witness, thresholds: Mapping[str, float] | None, 
         if claim is None:
             refuted = note != NOT_SUPPORTED
             break
-        if len(models) > 1 and not _told_apart(rankings[-1], claim, settings.probability_least):
+        if len(models) > 1 and not _told_apart(case, rankings[-1], witness):
             note = (
                 f"{claim.hypothesis.labels[-1]} or others like it may be missing too: too small to tell which"
             )
@@ -117,10 +117,12 @@ def climb(case: Case, witness: Witness, thresholds: Mapping[str, float] | None, 
     return Climb(models, rankings, level, note, refuted)
 
 
-def _told_apart(ranking: Ranking, claim: Fitted, least: float) -> bool:
-    """True where a further effect is told from its rivals, or a model that fails needs it anyway."""
-    something = 1 - ranking.probabilities[NOTHING]
-    return not holds(ranking.base) or ranking.probabilities[claim.hypothesis.label] >= least * something
+def _told_apart(case: Case, ranking: Ranking, witness: Witness) -> bool:
+    """True where a further effect is told from rivals elsewhere, or a model that fails needs it anyway."""
+    if not holds(ranking.base):
+        return True
+    places = {f.hypothesis.labels[-1].partition("@")[2] for f in group(case, ranking, witness)}
+    return len(places) == 1
 
 
 def claimable(

@@ -16,6 +16,7 @@ _STALE = 1.0
 _WIDE, _WIDENED = 3e-2, (3e-3, 5e-4)
 """Relative errors of frequency that widened uncertainties allow, whatever the noise level."""
 _FINEST = 1e-6
+_MOST_KEPT = 6
 
 
 def straight(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
@@ -70,6 +71,34 @@ def descend_rungs(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
         found = descend(LatentObjective(problem.evidence, tau), problem.space, x, mixture, 6)
         x = found.x
     assert found is not None
+    return found
+
+
+def keeping_one(problem: FitProblem, lost: NDArray[np.bool_]) -> list[Optimum]:
+    """Optima that hold on to one of the modes which a fit has given up, one after the other.
+
+    Modes that the model cannot have at their distance (a pair that is split) let go together, and of the parameter
+    that only they know: it is then anywhere, and what would explain them starts from nowhere.
+
+    Parameters
+    ----------
+    problem : FitProblem
+    lost : ndarray of bool, (R,)
+        Modes given up, configurations one after the other.
+    """
+    start = descend_rungs(problem, problem.space.point()).x
+    pairs = problem.assignments(start)
+    ends = np.cumsum([p.size for p in pairs])[:-1]
+    every = np.concatenate(pairs)
+    found = []
+    for kept in np.flatnonzero(lost & (every >= 0))[:_MOST_KEPT]:
+        alone = np.where(lost, -1, every)
+        alone[kept] = every[kept]
+        x = start
+        for error in (_WIDE, *_WIDENED):
+            mixture = _allowing(problem, error)
+            x = descend(problem.exact(np.split(alone, ends)), problem.space, x, mixture, 4).x
+        found.append(refine(problem, x))
     return found
 
 

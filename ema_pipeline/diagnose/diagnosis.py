@@ -214,7 +214,8 @@ def _candidates(
             for f in others:
                 rival = _candidate(case, below, f, stick, witness, thresholds)
                 result.append(replace(rival, probability=share * rival.probability))
-    for f in shown:
+    told = {c.label for c in result}
+    for f in [f for f in shown if f.hypothesis.label not in told]:
         made = _candidate(case, first, f, stick, witness, thresholds)
         heldout = float("nan")
         if f.hypothesis.label in alike:

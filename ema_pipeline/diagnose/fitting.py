@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
-from ema_pipeline.diagnose.descents import best_distinct, descend_rungs, first_steps, honest, settle, straight
+from ema_pipeline.diagnose.descents import (
+    best_distinct,
+    descend_rungs,
+    first_steps,
+    honest,
+    keeping_one,
+    settle,
+    straight,
+)
 from ema_pipeline.diagnose.frequencies import finer_grid, searched_starts
 from ema_pipeline.diagnose.hypotheses import Extra, Hypothesis, extras, make_rig, starting_points
 from ema_pipeline.diagnose.scan import likeliest, scanned
@@ -152,6 +160,8 @@ def fit_null(
     found = search(problem, start)
     if np.any(found.inlier < 0.5) and np.any(found.inlier > 0.5):
         found = min((found, settle(problem, found.x)), key=lambda o: o.objective)
+    if np.sum(found.inlier < 0.5) > 1:
+        found = min((found, *keeping_one(problem, found.inlier < 0.5)), key=lambda o: o.objective)
     return judge(case, problem, hypothesis, found)
 
 
