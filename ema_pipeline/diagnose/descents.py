@@ -15,6 +15,7 @@ _TAU_RUNGS = (0.1, 0.02, 0.004)
 _STALE = 1.0
 _WIDE, _WIDENED = 3e-2, (3e-3, 5e-4)
 """Relative errors of frequency that widened uncertainties allow, whatever the noise level."""
+_NARROW = 2e-4
 _FINEST = 1e-6
 _MOST_KEPT = 6
 
@@ -38,6 +39,15 @@ def settle(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
         return found
     again = _narrowed(problem, found.x, (_WIDE, *_WIDENED))
     return min((found, again), key=lambda o: o.objective)
+
+
+def insisting(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
+    """Narrowed slowly with no mode let go: one that is lost again in the end has no place in the model."""
+    for error in (*_WIDENED, _NARROW):
+        mixture = _allowing(problem, error)
+        mixture = replace(mixture, outlier_cost=np.full_like(mixture.outlier_cost, np.inf))
+        x = descend(problem.exact(problem.assignments(x), alone=0.0), problem.space, x, mixture, 6).x
+    return refine(problem, x)
 
 
 def _narrowed(problem: FitProblem, x: NDArray[np.float64], errors: Sequence[float]) -> Optimum:

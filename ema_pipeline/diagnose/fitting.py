@@ -15,6 +15,7 @@ from ema_pipeline.diagnose.descents import (
     descend_rungs,
     first_steps,
     honest,
+    insisting,
     keeping_one,
     settle,
     straight,
@@ -281,9 +282,11 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
         candidates += [settle(problem, x) for x in scanned(problem, base.values, moved)]
         if base.annealed:
             candidates += [settle(problem, x) for x in scanned(problem, base.annealed, moved, 1)]
-    if base.lost and dynamic and not np.isfinite(base.latent):
-        candidates += [settle(problem, space.point({**base.values, **p})) for p in _one_sided_points(moved)]
     rig = make_rig(case.rig, hypothesis, case.library, case.settings.parameter_range)
+    turned = any(rig.parameters[e.name].unit == "deg" for e in moved)
+    if base.lost and dynamic and (turned or not np.isfinite(base.latent)):
+        widened = [settle(problem, space.point({**base.values, **p})) for p in _one_sided_points(moved)]
+        candidates += [*widened, *(insisting(problem, o.x) for o in widened if np.any(o.inlier < 0.5))]
     if new and base.lost:
         tuned = tuned_sizes(rig, moved, base.values, base.unexplained)
         candidates += [settle(problem, x) for x in likeliest(problem, base.values, moved, tuned)]
@@ -301,6 +304,8 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
             near = best_distinct([first_steps(problem, x) for x in near], 2)
         candidates += [refine(problem, x) for x in near]
     best = min((honest(problem, o) for o in candidates), key=lambda o: o.objective)
+    if best.objective < base.objective - _CLEAR_GAIN and np.any(best.inlier < 0.5):
+        best = min((best, honest(problem, insisting(problem, best.x))), key=lambda o: o.objective)
     return judge(case, problem, hypothesis, best)
 
 
