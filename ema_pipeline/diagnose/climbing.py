@@ -9,7 +9,7 @@ import numpy as np
 
 from ema_pipeline.diagnose.fitting import Case, Fitted, fit_null, holds, refit
 from ema_pipeline.diagnose.heldout import held_out
-from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, make_rig, single_hypotheses
+from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, single_hypotheses
 from ema_pipeline.diagnose.ladder import noise_of, yardstick
 from ema_pipeline.diagnose.noise import NoiseLevel, floors
 from ema_pipeline.diagnose.ranking import Ranking, rank, sharpen
@@ -170,7 +170,7 @@ def at_bound(case: Case, f: Fitted) -> str:
     Data that only push a size away do not estimate it.
     """
     last = f.hypothesis.labels[-1]
-    parameters = make_rig(case.rig, f.hypothesis, case.library, case.settings.parameter_range).parameters
+    parameters = case.rig_of(f.hypothesis).parameters
     for e in extras(case.rig, Hypothesis((last,)), case.library):
         p, value = parameters[e.name], f.values.get(e.name)
         if value is None or p.unit == "deg" or p.minimum <= 0 or not np.isfinite(p.maximum):
@@ -198,15 +198,13 @@ def group(case: Case, ranking: Ranking, witness: Witness) -> list[Fitted]:
 
 
 def rivals(case: Case, climbed: Climb, witness: Witness) -> tuple[int, list[Fitted]]:
-    """The first rung whose claim the data do not tell from others, from 0, and all that explain them alike there.
+    """Of models with a claim: the first rung, from 0, whose claim the data do not tell from others, and all of these.
 
     Where every claim stands alone, the first rung and its claim.
     """
-    for rung, ranking in enumerate(climbed.rankings[: len(climbed.models) - 1]):
-        found = group(case, ranking, witness)
-        if len(found) > 1:
-            return rung, found
-    return 0, group(case, climbed.rankings[0], witness)
+    groups = [group(case, ranking, witness) for ranking in climbed.rankings[: len(climbed.models) - 1]]
+    rung = next((k for k, members in enumerate(groups) if len(members) > 1), 0)
+    return rung, groups[rung]
 
 
 def part(tell: Progress, low: float, high: float) -> Progress:

@@ -44,15 +44,20 @@ def settle(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
 def insisting(problem: FitProblem, x: NDArray[np.float64]) -> Optimum:
     """Narrowed slowly with no mode let go: one that is lost again in the end has no place in the model."""
     for error in (*_WIDENED, _NARROW):
-        mixture = _allowing(problem, error)
-        mixture = replace(mixture, outlier_cost=np.full_like(mixture.outlier_cost, np.inf))
+        mixture = _allowing(problem, error).trusting()
         x = descend(problem.exact(problem.assignments(x), alone=0.0), problem.space, x, mixture, 6).x
     return refine(problem, x)
 
 
-def _narrowed(problem: FitProblem, x: NDArray[np.float64], errors: Sequence[float]) -> Optimum:
+def _narrowed(
+    problem: FitProblem,
+    x: NDArray[np.float64],
+    errors: Sequence[float],
+    held: Sequence[NDArray[np.int64]] | None = None,
+) -> Optimum:
+    """Refined after steps with uncertainties less and less widened, in `held` pairs or those of each point."""
     for error in errors:
-        pairs = problem.assignments(x)
+        pairs = problem.assignments(x) if held is None else held
         x = descend(problem.exact(pairs), problem.space, x, _allowing(problem, error), 4).x
     return refine(problem, x)
 
@@ -104,11 +109,7 @@ def keeping_one(problem: FitProblem, lost: NDArray[np.bool_]) -> list[Optimum]:
     for kept in np.flatnonzero(lost & (every >= 0))[:_MOST_KEPT]:
         alone = np.where(lost, -1, every)
         alone[kept] = every[kept]
-        x = start
-        for error in (_WIDE, *_WIDENED):
-            mixture = _allowing(problem, error)
-            x = descend(problem.exact(np.split(alone, ends)), problem.space, x, mixture, 4).x
-        found.append(refine(problem, x))
+        found.append(_narrowed(problem, start, (_WIDE, *_WIDENED), np.split(alone, ends)))
     return found
 
 

@@ -32,6 +32,7 @@ from ema_pipeline.fit.matrices import MatrixFamily
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.solve import FitProblem, Optimum, prepare, refine, search
 from ema_pipeline.fit.space import Space
+from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.types import Rig
 
 _CLEAR_GAIN = 30.0
@@ -62,6 +63,10 @@ class Case:
     )
     """Matrices of the hypotheses' rigs, by their effects and configuration: made once."""
 
+    def rig_of(self, hypothesis: Hypothesis) -> ParametricRig:
+        """The rig of a hypothesis, without anything prepared for a fit."""
+        return make_rig(self.rig, hypothesis, self.library, self.settings.parameter_range)
+
     def problem(
         self,
         hypothesis: Hypothesis,
@@ -80,7 +85,7 @@ class Case:
         loosened : mapping of parameter to float, optional
             By what the tolerances of some parameters are multiplied.
         """
-        rig = make_rig(self.rig, hypothesis, self.library, self.settings.parameter_range)
+        rig = self.rig_of(hypothesis)
         changed = dict(rig.parameters)
         for name, factor in (loosened or {}).items():
             changed[name] = replace(changed[name], tolerance=changed[name].tolerance * factor)
@@ -282,7 +287,7 @@ def fit_hypothesis(case: Case, hypothesis: Hypothesis, fit: FitSettings, base: G
         candidates += [settle(problem, x) for x in scanned(problem, base.values, moved)]
         if base.annealed:
             candidates += [settle(problem, x) for x in scanned(problem, base.annealed, moved, 1)]
-    rig = make_rig(case.rig, hypothesis, case.library, case.settings.parameter_range)
+    rig = case.rig_of(hypothesis)
     turned = any(rig.parameters[e.name].unit == "deg" for e in moved)
     if base.lost and dynamic and (turned or not np.isfinite(base.latent)):
         widened = [settle(problem, space.point({**base.values, **p})) for p in _one_sided_points(moved)]

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ema_pipeline.diagnose.fitting import Case, Fitted
-from ema_pipeline.diagnose.hypotheses import make_rig
 from ema_pipeline.mechanics.modes import normal_modes
 
 _WELL_DETERMINED = 0.03
@@ -38,7 +37,7 @@ def strong_unexplained(case: Case, model: Fitted) -> list[StrayMode]:
     A mode of the foundation is hardly seen in mass-normalised shapes of the rig. Two modes closer than a half-width may
     have been measured as one: such a mode fits neither and is no sign of anything missing.
     """
-    rig = make_rig(case.rig, model.hypothesis, case.library, case.settings.parameter_range)
+    rig = case.rig_of(model.hypothesis)
     found, start = [], 0
     for c, m in case.measured.items():
         explained = model.explained[start : start + len(m)]

@@ -9,7 +9,7 @@ import numpy as np
 from ema_pipeline.diagnose.climbing import Climb, at_bound
 from ema_pipeline.diagnose.explain import label_text, size_text
 from ema_pipeline.diagnose.fitting import Case, Fitted
-from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, make_rig
+from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras
 from ema_pipeline.diagnose.ladder import Yardstick
 from ema_pipeline.diagnose.ranking import Ranking, slight
 from ema_pipeline.diagnose.screening import Screening
@@ -116,7 +116,7 @@ def _chance(ranking: Ranking) -> str:
 
 def sizes(case: Case, f: Fitted, label: str | None = None) -> dict[str, EffectSize]:
     """Sizes of one of the hypothesis' effects, the last where none is named, by their own names."""
-    rig = make_rig(case.rig, f.hypothesis, case.library, case.settings.parameter_range)
+    rig = case.rig_of(f.hypothesis)
     units = {p.name: p.unit for p in rig.parameters.values()}
     last = label or f.hypothesis.labels[-1]
     return {

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from ema_pipeline.correlate.compare import windowed_accelerance
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.fitting import Case, Fitted
-from ema_pipeline.diagnose.hypotheses import make_rig
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.rigs.types import Rig
 
@@ -167,9 +166,7 @@ class Witness:
         """FRF error of a fitted hypothesis."""
         if not self.lines:
             return FrfError(float("nan"), {})
-        case = self.case
-        rig = make_rig(case.rig, fitted.hypothesis, case.library, case.settings.parameter_range)
-        return frf_error(rig, fitted.values, self.lines)
+        return frf_error(self.case.rig_of(fitted.hypothesis), fitted.values, self.lines)
 
     def rejects(self, base: FrfError, fitted: Fitted, explains_modes: bool) -> bool:
         """True where the FRFs contradict a hypothesis, or it explains all modes and leaves the FRFs as wrong as

@@ -58,6 +58,10 @@ class Mixture:
     prior: float
     scale: float = 1.0
 
+    def trusting(self) -> Mixture:
+        """The same with no mode taken for an outlier."""
+        return replace(self, outlier_cost=np.full_like(self.outlier_cost, np.inf))
+
     def robust(self, cost: NDArray[np.float64]) -> NDArray[np.float64]:
         """Robust cost of each mode."""
         return -2 * np.logaddexp(-0.5 * cost / self.scale**2, self._rival())
@@ -289,9 +293,8 @@ def refine(problem: FitProblem, start: NDArray[np.float64], scale: float = 1.0) 
         if best is None and np.any(problem.damping_only):
             # The latent shapes say nothing of damping: far from it every mode would look like an outlier.
             held = ~problem.damping_only
-            trusting = replace(mixture, outlier_cost=np.full_like(mixture.outlier_cost, np.inf))
             matched = problem.exact(pairs, alone=0.0)
-            x = descend(matched, problem.space, x, trusting, 6, held).x
+            x = descend(matched, problem.space, x, mixture.trusting(), 6, held).x
         found = descend(
             problem.exact(pairs), problem.space, x, mixture, problem.settings.iterations, None,
             problem.settings.convergence,

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.fft
@@ -92,6 +93,14 @@ def batch_lines(
     return result
 
 
+def faded_lines(
+    signals: NDArray[np.float64], fade: float, numbers: NDArray[np.int64]
+) -> NDArray[np.complex128]:
+    """Lines of the spectra of signals (..., n_samples) that are weighted with exp(-k/fade), (..., n_lines)."""
+    shade = np.exp(-np.arange(signals.shape[-1]) / fade)
+    return np.asarray(scipy.fft.rfft(signals * shade, axis=-1)[..., numbers])
+
+
 @dataclass(frozen=True)
 class _Record:
     """Lines of a record whose samples are weighted with exp(-k/fade)."""
@@ -101,7 +110,7 @@ class _Record:
     fade: float
     numbers: NDArray[np.int64]
 
-    @property
+    @cached_property
     def turn(self) -> NDArray[np.complex128]:
         """Q of every line."""
         return np.asarray(np.exp(-1 / self.fade - 2j * np.pi * self.numbers / self.samples))
@@ -113,8 +122,7 @@ class _Record:
 
     def lines_of(self, signals: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Lines of signals (..., n_samples)."""
-        shade = np.exp(-np.arange(self.samples) / self.fade)
-        return np.asarray(scipy.fft.rfft(signals * shade, axis=-1)[..., self.numbers])
+        return faded_lines(signals, self.fade, self.numbers)
 
     def phases_of(self, forces: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Q·Uⱼ of forces (..., n_steps), (substeps, ..., n_lines)."""

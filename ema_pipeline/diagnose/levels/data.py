@@ -12,6 +12,7 @@ from scipy.ndimage import uniform_filter1d
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.ingest.records import Hit, Record
+from ema_pipeline.mechanics.batch_lines import faded_lines
 
 _BEFORE_S = 0.004
 """Taken before the peak of the force: the pulse's flank and the filter's ringing."""
@@ -99,8 +100,7 @@ class HitWindows:
 
     def spectra(self, signals: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Spectra inside the band of signals (..., n_samples) that are weighted with exp(-t/fade_s)."""
-        shade = np.exp(-self.time_s / self.fade_s)
-        return np.asarray(scipy.fft.rfft(signals * shade, axis=-1)[..., self.lines])
+        return faded_lines(signals, self.fade_s * self.sample_rate_hz, self.lines)
 
     def in_band(self, signals: NDArray[np.float64]) -> NDArray[np.float64]:
         """The signals' part inside the band, (..., n_samples)."""

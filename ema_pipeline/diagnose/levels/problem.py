@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,8 @@ from ema_pipeline.mechanics.batch import Blows, batch_response
 from ema_pipeline.mechanics.batch_lines import batch_lines
 from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.rigs.types import Rig
+
+_T = TypeVar("_T", np.float64, np.complex128)
 
 _STEP = 1e-3
 _CHUNK = 256
@@ -63,7 +66,7 @@ class TimeProblem:
             Where the motion of a model grows without bound.
         """
         return [
-            np.concatenate([batch_response(some, blows, self.substeps) for some in parts])
+            _joined([batch_response(some, blows, self.substeps) for some in parts])
             for w in self.windows
             for blows, parts in [self._parts(w, points)]
         ]
@@ -77,7 +80,7 @@ class TimeProblem:
             Where the motion of a model grows without bound.
         """
         return [
-            np.concatenate([batch_lines(some, blows, self.substeps, w.fade_s, w.lines) for some in parts])
+            _joined([batch_lines(some, blows, self.substeps, w.fade_s, w.lines) for some in parts])
             for w in self.windows
             for blows, parts in [self._parts(w, points)]
         ]
@@ -193,7 +196,12 @@ def weighted(weights: Sequence[Whitening], lines: Sequence[NDArray[np.complex128
     parts = []
     for weight, simulated in zip(weights, lines, strict=True):
         parts.append(weight.applied(simulated).reshape(len(simulated), -1).view(np.float64))
-    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
+    return _joined(parts, axis=1)
+
+
+def _joined(parts: Sequence[NDArray[_T]], axis: int = 0) -> NDArray[_T]:
+    """Arrays as one; a single one, which is large, is not copied."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=axis)
 
 
 @dataclass(frozen=True)

@@ -68,7 +68,6 @@ def follow(
         Typical values of the effects' parameters, and all values where a fit begins.
     floor : NoiseFloor
     """
-    last = hypothesis.labels[-1] if hypothesis.labels else ""
     parts = (case.softer().beginning(_GROWING[-1]), *(case.beginning(share) for share in _GROWING))
     grown: list[tuple[Mapping[str, float], TimeFit]] = []
     for sizes, values in begun:
@@ -76,8 +75,7 @@ def follow(
         for part in parts:
             found = _stage(part, hypothesis, sizes, now, floor)
             now = found.values
-        own = [n for n in sizes if n.rpartition(".")[0] == last][:1]
-        if not any(_met(found, other, own) for _, other in grown):
+        if not any(_met(found, other, _first_size(hypothesis, sizes)) for _, other in grown):
             grown.append((sizes, found))
     whole = case.coarse()
     ends = [
@@ -90,6 +88,11 @@ def follow(
         for sizes, found in grown
     ]
     return min(ends, key=lambda m: m.fit.objective)
+
+
+def _first_size(hypothesis: Hypothesis, sizes: Mapping[str, float]) -> list[str]:
+    """The first of the sizes of the effect added last, if any."""
+    return [n for n in sizes if n.rpartition(".")[0] in hypothesis.labels[-1:]][:1]
 
 
 def _met(one: TimeFit, other: TimeFit, own: Sequence[str]) -> bool:
@@ -107,10 +110,9 @@ def _stage(
     floor: NoiseFloor,
 ) -> TimeFit:
     """A fit from the best of neighbouring sizes: where parts strike there are many optima side by side."""
-    last = hypothesis.labels[-1] if hypothesis.labels else ""
     problem, weights = case.problem(hypothesis, sizes), case.weights(floor)
     x = np.array([problem.space.point(values)])
-    for name in [n for n in sizes if n.rpartition(".")[0] == last][:1]:
+    for name in _first_size(hypothesis, sizes):
         x = np.array([problem.space.point({**values, name: values[name] * k}) for k in _NEIGHBOURS])
         x = x[[np.argmin(objectives(problem, weights, x))]]
     return fit(problem, weights, x[0], _STEPS)
