@@ -127,12 +127,20 @@ def test_products_of_two_modes_are_told_by_their_frequencies(
     assert product_of(at(270.2, a), [a]) == ""
 
 
-def test_a_mode_grows_in_proportion_to_the_force_and_a_third_harmonic_with_its_cube() -> None:
-    force = np.array([10.0, 30.0, 100.0])
-    amplitude = np.stack([1e-6 * force, 1e-9 * force], axis=1)
-    assert growth(amplitude, force) == pytest.approx(1.0)
-    assert growth(1e-9 * force[:, None] ** 3, force) == pytest.approx(3.0)
-    assert np.isnan(growth(np.full((3, 2), np.nan), force))
+def test_a_mode_grows_in_proportion_to_the_force_and_a_third_harmonic_with_its_cube(
+    hardening: tuple[LevelStudy, ModalModel, FrfSet],
+) -> None:
+    mode, force = hardening[0].modes[0], np.array([10.0, 30.0, 100.0])
+
+    def sized(size: list[float], std: float) -> float:
+        return growth(replace(mode, size=np.array(size), size_std=np.full(3, std)), force)
+
+    assert sized([1.0, 1.0, 1.0], 0.01) == pytest.approx(1.0)
+    assert sized([0.01, 0.09, 1.0], 1e-4) == pytest.approx(3.0)
+    assert sized([-0.1, 0.1, 1.0], 0.2) == pytest.approx(1.0 + np.log10(1 / 0.4))
+    assert sized([np.nan, 0.3, 0.3], 0.01) == pytest.approx(1.0)
+    assert np.isnan(sized([np.nan, np.nan, 1.0], 0.01))
+    assert np.isnan(growth(replace(mode, size=None), force))
 
 
 def test_a_model_less_one_mode_keeps_its_chart(hardening: tuple[LevelStudy, ModalModel, FrfSet]) -> None:

@@ -37,11 +37,12 @@ PLAIN = 2.0
 
 @dataclass(frozen=True)
 class Solved:
-    """Per hit and mode: pole, standard deviation of its parts, participation."""
+    """Per hit and mode: pole and participation, and the standard deviations of their parts."""
 
     poles: Complex
     std: Real
     participation: Complex
+    participation_std: Real
 
 
 def solve(
@@ -77,7 +78,8 @@ def solve(
     start = _least_squares(*_whitened(along, mean, scale * np.sqrt(total), smooth))
     columns = np.concatenate([shapes.T[:, :, None] * start[:, None] * du, along], axis=1)
     if n_hits == 1:
-        return Solved(poles[None], np.full((1, m), np.inf), start[None])
+        unknown = np.full((1, m), np.inf)
+        return Solved(poles[None], unknown, start[None], unknown)
     moved = _of_mean(omega, poles, shapes, rest_s, start, mean, scale * np.sqrt(total), smooth)
     if np.any(np.abs(moved - poles) > -CURVED * poles.real):
         poles = moved
@@ -102,9 +104,10 @@ def solve(
         scale = 1 / np.sqrt(model.variance[:, 0])
     own = model.own[:, 0] * scale**2
     common = np.sqrt(model.common[:, 0]) * scale * mean / np.maximum(np.abs(mean), 1e-300)
-    std = np.array(
-        [_deviations(_whitened(columns, mean, scale * r, smooth)[0], own, common)[:m] for r in root]
+    deviations = np.array(
+        [_deviations(_whitened(columns, mean, scale * r, smooth)[0], own, common) for r in root]
     )
+    std = deviations[:, :m]
     large = (std < -UNKNOWN * poles.real) & (np.abs(solution[:, :m]) > -CURVED * poles.real)
     for h in np.flatnonzero(large.any(axis=1)).tolist():
         better = _refined(
@@ -112,7 +115,7 @@ def solve(
         )
         both = np.tile(large[h], 2)  # what the hit hardly tells of may have gone astray
         solution[h, both] = better[both]
-    return Solved(poles + solution[:, :m], std, start + solution[:, m:])
+    return Solved(poles + solution[:, :m], std, start + solution[:, m:], deviations[:, m:])
 
 
 def participations(omega: Real, frf: Complex, poles: Complex, shapes: Complex, rest_s: float) -> Complex:

@@ -25,6 +25,12 @@ while they decay."""
 GROWTH = 1.5
 """Power of the force, above which a response grows like no mode: 1 for a mode, 2 and 3 for what it makes."""
 
+FAINT = 2.0
+"""Standard deviations that a size which the softest hits do not show may have there."""
+
+SURE = 0.01
+"""Largest p value of the size of what is taken for no mode: it is known that something is not linear."""
+
 _PRODUCTS = ((2, 0), (3, 0), (1, 1), (1, -1), (2, 1), (2, -1), (1, 2), (-1, 2))
 """Multiples of the frequencies of two modes that springs with squares and cubes make."""
 
@@ -55,15 +61,15 @@ def without_products(
     levels : sequence of ForceLevel
         Two or more, from the softest up.
     modes : sequence of ModeLevels
-        What moves; the nonlinearity acts there.
+        What moves, where the nonlinearity acts, and what grows like no mode.
     modal : ModalModel
         That `modes` counts.
 
     Returns
     -------
     levels : tuple of ForceLevel
-        Without poles at multiples and sums of moving frequencies that the softest hits do not show, or that grow
-        with the force like no mode.
+        Without poles that grow with the force like no mode, and without those at multiples and sums of moving
+        frequencies that the softest hits do not show.
     products : tuple of str
         What was left out, ``"489.9 Hz (3 × 163.4 Hz)"``.
     """
@@ -71,18 +77,34 @@ def without_products(
     soft = {
         m.mode: int(m.level_modes[0]) for m in modes if m.level_modes is not None and m.level_modes[0] >= 0
     }
-    grown = {soft[m.mode] for m in modes if m.mode in soft and growth(m.amplitude_m, force) > GROWTH}
-    moving = [m for m in modes if m.depends and m.mode in soft and soft[m.mode] not in grown]
+    grown = {
+        m.mode: words
+        for m in modes
+        if m.size_p < SURE and growth(m, force) > GROWTH
+        for words in [f"grows with the force to the power of {growth(m, force):.1f}"]
+    }
+    real = [m for m in modes if m.mode in soft and m.mode not in grown]
+    # where no frequency moves, what is made tells of modes that make it
+    moving = [m for m in real if m.depends] or real
     parents = [modal.modes[m.mode] for m in moving]
+    grown_tracks = {
+        (k, int(m.level_modes[k])): grown[m.mode]
+        for m in modes
+        if m.mode in grown and m.level_modes is not None
+        for k in range(len(levels))
+        if m.level_modes[k] >= 0
+    }
     models = [level.modal for level in levels if level.modal is not None]
     drop: list[set[int]] = [set() for _ in models]
     found: dict[str, Mode] = {}
     for track in follow(models):
-        if track[0] >= 0 and int(track[0]) not in grown:
+        seen = np.flatnonzero(track >= 0).tolist()
+        grows = next((grown_tracks[k, int(track[k])] for k in seen if (k, int(track[k])) in grown_tracks), "")
+        if track[0] >= 0 and not grows:
             continue
-        for k in np.flatnonzero(track >= 0).tolist():
+        for k in seen:
             mode = models[k].modes[track[k]]
-            words = product_of(mode, parents)
+            words = product_of(mode, parents) or grows
             if words:
                 drop[k].add(int(track[k]))
                 found[words] = mode  # that of the hardest hits
@@ -94,26 +116,31 @@ def without_products(
     return kept, tuple(f"{mode.frequency_hz:.4g} Hz ({words})" for words, mode in by_frequency)
 
 
-def growth(amplitude_m: NDArray[np.float64], force_n: NDArray[np.float64]) -> float:
-    """Power of the force with which a mode grows from the softest to the hardest hits, where it answers most.
+def growth(mode: ModeLevels, force_n: NDArray[np.float64]) -> float:
+    """Least power of the force with which a mode's motion grows, from the softest hits that tell to the hardest.
 
     Parameters
     ----------
-    amplitude_m : ndarray, (n_levels, n_inputs)
+    mode : ModeLevels
     force_n : ndarray, (n_levels,)
 
     Returns
     -------
     float
-        NaN where unknown.
+        1 for a mode, 2 and 3 for what springs with squares and cubes make; a size that the softest hits do not show
+        counts as `FAINT` of its standard deviations. NaN where unknown.
     """
-    if not np.isfinite(amplitude_m[-1]).any():
+    if mode.size is None or mode.size_std is None:
         return float("nan")
-    at = int(np.nanargmax(amplitude_m[-1]))
-    soft, hard = float(amplitude_m[0, at]), float(amplitude_m[-1, at])
-    if not (np.isfinite(soft) and soft > 0 and hard > 0):
+    known = np.flatnonzero(np.isfinite(mode.size))
+    if len(known) < 2:
         return float("nan")
-    return float(np.log(hard / soft) / np.log(force_n[-1] / force_n[0]))
+    a, b = int(known[0]), int(known[-1])
+    soft = max(abs(float(mode.size[a])), FAINT * float(mode.size_std[a]))
+    hard = float(mode.size[b])
+    if not (hard > 0 and soft > 0):
+        return float("nan")
+    return 1.0 + float(np.log(hard / soft) / np.log(force_n[b] / force_n[a]))
 
 
 def without(modal: ModalModel, gone: set[int]) -> ModalModel:

@@ -89,16 +89,22 @@ def linear_words(study: LevelStudy) -> str:
 
 
 def _rubs(modes: Sequence[ModeLevels]) -> bool:
-    """True where damping falls with the force by more than frequencies move: friction, not a spring."""
-    loss, move = 0.0, 0.0
+    """True where damping falls with the force by more than frequencies move: friction, not a spring.
+
+    Where neither is seen to move, sizes that fall: what friction makes by locking fades, what springs make grows.
+    """
+    loss, move, fade = 0.0, 0.0, 0.0
     for m in modes:
+        if "size" in m.trend and m.size is not None:
+            known = m.size[np.isfinite(m.size)]
+            fade -= float(known[-1] - known[0]) if known.size else 0.0
         if m.level_modes is None or m.level_modes[0] < 0:
             continue  # what the softest hits do not show may be no mode
         if "damping falls" in m.trend:
             loss -= _change(m.damping_ratio, m.damping_shift)
         if "hardening" in m.trend or "softening" in m.trend:
             move += abs(_change(m.frequency_hz, m.frequency_shift_hz)) / float(np.nanmax(m.frequency_hz))
-    return loss > move
+    return loss > move if max(loss, move) > 0 else fade > 0
 
 
 def _change(values: Real, shift: Real | None) -> float:

@@ -60,6 +60,10 @@ class HitPoles:
         Standard deviations from noise alone; ``inf`` where a hit tells nothing of the mode.
     amplitude_m : ndarray, (n_hits, n_modes)
         Largest displacement amplitude at any sensor just after the hit; NaN for an uncalibrated hammer.
+    size : complex ndarray, (n_hits, n_modes)
+        Participation: the residues over the shape, which a linear mode has alike in all hits of a point.
+    size_std : ndarray, (n_hits, n_modes)
+        From noise alone, of real and imaginary part; ``inf`` where a hit tells nothing.
     """
 
     names: tuple[str, ...]
@@ -71,6 +75,8 @@ class HitPoles:
     damping_ratio: Real
     damping_std: Real
     amplitude_m: Real
+    size: Complex
+    size_std: Real
 
 
 @dataclass(frozen=True)
@@ -126,6 +132,7 @@ def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSe
     point, sheet = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
     pole, std = np.tile(poles, (count, 1)), np.full(shape, np.inf)
     amplitude = np.full(shape, np.nan)
+    size, size_std = np.zeros(shape, dtype=np.complex128), np.full(shape, np.inf)
     places = [d.point for d in frfs.inputs]
     dofs = [d.point for d in frfs.outputs]
     shapes = output_shapes(frfs, modal)
@@ -145,6 +152,9 @@ def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSe
             known = solved.std < -UNKNOWN * poles[m].real
             known &= np.array([h.heard[m] for h in members])
             std[np.ix_(index, m)] = np.where(known, solved.std, np.inf)
+            heard = np.array([h.heard[m] for h in members])
+            size[np.ix_(index, m)] = solved.participation
+            size_std[np.ix_(index, m)] = np.where(heard, solved.participation_std, np.inf)
             if members[0].calibrated:
                 impulse = np.array([np.abs(h.impulse[m]) for h in members])
                 largest = np.abs(seen[m]).max(axis=1)
@@ -155,7 +165,7 @@ def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSe
     return HitPoles(
         tuple(names), point, sheet, force,
         np.abs(physical) / (2 * np.pi), std / (2 * np.pi),
-        -physical.real / np.abs(physical), std / np.abs(physical), amplitude,
+        -physical.real / np.abs(physical), std / np.abs(physical), amplitude, size, size_std,
     )  # fmt: skip
 
 

@@ -101,10 +101,10 @@ def study_levels(
     progress(0.7, "modes of single hits")
     level_of = dict(zip(names, place.tolist(), strict=True))
 
-    def tested(model: ModalModel) -> tuple[tuple[ModeLevels, ...], float]:
-        return _tested(model, levels, hits, frfs, frf_settings, level_of, settings)
+    def tested(model: ModalModel, one_at_least: bool) -> tuple[tuple[ModeLevels, ...], float]:
+        return _tested(model, levels, hits, frfs, frf_settings, level_of, settings, one_at_least)
 
-    modes, p_value = tested(modal)
+    modes, p_value = tested(modal, one_at_least=True)
     depends = bool(p_value < settings.false_alarm)
     linear: int | None = None
     products: tuple[str, ...] = ()
@@ -114,7 +114,7 @@ def study_levels(
         ):  # friction makes poles of all kinds: there the softest hits do not tell which are modes
             levels, products = without_products(levels, modes, modal)
         modal = levels[linear].modal or modal
-        modes, _ = tested(modal)
+        modes, _ = tested(modal, one_at_least=not products)  # what was seen to move may have been left out
     elif not depends:
         modes = tuple(replace(m, depends=False, trend="") for m in modes)
     progress(0.9, "decays of single hits")
@@ -185,9 +185,11 @@ def _tested(
     frf_settings: FrfSettings,
     place: dict[str, int],
     settings: LevelSettings,
+    one_at_least: bool,
 ) -> tuple[tuple[ModeLevels, ...], float]:
     """The modes of a model with their tests, those that move if any does, and the p value of all tests together."""
     from ema_pipeline.levels.single import excitation, single_hits
+    from ema_pipeline.levels.sizes import plain, relative_sizes, sizes_at_levels, unknown
     from ema_pipeline.levels.trend import clearest, combined, samples, shifts, trends
     from ema_pipeline.levels.words import trend_words
 
@@ -209,11 +211,19 @@ def _tested(
         given(found.frequency_hz, found.frequency_std_hz) + given(found.damping_ratio, found.damping_std)
     )
     frequency, damping = tests[: len(base)], tests[len(base) :]
-    p_values = np.array([t.p for t in tests])
-    moves = clearest(p_values, settings.false_alarm)
+    sizes, size_std, size_mean = relative_sizes(found)
+    at_levels = []
+    size_tests = []
+    for r, test in enumerate(trends(given(sizes, size_std))):
+        at_levels.append(sizes_at_levels(sizes[:, r], size_std[:, r], size_mean[:, r], level, test.extra_std))
+        # of poles that go far, the differences between hits do not tell the size
+        size_tests.append(plain(test, at_levels[r][0]) if not _far(modes[base[r]]) else unknown(test))
+    p_values = np.array([t.p for t in (*tests, *size_tests)])
+    moves = clearest(p_values, settings.false_alarm, one_at_least)
     out = list(modes)
     for r, k in enumerate(base):
         both = bool(moves[r]), bool(moves[r + len(base)])
+        grows = bool(moves[r + 2 * len(base)])
         slope, far = frequency[r].slope, _far(modes[k])
         shift = shifts(
             found.frequency_hz[:, r], found.frequency_std_hz[:, r], found.sheet, level, frequency[r]
@@ -230,12 +240,15 @@ def _tested(
             amplitude_m=_amplitudes(found, level, r, modes[k].amplitude_m.shape),
             frequency_p=frequency[r].p,
             damping_p=damping[r].p,
-            depends=any(both),
-            trend=trend_words(both[0], slope, both[1], damping[r].slope),
+            depends=any(both) or grows,
+            trend=trend_words(both[0], slope, both[1], damping[r].slope, grows, size_tests[r].slope),
             frequency_shift_hz=shift[0],
             frequency_shift_std_hz=shift[1],
             damping_shift=damping_shift[0],
             damping_shift_std=damping_shift[1],
+            size=at_levels[r][0],
+            size_std=at_levels[r][1],
+            size_p=size_tests[r].p,
         )
     return tuple(out), combined(p_values)
 

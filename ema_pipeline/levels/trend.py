@@ -272,13 +272,14 @@ def holm(p_values: Real) -> Real:
     return out
 
 
-def clearest(p_values: Real, false_alarm: float) -> NDArray[np.bool_]:
+def clearest(p_values: Real, false_alarm: float, one_at_least: bool = True) -> NDArray[np.bool_]:
     """Which of many quantities move, where it is known that something does, (n_tests,).
 
-    Those that Holm's correction names at this rate; where it names none, the one with the least p value.
+    Those that Holm's correction names at this rate; where it names none, the one with the least p value, unless what
+    was known to move may not be among them.
     """
     moves = np.nan_to_num(holm(p_values), nan=1.0) < false_alarm
-    if np.isfinite(p_values).any():
+    if one_at_least and np.isfinite(p_values).any():
         moves[int(np.nanargmin(p_values))] = True
     return moves
 

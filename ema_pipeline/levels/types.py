@@ -60,16 +60,21 @@ class ModeLevels:
         Probability of a trend as clear as this where nothing depends on the level, from single hits (from
         decays where there is one level); NaN where unknown.
     depends : bool
-        True where frequency or damping moves with the level beyond what scatter explains, all modes' tests
+        True where frequency, damping or size moves with the level beyond what scatter explains, all modes' tests
         taken into account.
     trend : str
-        ``"hardening"``, ``"softening"``, ``"damping falls"``, ``"damping rises"``, joined by ``", "``; empty where
-        nothing moves.
+        ``"hardening"``, ``"softening"``, ``"damping falls"``, ``"damping rises"``, ``"size rises"``, ``"size
+        falls"``, joined by ``", "``; empty where nothing moves.
     level_modes : ndarray of int, (n_levels,), or None
         Index into the modes of each level's own `ModalModel`; -1 where the mode was not found there.
     frequency_shift_hz, frequency_shift_std_hz, damping_shift, damping_shift_std : ndarray, (n_levels,), or None
         Difference from the softest level in single hits, each compared with hits on its own point alone; of the
         levels' own FRFs where a frequency moves by more than half a half-width.
+    size, size_std : ndarray, (n_levels,), or None
+        Participation in the FRFs of each level over that in all hits, see `sizes`; 1 for a linear mode. NaN where
+        no hit tells.
+    size_p : float
+        As `frequency_p`.
     """
 
     mode: int
@@ -87,6 +92,9 @@ class ModeLevels:
     frequency_shift_std_hz: NDArray[np.float64] | None = None
     damping_shift: NDArray[np.float64] | None = None
     damping_shift_std: NDArray[np.float64] | None = None
+    size: NDArray[np.float64] | None = None
+    size_std: NDArray[np.float64] | None = None
+    size_p: float = float("nan")
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,22 @@ CLEAR = 3.0
 """A change between two levels of this many standard deviations can be read off the levels' own FRFs."""
 
 
-def trend_words(frequency_moves: bool, slope: float, damping_moves: bool, damping_slope: float) -> str:
-    """``"hardening"``, ``"softening"``, ``"damping falls"``, ``"damping rises"``, joined; empty for none."""
+def trend_words(
+    frequency_moves: bool,
+    slope: float,
+    damping_moves: bool,
+    damping_slope: float,
+    size_moves: bool = False,
+    size_slope: float = 0.0,
+) -> str:
+    """``"hardening"``, ``"softening"``, ``"damping falls"``, ``"size rises"`` and so on, joined; empty for none."""
     words = []
     if frequency_moves:
         words.append("hardening" if slope > 0 else "softening")
     if damping_moves:
         words.append("damping rises" if damping_slope > 0 else "damping falls")
+    if size_moves:
+        words.append("size rises" if size_slope > 0 else "size falls")
     return ", ".join(words)
 
 
@@ -64,18 +73,20 @@ def several_levels(study: LevelStudy, modal: ModalModel, settings: LevelSettings
             f"Hits at {forces}, but too few to tell a change with the force from scatter: strike every point at "
             "least twice at each force."
         )
-    if not moving:
+    if not study.level_dependent:
         return (
             f"Nothing moves with the force of the hits from {forces}: {len(tested)} modes tested, p = "
             f"{study.p_value:.2g}, false alarms {100 * settings.false_alarm:.2g} %."
         )
     words = "; ".join(f"mode {m.mode + 1}: {move_text(study, m)}" for m in moving[:3])
     more = f"; and {len(moving) - 3} more" if len(moving) > 3 else ""
-    linear = linear_words(study)
-    return (
-        f"The structure is not linear: {len(moving)} of {len(tested)} modes move with the force. {words}{more}."
-        + (f" {linear}" if linear else "")
+    told = (
+        f"{len(moving)} of {len(tested)} modes move with the force. {words}{more}."
+        if moving
+        else f"none of {len(tested)} modes is seen to move with the force, but the FRFs change with it."
     )
+    linear = linear_words(study)
+    return f"The structure is not linear: {told}" + (f" {linear}" if linear else "")
 
 
 def forces_text(study: LevelStudy) -> str:
@@ -101,6 +112,10 @@ def move_text(study: LevelStudy, mode: ModeLevels) -> str:
             1.0 if word == "rises" else -1.0,
         )  # fmt: skip
         parts.append(f"damping {word} with {_cause(study)}{_arrow(ends, 100)}" + (" %" if ends else ""))
+    if "size" in mode.trend:
+        word = "rises" if "size rises" in mode.trend else "falls"
+        ends = _size_ends(mode)
+        parts.append(f"size in the FRFs {word} with {_cause(study)}{_arrow(ends, 1)}")
     if not parts:
         return ""
     span = f" from {study.levels[0].force_n:.3g} to {study.levels[-1].force_n:.3g} N"
@@ -133,6 +148,17 @@ def _ends(values: Real, stds: Real, shift: Real | None, shift_std: Real | None, 
         float(values[0] + shift[-1]),
         float(np.hypot(stds[0], shift_std[-1])),
     )
+
+
+def _size_ends(mode: ModeLevels) -> Ends | None:
+    """Size at the softest and the hardest level that tell, over that in all hits."""
+    if mode.size is None or mode.size_std is None:
+        return None
+    known = np.flatnonzero(np.isfinite(mode.size))
+    if len(known) < 2:
+        return None
+    a, b = int(known[0]), int(known[-1])
+    return float(mode.size[a]), float(mode.size_std[a]), float(mode.size[b]), float(mode.size_std[b])
 
 
 def _arrow(ends: Ends | None, factor: float) -> str:

@@ -1,0 +1,91 @@
+"""Sizes of modes in the FRFs of single hits: their residues, which a linear structure has alike at every force.
+
+What a nonlinearity makes shows here first. A spring with a square answers a mode of frequency f at 2f, with a force
+that grows with the square of the motion, so that a pole stands there whose residue grows with the force; friction
+that locks leaves poles that fade as the force grows. The frequencies of the modes may hardly move meanwhile.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.levels.single import HitPoles
+from ema_pipeline.levels.trend import Trend
+
+Real = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+PLAIN_SIZE = 0.1
+"""Least change from the softest to the hardest hits that is claimed, over the mode's size where it answers most. A
+hammer whose reading bends, or a hand that aims otherwise when it strikes harder, changes sizes by some per cent."""
+
+
+NO_TREND = 0.5
+"""P value of a change that is not plain: one that speaks neither for nor against any other test's."""
+
+
+def relative_sizes(found: HitPoles) -> tuple[Real, Real, Real]:
+    """Every hit's participation along the mean of its sheet, over the largest mean of any sheet.
+
+    Parameters
+    ----------
+    found : HitPoles
+
+    Returns
+    -------
+    values, std : ndarray, (n_hits, n_modes)
+        The standard deviation is ``inf`` where a hit tells nothing.
+    mean : ndarray, (n_hits, n_modes)
+        What a linear mode would have there: the mean of the hit's sheet, at most 1.
+
+    Notes
+    -----
+    The mean holds the hit's own noise. That shifts all hits of a sheet by the same amount, since the mean is
+    weighted with the noise, and only their differences are looked at.
+    """
+    weight = found.size_std**-2.0
+    mean = np.zeros_like(found.size)
+    for s in np.unique(found.sheet):
+        of = found.sheet == s
+        total = np.maximum(weight[of].sum(axis=0), 1e-300)
+        mean[of] = np.sum(weight[of] * found.size[of], axis=0) / total
+    length = np.abs(mean)
+    largest = np.maximum(length.max(axis=0), 1e-300)
+    values = np.real(found.size * mean.conj()) / np.maximum(length, 1e-300) / largest
+    known = (length > 0) & np.isfinite(found.size_std)
+    return values, np.where(known, found.size_std / largest, np.inf), length / largest
+
+
+def sizes_at_levels(values: Real, std: Real, mean: Real, level: Integers, extra_std: float) -> tuple[Real, Real]:
+    """Size of one mode in the hits of each level over that in all hits, and its standard deviation, (n_levels,).
+
+    Parameters
+    ----------
+    values, std, mean : ndarray, (n_hits,)
+        From `relative_sizes`.
+    level : ndarray of int, (n_hits,)
+    extra_std : float
+        Scatter of hits beyond their noise.
+    """
+    n_levels = int(level.max()) + 1
+    size, size_std = np.full((2, n_levels), np.nan)
+    for k in range(n_levels):
+        of = (level == k) & np.isfinite(std)
+        weight = 1.0 / (std[of] ** 2 + extra_std**2)
+        strength = float(np.sum(weight * mean[of] ** 2))
+        if strength > 0:
+            size[k] = float(np.sum(weight * mean[of] * values[of])) / strength
+            size_std[k] = strength**-0.5
+    return size, size_std
+
+
+def plain(trend: Trend, size: Real) -> Trend:
+    """The test's result, without significance where the size changes by too little to tell of the structure."""
+    known = size[np.isfinite(size)]
+    return trend if known.size and np.ptp(known) >= PLAIN_SIZE else unknown(trend)
+
+
+def unknown(trend: Trend) -> Trend:
+    """The test's result without significance."""
+    return Trend(NO_TREND if np.isfinite(trend.p) else trend.p, trend.slope, trend.extra_std)
