@@ -35,9 +35,10 @@ from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import HitSamples, cut_hit
 from ema_pipeline.levels import LevelSettings, LevelStudy, study_levels
-from ema_pipeline.levels.single import excitation, single_hits
+from ema_pipeline.levels.hit_trends import hit_trends
+from ema_pipeline.levels.single import single_hits
 from ema_pipeline.levels.sort import sort_levels
-from ema_pipeline.levels.trend import clearest, combined, samples, trends
+from ema_pipeline.levels.trend import clearest
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
@@ -120,23 +121,15 @@ def test_alone(case: Case, rng: np.random.Generator) -> tuple[float, list[bool],
     level = np.array([level_of[name] for name in found.names])
     if level.max() == 0:
         return float("nan"), [False] * len(case.damping), 0.0
-    relative = excitation(found)
-    sets = [
-        samples(values[:, r], stds[:, r], found.sheet, level, found.force_n, relative[:, r])
-        for values, stds in (
-            (found.frequency_hz, found.frequency_std_hz), (found.damping_ratio, found.damping_std),
-        )
-        for r in range(len(case.damping))
-    ]  # fmt: skip
-    p_values = np.array([t.p for t in trends(sets)])
-    p = combined(p_values)
+    tests = hit_trends(found, level, np.zeros(len(case.damping), dtype=bool))
+    p_values, p = tests.p_values, tests.p_value
     moves = clearest(p_values, LevelSettings().false_alarm) & (p < LevelSettings().false_alarm)
     change, stds = case.frequency_shift * case.frequency_hz[case.mode], found.frequency_std_hz
     if not case.frequency_shift:
         change, stds = case.damping_shift * case.damping[case.mode], found.damping_std
     ends = [float(np.sum(stds[level == k, case.mode] ** -2.0)) for k in (0, level.max())]
     size = abs(change) / np.sqrt(sum(1 / max(e, 1e-300) for e in ends))
-    return p, moves.reshape(2, -1).any(axis=0).tolist(), float(size)
+    return p, moves.reshape(3, -1).any(axis=0).tolist(), float(size)
 
 
 def true_modes(case: Case, frfs: FrfSet) -> ModalModel:

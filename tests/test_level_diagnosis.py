@@ -299,19 +299,28 @@ def test_hypotheses_are_the_effects_that_are_not_linear_at_every_place() -> None
 
 def test_a_false_alarm_of_the_levels_leaves_the_diagnosis_to_the_modes(tmp_path) -> None:
     from dataclasses import replace
+    from typing import cast
 
+    from ema_pipeline.diagnose.levels.prepare import LevelTest
+    from ema_pipeline.levels.types import LevelStudy
+    from ema_pipeline.modal.types import ModalModel
     from ema_pipeline.stages.base import Run, RunInfo
     from ema_pipeline.stages.diagnose import linear_after_all
     from ema_pipeline.store import Store
 
+    def seen(p_value: float) -> list[LevelTest]:
+        study = LevelStudy((), (), (), (), (), level_dependent=True, p_value=p_value, summary="")
+        return [LevelTest("no_ring", study, cast(ModalModel, None))]
+
     info = RunInfo("hammer", "", "", "planetary", "planetary", ("no_ring",), (), "", {})
     run = Run(Store(tmp_path), info, {"diagnose": DiagnoseSettings()})
     chance = diagnose_levels(case_of(windows()), (), None, "", ())
-    assert linear_after_all(run, chance)
-    assert not linear_after_all(run, replace(chance, error=1.3))
+    assert linear_after_all(run, seen(0.005), chance)
+    assert not linear_after_all(run, seen(1e-6), chance)  # no chance, though no effect is told
+    assert not linear_after_all(run, seen(0.005), replace(chance, error=1.3))
     top = replace(chance.ladder.rungs[-1], effects=("bearing_cubic@carrier",))
     moving = replace(chance, ladder=replace(chance.ladder, rungs=(*chance.ladder.rungs, top)))
-    assert not linear_after_all(run, moving)
+    assert not linear_after_all(run, seen(0.005), moving)
 
 
 def test_friction_finer_than_a_step_stops_the_motion_without_ringing() -> None:

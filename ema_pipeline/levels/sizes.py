@@ -57,7 +57,9 @@ def relative_sizes(found: HitPoles) -> tuple[Real, Real, Real]:
     return values, np.where(known, found.size_std / largest, np.inf), length / largest
 
 
-def sizes_at_levels(values: Real, std: Real, mean: Real, level: Integers, extra_std: float) -> tuple[Real, Real]:
+def sizes_at_levels(
+    values: Real, std: Real, mean: Real, level: Integers, extra_std: float
+) -> tuple[Real, Real]:
     """Size of one mode in the hits of each level over that in all hits, and its standard deviation, (n_levels,).
 
     Parameters

@@ -18,7 +18,6 @@ from ema_pipeline.modal.settings import ModalSettings
 if TYPE_CHECKING:
     from ema_pipeline.ingest.records import HitSamples
     from ema_pipeline.levels.single import HitPoles
-    from ema_pipeline.levels.trend import Samples
     from ema_pipeline.modal.types import ModalModel
 
 Progress = Callable[[float, str], None]
@@ -188,9 +187,9 @@ def _tested(
     one_at_least: bool,
 ) -> tuple[tuple[ModeLevels, ...], float]:
     """The modes of a model with their tests, those that move if any does, and the p value of all tests together."""
-    from ema_pipeline.levels.single import excitation, single_hits
-    from ema_pipeline.levels.sizes import plain, relative_sizes, sizes_at_levels, unknown
-    from ema_pipeline.levels.trend import clearest, combined, samples, shifts, trends
+    from ema_pipeline.levels.hit_trends import hit_trends
+    from ema_pipeline.levels.single import single_hits
+    from ema_pipeline.levels.trend import clearest, shifts
     from ema_pipeline.levels.words import trend_words
 
     modes = _modes(modal, levels, len(frfs.inputs))
@@ -199,27 +198,9 @@ def _tested(
         return modes, float("nan")
     found = single_hits(hits, _only(modal, base), frfs, frf_settings)
     level = np.array([place[name] for name in found.names], dtype=np.int64)
-    relative = excitation(found)
-
-    def given(values: Real, stds: Real) -> list[Samples]:
-        return [
-            samples(values[:, r], stds[:, r], found.sheet, level, found.force_n, relative[:, r])
-            for r in range(len(base))
-        ]
-
-    tests = trends(
-        given(found.frequency_hz, found.frequency_std_hz) + given(found.damping_ratio, found.damping_std)
-    )
-    frequency, damping = tests[: len(base)], tests[len(base) :]
-    sizes, size_std, size_mean = relative_sizes(found)
-    at_levels = []
-    size_tests = []
-    for r, test in enumerate(trends(given(sizes, size_std))):
-        at_levels.append(sizes_at_levels(sizes[:, r], size_std[:, r], size_mean[:, r], level, test.extra_std))
-        # of poles that go far, the differences between hits do not tell the size
-        size_tests.append(plain(test, at_levels[r][0]) if not _far(modes[base[r]]) else unknown(test))
-    p_values = np.array([t.p for t in (*tests, *size_tests)])
-    moves = clearest(p_values, settings.false_alarm, one_at_least)
+    tests = hit_trends(found, level, np.array([_far(modes[k]) != 0 for k in base]))
+    frequency, damping, size = tests.frequency, tests.damping, tests.size
+    moves = clearest(tests.p_values, settings.false_alarm, one_at_least)
     out = list(modes)
     for r, k in enumerate(base):
         both = bool(moves[r]), bool(moves[r + len(base)])
@@ -241,16 +222,16 @@ def _tested(
             frequency_p=frequency[r].p,
             damping_p=damping[r].p,
             depends=any(both) or grows,
-            trend=trend_words(both[0], slope, both[1], damping[r].slope, grows, size_tests[r].slope),
+            trend=trend_words(both[0], slope, both[1], damping[r].slope, grows, size[r].slope),
             frequency_shift_hz=shift[0],
             frequency_shift_std_hz=shift[1],
             damping_shift=damping_shift[0],
             damping_shift_std=damping_shift[1],
-            size=at_levels[r][0],
-            size_std=at_levels[r][1],
-            size_p=size_tests[r].p,
+            size=tests.level_sizes[r][0],
+            size_std=tests.level_sizes[r][1],
+            size_p=size[r].p,
         )
-    return tuple(out), combined(p_values)
+    return tuple(out), tests.p_value
 
 
 def _far(mode: ModeLevels) -> float:

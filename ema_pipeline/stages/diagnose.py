@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.stages import loop_ladder
 from ema_pipeline.stages.base import Progress, Run, code_fingerprint
 from ema_pipeline.stages.correlate import correlate
-from ema_pipeline.stages.level_case import depends_on_level, level_case, level_tests, linear_part
+from ema_pipeline.stages.level_case import all_tests, depends_on_level, level_case, linear_part
 from ema_pipeline.stages.modes import measured_frfs, measured_modes
 
 if TYPE_CHECKING:
@@ -40,15 +42,25 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
     settings = cast(DiagnoseSettings, run.settings[NAME])
     model = run.require_model(NAME)
-    if tests := level_tests(run):
+    tests = all_tests(run)
+    known = any(t.study.level_dependent for t in tests)
+    if known or (tests and any(depends_on_level(run, x) for x in run.info.effects)):
         of_hits = by_hits(run, tests, progress)
-        if not linear_after_all(run, of_hits):
+        if not linear_after_all(run, tests, of_hits):
             return {"diagnosis": of_hits, "on_top_of": run.info.effects}
     measured = measured_modes(run)
-    limits, tell = own_thresholds(run, settings, model, measured, progress)
+    several = not known and any(len(t.levels) > 1 for t in tests)
+    first, second = (
+        (_part(progress, 0.0, 0.5), _part(progress, 0.5, 1.0)) if several else (progress, progress)
+    )
+    limits, tell = own_thresholds(run, settings, model, measured, first)
     found = diagnose(
         model, measured, settings, run.library, tell, failed_checks(run), limits, measured_frfs(run)
     )
+    if several:
+        found = with_hits(run, tests, found, second)
+        if any(depends_on_level(run, x) for x in found.ladder.rungs[-1].effects):
+            return {"diagnosis": found, "on_top_of": run.info.effects}
     results: dict[str, object] = {"diagnosis": found, "on_top_of": run.info.effects}
     top = found.ladder.rungs[-1]
     if top.effects:
@@ -58,14 +70,43 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     return results
 
 
-def linear_after_all(run: Run, found: Diagnosis) -> bool:
+_EXACT = 0.002
+"""Share of the measured amplitude: a model that misses no more of any hit explains them as well as any could."""
+
+_CHANCE = 1e-4
+"""Least p value of the study of the levels that may yet be chance."""
+
+
+def linear_after_all(run: Run, tests: Sequence[LevelTest], found: Diagnosis) -> bool:
     """True where a linear model explains the hits of all levels as well as any model could.
 
     What the study of the levels saw was then chance, and the modes of its level are as good as any.
     """
-    least = cast(DiagnoseSettings, run.settings[NAME]).levels.noise_least
-    exact = found.ladder.hit_noise <= least and found.error <= 1.0
-    return exact and not any(depends_on_level(run, x) for x in found.ladder.rungs[-1].effects)
+    chance = all(t.study.p_value >= _CHANCE for t in tests if t.study.level_dependent)
+    exact = found.ladder.hit_noise <= _EXACT and found.error <= 1.0
+    return chance and exact and not any(depends_on_level(run, x) for x in found.ladder.rungs[-1].effects)
+
+
+def with_hits(run: Run, tests: Sequence[LevelTest], found: Diagnosis, progress: Progress) -> Diagnosis:
+    """A diagnosis by modes, and what simulated hits add to it where no mode is seen to move with the force.
+
+    Simulated hits show smaller effects than the modes do: a third harmonic is no shift of a frequency. Where they
+    claim an effect that depends on the level, theirs is the diagnosis; else they tell what they would have shown.
+    """
+    from ema_pipeline.diagnose.levels.diagnosis import diagnose_levels
+
+    missing = found.ladder.rungs[-1].effects if found.verdict == "effect" else ()
+    starts = [{n: p.value for n, p in rung.parameters.items()} for rung in found.ladder.rungs[::-1]]
+    try:
+        case = level_case(run, tests, starts[:3])
+        of_hits = diagnose_levels(
+            case, (*run.info.effects, *missing), found if missing else None, "", failed_checks(run), progress
+        )
+    except EmaError as error:
+        return replace(found, notes=(*found.notes, f"The hits could not be simulated: {error}"))
+    if any(depends_on_level(run, x) for x in of_hits.ladder.rungs[-1].effects):
+        return of_hits
+    return replace(found, detection_limits=(*found.detection_limits, *of_hits.detection_limits))
 
 
 def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnosis:

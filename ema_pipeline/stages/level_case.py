@@ -31,12 +31,6 @@ def all_tests(run: Run) -> tuple[LevelTest, ...]:
     )
 
 
-def level_tests(run: Run) -> tuple[LevelTest, ...]:
-    """The same where the answer of one of them depends on the level."""
-    tests = all_tests(run)
-    return tests if any(t.study.level_dependent for t in tests) else ()
-
-
 def level_case(run: Run, tests: Sequence[LevelTest], starts: Sequence[Mapping[str, float]]) -> LevelCase:
     """The rig without effects and windows after the hits of every level."""
     from ema_pipeline.diagnose.levels.case import LevelCase

@@ -23,8 +23,9 @@ _LEAST_S = 0.02
 _QUIET_S = 0.05
 """The stretch before that which tells offset and noise."""
 
-_TIMING = 0.05
-"""Samples by which hammer and sensors, or the simulation's steps, may be apart in time."""
+_TIMING = 0.02
+"""Samples by which hammer and sensors may be apart in time otherwise than in the other hits: a delay that all hits
+share is an error alike at every level."""
 
 _SPILT = 0.2
 """Share of what the simulation misses, on average over the sensors, that shows in a sensor which hardly moves."""

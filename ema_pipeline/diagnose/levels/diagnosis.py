@@ -45,6 +45,10 @@ _HARDER = 2.0
 """A next test is thought of with blows this much harder than the hardest."""
 
 
+_NOTHING_LEFT, _ELSEWHERE = 2.0, 3.0
+"""Standard deviations: a size vanishes within the first of nothing, and beyond the second of what was claimed."""
+
+
 @dataclass(frozen=True)
 class _Climbed:
     """Models from the base upwards, the rankings on top of each, and the windows that they were fitted to."""
@@ -97,6 +101,10 @@ def _diagnose(
     tell: Progress,
 ) -> Diagnosis:
     climbed = _climb(case, effects, tell)
+    if linear is not None and (idle := _withdrawn(case, climbed, _claims(linear))):
+        effects = tuple(x for x in effects if x not in idle)
+        linear = _without(linear, idle)
+        climbed = _climb(case, effects, tell)
     shortened, case = climbed.case is not case, climbed.case
     first, base = climbed.rankings[0], climbed.rankings[0].base
     forces = [float(f) for f in case.windows[0].force_n]
@@ -363,6 +371,34 @@ def _claims(linear: Diagnosis | None) -> tuple[Candidate, ...]:
     if linear is None or linear.verdict != "effect":
         return ()
     return tuple(c for c in linear.candidates if c.claimed)
+
+
+def _withdrawn(case: LevelCase, climbed: _Climbed, claimed: Sequence[Candidate]) -> set[str]:
+    """Effects claimed from the modes of one level that vanish beside those that the hits show.
+
+    Friction that locks acts at one level as a damper does. Fitted together, the friction leaves nothing to the damper.
+    """
+    top = climbed.models[-1]
+    if not any(_depends(case, x) for x in top.hypothesis.labels):
+        return set()
+    gone = set()
+    for c in claimed:
+        for p in case.parameters_of(c.label):
+            before, name = c.parameters.get(p.name), f"{c.label}.{p.name}"
+            if before is None or name not in top.values or not np.isfinite(p.null):
+                continue
+            value, std = top.values[name], top.std[name]
+            vanished = abs(value - p.null) < _NOTHING_LEFT * std
+            moved = abs(value - before.value) > _ELSEWHERE * np.hypot(std, before.std)
+            if vanished and moved:
+                gone.add(c.label)
+    return gone
+
+
+def _without(linear: Diagnosis, labels: set[str]) -> Diagnosis | None:
+    """The diagnosis of one level without some of its claims; None where nothing is left of them."""
+    kept = tuple(replace(c, claimed=c.claimed and c.label not in labels) for c in linear.candidates)
+    return replace(linear, candidates=kept) if any(c.claimed for c in kept) else None
 
 
 def _claim_text(claimed: Sequence[Candidate]) -> str:

@@ -27,7 +27,7 @@ class LevelDiagnosisSettings(Settings):
         description="Share of the measured amplitude that a simulation may miss, while hypotheses are searched.",
     )
     noise_least: float = Field(
-        default=0.002, gt=0, description="Least value to which this share is lowered by the best hypothesis."
+        default=0.001, gt=0, description="Least value to which this share is lowered by the best hypothesis."
     )
     noise_most: float = Field(
         default=0.1, gt=0, description="Largest value of it at which a model still counts as adequate."

@@ -1,0 +1,78 @@
+"""All quantities of all modes, as single hits show them, tested for a trend with the force."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.levels.single import HitPoles, excitation
+from ema_pipeline.levels.sizes import plain, relative_sizes, sizes_at_levels, unknown
+from ema_pipeline.levels.trend import Samples, Trend, combined, samples, trends
+
+Real = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class HitTrends:
+    """Trends of every mode, (n_modes,) each.
+
+    Attributes
+    ----------
+    frequency, damping, size : tuple of Trend
+    level_sizes : tuple of (ndarray, ndarray)
+        Size at every level over that in all hits, and its standard deviation, (n_levels,).
+    """
+
+    frequency: tuple[Trend, ...]
+    damping: tuple[Trend, ...]
+    size: tuple[Trend, ...]
+    level_sizes: tuple[tuple[Real, Real], ...]
+
+    @property
+    def p_values(self) -> Real:
+        """Frequencies, dampings and sizes in turn, (3·n_modes,)."""
+        return np.array([t.p for t in (*self.frequency, *self.damping, *self.size)])
+
+    @property
+    def p_value(self) -> float:
+        """Of all together."""
+        return combined(self.p_values)
+
+
+def hit_trends(found: HitPoles, level: Integers, far: NDArray[np.bool_]) -> HitTrends:
+    """Test frequency, damping and size of every mode.
+
+    Parameters
+    ----------
+    found : HitPoles
+    level : ndarray of int, (n_hits,)
+        Force level of each hit.
+    far : ndarray of bool, (n_modes,)
+        Modes whose poles go so far that differences between hits do not tell their sizes.
+    """
+    n_modes = found.frequency_hz.shape[1]
+    relative = excitation(found)
+
+    def given(values: Real, stds: Real) -> list[Samples]:
+        return [
+            samples(values[:, r], stds[:, r], found.sheet, level, found.force_n, relative[:, r])
+            for r in range(n_modes)
+        ]
+
+    poles = trends(
+        given(found.frequency_hz, found.frequency_std_hz) + given(found.damping_ratio, found.damping_std)
+    )
+    values, std, mean = relative_sizes(found)
+    sizes = trends(given(values, std))  # by themselves: an unsteady hand scatters them more than the poles
+    at_levels = tuple(
+        sizes_at_levels(values[:, r], std[:, r], mean[:, r], level, test.extra_std)
+        for r, test in enumerate(sizes)
+    )
+    told = tuple(
+        unknown(test) if gone else plain(test, size)
+        for test, (size, _), gone in zip(sizes, at_levels, far, strict=True)
+    )
+    return HitTrends(poles[:n_modes], poles[n_modes:], told, at_levels)
