@@ -124,7 +124,10 @@ def compiled_response(
         For structural damping, and where the motion grows without bound.
     """
     batch = prepared(assemblies, out_rows, orders, in_rows)
-    found = marched(batch, batch.outputs, force, 1 / (sample_rate_hz * substeps), substeps)
+    step = 1 / (sample_rate_hz * substeps)
+    found = marched(batch, batch.outputs, force, step, substeps)
+    if found.failed.any():
+        raise no_solution(batch.names, step)
     return found.motion.swapaxes(2, 3), batch.direct[:, :, : len(force)].swapaxes(1, 2)
 
 
@@ -198,19 +201,21 @@ def marched(
     substeps: int,
     trace: bool = False,
 ) -> Marched:
-    """`mechanics.kernel.march` of a batch, with an error where the motion has no solution."""
+    """`mechanics.kernel.march` of a batch."""
     from ema_pipeline.mechanics.kernel import march  # compiles at its first use
 
     direct = batch.direct[:, : outputs.shape[1], len(force) :]
-    found = march(
+    return march(
         batch.laws, batch.poles, batch.inputs, batch.stretch, outputs, direct, force, step, substeps, trace
     )
-    if found.failed:
-        raise EmaError(
-            f"no solution with {', '.join(batch.names)}: the motion grows without bound, or the step of "
-            f"{step:.3g} s is too long; check the elements' values, or give more substeps"
-        )
-    return found
+
+
+def no_solution(names: Sequence[str], step: float) -> EmaError:
+    """What is raised where no motion was found."""
+    return EmaError(
+        f"no solution with {', '.join(names)}: the motion grows without bound, or the step of {step:.3g} s is too "
+        "long; check the elements' values, or give more substeps"
+    )
 
 
 def one_by_one(assemblies: Sequence[Assembly], blows: Blows, substeps: int) -> NDArray[np.float64]:

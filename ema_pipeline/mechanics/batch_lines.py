@@ -34,7 +34,7 @@ def batch_lines(
     fade_s: float,
     lines: NDArray[np.int64],
 ) -> NDArray[np.complex128]:
-    """Lines of the spectra of what `batch_response` gives, (n_assemblies, n_blows, n_outputs, n_lines).
+    """Lines of the spectra of what `batch_response` gives.
 
     Line n of a signal x is the sum of x(t)·exp(-t/fade_s - 2πint/T) over the samples of a record of length T. Elements
     with a memory take the way through `batch_response`.
@@ -47,10 +47,15 @@ def batch_lines(
     fade_s : float
     lines : ndarray of int, (n_lines,)
 
+    Returns
+    -------
+    complex ndarray, (n_assemblies, n_blows, n_outputs, n_lines)
+        NaN for an assembly whose motion grows without bound.
+
     Raises
     ------
     EmaError
-        As `batch_response`.
+        For structural damping; where an element with a memory has no solution.
     """
     record = _Record(blows.force.shape[1], substeps, fade_s * blows.sample_rate_hz, lines)
     if any(e.law is None for a in assemblies for e in a.nonlinear):
@@ -70,6 +75,9 @@ def batch_lines(
     later = np.arange(substeps)[::-1, None, None]
     result = np.empty((len(assemblies), hits, channels, len(lines)), dtype=complex)
     for a in range(len(assemblies)):
+        if found.failed[a]:
+            result[a] = np.nan
+            continue
         decay, outputs = np.exp(batch.poles[a] * step), batch.outputs[a]
         begun, ended, forces = found.begun[a], found.ended[a], found.forces[a]
         functions = record.functions(decay**substeps)

@@ -33,8 +33,8 @@ class Marched(NamedTuple):
         Real and imaginary parts of y = z - Γ₁f at the last step.
     begun, ended : complex ndarray, (A, n_blows + m, P)
         Γ₀ + EΓ₁ and Γ₁: what a force at the start of a step and one at its end add to y and to z.
-    failed : bool
-        True where no solution was found at some step.
+    failed : ndarray of bool, (A,)
+        True where no solution was found at some step: what is given of that assembly is nothing then.
     """
 
     motion: NDArray[np.float64]
@@ -42,7 +42,7 @@ class Marched(NamedTuple):
     last: NDArray[np.float64]
     begun: NDArray[np.complex128]
     ended: NDArray[np.complex128]
-    failed: bool
+    failed: NDArray[np.bool_]
 
 
 def march(
@@ -79,9 +79,7 @@ def march(
 
     Returns
     -------
-    ndarray, (A, n_blows, n_kept, n_outputs)
-    bool
-        True where no solution was found at some step.
+    Marched
 
     Notes
     -----
@@ -111,8 +109,9 @@ def march(
         laws, decay, begun, ended, _halves(stretch), _halves(outputs), reach, seen, force,
     )  # fmt: skip
     same = [np.ascontiguousarray(a) for a in numbers]
-    failed = _march(*same, step, keep_every, result, forces, last)  # type: ignore[call-arg]
-    return Marched(result, forces, last, begun, ended, bool(failed))
+    failed = np.zeros(len(poles), dtype=np.bool_)
+    _march(*same, step, keep_every, result, forces, last, failed)
+    return Marched(result, forces, last, begun, ended, failed)
 
 
 def _halves(rows: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -144,7 +143,21 @@ def _gripped(free, own, limit, velocity):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
 def _march(  # type: ignore[no-untyped-def]
-    laws, decay, begun, ended, stretch, outputs, reach, seen, force, step, keep_every, result, forces, last
+    laws,
+    decay,
+    begun,
+    ended,
+    stretch,
+    outputs,
+    reach,
+    seen,
+    force,
+    step,
+    keep_every,
+    result,
+    forces,
+    last,
+    failed,
 ):
     count, size = decay.shape
     hits, steps = force.shape
@@ -157,6 +170,8 @@ def _march(  # type: ignore[no-untyped-def]
         turn, fade = decay[a].imag.copy(), decay[a].real.copy()
         push_re, push_im = begun[a, hits:].real.copy(), begun[a, hits:].imag.copy()
         for h in range(hits):
+            if failed[a]:
+                break
             g[:] = 0.0
             for p in range(size):  # z = 0
                 y[p] = -ended[a, h, p].real * force[h, 0]
@@ -212,7 +227,8 @@ def _march(  # type: ignore[no-untyped-def]
                     if not worst > _TOLERANCE * scale:
                         break
                 if not (worst <= 1e-4 * scale and scale < _WILD):
-                    return True
+                    failed[a] = True
+                    break
                 if trace:
                     for j in range(m):
                         forces[a, h, j, k] = g[j]
@@ -226,7 +242,6 @@ def _march(  # type: ignore[no-untyped-def]
                             s += outputs[a, c, p] * y[p]
                         result[a, h, at, c] = s
             last[a, h] = y
-    return False
 
 
 @numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})

@@ -44,12 +44,13 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     model = run.require_model(NAME)
     tests = all_tests(run)
     known = any(t.study.level_dependent for t in tests)
+    of_hits: Diagnosis | None = None
     if known or (tests and any(depends_on_level(run, x) for x in run.info.effects)):
         of_hits = by_hits(run, tests, progress)
         if not linear_after_all(run, tests, of_hits):
             return {"diagnosis": of_hits, "on_top_of": run.info.effects}
     measured = measured_modes(run)
-    several = not known and any(len(t.levels) > 1 for t in tests)
+    several = of_hits is None and any(len(t.levels) > 1 for t in tests)
     first, second = (
         (_part(progress, 0.0, 0.5), _part(progress, 0.5, 1.0)) if several else (progress, progress)
     )
@@ -57,7 +58,9 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     found = diagnose(
         model, measured, settings, run.library, tell, failed_checks(run), limits, measured_frfs(run)
     )
-    if several:
+    if of_hits is not None:
+        found = with_limits(found, of_hits)
+    elif several:
         found = with_hits(run, tests, found, second)
         if any(depends_on_level(run, x) for x in found.ladder.rungs[-1].effects):
             return {"diagnosis": found, "on_top_of": run.info.effects}
@@ -106,6 +109,11 @@ def with_hits(run: Run, tests: Sequence[LevelTest], found: Diagnosis, progress: 
         return replace(found, notes=(*found.notes, f"The hits could not be simulated: {error}"))
     if any(depends_on_level(run, x) for x in of_hits.ladder.rungs[-1].effects):
         return of_hits
+    return with_limits(found, of_hits)
+
+
+def with_limits(found: Diagnosis, of_hits: Diagnosis) -> Diagnosis:
+    """A diagnosis by modes with what the hits would have shown besides."""
     return replace(found, detection_limits=(*found.detection_limits, *of_hits.detection_limits))
 
 

@@ -74,10 +74,12 @@ class TimeProblem:
     def lines(self, points: NDArray[np.float64]) -> list[NDArray[np.complex128]]:
         """The spectra of that as `HitWindows.spectra` gives them, (B, n_hits, n_sensors, n_lines), much faster.
 
+        NaN where the motion of a model grows without bound.
+
         Raises
         ------
         EmaError
-            Where the motion of a model grows without bound.
+            Where an element with a memory has no solution.
         """
         return [
             _joined([batch_lines(some, blows, self.substeps, w.fade_s, w.lines) for some in parts])
@@ -187,8 +189,17 @@ def whitenings(windows: Sequence[HitWindows], floor: NoiseFloor, data_per_mode: 
 def residuals(
     problem: TimeProblem, weights: Sequence[Whitening], points: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Weighted differences of measured and simulated lines, real and imaginary in turn, (B, n)."""
-    return weighted(weights, problem.lines(points))
+    """Weighted differences of measured and simulated lines, real and imaginary in turn, (B, n).
+
+    Raises
+    ------
+    EmaError
+        Where the motion of a model has no solution.
+    """
+    r = weighted(weights, problem.lines(points))
+    if not np.all(np.isfinite(r[:, 0])):
+        raise EmaError("the motion of a model grows without bound: check the values of its effects")
+    return r
 
 
 def weighted(weights: Sequence[Whitening], lines: Sequence[NDArray[np.complex128]]) -> NDArray[np.float64]:
@@ -300,7 +311,7 @@ def objectives(
     """-2 log posterior at points, (B,); infinite where the motion of a model has no solution."""
     prior = problem.space.has_prior.astype(float)
     try:
-        r = residuals(problem, weights, points)
+        r = weighted(weights, problem.lines(points))
     except EmaError:
         if len(points) == 1:
             return np.array([np.inf])

@@ -143,6 +143,13 @@ def fit_effect(case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: 
         *_competing(case.softer().beginning(_GROWING[-1]), hypothesis, base, starts, most, _DENSE),
         *_competing(case.rough(), hypothesis, base, starts, floor, _SPARSE),
     ]
+    if chosen and not any(t.helps for t in chosen):
+        # no size leads away from the base model, where all windows are at their optimum
+        own = sized(case, hypothesis, chosen[0].sizes)
+        sizes = {**base.sizes, **own}
+        problem = case.coarse().problem(hypothesis, sizes)
+        start = problem.space.point({**base.values, **own})
+        return judged(problem, hypothesis, sizes, fit(problem, case.weights(floor), start, _STEPS))
     begun = []
     for t in chosen:
         own = sized(case, hypothesis, t.sizes)
@@ -190,11 +197,14 @@ def fit_linear(
 
 
 class _Tried(NamedTuple):
-    """A size that competed: its objective, the start that it went with, the sizes."""
+    """A size that competed: its objective, the start that it went with, the sizes, and whether they are better than
+    none.
+    """
 
     objective: float
     start: int
     sizes: tuple[float, ...]
+    helps: bool = False
 
 
 def _worth_following(tried: Sequence[_Tried], null: float) -> list[_Tried]:
@@ -217,7 +227,7 @@ def _worth_following(tried: Sequence[_Tried], null: float) -> list[_Tried]:
             abs(np.log(abs(t.sizes[0] / k.sizes[0]))) > _APART or t.sizes[0] * k.sizes[0] < 0 for k in kept
         ]
         if all(apart) and t.objective < absent.objective:
-            kept.append(t)
+            kept.append(t._replace(helps=True))
         if len(kept) == _FOLLOWED:
             break
     return kept
