@@ -35,8 +35,12 @@ _GROWING = (0.05, 0.15)
 """Shares of the windows: far from the right frequencies, or where parts strike, long ones have no slope to follow."""
 _STEPS = 8
 _NEIGHBOURS = (1.0, 0.9, 0.93, 0.96, 0.98, 1.02, 1.04, 1.07, 1.1)
-_DENSE, _SPARSE = 10, 2
+_DENSE, _SPARSE = 5, 2
 """Sizes per decade that compete in short windows after softer hits, and in longer ones after all."""
+_BETWEEN = 0.5
+"""Decades over `_DENSE` to either side of the best sizes, which compete as well: where parts strike, optima are narrow."""
+_CLOSE = 1.5
+"""Error, in standard uncertainties, of a base model to which a further effect adds little: long windows lead there."""
 _POLISHED = 2
 _MOST_STEPS = 25
 
@@ -139,10 +143,9 @@ def fit_effect(case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: 
     """
     starts = _distinct_starts((base.values, *case.starts))
     most = NoiseFloor(case.settings.levels.noise_most, floor.common)
-    chosen = [
-        *_competing(case.softer().beginning(_GROWING[-1]), hypothesis, base, starts, most, _DENSE),
-        *_competing(case.rough(), hypothesis, base, starts, floor, _SPARSE),
-    ]
+    chosen = _competing(case.rough(), hypothesis, base, starts, floor, _SPARSE)
+    if base.fit.objective > _CLOSE**2 * case.data or not base.sizes:
+        chosen += _competing(case.softer().beginning(_GROWING[-1]), hypothesis, base, starts, most, _DENSE)
     if chosen and not any(t.helps for t in chosen):
         # no size leads away from the base model, where all windows are at their optimum
         own = sized(case, hypothesis, chosen[0].sizes)
@@ -171,14 +174,17 @@ def _competing(
     first, *others = case.parameters_of(hypothesis.labels[-1])
     points = list(product(size_grid(first, per_decade), *((p.start, 0.1 * p.start) for p in others)))
     problem, weights = case.problem(hypothesis), case.weights(floor)
-    tried: list[_Tried] = []
-    for k, start in enumerate(starts):
-        named = [{**base.values, **start, **sized(case, hypothesis, v)} for v in points]
+
+    def tries(of: Sequence[tuple[int, tuple[float, ...]]]) -> list[_Tried]:
+        named = [{**base.values, **starts[k], **sized(case, hypothesis, v)} for k, v in of]
         x = np.array([problem.space.point(values) for values in named])
-        tried += [
-            _Tried(float(o), k, v) for o, v in zip(objectives(problem, weights, x), points, strict=True)
-        ]
-    return _worth_following(tried, first.null)
+        return [_Tried(float(o), k, v) for o, (k, v) in zip(objectives(problem, weights, x), of, strict=True)]
+
+    tried = tries(list(product(range(len(starts)), points)))
+    best = [t for t in _worth_following(tried, first.null) if t.helps]
+    beside = 10.0 ** (_BETWEEN / per_decade * np.array([-1, 1]))
+    near = [(t.start, (t.sizes[0] * float(b), *t.sizes[1:])) for t in best for b in beside]
+    return _worth_following(tried + tries(near), first.null) if near else _worth_following(tried, first.null)
 
 
 def fit_linear(
