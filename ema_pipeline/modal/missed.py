@@ -35,6 +35,10 @@ HALF_WINDOW = 48
 WINDOWS = 4
 """Windows searched, the worst first."""
 
+MOST = 12
+"""Candidates of one search beyond which no further window is looked at: so many are no modes but what is left over of
+a structure that is not linear, and a fit of all of them takes minutes."""
+
 
 def left_over(
     data: FitData, hits: Noise, estimate: Estimate, solution: LinearSolution
@@ -74,7 +78,7 @@ def missed(
     ratio = scipy.ndimage.gaussian_filter1d(ratio, 1.5, mode="nearest")
     for _ in range(WINDOWS):
         peak = int(np.argmax(ratio))
-        if ratio[peak] < TOO_MUCH:
+        if ratio[peak] < TOO_MUCH or len(found.poles) > MOST:
             break
         first = int(np.clip(peak - HALF_WINDOW, 0, max(len(ratio) - 2 * HALF_WINDOW, 0)))
         stop = min(first + 2 * HALF_WINDOW, len(ratio))
