@@ -10,7 +10,7 @@ import numpy as np
 from ema_pipeline.diagnose.explain import label_text, size_text
 from ema_pipeline.diagnose.hypotheses import NOTHING, describe
 from ema_pipeline.diagnose.levels import words
-from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
+from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, level_hypotheses
 from ema_pipeline.diagnose.levels.detection import detection_limits
 from ema_pipeline.diagnose.levels.ladder import (
     LevelErrors,
@@ -25,6 +25,7 @@ from ema_pipeline.diagnose.levels.search import (
     LevelRanking,
     again,
     at_floor,
+    fit_effect,
     own_floor,
     ranked,
     ranked_linear,
@@ -100,10 +101,11 @@ def _diagnose(
     notes: tuple[str, ...],
     tell: Progress,
 ) -> Diagnosis:
+    if linear is not None and (idle := _replaced(case, effects, _claims(linear), _part(tell, 0.0, 0.1))):
+        effects, linear = tuple(x for x in effects if x not in idle), _without(linear, idle)
     climbed = _climb(case, effects, tell)
-    if linear is not None and (idle := _withdrawn(case, climbed, _claims(linear))):
-        effects = tuple(x for x in effects if x not in idle)
-        linear = _without(linear, idle)
+    if linear is not None and (idle := _withdrawn(case, climbed.models[-1], _claims(linear))):
+        effects, linear = tuple(x for x in effects if x not in idle), _without(linear, idle)
         climbed = _climb(case, effects, tell)
     shortened, case = climbed.case is not case, climbed.case
     first, base = climbed.rankings[0], climbed.rankings[0].base
@@ -373,12 +375,34 @@ def _claims(linear: Diagnosis | None) -> tuple[Candidate, ...]:
     return tuple(c for c in linear.candidates if c.claimed)
 
 
-def _withdrawn(case: LevelCase, climbed: _Climbed, claimed: Sequence[Candidate]) -> set[str]:
+def _replaced(
+    case: LevelCase, effects: tuple[str, ...], claimed: Sequence[Candidate], tell: Progress
+) -> set[str]:
+    """Effects claimed from the modes of one level that vanish beside one at the same place that the hits show.
+
+    Seen at once, these need no ranking of everything else on top of them.
+    """
+    places = {c.at for c in claimed if c.label in effects}
+    if not places:
+        return set()
+    base = climb(case, effects, case.floor, tell)[-1]
+    for h in level_hypotheses(case, base.hypothesis):
+        if h.labels[-1].partition("@")[2] not in places:
+            continue
+        found = fit_effect(case, h, base, case.floor)
+        if base.fit.objective - found.fit.objective < case.settings.levels.gain_least:
+            continue
+        found = again(case, found, own_floor(case, found))
+        if gone := _withdrawn(case, found, claimed):
+            return gone
+    return set()
+
+
+def _withdrawn(case: LevelCase, top: Simulated, claimed: Sequence[Candidate]) -> set[str]:
     """Effects claimed from the modes of one level that vanish beside those that the hits show.
 
     Friction that locks acts at one level as a damper does. Fitted together, the friction leaves nothing to the damper.
     """
-    top = climbed.models[-1]
     if not any(_depends(case, x) for x in top.hypothesis.labels):
         return set()
     gone = set()

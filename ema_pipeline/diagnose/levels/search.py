@@ -38,7 +38,7 @@ _NEIGHBOURS = (1.0, 0.9, 0.93, 0.96, 0.98, 1.02, 1.04, 1.07, 1.1)
 _DENSE, _SPARSE = 5, 2
 """Sizes per decade that compete in short windows after softer hits, and in longer ones after all."""
 _BETWEEN = 0.5
-"""Decades over `_DENSE` to either side of the best sizes, which compete as well: where parts strike, optima are narrow."""
+"""Steps of that grid to either side of the best sizes, which compete as well: where parts strike, optima are narrow."""
 _CLOSE = 1.5
 """Error, in standard uncertainties, of a base model to which a further effect adds little: long windows lead there."""
 _POLISHED = 2
