@@ -23,7 +23,10 @@ TRIGGER_S = 0.05
 
 @dataclass(frozen=True)
 class Case:
-    """A modal system and how it is struck; `mode` moves by `shift` (relative) from the softest to the hardest."""
+    """A modal system and how it is struck; `mode` moves by `shift` (relative) from the softest to the hardest.
+
+    Its size in the FRFs is in proportion to the force to the power of `growth`.
+    """
 
     frequency_hz: Real
     damping: Real
@@ -37,6 +40,7 @@ class Case:
     mode: int = 0
     frequency_shift: float = 0.0
     damping_shift: float = 0.0
+    growth: float = 0.0
 
 
 def random_case(rng: np.random.Generator) -> Case:
@@ -80,6 +84,7 @@ def hits_of(case: Case, rng: np.random.Generator) -> list[HitSamples]:
                 damping[case.mode] *= 1 + case.damping_shift * moved
                 w, wr = 2 * np.pi * axis, 2 * np.pi * frequency[:, None]
                 transfer = -(w**2) / (wr**2 - w**2 + 2j * damping[:, None] * wr * w)
+                transfer[case.mode] *= (peak / top) ** case.growth
                 frf = (case.shapes * case.shapes[:, [point]]).T @ transfer
                 force = scipy.fft.irfft(spectrum, period)[:SAMPLES]
                 clean.append((point, level, force, scipy.fft.irfft(frf * spectrum, period)[:, :SAMPLES]))

@@ -18,6 +18,7 @@ from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import HitSamples, cut_hit
 from ema_pipeline.levels import LevelSettings, LevelStudy, study_levels
 from ema_pipeline.levels.single import single_hits
+from ema_pipeline.levels.sizes import relative_sizes, sizes_at_levels
 from ema_pipeline.levels.trend import Samples, clearest, combined, holm, samples, shifts, trends
 from ema_pipeline.levels.words import flagged
 from ema_pipeline.modal.identify import identify
@@ -107,6 +108,25 @@ def test_poles_of_single_hits_scatter_as_their_standard_deviations_say() -> None
     assert np.all((z[soft].std(axis=0) > 0.5) & (z[soft].std(axis=0) < 1.7))
     z = (found.damping_ratio - true_damping) / found.damping_std
     assert np.all((z[soft].std(axis=0) > 0.5) & (z[soft].std(axis=0) < 1.7))
+
+
+def test_sizes_of_single_hits_scatter_as_their_standard_deviations_say() -> None:
+    case = replace(LINEAR, frequency_hz=np.array([80.0, 130.0, 620.0]), hits_per_level=4, hand=0.02)
+    hits = hits_of(case, np.random.default_rng(5))
+    frfs = estimate_frfs(hits)
+    found = single_hits(lambda: hits, identify(frfs, ModalSettings()), frfs, FrfSettings())
+    values, std, mean = relative_sizes(found)
+    assert mean.max(axis=0) == pytest.approx(np.ones(3))
+    z = (values - mean) / std
+    for soft in (found.force_n < 35, found.force_n > 100):
+        assert np.isfinite(z[soft]).all()
+        assert np.all((z[soft].std(axis=0) > 0.5) & (z[soft].std(axis=0) < 1.7))
+    # alike at every level, within what is known of them
+    level = np.digitize(found.force_n, [35, 100])
+    for r in range(3):
+        size, size_std = sizes_at_levels(values[:, r], std[:, r], mean[:, r], level, 0.0)
+        assert np.all(np.abs(size - 1) < 4 * size_std)
+        assert np.all(size_std < 0.02)
 
 
 def test_displacement_after_a_hit_is_that_of_the_impulse() -> None:

@@ -115,6 +115,33 @@ def test_poles_at_multiples_of_what_moves_are_no_modes(
     assert cleaned[0].modal is soft
 
 
+def test_a_pole_that_grows_with_the_force_is_no_mode_though_nothing_else_moves() -> None:
+    study, modal, _ = studied(replace(CASE, mode=2, growth=1.0), 4)
+    assert study.level_dependent
+    assert study.linear_level == 0
+    assert [round(m.frequency_hz) for m in structure(modal, study).modes] == [80, 130]
+    assert len(study.products) == 1
+    assert study.products[0].startswith("215 Hz (grows with the force to the power of ")
+    assert not any(m.depends for m in study.modes)  # of the modes that are left
+    assert "the FRFs change with it" in study.summary
+
+
+def test_a_pole_that_fades_with_the_force_speaks_for_the_hardest_hits() -> None:
+    study, _, _ = studied(replace(CASE, mode=2, growth=-0.5), 4)
+    assert study.level_dependent
+    assert study.linear_level == 2
+    assert "size falls" in study.modes[2].trend
+    assert "size in the FRFs falls with force" in study.summary
+
+
+def test_sizes_that_change_by_some_per_cent_tell_nothing() -> None:
+    study, _, _ = studied(replace(CASE, noise=1e-4, mode=2, growth=0.02), 4)
+    assert not study.level_dependent
+    size = study.modes[2].size
+    assert size is not None
+    assert size[2] - size[0] == pytest.approx(0.05, abs=0.02)  # seen, but too little to tell of the structure
+
+
 def test_products_of_two_modes_are_told_by_their_frequencies(
     hardening: tuple[LevelStudy, ModalModel, FrfSet],
 ) -> None:

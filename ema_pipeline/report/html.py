@@ -177,6 +177,7 @@ def _levels(c: ConfigurationResults) -> dict[str, Any] | None:
         "summary": c.levels.summary,
         "frequency": levels.frequency_table(c.levels, c.modal) if c.levels.modes else None,
         "damping": levels.damping_table(c.levels) if c.levels.modes else None,
+        "size": levels.size_table(c.levels),
         "evidence": levels.evidence_table(c.levels) if any(not v.passes for v in c.levels.verdicts) else None,
     }
 

@@ -50,6 +50,22 @@ def damping_table(study: LevelStudy) -> Table:
     return Table(("mode", *heads, "p"), rows, frozenset(range(len(heads) + 2)))
 
 
+def size_table(study: LevelStudy) -> Table | None:
+    """Size of every mode in the FRFs of each level over that in all hits, with the test's p value; None where unknown."""
+    known = [m for m in study.modes if m.size is not None]
+    if not known:
+        return None
+    rows = tuple(
+        Row(
+            (str(m.mode + 1), *(_size(m, k) for k in range(len(study.levels))), _p(m.size_p)),
+            m.depends and "size" in m.trend,
+        )
+        for m in known
+    )
+    heads = tuple(f"size at {level.force_n:.3g} N" for level in study.levels)
+    return Table(("mode", *heads, "p"), rows, frozenset(range(len(heads) + 2)))
+
+
 def evidence_table(study: LevelStudy) -> Table:
     """Other signs that were seen: FRFs that differ between levels, coherence dips, distorted circles."""
     rows = tuple(
@@ -77,6 +93,9 @@ def summary_of(study: LevelStudy) -> dict[str, Any]:
                 "damping_std": m.damping_std.tolist(),
                 "frequency_p": m.frequency_p,
                 "damping_p": m.damping_p,
+                "size": None if m.size is None else m.size.tolist(),
+                "size_std": None if m.size_std is None else m.size_std.tolist(),
+                "size_p": m.size_p,
                 "depends": m.depends,
                 "trend": m.trend,
             }
@@ -95,6 +114,14 @@ def _damping(mode: ModeLevels, k: int) -> str:
     if not math.isfinite(mode.damping_ratio[k]):
         return "–"
     return format_percent(float(mode.damping_ratio[k]), float(mode.damping_std[k])).removesuffix(" %")
+
+
+def _size(mode: ModeLevels, k: int) -> str:
+    assert mode.size is not None
+    assert mode.size_std is not None
+    if not math.isfinite(mode.size[k]):
+        return "–"
+    return format_value(float(mode.size[k]), float(mode.size_std[k]))
 
 
 def _p(value: float) -> str:

@@ -97,6 +97,12 @@ def levels_tables(study: LevelStudy, modal: ModalModel, title: str = "") -> Rend
             if remark:
                 parts.append(_line(f"{'mode' if len(alike) == 1 else 'modes'} {', '.join(alike)}: {remark}"))
         parts += [_line(""), _rich(levels.damping_table(study), "Damping ratio by force level")]
+        sizes = levels.size_table(study)
+        if sizes is not None:
+            parts += [
+                _line(""),
+                _rich(sizes, "Size in the FRFs by force level, 1 where it is alike in all hits"),
+            ]
         parts.append(_line("p: probability of a trend as clear as this where nothing depends on the force."))
     failed = [v for v in study.verdicts if not v.passes]
     if failed:
