@@ -110,7 +110,7 @@ def march(
     )  # fmt: skip
     same = [np.ascontiguousarray(a) for a in numbers]
     failed = np.zeros(len(poles), dtype=np.bool_)
-    _march(*same, step, keep_every, result, forces, last, failed)
+    _march(*same, step, keep_every, result, forces, last, failed)  # type: ignore[call-arg]
     return Marched(result, forces, last, begun, ended, failed)
 
 

@@ -51,7 +51,7 @@ def damping_table(study: LevelStudy) -> Table:
 
 
 def size_table(study: LevelStudy) -> Table | None:
-    """Size of every mode in the FRFs of each level over that in all hits, with the test's p value; None where unknown."""
+    """Size of every mode in the FRFs of each level over that in all hits, with p value; None where unknown."""
     known = [m for m in study.modes if m.size is not None]
     if not known:
         return None

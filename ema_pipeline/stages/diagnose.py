@@ -38,39 +38,40 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit every effect of the library on top of the model as it stands, and judge what the data support."""
     if run.info.kind == "hysteresis":
         return loop_ladder.diagnose_run(run, progress)
-    from ema_pipeline.diagnose import diagnose
-
-    settings = cast(DiagnoseSettings, run.settings[NAME])
     model = run.require_model(NAME)
     tests = all_tests(run)
     known = any(t.study.level_dependent for t in tests)
-    of_hits: Diagnosis | None = None
     if known or (tests and any(depends_on_level(run, x) for x in run.info.effects)):
-        of_hits = by_hits(run, tests, progress)
+        of_hits = by_hits(run, tests, _part(progress, 0.0, 0.9))
         if not linear_after_all(run, tests, of_hits):
             return {"diagnosis": of_hits, "on_top_of": run.info.effects}
-    measured = measured_modes(run)
-    several = of_hits is None and any(len(t.levels) > 1 for t in tests)
-    first, second = (
-        (_part(progress, 0.0, 0.5), _part(progress, 0.5, 1.0)) if several else (progress, progress)
-    )
-    limits, tell = own_thresholds(run, settings, model, measured, first)
-    found = diagnose(
-        model, measured, settings, run.library, tell, failed_checks(run), limits, measured_frfs(run)
-    )
-    if of_hits is not None:
-        found = with_limits(found, of_hits)
-    elif several:
-        found = with_hits(run, tests, found, second)
-        if any(depends_on_level(run, x) for x in found.ladder.rungs[-1].effects):
-            return {"diagnosis": found, "on_top_of": run.info.effects}
+        found = with_limits(by_modes(run, model, _part(progress, 0.9, 1.0)), of_hits)
+    elif any(len(t.levels) > 1 for t in tests):
+        found = with_hits(
+            run, tests, by_modes(run, model, _part(progress, 0.0, 0.5)), _part(progress, 0.5, 1.0)
+        )
+    else:
+        found = by_modes(run, model, progress)
     results: dict[str, object] = {"diagnosis": found, "on_top_of": run.info.effects}
     top = found.ladder.rungs[-1]
-    if top.effects:
+    if top.effects and not any(depends_on_level(run, x) for x in top.effects):
+        settings = cast(DiagnoseSettings, run.settings[NAME])
         mended = make_rig(model, Hypothesis(top.effects), run.library, settings.parameter_range)
         values = {name: size.value for name, size in top.parameters.items()}
         _, results["comparison_after"] = correlate(run, mended, values)
     return results
+
+
+def by_modes(run: Run, model: Rig, progress: Progress) -> Diagnosis:
+    """The diagnosis where the answer does not depend on the force level."""
+    from ema_pipeline.diagnose import diagnose
+
+    settings = cast(DiagnoseSettings, run.settings[NAME])
+    measured = measured_modes(run)
+    limits, tell = own_thresholds(run, settings, model, measured, progress)
+    return diagnose(
+        model, measured, settings, run.library, tell, failed_checks(run), limits, measured_frfs(run)
+    )
 
 
 _EXACT = 0.002

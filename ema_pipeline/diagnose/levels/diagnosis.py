@@ -10,7 +10,7 @@ import numpy as np
 from ema_pipeline.diagnose.explain import label_text, size_text
 from ema_pipeline.diagnose.hypotheses import NOTHING, describe
 from ema_pipeline.diagnose.levels import words
-from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, level_hypotheses
+from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
 from ema_pipeline.diagnose.levels.detection import detection_limits
 from ema_pipeline.diagnose.levels.ladder import (
     LevelErrors,
@@ -20,18 +20,17 @@ from ema_pipeline.diagnose.levels.ladder import (
     level_errors,
     sizes_of,
 )
+from ema_pipeline.diagnose.levels.linear_claims import depends_on_level, replaced, withdrawn, without
 from ema_pipeline.diagnose.levels.problem import NoiseFloor
 from ema_pipeline.diagnose.levels.search import (
     LevelRanking,
     again,
     at_floor,
-    fit_effect,
     own_floor,
     ranked,
     ranked_linear,
 )
 from ema_pipeline.diagnose.types import Candidate, DetectionLimit, Diagnosis, EffectSize, Ladder, VerdictWord
-from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.threads import single_blas_thread
 
 Progress = Callable[[float, str], None]
@@ -44,10 +43,6 @@ _FINER = 0.7
 
 _HARDER = 2.0
 """A next test is thought of with blows this much harder than the hardest."""
-
-
-_NOTHING_LEFT, _ELSEWHERE = 2.0, 3.0
-"""Standard deviations: a size vanishes within the first of nothing, and beyond the second of what was claimed."""
 
 
 @dataclass(frozen=True)
@@ -101,11 +96,11 @@ def _diagnose(
     notes: tuple[str, ...],
     tell: Progress,
 ) -> Diagnosis:
-    if linear is not None and (idle := _replaced(case, effects, _claims(linear), _part(tell, 0.0, 0.1))):
-        effects, linear = tuple(x for x in effects if x not in idle), _without(linear, idle)
+    if linear is not None and (idle := replaced(case, effects, _claims(linear), _part(tell, 0.0, 0.1))):
+        effects, linear = tuple(x for x in effects if x not in idle), without(linear, idle)
     climbed = _climb(case, effects, tell)
-    if linear is not None and (idle := _withdrawn(case, climbed.models[-1], _claims(linear))):
-        effects, linear = tuple(x for x in effects if x not in idle), _without(linear, idle)
+    if linear is not None and (idle := withdrawn(case, climbed.models[-1], _claims(linear))):
+        effects, linear = tuple(x for x in effects if x not in idle), without(linear, idle)
         climbed = _climb(case, effects, tell)
     shortened, case = climbed.case is not case, climbed.case
     first, base = climbed.rankings[0], climbed.rankings[0].base
@@ -297,7 +292,7 @@ def _verdict(
     error = error_of(case, last)
     known = climbed.rankings[0].base.hypothesis.labels
     added = [x for x in last.hypothesis.labels if x not in known]
-    nonlinear = [x for x in last.hypothesis.labels if _depends(case, x)]
+    nonlinear = [x for x in last.hypothesis.labels if depends_on_level(case, x)]
     limit = case.settings.error_limit
     if not error <= limit:
         best = f" {label_text(added[0]).capitalize()} helps most but does not mend it." if added else ""
@@ -344,16 +339,10 @@ def _mending(case: LevelCase, climbed: _Climbed, members: Sequence[Simulated]) -
     return sure and ranking.gain(members[0]) >= s.levels.gain_least
 
 
-def _depends(case: LevelCase, label: str) -> bool:
-    known = shipped_effects() if case.library is None else case.library
-    family = label.partition("@")[0]
-    return family in known and not known[family].linear
-
-
 def _limits(climbed: _Climbed) -> tuple[DetectionLimit, ...]:
     """What these hits would show of the effects that depend on the level."""
     case, first = climbed.case, climbed.rankings[0]
-    nonlinear = [m.hypothesis for m in first.fitted if _depends(case, m.hypothesis.labels[-1])]
+    nonlinear = [m.hypothesis for m in first.fitted if depends_on_level(case, m.hypothesis.labels[-1])]
     return detection_limits(case, nonlinear, climbed.models[-1], climbed.floor)
 
 
@@ -373,56 +362,6 @@ def _claims(linear: Diagnosis | None) -> tuple[Candidate, ...]:
     if linear is None or linear.verdict != "effect":
         return ()
     return tuple(c for c in linear.candidates if c.claimed)
-
-
-def _replaced(
-    case: LevelCase, effects: tuple[str, ...], claimed: Sequence[Candidate], tell: Progress
-) -> set[str]:
-    """Effects claimed from the modes of one level that vanish beside one at the same place that the hits show.
-
-    Seen at once, these need no ranking of everything else on top of them.
-    """
-    places = {c.at for c in claimed if c.label in effects}
-    if not places:
-        return set()
-    base = climb(case, effects, case.floor, tell)[-1]
-    for h in level_hypotheses(case, base.hypothesis):
-        if h.labels[-1].partition("@")[2] not in places:
-            continue
-        found = fit_effect(case, h, base, case.floor)
-        if base.fit.objective - found.fit.objective < case.settings.levels.gain_least:
-            continue
-        found = again(case, found, own_floor(case, found))
-        if gone := _withdrawn(case, found, claimed):
-            return gone
-    return set()
-
-
-def _withdrawn(case: LevelCase, top: Simulated, claimed: Sequence[Candidate]) -> set[str]:
-    """Effects claimed from the modes of one level that vanish beside those that the hits show.
-
-    Friction that locks acts at one level as a damper does. Fitted together, the friction leaves nothing to the damper.
-    """
-    if not any(_depends(case, x) for x in top.hypothesis.labels):
-        return set()
-    gone = set()
-    for c in claimed:
-        for p in case.parameters_of(c.label):
-            before, name = c.parameters.get(p.name), f"{c.label}.{p.name}"
-            if before is None or name not in top.values or not np.isfinite(p.null):
-                continue
-            value, std = top.values[name], top.std[name]
-            vanished = abs(value - p.null) < _NOTHING_LEFT * std
-            moved = abs(value - before.value) > _ELSEWHERE * np.hypot(std, before.std)
-            if vanished and moved:
-                gone.add(c.label)
-    return gone
-
-
-def _without(linear: Diagnosis, labels: set[str]) -> Diagnosis | None:
-    """The diagnosis of one level without some of its claims; None where nothing is left of them."""
-    kept = tuple(replace(c, claimed=c.claimed and c.label not in labels) for c in linear.candidates)
-    return replace(linear, candidates=kept) if any(c.claimed for c in kept) else None
 
 
 def _claim_text(claimed: Sequence[Candidate]) -> str:

@@ -1,0 +1,76 @@
+"""What the modes of one level show to be missing, held against the hits of all levels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, level_hypotheses
+from ema_pipeline.diagnose.levels.ladder import climb
+from ema_pipeline.diagnose.levels.search import again, fit_effect, own_floor
+from ema_pipeline.diagnose.types import Candidate, Diagnosis
+from ema_pipeline.effects.library import shipped_effects
+
+Progress = Callable[[float, str], None]
+
+_NOTHING_LEFT, _ELSEWHERE = 2.0, 3.0
+"""Standard deviations: a size vanishes within the first of nothing, and beyond the second of what was claimed."""
+
+
+def replaced(
+    case: LevelCase, effects: tuple[str, ...], claimed: Sequence[Candidate], tell: Progress
+) -> set[str]:
+    """Effects claimed from the modes of one level that vanish beside one at the same place that the hits show.
+
+    Seen at once, these need no ranking of everything else on top of them.
+    """
+    places = {c.at for c in claimed if c.label in effects}
+    if not places:
+        return set()
+    base = climb(case, effects, case.floor, tell)[-1]
+    for h in level_hypotheses(case, base.hypothesis):
+        if h.labels[-1].partition("@")[2] not in places:
+            continue
+        found = fit_effect(case, h, base, case.floor)
+        if base.fit.objective - found.fit.objective < case.settings.levels.gain_least:
+            continue
+        found = again(case, found, own_floor(case, found))
+        if gone := withdrawn(case, found, claimed):
+            return gone
+    return set()
+
+
+def withdrawn(case: LevelCase, top: Simulated, claimed: Sequence[Candidate]) -> set[str]:
+    """Effects claimed from the modes of one level that vanish beside those that the hits show.
+
+    Friction that locks acts at one level as a damper does. Fitted together, the friction leaves nothing to the damper.
+    """
+    if not any(depends_on_level(case, x) for x in top.hypothesis.labels):
+        return set()
+    gone = set()
+    for c in claimed:
+        for p in case.parameters_of(c.label):
+            before, name = c.parameters.get(p.name), f"{c.label}.{p.name}"
+            if before is None or name not in top.values or not np.isfinite(p.null):
+                continue
+            value, std = top.values[name], top.std[name]
+            vanished = abs(value - p.null) < _NOTHING_LEFT * std
+            moved = abs(value - before.value) > _ELSEWHERE * np.hypot(std, before.std)
+            if vanished and moved:
+                gone.add(c.label)
+    return gone
+
+
+def without(linear: Diagnosis, labels: set[str]) -> Diagnosis | None:
+    """The diagnosis of one level without some of its claims; None where nothing is left of them."""
+    kept = tuple(replace(c, claimed=c.claimed and c.label not in labels) for c in linear.candidates)
+    return replace(linear, candidates=kept) if any(c.claimed for c in kept) else None
+
+
+def depends_on_level(case: LevelCase, label: str) -> bool:
+    """True for an effect whose answer is not in proportion to the force."""
+    known = shipped_effects() if case.library is None else case.library
+    family = label.partition("@")[0]
+    return family in known and not known[family].linear
