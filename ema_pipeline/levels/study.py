@@ -189,6 +189,7 @@ def _tested(
     """The modes of a model with their tests, those that move if any does, and the p value of all tests together."""
     from ema_pipeline.levels.hit_trends import hit_trends
     from ema_pipeline.levels.single import single_hits
+    from ema_pipeline.levels.sizes import NO_TREND
     from ema_pipeline.levels.trend import clearest, shifts
     from ema_pipeline.levels.words import trend_words
 
@@ -229,7 +230,7 @@ def _tested(
             damping_shift_std=damping_shift[1],
             size=tests.level_sizes[r][0],
             size_std=tests.level_sizes[r][1],
-            size_p=size[r].p,
+            size_p=float("nan") if size[r].p == NO_TREND else size[r].p,
         )
     return tuple(out), tests.p_value
 

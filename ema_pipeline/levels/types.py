@@ -74,7 +74,7 @@ class ModeLevels:
         Participation in the FRFs of each level over that in all hits, see `sizes`; 1 for a linear mode. NaN where
         no hit tells.
     size_p : float
-        As `frequency_p`.
+        As `frequency_p`; NaN also for a change too small to tell of the structure, see `sizes.PLAIN_SIZE`.
     """
 
     mode: int

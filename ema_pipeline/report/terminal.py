@@ -103,7 +103,8 @@ def levels_tables(study: LevelStudy, modal: ModalModel, title: str = "") -> Rend
                 _line(""),
                 _rich(sizes, "Size in the FRFs by force level, 1 where it is alike in all hits"),
             ]
-        parts.append(_line("p: probability of a trend as clear as this where nothing depends on the force."))
+        parts.append(_line("p: probability of a trend as clear as this where nothing depends on the force;"))
+        parts.append(_line("–: not tested, or a size that changes by less than a tenth."))
     failed = [v for v in study.verdicts if not v.passes]
     if failed:
         parts += [_line(""), _line("Other signs:"), *(_line(f"! {v.message}") for v in failed)]
