@@ -23,7 +23,7 @@ from ema_pipeline.fit.error_function import (
 from ema_pipeline.fit.latent import LatentObjective
 from ema_pipeline.fit.map_fit import fit_rig
 from ema_pipeline.fit.settings import FitSettings
-from ema_pipeline.fit.solve import FitProblem, prepare
+from ema_pipeline.fit.solve import FitProblem, Mixture, descend, prepare
 from ema_pipeline.fit.space import make_space
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.mechanics.modes import normal_modes
@@ -402,3 +402,21 @@ def test_standard_deviations_agree_with_the_profile_also_for_an_effect_with_boun
         p = fitted.parameters[name]
         assert (p.high - p.low) / 2 == pytest.approx(p.std, rel=0.15)
         assert abs(p.value - values[name]) < 3.5 * p.std
+
+
+class _Cliff:
+    """(x - 3)² with a Newton step that leads to where no mass matrix is left."""
+
+    def costs(self, x: np.ndarray) -> np.ndarray:
+        if x[0] > 4.0:
+            raise np.linalg.LinAlgError("Matrix is not positive definite")
+        return (x - 3.0) ** 2
+
+    def normal_equations(self, x: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([[0.1]]), weight * (x - 3.0)  # far too flat: the first steps lead beyond 4
+
+
+def test_a_step_to_where_no_mass_matrix_is_left_is_shortened() -> None:
+    space = make_space([Parameter("k", 1.0, "N/m", minimum=-100.0, maximum=100.0, free=True)])
+    found = descend(_Cliff(), space, np.array([1.0]), Mixture(np.array([np.inf]), 0.01), 50)
+    assert found.x[0] == pytest.approx(3.0, abs=0.01)

@@ -254,7 +254,11 @@ def descend(
             step = np.zeros(x.size)
             step[free] = -np.linalg.solve(a + np.diag(lift), gradient[free])
             candidate = space.retract(x, step)
-            candidate_costs = objective.costs(candidate)
+            try:
+                candidate_costs = objective.costs(candidate)
+            except np.linalg.LinAlgError:  # a step so far that no mass matrix is left: a shorter one may do
+                damping = min(damping * 10, 1e9)
+                continue
             after = value(candidate_costs, candidate)
             if np.isfinite(after) and after < best:
                 improved, gain = True, best - after
