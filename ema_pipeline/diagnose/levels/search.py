@@ -146,13 +146,6 @@ def fit_effect(case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: 
     chosen = _competing(case.rough(), hypothesis, base, starts, floor, _SPARSE)
     if base.fit.objective > _CLOSE**2 * case.data or not base.sizes:
         chosen += _competing(case.softer().beginning(_GROWING[-1]), hypothesis, base, starts, most, _DENSE)
-    if chosen and not any(t.helps for t in chosen):
-        # no size leads away from the base model, where all windows are at their optimum
-        own = sized(case, hypothesis, chosen[0].sizes)
-        sizes = {**base.sizes, **own}
-        problem = case.coarse().problem(hypothesis, sizes)
-        start = problem.space.point({**base.values, **own})
-        return judged(problem, hypothesis, sizes, fit(problem, case.weights(floor), start, _STEPS))
     begun = []
     for t in chosen:
         own = sized(case, hypothesis, t.sizes)
