@@ -79,6 +79,12 @@ def get_effect(effect_id: str, library: Library | None = None) -> Effect:
     return known[effect_id]
 
 
+def depends_on_level(label: str, library: Library | None = None) -> bool:
+    """True for an effect ``id@place``, or a parameter of it, whose answer is not in proportion to the force."""
+    effect = (shipped_effects() if library is None else library).get(label.partition("@")[0])
+    return effect is not None and not effect.linear
+
+
 def parse_sized(text: str) -> tuple[str, dict[str, float]]:
     """Read ``id@place:name=value,name=value``; without values the effect's start values apply later.
 

@@ -77,22 +77,17 @@ def without_products(
     soft = {
         m.mode: int(m.level_modes[0]) for m in modes if m.level_modes is not None and m.level_modes[0] >= 0
     }
-    grown = {
-        m.mode: words
-        for m in modes
-        if m.size_p < SURE and growth(m, force) > GROWTH
-        for words in [f"grows with the force to the power of {growth(m, force):.1f}"]
-    }
+    power = {m.mode: growth(m, force) for m in modes if m.size_p < SURE}
+    grown = {mode for mode, p in power.items() if p > GROWTH}
     real = [m for m in modes if m.mode in soft and m.mode not in grown]
     # where no frequency moves, what is made tells of modes that make it
     moving = [m for m in real if m.depends] or real
     parents = [modal.modes[m.mode] for m in moving]
     grown_tracks = {
-        (k, int(m.level_modes[k])): grown[m.mode]
+        (k, int(r)): f"grows with the force to the power of {power[m.mode]:.1f}"
         for m in modes
         if m.mode in grown and m.level_modes is not None
-        for k in range(len(levels))
-        if m.level_modes[k] >= 0
+        for k, r in enumerate(m.level_modes)
     }
     models = [level.modal for level in levels if level.modal is not None]
     drop: list[set[int]] = [set() for _ in models]
@@ -130,12 +125,9 @@ def growth(mode: ModeLevels, force_n: NDArray[np.float64]) -> float:
         1 for a mode, 2 and 3 for what springs with squares and cubes make; a size that the softest hits do not show
         counts as `FAINT` of its standard deviations. NaN where unknown.
     """
-    if mode.size is None or mode.size_std is None:
+    if mode.sized_levels is None or mode.size is None or mode.size_std is None:
         return float("nan")
-    known = np.flatnonzero(np.isfinite(mode.size))
-    if len(known) < 2:
-        return float("nan")
-    a, b = int(known[0]), int(known[-1])
+    a, b = mode.sized_levels
     soft = max(abs(float(mode.size[a])), FAINT * float(mode.size_std[a]))
     hard = float(mode.size[b])
     if not (hard > 0 and soft > 0):

@@ -95,9 +95,9 @@ def _rubs(modes: Sequence[ModeLevels]) -> bool:
     """
     loss, move, fade = 0.0, 0.0, 0.0
     for m in modes:
-        if "size" in m.trend and m.size is not None:
-            known = m.size[np.isfinite(m.size)]
-            fade -= float(known[-1] - known[0]) if known.size else 0.0
+        if "size" in m.trend and m.size is not None and m.sized_levels is not None:
+            softest, hardest = m.sized_levels
+            fade += float(m.size[softest] - m.size[hardest])
         if m.level_modes is None or m.level_modes[0] < 0:
             continue  # what the softest hits do not show may be no mode
         if "damping falls" in m.trend:

@@ -199,14 +199,15 @@ def _tested(
         return modes, float("nan")
     found = single_hits(hits, _only(modal, base), frfs, frf_settings)
     level = np.array([place[name] for name in found.names], dtype=np.int64)
-    tests = hit_trends(found, level, np.array([_far(modes[k]) != 0 for k in base]))
+    changes = [_far(modes[k]) for k in base]
+    tests = hit_trends(found, level, np.array(changes) != 0)
     frequency, damping, size = tests.frequency, tests.damping, tests.size
     moves = clearest(tests.p_values, settings.false_alarm, one_at_least)
     out = list(modes)
     for r, k in enumerate(base):
         both = bool(moves[r]), bool(moves[r + len(base)])
         grows = bool(moves[r + 2 * len(base)])
-        slope, far = frequency[r].slope, _far(modes[k])
+        slope, far = frequency[r].slope, changes[r]
         shift = shifts(
             found.frequency_hz[:, r], found.frequency_std_hz[:, r], found.sheet, level, frequency[r]
         )

@@ -96,6 +96,12 @@ class ModeLevels:
     size_std: NDArray[np.float64] | None = None
     size_p: float = float("nan")
 
+    @property
+    def sized_levels(self) -> tuple[int, int] | None:
+        """The softest and the hardest level whose hits tell the size; None where fewer than two do."""
+        known = [] if self.size is None else np.flatnonzero(np.isfinite(self.size)).tolist()
+        return (known[0], known[-1]) if len(known) > 1 else None
+
 
 @dataclass(frozen=True)
 class DecayCurve:

@@ -152,12 +152,9 @@ def _ends(values: Real, stds: Real, shift: Real | None, shift_std: Real | None, 
 
 def _size_ends(mode: ModeLevels) -> Ends | None:
     """Size at the softest and the hardest level that tell, over that in all hits."""
-    if mode.size is None or mode.size_std is None:
+    if mode.sized_levels is None or mode.size is None or mode.size_std is None:
         return None
-    known = np.flatnonzero(np.isfinite(mode.size))
-    if len(known) < 2:
-        return None
-    a, b = int(known[0]), int(known[-1])
+    a, b = mode.sized_levels
     return float(mode.size[a]), float(mode.size_std[a]), float(mode.size[b]), float(mode.size_std[b])
 
 

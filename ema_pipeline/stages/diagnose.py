@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, cast
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.stages import loop_ladder
 from ema_pipeline.stages.base import Progress, Run, code_fingerprint
 from ema_pipeline.stages.correlate import correlate
-from ema_pipeline.stages.level_case import all_tests, depends_on_level, level_case, linear_part
+from ema_pipeline.stages.level_case import all_tests, level_case, linear_part
 from ema_pipeline.stages.modes import measured_frfs, measured_modes
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     model = run.require_model(NAME)
     tests = all_tests(run)
     known = any(t.study.level_dependent for t in tests)
-    if known or (tests and any(depends_on_level(run, x) for x in run.info.effects)):
+    if known or (tests and any(depends_on_level(x, run.library) for x in run.info.effects)):
         of_hits = by_hits(run, tests, _part(progress, 0.0, 0.9))
         if not linear_after_all(run, tests, of_hits):
             return {"diagnosis": of_hits, "on_top_of": run.info.effects}
@@ -54,7 +55,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
         found = by_modes(run, model, progress)
     results: dict[str, object] = {"diagnosis": found, "on_top_of": run.info.effects}
     top = found.ladder.rungs[-1]
-    if top.effects and not any(depends_on_level(run, x) for x in top.effects):
+    if top.effects and not any(depends_on_level(x, run.library) for x in top.effects):
         settings = cast(DiagnoseSettings, run.settings[NAME])
         mended = make_rig(model, Hypothesis(top.effects), run.library, settings.parameter_range)
         values = {name: size.value for name, size in top.parameters.items()}
@@ -88,7 +89,9 @@ def linear_after_all(run: Run, tests: Sequence[LevelTest], found: Diagnosis) -> 
     """
     chance = all(t.study.p_value >= _CHANCE for t in tests if t.study.level_dependent)
     exact = found.ladder.hit_noise <= _EXACT and found.error <= 1.0
-    return chance and exact and not any(depends_on_level(run, x) for x in found.ladder.rungs[-1].effects)
+    return (
+        chance and exact and not any(depends_on_level(x, run.library) for x in found.ladder.rungs[-1].effects)
+    )
 
 
 def with_hits(run: Run, tests: Sequence[LevelTest], found: Diagnosis, progress: Progress) -> Diagnosis:
@@ -108,7 +111,7 @@ def with_hits(run: Run, tests: Sequence[LevelTest], found: Diagnosis, progress: 
         )
     except EmaError as error:
         return replace(found, notes=(*found.notes, f"The hits could not be simulated: {error}"))
-    if any(depends_on_level(run, x) for x in of_hits.ladder.rungs[-1].effects):
+    if any(depends_on_level(x, run.library) for x in of_hits.ladder.rungs[-1].effects):
         return of_hits
     return with_limits(found, of_hits)
 

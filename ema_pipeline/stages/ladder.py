@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.stages import loop_ladder
 from ema_pipeline.stages.base import Progress, Run
-from ema_pipeline.stages.level_case import all_tests, depends_on_level, level_case, linear_part
+from ema_pipeline.stages.level_case import all_tests, level_case, linear_part
 from ema_pipeline.stages.modes import measured_frfs, measured_modes
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     if run.rig is None:
         raise EmaError(f"{run.store.folder}: a ladder needs a model; run again with --rig")
     settings = cast(DiagnoseSettings, run.settings["diagnose"])
-    if any(depends_on_level(run, label) for label in run.info.effects):
+    if any(depends_on_level(label, run.library) for label in run.info.effects):
         return {"ladder": by_hits(run, progress)}
     return {
         "ladder": make_ladder(
@@ -67,7 +68,7 @@ def by_hits(run: Run, progress: Progress) -> Ladder:
 
     tests = all_tests(run)
     if not tests:
-        label = next(x for x in run.info.effects if depends_on_level(run, x))
+        label = next(x for x in run.info.effects if depends_on_level(x, run.library))
         raise EmaError(
             f"{run.store.folder}: '{label}' shows in hits only, and there are none; "
             f"take it out with 'ema remove {run.store.folder} {label}'"

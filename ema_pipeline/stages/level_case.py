@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.rigs.base import ParametricRig
@@ -54,7 +55,7 @@ def linear_part(run: Run) -> Rig:
     """The rig with those of the added effects that do not depend on the level."""
     assert run.rig is not None
     settings = cast(DiagnoseSettings, run.settings["diagnose"])
-    kept = tuple(x for x in run.info.effects if not depends_on_level(run, x))
+    kept = tuple(x for x in run.info.effects if not depends_on_level(x, run.library))
     return make_rig(run.rig, Hypothesis(kept), run.library, settings.parameter_range)
 
 
@@ -63,14 +64,8 @@ def with_sizes_of(run: Run, rig: Rig, values: Mapping[str, float]) -> Rig:
     held = {
         n: replace(p, value=values[n], free=False, tolerance=0.0)
         for n, p in rig.parameters.items()
-        if n in values and n.rpartition(".")[0] in run.info.effects and depends_on_level(run, n)
+        if n in values and n.rpartition(".")[0] in run.info.effects and depends_on_level(n, run.library)
     }
     if not held or not isinstance(rig, ParametricRig):
         return rig
     return replace(rig, parameters={**rig.parameters, **held})
-
-
-def depends_on_level(run: Run, label: str) -> bool:
-    """True for an effect whose answer is not in proportion to the force."""
-    effect = run.library.get(label.partition("@")[0])
-    return effect is not None and not effect.linear

@@ -20,7 +20,7 @@ from ema_pipeline.diagnose.levels.ladder import (
     level_errors,
     sizes_of,
 )
-from ema_pipeline.diagnose.levels.linear_claims import depends_on_level, replaced, withdrawn, without
+from ema_pipeline.diagnose.levels.linear_claims import replaced, withdrawn, without
 from ema_pipeline.diagnose.levels.problem import NoiseFloor
 from ema_pipeline.diagnose.levels.search import (
     LevelRanking,
@@ -31,6 +31,7 @@ from ema_pipeline.diagnose.levels.search import (
     ranked_linear,
 )
 from ema_pipeline.diagnose.types import Candidate, DetectionLimit, Diagnosis, EffectSize, Ladder, VerdictWord
+from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.threads import single_blas_thread
 
 Progress = Callable[[float, str], None]
@@ -96,12 +97,14 @@ def _diagnose(
     notes: tuple[str, ...],
     tell: Progress,
 ) -> Diagnosis:
-    if linear is not None and (idle := replaced(case, effects, _claims(linear), _part(tell, 0.0, 0.1))):
+    start = _start(case, effects, tell)
+    if linear is not None and (idle := replaced(case, start[-1], _claims(linear))):
         effects, linear = tuple(x for x in effects if x not in idle), without(linear, idle)
-    climbed = _climb(case, effects, tell)
+        start = _start(case, effects, tell)
+    climbed = _climb(case, effects, start, tell)
     if linear is not None and (idle := withdrawn(case, climbed.models[-1], _claims(linear))):
         effects, linear = tuple(x for x in effects if x not in idle), without(linear, idle)
-        climbed = _climb(case, effects, tell)
+        climbed = _climb(case, effects, _start(case, effects, tell), tell)
     shortened, case = climbed.case is not case, climbed.case
     first, base = climbed.rankings[0], climbed.rankings[0].base
     forces = [float(f) for f in case.windows[0].force_n]
@@ -138,17 +141,24 @@ def _diagnose(
     )
 
 
-def _climb(case: LevelCase, effects: tuple[str, ...], tell: Progress) -> _Climbed:
+def _start(case: LevelCase, effects: tuple[str, ...], tell: Progress) -> list[Simulated]:
+    """Models with the effects that are known before anything is ranked."""
+    tell(0.0, "base model")
+    return climb(case, effects, case.floor, _part(tell, 0.0, 0.1))
+
+
+def _climb(case: LevelCase, effects: tuple[str, ...], start: list[Simulated], tell: Progress) -> _Climbed:
     """Add what is claimed, one effect after the other; on the first part of the windows where nothing holds in all.
 
     Teeth that part often, and friction that sticks, move so sensitively that the true model loses the measured motion
     in time.
     """
-    whole = _climb_windows(case, effects, tell)
+    whole = _climb_windows(case, start, tell)
     if _holds(whole):
         return whole
     for share in _SHORTER:
-        part = _climb_windows(case.beginning(share), effects, tell)
+        beginning = case.beginning(share)
+        part = _climb_windows(beginning, _start(beginning, effects, tell), tell)
         if _holds(part):
             return part
     return whole
@@ -160,11 +170,9 @@ def _holds(climbed: _Climbed) -> bool:
     return error_of(case, climbed.models[-1]) <= case.settings.error_limit
 
 
-def _climb_windows(case: LevelCase, effects: tuple[str, ...], tell: Progress) -> _Climbed:
+def _climb_windows(case: LevelCase, start: list[Simulated], tell: Progress) -> _Climbed:
     """Rank on the base model, lower the noise to what the best leaves, add what is claimed, and rank again."""
     floor = case.floor
-    tell(0.0, "base model")
-    start = climb(case, effects, floor, _part(tell, 0.0, 0.1))
     rankings = [ranked(case, start[-1], floor, _part(tell, 0.1, 0.5))]
     floor = own_floor(case, _best(rankings[0]))
     rankings[0] = at_floor(case, rankings[0], floor, _part(tell, 0.5, 0.6))
@@ -186,9 +194,7 @@ def _climb_windows(case: LevelCase, effects: tuple[str, ...], tell: Progress) ->
         if finer.own < _FINER * floor.own:
             floor = finer
             rankings = [at_floor(case, r, floor, told) for r in rankings]
-    models = [r.base for r in rankings]
-    if effects:
-        models = [*(again(case, m, floor) for m in start[:-1]), *models]
+    models = [*(again(case, m, floor) for m in start[:-1]), *(r.base for r in rankings)]
     return _Climbed(case, models, rankings, floor, note)
 
 
@@ -292,7 +298,7 @@ def _verdict(
     error = error_of(case, last)
     known = climbed.rankings[0].base.hypothesis.labels
     added = [x for x in last.hypothesis.labels if x not in known]
-    nonlinear = [x for x in last.hypothesis.labels if depends_on_level(case, x)]
+    nonlinear = [x for x in last.hypothesis.labels if depends_on_level(x, case.library)]
     limit = case.settings.error_limit
     if not error <= limit:
         best = f" {label_text(added[0]).capitalize()} helps most but does not mend it." if added else ""
@@ -342,7 +348,9 @@ def _mending(case: LevelCase, climbed: _Climbed, members: Sequence[Simulated]) -
 def _limits(climbed: _Climbed) -> tuple[DetectionLimit, ...]:
     """What these hits would show of the effects that depend on the level."""
     case, first = climbed.case, climbed.rankings[0]
-    nonlinear = [m.hypothesis for m in first.fitted if depends_on_level(case, m.hypothesis.labels[-1])]
+    nonlinear = [
+        m.hypothesis for m in first.fitted if depends_on_level(m.hypothesis.labels[-1], case.library)
+    ]
     return detection_limits(case, nonlinear, climbed.models[-1], climbed.floor)
 
 

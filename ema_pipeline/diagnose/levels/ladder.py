@@ -13,7 +13,7 @@ from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
 from ema_pipeline.diagnose.levels.problem import NoiseFloor, hit_misfits, residuals
 from ema_pipeline.diagnose.levels.search import again, fit_base, fit_effect, fit_linear, own_floor
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung, TimeTrace
-from ema_pipeline.effects.library import shipped_effects
+from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
 
 Progress = Callable[[float, str], None]
@@ -120,13 +120,11 @@ def make_rung(
 
 def climb(case: LevelCase, effects: Sequence[str], floor: NoiseFloor, tell: Progress) -> list[Simulated]:
     """Fits of the base model and of every rung above it, at one floor of the noise."""
-    known = shipped_effects() if case.library is None else case.library
     models = [fit_base(case, Hypothesis(), floor, {})]
     for i, label in enumerate(effects):
         tell(i / len(effects), f"fitting {label}")
         hypothesis = models[-1].hypothesis.plus(label)
-        effect = known.get(label.partition("@")[0])
-        if effect is None or effect.linear:
+        if not depends_on_level(label, case.library):
             found = fit_linear(case, hypothesis, models[-1], floor)
             if found is None:
                 raise EmaError(

@@ -2,34 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, level_hypotheses
-from ema_pipeline.diagnose.levels.ladder import climb
 from ema_pipeline.diagnose.levels.search import again, fit_effect, own_floor
 from ema_pipeline.diagnose.types import Candidate, Diagnosis
-from ema_pipeline.effects.library import shipped_effects
-
-Progress = Callable[[float, str], None]
+from ema_pipeline.effects.library import depends_on_level
 
 _NOTHING_LEFT, _ELSEWHERE = 2.0, 3.0
 """Standard deviations: a size vanishes within the first of nothing, and beyond the second of what was claimed."""
 
 
-def replaced(
-    case: LevelCase, effects: tuple[str, ...], claimed: Sequence[Candidate], tell: Progress
-) -> set[str]:
+def replaced(case: LevelCase, base: Simulated, claimed: Sequence[Candidate]) -> set[str]:
     """Effects claimed from the modes of one level that vanish beside one at the same place that the hits show.
 
-    Seen at once, these need no ranking of everything else on top of them.
+    Seen at once, these need no ranking of everything else on top of them. `base` is the model with them all.
     """
-    places = {c.at for c in claimed if c.label in effects}
-    if not places:
-        return set()
-    base = climb(case, effects, case.floor, tell)[-1]
+    places = {c.at for c in claimed if c.label in base.hypothesis.labels}
     for h in level_hypotheses(case, base.hypothesis):
         if h.labels[-1].partition("@")[2] not in places:
             continue
@@ -47,7 +39,7 @@ def withdrawn(case: LevelCase, top: Simulated, claimed: Sequence[Candidate]) -> 
 
     Friction that locks acts at one level as a damper does. Fitted together, the friction leaves nothing to the damper.
     """
-    if not any(depends_on_level(case, x) for x in top.hypothesis.labels):
+    if not any(depends_on_level(x, case.library) for x in top.hypothesis.labels):
         return set()
     gone = set()
     for c in claimed:
@@ -67,10 +59,3 @@ def without(linear: Diagnosis, labels: set[str]) -> Diagnosis | None:
     """The diagnosis of one level without some of its claims; None where nothing is left of them."""
     kept = tuple(replace(c, claimed=c.claimed and c.label not in labels) for c in linear.candidates)
     return replace(linear, candidates=kept) if any(c.claimed for c in kept) else None
-
-
-def depends_on_level(case: LevelCase, label: str) -> bool:
-    """True for an effect whose answer is not in proportion to the force."""
-    known = shipped_effects() if case.library is None else case.library
-    family = label.partition("@")[0]
-    return family in known and not known[family].linear
