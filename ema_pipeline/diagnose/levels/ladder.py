@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
 from ema_pipeline.diagnose.levels.problem import NoiseFloor, hit_misfits, residuals
-from ema_pipeline.diagnose.levels.search import again, fit_base, fit_effect, fit_linear, own_floor
+from ema_pipeline.diagnose.levels.search import Growing, again, fit_base, fit_effect, fit_linear, own_floor
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung, TimeTrace
 from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
@@ -125,13 +125,13 @@ def climb(case: LevelCase, effects: Sequence[str], floor: NoiseFloor, tell: Prog
         tell(i / len(effects), f"fitting {label}")
         hypothesis = models[-1].hypothesis.plus(label)
         if not depends_on_level(label, case.library):
-            found = fit_linear(case, hypothesis, models[-1], floor)
+            found = fit_linear(Growing(case, floor, models[-1]), hypothesis, models[-1])
             if found is None:
                 raise EmaError(
                     f"'{label}' has no time response, so hits cannot be simulated with it: take it out"
                 )
         else:
-            found = fit_effect(case, hypothesis, models[-1], floor)
+            found = fit_effect(Growing(case, floor, models[-1]), hypothesis, models[-1])
         models.append(again(case, found, floor, _FOLLOWED_STEPS))
     return models
 

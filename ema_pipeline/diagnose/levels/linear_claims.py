@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, level_hypotheses
-from ema_pipeline.diagnose.levels.search import again, fit_effect, own_floor
+from ema_pipeline.diagnose.levels.search import Growing, again, fit_effect, own_floor
 from ema_pipeline.diagnose.types import Candidate, Diagnosis
 from ema_pipeline.effects.library import depends_on_level
 
@@ -22,10 +22,11 @@ def replaced(case: LevelCase, base: Simulated, claimed: Sequence[Candidate]) -> 
     Seen at once, these need no ranking of everything else on top of them. `base` is the model with them all.
     """
     places = {c.at for c in claimed if c.label in base.hypothesis.labels}
+    windows = Growing(case, case.floor, base)
     for h in level_hypotheses(case, base.hypothesis):
         if h.labels[-1].partition("@")[2] not in places:
             continue
-        found = fit_effect(case, h, base, case.floor)
+        found = fit_effect(windows, h, base)
         if base.fit.objective - found.fit.objective < case.settings.levels.gain_least:
             continue
         found = again(case, found, own_floor(case, found))

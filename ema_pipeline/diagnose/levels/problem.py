@@ -33,6 +33,8 @@ from ema_pipeline.rigs.types import Rig
 _T = TypeVar("_T", np.float64, np.complex128)
 
 _STEP = 1e-3
+_TRUSTED = 0.3
+"""A step whose gain is foreseen to this share is followed by another without new finite differences."""
 _CHUNK = 256
 """Pairs of model and hit that are simulated side by side."""
 
@@ -243,9 +245,13 @@ def fit(
     weights: Sequence[Whitening],
     start: NDArray[np.float64],
     most: int,
+    known: Mapping[str, NDArray[np.float64]] | None = None,
     tolerance: float = 0.05,
 ) -> TimeFit:
     """Levenberg-Marquardt steps with finite differences, all models of a step side by side.
+
+    Where a step does what was foreseen, the slopes are brought up to date by what it found (C. G. Broyden, *Math.
+    Comp.* 19 (1965) 577-593) instead of by new differences.
 
     Parameters
     ----------
@@ -254,6 +260,8 @@ def fit(
     start : ndarray, (P,)
     most : int
         Steps at most.
+    known : mapping of str to ndarray (n,), optional
+        Slopes of the weighted differences near the start, of some of the parameters: tried before they are sought.
     tolerance : float
         Ends where a step lowers the objective by less than this and a thousandth.
 
@@ -267,9 +275,13 @@ def fit(
     x = np.clip(np.asarray(start, dtype=float), space.low, space.high)
     damping, value = 1e-3, np.inf
     normal = np.eye(x.size)
+    slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+    fresh = not known
     while True:
         try:
-            r, jacobian = linearised(problem, weights, x)
+            r, jacobian = (
+                linearised(problem, weights, x, {} if fresh else known) if slopes is None else slopes
+            )
         except EmaError:  # on the edge of what has a solution
             break
         value = float(r @ r) + float(prior @ x**2)
@@ -282,27 +294,47 @@ def fit(
         trials = np.array(
             [space.retract(x, -np.linalg.solve(normal + d * np.diag(scale), gradient)) for d in ladder]
         )
-        found = objectives(problem, weights, trials)
+        tried = _tried(problem, weights, trials)
+        found = np.sum(tried**2, axis=1) + trials**2 @ prior
         best = int(np.argmin(found))
-        if not found[best] < value:
+        step = trials[best] - x
+        ahead = r + step @ jacobian
+        foreseen = value - float(ahead @ ahead) - float(prior @ trials[best] ** 2)
+        fell = value - float(found[best])
+        small = tolerance + 1e-3 * value
+        follows = abs(fell - foreseen) <= _TRUSTED * foreseen + tolerance
+        if fell > 0:
+            x, value, most = trials[best], float(found[best]), most - 1
+            damping = float(np.clip(ladder[best], 1e-6, 1e6))
+        if fell < small and (fresh or follows):
             break
-        x = trials[best]
-        damping = float(np.clip(ladder[best], 1e-6, 1e6))
-        most -= 1
-        if value - found[best] < tolerance + 1e-3 * found[best]:
-            value = float(found[best])
-            break
-        value = float(found[best])
+        fresh = not follows or not fell > 0
+        slopes = (
+            None if fresh else (tried[best], jacobian + np.outer(step, (tried[best] - ahead) / (step @ step)))
+        )
     return TimeFit(x, space.named(x), value, value - float(prior @ x**2), normal)
 
 
 def linearised(
-    problem: TimeProblem, weights: Sequence[Whitening], x: NDArray[np.float64]
+    problem: TimeProblem,
+    weights: Sequence[Whitening],
+    x: NDArray[np.float64],
+    known: Mapping[str, NDArray[np.float64]] | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Residual (n,) and Jacobian (P, n) by forward differences that stay inside the bounds."""
+    """Residual (n,) and Jacobian (P, n) by forward differences that stay inside the bounds.
+
+    Rows of parameters in `known` are taken from there.
+    """
+    names = problem.space.names
+    sought = [i for i, n in enumerate(names) if n not in (known or {})]
     step = np.where(x + _STEP > problem.space.high, -_STEP, _STEP)
-    r = residuals(problem, weights, np.vstack([x[None], x + np.diag(step)]))
-    return r[0], (r[1:] - r[0]) / step[:, None]
+    r = residuals(problem, weights, np.vstack([x[None], x + np.diag(step)[sought]]))
+    jacobian = np.empty((x.size, r.shape[1]))
+    jacobian[sought] = (r[1:] - r[0]) / step[sought, None]
+    for i, name in enumerate(names):
+        if known and name in known:
+            jacobian[i] = known[name]
+    return r[0], jacobian
 
 
 def objectives(
@@ -310,14 +342,23 @@ def objectives(
 ) -> NDArray[np.float64]:
     """-2 log posterior at points, (B,); infinite where the motion of a model has no solution."""
     prior = problem.space.has_prior.astype(float)
+    return np.sum(_tried(problem, weights, points) ** 2, axis=1) + points**2 @ prior
+
+
+def _tried(
+    problem: TimeProblem, weights: Sequence[Whitening], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Weighted differences at points, (B, n); infinite where the motion of a model has no solution."""
     try:
         r = weighted(weights, problem.lines(points))
     except EmaError:
         if len(points) == 1:
-            return np.array([np.inf])
-        return np.concatenate([objectives(problem, weights, p[None]) for p in points])
-    value = np.sum(r**2, axis=1) + points**2 @ prior
-    return np.asarray(np.where(np.isfinite(value), value, np.inf))
+            return np.full((1, 1), np.inf)
+        apart = [_tried(problem, weights, p[None]) for p in points]
+        most = max(a.shape[1] for a in apart)
+        return np.concatenate([np.broadcast_to(a, (1, most)) for a in apart])
+    r[~np.isfinite(np.sum(r, axis=1))] = np.inf
+    return r
 
 
 def misfits(problem: TimeProblem, values: Mapping[str, float]) -> list[NDArray[np.float64]]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 import scipy.optimize
+from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import (
     NOTHING,
@@ -18,8 +20,17 @@ from ema_pipeline.diagnose.hypotheses import (
     starting_points,
 )
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, judged, level_hypotheses, size_grid, sized
-from ema_pipeline.diagnose.levels.problem import NoiseFloor, TimeFit, fit, objectives, weighted
+from ema_pipeline.diagnose.levels.problem import (
+    NoiseFloor,
+    TimeFit,
+    Whitening,
+    fit,
+    linearised,
+    objectives,
+    weighted,
+)
 from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.errors import EmaError
 
 Progress = Callable[[float, str], None]
 
@@ -45,53 +56,98 @@ _POLISHED = 2
 _MOST_STEPS = 25
 
 
+class Growing:
+    """The windows over which fits grow, with their weights, and what the parameters of a base model do there.
+
+    Parameters
+    ----------
+    case : LevelCase
+    floor : NoiseFloor
+    base : Simulated, optional
+        Its slopes are tried first by the fits on top of it, which all begin near to it.
+    """
+
+    def __init__(self, case: LevelCase, floor: NoiseFloor, base: Simulated | None = None) -> None:
+        self.case, self.floor = case, floor
+        self.first = _Part(case.beginning(_GROWING[0]), floor, base)
+        softer, longer = case.softer().beginning(_GROWING[-1]), case.beginning(_GROWING[-1])
+        self.parts = (_Part(softer, floor, base), self.first, _Part(longer, floor, base))
+        self.whole = _Part(case.coarse(), floor, base)
+
+    @cached_property
+    def rough(self) -> _Part:
+        """Enough to tell orders of magnitude."""
+        return _Part(self.case.rough(), self.floor)
+
+    @cached_property
+    def forgiving(self) -> _Part:
+        """The first part of the windows after softer hits, for a base model that is far off."""
+        most = NoiseFloor(self.case.settings.levels.noise_most, self.floor.common)
+        return _Part(self.parts[0].case, most)
+
+    def follow(
+        self,
+        hypothesis: Hypothesis,
+        begun: Sequence[tuple[Mapping[str, float], Mapping[str, float]]],
+    ) -> Simulated:
+        """The best of fits that begin on the first part of the windows after softer hits and follow it as they grow.
+
+        Fits that have met by then are followed to the end once.
+
+        Parameters
+        ----------
+        hypothesis : Hypothesis
+        begun : sequence of (mapping of str to float, mapping of str to float)
+            Typical values of the effects' parameters, and all values where a fit begins.
+        """
+        grown: list[tuple[Mapping[str, float], TimeFit]] = []
+        for sizes, values in begun:
+            now = values
+            for part in self.parts:
+                found = _stage(part, hypothesis, sizes, now)
+                now = found.values
+            if not any(_met(found, other, _first_size(hypothesis, sizes)) for _, other in grown):
+                grown.append((sizes, found))
+        ends = [
+            judged(
+                self.whole.case.problem(hypothesis, sizes),
+                hypothesis,
+                sizes,
+                _stage(self.whole, hypothesis, sizes, found.values),
+            )
+            for sizes, found in grown
+        ]
+        return min(ends, key=lambda m: m.fit.objective)
+
+
+class _Part:
+    """Some of the windows."""
+
+    def __init__(self, case: LevelCase, floor: NoiseFloor, base: Simulated | None = None) -> None:
+        self.case = case
+        self.weights = case.weights(floor)
+        self.slopes = slopes_of(case, self.weights, base) if base is not None else {}
+
+
+def slopes_of(
+    case: LevelCase, weights: Sequence[Whitening], base: Simulated
+) -> dict[str, NDArray[np.float64]]:
+    """Slopes of the weighted differences at a model, by parameter; none where its motion has no solution."""
+    problem = case.problem(base.hypothesis, base.sizes)
+    try:
+        _, jacobian = linearised(problem, weights, problem.space.point(base.values))
+    except EmaError:
+        return {}
+    return dict(zip(problem.space.names, jacobian, strict=True))
+
+
 def fit_base(
     case: LevelCase, hypothesis: Hypothesis, floor: NoiseFloor, sizes: Mapping[str, float]
 ) -> Simulated:
     """The best fit of a model from all of the case's starts."""
     begun = [(sizes, {**s, **sizes}) for s in _distinct_starts(case.starts)]
-    best = again(case.coarse(), follow(case, hypothesis, begun, floor), floor, _MOST_STEPS)
+    best = again(case.coarse(), Growing(case, floor).follow(hypothesis, begun), floor, _MOST_STEPS)
     return again(case, best, floor, _MOST_STEPS)
-
-
-def follow(
-    case: LevelCase,
-    hypothesis: Hypothesis,
-    begun: Sequence[tuple[Mapping[str, float], Mapping[str, float]]],
-    floor: NoiseFloor,
-) -> Simulated:
-    """The best of fits that begin on the first part of the windows after softer hits and follow it as they grow.
-
-    Fits that have met by then are followed to the end once.
-
-    Parameters
-    ----------
-    case : LevelCase
-    hypothesis : Hypothesis
-    begun : sequence of (mapping of str to float, mapping of str to float)
-        Typical values of the effects' parameters, and all values where a fit begins.
-    floor : NoiseFloor
-    """
-    parts = (case.softer().beginning(_GROWING[-1]), *(case.beginning(share) for share in _GROWING))
-    grown: list[tuple[Mapping[str, float], TimeFit]] = []
-    for sizes, values in begun:
-        now = values
-        for part in parts:
-            found = _stage(part, hypothesis, sizes, now, floor)
-            now = found.values
-        if not any(_met(found, other, _first_size(hypothesis, sizes)) for _, other in grown):
-            grown.append((sizes, found))
-    whole = case.coarse()
-    ends = [
-        judged(
-            whole.problem(hypothesis, sizes),
-            hypothesis,
-            sizes,
-            _stage(whole, hypothesis, sizes, found.values, floor),
-        )
-        for sizes, found in grown
-    ]
-    return min(ends, key=lambda m: m.fit.objective)
 
 
 def _first_size(hypothesis: Hypothesis, sizes: Mapping[str, float]) -> list[str]:
@@ -107,66 +163,67 @@ def _met(one: TimeFit, other: TimeFit, own: Sequence[str]) -> bool:
 
 
 def _stage(
-    case: LevelCase,
-    hypothesis: Hypothesis,
-    sizes: Mapping[str, float],
-    values: Mapping[str, float],
-    floor: NoiseFloor,
+    part: _Part, hypothesis: Hypothesis, sizes: Mapping[str, float], values: Mapping[str, float]
 ) -> TimeFit:
     """A fit from the best of neighbouring sizes: where parts strike there are many optima side by side."""
-    problem, weights = case.problem(hypothesis, sizes), case.weights(floor)
+    problem = part.case.problem(hypothesis, sizes)
     x = np.array([problem.space.point(values)])
     for name in _first_size(hypothesis, sizes):
         x = np.array([problem.space.point({**values, name: values[name] * k}) for k in _NEIGHBOURS])
-        x = x[[np.argmin(objectives(problem, weights, x))]]
-    return fit(problem, weights, x[0], _STEPS)
+        x = x[[np.argmin(objectives(problem, part.weights, x))]]
+    return fit(problem, part.weights, x[0], _STEPS, part.slopes)
 
 
-def again(case: LevelCase, model: Simulated, floor: NoiseFloor, steps: int = _AGAIN) -> Simulated:
+def again(
+    case: LevelCase,
+    model: Simulated,
+    floor: NoiseFloor,
+    steps: int = _AGAIN,
+    known: Mapping[str, NDArray[np.float64]] | None = None,
+) -> Simulated:
     """The same model at another floor of the noise, from its own optimum."""
     sizes = {n: model.values.get(n, v) or v for n, v in model.sizes.items()}
     problem = case.problem(model.hypothesis, sizes)
-    found = fit(problem, case.weights(floor), problem.space.point(model.values), steps)
+    found = fit(problem, case.weights(floor), problem.space.point(model.values), steps, known)
     return judged(problem, model.hypothesis, sizes, found)
 
 
-def fit_effect(case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: NoiseFloor) -> Simulated:
+def fit_effect(windows: Growing, hypothesis: Hypothesis, base: Simulated) -> Simulated:
     """Fit of a hypothesis on top of a base model, from sizes over many decades.
 
     Parameters
     ----------
-    case : LevelCase
+    windows : Growing
     hypothesis : Hypothesis
         The base model's and one more effect.
     base : Simulated
-    floor : NoiseFloor
     """
+    case = windows.case
     starts = _distinct_starts((base.values, *case.starts))
-    most = NoiseFloor(case.settings.levels.noise_most, floor.common)
-    chosen = _competing(case.rough(), hypothesis, base, starts, floor, _SPARSE)
+    chosen = _competing(windows.rough, hypothesis, base, starts, _SPARSE)
     if base.fit.objective > _CLOSE**2 * case.data or not base.sizes:
-        chosen += _competing(case.softer().beginning(_GROWING[-1]), hypothesis, base, starts, most, _DENSE)
+        chosen += _competing(windows.forgiving, hypothesis, base, starts, _DENSE)
     begun = []
     for t in chosen:
         own = sized(case, hypothesis, t.sizes)
         begun.append(({**base.sizes, **own}, {**base.values, **starts[t.start], **own}))
     if not begun:
         raise AssertionError(f"no size of {hypothesis.label} can be simulated")
-    return follow(case, hypothesis, begun, floor)
+    return windows.follow(hypothesis, begun)
 
 
 def _competing(
-    case: LevelCase,
+    part: _Part,
     hypothesis: Hypothesis,
     base: Simulated,
     starts: Sequence[Mapping[str, float]],
-    floor: NoiseFloor,
     per_decade: int,
 ) -> list[_Tried]:
     """Sizes of the effect added last that are worth following, from all starts of the other parameters."""
+    case = part.case
     first, *others = case.parameters_of(hypothesis.labels[-1])
     points = list(product(size_grid(first, per_decade), *((p.start, 0.1 * p.start) for p in others)))
-    problem, weights = case.problem(hypothesis), case.weights(floor)
+    problem, weights = case.problem(hypothesis), part.weights
 
     def tries(of: Sequence[tuple[int, tuple[float, ...]]]) -> list[_Tried]:
         named = [{**base.values, **starts[k], **sized(case, hypothesis, v)} for k, v in of]
@@ -180,19 +237,17 @@ def _competing(
     return _worth_following(tried + tries(near), first.null) if near else _worth_following(tried, first.null)
 
 
-def fit_linear(
-    case: LevelCase, hypothesis: Hypothesis, base: Simulated, floor: NoiseFloor
-) -> Simulated | None:
+def fit_linear(windows: Growing, hypothesis: Hypothesis, base: Simulated) -> Simulated | None:
     """Fit with one more effect that does not depend on the level, or None for one that has no time response."""
-    brief = case.beginning(_GROWING[0])
-    problem, weights = brief.problem(hypothesis, base.sizes), brief.weights(floor)
+    case, brief = windows.case, windows.first
+    problem = brief.case.problem(hypothesis, base.sizes)
     added = starting_points(extras(case.rig, hypothesis, case.library))
     starts = [{**base.values, **s, **p} for s in _distinct_starts((base.values, *case.starts)) for p in added]
-    tried = objectives(problem, weights, np.array([problem.space.point(s) for s in starts]))
+    tried = objectives(problem, brief.weights, np.array([problem.space.point(s) for s in starts]))
     if not np.any(np.isfinite(tried)):
         return None
     order = [int(k) for k in np.argsort(tried)[:_FOLLOWED] if np.isfinite(tried[k])]
-    return follow(case, hypothesis, [(base.sizes, starts[k]) for k in order], floor)
+    return windows.follow(hypothesis, [(base.sizes, starts[k]) for k in order])
 
 
 class _Tried(NamedTuple):
@@ -307,7 +362,8 @@ class LevelRanking:
 def ranked(case: LevelCase, base: Simulated, floor: NoiseFloor, tell: Progress) -> LevelRanking:
     """Fits of all hypotheses that depend on the level on top of a base model at one floor."""
     hypotheses = level_hypotheses(case, base.hypothesis)
-    fitted = _each(lambda h: fit_effect(case, h, base, floor), hypotheses, case, tell)
+    windows = Growing(case, floor, base)
+    fitted = _each(lambda h: fit_effect(windows, h, base), hypotheses, case, tell)
     return polished(case, LevelRanking(case, base, fitted), floor)
 
 
@@ -315,7 +371,8 @@ def ranked_linear(case: LevelCase, base: Simulated, floor: NoiseFloor, tell: Pro
     """The same of the effects that do not depend on the level."""
     configurations = [w.configuration for w in case.windows]
     hypotheses = single_hypotheses(case.rig, configurations, case.library, base.hypothesis, parameters=False)
-    fitted = _each(lambda h: fit_linear(case, h, base, floor), hypotheses, case, tell)
+    windows = Growing(case, floor, base)
+    fitted = _each(lambda h: fit_linear(windows, h, base), hypotheses, case, tell)
     return polished(case, LevelRanking(case, base, fitted), floor)
 
 
@@ -356,13 +413,17 @@ def polished(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor) -> Level
 def at_floor(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor, tell: Progress) -> LevelRanking:
     """The same ranking at another floor, every fit from its own optimum; those without a solution left out.
 
-    Those that cannot come back are judged where they are.
+    Those that cannot come back are judged where they are; all but the base model and the best try the slopes of the
+    base model first.
     """
     models = [ranking.base, *ranking.fitted]
     least = min(m.evidence for m in models) + _HOPELESS
+    slopes = slopes_of(case, case.weights(floor), ranking.base)
+    best = [ranking.base, *ranking.ordered()[:_POLISHED]]
 
     def job(m: Simulated) -> Simulated:
-        return again(case, m, floor, _AGAIN if m is ranking.base or m.evidence < least else 0)
+        steps = _AGAIN if m is ranking.base or m.evidence < least else 0
+        return again(case, m, floor, steps, {} if any(m is b for b in best) else slopes)
 
     fitted = []
     for f in spread(job, models, case.settings.processes):
