@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.ingest.records import Hit, HitSamples, ResponseChannel
-from ema_pipeline.simulate.hammer import ForceHistory, Pulse, anti_alias
+from ema_pipeline.mechanics.sampling import anti_alias
+from ema_pipeline.simulate.hammer import ForceHistory, Pulse
 
 Real = NDArray[np.float64]
 RATE_HZ = 2048.0

@@ -10,7 +10,7 @@ neighbouring sets of parameters. Elements with a memory take the slower way of
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +22,7 @@ from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.laws import check_element
 from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.mechanics.nonlinear import element_rows, nonlinear_response
+from ema_pipeline.mechanics.sampling import band_limited
 from ema_pipeline.mechanics.system import LinearSystem
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ class Blows:
 
 
 def batch_response(assemblies: Sequence[Assembly], blows: Blows, substeps: int) -> NDArray[np.float64]:
-    """What the sensors read, (n_assemblies, n_blows, n_outputs, n_samples).
+    """What the sensors read behind an anti-alias filter, (n_assemblies, n_blows, n_outputs, n_samples).
 
     Parameters
     ----------
@@ -80,11 +81,40 @@ def batch_response(assemblies: Sequence[Assembly], blows: Blows, substeps: int) 
         return one_by_one(assemblies, blows, substeps)
     force, straight = fine_force(blows.force, substeps)
     orders = np.array([ORDERS[q] for q in blows.quantities])
-    result, direct = compiled_response(
-        assemblies, blows.sample_rate_hz, straight, blows.out_rows, orders, blows.in_rows, substeps
-    )
-    result += direct[..., None] * force[None, :, None, ::substeps]
+    batch = prepared(assemblies, blows.out_rows, orders, blows.in_rows)
+    step = 1 / (blows.sample_rate_hz * substeps)
+    found = marched(batch, batch.outputs, straight, step, substeps, trace=True)
+    if found.failed.any():
+        raise no_solution(batch.names, step)
+    result = found.motion.swapaxes(2, 3)
+    result += batch.direct[:, :, : len(force)].swapaxes(1, 2)[..., None] * force[None, :, None, ::substeps]
+    lost = band_limited(found.forces, substeps) - found.forces
+    for a in range(len(assemblies)):
+        result[a] += _driven(batch, a, lost[a], step, substeps)
     return result
+
+
+def _driven(
+    batch: Batch, a: int, forces: NDArray[np.float64], step: float, substeps: int
+) -> NDArray[np.float64]:
+    """Motion (n_blows, n_outputs, n_samples) of one assembly's linear part under the elements' forces given."""
+    hits, m, steps = forces.shape
+    if not forces.any():
+        return np.zeros((hits, len(batch.outputs[a]), (steps - 1) // substeps + 1))
+    at = np.tile(np.arange(batch.inputs.shape[1] - m, batch.inputs.shape[1]), hits)
+    linear = replace(
+        batch,
+        laws=batch.laws[a : a + 1, :0],
+        poles=batch.poles[a : a + 1],
+        inputs=batch.inputs[a : a + 1, at],
+        stretch=batch.stretch[a : a + 1, :0],
+        outputs=batch.outputs[a : a + 1],
+        direct=batch.direct[a : a + 1, :, at],
+    )
+    flat = forces.reshape(-1, steps)
+    found = marched(linear, linear.outputs, flat, step, substeps).motion[0].swapaxes(1, 2)
+    found += linear.direct[0].T[..., None] * flat[:, None, ::substeps]
+    return np.asarray(found.reshape(hits, m, *found.shape[1:]).sum(axis=1))
 
 
 def compiled_response(

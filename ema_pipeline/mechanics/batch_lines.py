@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.batch import ORDERS, Blows, fine_force, marched, one_by_one, prepared
+from ema_pipeline.mechanics.sampling import band_limited
 
 
 def batch_lines(
@@ -67,6 +68,7 @@ def batch_lines(
     orders = np.array([ORDERS[q] for q in blows.quantities])
     batch = prepared(assemblies, blows.out_rows, orders, blows.in_rows)
     found = marched(batch, batch.outputs[:, :0], force, step, substeps, trace=True)
+    sensed = band_limited(found.forces, substeps)
 
     hits, channels = len(force), len(blows.out_rows)
     _, first_hits, at = np.unique(blows.in_rows, axis=0, return_index=True, return_inverse=True)
@@ -79,7 +81,7 @@ def batch_lines(
             result[a] = np.nan
             continue
         decay, outputs = np.exp(batch.poles[a] * step), batch.outputs[a]
-        begun, ended, forces = found.begun[a], found.ended[a], found.forces[a]
+        begun, ended, forces = found.begun[a], found.ended[a], sensed[a]
         functions = record.functions(decay**substeps)
         # the blows themselves reach accelerometers as recorded, not as straight lines from step to step
         direct = batch.direct[a].copy()

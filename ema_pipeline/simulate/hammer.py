@@ -50,10 +50,3 @@ class ForceHistory:
     def spectrum(self, frequency_hz: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Fourier transform of all blows, N·s."""
         return np.asarray(sum(p.spectrum(frequency_hz) for p in self.pulses))
-
-
-def anti_alias(frequency_hz: NDArray[np.float64], sample_rate_hz: float) -> NDArray[np.float64]:
-    """Gain of the analyser's filter: 1 up to rate/2.56, a cosine flank, 0 at half the rate (no phase)."""
-    low, high = sample_rate_hz / 2.56, sample_rate_hz / 2
-    flank = np.clip((frequency_hz - low) / (high - low), 0.0, 1.0)
-    return np.asarray(np.cos(0.5 * np.pi * flank) ** 2)

@@ -14,8 +14,9 @@ from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.frf import accelerance
 from ema_pipeline.mechanics.modes import complex_modes
 from ema_pipeline.mechanics.nonlinear import nonlinear_response
+from ema_pipeline.mechanics.sampling import anti_alias
 from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
-from ema_pipeline.simulate.hammer import ForceHistory, anti_alias
+from ema_pipeline.simulate.hammer import ForceHistory
 
 Respond = Callable[
     [Assembly, tuple[ForceHistory, ...], Dof, tuple[Dof, ...]],
