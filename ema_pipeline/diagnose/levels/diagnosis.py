@@ -151,17 +151,21 @@ def _climb(case: LevelCase, effects: tuple[str, ...], start: list[Simulated], te
     """Add what is claimed, one effect after the other; on the first part of the windows where nothing holds in all.
 
     Teeth that part often, and friction that sticks, move so sensitively that the true model loses the measured motion
-    in time.
+    in time. What is left then is no sign of a further effect: more than one is added only where one holds in no part.
     """
-    whole = _climb_windows(case, start, tell)
-    if _holds(whole):
-        return whole
-    for share in _SHORTER:
-        beginning = case.beginning(share)
-        part = _climb_windows(beginning, _start(beginning, effects, tell), tell)
-        if _holds(part):
-            return part
-    return whole
+    climbs: list[_Climb] = []
+    for share in (1.0, *_SHORTER):
+        part = case.beginning(share)
+        climbs.append(_Climb(part, start if share == 1.0 else _start(part, effects, tell), tell))
+        climbed = climbs[-1].climbed(patient=False)
+        if _holds(climbed):
+            return climbed
+    ends = []
+    for climb_on in climbs:
+        ends.append(climb_on.climbed(patient=True))
+        if _holds(ends[-1]):
+            return ends[-1]
+    return ends[0]
 
 
 def _holds(climbed: _Climbed) -> bool:
@@ -170,32 +174,42 @@ def _holds(climbed: _Climbed) -> bool:
     return error_of(case, climbed.models[-1]) <= case.settings.error_limit
 
 
-def _climb_windows(case: LevelCase, start: list[Simulated], tell: Progress) -> _Climbed:
+class _Climb:
     """Rank on the base model, lower the noise to what the best leaves, add what is claimed, and rank again."""
-    floor = case.floor
-    rankings = [ranked(case, start[-1], floor, _part(tell, 0.1, 0.5))]
-    floor = own_floor(case, _best(rankings[0]))
-    rankings[0] = at_floor(case, rankings[0], floor, _part(tell, 0.5, 0.6))
-    told = _part(tell, 0.6, 0.8)
-    while True:
-        top = _claimable(case, rankings[-1], floor)
-        if top is None and floor.own >= case.settings.levels.noise_most:
-            # what depends on the level cannot mend it alone: something else may be missing at every level
-            rankings[-1] = _with(case, rankings[-1], ranked_linear(case, rankings[-1].base, floor, told))
-            top = _claimable(case, rankings[-1], floor)
-        if top is None:
-            note = "no further effect is supported by the data"
-            break
-        if len(rankings) > case.settings.most_rungs:
-            note = f"stopped after {case.settings.most_rungs} effects"
-            break
-        rankings.append(ranked(case, top, floor, told))
-        finer = own_floor(case, _best(rankings[-1]))
-        if finer.own < _FINER * floor.own:
-            floor = finer
-            rankings = [at_floor(case, r, floor, told) for r in rankings]
-    models = [*(again(case, m, floor) for m in start[:-1]), *(r.base for r in rankings)]
-    return _Climbed(case, models, rankings, floor, note)
+
+    def __init__(self, case: LevelCase, start: list[Simulated], tell: Progress) -> None:
+        self.case, self.start = case, start
+        first = ranked(case, start[-1], case.floor, _part(tell, 0.1, 0.5))
+        self.floor = own_floor(case, _best(first))
+        self.rankings = [at_floor(case, first, self.floor, _part(tell, 0.5, 0.6))]
+        self.tell = _part(tell, 0.6, 0.8)
+
+    def climbed(self, patient: bool) -> _Climbed:
+        """As far as it goes; without patience no further than to an effect that leaves an error over the limit."""
+        case, rankings, tell, s = self.case, self.rankings, self.tell, self.case.settings
+        while True:
+            top = _claimable(case, rankings[-1], self.floor)
+            if top is None and self.floor.own >= s.levels.noise_most and patient:
+                # what depends on the level cannot mend it alone: something else may be missing at every level
+                linear = ranked_linear(case, rankings[-1].base, self.floor, tell)
+                rankings[-1] = _with(case, rankings[-1], linear)
+                top = _claimable(case, rankings[-1], self.floor)
+            if top is None:
+                note = "no further effect is supported by the data"
+                break
+            if len(rankings) > s.most_rungs:
+                note = f"stopped after {s.most_rungs} effects"
+                break
+            if not patient and error_of(case, top) > s.error_limit:
+                note = "stopped where one effect does not mend it"
+                break
+            rankings.append(ranked(case, top, self.floor, tell))
+            finer = own_floor(case, _best(rankings[-1]))
+            if finer.own < _FINER * self.floor.own:
+                self.floor = finer
+                rankings[:] = [at_floor(case, r, self.floor, tell) for r in rankings]
+        models = [*(again(case, m, self.floor) for m in self.start[:-1]), *(r.base for r in rankings)]
+        return _Climbed(case, models, list(rankings), self.floor, note)
 
 
 def _best(ranking: LevelRanking) -> Simulated:
