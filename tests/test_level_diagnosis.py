@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import firwin, resample
 
 from ema_pipeline import codec
+from ema_pipeline.diagnose.explain import size_text
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.levels.case import LevelCase
 from ema_pipeline.diagnose.levels.data import HitWindows
@@ -14,7 +15,7 @@ from ema_pipeline.diagnose.levels.diagnosis import diagnose_levels
 from ema_pipeline.diagnose.levels.ladder import make_level_ladder
 from ema_pipeline.diagnose.levels.problem import NoiseFloor, hit_misfits, whitenings
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Ladder
+from ema_pipeline.diagnose.types import EffectSize, Ladder
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import get_effect, shipped_effects
 from ema_pipeline.errors import EmaError
@@ -23,6 +24,7 @@ from ema_pipeline.mechanics.batch import Blows, batch_response
 from ema_pipeline.mechanics.batch_lines import batch_lines
 from ema_pipeline.mechanics.laws import BoucWen, DryFriction, Nonlinear, PartingSpring, PolynomialSpring
 from ema_pipeline.mechanics.nonlinear import nonlinear_response
+from ema_pipeline.report.diagnosis import size_words
 from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.types import Parameter
 
@@ -383,3 +385,13 @@ def test_friction_of_any_transition_is_told_with_its_force() -> None:
     assert abs(size.value - 1.5) < 3 * size.std
     limits = {x.label: x.size for x in found.detection_limits}
     assert 0 < limits["dry_friction@rim"] < 1.5
+
+
+def test_a_size_that_the_data_do_not_tell_is_not_given() -> None:
+    sizes = {
+        "mesh_backlash@m.preload": EffectSize(2.7e-7, 6e-9, "m"),
+        "mesh_backlash@m.gap": EffectSize(1e-4, 3.2, "m"),
+    }
+    assert size_text(sizes) == "preload 2.7e-07 ± 6e-09 m, gap not told by these data"
+    assert "gap not told by these data" in size_words(sizes)
+    assert "force 0.0 ± 1.4 N" in size_words({"dry_friction@m.force": EffectSize(0.0, 1.4, "N")})

@@ -36,10 +36,13 @@ def why(base: Fitted, fitted: Fitted, measured: Mapping[str, MeasuredModes], sig
 
 def size_text(sizes: Mapping[str, EffectSize]) -> str:
     """``fraction 0.350 ± 0.002, …``."""
-    return ", ".join(
-        f"{n.rpartition('.')[2]} {s.value:.4g} ± {s.std:.2g}{'' if s.unit in ('', '1') else ' ' + s.unit}"
-        for n, s in sizes.items()
-    )
+    return ", ".join(f"{n.rpartition('.')[2]} {_one_size(s)}" for n, s in sizes.items())
+
+
+def _one_size(s: EffectSize) -> str:
+    if not s.told:
+        return "not told by these data"
+    return f"{s.value:.4g} ± {s.std:.2g}{'' if s.unit in ('', '1') else ' ' + s.unit}"
 
 
 def label_text(label: str) -> str:

@@ -19,6 +19,10 @@ EXTRA_COORDINATE = "a degree of freedom of its own"
 """What a misfit acts like where a test shows more modes than the model has."""
 
 
+_UNTOLD = 100.0
+"""Standard deviations of this many times the value tell nothing of a size."""
+
+
 @dataclass(frozen=True)
 class EffectSize:
     """A fitted size; `std` is 1 σ."""
@@ -26,6 +30,11 @@ class EffectSize:
     value: float
     std: float
     unit: str
+
+    @property
+    def told(self) -> bool:
+        """False where the data say nothing of it: a free gap that never closes stays where its fit began."""
+        return self.value == 0.0 or not self.std > _UNTOLD * abs(self.value)
 
 
 @dataclass(frozen=True)

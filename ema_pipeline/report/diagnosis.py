@@ -62,7 +62,10 @@ def leading(found: Diagnosis) -> tuple[Candidate, ...]:
 
 def size_words(parameters: Mapping[str, EffectSize], between: str = "; ") -> str:
     """Sizes with their uncertainty, e.g. ``fraction 0.3500 ± 0.0020``."""
-    return between.join(f"{words(n)} {format_value(s.value, s.std, s.unit)}" for n, s in parameters.items())
+    return between.join(
+        f"{words(n)} {format_value(s.value, s.std, s.unit) if s.told else 'not told by these data'}"
+        for n, s in parameters.items()
+    )
 
 
 def probability_words(p: float) -> str:
