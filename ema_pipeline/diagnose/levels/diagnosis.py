@@ -261,13 +261,21 @@ def _candidates(
     before: LevelErrors,
     forces: Sequence[float],
 ) -> tuple[Candidate, ...]:
-    ranking = climbed.rankings[0]
+    first, *later = climbed.rankings
     added = climbed.models[-1].hypothesis.labels
-    listed = ranking.ordered()
+    listed = first.ordered()
     shown = listed[: case.settings.candidates]
     shown += [m for m in listed if m not in shown and m.hypothesis.labels[-1] in added]
+    rows = [(first, m, before) for m in shown]
+    # what was found only beside another effect is judged by what it adds to that
+    told = {m.hypothesis.labels[-1] for m in shown}
+    for ranking in later:
+        new = [m for m in ranking.ordered() if m.hypothesis.labels[-1] in set(added) - told]
+        errors = level_errors(case, ranking.base, climbed.floor) if new else before
+        rows += [(ranking, m, errors) for m in new[:1]]
+        told |= {m.hypothesis.labels[-1] for m in new[:1]}
     result = []
-    for m in shown:
+    for ranking, m, before in rows:
         label = m.hypothesis.labels[-1]
         title, signs = describe(m.hypothesis, case.library)
         full = any(m is x for x in members) or label in added
