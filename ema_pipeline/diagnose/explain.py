@@ -45,6 +45,16 @@ def _one_size(s: EffectSize) -> str:
     return f"{s.value:.4g} ± {s.std:.2g}{'' if s.unit in ('', '1') else ' ' + s.unit}"
 
 
+def first_part_text(compared_s: float) -> str:
+    """A remark where only the first part of each hit was compared; empty for NaN."""
+    if not np.isfinite(compared_s):
+        return ""
+    return (
+        f"Only the first {1e3 * compared_s:.0f} ms of each hit are compared: in longer windows no model follows the "
+        "measured motion, as where parts strike or stick."
+    )
+
+
 def label_text(label: str) -> str:
     """A label as a phrase."""
     effect, _, place = label.partition("@")

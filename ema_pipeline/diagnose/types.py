@@ -183,6 +183,8 @@ class Ladder:
         Share of the measured amplitude that the simulation of a hit may miss; NaN where modes were compared.
     traces : tuple of TimeTrace
         Measured and simulated signals of the base model and of the last rung.
+    compared_s : float
+        Length of what was compared of each hit, where that is only the first part of its window; else NaN.
     """
 
     rungs: tuple[Rung, ...]
@@ -193,6 +195,7 @@ class Ladder:
     force_n: tuple[float, ...] = ()
     hit_noise: float = float("nan")
     traces: tuple[TimeTrace, ...] = ()
+    compared_s: float = float("nan")
 
 
 @dataclass(frozen=True)

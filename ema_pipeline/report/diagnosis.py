@@ -6,7 +6,7 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 
-from ema_pipeline.diagnose.explain import label_text
+from ema_pipeline.diagnose.explain import first_part_text, label_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import (
     OUT_OF_TOLERANCE,
@@ -191,12 +191,13 @@ def of_modes(ladder: Ladder) -> bool:
 def noise_words(ladder: Ladder) -> str:
     """What σ holds beside the test's own scatter."""
     if ladder.force_n:
-        return f"{hits_words(ladder)} " + (
+        of_sigma = (
             "Error: simulated against measured hits, in standard uncertainties: the sensors' noise, "
             f"{plain(100 * ladder.hit_noise, 2)} % of the signal around each frequency, and an error of the linear "
             "model that is alike at every force level. A linear model can therefore have an error of about 1 and "
             "still miss much of the hard hits: look at the shares that are missed."
         )
+        return " ".join(filter(None, (hits_words(ladder), first_part_text(ladder.compared_s), of_sigma)))
     if not of_modes(ladder):
         return "σ: the scatter of the measured signals."
     return (

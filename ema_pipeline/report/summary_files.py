@@ -55,6 +55,8 @@ def summary(results: RunResults) -> dict[str, Any]:
     if results.shown_ladder is not None:
         content["ladder"] = _ladder(results.shown_ladder)
         content["ladder_note"] = results.shown_ladder.note
+        if math.isfinite(results.shown_ladder.compared_s):
+            content["ladder_compared_s"] = results.shown_ladder.compared_s
     content["warnings"] = list(results.warnings)
     return content
 

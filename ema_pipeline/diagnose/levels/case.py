@@ -32,6 +32,8 @@ class LevelCase:
         Parameters of the linear part, from fits to the modes of single levels.
     top_hz : float
         Frequency of the highest mode.
+    share : float
+        Of the windows that are there to be compared.
     """
 
     rig: Rig
@@ -40,6 +42,7 @@ class LevelCase:
     library: Library | None
     starts: tuple[Mapping[str, float], ...]
     top_hz: float
+    share: float = 1.0
 
     @property
     def floor(self) -> NoiseFloor:
@@ -63,7 +66,8 @@ class LevelCase:
         """The first part of all windows."""
         if share == 1.0:
             return self
-        return replace(self, windows=tuple(w.shortened(share) for w in self.windows))
+        shorter = tuple(w.shortened(share) for w in self.windows)
+        return replace(self, windows=shorter, share=share * self.share)
 
     def softer(self) -> LevelCase:
         """Without the hits of the hardest level, after which parts strike most often."""

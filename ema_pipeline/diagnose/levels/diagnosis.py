@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ema_pipeline.diagnose.explain import label_text, size_text
+from ema_pipeline.diagnose.explain import first_part_text, label_text, size_text
 from ema_pipeline.diagnose.hypotheses import NOTHING, describe
 from ema_pipeline.diagnose.levels import words
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
 from ema_pipeline.diagnose.levels.detection import detection_limits
 from ema_pipeline.diagnose.levels.ladder import (
+    PARTS,
     LevelErrors,
     assemble,
     climb,
@@ -35,9 +36,6 @@ from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.threads import single_blas_thread
 
 Progress = Callable[[float, str], None]
-
-_SHORTER = (0.4, 0.16)
-"""Shares of the windows that are tried where no model holds in all of them."""
 
 _FINER = 0.7
 """The floor of the noise is lowered where a further effect leaves less than this share of it."""
@@ -105,7 +103,7 @@ def _diagnose(
     if linear is not None and (idle := withdrawn(case, climbed.models[-1], _claims(linear))):
         effects, linear = tuple(x for x in effects if x not in idle), without(linear, idle)
         climbed = _climb(case, effects, _start(case, effects, tell), tell)
-    shortened, case = climbed.case is not case, climbed.case
+    case = climbed.case
     first, base = climbed.rankings[0], climbed.rankings[0].base
     forces = [float(f) for f in case.windows[0].force_n]
     tell(0.8, "predicting held-out levels")
@@ -135,7 +133,7 @@ def _diagnose(
         notes=(
             *((summary,) if summary else ()),
             *(linear.notes if linear is not None else ()),
-            *_short(case, shortened),
+            *((first_part_text(ladder.compared_s),) if case.share < 1 else ()),
             *notes,
         ),
     )
@@ -151,14 +149,14 @@ def _climb(case: LevelCase, effects: tuple[str, ...], start: list[Simulated], te
     """Add what is claimed, one effect after the other; on the first part of the windows where nothing holds in all.
 
     Teeth that part often, and friction that sticks, move so sensitively that the true model loses the measured motion
-    in time. What is left then is no sign of a further effect: more than one is added only where one holds in no part.
+    in time. What is left then is no sign of a further effect: the longest part counts in which a model follows the
+    motion.
     """
     climbs: list[_Climb] = []
-    for share in (1.0, *_SHORTER):
-        part = case.beginning(share)
-        climbs.append(_Climb(part, start if share == 1.0 else _start(part, effects, tell), tell))
+    for part in map(case.beginning, PARTS):
+        climbs.append(_Climb(part, start if part is case else _start(part, effects, tell), tell))
         climbed = climbs[-1].climbed(patient=False)
-        if _holds(climbed):
+        if not climbs[-1].lost:
             return climbed
     ends = []
     for climb_on in climbs:
@@ -184,12 +182,20 @@ class _Climb:
         self.rankings = [at_floor(case, first, self.floor, _part(tell, 0.5, 0.6))]
         self.tell = _part(tell, 0.6, 0.8)
 
+    @property
+    def lost(self) -> bool:
+        """True where no model follows the motion within the largest own error."""
+        return self.floor.own >= self.case.settings.levels.noise_most
+
     def climbed(self, patient: bool) -> _Climbed:
-        """As far as it goes; without patience no further than to an effect that leaves an error over the limit."""
+        """As far as it goes; without patience only while a model follows the motion."""
         case, rankings, tell, s = self.case, self.rankings, self.tell, self.case.settings
         while True:
+            if self.lost and (not patient or self._as_good_as_it_gets()):
+                note = "stopped where no model follows the motion"
+                break
             top = _claimable(case, rankings[-1], self.floor)
-            if top is None and self.floor.own >= s.levels.noise_most and patient:
+            if top is None and self.lost:
                 # what depends on the level cannot mend it alone: something else may be missing at every level
                 linear = ranked_linear(case, rankings[-1].base, self.floor, tell)
                 rankings[-1] = _with(case, rankings[-1], linear)
@@ -200,9 +206,6 @@ class _Climb:
             if len(rankings) > s.most_rungs:
                 note = f"stopped after {s.most_rungs} effects"
                 break
-            if not patient and error_of(case, top) > s.error_limit:
-                note = "stopped where one effect does not mend it"
-                break
             rankings.append(ranked(case, top, self.floor, tell))
             finer = own_floor(case, _best(rankings[-1]))
             if finer.own < _FINER * self.floor.own:
@@ -210,6 +213,12 @@ class _Climb:
                 rankings[:] = [at_floor(case, r, self.floor, tell) for r in rankings]
         models = [*(again(case, m, self.floor) for m in self.start[:-1]), *(r.base for r in rankings)]
         return _Climbed(case, models, list(rankings), self.floor, note)
+
+    def _as_good_as_it_gets(self) -> bool:
+        """True for a model within the limit that has an effect after which motion is lost."""
+        base = self.rankings[-1].base
+        known = any(depends_on_level(x, self.case.library) for x in base.hypothesis.labels)
+        return known and error_of(self.case, base) <= self.case.settings.error_limit
 
 
 def _best(ranking: LevelRanking) -> Simulated:
@@ -374,17 +383,6 @@ def _limits(climbed: _Climbed) -> tuple[DetectionLimit, ...]:
         m.hypothesis for m in first.fitted if depends_on_level(m.hypothesis.labels[-1], case.library)
     ]
     return detection_limits(case, nonlinear, climbed.models[-1], climbed.floor)
-
-
-def _short(case: LevelCase, shortened: bool) -> tuple[str, ...]:
-    """A remark where only the first part of the windows was compared."""
-    if not shortened:
-        return ()
-    length = max(float(w.time_s[-1]) for w in case.windows)
-    return (
-        f"Only the first {1e3 * length:.0f} ms of each hit are compared: in longer windows no model follows the "
-        "measured motion, as where parts strike or stick.",
-    )
 
 
 def _claims(linear: Diagnosis | None) -> tuple[Candidate, ...]:

@@ -18,6 +18,9 @@ from ema_pipeline.errors import EmaError
 
 Progress = Callable[[float, str], None]
 
+PARTS = (1.0, 0.4, 0.16)
+"""Shares of the windows that are tried one after the other, until a model holds."""
+
 _HELD_OUT_STEPS = 3
 _FOLLOWED_STEPS = 15
 _TRACE_SENSORS = 1
@@ -153,16 +156,29 @@ def assemble(
         force_n=tuple(float(f) for f in case.windows[0].force_n),
         hit_noise=floor.own,
         traces=time_traces(case, models[0], models[-1]),
+        compared_s=max(float(w.time_s[-1]) for w in case.windows) if case.share < 1 else float("nan"),
     )
 
 
 def make_level_ladder(case: LevelCase, effects: Sequence[str], tell: Progress) -> Ladder:
-    """The ladder that adds `effects` one after the other, all at the noise level that the best rung leaves."""
-    models = climb(case, effects, case.floor, lambda share, text: tell(0.5 * share, text))
-    floor = own_floor(case, min(models, key=lambda m: m.evidence))
-    tell(0.5, "noise level")
-    final = [again(case, m, floor) for m in models]
-    return assemble(case, final, floor, "", lambda share, text: tell(0.6 + 0.4 * share, text))
+    """The ladder that adds `effects` one after the other, all at the noise level that the best rung leaves.
+
+    Of the longest part of the windows in which a rung follows the motion, or in which at least the last one's error is
+    within the limit; of all of them where there is none.
+    """
+    tried = []
+    for part in map(case.beginning, PARTS):
+        models = climb(part, effects, case.floor, lambda share, text: tell(0.5 * share, text))
+        floor = own_floor(part, min(models, key=lambda m: m.evidence))
+        tell(0.5, "noise level")
+        tried.append((part, [again(part, m, floor) for m in models], floor))
+        if floor.own < case.settings.levels.noise_most:
+            break
+    else:
+        within = [t for t in tried if error_of(t[0], t[1][-1]) <= case.settings.error_limit]
+        tried = (within or tried)[:1]
+    part, final, floor = tried[-1]
+    return assemble(part, final, floor, "", lambda share, text: tell(0.6 + 0.4 * share, text))
 
 
 def time_traces(case: LevelCase, before: Simulated, after: Simulated) -> tuple[TimeTrace, ...]:
