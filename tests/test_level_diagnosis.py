@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import firwin, resample
@@ -19,12 +21,12 @@ from ema_pipeline.diagnose.types import EffectSize, Ladder
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import get_effect, shipped_effects
 from ema_pipeline.errors import EmaError
-from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
+from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Mass, Spring
 from ema_pipeline.mechanics.batch import Blows, batch_response
 from ema_pipeline.mechanics.batch_lines import batch_lines
 from ema_pipeline.mechanics.laws import BoucWen, DryFriction, Nonlinear, PartingSpring, PolynomialSpring
 from ema_pipeline.mechanics.nonlinear import nonlinear_response
-from ema_pipeline.report.diagnosis import size_words
+from ema_pipeline.report.diagnosis import noise_words, size_words
 from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.types import Parameter
 
@@ -189,7 +191,7 @@ def test_asymmetric_bearing_drifts_towards_its_soft_side() -> None:
     assert not effect.linear
 
 
-def windows(*elements: Nonlinear, noise: float = 0.002, seed: int = 1) -> HitWindows:
+def windows(*elements: Element, noise: float = 0.002, seed: int = 1) -> HitWindows:
     """Hits at three levels on two points, from the general integrator, with noise."""
     random = np.random.default_rng(seed)
     assembly = RIG.assembly("test", TRUE).add(*elements)
@@ -254,6 +256,24 @@ def test_the_effect_its_place_and_its_size_are_found(label: str) -> None:
     assert last.heldout_error < first.heldout_error
 
 
+def test_a_linear_effect_beside_is_found_and_listed_with_what_it_adds() -> None:
+    masses = [Mass(f"m{a}", {f"rim.{a}": 1.0}, 0.1) for a in "xy"]
+    case = case_of(windows(*TRUTHS["bearing_cubic@hub"][0], *masses))
+    assert case.library is not None
+    case = replace(case, library={**case.library, "sensor_mass": shipped_effects()["sensor_mass"]})
+    found = diagnose_levels(case, (), None, "", ())
+    sizes = {c.label: c.parameters for c in found.candidates if c.claimed}
+    assert set(sizes) == {"bearing_cubic@hub", "sensor_mass@rim"}, found.summary
+    assert sizes["sensor_mass@rim"]["mass"].value == pytest.approx(0.1, rel=0.1)
+    assert sizes["bearing_cubic@hub"]["stiffness"].value == pytest.approx(2e11, rel=0.1)
+
+
+def test_a_damper_is_not_claimed_as_friction_whose_force_nobody_can_tell() -> None:
+    dampers = [Damper(f"d{a}", {f"rim.{a}": 1.0}, 8.0) for a in "xy"]
+    found = diagnose_levels(case_of(windows(*TRUTHS["bearing_cubic@hub"][0], *dampers)), (), None, "", ())
+    assert [c.label for c in found.candidates if c.claimed] == ["bearing_cubic@hub"], found.summary
+
+
 def test_linear_hits_make_no_effect_probable() -> None:
     found = diagnose_levels(case_of(windows()), (), None, "", ())
     assert not any(c.claimed for c in found.candidates)
@@ -275,11 +295,33 @@ def test_a_ladder_of_hits_survives_the_store(tmp_path) -> None:
     elements = TRUTHS["bearing_cubic@hub"][0]
     ladder = make_level_ladder(case_of(windows(*elements)), ("bearing_cubic@hub",), lambda share, text: None)
     assert [r.effects for r in ladder.rungs] == [(), ("bearing_cubic@hub",)]
+    assert np.isnan(ladder.compared_s)
     with h5py.File(tmp_path / "x.h5", "w") as file:
         codec.write(file, "ladder", ladder)
         back = codec.read(file, "ladder", Ladder)
     assert back.rungs[1].misfit == ladder.rungs[1].misfit
     assert {t.force_n for t in back.traces} == set(LEVELS)
+
+
+def test_motion_that_is_lost_in_time_is_compared_as_long_as_a_model_follows_it() -> None:
+    """After 45 % of each window the signals are turned round, as after strikes that come otherwise."""
+    label, (elements, parameter, true) = "bearing_cubic@hub", TRUTHS["bearing_cubic@hub"]
+    w = windows(*elements)
+    late = int(0.45 * w.measured.shape[-1])
+    turned = np.concatenate([w.measured[..., :late], -w.measured[..., late:]], axis=-1)
+    case = case_of(replace(w, measured=turned))
+    window_s = float(w.time_s[-1])
+    found = diagnose_levels(case, (), None, "", ())
+    assert found.verdict == "effect", found.summary
+    assert [c.label for c in found.candidates if c.claimed] == [label]
+    assert found.candidates[0].parameters[parameter].value == pytest.approx(true, rel=0.15)
+    assert 0.3 * window_s < found.ladder.compared_s < 0.45 * window_s
+    remark = f"Only the first {1e3 * found.ladder.compared_s:.0f} ms of each hit are compared"
+    assert any(n.startswith(remark) for n in found.notes)
+    ladder = make_level_ladder(case, (label,), lambda share, text: None)
+    assert ladder.compared_s == found.ladder.compared_s
+    assert remark in noise_words(ladder)
+    assert ladder.rungs[-1].error < 1.3 < ladder.rungs[0].error
 
 
 def test_an_error_alike_at_all_levels_weighs_little_and_one_at_one_level_weighs_much() -> None:
@@ -326,7 +368,6 @@ def test_hypotheses_are_the_effects_that_are_not_linear_at_every_place() -> None
 
 
 def test_a_false_alarm_of_the_levels_leaves_the_diagnosis_to_the_modes(tmp_path) -> None:
-    from dataclasses import replace
     from typing import cast
 
     from ema_pipeline.diagnose.levels.prepare import LevelTest

@@ -40,6 +40,9 @@ Progress = Callable[[float, str], None]
 _FINER = 0.7
 """The floor of the noise is lowered where a further effect leaves less than this share of it."""
 
+_DETERMINED = 2.0
+"""A size that is claimed differs from nothing by more than so many standard deviations."""
+
 _HARDER = 2.0
 """A next test is thought of with blows this much harder than the hardest."""
 
@@ -238,10 +241,23 @@ def _claimable(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor) -> Sim
     if 1 - ranking.probabilities[NOTHING] < s.probability_least or not ranking.fitted:
         return None
     top = ranking.ordered()[0]
-    if ranking.gain(top) < s.levels.gain_least:
+    if ranking.gain(top) < s.levels.gain_least or not _determined(case, top):
         return None
     before, after = (level_errors(case, m, floor).heldout_error for m in (ranking.base, top))
     return top if not after >= before else None
+
+
+def _determined(case: LevelCase, model: Simulated) -> bool:
+    """True where the size of the effect added last differs from nothing.
+
+    Friction that never turns over is a damper: only the ratio of its force to its rate is told, and no force.
+    """
+    label = model.hypothesis.labels[-1]
+    return all(
+        np.isinf(p.null) or abs(model.values[name]) > _DETERMINED * model.std[name]
+        for p in case.parameters_of(label)[:1]
+        if (name := f"{label}.{p.name}") in model.sizes
+    )
 
 
 def _group(case: LevelCase, ranking: LevelRanking) -> list[Simulated]:
