@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.residuals import observable_modes
-from ema_pipeline.diagnose.climbing import first_ranking, part
+from ema_pipeline.diagnose.climbing import first_ranking
 from ema_pipeline.diagnose.fitting import Case, Fitted, fit_null, holds
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.ladder import noise_of
 from ema_pipeline.diagnose.noise import floors
+from ema_pipeline.diagnose.progress import Progress, part
 from ema_pipeline.diagnose.screening import screen
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.thresholds import from_null_gains
@@ -34,7 +35,6 @@ from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.threads import single_blas_thread
 
-Progress = Callable[[float, str], None]
 _REACH = 3.0
 """Nominal values are drawn within so many tolerances."""
 

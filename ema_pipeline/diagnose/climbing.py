@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,12 +12,11 @@ from ema_pipeline.diagnose.heldout import held_out
 from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, single_hypotheses
 from ema_pipeline.diagnose.ladder import noise_of, yardstick
 from ema_pipeline.diagnose.noise import NoiseLevel, floors
+from ema_pipeline.diagnose.progress import Progress, part
 from ema_pipeline.diagnose.ranking import Ranking, rank, sharpen
 from ema_pipeline.diagnose.thresholds import threshold
 from ema_pipeline.diagnose.witness import Witness
 from ema_pipeline.fit.settings import FitSettings
-
-Progress = Callable[[float, str], None]
 
 _NEAR_BOUND = 1.02
 NOT_SUPPORTED = "no further effect is supported by the data"
@@ -205,8 +204,3 @@ def rivals(case: Case, climbed: Climb, witness: Witness) -> tuple[int, list[Fitt
     groups = [group(case, ranking, witness) for ranking in climbed.rankings[: len(climbed.models) - 1]]
     rung = next((k for k, members in enumerate(groups) if len(members) > 1), 0)
     return rung, groups[rung]
-
-
-def part(tell: Progress, low: float, high: float) -> Progress:
-    """Progress of a part of the work within the whole."""
-    return lambda share, text: tell(low + (high - low) * share, text)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.advice import next_measurement
-from ema_pipeline.diagnose.climbing import Climb, at_bound, climb, group, part, rivals
+from ema_pipeline.diagnose.climbing import Climb, at_bound, climb, group, rivals
 from ema_pipeline.diagnose.detection import detection_limits
 from ema_pipeline.diagnose.explain import why
 from ema_pipeline.diagnose.fitting import Case, Fitted
@@ -16,6 +16,7 @@ from ema_pipeline.diagnose.hypotheses import NOTHING, describe, same_physics
 from ema_pipeline.diagnose.ladder import Yardstick, assemble_ladder, with_frfs, yardstick
 from ema_pipeline.diagnose.localise import extra_coordinates, localise
 from ema_pipeline.diagnose.predict import predict_left_out
+from ema_pipeline.diagnose.progress import Progress, part
 from ema_pipeline.diagnose.ranking import Ranking
 from ema_pipeline.diagnose.screening import Screening, screen
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -33,8 +34,6 @@ from ema_pipeline.effects.library import Library
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.threads import single_blas_thread
-
-Progress = Callable[[float, str], None]
 
 _AS_GOOD = 0.9
 

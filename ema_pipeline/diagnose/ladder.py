@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, fit_null
 from ema_pipeline.diagnose.heldout import HeldOut, error_of, held_out
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.noise import NoiseLevel, estimate_noise
+from ema_pipeline.diagnose.progress import Progress
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung
 from ema_pipeline.diagnose.witness import Witness, frf_lines
@@ -23,8 +24,6 @@ from ema_pipeline.fit.solve import Optimum
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.threads import single_blas_thread
-
-Progress = Callable[[float, str], None]
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,9 @@ import numpy as np
 from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, follow, ground, holds, near, refit
 from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, prior_probabilities
 from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.progress import Progress
 from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE
 from ema_pipeline.fit.settings import FitSettings
-
-Progress = Callable[[float, str], None]
 
 _NULL_FROM = 4
 _NULL_ROUNDS = 3

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
+from ema_pipeline.diagnose.progress import part
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
@@ -43,13 +44,13 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     tests = all_tests(run)
     known = any(t.study.level_dependent for t in tests)
     if known or (tests and any(depends_on_level(x, run.library) for x in run.info.effects)):
-        of_hits = by_hits(run, tests, _part(progress, 0.0, 0.9))
+        of_hits = by_hits(run, tests, part(progress, 0.0, 0.9))
         if not linear_after_all(run, tests, of_hits):
             return {"diagnosis": of_hits, "on_top_of": run.info.effects}
-        found = with_limits(by_modes(run, model, _part(progress, 0.9, 1.0)), of_hits)
+        found = with_limits(by_modes(run, model, part(progress, 0.9, 1.0)), of_hits)
     elif any(len(t.levels) > 1 for t in tests):
         found = with_hits(
-            run, tests, by_modes(run, model, _part(progress, 0.0, 0.5)), _part(progress, 0.5, 1.0)
+            run, tests, by_modes(run, model, part(progress, 0.0, 0.5)), part(progress, 0.5, 1.0)
         )
     else:
         found = by_modes(run, model, progress)
@@ -135,7 +136,7 @@ def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnos
     linear = linear_part(run)
     found: list[Diagnosis] = []
     for i, modes in enumerate(soft_and_hard(tests)):
-        tell = _part(progress, 0.15 * i, 0.15 * (i + 1))
+        tell = part(progress, 0.15 * i, 0.15 * (i + 1))
         found.append(diagnose(linear, modes, settings, run.library, tell))
         if found[-1].verdict in ("adequate", "not_enough_data"):
             break
@@ -155,7 +156,7 @@ def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnos
         best if missing else None,
         " ".join(t.study.summary for t in tests if t.study.level_dependent),
         failed_checks(run),
-        _part(progress, 0.3, 1.0),
+        part(progress, 0.3, 1.0),
     )
 
 
@@ -166,11 +167,6 @@ def _seen(found: Diagnosis, labels: Sequence[str]) -> bool:
 
 
 _LIKELY = 3
-
-
-def _part(progress: Progress, low: float, high: float) -> Progress:
-    """Progress of a part of the work within the whole."""
-    return lambda share, text: progress(low + (high - low) * share, text)
 
 
 _TRUSTED = ("adequate", "not_enough_data", "effect", "ambiguous", "unknown_effect")

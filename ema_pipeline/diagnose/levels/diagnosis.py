@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,51 +11,19 @@ from ema_pipeline.diagnose.explain import first_part_text, label_text, size_text
 from ema_pipeline.diagnose.hypotheses import NOTHING, describe
 from ema_pipeline.diagnose.levels import words
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
+from ema_pipeline.diagnose.levels.climbing import Climbed, climbed_parts, holds, started
 from ema_pipeline.diagnose.levels.detection import detection_limits
-from ema_pipeline.diagnose.levels.ladder import (
-    PARTS,
-    LevelErrors,
-    assemble,
-    climb,
-    error_of,
-    level_errors,
-    sizes_of,
-)
+from ema_pipeline.diagnose.levels.ladder import LevelErrors, assemble, error_of, level_errors, sizes_of
 from ema_pipeline.diagnose.levels.linear_claims import replaced, withdrawn, without
 from ema_pipeline.diagnose.levels.problem import NoiseFloor
-from ema_pipeline.diagnose.levels.search import (
-    LevelRanking,
-    again,
-    at_floor,
-    own_floor,
-    ranked,
-    ranked_linear,
-)
+from ema_pipeline.diagnose.levels.search import LevelRanking
+from ema_pipeline.diagnose.progress import Progress, part
 from ema_pipeline.diagnose.types import Candidate, DetectionLimit, Diagnosis, EffectSize, Ladder, VerdictWord
 from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.threads import single_blas_thread
 
-Progress = Callable[[float, str], None]
-
-_FINER = 0.7
-"""The floor of the noise is lowered where a further effect leaves less than this share of it."""
-
-_DETERMINED = 2.0
-"""A size that is claimed differs from nothing by more than so many standard deviations."""
-
 _HARDER = 2.0
 """A next test is thought of with blows this much harder than the hardest."""
-
-
-@dataclass(frozen=True)
-class _Climbed:
-    """Models from the base upwards, the rankings on top of each, and the windows that they were fitted to."""
-
-    case: LevelCase
-    models: list[Simulated]
-    rankings: list[LevelRanking]
-    floor: NoiseFloor
-    note: str
 
 
 def diagnose_levels(
@@ -98,21 +66,21 @@ def _diagnose(
     notes: tuple[str, ...],
     tell: Progress,
 ) -> Diagnosis:
-    start = _start(case, effects, tell)
+    start = started(case, effects, tell)
     if linear is not None and (idle := replaced(case, start[-1], _claims(linear))):
         effects, linear = tuple(x for x in effects if x not in idle), without(linear, idle)
-        start = _start(case, effects, tell)
-    climbed = _climb(case, effects, start, tell)
+        start = started(case, effects, tell)
+    climbed = climbed_parts(case, effects, start, tell)
     if linear is not None and (idle := withdrawn(case, climbed.models[-1], _claims(linear))):
         effects, linear = tuple(x for x in effects if x not in idle), without(linear, idle)
-        climbed = _climb(case, effects, _start(case, effects, tell), tell)
+        climbed = climbed_parts(case, effects, started(case, effects, tell), tell)
     case = climbed.case
     first, base = climbed.rankings[0], climbed.rankings[0].base
     forces = [float(f) for f in case.windows[0].force_n]
     tell(0.8, "predicting held-out levels")
     before = level_errors(case, base, climbed.floor)
     members = _group(case, first)
-    ladder = assemble(case, climbed.models, climbed.floor, climbed.note, _part(tell, 0.82, 0.95))
+    ladder = assemble(case, climbed.models, climbed.floor, climbed.note, part(tell, 0.82, 0.95))
     candidates = _candidates(case, climbed, members, before, forces)
     verdict, text = _verdict(case, climbed, members, ladder, summary)
     claimed = _claims(linear)
@@ -132,131 +100,13 @@ def _diagnose(
         error=before.error,
         heldout_error=before.heldout_error,
         ladder=ladder,
-        detection_limits=_limits(climbed) if _holds(climbed) else (),
+        detection_limits=_limits(climbed) if holds(climbed) else (),
         notes=(
             *((summary,) if summary else ()),
             *(linear.notes if linear is not None else ()),
             *((first_part_text(ladder.compared_s),) if case.share < 1 else ()),
             *notes,
         ),
-    )
-
-
-def _start(case: LevelCase, effects: tuple[str, ...], tell: Progress) -> list[Simulated]:
-    """Models with the effects that are known before anything is ranked."""
-    tell(0.0, "base model")
-    return climb(case, effects, case.floor, _part(tell, 0.0, 0.1))
-
-
-def _climb(case: LevelCase, effects: tuple[str, ...], start: list[Simulated], tell: Progress) -> _Climbed:
-    """Add what is claimed, one effect after the other; on the first part of the windows where nothing holds in all.
-
-    Teeth that part often, and friction that sticks, move so sensitively that the true model loses the measured motion
-    in time. What is left then is no sign of a further effect: the longest part counts in which a model follows the
-    motion.
-    """
-    climbs: list[_Climb] = []
-    for part in map(case.beginning, PARTS):
-        climbs.append(_Climb(part, start if part is case else _start(part, effects, tell), tell))
-        climbed = climbs[-1].climbed(patient=False)
-        if not climbs[-1].lost:
-            return climbed
-    ends = []
-    for climb_on in climbs:
-        ends.append(climb_on.climbed(patient=True))
-        if _holds(ends[-1]):
-            return ends[-1]
-    return ends[0]
-
-
-def _holds(climbed: _Climbed) -> bool:
-    """True where the last model's error is within the limit."""
-    case = climbed.case
-    return error_of(case, climbed.models[-1]) <= case.settings.error_limit
-
-
-class _Climb:
-    """Rank on the base model, lower the noise to what the best leaves, add what is claimed, and rank again."""
-
-    def __init__(self, case: LevelCase, start: list[Simulated], tell: Progress) -> None:
-        self.case, self.start = case, start
-        first = ranked(case, start[-1], case.floor, _part(tell, 0.1, 0.5))
-        self.floor = own_floor(case, _best(first))
-        self.rankings = [at_floor(case, first, self.floor, _part(tell, 0.5, 0.6))]
-        self.tell = _part(tell, 0.6, 0.8)
-
-    @property
-    def lost(self) -> bool:
-        """True where no model follows the motion within the largest own error."""
-        return self.floor.own >= self.case.settings.levels.noise_most
-
-    def climbed(self, patient: bool) -> _Climbed:
-        """As far as it goes; without patience only while a model follows the motion."""
-        case, rankings, tell, s = self.case, self.rankings, self.tell, self.case.settings
-        while True:
-            if self.lost and (not patient or self._as_good_as_it_gets()):
-                note = "stopped where no model follows the motion"
-                break
-            top = _claimable(case, rankings[-1], self.floor)
-            if top is None and self.lost:
-                # what depends on the level cannot mend it alone: something else may be missing at every level
-                linear = ranked_linear(case, rankings[-1].base, self.floor, tell)
-                rankings[-1] = _with(case, rankings[-1], linear)
-                top = _claimable(case, rankings[-1], self.floor)
-            if top is None:
-                note = "no further effect is supported by the data"
-                break
-            if len(rankings) > s.most_rungs:
-                note = f"stopped after {s.most_rungs} effects"
-                break
-            rankings.append(ranked(case, top, self.floor, tell))
-            finer = own_floor(case, _best(rankings[-1]))
-            if finer.own < _FINER * self.floor.own:
-                self.floor = finer
-                rankings[:] = [at_floor(case, r, self.floor, tell) for r in rankings]
-        models = [*(again(case, m, self.floor) for m in self.start[:-1]), *(r.base for r in rankings)]
-        return _Climbed(case, models, list(rankings), self.floor, note)
-
-    def _as_good_as_it_gets(self) -> bool:
-        """True for a model within the limit that has an effect after which motion is lost."""
-        base = self.rankings[-1].base
-        known = any(depends_on_level(x, self.case.library) for x in base.hypothesis.labels)
-        return known and error_of(self.case, base) <= self.case.settings.error_limit
-
-
-def _best(ranking: LevelRanking) -> Simulated:
-    """The model of the largest evidence."""
-    return min((ranking.base, *ranking.fitted), key=lambda m: m.evidence)
-
-
-def _with(case: LevelCase, one: LevelRanking, other: LevelRanking) -> LevelRanking:
-    """Both rankings of the same base model as one."""
-    base = min(one.base, other.base, key=lambda m: m.fit.objective)
-    return LevelRanking(case, base, [*one.fitted, *other.fitted])
-
-
-def _claimable(case: LevelCase, ranking: LevelRanking, floor: NoiseFloor) -> Simulated | None:
-    """The most probable hypothesis where something is missing for sure and held-out levels agree."""
-    s = case.settings
-    if 1 - ranking.probabilities[NOTHING] < s.probability_least or not ranking.fitted:
-        return None
-    top = ranking.ordered()[0]
-    if ranking.gain(top) < s.levels.gain_least or not _determined(case, top):
-        return None
-    before, after = (level_errors(case, m, floor).heldout_error for m in (ranking.base, top))
-    return top if not after >= before else None
-
-
-def _determined(case: LevelCase, model: Simulated) -> bool:
-    """True where the size of the effect added last differs from nothing.
-
-    Friction that never turns over is a damper: only the ratio of its force to its rate is told, and no force.
-    """
-    label = model.hypothesis.labels[-1]
-    return all(
-        np.isinf(p.null) or abs(model.values[name]) > _DETERMINED * model.std[name]
-        for p in case.parameters_of(label)[:1]
-        if (name := f"{label}.{p.name}") in model.sizes
     )
 
 
@@ -281,7 +131,7 @@ def _by_last(ranking: LevelRanking) -> dict[str, float]:
 
 def _candidates(
     case: LevelCase,
-    climbed: _Climbed,
+    climbed: Climbed,
     members: Sequence[Simulated],
     before: LevelErrors,
     forces: Sequence[float],
@@ -339,7 +189,7 @@ def _own_sizes(case: LevelCase, m: Simulated, floor: NoiseFloor, label: str) -> 
 
 
 def _verdict(
-    case: LevelCase, climbed: _Climbed, members: Sequence[Simulated], ladder: Ladder, summary: str
+    case: LevelCase, climbed: Climbed, members: Sequence[Simulated], ladder: Ladder, summary: str
 ) -> tuple[VerdictWord, str]:
     last = climbed.models[-1]
     error = error_of(case, last)
@@ -385,14 +235,14 @@ def _verdict(
     )
 
 
-def _mending(case: LevelCase, climbed: _Climbed, members: Sequence[Simulated]) -> bool:
+def _mending(case: LevelCase, climbed: Climbed, members: Sequence[Simulated]) -> bool:
     """True where something of the library helps for sure, though it cannot be told what."""
     ranking, s = climbed.rankings[0], case.settings
     sure = 1 - ranking.probabilities[NOTHING] >= s.probability_least
     return sure and ranking.gain(members[0]) >= s.levels.gain_least
 
 
-def _limits(climbed: _Climbed) -> tuple[DetectionLimit, ...]:
+def _limits(climbed: Climbed) -> tuple[DetectionLimit, ...]:
     """What these hits would show of the effects that depend on the level."""
     case, first = climbed.case, climbed.rankings[0]
     nonlinear = [
@@ -450,8 +300,3 @@ def _next(case: LevelCase, members: Sequence[Simulated], floor: NoiseFloor) -> s
         )
     force = _HARDER * float(case.windows[0].force_n[-1])
     return f"Blows of {force:.0f} N on {where} would tell {pair}: expected difference {best:.1f} σ."
-
-
-def _part(tell: Progress, low: float, high: float) -> Progress:
-    """Progress of a part of the work within the whole."""
-    return lambda share, text: tell(low + (high - low) * share, text)

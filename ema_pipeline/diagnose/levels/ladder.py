@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,11 +12,10 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
 from ema_pipeline.diagnose.levels.problem import NoiseFloor, hit_misfits, residuals
 from ema_pipeline.diagnose.levels.search import Growing, again, fit_base, fit_effect, fit_linear, own_floor
+from ema_pipeline.diagnose.progress import Progress
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung, TimeTrace
 from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
-
-Progress = Callable[[float, str], None]
 
 PARTS = (1.0, 0.4, 0.16)
 """Shares of the windows that are tried one after the other, until a model holds."""

@@ -30,9 +30,8 @@ from ema_pipeline.diagnose.levels.problem import (
     weighted,
 )
 from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.progress import Progress
 from ema_pipeline.errors import EmaError
-
-Progress = Callable[[float, str], None]
 
 _FOLLOWED = 2
 _HELPS = 0.5
