@@ -268,6 +268,15 @@ def test_a_linear_effect_beside_is_found_and_listed_with_what_it_adds() -> None:
     assert sizes["bearing_cubic@hub"]["stiffness"].value == pytest.approx(2e11, rel=0.1)
 
 
+def test_effects_without_a_time_response_are_told_from_those_with_one() -> None:
+    from ema_pipeline.diagnose.levels.linear_claims import without_time_response
+    from ema_pipeline.rigs.planetary import planetary
+
+    labels = ("hysteretic_damping@sun", "local_damper@sun", "mesh_stiffness_loss@sun-planet1")
+    found = without_time_response(planetary(2), ["no_ring"], labels, DiagnoseSettings(), None)
+    assert found == {"hysteretic_damping@sun"}
+
+
 def test_a_damper_is_not_claimed_as_friction_whose_force_nobody_can_tell() -> None:
     dampers = [Damper(f"d{a}", {f"rim.{a}": 1.0}, 8.0) for a in "xy"]
     found = diagnose_levels(case_of(windows(*TRUTHS["bearing_cubic@hub"][0], *dampers)), (), None, "", ())

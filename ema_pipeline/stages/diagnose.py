@@ -130,6 +130,7 @@ def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnos
     """
     from ema_pipeline.diagnose import diagnose
     from ema_pipeline.diagnose.levels.diagnosis import diagnose_levels
+    from ema_pipeline.diagnose.levels.linear_claims import without, without_time_response
     from ema_pipeline.diagnose.levels.prepare import soft_and_hard
 
     settings = cast(DiagnoseSettings, run.settings[NAME])
@@ -144,6 +145,11 @@ def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnos
     missing = best.ladder.rungs[-1].effects if best.verdict == "effect" else ()
     if not all(_seen(d, missing) for d in found):
         missing = ()
+    notes = failed_checks(run)
+    steady = without_time_response(linear, [t.configuration for t in tests], missing, settings, run.library)
+    if steady:
+        missing = tuple(x for x in missing if x not in steady)
+        notes = (_steady_text(steady), *notes)
     starts = [
         {n: p.value for n, p in rung.parameters.items()}
         for d in (best, *found)
@@ -153,11 +159,19 @@ def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnos
     return diagnose_levels(
         case,
         (*run.info.effects, *missing),
-        best if missing else None,
+        without(best, steady) if missing else None,
         " ".join(t.study.summary for t in tests if t.study.level_dependent),
-        failed_checks(run),
+        notes,
         part(progress, 0.3, 1.0),
     )
+
+
+def _steady_text(labels: set[str]) -> str:
+    """A remark where effects of single levels cannot be simulated in time."""
+    from ema_pipeline.diagnose.explain import label_text
+
+    named = " and ".join(label_text(x) for x in sorted(labels))
+    return f"The modes of one level ask for {named}, which has no time response: the hits are simulated without it."
 
 
 def _seen(found: Diagnosis, labels: Sequence[str]) -> bool:

@@ -7,10 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from ema_pipeline.diagnose.hypotheses import Hypothesis, extras, make_rig, starting_points
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, level_hypotheses
 from ema_pipeline.diagnose.levels.search import Growing, again, fit_effect, own_floor
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Candidate, Diagnosis
-from ema_pipeline.effects.library import depends_on_level
+from ema_pipeline.effects.library import Library, depends_on_level
+from ema_pipeline.rigs.types import Rig
 
 _NOTHING_LEFT, _ELSEWHERE = 2.0, 3.0
 """Standard deviations: a size vanishes within the first of nothing, and beyond the second of what was claimed."""
@@ -60,3 +63,21 @@ def without(linear: Diagnosis, labels: set[str]) -> Diagnosis | None:
     """The diagnosis of one level without some of its claims; None where nothing is left of them."""
     kept = tuple(replace(c, claimed=c.claimed and c.label not in labels) for c in linear.candidates)
     return replace(linear, candidates=kept) if any(c.claimed for c in kept) else None
+
+
+def without_time_response(
+    rig: Rig,
+    configurations: Sequence[str],
+    labels: Sequence[str],
+    settings: DiagnoseSettings,
+    library: Library | None,
+) -> set[str]:
+    """Effects with which no hit can be simulated: a loss factor holds at steady state only."""
+    found = set()
+    for label in labels:
+        hypothesis = Hypothesis((label,))
+        made = make_rig(rig, hypothesis, library, settings.parameter_range)
+        at = starting_points(extras(rig, hypothesis, library))[0]
+        if any(np.any(made.assembly(c, at).system().structural) for c in configurations):
+            found.add(label)
+    return found
