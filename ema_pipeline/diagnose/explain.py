@@ -8,7 +8,7 @@ import numpy as np
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.fitting import Fitted
-from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE, EffectSize
+from ema_pipeline.diagnose.types import NOT_TOLD, OUT_OF_TOLERANCE, EffectSize
 
 
 def why(base: Fitted, fitted: Fitted, measured: Mapping[str, MeasuredModes], signs: str) -> str:
@@ -41,7 +41,7 @@ def size_text(sizes: Mapping[str, EffectSize]) -> str:
 
 def _one_size(s: EffectSize) -> str:
     if not s.told:
-        return "not told by these data"
+        return NOT_TOLD
     return f"{s.value:.4g} ± {s.std:.2g}{'' if s.unit in ('', '1') else ' ' + s.unit}"
 
 

@@ -19,6 +19,8 @@ EXTRA_COORDINATE = "a degree of freedom of its own"
 """What a misfit acts like where a test shows more modes than the model has."""
 
 
+NOT_TOLD = "not told by these data"
+
 _UNTOLD = 100.0
 """Standard deviations of this many times the value tell nothing of a size."""
 

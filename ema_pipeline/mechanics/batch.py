@@ -83,9 +83,7 @@ def batch_response(assemblies: Sequence[Assembly], blows: Blows, substeps: int) 
     orders = np.array([ORDERS[q] for q in blows.quantities])
     batch = prepared(assemblies, blows.out_rows, orders, blows.in_rows)
     step = 1 / (blows.sample_rate_hz * substeps)
-    found = marched(batch, batch.outputs, straight, step, substeps, trace=True)
-    if found.failed.any():
-        raise no_solution(batch.names, step)
+    found = _moved(batch, straight, step, substeps, trace=True)
     result = found.motion.swapaxes(2, 3)
     result += batch.direct[:, :, : len(force)].swapaxes(1, 2)[..., None] * force[None, :, None, ::substeps]
     lost = band_limited(found.forces, substeps) - found.forces
@@ -155,9 +153,7 @@ def compiled_response(
     """
     batch = prepared(assemblies, out_rows, orders, in_rows)
     step = 1 / (sample_rate_hz * substeps)
-    found = marched(batch, batch.outputs, force, step, substeps)
-    if found.failed.any():
-        raise no_solution(batch.names, step)
+    found = _moved(batch, force, step, substeps)
     return found.motion.swapaxes(2, 3), batch.direct[:, :, : len(force)].swapaxes(1, 2)
 
 
@@ -240,12 +236,17 @@ def marched(
     )
 
 
-def no_solution(names: Sequence[str], step: float) -> EmaError:
-    """What is raised where no motion was found."""
-    return EmaError(
-        f"no solution with {', '.join(names)}: the motion grows without bound, or the step of {step:.3g} s is too "
-        "long; check the elements' values, or give more substeps"
-    )
+def _moved(
+    batch: Batch, force: NDArray[np.float64], step: float, substeps: int, trace: bool = False
+) -> Marched:
+    """`marched` at all outputs; EmaError where the motion of an assembly has no solution."""
+    found = marched(batch, batch.outputs, force, step, substeps, trace)
+    if found.failed.any():
+        raise EmaError(
+            f"no solution with {', '.join(batch.names)}: the motion grows without bound, or the step of {step:.3g} s "
+            "is too long; check the elements' values, or give more substeps"
+        )
+    return found
 
 
 def one_by_one(assemblies: Sequence[Assembly], blows: Blows, substeps: int) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from ema_pipeline.diagnose.explain import first_part_text, label_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import (
+    NOT_TOLD,
     OUT_OF_TOLERANCE,
     Candidate,
     DetectionLimit,
@@ -63,7 +64,7 @@ def leading(found: Diagnosis) -> tuple[Candidate, ...]:
 def size_words(parameters: Mapping[str, EffectSize], between: str = "; ") -> str:
     """Sizes with their uncertainty, e.g. ``fraction 0.3500 ± 0.0020``."""
     return between.join(
-        f"{words(n)} {format_value(s.value, s.std, s.unit) if s.told else 'not told by these data'}"
+        f"{words(n)} {format_value(s.value, s.std, s.unit) if s.told else NOT_TOLD}"
         for n, s in parameters.items()
     )
 

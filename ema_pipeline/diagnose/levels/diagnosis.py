@@ -104,7 +104,7 @@ def _diagnose(
         notes=(
             *((summary,) if summary else ()),
             *(linear.notes if linear is not None else ()),
-            *((first_part_text(ladder.compared_s),) if case.share < 1 else ()),
+            *filter(None, (first_part_text(ladder.compared_s),)),
             *notes,
         ),
     )

@@ -126,14 +126,15 @@ def climb(case: LevelCase, effects: Sequence[str], floor: NoiseFloor, tell: Prog
     for i, label in enumerate(effects):
         tell(i / len(effects), f"fitting {label}")
         hypothesis = models[-1].hypothesis.plus(label)
+        windows = Growing(case, floor, models[-1])
         if not depends_on_level(label, case.library):
-            found = fit_linear(Growing(case, floor, models[-1]), hypothesis, models[-1])
+            found = fit_linear(windows, hypothesis, models[-1])
             if found is None:
                 raise EmaError(
                     f"'{label}' has no time response, so hits cannot be simulated with it: take it out"
                 )
         else:
-            found = fit_effect(Growing(case, floor, models[-1]), hypothesis, models[-1])
+            found = fit_effect(windows, hypothesis, models[-1])
         models.append(again(case, found, floor, _FOLLOWED_STEPS))
     return models
 

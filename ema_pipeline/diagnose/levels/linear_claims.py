@@ -25,6 +25,8 @@ def replaced(case: LevelCase, base: Simulated, claimed: Sequence[Candidate]) -> 
     Seen at once, these need no ranking of everything else on top of them. `base` is the model with them all.
     """
     places = {c.at for c in claimed if c.label in base.hypothesis.labels}
+    if not places:
+        return set()
     windows = Growing(case, case.floor, base)
     for h in level_hypotheses(case, base.hypothesis):
         if h.labels[-1].partition("@")[2] not in places:

@@ -276,12 +276,11 @@ def fit(
     damping, value = 1e-3, np.inf
     normal = np.eye(x.size)
     slopes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
-    fresh = not known
+    trusted = known or {}
     while True:
+        fresh = slopes is None and not trusted
         try:
-            r, jacobian = (
-                linearised(problem, weights, x, {} if fresh else known) if slopes is None else slopes
-            )
+            r, jacobian = linearised(problem, weights, x, trusted) if slopes is None else slopes
         except EmaError:  # on the edge of what has a solution
             break
         value = float(r @ r) + float(prior @ x**2)
@@ -308,10 +307,9 @@ def fit(
             damping = float(np.clip(ladder[best], 1e-6, 1e6))
         if fell < small and (fresh or follows):
             break
-        fresh = not follows or not fell > 0
-        slopes = (
-            None if fresh else (tried[best], jacobian + np.outer(step, (tried[best] - ahead) / (step @ step)))
-        )
+        trusted, slopes = {}, None
+        if follows and fell > 0:
+            slopes = tried[best], jacobian + np.outer(step, (tried[best] - ahead) / (step @ step))
     return TimeFit(x, space.named(x), value, value - float(prior @ x**2), normal)
 
 
@@ -325,15 +323,15 @@ def linearised(
 
     Rows of parameters in `known` are taken from there.
     """
-    names = problem.space.names
-    sought = [i for i, n in enumerate(names) if n not in (known or {})]
+    names, taken = problem.space.names, known or {}
+    sought = [i for i, n in enumerate(names) if n not in taken]
     step = np.where(x + _STEP > problem.space.high, -_STEP, _STEP)
     r = residuals(problem, weights, np.vstack([x[None], x + np.diag(step)[sought]]))
     jacobian = np.empty((x.size, r.shape[1]))
     jacobian[sought] = (r[1:] - r[0]) / step[sought, None]
     for i, name in enumerate(names):
-        if known and name in known:
-            jacobian[i] = known[name]
+        if name in taken:
+            jacobian[i] = taken[name]
     return r[0], jacobian
 
 
