@@ -104,13 +104,14 @@ def climb(case: Case, witness: Witness, thresholds: Mapping[str, float] | None, 
                 f"{claim.hypothesis.labels[-1]} or others like it may be missing too: too small to tell which"
             )
             break
-        if len(models) > settings.most_rungs:
-            note = f"stopped after {settings.most_rungs} effects"
-            break
         models.append(claim)
-        rest = single_hypotheses(case.rig, list(case.measured), case.library, claim.hypothesis)
         told = part(tell, 0.8, 1.0)
         told(0.0, f"on top of {claim.hypothesis.label}")
+        if len(models) > settings.most_rungs:
+            note = f"stopped after {settings.most_rungs} effects"
+            rankings.append(rank(case, claim, (), fit, told))
+            break
+        rest = single_hypotheses(case.rig, list(case.measured), case.library, claim.hypothesis)
         rankings.append(rank(case, claim, rest, fit, told))
         models[-1] = rankings[-1].base
     return Climb(models, rankings, level, note, refuted)

@@ -60,12 +60,15 @@ def climbed_parts(
         climbed = climbs[-1].climbed(patient=False)
         if not climbs[-1].lost and holds(climbed):
             return climbed
-    ends = []
-    for climb_on in climbs:
-        ends.append(climb_on.climbed(patient=True))
-        if holds(ends[-1]):
-            return ends[-1]
-    return ends[0]
+    # what follows the motion follows its beginning: where nothing does, longer windows are in vain
+    *longer, shortest = climbs
+    end = shortest.climbed(patient=True)
+    if holds(end):
+        for climb_on in longer:
+            further = climb_on.climbed(patient=True)
+            if holds(further):
+                return further
+    return end
 
 
 def holds(climbed: Climbed) -> bool:

@@ -31,6 +31,7 @@ from ema_pipeline.diagnose.levels.problem import (
 )
 from ema_pipeline.diagnose.pool import spread
 from ema_pipeline.diagnose.progress import Progress
+from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
 
 _FOLLOWED = 2
@@ -198,7 +199,7 @@ def fit_effect(windows: Growing, hypothesis: Hypothesis, base: Simulated) -> Sim
     base : Simulated
     """
     case = windows.case
-    starts = _distinct_starts((base.values, *case.starts))
+    starts = _starts(case, base)
     chosen = _competing(windows.rough, hypothesis, base, starts, _SPARSE)
     if base.fit.objective > _CLOSE**2 * case.data or not base.sizes:
         chosen += _competing(windows.forgiving, hypothesis, base, starts, _DENSE)
@@ -241,7 +242,7 @@ def fit_linear(windows: Growing, hypothesis: Hypothesis, base: Simulated) -> Sim
     case, brief = windows.case, windows.first
     problem = brief.case.problem(hypothesis, base.sizes)
     added = starting_points(extras(case.rig, hypothesis, case.library))
-    starts = [{**base.values, **s, **p} for s in _distinct_starts((base.values, *case.starts)) for p in added]
+    starts = [{**base.values, **s, **p} for s in _starts(case, base) for p in added]
     tried = objectives(problem, brief.weights, np.array([problem.space.point(s) for s in starts]))
     if not np.any(np.isfinite(tried)):
         return None
@@ -284,6 +285,15 @@ def _worth_following(tried: Sequence[_Tried], null: float) -> list[_Tried]:
         if len(kept) == _FOLLOWED:
             break
     return kept
+
+
+def _starts(case: LevelCase, base: Simulated) -> list[Mapping[str, float]]:
+    """Where the other parameters may begin beside a further effect.
+
+    The modes of single levels lead a model that knows how its answer depends on the level astray.
+    """
+    levels = any(depends_on_level(x, case.library) for x in base.hypothesis.labels)
+    return _distinct_starts((base.values,) if levels else (base.values, *case.starts))
 
 
 def _distinct_starts(starts: Sequence[Mapping[str, float]]) -> list[Mapping[str, float]]:
