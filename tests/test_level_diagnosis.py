@@ -35,7 +35,7 @@ LEVELS = np.array([30.0, 100.0, 300.0])
 TRUE = {"mass": 1.005, "bearing": 3.9e5, "link": 2.1e5, "modal_damping_ratio": 0.012}
 
 
-def _build(configuration: str, values: dict[str, float]) -> Assembly:
+def build(configuration: str, values: dict[str, float]) -> Assembly:
     """Two bodies in the plane, hub on a bearing and rim on the hub."""
     elements: list[Mass | Spring | Damper] = []
     for axis, factor in (("x", 1.0), ("y", 1.15)):
@@ -59,7 +59,7 @@ RIG = ParametricRig(
         "link": Parameter("link", 2e5, "N/m", 0.1),
         "modal_damping_ratio": Parameter("modal_damping_ratio", 0.01, "1", 0.3),
     },
-    _build,
+    build,
 )
 
 
@@ -220,6 +220,7 @@ def windows(*elements: Element, noise: float = 0.002, seed: int = 1) -> HitWindo
         noise=np.full((len(level), 4), noise),
         band_hz=(30.0, 500.0),
         modes=4,
+        unsure=np.zeros(len(level)),
     )
 
 

@@ -8,7 +8,10 @@ import numpy as np
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.fitting import Fitted
-from ema_pipeline.diagnose.types import NOT_TOLD, OUT_OF_TOLERANCE, EffectSize
+from ema_pipeline.diagnose.types import NOT_TOLD, OUT_OF_TOLERANCE, EffectSize, Ladder
+
+_NAMED = 4
+"""Hits that a sentence names; a count stands for the rest."""
 
 
 def why(base: Fitted, fitted: Fitted, measured: Mapping[str, MeasuredModes], signs: str) -> str:
@@ -45,14 +48,23 @@ def _one_size(s: EffectSize) -> str:
     return f"{s.value:.4g} ± {s.std:.2g}{'' if s.unit in ('', '1') else ' ' + s.unit}"
 
 
-def first_part_text(compared_s: float) -> str:
-    """A remark where only the first part of each hit was compared; empty for NaN."""
-    if not np.isfinite(compared_s):
-        return ""
-    return (
-        f"Only the first {1e3 * compared_s:.0f} ms of each hit are compared: in longer windows no model follows the "
-        "measured motion, as where parts strike or stick."
-    )
+def compared_text(ladder: Ladder) -> str:
+    """A remark where not all of the hits, or only the first part of each, was compared; else empty."""
+    if ladder.left_out:
+        names = list(ladder.left_out[:_NAMED])
+        if more := len(ladder.left_out) - len(names):
+            names.append(f"{more} more")
+        return (
+            f"{len(ladder.left_out)} {'hits are' if len(ladder.left_out) > 1 else 'hit is'} left out "
+            f"({', '.join(names)}): the motion hangs on the last thousandth of the force, as where parts strike again "
+            "and again, and no model can foretell it."
+        )
+    if np.isfinite(ladder.compared_s):
+        return (
+            f"Only the first {1e3 * ladder.compared_s:.0f} ms of each hit are compared: in longer windows no model "
+            "follows the measured motion, as where parts strike or stick."
+        )
+    return ""
 
 
 def label_text(label: str) -> str:

@@ -187,6 +187,8 @@ class Ladder:
         Measured and simulated signals of the base model and of the last rung.
     compared_s : float
         Length of what was compared of each hit, where that is only the first part of its window; else NaN.
+    left_out : tuple of str
+        Hits, as ``file#number``, that were not compared because their motion hangs on the last thousandth of the force.
     """
 
     rungs: tuple[Rung, ...]
@@ -198,6 +200,7 @@ class Ladder:
     hit_noise: float = float("nan")
     traces: tuple[TimeTrace, ...] = ()
     compared_s: float = float("nan")
+    left_out: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -57,6 +57,8 @@ def summary(results: RunResults) -> dict[str, Any]:
         content["ladder_note"] = results.shown_ladder.note
         if math.isfinite(results.shown_ladder.compared_s):
             content["ladder_compared_s"] = results.shown_ladder.compared_s
+        if results.shown_ladder.left_out:
+            content["ladder_left_out"] = list(results.shown_ladder.left_out)
     content["warnings"] = list(results.warnings)
     return content
 

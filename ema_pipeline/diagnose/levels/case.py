@@ -34,6 +34,8 @@ class LevelCase:
         Frequency of the highest mode.
     share : float
         Of the windows that are there to be compared.
+    left_out : tuple of str
+        Names of hits that are not, see `diagnose.levels.views`.
     """
 
     rig: Rig
@@ -43,6 +45,7 @@ class LevelCase:
     starts: tuple[Mapping[str, float], ...]
     top_hz: float
     share: float = 1.0
+    left_out: tuple[str, ...] = ()
 
     @property
     def floor(self) -> NoiseFloor:
@@ -68,6 +71,12 @@ class LevelCase:
             return self
         shorter = tuple(w.shortened(share) for w in self.windows)
         return replace(self, windows=shorter, share=share * self.share)
+
+    def only(self, kept: Sequence[NDArray[np.bool_]]) -> LevelCase:
+        """The case with some of the hits, by configuration; the others are named in `left_out`."""
+        pairs = list(zip(self.windows, kept, strict=True))
+        out = [str(n) for w, k in pairs for n in np.array(w.names)[~k]]
+        return replace(self, windows=tuple(w.only(k) for w, k in pairs), left_out=(*self.left_out, *out))
 
     def softer(self) -> LevelCase:
         """Without the hits of the hardest level, after which parts strike most often."""
@@ -185,6 +194,12 @@ def judged(
     told = np.linalg.inv(found.hessian + 1e-9 * np.eye(len(space.names)))
     std = {n: float(np.sqrt(max(told[i, i], 0.0)) * slopes[i]) for i, n in enumerate(space.names)}
     return Simulated(hypothesis, dict(sizes), found, std, float(found.objective + cost))
+
+
+def error_of(case: LevelCase, model: Simulated) -> float:
+    """Root-mean-square of data and nominal values, in standard uncertainties."""
+    prior = float(np.sum(case.problem(model.hypothesis, model.sizes).space.has_prior))
+    return float(np.sqrt(model.fit.objective / (case.data + prior)))
 
 
 def prior_width(p: Parameter | EffectParameter) -> float:

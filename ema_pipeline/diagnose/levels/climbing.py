@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ema_pipeline.diagnose.hypotheses import NOTHING
-from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
-from ema_pipeline.diagnose.levels.ladder import PARTS, climb, error_of, level_errors
+from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, error_of
+from ema_pipeline.diagnose.levels.ladder import level_errors
 from ema_pipeline.diagnose.levels.problem import NoiseFloor
+from ema_pipeline.diagnose.levels.rungs import climb
 from ema_pipeline.diagnose.levels.search import (
     LevelRanking,
     again,
@@ -18,6 +19,7 @@ from ema_pipeline.diagnose.levels.search import (
     ranked,
     ranked_linear,
 )
+from ema_pipeline.diagnose.levels.views import holds, views
 from ema_pipeline.diagnose.progress import Progress, part
 from ema_pipeline.effects.library import depends_on_level
 
@@ -38,6 +40,10 @@ class Climbed:
     floor: NoiseFloor
     note: str
 
+    def holds(self, case: LevelCase) -> bool:
+        """True where the last model explains all hits of a case that it can foretell."""
+        return holds(case, self.case, self.models[-1], self.floor)
+
 
 def started(case: LevelCase, effects: tuple[str, ...], tell: Progress) -> list[Simulated]:
     """Models with the effects that are known before anything is ranked."""
@@ -45,36 +51,31 @@ def started(case: LevelCase, effects: tuple[str, ...], tell: Progress) -> list[S
     return climb(case, effects, case.floor, part(tell, 0.0, 0.1))
 
 
-def climbed_parts(
+def climbed_views(
     case: LevelCase, effects: tuple[str, ...], start: list[Simulated], tell: Progress
 ) -> Climbed:
-    """Add what is claimed, one effect after the other; on the first part of the windows where nothing holds in all.
+    """Add what is claimed, one effect after the other; on some of the hits, or their first part, where nothing holds.
 
-    Teeth that part often, and friction that sticks, move so sensitively that the true model loses the measured motion
-    in time. What is left then is no sign of a further effect: the longest part counts in which a model follows the
-    motion.
+    Teeth that part often, and friction that sticks, move so sensitively that the true model loses the measured motion:
+    in some hits, or in time. What is left then is no sign of a further effect: the first view counts in which a model
+    follows the motion.
     """
     climbs: list[_Climb] = []
-    for windows in map(case.beginning, PARTS):
-        climbs.append(_Climb(windows, start if windows is case else started(windows, effects, tell), tell))
+    for view in views(case, lambda: climbs[0].best):
+        climbs.append(_Climb(view, start if view is case else started(view, effects, tell), tell))
         climbed = climbs[-1].climbed(patient=False)
-        if not climbs[-1].lost and holds(climbed):
+        if not climbs[-1].lost and climbed.holds(case):
             return climbed
-    # what follows the motion follows its beginning: where nothing does, longer windows are in vain
+    # what follows the motion follows its beginning: where nothing does, longer windows of the same hits are in vain
     *longer, shortest = climbs
     end = shortest.climbed(patient=True)
-    if holds(end):
-        for climb_on in longer:
+    within = end.holds(case)
+    for climb_on in longer:
+        if within or climb_on.case.left_out:
             further = climb_on.climbed(patient=True)
-            if holds(further):
+            if further.holds(case):
                 return further
     return end
-
-
-def holds(climbed: Climbed) -> bool:
-    """True where the last model's error is within the limit."""
-    case = climbed.case
-    return error_of(case, climbed.models[-1]) <= case.settings.error_limit
 
 
 class _Climb:
@@ -86,6 +87,11 @@ class _Climb:
         self.floor = own_floor(case, _best(first))
         self.rankings = [at_floor(case, first, self.floor, part(tell, 0.5, 0.6))]
         self.tell = part(tell, 0.6, 0.8)
+
+    @property
+    def best(self) -> Simulated:
+        """The model of the largest evidence on the first rung."""
+        return _best(self.rankings[0])
 
     @property
     def lost(self) -> bool:
@@ -116,6 +122,9 @@ class _Climb:
             if finer.own < _FINER * self.floor.own:
                 self.floor = finer
                 rankings[:] = [at_floor(case, r, self.floor, tell) for r in rankings]
+        while len(rankings) > 1 and not _determined(case, rankings[-1].base):
+            rankings.pop()  # what looked like a size at a higher floor of the noise
+            note = "no further effect is supported by the data"
         models = [*(again(case, m, self.floor) for m in self.start[:-1]), *(r.base for r in rankings)]
         return Climbed(case, models, list(rankings), self.floor, note)
 

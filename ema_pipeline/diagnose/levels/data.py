@@ -61,6 +61,8 @@ class HitWindows:
     band_hz : tuple of float
     modes : int
         Measured modes in the band.
+    unsure : ndarray, (n_hits,)
+        Share of each hit's motion that no model foretells, see `diagnose.levels.views`.
     """
 
     configuration: str
@@ -77,6 +79,7 @@ class HitWindows:
     noise: NDArray[np.float64]
     band_hz: tuple[float, float]
     modes: int
+    unsure: NDArray[np.float64]
 
     @property
     def time_s(self) -> NDArray[np.float64]:
@@ -114,15 +117,16 @@ class HitWindows:
         """Uncertainty of each line, measured amplitude around it, and share of its power that is no noise.
 
         The standard uncertainty, (n_hits, n_sensors, n_lines), is the sensors' noise, and shares of the measured
-        amplitude: `floor`, and the angle that `_TIMING` of a sample between hammer and sensors makes. A sensor that
-        symmetry keeps still gets `_SPILT` of the `floor` of the others: a force between bodies that is a little off
-        moves it at once. The uncertainty is infinite, and the share 0, where a sensor is absent.
+        amplitude: `floor`, what is `unsure`, and the angle that `_TIMING` of a sample between hammer and sensors makes.
+        A sensor that symmetry keeps still gets `_SPILT` of the first two of the others: a force between bodies that is
+        a little off moves it at once. The uncertainty is infinite, and the share 0, where a sensor is absent.
         """
         f = self.frequency_hz
         noise = self.noise[..., None] ** 2 * np.sum(np.exp(-2 * self.time_s / self.fade_s))
-        share = floor**2 + (2 * np.pi * f * _TIMING / self.sample_rate_hz) ** 2
+        own = np.hypot(floor, self.unsure)[:, None, None]
+        share = own**2 + (2 * np.pi * f * _TIMING / self.sample_rate_hz) ** 2
         power = _smoothed(f, np.abs(self.spectra(self.measured)) ** 2)
-        total = np.sqrt(noise + share * power + (_SPILT * floor) ** 2 * self._alike(power))
+        total = np.sqrt(noise + share * power + (_SPILT * own) ** 2 * self._alike(power))
         there = self.present[..., None]
         signal = np.clip(1 - 2 * noise / np.maximum(power, 1e-300), 0.0, 1.0)
         return np.where(there, total, np.inf), np.sqrt(power), np.where(there, signal, 0.0)
@@ -154,6 +158,7 @@ class HitWindows:
             measured=self.measured[keep],
             present=self.present[keep],
             noise=self.noise[keep],
+            unsure=self.unsure[keep],
         )
 
 
@@ -240,6 +245,7 @@ def hit_windows(
         noise=noise,
         band_hz=band_hz,
         modes=modes,
+        unsure=np.zeros(len(chosen)),
     )
 
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from ema_pipeline.diagnose.explain import first_part_text, label_text, size_text
+from ema_pipeline.diagnose.explain import compared_text, label_text, size_text
 from ema_pipeline.diagnose.hypotheses import NOTHING, describe
 from ema_pipeline.diagnose.levels import words
-from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
-from ema_pipeline.diagnose.levels.climbing import Climbed, climbed_parts, holds, started
+from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, error_of
+from ema_pipeline.diagnose.levels.climbing import Climbed, climbed_views, started
 from ema_pipeline.diagnose.levels.detection import detection_limits
-from ema_pipeline.diagnose.levels.ladder import LevelErrors, assemble, error_of, level_errors, sizes_of
+from ema_pipeline.diagnose.levels.ladder import LevelErrors, assemble, level_errors, sizes_of
 from ema_pipeline.diagnose.levels.linear_claims import replaced, withdrawn, without
 from ema_pipeline.diagnose.levels.problem import NoiseFloor
 from ema_pipeline.diagnose.levels.search import LevelRanking
@@ -70,10 +70,11 @@ def _diagnose(
     if linear is not None and (idle := replaced(case, start[-1], _claims(linear))):
         effects, linear = tuple(x for x in effects if x not in idle), without(linear, idle)
         start = started(case, effects, tell)
-    climbed = climbed_parts(case, effects, start, tell)
+    climbed = climbed_views(case, effects, start, tell)
     if linear is not None and (idle := withdrawn(case, climbed.models[-1], _claims(linear))):
         effects, linear = tuple(x for x in effects if x not in idle), without(linear, idle)
-        climbed = climbed_parts(case, effects, started(case, effects, tell), tell)
+        climbed = climbed_views(case, effects, started(case, effects, tell), tell)
+    followed = climbed.holds(case)
     case = climbed.case
     first, base = climbed.rankings[0], climbed.rankings[0].base
     forces = [float(f) for f in case.windows[0].force_n]
@@ -100,11 +101,11 @@ def _diagnose(
         error=before.error,
         heldout_error=before.heldout_error,
         ladder=ladder,
-        detection_limits=_limits(climbed) if holds(climbed) else (),
+        detection_limits=_limits(climbed) if followed else (),
         notes=(
             *((summary,) if summary else ()),
             *(linear.notes if linear is not None else ()),
-            *filter(None, (first_part_text(ladder.compared_s),)),
+            *filter(None, (compared_text(ladder),)),
             *notes,
         ),
     )
@@ -207,6 +208,12 @@ def _verdict(
         return "ambiguous", (
             f"The answer depends on the force level, and these explain it alike: "
             f"{words.names([m.hypothesis.labels[-1] for m in members])}."
+        )
+    if not nonlinear and _mending(case, climbed, members):
+        best = label_text(members[0].hypothesis.labels[-1]).capitalize()
+        return "unknown_effect", (
+            f"The answer depends on the force level. {best} fits best, but is not confirmed: its size may be nothing, or "
+            "the levels left out of the fit are not predicted better with it."
         )
     if not nonlinear:
         return "unknown_effect", (

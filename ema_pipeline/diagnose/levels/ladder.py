@@ -8,20 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.levels.case import LevelCase, Simulated
+from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, error_of
 from ema_pipeline.diagnose.levels.problem import NoiseFloor, hit_misfits, residuals
-from ema_pipeline.diagnose.levels.search import Growing, again, fit_base, fit_effect, fit_linear, own_floor
+from ema_pipeline.diagnose.levels.rungs import climb
+from ema_pipeline.diagnose.levels.search import again, own_floor
+from ema_pipeline.diagnose.levels.views import holds, views
 from ema_pipeline.diagnose.progress import Progress
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung, TimeTrace
-from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
 
-PARTS = (1.0, 0.4, 0.16)
-"""Shares of the windows that are tried one after the other, until a model holds."""
-
 _HELD_OUT_STEPS = 3
-_FOLLOWED_STEPS = 15
 _TRACE_SENSORS = 1
 
 
@@ -43,17 +39,12 @@ class LevelErrors:
     heldout_misfit: NDArray[np.float64]
 
 
-def error_of(case: LevelCase, model: Simulated) -> float:
-    """Root-mean-square of data and nominal values, in standard uncertainties."""
-    prior = float(np.sum(case.problem(model.hypothesis, model.sizes).space.has_prior))
-    return float(np.sqrt(model.fit.objective / (case.data + prior)))
-
-
 def level_errors(case: LevelCase, model: Simulated, floor: NoiseFloor, hold_out: bool = True) -> LevelErrors:
     """Errors and misfits of a model at its optimum.
 
     A level's held-out error is that of the prediction by a fit to the other levels: what it adds to their sum of
-    squares, an error common to all levels being known from these as far as it can be.
+    squares, an error common to all levels being known from these as far as it can be. It is infinite where that fit
+    has no motion at the level left out.
     """
     misfit = _level_misfits(case, model)
     held = np.full(misfit.size, np.nan)
@@ -61,8 +52,11 @@ def level_errors(case: LevelCase, model: Simulated, floor: NoiseFloor, hold_out:
     for level in case.levels if hold_out and len(case.levels) > 1 else ():
         part = case.without_level(level)
         fitted = again(part, model, floor, _HELD_OUT_STEPS)
-        held[level] = _level_misfits(case, fitted)[level]
-        squares += max(_squares(case, fitted, floor) - _squares(part, fitted, floor), 0.0)
+        try:
+            held[level] = _level_misfits(case, fitted)[level]
+            squares += max(_squares(case, fitted, floor) - _squares(part, fitted, floor), 0.0)
+        except EmaError:
+            squares = np.inf
         data += case.data - part.data
     out = float(np.sqrt(squares / data)) if data else float("nan")
     return LevelErrors(error_of(case, model), out, misfit, held)
@@ -90,12 +84,14 @@ def sizes_of(
 ) -> dict[str, EffectSize]:
     """Fitted parameters with their uncertainties.
 
-    What even this model misses is no noise that averages out over hits and lines: the size of an effect is known no
-    better than to that share.
+    What even this model misses, or cannot foretell, is no noise that averages out over hits and lines: the size of an
+    effect is known no better than to that share.
     """
     units = {n: p.unit for n, p in case.problem(model.hypothesis, model.sizes).rig.parameters.items()}
     chosen = model.values if names is None else names
-    missed = {n: floor.own * abs(model.values[n]) for n in model.sizes}
+    unsure = np.concatenate([w.unsure for w in case.windows])
+    share = float(np.hypot(floor.own, np.sqrt(np.mean(unsure**2))))
+    missed = {n: share * abs(model.values[n]) for n in model.sizes}
     return {
         n: EffectSize(float(model.values[n]), float(np.hypot(model.std[n], missed.get(n, 0.0))), units[n])
         for n in chosen
@@ -120,25 +116,6 @@ def make_rung(
     )
 
 
-def climb(case: LevelCase, effects: Sequence[str], floor: NoiseFloor, tell: Progress) -> list[Simulated]:
-    """Fits of the base model and of every rung above it, at one floor of the noise."""
-    models = [fit_base(case, Hypothesis(), floor, {})]
-    for i, label in enumerate(effects):
-        tell(i / len(effects), f"fitting {label}")
-        hypothesis = models[-1].hypothesis.plus(label)
-        windows = Growing(case, floor, models[-1])
-        if not depends_on_level(label, case.library):
-            found = fit_linear(windows, hypothesis, models[-1])
-            if found is None:
-                raise EmaError(
-                    f"'{label}' has no time response, so hits cannot be simulated with it: take it out"
-                )
-        else:
-            found = fit_effect(windows, hypothesis, models[-1])
-        models.append(again(case, found, floor, _FOLLOWED_STEPS))
-    return models
-
-
 def assemble(
     case: LevelCase, models: Sequence[Simulated], floor: NoiseFloor, note: str, tell: Progress
 ) -> Ladder:
@@ -157,28 +134,30 @@ def assemble(
         hit_noise=floor.own,
         traces=time_traces(case, models[0], models[-1]),
         compared_s=max(float(w.time_s[-1]) for w in case.windows) if case.share < 1 else float("nan"),
+        left_out=case.left_out,
     )
 
 
 def make_level_ladder(case: LevelCase, effects: Sequence[str], tell: Progress) -> Ladder:
     """The ladder that adds `effects` one after the other, all at the noise level that the best rung leaves.
 
-    Of the longest part of the windows in which a rung follows the motion, or in which at least the last one's error is
-    within the limit; of all of them where there is none.
+    Of the first of the `views` in which a rung follows the motion, or in which at least the last one's error is within
+    the limit; of all hits where there is none.
     """
-    tried = []
-    for part in map(case.beginning, PARTS):
-        models = climb(part, effects, case.floor, lambda share, text: tell(0.5 * share, text))
-        floor = own_floor(part, min(models, key=lambda m: m.evidence))
+    tried: list[tuple[LevelCase, list[Simulated], NoiseFloor]] = []
+    for view in views(case, lambda: tried[0][1][-1]):
+        models = climb(view, effects, case.floor, lambda share, text: tell(0.5 * share, text))
+        floor = own_floor(view, min(models, key=lambda m: m.evidence))
         tell(0.5, "noise level")
-        tried.append((part, [again(part, m, floor) for m in models], floor))
-        if floor.own < case.settings.levels.noise_most:
+        tried.append((view, [again(view, m, floor) for m in models], floor))
+        followed = floor.own < case.settings.levels.noise_most
+        if followed and (not view.left_out or holds(case, view, tried[-1][1][-1], floor)):
             break
     else:
-        within = [t for t in tried if error_of(t[0], t[1][-1]) <= case.settings.error_limit]
-        tried = (within or tried)[:1]
-    part, final, floor = tried[-1]
-    return assemble(part, final, floor, "", lambda share, text: tell(0.6 + 0.4 * share, text))
+        within = [t for t in tried if holds(case, t[0], t[1][-1], t[2])]
+        tried.append((within or tried)[0])
+    view, final, floor = tried[-1]
+    return assemble(view, final, floor, "", lambda share, text: tell(0.6 + 0.4 * share, text))
 
 
 def time_traces(case: LevelCase, before: Simulated, after: Simulated) -> tuple[TimeTrace, ...]:
