@@ -212,8 +212,8 @@ def _verdict(
     if not nonlinear and _mending(case, climbed, members):
         best = label_text(members[0].hypothesis.labels[-1]).capitalize()
         return "unknown_effect", (
-            f"The answer depends on the force level. {best} fits best, but is not confirmed: its size may be nothing, or "
-            "the levels left out of the fit are not predicted better with it."
+            f"The answer depends on the force level. {best} fits best, but is not confirmed: its size may be nothing, "
+            "or the levels left out of the fit are not predicted better with it."
         )
     if not nonlinear:
         return "unknown_effect", (
