@@ -168,9 +168,8 @@ def time_traces(case: LevelCase, before: Simulated, after: Simulated) -> tuple[T
         size = np.sqrt(np.mean(measured**2, axis=2))
         gain = np.mean((measured - first) ** 2 - (measured - last) ** 2, axis=2) / np.maximum(size, 1e-12)
         gain = np.where(w.present, gain, -np.inf)
-        hardest = np.flatnonzero(w.level == w.level.max())
-        hit, sensor = np.unravel_index(np.argmax(gain[hardest]), gain[hardest].shape)
-        point = str(w.impacts[hardest[hit]])
+        hit, sensor = np.unravel_index(np.argmax(gain), gain.shape)
+        point = str(w.impacts[hit])
         for level in sorted(set(w.level)):
             at = [i for i in range(len(w.names)) if w.level[i] == level and str(w.impacts[i]) == point]
             if not at or not w.present[at[0], sensor]:
