@@ -79,7 +79,13 @@ def first_ranking(case: Case, tell: Progress) -> tuple[Ranking, NoiseLevel]:
     return ranking, level
 
 
-def climb(case: Case, witness: Witness, thresholds: Mapping[str, float] | None, tell: Progress) -> Climb:
+def climb(
+    case: Case,
+    witness: Witness,
+    thresholds: Mapping[str, float] | None,
+    tell: Progress,
+    first_only: bool = False,
+) -> Climb:
     """Add what is claimed, one effect after the other.
 
     Parameters
@@ -89,6 +95,8 @@ def climb(case: Case, witness: Witness, thresholds: Mapping[str, float] | None, 
         What its FRFs contradict is not added.
     thresholds : mapping of family to gain, optional
     tell : callable
+    first_only : bool
+        Nothing is ranked on top of the first effect.
     """
     settings = case.settings
     ranking, level = first_ranking(case, part(tell, 0.0, 0.8))
@@ -104,14 +112,17 @@ def climb(case: Case, witness: Witness, thresholds: Mapping[str, float] | None, 
                 f"{claim.hypothesis.labels[-1]} or others like it may be missing too: too small to tell which"
             )
             break
-        models.append(claim)
-        told = part(tell, 0.8, 1.0)
-        told(0.0, f"on top of {claim.hypothesis.label}")
         if len(models) > settings.most_rungs:
             note = f"stopped after {settings.most_rungs} effects"
-            rankings.append(rank(case, claim, (), fit, told))
+            break
+        models.append(claim)
+        if first_only:
+            note = "stopped after the first effect"
+            rankings.append(Ranking(claim, (), {NOTHING: 1.0}))
             break
         rest = single_hypotheses(case.rig, list(case.measured), case.library, claim.hypothesis)
+        told = part(tell, 0.8, 1.0)
+        told(0.0, f"on top of {claim.hypothesis.label}")
         rankings.append(rank(case, claim, rest, fit, told))
         models[-1] = rankings[-1].base
     return Climb(models, rankings, level, note, refuted)

@@ -47,6 +47,7 @@ def diagnose(
     warnings: Sequence[str] = (),
     thresholds: Mapping[str, float] | None = None,
     frfs: Mapping[str, FrfSet] | None = None,
+    first_only: bool = False,
 ) -> Diagnosis:
     """Find the physics that a rig's model is missing.
 
@@ -66,6 +67,8 @@ def diagnose(
         Calibrated thresholds in place of the shipped ones, see `diagnose.thresholds` and `diagnose.bootstrap`.
     frfs : mapping of configuration to FrfSet, optional
         The FRFs that the modes were read from: a second witness, see `diagnose.witness`.
+    first_only : bool
+        Whether to stop at the first effect, where other data tell what else is missing.
 
     Returns
     -------
@@ -90,7 +93,7 @@ def diagnose(
     case = Case(rig, screening.measured, settings, library)
     witness = Witness(case, frf_lines(frfs or {}, screening.measured))
     with single_blas_thread():
-        found = _diagnose(case, screening, witness, thresholds, tell)
+        found = _diagnose(case, screening, witness, thresholds, tell, first_only)
     return replace(found, notes=(*found.notes, *warnings))
 
 
@@ -100,8 +103,9 @@ def _diagnose(
     witness: Witness,
     thresholds: Mapping[str, float] | None,
     tell: Progress,
+    first_only: bool,
 ) -> Diagnosis:
-    climbed = climb(case, witness, thresholds, part(tell, 0.0, 0.85))
+    climbed = climb(case, witness, thresholds, part(tell, 0.0, 0.85), first_only)
     first, top = climbed.rankings[0], climbed.top
     fit = climbed.level.applied(case.settings.fit)
     ladder = assemble_ladder(

@@ -57,7 +57,7 @@ def compared_text(ladder: Ladder) -> str:
         return (
             f"{len(ladder.left_out)} {'hits are' if len(ladder.left_out) > 1 else 'hit is'} left out "
             f"({', '.join(names)}): the motion hangs on the last thousandth of the force, as where parts strike again "
-            "and again, and no model can foretell it."
+            "and again, and cannot be foretold."
         )
     if np.isfinite(ladder.compared_s):
         return (

@@ -134,13 +134,12 @@ def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnos
     from ema_pipeline.diagnose.levels.prepare import soft_and_hard
 
     settings = cast(DiagnoseSettings, run.settings[NAME])
-    # what one level asks for besides may come of the force: the hits of all levels tell
-    once = settings.model_copy(update={"most_rungs": 1})
     linear = linear_part(run)
     found: list[Diagnosis] = []
     for i, modes in enumerate(soft_and_hard(tests)):
         tell = part(progress, 0.15 * i, 0.15 * (i + 1))
-        found.append(diagnose(linear, modes, once, run.library, tell))
+        # what one level asks for besides may come of the force: the hits of all levels tell
+        found.append(diagnose(linear, modes, settings, run.library, tell, first_only=True))
         if found[-1].verdict in ("adequate", "not_enough_data"):
             break
     best = min(found, key=lambda d: (_TRUSTED.index(d.verdict), d.ladder.rungs[-1].error))

@@ -40,9 +40,9 @@ class Climbed:
     floor: NoiseFloor
     note: str
 
-    def holds(self, case: LevelCase) -> bool:
-        """True where the last model explains all hits of a case that it can foretell."""
-        return holds(case, self.case, self.models[-1], self.floor)
+    def holds(self, whole: LevelCase) -> bool:
+        """True where the last model explains all hits of the whole case that it can foretell."""
+        return holds(whole, self.case, self.models[-1], self.floor)
 
 
 def started(case: LevelCase, effects: tuple[str, ...], tell: Progress) -> list[Simulated]:
@@ -122,11 +122,20 @@ class _Climb:
             if finer.own < _FINER * self.floor.own:
                 self.floor = finer
                 rankings[:] = [at_floor(case, r, self.floor, tell) for r in rankings]
-        while len(rankings) > 1 and not _determined(case, rankings[-1].base):
-            rankings.pop()  # what looked like a size at a higher floor of the noise
-            note = "no further effect is supported by the data"
+        self._without_undetermined()
         models = [*(again(case, m, self.floor) for m in self.start[:-1]), *(r.base for r in rankings)]
         return Climbed(case, models, list(rankings), self.floor, note)
+
+    def _without_undetermined(self) -> None:
+        """Take back what looked like a size at a higher floor of the noise, and lower the floor no further than it
+        was."""
+        kept = len(self.rankings)
+        while kept > 1 and not _determined(self.case, self.rankings[kept - 1].base):
+            kept -= 1
+        if kept < len(self.rankings):
+            del self.rankings[kept:]
+            self.floor = own_floor(self.case, _best(self.rankings[-1]))
+            self.rankings[:] = [at_floor(self.case, r, self.floor, self.tell) for r in self.rankings]
 
     def _as_good_as_it_gets(self) -> bool:
         """True for a model within the limit that has an effect after which motion is lost."""

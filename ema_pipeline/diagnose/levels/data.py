@@ -62,7 +62,7 @@ class HitWindows:
     modes : int
         Measured modes in the band.
     unsure : ndarray, (n_hits,)
-        Share of each hit's motion that no model foretells, see `diagnose.levels.views`.
+        Share of each hit's motion that the model which chose the hits does not foretell, see `diagnose.levels.views`.
     """
 
     configuration: str

@@ -209,7 +209,7 @@ def _verdict(
             f"The answer depends on the force level, and these explain it alike: "
             f"{words.names([m.hypothesis.labels[-1] for m in members])}."
         )
-    if not nonlinear and _mending(case, climbed, members):
+    if not (nonlinear or added) and _mending(case, climbed, members):
         best = label_text(members[0].hypothesis.labels[-1]).capitalize()
         return "unknown_effect", (
             f"The answer depends on the force level. {best} fits best, but is not confirmed: its size may be nothing, "
@@ -233,12 +233,13 @@ def _verdict(
         f"{label_text(label)} ({size_text(_own_sizes(case, last, climbed.floor, label))})" for label in added
     ]
     rungs = ladder.rungs[-len(added) - 1], ladder.rungs[-1]
-    both = [np.where(np.isfinite(r.heldout_misfit), r.heldout_misfit, r.misfit) for r in rungs]
-    k = int(np.nanargmax(both[0] - both[1]))
-    held = [float(b[k]) for b in both]
+    known = np.all(np.isfinite([r.heldout_misfit for r in rungs]), axis=0)
+    before, after = (np.where(known, r.heldout_misfit, r.misfit) for r in rungs)
+    k = int(np.nanargmax(np.where(known | ~known.any(), before - after, np.nan)))
+    left_out = ", that level being left out of the fit" if known[k] else ""
     return "effect", (
-        f"Missing: {' and '.join(texts)}. Simulated hits miss {100 * held[0]:.2g} % of the signals at "
-        f"{ladder.force_n[k]:.3g} N without it and {100 * held[1]:.2g} % with it, that level being left out of the fit."
+        f"Missing: {' and '.join(texts)}. Simulated hits miss {100 * before[k]:.2g} % of the signals at "
+        f"{ladder.force_n[k]:.3g} N without it and {100 * after[k]:.2g} % with it{left_out}."
     )
 
 
@@ -294,16 +295,16 @@ def _next(case: LevelCase, members: Sequence[Simulated], floor: NoiseFloor) -> s
         for m in (one, two)
         for p in [harder.problem(m.hypothesis, m.sizes)]
     )
-    best, where = 0.0, ""
+    best, where, force = 0.0, "", 0.0
     for w, a, b, weight in zip(harder.windows, first, second, harder.weights(floor), strict=True):
         r = replace(weight, measured=b[0]).applied(a)[0]
         z = np.sqrt(np.sum(np.abs(r) ** 2, axis=(1, 2))) / _HARDER
         if z.max() > best:
             best, where = float(z.max()), f"{w.impacts[int(np.argmax(z))]} ({w.configuration})"
+            force = _HARDER * float(w.force_n[w.level.max()])
     pair = " from ".join(label_text(m.hypothesis.labels[-1]) for m in members[:2])
     if best < 1:
         return (
             f"Blows of {_HARDER:g} times the force would not tell {pair} either; put sensors on both places."
         )
-    force = _HARDER * float(case.windows[0].force_n[-1])
     return f"Blows of {force:.0f} N on {where} would tell {pair}: expected difference {best:.1f} σ."

@@ -12,7 +12,7 @@ from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, error_of
 from ema_pipeline.diagnose.levels.problem import NoiseFloor, hit_misfits, residuals
 from ema_pipeline.diagnose.levels.rungs import climb
 from ema_pipeline.diagnose.levels.search import again, own_floor
-from ema_pipeline.diagnose.levels.views import holds, views
+from ema_pipeline.diagnose.levels.views import holds, unforeseen, views
 from ema_pipeline.diagnose.progress import Progress
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung, TimeTrace
 from ema_pipeline.errors import EmaError
@@ -89,8 +89,7 @@ def sizes_of(
     """
     units = {n: p.unit for n, p in case.problem(model.hypothesis, model.sizes).rig.parameters.items()}
     chosen = model.values if names is None else names
-    unsure = np.concatenate([w.unsure for w in case.windows])
-    share = float(np.hypot(floor.own, np.sqrt(np.mean(unsure**2))))
+    share = float(np.hypot(floor.own, unforeseen(case, model)))
     missed = {n: share * abs(model.values[n]) for n in model.sizes}
     return {
         n: EffectSize(float(model.values[n]), float(np.hypot(model.std[n], missed.get(n, 0.0))), units[n])
@@ -161,7 +160,7 @@ def make_level_ladder(case: LevelCase, effects: Sequence[str], tell: Progress) -
 
 
 def time_traces(case: LevelCase, before: Simulated, after: Simulated) -> tuple[TimeTrace, ...]:
-    """One signal per level: of the hit and sensor where the two models differ most."""
+    """One signal per level: of the hit and sensor where the second model improves most."""
     found: list[TimeTrace] = []
     for w, one, two in zip(case.windows, _signals(case, before), _signals(case, after), strict=True):
         measured, first, last = w.in_band(w.measured), w.in_band(one), w.in_band(two)

@@ -199,7 +199,7 @@ def residuals(
         Where the motion of a model has no solution.
     """
     r = weighted(weights, problem.lines(points))
-    if not np.all(np.isfinite(r[:, 0])):
+    if not np.all(np.isfinite(np.sum(r, axis=1))):
         raise EmaError("the motion of a model grows without bound: check the values of its effects")
     return r
 

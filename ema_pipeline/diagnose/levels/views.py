@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.levels.case import LevelCase, Simulated, error_of
-from ema_pipeline.diagnose.levels.problem import NoiseFloor, TimeProblem
+from ema_pipeline.diagnose.levels.problem import NoiseFloor, TimeProblem, objectives
 from ema_pipeline.diagnose.levels.rungs import climb
 from ema_pipeline.diagnose.levels.search import Growing, again, fit_effect
 from ema_pipeline.effects.library import depends_on_level
@@ -38,19 +38,22 @@ def views(case: LevelCase, best: Callable[[], Simulated]) -> Iterator[LevelCase]
     ----------
     case : LevelCase
     best : callable
-        The model that fits all hits best, asked for where they were not enough.
+        The model that chooses the hits, asked for where all were not enough.
     """
     yield case
-    if (some := foreseeable(case, best())) is not None:
+    if (some := settled_view(case, best())) is not None:
         yield some
     yield from map(case.beginning, _PARTS)
 
 
-def foreseeable(case: LevelCase, model: Simulated) -> LevelCase | None:
-    """The hits that a model foretells once it is fitted to them alone; None where none or too many are left out."""
+def settled_view(case: LevelCase, model: Simulated) -> LevelCase | None:
+    """The hits that a model foretells once it is fitted to them alone; None where none or too many are left out.
+
+    The choice after `_ROUNDS` fits stands where it has not settled: `holds` tells whether it may.
+    """
     kept: LevelCase | None = None
     for _ in range(_ROUNDS):
-        view = foretold(case, model)
+        view = foretold_hits(case, model)
         if view is None or (kept is not None and view.left_out == kept.left_out):
             return view
         if not view.left_out:
@@ -59,10 +62,11 @@ def foreseeable(case: LevelCase, model: Simulated) -> LevelCase | None:
     return kept
 
 
-def foretold(case: LevelCase, model: Simulated) -> LevelCase | None:
+def foretold_hits(case: LevelCase, model: Simulated) -> LevelCase | None:
     """The hits whose motion a model foretells, with what is `unsure` in each; None where these are too few.
 
-    Where parts strike again and again, a thousandth of the force decides what comes next.
+    Enough are `_ENOUGH` of all, one in every configuration and two levels. Where parts strike again and again, a
+    thousandth of the force decides what comes next.
     """
     try:
         unsure = sensitivity(case, model)
@@ -83,18 +87,23 @@ def holds(case: LevelCase, view: LevelCase, model: Simulated, floor: NoiseFloor)
     Hits may be left out only by the model that says why they cannot be foretold.
     """
     limit = case.settings.error_limit
-    if error_of(view, model) > limit:
+    if not error_of(view, model) <= limit:
         return False
     if not view.left_out:
         return True
-    all_foretold = foretold(case, model)
-    return all_foretold is not None and error_of(all_foretold, again(all_foretold, model, floor, 0)) <= limit
+    every = foretold_hits(case, model)
+    if every is None:
+        return False
+    problem = every.problem(model.hypothesis, model.sizes)
+    objective = objectives(problem, every.weights(floor), problem.space.point(model.values)[None])[0]
+    return error_of(every, replace(model, fit=replace(model.fit, objective=float(objective)))) <= limit
 
 
 def sensitivity(case: LevelCase, model: Simulated) -> list[NDArray[np.float64]]:
     """Share by which the motion after each hit changes where the force, or the step of the integration, hardly does.
 
-    That is, beyond proportion where the force is `_NUDGE` larger, and where the step is half as long.
+    That is, beyond proportion where the force is `_NUDGE` larger, and where the step is half as long: the root of the
+    sum of both squares.
 
     Returns
     -------
@@ -114,10 +123,22 @@ def sensitivity(case: LevelCase, model: Simulated) -> list[NDArray[np.float64]]:
     )
     found = []
     for w, one, more, fine in zip(case.windows, plain, nudged, finer, strict=True):
-        before = w.in_band(one[0])
-        moved = (w.in_band(more[0]) / (1 + _NUDGE) - before) ** 2 + (w.in_band(fine[0]) - before) ** 2
+        before = w.in_band(one[0]) * w.present[..., None]
+        apart = (w.in_band(more[0]) / (1 + _NUDGE), w.in_band(fine[0]))
+        moved = sum((x * w.present[..., None] - before) ** 2 for x in apart)
         found.append(np.sqrt(np.sum(moved, axis=(1, 2)) / np.sum(before**2, axis=(1, 2))))
     return found
+
+
+def unforeseen(case: LevelCase, model: Simulated) -> float:
+    """Share of the motion that a model does not foretell, over all hits; none counts for more than `_MOVED`."""
+    if not any(depends_on_level(x, case.library) for x in model.hypothesis.labels):
+        return 0.0
+    try:
+        shares = np.concatenate(sensitivity(case, model))
+    except EmaError:  # on the edge of what has a solution
+        return _MOVED
+    return float(np.sqrt(np.mean(np.minimum(shares, _MOVED) ** 2)))
 
 
 def _fitted_to(view: LevelCase, model: Simulated) -> Simulated:
