@@ -54,6 +54,7 @@ def rig_with_effects(
             build=partial(_build, rig, tuple(placed)),
             uses=partial(_uses, rig, tuple(placed)),
             classifier=rig.classify,
+            modal_damping_scatter=rig.modal_damping_scatter,
         )
     if isinstance(current, ParametricRig):
         return current
@@ -64,6 +65,7 @@ def rig_with_effects(
         partial(_build, rig, ()),
         partial(_uses, rig, ()),
         rig.classify,
+        rig.modal_damping_scatter,
     )
 
 

@@ -36,11 +36,16 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Mass:
-    """Kinetic energy ½·value·(row·ẋ)²; kg, or I/r² for a coordinate u = r·θ."""
+    """Kinetic energy ½·value·(row·ẋ)²; kg, or I/r² for a coordinate u = r·θ.
+
+    Elements of one `part` are one piece of hardware and deviate from the drawing together; an element without one
+    is a part of its own.
+    """
 
     name: str
     row: Row
     value: float
+    part: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,7 @@ class Damper:
     name: str
     row: Row
     coefficient: float
+    part: str = ""
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ class Spring:
     row: Row
     stiffness: float
     loss_factor: float = 0.0
+    part: str = ""
 
 
 class Nonlinear:

@@ -13,7 +13,7 @@ from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.modes import complex_modes, damping_ratios, normal_modes
 from ema_pipeline.mechanics.system import LinearSystem
-from ema_pipeline.rigs.types import ModelMode, Parameter, Rig
+from ema_pipeline.rigs.types import MODAL_DAMPING_SCATTER, ModelMode, Parameter, Rig
 
 Build = Callable[[str, Mapping[str, float]], Assembly]
 Families = tuple[tuple[str, ...], NDArray[np.float64]]
@@ -53,6 +53,8 @@ class ParametricRig:
         ``uses(configuration, parameter name) -> bool``.
     classifier : callable
         See `Rig.classify`.
+    modal_damping_scatter : float
+        Standard deviation (1 σ) of ln ζ from mode to mode.
     """
 
     name: str
@@ -61,6 +63,7 @@ class ParametricRig:
     build: Build
     uses: Callable[[str, str], bool] = uses_everything
     classifier: Classify = classify_plain
+    modal_damping_scatter: float = MODAL_DAMPING_SCATTER
 
     def used(self, configuration: str) -> tuple[str, ...]:
         """Names of the parameters that this configuration depends on."""

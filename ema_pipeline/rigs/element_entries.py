@@ -8,6 +8,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator
 
 from ema_pipeline.rigs.entries import ParameterEntry
+from ema_pipeline.rigs.types import MODAL_DAMPING_SCATTER
 from ema_pipeline.settings import Settings
 from ema_pipeline.toml_lines import Location
 
@@ -126,6 +127,9 @@ class ElementRigFile(Settings):
     configurations: tuple[str, ...] = Field(("default",), min_length=1, description="configurations")
     modal_damping_ratio: float = Field(
         0.01, ge=0, lt=1, description="damping ratio of every mode, 30 % tolerance"
+    )
+    modal_damping_scatter: float = Field(
+        MODAL_DAMPING_SCATTER, ge=0, le=3, description="1 sigma of ln(damping ratio) from mode to mode"
     )
     parameters: dict[str, ParameterEntry] = Field({}, description="values with unit and tolerance")
     masses: tuple[ElementEntry, ...] = Field(min_length=1, description="masses, kg")

@@ -65,6 +65,7 @@ def rig_from_elements(file: ElementRigFile) -> Rig:
         parameters=parameters,
         build=partial(_build, file),
         uses=partial(_uses, file),
+        modal_damping_scatter=file.modal_damping_scatter,
     )
     for configuration in file.configurations:
         try:

@@ -34,6 +34,9 @@ class ParameterEntry(Settings):
     tolerance: float | None = Field(
         None, ge=0, description="relative standard deviation of the nominal value"
     )
+    scatter: float | None = Field(
+        None, ge=0, le=1, description="relative standard deviation of single parts about the common value"
+    )
     min: float | None = Field(None, description="lower bound")
     max: float | None = Field(None, description="upper bound")
     free: bool | None = Field(None, description="true where the data alone must determine the parameter")
@@ -96,6 +99,7 @@ def merged(default: Parameter, given: ParameterEntry) -> Parameter:
         minimum=default.minimum if given.min is None else given.min,
         maximum=default.maximum if given.max is None else given.max,
         free=free,
+        scatter=default.scatter if given.scatter is None else given.scatter,
     )
     if result.minimum > result.maximum:
         raise Mistake(

@@ -30,6 +30,9 @@ class DerivedRigFile(Settings):
     )
     geometry: dict[str, int] = Field({}, description="counts, e.g. planets = 3")
     parameters: dict[str, ParameterEntry] = Field({}, description="values that differ from the base")
+    modal_damping_scatter: float | None = Field(
+        None, ge=0, le=3, description="1 sigma of ln(damping ratio) from mode to mode"
+    )
 
     @field_validator("parameters", mode="before")
     @classmethod
@@ -124,6 +127,8 @@ def _derived(file: DerivedRigFile, kinds: Mapping[str, RigKind]) -> Rig:
             raise Mistake(("parameters", name), f"unknown key 'parameters.{name}'{hint}")
         changed[name] = merged(default, entry)
     rig = kind.make(geometry, changed)
-    if file.name and dataclasses.is_dataclass(rig) and not isinstance(rig, type):
-        return dataclasses.replace(rig, name=file.name)
+    stated: dict[str, Any] = {"name": file.name, "modal_damping_scatter": file.modal_damping_scatter}
+    stated = {key: value for key, value in stated.items() if value is not None}
+    if stated and dataclasses.is_dataclass(rig) and not isinstance(rig, type):
+        return dataclasses.replace(rig, **stated)
     return rig

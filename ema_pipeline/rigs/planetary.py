@@ -174,7 +174,8 @@ def _build(planets: int, configuration: str, values: Mapping[str, float]) -> Ass
             ("u", values[f"{body}_inertia"], torsional, values.get(f"{body}_torsional_damping", 0.0)),
         ):
             row = {f"{body}.{axis}": 1.0}
-            elements.append(Mass(f"{body} mass {axis}", row, mass))
+            part = f"{body} inertia" if axis == "u" else f"{body} mass"
+            elements.append(Mass(f"{body} mass {axis}", row, mass, part))
             elements.append(Spring(f"{body} bearing {axis}", row, k))
             if c:
                 elements.append(Damper(f"{body} bearing {axis} damper", row, c))
@@ -187,7 +188,7 @@ def _build(planets: int, configuration: str, values: Mapping[str, float]) -> Ass
             return values.get(f"planet{n}_{quantity}", values.get(f"planet_{quantity}", 0.0))
 
         for axis, quantity in (("zeta", "mass"), ("eta", "mass"), ("u", "inertia")):
-            elements.append(Mass(f"{p} mass {axis}", {f"{p}.{axis}": 1.0}, own(quantity)))
+            elements.append(Mass(f"{p} mass {axis}", {f"{p}.{axis}": 1.0}, own(quantity), f"{p} {quantity}"))
         for axis, stretch in planet_bearing_rows(n, psi).items():
             elements.append(Spring(f"{p} bearing {axis}", stretch, own("bearing_stiffness")))
             if own("bearing_damping"):

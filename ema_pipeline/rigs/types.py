@@ -13,6 +13,9 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.system import LinearSystem
 
+MODAL_DAMPING_SCATTER = 0.3
+"""1 σ of ln ζ from mode to mode where a rig states none: joints damp modes without a law."""
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -32,6 +35,9 @@ class Parameter:
     free : bool
         True where the nominal value is only a start and the data must determine the parameter
         (no prior but the bounds).
+    scatter : float or None
+        Relative standard deviation (1 σ) of single parts about the value that all like parts share; 0 where they
+        are identical, None where nothing is stated.
     """
 
     name: str
@@ -41,6 +47,7 @@ class Parameter:
     minimum: float = 0.0
     maximum: float = float("inf")
     free: bool = False
+    scatter: float | None = None
 
 
 @dataclass(frozen=True)
@@ -80,6 +87,11 @@ class Rig(Protocol):
 
     @property
     def parameters(self) -> Mapping[str, Parameter]: ...
+
+    @property
+    def modal_damping_scatter(self) -> float:
+        """Standard deviation (1 σ) of ln ζ from mode to mode."""
+        ...
 
     def used(self, configuration: str) -> tuple[str, ...]:
         """Names of the parameters that this configuration depends on."""

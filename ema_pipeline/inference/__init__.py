@@ -1,0 +1,23 @@
+"""One posterior: unknowns with Gaussian priors, maximum a posteriori, Laplace evidence, learned scatter.
+
+Knows no rig, no mode and no effect. A problem hands over its unknowns and its residuals with their derivatives;
+everything else that a user sees is read from the `Posterior`.
+"""
+
+from ema_pipeline.inference.maximise import anneal, descend
+from ema_pipeline.inference.posterior import Posterior
+from ema_pipeline.inference.problem import Problem, Residuals
+from ema_pipeline.inference.scatter import Scatter, learn
+from ema_pipeline.inference.unknowns import Unknowns, joined
+
+__all__ = [
+    "Posterior",
+    "Problem",
+    "Residuals",
+    "Scatter",
+    "Unknowns",
+    "anneal",
+    "descend",
+    "joined",
+    "learn",
+]

@@ -1,0 +1,150 @@
+"""Modes of given matrices, and their exact derivatives by the unknowns that the matrices depend on.
+
+References
+----------
+R. L. Fox, M. P. Kapoor, Rates of change of eigenvalues and eigenvectors, AIAA Journal 6 (1968) 2426-2429: the
+derivative of a shape is expanded over all shapes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from ema_pipeline.mechanics.terms import DAMPING_MATRIX, MASS, STIFFNESS, STRUCTURAL, Matrices
+
+_CLOSE = 1e-4
+"""Relative distance of eigenvalues below which the rotation of their shapes into each other is no longer linear."""
+_LEAST_DAMPING_RATIO = 1e-6
+
+
+@dataclass(frozen=True)
+class EigenSolution:
+    """Undamped modes with damping ratios from the diagonal of the modal damping matrix.
+
+    Attributes
+    ----------
+    eigenvalues : ndarray, (n,)
+        ω², (rad/s)², ascending; never negative.
+    shapes : ndarray, (n, n)
+        Mass-normalised columns.
+    frequency_hz, damping_ratio : ndarray, (n,)
+    """
+
+    eigenvalues: NDArray[np.float64]
+    shapes: NDArray[np.float64]
+    frequency_hz: NDArray[np.float64]
+    damping_ratio: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, dense: NDArray[np.float64], skew: NDArray[np.float64], damping_ratio: float
+    ) -> EigenSolution | None:
+        """Modes of M, C, K and structural matrix, (4, n, n); None where a trial mass is not positive."""
+        mass, damping, stiffness, structural = dense
+        if not np.all(np.isfinite(dense)):
+            return None
+        try:
+            values, shapes = scipy.linalg.eigh(stiffness, mass, check_finite=False)
+        except (np.linalg.LinAlgError, ValueError):
+            return None
+        values = np.maximum(values, 1.0)  # rigid bodies, and trial stiffnesses below zero: far under any band
+        omega = np.sqrt(values)
+        viscous = np.einsum("ir,ij,jr->r", shapes, damping, shapes)
+        loss = np.einsum("ir,ij,jr->r", shapes, structural, shapes)
+        ratio = damping_ratio + viscous / (2 * omega) + loss / (2 * values)
+        return cls(values, shapes, omega / (2 * np.pi), np.maximum(ratio, _LEAST_DAMPING_RATIO))
+
+
+@dataclass(frozen=True)
+class ModeDerivatives:
+    """Derivatives of some modes by the model's unknowns: logarithms, the damping ratio, then what is left.
+
+    Attributes
+    ----------
+    log_frequency : ndarray, (m, n)
+    damping_ratio : ndarray, (m, n)
+    shapes : ndarray, (n_dofs, m, n)
+    """
+
+    log_frequency: NDArray[np.float64]
+    damping_ratio: NDArray[np.float64]
+    shapes: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64], has_ratio: bool
+    ) -> ModeDerivatives:
+        """Derivatives of the modes with these indices.
+
+        Parameters
+        ----------
+        matrices : Matrices
+        solution : EigenSolution
+            Their modes.
+        modes : ndarray of int, (m,)
+        has_ratio : bool
+            True where the logarithm of the common damping ratio is an unknown.
+        """
+        stiffness, mass = (
+            _forms(matrices, solution, modes, STIFFNESS),
+            _forms(matrices, solution, modes, MASS),
+        )
+        values = solution.eigenvalues[modes]
+        apart = values[None, :] - solution.eigenvalues[:, None]
+        nearness = apart / (apart**2 + (_CLOSE * values[None, :]) ** 2)
+        weight = (stiffness - values * mass) * nearness
+        here = np.arange(len(modes))
+        own = stiffness[:, modes, here] - values * mass[:, modes, here]
+        weight[:, modes, here] = -0.5 * mass[:, modes, here]
+        log_frequency = own / (2 * values)
+        shapes = np.einsum("is,jsr->irj", solution.shapes, weight)
+        ratio = _damping(matrices, solution, modes, log_frequency, weight)
+        if has_ratio:
+            at = matrices.terms.log.shape[1]
+            log_frequency = np.insert(log_frequency, at, 0.0, axis=0)
+            ratio = np.insert(ratio, at, matrices.damping_ratio, axis=0)
+            shapes = np.insert(shapes, at, 0.0, axis=2)
+        return cls(log_frequency.T, ratio.T, shapes)
+
+
+def _forms(
+    matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64], kind: int
+) -> NDArray[np.float64]:
+    """φ_sᵀ(∂A/∂x_j)φ_r of one kind of matrix, (n_unknowns, n, m)."""
+    terms = matrices.terms
+    on = terms.matrix == kind
+    along = terms.rows[on] @ solution.shapes
+    weighted = matrices.coefficient[on, None] * along[:, modes]
+    products = along[:, :, None] * weighted[:, None, :]
+    by_log = np.tensordot(terms.log[on], products, axes=(0, 0))
+    phi = solution.shapes
+    by_shape = phi.T @ (matrices.by_shape[:, kind] @ phi[:, modes]) if len(matrices.by_shape) else by_log[:0]
+    return np.concatenate([by_log, by_shape])
+
+
+def _damping(
+    matrices: Matrices,
+    solution: EigenSolution,
+    modes: NDArray[np.int64],
+    log_frequency: NDArray[np.float64],
+    weight: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Derivatives of the damping ratios but for the common one, (n_unknowns, m)."""
+    values = solution.eigenvalues[modes]
+    total = np.zeros_like(log_frequency)
+    here = np.arange(len(modes))
+    phi = solution.shapes
+    for kind, size, power in ((DAMPING_MATRIX, np.sqrt(values), 1.0), (STRUCTURAL, values, 2.0)):
+        dense = matrices.dense[kind]
+        if not np.any(dense) and not np.any(matrices.by_shape[:, kind]):
+            continue
+        forms = phi.T @ dense @ phi[:, modes]
+        share = 0.5 * forms[modes, here] / size
+        moved = np.einsum("sr,jsr->jr", forms, weight) / size
+        changed = 0.5 * _forms(matrices, solution, modes, kind)[:, modes, here] / size
+        total += changed - power * share * log_frequency + moved
+    return total

@@ -1,0 +1,148 @@
+"""Matrices as sums of coefficient·v·vᵀ, each coefficient a power of unknowns, so that derivatives are exact."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.mechanics.assembly import (
+    Assembly,
+    Damper,
+    Element,
+    Gyroscopic,
+    Mass,
+    Nonlinear,
+    Row,
+    Spring,
+)
+
+MASS, DAMPING_MATRIX, STIFFNESS, STRUCTURAL = range(4)
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Matrices as sums of coefficient·v·vᵀ.
+
+    Attributes
+    ----------
+    dofs : tuple of str
+    rows : ndarray, (t, n)
+    coefficient : ndarray, (t,)
+    matrix : ndarray of int, (t,)
+        `MASS`, `DAMPING_MATRIX`, `STIFFNESS` or `STRUCTURAL`.
+    log : ndarray, (t, u)
+        Derivatives of ln coefficient by the unknown logarithms.
+    skew : ndarray, (n, n)
+        Skew part of the damping matrix.
+    """
+
+    dofs: tuple[str, ...]
+    rows: NDArray[np.float64]
+    coefficient: NDArray[np.float64]
+    matrix: NDArray[np.int64]
+    log: NDArray[np.float64]
+    skew: NDArray[np.float64]
+
+    def scaled(self, logs: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coefficients at these unknown logarithms, (t,)."""
+        return np.asarray(self.coefficient * np.exp(self.log @ logs))
+
+    def dense(self, coefficient: NDArray[np.float64]) -> NDArray[np.float64]:
+        """M, C without its skew part, K and the structural part, (4, n, n)."""
+        n = len(self.dofs)
+        result = np.zeros((4, n, n))
+        for k in range(4):
+            on = self.matrix == k
+            v = self.rows[on]
+            result[k] = (v * coefficient[on, None]).T @ v
+        return result
+
+
+@dataclass(frozen=True)
+class Matrices:
+    """One configuration's matrices and their derivatives at a point.
+
+    Attributes
+    ----------
+    terms : Terms
+    coefficient : ndarray, (t,)
+        Of the terms at this point.
+    dense : ndarray, (4, n, n)
+    skew : ndarray, (n, n)
+    damping_ratio : float
+        Of every mode, besides the matrices.
+    by_shape : ndarray, (k, 4, n, n)
+        Derivatives by effects' unknowns and geometric ones.
+    skew_by_shape : ndarray, (k, n, n)
+    """
+
+    terms: Terms
+    coefficient: NDArray[np.float64]
+    dense: NDArray[np.float64]
+    skew: NDArray[np.float64]
+    damping_ratio: float
+    by_shape: NDArray[np.float64]
+    skew_by_shape: NDArray[np.float64]
+
+
+def assemble_terms(
+    assembly: Assembly,
+    dependent: Mapping[Hashable, NDArray[np.float64]],
+    key: Callable[[Element], Hashable],
+) -> Terms:
+    """All elements as terms; nonlinear ones with their tangents.
+
+    Parameters
+    ----------
+    assembly : Assembly
+    dependent : dict to ndarray, (u,)
+        Derivatives of ln value by the unknown logarithms, by `key` of an element; elements without an entry are fixed.
+    key : callable
+        What identifies an element among `dependent`.
+    """
+    index = {d: i for i, d in enumerate(assembly.dofs)}
+    n = len(index)
+    count = len(next(iter(dependent.values()))) if dependent else 0
+    still = np.zeros(count)
+    rows, coefficient, matrix, log = [], [], [], []
+    skew = np.zeros((n, n))
+
+    def vector(row: Row) -> NDArray[np.float64]:
+        v = np.zeros(n)
+        for dof, value in row.items():
+            v[index[dof]] = value
+        return v
+
+    def add(kind: int, row: Row, value: float, of: NDArray[np.float64]) -> None:
+        if value != 0.0:
+            rows.append(vector(row))
+            coefficient.append(value)
+            matrix.append(kind)
+            log.append(of)
+
+    for e in assembly.elements:
+        of = dependent.get(key(e), still)
+        if isinstance(e, Mass):
+            add(MASS, e.row, e.value, of)
+        elif isinstance(e, Spring):
+            add(STIFFNESS, e.row, e.stiffness, of)
+            add(STRUCTURAL, e.row, e.stiffness * e.loss_factor, of)
+        elif isinstance(e, Damper):
+            add(DAMPING_MATRIX, e.row, e.coefficient, of)
+        elif isinstance(e, Gyroscopic):
+            a, b = vector(e.a), vector(e.b)
+            skew += e.coefficient * (np.outer(a, b) - np.outer(b, a))
+        elif isinstance(e, Nonlinear):
+            add(STIFFNESS, e.row, e.tangent_stiffness, still)
+            add(DAMPING_MATRIX, e.row, e.tangent_damping, still)
+    return Terms(
+        assembly.dofs,
+        np.array(rows).reshape(-1, n),
+        np.array(coefficient),
+        np.array(matrix, np.int64),
+        np.array(log).reshape(len(rows), count),
+        skew,
+    )

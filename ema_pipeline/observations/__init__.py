@@ -1,0 +1,1 @@
+"""What was measured, as residuals with their derivatives: one file per kind of observation."""

@@ -1,0 +1,47 @@
+"""What the diagnosis asks of a kind of observation: a problem for any list of effects, and parts to leave out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.effects.base import PlacedEffect
+from ema_pipeline.inference import Problem, Scatter
+from ema_pipeline.observations.rig_model import SizeMap
+
+
+class EffectProblem(Problem, Protocol):
+    """The data and one model: the rig with a list of effects."""
+
+    @property
+    def sizes(self) -> Mapping[str, SizeMap]:
+        """How the effects' sizes follow from their unknowns, by ``id@place.name``."""
+        ...
+
+    def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
+        """Nominal values with the effects at `sizes`, or at their start values, (n,)."""
+        ...
+
+    def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
+        """Values of the rig's parameters and of the effects' sizes."""
+        ...
+
+
+class Observations(Protocol):
+    """Measured data of one kind, compared with any model."""
+
+    @property
+    def scatters(self) -> Mapping[str, Scatter]:
+        """The hyper-parameters that these data depend on."""
+        ...
+
+    def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> EffectProblem:
+        """The problem of fitting the rig with `effects`, whose sizes have these prior 1 σ, to the data."""
+        ...
+
+    def folds(self) -> Sequence[tuple[Observations, Observations]]:
+        """Pairs of what is fitted and what is held out: a configuration, a hit point, a level or a share of the modes."""
+        ...

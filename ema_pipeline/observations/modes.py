@@ -1,0 +1,462 @@
+"""Measured modes as observations: frequencies, damping ratios and shapes of every configuration.
+
+Every sensor has its own calibration and reads a share of the motion across it; both are unknowns that all modes and
+configurations share. Shapes are compared up to a factor, which is projected out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.optimize
+from numpy.typing import NDArray
+
+from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.dof import Dof
+from ema_pipeline.effects.base import PlacedEffect
+from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
+from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
+from ema_pipeline.mechanics.terms import Matrices
+from ema_pipeline.observations.parts import PART_SCATTER, STIFFNESS_SCATTER, Dependence, dependence
+from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.rigs.types import Rig
+
+CALIBRATION = "calibration"
+DAMPING_SCATTER = "damping_scatter"
+FREQUENCY = "frequency_scatter"
+SHAPE = "shape_scatter"
+
+CALIBRATION_STD = 0.02
+TRANSVERSE_STD = 0.03
+
+UNEXPLAINED = 12.0
+"""Cost, in the log posterior, of a measured mode without a model mode."""
+UNSEEN = 3.0
+"""Cost of a model mode in the band that was not measured: it may lie on a node of every sensor or hit point."""
+
+_SHAPE_REACH = 0.3
+"""Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
+_FREQUENCY_REACH = 0.1
+"""Difference of ln f that costs a pair as much as shapes that have nothing in common."""
+_FREQUENCY_REACH_ALONE = 0.3
+_LEAVE = 0.3
+"""Cost above the best at which an assignment leaves a measured mode without a partner."""
+
+_ACROSS = {"x": "y", "y": "x", "zeta": "eta", "eta": "zeta"}
+
+
+@dataclass(frozen=True)
+class ChannelUncertainty:
+    """Relative 1 σ of a channel's sensitivity, and its transverse sensitivity."""
+
+    calibration: float = CALIBRATION_STD
+    transverse: float = TRANSVERSE_STD
+
+
+def scatters_of(rig: Rig) -> dict[str, Scatter]:
+    """The hyper-parameters of measured modes, with the defaults that the rig states."""
+    known = (
+        Scatter(PART_SCATTER, "parts", STIFFNESS_SCATTER, 0.7, 0.04),
+        Scatter(CALIBRATION, "calibration", CALIBRATION_STD, 0.7, 0.04),
+        Scatter(DAMPING_SCATTER, "ln ζ from mode to mode", rig.modal_damping_scatter, 0.5, 0.5),
+        Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3),
+        Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03),
+    )
+    return {s.name: s for s in known}
+
+
+@dataclass(frozen=True)
+class ModeData:
+    """One configuration's measured modes, prepared: real shapes with their largest entry 1.
+
+    Attributes
+    ----------
+    configuration : str
+    log_frequency, log_frequency_std : ndarray, (m,)
+    log_damping, log_damping_std : ndarray, (m,)
+        NaN where not measured.
+    shapes, shape_std : ndarray, (m, s)
+        NaN where not measured; s may be 0.
+    dofs : tuple of Dof
+    band_hz : tuple of float
+    """
+
+    configuration: str
+    log_frequency: NDArray[np.float64]
+    log_frequency_std: NDArray[np.float64]
+    log_damping: NDArray[np.float64]
+    log_damping_std: NDArray[np.float64]
+    shapes: NDArray[np.float64]
+    shape_std: NDArray[np.float64]
+    dofs: tuple[Dof, ...]
+    band_hz: tuple[float, float]
+
+    def __len__(self) -> int:
+        return len(self.log_frequency)
+
+    def only(self, keep: NDArray[np.bool_]) -> ModeData:
+        """The modes of a mask, (m,)."""
+        names = (
+            "log_frequency",
+            "log_frequency_std",
+            "log_damping",
+            "log_damping_std",
+            "shapes",
+            "shape_std",
+        )
+        return dataclasses.replace(self, **{n: getattr(self, n)[keep] for n in names})
+
+
+def prepare(measured: MeasuredModes) -> ModeData:
+    """Measured modes in the form that residuals need."""
+    m, f = len(measured), measured.frequency_hz
+    shapes = np.zeros((m, 0))
+    std = np.zeros((m, 0))
+    dofs: tuple[Dof, ...] = ()
+    if measured.shapes is not None and measured.dofs:
+        dofs = measured.dofs
+        shapes, std = np.zeros((m, len(dofs))), np.zeros((m, len(dofs)))
+        for r in range(m):
+            y = measured.shapes[r]
+            real = np.real(y * np.exp(-0.5j * np.angle(np.nansum(y**2))))
+            size = max(float(np.nanmax(np.abs(real), initial=0.0)), 1e-300)
+            shapes[r] = real / size
+            given = (
+                np.zeros(len(dofs)) if measured.shape_std is None else np.nan_to_num(measured.shape_std[r])
+            )
+            std[r] = given / size
+    with np.errstate(invalid="ignore", divide="ignore"):
+        relative = np.nan_to_num(measured.frequency_std_hz) / f
+        damping = np.where(measured.damping_ratio > 0, measured.damping_ratio, np.nan)
+        damping_std = np.nan_to_num(measured.damping_std) / damping
+    band = measured.band_hz or (0.9 * float(np.min(f, initial=1.0)), 1.1 * float(np.max(f, initial=1.0)))
+    return ModeData(
+        measured.configuration, np.log(f), relative, np.log(damping), damping_std, shapes, std, dofs, band
+    )
+
+
+class ModeObservations:
+    """Measured modes of a rig's configurations.
+
+    Parameters
+    ----------
+    rig : Rig
+        Without effects.
+    data : sequence of ModeData
+    channels : dict of str to ChannelUncertainty, optional
+        By DOF; the defaults where left out.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        data: Sequence[ModeData],
+        channels: Mapping[str, ChannelUncertainty] | None = None,
+        shared: Dependence | None = None,
+    ) -> None:
+        self.rig = rig
+        self.data = tuple(d for d in data if len(d))
+        self.channels = dict(channels or {})
+        self.shared = shared or dependence(rig)
+        self.scatters = scatters_of(rig)
+
+    def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> ModeProblem:
+        """See `Observations`."""
+        return ModeProblem(self, RigModel(self.rig, effects, scales, self.shared))
+
+    def with_data(self, data: Sequence[ModeData]) -> ModeObservations:
+        """The same rig and channels with other modes."""
+        return ModeObservations(self.rig, data, self.channels, self.shared)
+
+    def folds(self, count: int = 4) -> list[tuple[ModeObservations, ModeObservations]]:
+        """Every `count`-th mode held out in turn, over all configurations."""
+        total = sum(len(d) for d in self.data)
+        pairs = []
+        for k in range(min(count, total)):
+            kept, out, offset = [], [], 0
+            for d in self.data:
+                held = (np.arange(len(d)) + offset) % count == k
+                offset += len(d)
+                kept.append(d.only(~held))
+                out.append(d.only(held))
+            pairs.append((self.with_data(kept), self.with_data(out)))
+        return pairs
+
+    @cached_property
+    def sensors(self) -> tuple[str, ...]:
+        """DOFs at which shapes are given in any configuration."""
+        return tuple(dict.fromkeys(d.point for data in self.data for d in data.dofs))
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """What the sensors of one configuration read: rows of the motion along and across each, and their unknowns."""
+
+    along: NDArray[np.float64]
+    across: NDArray[np.float64]
+    gain: NDArray[np.int64]
+    transverse: NDArray[np.int64]
+
+
+class ModeProblem:
+    """Measured modes and the rig with a list of effects."""
+
+    def __init__(self, observations: ModeObservations, model: RigModel) -> None:
+        self.observations, self.model = observations, model
+        self.offset = len(model.unknowns)
+
+    @property
+    def sizes(self) -> Mapping[str, SizeMap]:
+        """See `EffectProblem`."""
+        return self.model.sizes
+
+    def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
+        """See `EffectProblem`."""
+        return np.concatenate([self.model.start(sizes), np.zeros(len(self.unknowns) - self.offset)])
+
+    def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
+        """See `EffectProblem`."""
+        return self.model.parameter_values(x[: self.offset])
+
+    @cached_property
+    def unknowns(self) -> Unknowns:
+        """The model's unknowns, every sensor's calibration, and its transverse sensitivity where it has one."""
+        sensors = self.observations.sensors
+        known = [self.observations.channels.get(s, ChannelUncertainty()) for s in sensors]
+        stated = [k.calibration / CALIBRATION_STD for k in known]
+        uncertain = [(s, c) for s, c in zip(sensors, stated, strict=True) if c > 0]
+        across = [
+            (s, k.transverse)
+            for s, k in zip(sensors, known, strict=True)
+            if k.transverse > 0 and self._has_across(s)
+        ]
+        return joined(
+            self.model.unknowns,
+            Unknowns.plain(
+                [f"calibration of {s}" for s, _ in uncertain], [c for _, c in uncertain], CALIBRATION
+            ),
+            Unknowns.plain([f"transverse sensitivity of {s}" for s, _ in across], [t for _, t in across]),
+        )
+
+    def _has_across(self, sensor: str) -> bool:
+        body, _, direction = sensor.rpartition(".")
+        other = _ACROSS.get(direction)
+        if other is None:
+            return False
+        dof = Dof(body, other)
+        return any(self.observations.rig.knows(d.configuration, dof) for d in self.observations.data)
+
+    @cached_property
+    def sensing(self) -> tuple[Sensing, ...]:
+        """Of every configuration."""
+        found = []
+        for d in self.observations.data:
+            along = self.model.sensor_rows(d.configuration, d.dofs)
+            across = np.zeros_like(along)
+            gain = np.full(len(d.dofs), -1)
+            transverse = np.full(len(d.dofs), -1)
+            for i, dof in enumerate(d.dofs):
+                gain[i] = self.unknowns.index.get(f"calibration of {dof.point}", -1)
+                transverse[i] = self.unknowns.index.get(f"transverse sensitivity of {dof.point}", -1)
+                if transverse[i] >= 0:
+                    other = Dof(dof.body, _ACROSS[dof.direction])
+                    if self.observations.rig.knows(d.configuration, other):
+                        across[i] = self.model.sensor_rows(d.configuration, (other,))[0]
+            found.append(Sensing(along, across, gain, transverse))
+        return tuple(found)
+
+    def residuals(
+        self,
+        x: NDArray[np.float64],
+        scatters: Mapping[str, float],
+        *,
+        heat: float = 1.0,
+        matching: object = None,
+        derivatives: bool = True,
+    ) -> Residuals:
+        """See `Problem`."""
+        given = matching if isinstance(matching, tuple) else (None,) * len(self.observations.data)
+        parts = [
+            _Configuration(self, d, s, x, scatters, heat).residuals(m, derivatives)
+            for d, s, m in zip(self.observations.data, self.sensing, given, strict=True)
+        ]
+        return _stacked(parts, len(x))
+
+
+def _stacked(parts: Sequence[Residuals], n: int) -> Residuals:
+    names = dict.fromkeys(k for p in parts for k in p.share)
+    return Residuals(
+        values=np.concatenate([p.values for p in parts] or [np.zeros(0)]),
+        jacobian=np.concatenate([p.jacobian for p in parts] or [np.zeros((0, n))]),
+        share={k: np.concatenate([p.share.get(k, np.zeros(len(p.values))) for p in parts]) for k in names},
+        log_scale=sum(p.log_scale for p in parts),
+        penalty=sum(p.penalty for p in parts),
+        matching=tuple(p.matching for p in parts),
+        projected=sum(p.projected for p in parts),
+    )
+
+
+class _Configuration:
+    """Residuals of one configuration at one point."""
+
+    def __init__(
+        self,
+        problem: ModeProblem,
+        data: ModeData,
+        sensing: Sensing,
+        x: NDArray[np.float64],
+        scatters: Mapping[str, float],
+        heat: float,
+    ) -> None:
+        self.problem, self.data, self.sensing, self.x, self.heat = problem, data, sensing, x, heat
+        self.scatters = scatters
+        self.gain = np.where(sensing.gain >= 0, np.exp(x[np.maximum(sensing.gain, 0)]), 1.0)
+        cross = np.where(sensing.transverse >= 0, x[np.maximum(sensing.transverse, 0)], 0.0)
+        self.reading = self.gain[:, None] * (sensing.along + cross[:, None] * sensing.across)
+
+    def residuals(self, matching: object, derivatives: bool) -> Residuals:
+        model = self.problem.model
+        own = self.x[: self.problem.offset]
+        matrices = model.matrices(self.data.configuration, own, derivatives)
+        solution = EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio)
+        if solution is None:
+            return Residuals(np.full(1, np.inf), np.zeros((1, len(self.x))), matching=matching)
+        width = self.reading.shape[1]
+        predicted = self.reading @ solution.shapes[:width]
+        match = matching if isinstance(matching, np.ndarray) else self._matched(solution, predicted)
+        return self._compared(matrices, solution, predicted, match, derivatives)
+
+    def _matched(self, solution: EigenSolution, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Index of the model mode of every measured one, -1 for none, (m,)."""
+        d = self.data
+        log = np.log(np.maximum(solution.frequency_hz, 1e-6))
+        apart = np.abs(log[None] - d.log_frequency[:, None])
+        if d.shapes.shape[1]:
+            y = np.nan_to_num(d.shapes)
+            seen = np.isfinite(d.shapes).astype(float)
+            cross = (y @ predicted) ** 2
+            norm = np.sum(y**2, axis=1)[:, None] * (seen @ predicted**2)
+            cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / _FREQUENCY_REACH, 3.0)
+        else:
+            cost = np.minimum(apart / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
+        m = len(d)
+        padded = np.hstack([cost, np.full((m, m), _LEAVE)])
+        column = scipy.optimize.linear_sum_assignment(padded)[1]
+        return np.where(column < cost.shape[1], column, -1)
+
+    def _compared(
+        self,
+        matrices: Matrices,
+        solution: EigenSolution,
+        predicted: NDArray[np.float64],
+        match: NDArray[np.int64],
+        derivatives: bool,
+    ) -> Residuals:
+        d, h = self.data, self.scatters
+        on = np.flatnonzero(match >= 0)
+        model_mode = match[on]
+        slopes = (
+            ModeDerivatives.of(matrices, solution, model_mode, self.problem.model.has_ratio)
+            if derivatives
+            else None
+        )
+        n = len(self.x)
+        values, jacobians, shares, log_scale = [], [], {FREQUENCY: [], DAMPING_SCATTER: [], SHAPE: []}, 0.0
+        defaults = {k: s.default for k, s in self.problem.observations.scatters.items()}
+
+        def block(
+            difference: NDArray[np.float64],
+            own: NDArray[np.float64],
+            unit: NDArray[np.float64] | float,
+            scatter: str,
+            factor: float,
+            slope: NDArray[np.float64] | None,
+        ) -> None:
+            nonlocal log_scale
+            added = (h[scatter] * unit) ** 2 + np.zeros(len(difference))
+            variance = own**2 + added
+            sigma = np.sqrt(variance) * factor
+            log_scale += 0.5 * float(np.sum(np.log(variance / (own**2 + (defaults[scatter] * unit) ** 2))))
+            values.append(difference / sigma)
+            jacobians.append(np.zeros((0, n)) if slope is None else -slope / sigma[:, None])
+            for name, store in shares.items():
+                store.append(added / variance if name == scatter else np.zeros(len(difference)))
+
+        block(
+            d.log_frequency[on] - np.log(np.maximum(solution.frequency_hz[model_mode], 1e-6)),
+            d.log_frequency_std[on],
+            1.0,
+            FREQUENCY,
+            self.heat,
+            None if slopes is None else self._padded(slopes.log_frequency),
+        )
+        measured = np.isfinite(d.log_damping[on])
+        ratio = np.maximum(solution.damping_ratio[model_mode], 1e-6)
+        block(
+            (d.log_damping[on] - np.log(ratio))[measured],
+            d.log_damping_std[on][measured],
+            1.0,
+            DAMPING_SCATTER,
+            1.0,
+            None if slopes is None else self._padded(slopes.damping_ratio / ratio[:, None])[measured],
+        )
+        for k, r in enumerate(on):
+            y, p = d.shapes[r], predicted[:, match[r]]
+            seen = np.isfinite(y)
+            if not np.any(seen):
+                continue
+            unit = np.maximum(_SHAPE_REACH, np.abs(y[seen]))
+            weight = 1.0 / (d.shape_std[r][seen] ** 2 + (h[SHAPE] * unit) ** 2)
+            squared = max(float(p[seen] @ (weight * p[seen])), 1e-300)
+            scale = float(p[seen] @ (weight * y[seen])) / squared
+            slope = None
+            if slopes is not None:
+                dp = self._shape_slopes(slopes.shapes[:, k], solution.shapes[:, match[r]], p)[seen]
+                towards = weight * (y[seen] - 2 * scale * p[seen])
+                slope = scale * dp + np.outer(p[seen], towards @ dp / squared)
+            block(
+                y[seen] - scale * p[seen],
+                d.shape_std[r][seen],
+                unit,
+                SHAPE,
+                1 + 0.1 * (self.heat - 1),
+                slope,
+            )
+        return Residuals(
+            values=np.concatenate(values),
+            jacobian=np.concatenate(jacobians),
+            share={k: np.concatenate(s) for k, s in shares.items()},
+            log_scale=log_scale,
+            penalty=UNEXPLAINED * float(np.sum(match < 0)) + UNSEEN * self._unseen(solution, match),
+            matching=match,
+            projected=len(on) if d.shapes.shape[1] else 0,
+        )
+
+    def _unseen(self, solution: EigenSolution, match: NDArray[np.int64]) -> int:
+        """Model modes well inside the band that no measured mode is paired with."""
+        low, high = self.data.band_hz
+        inside = (solution.frequency_hz > 1.05 * low) & (solution.frequency_hz < 0.95 * high)
+        inside[match[match >= 0]] = False
+        return int(np.sum(inside))
+
+    def _padded(self, by_model: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives by the model's unknowns, filled up with zeros for the sensors', (k, n)."""
+        return np.pad(by_model, ((0, 0), (0, len(self.x) - by_model.shape[1])))
+
+    def _shape_slopes(
+        self, by_model: NDArray[np.float64], shape: NDArray[np.float64], predicted: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Derivatives of what the sensors read of one shape by all unknowns, (s, n)."""
+        width = self.reading.shape[1]
+        slope = self._padded(self.reading @ by_model[:width])
+        rows = np.arange(len(predicted))
+        s = self.sensing
+        has = s.gain >= 0
+        slope[rows[has], s.gain[has]] += predicted[has]
+        has = s.transverse >= 0
+        slope[rows[has], s.transverse[has]] += (self.gain * (s.across @ shape[:width]))[has]
+        return slope

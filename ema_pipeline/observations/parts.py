@@ -1,0 +1,185 @@
+"""How every element of a rig depends on the values that like parts share, and on what its own part deviates.
+
+A *family* is a parameter of the rig: the value that all like parts share, known to its tolerance. A *part* is one
+piece of hardware: an element, or several that say that they are one. Both are unknown logarithms, so that no trial
+value of a mass or a stiffness is ever negative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.inference import Unknowns, joined
+from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Mass, Spring
+from ema_pipeline.rigs.types import Parameter, Rig
+
+PART_SCATTER = "part_scatter"
+STIFFNESS_SCATTER = 0.02
+"""1 σ from part to part where a rig states none, relative; the scatter of all parts is learned in its units."""
+MASS_SCATTER = 0.005
+DAMPER_SCATTER = 0.3
+
+FREE_STD = (0.5, 2.5)
+"""Least and largest prior 1 σ of the logarithm of a free parameter."""
+_UNBOUNDED_STD = 1.5
+DAMPING = "modal_damping_ratio"
+
+PartKey = tuple[type, str]
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """Derivatives of the logarithms of all elements' values by the unknown logarithms.
+
+    Attributes
+    ----------
+    unknowns : Unknowns
+        Families first, then parts.
+    elements : dict of str to dict of key to ndarray, (n,)
+        By configuration and by part of an element.
+    families : tuple of str
+        Parameters among the unknowns.
+    geometric : tuple of str
+        Uncertain parameters that no element's value is a power of: with them the elements are built anew.
+    """
+
+    unknowns: Unknowns
+    elements: Mapping[str, Mapping[PartKey, NDArray[np.float64]]]
+    families: tuple[str, ...]
+    geometric: tuple[str, ...]
+
+
+def part_key(element: Element) -> PartKey:
+    """What identifies the part that an element belongs to."""
+    return type(element), getattr(element, "part", "") or element.name
+
+
+def value_of(element: Element) -> float:
+    """Mass, stiffness or damping coefficient of an element; 0 for elements of another kind."""
+    if isinstance(element, Mass):
+        return element.value
+    if isinstance(element, Spring):
+        return element.stiffness
+    if isinstance(element, Damper):
+        return element.coefficient
+    return 0.0
+
+
+def dependence(rig: Rig) -> Dependence:
+    """Find out by trial on which parameters every element's value depends, and give every part its unknown."""
+    nominal = {c: rig.assembly(c) for c in rig.configurations}
+    uncertain = [
+        p
+        for p in rig.parameters.values()
+        if p.name != DAMPING and p.value != 0 and (p.free or p.tolerance > 0)
+    ]
+    exponents: dict[str, dict[str, dict[PartKey, float]]] = {}
+    geometric = []
+    for p in uncertain:
+        powers = _powers(rig, nominal, p)
+        if powers is None:
+            geometric.append(p.name)
+        elif any(powers.values()):
+            exponents[p.name] = powers
+    parts = _parts(rig, nominal, exponents)
+    families = tuple(exponents)
+    names = (*families, *(f"{key[1]} ({key[0].__name__.lower()})" for key in parts))
+    unknowns = joined(
+        Unknowns.plain(families, [prior_std(rig.parameters[f]) for f in families]),
+        Unknowns.plain(names[len(families) :], list(parts.values()), PART_SCATTER),
+    )
+    return Dependence(
+        unknowns, _rows(nominal, exponents, families, tuple(parts), len(names)), families, tuple(geometric)
+    )
+
+
+def prior_std(parameter: Parameter) -> float:
+    """Prior 1 σ of the logarithm of a parameter: its tolerance, or a quarter of its range where it is free."""
+    if not parameter.free:
+        return parameter.tolerance
+    if not 0 < parameter.minimum < parameter.maximum < np.inf:
+        return _UNBOUNDED_STD
+    return float(np.clip(np.log(parameter.maximum / parameter.minimum) / 4, *FREE_STD))
+
+
+def _powers(
+    rig: Rig, nominal: Mapping[str, Assembly], parameter: Parameter
+) -> dict[str, dict[PartKey, float]] | None:
+    """Exponent with which each element's value follows a parameter; None where one does not follow a power."""
+    found: dict[str, dict[PartKey, float]] = {}
+    for configuration, assembly in nominal.items():
+        tries = []
+        for factor in (1.05, 0.9):
+            other = rig.assembly(configuration, {parameter.name: parameter.value * factor})
+            powers = {}
+            for before, after in zip(assembly.elements, other.elements, strict=True):
+                power = _power(before, after, factor)
+                if power is None:
+                    return None
+                if power:
+                    powers[part_key(before)] = power
+            tries.append(powers)
+        if tries[0].keys() != tries[1].keys() or any(abs(tries[0][k] - tries[1][k]) > 1e-6 for k in tries[0]):
+            return None
+        found[configuration] = tries[0]
+    return found
+
+
+def _power(before: Element, after: Element, factor: float) -> float | None:
+    if before == after:
+        return 0.0
+    a, b = value_of(before), value_of(after)
+    same_row = getattr(before, "row", None) == getattr(after, "row", None)
+    if not same_row or a == 0 or b / a <= 0:
+        return None
+    if isinstance(before, Spring) and isinstance(after, Spring) and before.loss_factor != after.loss_factor:
+        return None
+    return float(np.log(b / a) / np.log(factor))
+
+
+def _parts(
+    rig: Rig, nominal: Mapping[str, Assembly], exponents: Mapping[str, Mapping[str, Mapping[PartKey, float]]]
+) -> dict[PartKey, float]:
+    """Every part with the 1 σ of its deviation, in units of the part scatter; identical parts have none."""
+    parts: dict[PartKey, float] = {}
+    for configuration, assembly in nominal.items():
+        for element in assembly.elements:
+            key = part_key(element)
+            if not isinstance(element, Mass | Spring | Damper) or value_of(element) == 0.0 or key in parts:
+                continue
+            stated = [
+                rig.parameters[name].scatter
+                for name, powers in exponents.items()
+                if powers[configuration].get(key) and rig.parameters[name].scatter is not None
+            ]
+            default = {Mass: MASS_SCATTER, Spring: STIFFNESS_SCATTER}.get(type(element), DAMPER_SCATTER)
+            scatter = stated[0] if stated and stated[0] is not None else default
+            if scatter > 0:
+                parts[key] = scatter / STIFFNESS_SCATTER
+    return parts
+
+
+def _rows(
+    nominal: Mapping[str, Assembly],
+    exponents: Mapping[str, Mapping[str, Mapping[PartKey, float]]],
+    families: tuple[str, ...],
+    parts: tuple[PartKey, ...],
+    count: int,
+) -> dict[str, dict[PartKey, NDArray[np.float64]]]:
+    at = {key: len(families) + i for i, key in enumerate(parts)}
+    rows: dict[str, dict[PartKey, NDArray[np.float64]]] = {}
+    for configuration, assembly in nominal.items():
+        rows[configuration] = {}
+        for key in {part_key(e) for e in assembly.elements}:
+            row = np.zeros(count)
+            for i, name in enumerate(families):
+                row[i] = exponents[name][configuration].get(key, 0.0)
+            if key in at:
+                row[at[key]] = 1.0
+            if np.any(row):
+                rows[configuration][key] = row
+    return rows

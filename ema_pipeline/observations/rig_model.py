@@ -1,0 +1,234 @@
+"""A rig with effects of unknown size, as matrices that depend on unknowns, with exact derivatives.
+
+Every element is a coefficient times v·vᵀ, so that the derivative of an eigenvalue by the logarithm of a coefficient
+is one product. Only what an effect edits is differentiated by small differences, of the matrices, not of the modes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.effects.base import EffectParameter, PlacedEffect
+from ema_pipeline.inference import Unknowns, joined
+from ema_pipeline.mechanics.assembly import Assembly, Row
+from ema_pipeline.mechanics.terms import Matrices, Terms, assemble_terms
+from ema_pipeline.observations.parts import DAMPING, Dependence, dependence, part_key
+from ema_pipeline.rigs.types import Rig
+
+_LOG_STD = 1.2
+"""Prior 1 σ of the logarithm of a size that has no null: within a factor of three of its start, mostly."""
+_DIFFERENCE = 1e-4
+"""Step of the differences by effects' sizes, in units of their prior σ."""
+
+
+@dataclass(frozen=True)
+class SizeMap:
+    """How one size of an effect follows from its unknown: value = null + scale·x, or start·exp(1.2 x)."""
+
+    parameter: EffectParameter
+    scale: float
+    logarithmic: bool
+
+    @classmethod
+    def of(cls, parameter: EffectParameter, scale: float) -> SizeMap:
+        """Logarithmic where the size has no finite null within its range, or cannot be zero."""
+        no_null = not np.isfinite(parameter.null) or not parameter.minimum <= parameter.null
+        return cls(parameter, scale, no_null or parameter.minimum > 0)
+
+    def value(self, x: float) -> float:
+        """Size at the unknown `x`, within its range."""
+        p = self.parameter
+        value = p.start * np.exp(_LOG_STD * x) if self.logarithmic else p.null + self.scale * x
+        return float(np.clip(value, p.minimum, p.maximum))
+
+    def unknown(self, value: float) -> float:
+        """The unknown at which the size is `value`."""
+        p = self.parameter
+        if self.logarithmic:
+            return float(np.log(max(value, 1e-300) / p.start) / _LOG_STD)
+        return (value - p.null) / self.scale
+
+    def slope(self, x: float) -> float:
+        """Derivative of the size by the unknown."""
+        return self.value(x) * _LOG_STD if self.logarithmic else self.scale
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Range of the unknown."""
+        p = self.parameter
+        low = self.unknown(p.minimum) if p.minimum > 0 or not self.logarithmic else -np.inf
+        return low, self.unknown(p.maximum)
+
+
+class RigModel:
+    """A rig, with effects on top of it, as a function of unknowns.
+
+    The unknowns are, in this order: families, parts, the damping ratio of all modes (logarithms), geometric
+    parameters, and the effects' sizes.
+
+    Parameters
+    ----------
+    rig : Rig
+    effects : sequence of PlacedEffect
+        In the order in which they are applied.
+    scales : dict of str to float, optional
+        Prior 1 σ of effects' sizes by ``id@place.name``; the library's where left out.
+    shared : Dependence, optional
+        Of the rig, where it is known already.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        effects: Sequence[PlacedEffect] = (),
+        scales: Mapping[str, float] | None = None,
+        shared: Dependence | None = None,
+    ) -> None:
+        self.rig, self.effects = rig, tuple(effects)
+        self.dependence = shared or dependence(rig)
+        given = scales or {}
+        self.sizes = {
+            one.parameter_name(p.name): SizeMap.of(p, given.get(one.parameter_name(p.name), p.scale))
+            for one in self.effects
+            for p in one.effect.parameters
+        }
+        self._terms: dict[tuple[object, ...], Terms] = {}
+        self._nominal: dict[tuple[object, ...], Assembly] = {}
+
+    @cached_property
+    def unknowns(self) -> Unknowns:
+        """All unknowns of the model."""
+        damping = self.rig.parameters.get(DAMPING)
+        loose = damping is not None and damping.value > 0 and (damping.free or damping.tolerance > 0)
+        bounds = [s.bounds for s in self.sizes.values()]
+        return joined(
+            self.dependence.unknowns,
+            Unknowns.plain((DAMPING,), damping.tolerance or _LOG_STD) if loose and damping else _NOTHING,
+            Unknowns.plain(
+                self.dependence.geometric,
+                [self.rig.parameters[g].tolerance for g in self.dependence.geometric],
+            ),
+            Unknowns.plain(
+                tuple(self.sizes),
+                1.0,
+                lower=np.array([b[0] for b in bounds]),
+                upper=np.array([b[1] for b in bounds]),
+            ),
+        )
+
+    @cached_property
+    def _logs(self) -> int:
+        """Number of families and parts."""
+        return len(self.dependence.unknowns)
+
+    @cached_property
+    def shape_start(self) -> int:
+        """Position of the first unknown by which matrices are differentiated as a whole."""
+        return len(self.unknowns) - len(self.dependence.geometric) - len(self.sizes)
+
+    @property
+    def has_ratio(self) -> bool:
+        """True where the common damping ratio is an unknown."""
+        return DAMPING in self.unknowns.index
+
+    def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
+        """Nominal values and the effects at `sizes` (their start values where left out), (n,)."""
+        x = np.zeros(len(self.unknowns))
+        for name, size in self.sizes.items():
+            value = (sizes or {}).get(name, size.parameter.start)
+            x[self.unknowns.index[name]] = size.unknown(value)
+        return self.unknowns.clipped(x)
+
+    def size_values(self, x: NDArray[np.float64]) -> dict[str, float]:
+        """Sizes of the effects at `x` by ``id@place.name``."""
+        return {name: size.value(float(x[self.unknowns.index[name]])) for name, size in self.sizes.items()}
+
+    def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
+        """Values of the rig's parameters and of the effects' at `x`; parts are left out."""
+        values = {name: p.value for name, p in self.rig.parameters.items()}
+        for name in (*self.dependence.families, *self.dependence.geometric, DAMPING):
+            if name in self.unknowns.index:
+                values[name] *= float(np.exp(x[self.unknowns.index[name]]))
+        return values | self.size_values(x)
+
+    def matrices(self, configuration: str, x: NDArray[np.float64], derivatives: bool = True) -> Matrices:
+        """Matrices of a configuration at `x`, and their derivatives by effects and geometry."""
+        logs, ratio = x[: self._logs], self._damping_ratio(x)
+        shape = x[self.shape_start :]
+        terms = self.terms(configuration, shape)
+        coefficient = terms.scaled(logs)
+        dense = terms.dense(coefficient)
+        n = len(terms.dofs)
+        count = len(shape) if derivatives else 0
+        by_shape, skew = np.zeros((count, 4, n, n)), np.zeros((count, n, n))
+        for i in range(count):
+            ends = []
+            for h in (-_DIFFERENCE, _DIFFERENCE):
+                moved = shape.copy()
+                moved[i] += h
+                other = self.terms(configuration, moved)
+                ends.append((other.dense(other.scaled(logs)), other.skew))
+            if ends[0][0].shape == dense.shape == ends[1][0].shape:
+                by_shape[i] = (ends[1][0] - ends[0][0]) / (2 * _DIFFERENCE)
+                skew[i] = (ends[1][1] - ends[0][1]) / (2 * _DIFFERENCE)
+        return Matrices(terms, coefficient, dense, terms.skew, ratio, by_shape, skew)
+
+    def _damping_ratio(self, x: NDArray[np.float64]) -> float:
+        parameter = self.rig.parameters.get(DAMPING)
+        if parameter is None:
+            return 0.0
+        i = self.unknowns.index.get(DAMPING)
+        return parameter.value * (1.0 if i is None else float(np.exp(x[i])))
+
+    def terms(self, configuration: str, shape: NDArray[np.float64]) -> Terms:
+        """Elements of a configuration with geometry and effects' unknowns at `shape`."""
+        key = (configuration, shape.tobytes())
+        if key not in self._terms:
+            if len(self._terms) > 64:
+                self._terms.clear()
+            self._terms[key] = assemble_terms(
+                self.assembly(configuration, shape), self.dependence.elements[configuration], part_key
+            )
+        return self._terms[key]
+
+    def assembly(self, configuration: str, shape: NDArray[np.float64]) -> Assembly:
+        """Nominal elements with the effects applied."""
+        geometric = self.dependence.geometric
+        assembly = self._base(configuration, shape[: len(geometric)])
+        values = dict(zip(self.sizes, shape[len(geometric) :], strict=True))
+        for one in self.effects:
+            if one.effect.fits(assembly, one.place):
+                names = {p.name: one.parameter_name(p.name) for p in one.effect.parameters}
+                own = {short: self.sizes[full].value(float(values[full])) for short, full in names.items()}
+                assembly = one.effect.edit(assembly, one.place, own)
+        return assembly
+
+    def _base(self, configuration: str, geometry: NDArray[np.float64]) -> Assembly:
+        key = (configuration, geometry.tobytes())
+        if key not in self._nominal:
+            values = {
+                name: self.rig.parameters[name].value * float(np.exp(g))
+                for name, g in zip(self.dependence.geometric, geometry, strict=True)
+            }
+            self._nominal[key] = self.rig.assembly(configuration, values)
+        return self._nominal[key]
+
+    def sensor_rows(self, configuration: str, dofs: Sequence[Dof]) -> NDArray[np.float64]:
+        """What sensors at `dofs` read of the rig's own coordinates, (n_dofs, n)."""
+        assembly = self._base(configuration, np.zeros(len(self.dependence.geometric)))
+        return np.array([d.sign * _row(assembly.row(d.point), assembly.dofs) for d in dofs]).reshape(
+            len(dofs), len(assembly.dofs)
+        )
+
+
+_NOTHING = Unknowns.plain((), 1.0)
+
+
+def _row(row: Row, dofs: tuple[str, ...]) -> NDArray[np.float64]:
+    return np.array([row.get(d, 0.0) for d in dofs])
