@@ -22,7 +22,15 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
 
     def let_part(element: Element) -> Element:
         assert isinstance(element, Spring)
-        return PartingSpring(element.name, element.row, element.stiffness, element.loss_factor, preload, gap)
+        return PartingSpring(
+            element.name,
+            element.row,
+            element.stiffness,
+            element.loss_factor,
+            element.part,
+            preload=preload,
+            gap=gap,
+        )
 
     return assembly.edit([place + _MESH], let_part)
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ from ema_pipeline.mechanics.assembly import (
 )
 
 MASS, DAMPING_MATRIX, STIFFNESS, STRUCTURAL = range(4)
+
+K = TypeVar("K")
 
 
 @dataclass(frozen=True)
@@ -90,8 +93,8 @@ class Matrices:
 
 def assemble_terms(
     assembly: Assembly,
-    dependent: Mapping[Hashable, NDArray[np.float64]],
-    key: Callable[[Element], Hashable],
+    dependent: Mapping[K, NDArray[np.float64]],
+    key: Callable[[Element], K],
 ) -> Terms:
     """All elements as terms; nonlinear ones with their tangents.
 

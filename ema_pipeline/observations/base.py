@@ -43,5 +43,5 @@ class Observations(Protocol):
         ...
 
     def folds(self) -> Sequence[tuple[Observations, Observations]]:
-        """Pairs of what is fitted and what is held out: a configuration, a hit point, a level or a share of the modes."""
+        """Pairs of what is fitted and what is held out: a configuration, a hit point, a level, a share of modes."""
         ...

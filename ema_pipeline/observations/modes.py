@@ -365,7 +365,10 @@ class _Configuration:
             else None
         )
         n = len(self.x)
-        values, jacobians, shares, log_scale = [], [], {FREQUENCY: [], DAMPING_SCATTER: [], SHAPE: []}, 0.0
+        values: list[NDArray[np.float64]] = []
+        jacobians: list[NDArray[np.float64]] = []
+        shares: dict[str, list[NDArray[np.float64]]] = {FREQUENCY: [], DAMPING_SCATTER: [], SHAPE: []}
+        log_scale = 0.0
         defaults = {k: s.default for k, s in self.problem.observations.scatters.items()}
 
         def block(

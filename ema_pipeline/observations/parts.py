@@ -29,6 +29,7 @@ _UNBOUNDED_STD = 1.5
 DAMPING = "modal_damping_ratio"
 
 PartKey = tuple[type, str]
+"""Kind of element and name of its part."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ class Dependence:
 
 def part_key(element: Element) -> PartKey:
     """What identifies the part that an element belongs to."""
-    return type(element), getattr(element, "part", "") or element.name
+    kind = next((k for k in (Mass, Spring, Damper) if isinstance(element, k)), type(element))
+    return kind, getattr(element, "part", "") or element.name
 
 
 def value_of(element: Element) -> float:
@@ -156,7 +158,7 @@ def _parts(
                 for name, powers in exponents.items()
                 if powers[configuration].get(key) and rig.parameters[name].scatter is not None
             ]
-            default = {Mass: MASS_SCATTER, Spring: STIFFNESS_SCATTER}.get(type(element), DAMPER_SCATTER)
+            default = {Mass: MASS_SCATTER, Spring: STIFFNESS_SCATTER}.get(key[0], DAMPER_SCATTER)
             scatter = stated[0] if stated and stated[0] is not None else default
             if scatter > 0:
                 parts[key] = scatter / STIFFNESS_SCATTER
