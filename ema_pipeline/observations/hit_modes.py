@@ -20,7 +20,7 @@ from ema_pipeline.correlate.measured import from_modal_model
 from ema_pipeline.dof import Dof
 from ema_pipeline.levels.differences import smooth_terms
 from ema_pipeline.levels.types import HitModes
-from ema_pipeline.mechanics.equivalent import equivalent_stiffness
+from ema_pipeline.mechanics.equivalent import Motions, settled_offsets
 from ema_pipeline.mechanics.laws import Nonlinear
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.observations.modes import ModeData, prepare
@@ -36,6 +36,7 @@ weight of one mode's force in the other's pole, 1/|1 - jΔω/2σ|², is 0.2."""
 _FIRST, _LAST = 0.03, 8.0
 """First and last instant, in units of 1/2σ of the fastest and the slowest mode; all but 0.3 % of the weight is between."""
 _PER_EFOLD = 1.5
+_STILL = 1e-300
 _FINE = 400
 """Instants at which the weight of a mode's fit is found before it is put together to few."""
 
@@ -113,6 +114,11 @@ class HitData:
         omega = np.where(self.used, self.log_frequency, own.log_frequency[self.modes])
         decay = np.where(self.used, self.damping, np.exp(own.log_damping[self.modes]))
         return np.asarray(2 * np.pi * np.exp(omega) * (1j - np.nan_to_num(decay, nan=1e-3)))
+
+    @cached_property
+    def usual_damping(self) -> Real:
+        """Median damping ratio of every mode over the hits, (m,)."""
+        return np.asarray(np.median(-self.poles.real / self.poles.imag, axis=0))
 
     @cached_property
     def groups(self) -> tuple[Integers, ...]:
@@ -209,22 +215,27 @@ def comparable(data: HitData) -> bool:
     )
 
 
-def shifted_poles(
-    data: HitData,
-    elements: Sequence[Nonlinear],
-    along: Real,
-    displacement: Complex,
-) -> Complex:
-    """Change of every mode's pole in every hit that nonlinear elements make, 1/s, (h, m).
+@dataclass(frozen=True)
+class Linear:
+    """What of the linear model the elements' forces act on.
 
-    Parameters
+    Attributes
     ----------
-    data : HitData
-    elements : sequence of Nonlinear
     along : ndarray, (n_elements, m)
-        Stretch of every element in each mode's mass-normalised shape.
+        Stretch of every element in each hit mode's mass-normalised shape.
+    flexibility : ndarray, (n_elements, n_elements)
+        Static stretch per force, m/N.
     displacement : complex ndarray, (h, m)
         Amplitude of each modal coordinate just after the blow.
+    """
+
+    along: Real
+    flexibility: Real
+    displacement: Complex
+
+
+def shifted_poles(data: HitData, elements: Sequence[Nonlinear], linear: Linear) -> Complex:
+    """Change of every mode's pole in every hit that nonlinear elements make, 1/s, (h, m).
 
     Notes
     -----
@@ -238,16 +249,15 @@ def shifted_poles(
     for k, g in enumerate(data.groups):
         group_of[g] = k
     turning = data.poles - 1j * centre[group_of]
-    z = displacement[:, None] * np.exp(turning[:, None] * instants[:, None])  # (h, t, m)
-    total = np.zeros(displacement.shape, complex)
-    for element, v in zip(elements, along, strict=True):
-        motion = np.stack([z[..., g] @ v[g] for g in data.groups], axis=-1)
-        flat = motion.reshape(-1, len(centre))
-        stiffness = equivalent_stiffness(element, flat, centre).reshape(motion.shape)
-        force = (stiffness * motion)[..., group_of]
-        still = np.abs(z) < 1e-300
+    z = linear.displacement[:, None] * np.exp(turning[:, None] * instants[:, None])  # (h, t, m)
+    paths = [np.stack([z[..., g] @ v[g] for g in data.groups], axis=-1) for v in linear.along]
+    motions = [Motions(np.abs(p).reshape(-1, len(centre)), centre) for p in paths]
+    offsets = settled_offsets(elements, motions, linear.flexibility)
+    still = np.abs(z) < _STILL
+    total = np.zeros(linear.displacement.shape, complex)
+    for element, v, path, motion, offset in zip(elements, linear.along, paths, motions, offsets, strict=True):
+        stiffness = motion.stiffness(element, offset).reshape(path.shape)
+        force = (stiffness * path)[..., group_of]
         ratio = np.where(still, 0.0, force / np.where(still, 1.0, z))
         total += 0.5j * v / omega * np.einsum("htm,tm->hm", ratio, weight)
     return total
-
-
