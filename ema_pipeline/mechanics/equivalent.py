@@ -12,7 +12,9 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +23,14 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.harmonic import describing_function
 from ema_pipeline.mechanics.laws import BoucWen, Nonlinear
 
-OWN_PHASES = 12
-"""Phases of the frequency itself; the describing function of a sign is then 1 % off."""
-OTHER_PHASES = 16
+OWN_PHASES = 8
+"""Phases of the frequency itself; the describing function of a sign alone is then 3 % off."""
+OTHER_PHASES = 12
 """Sets of phases of all other frequencies, which are in no fixed ratio to it."""
+_OFFSET_STEPS = 4
+_LEAST_SLOPE = 0.3
+"""Newton steps to an offset, and the least slope they take: a spring about to buckle has none."""
+_LEAST = 1e-300
 _TABLE_POINTS = 25
 _TABLE_SAMPLES = 256
 _DECADES = 6.0
@@ -35,39 +41,89 @@ Complex = NDArray[np.complex128]
 Force = Callable[[Real, Real], Real]
 
 
-def equivalent_stiffness(element: Nonlinear, motion: Complex, omega: Real) -> Complex:
-    """Complex stiffness of an element beside its tangent, at every frequency of a motion.
+@dataclass(frozen=True)
+class Motions:
+    """States of motion of an element: sines of several frequencies about an offset.
+
+    Attributes
+    ----------
+    amplitude : ndarray, (n_states, n_frequencies)
+        Of the stretch, m.
+    omega : ndarray, (n_frequencies,)
+        rad/s, in no fixed ratio.
+    """
+
+    amplitude: Real
+    omega: Real
+
+    @cached_property
+    def _each(self) -> tuple[Real, Real]:
+        """Stretch and rate of each frequency at sets of phases, (n_states, n_frequencies, `OTHER_PHASES`)."""
+        phases = _phases(len(self.omega))
+        size = self.amplitude[:, :, None]
+        return size * np.cos(phases), -self.omega[:, None] * size * np.sin(phases)
+
+    def mean_force(self, element: Nonlinear, offset: Real) -> Real:
+        """Mean force beside the tangent's about an offset (n_states,), N; 0 for an element with memory."""
+        if element.law is None:
+            return np.zeros(len(offset))
+        stretch, rate = (each.sum(axis=1) for each in self._each)
+        both = [offset[:, None] + stretch, offset[:, None] - stretch]
+        force = _vectorised(element.law)
+        return np.asarray(0.5 * (force(both[0], rate) + force(both[1], -rate)).mean(axis=1))
+
+    def stiffness(self, element: Nonlinear, offset: Real) -> Complex:
+        """Complex stiffness beside the tangent at every frequency, N/m, (n_states, n_frequencies).
+
+        Averaged over the phases of all frequencies for an element without memory; for one with memory, that of a single
+        sine whose amplitude is the root of the sum of squares.
+        """
+        law = element.law
+        if law is None:
+            return _from_table(element, np.sqrt(np.sum(self.amplitude**2, axis=1)), self.omega)
+        own = 2 * np.pi * (np.arange(OWN_PHASES) + 0.5) / OWN_PHASES
+        stretch, rate = self._each
+        rest = stretch.sum(axis=1, keepdims=True) - stretch + offset[:, None, None]
+        rest_rate = rate.sum(axis=1, keepdims=True) - rate
+        size = self.amplitude[:, :, None, None]
+        x = rest[..., None] + size * np.cos(own)
+        v = rest_rate[..., None] - self.omega[:, None, None] * size * np.sin(own)
+        force = _vectorised(law)(x, v).mean(axis=2)
+        mean = (force @ np.cos(own) - 1j * (force @ np.sin(own))) / OWN_PHASES
+        return np.asarray(2 * mean / np.maximum(self.amplitude, _LEAST))
+
+
+def settled_offsets(
+    elements: Sequence[Nonlinear], motions: Sequence[Motions], flexibility: Real
+) -> Real:
+    """Offsets about which elements move whose mean force is not zero, m, (n_elements, n_states).
 
     Parameters
     ----------
-    element : Nonlinear
-    motion : complex ndarray, (n_states, n_frequencies)
-        Amplitudes of the stretch, m.
-    omega : ndarray, (n_frequencies,)
-        rad/s.
+    elements : sequence of Nonlinear
+    motions : sequence of Motions
+        Of each element.
+    flexibility : ndarray, (n_elements, n_elements)
+        Static stretch of each per force along each, m/N.
 
-    Returns
-    -------
-    complex ndarray, (n_states, n_frequencies)
-        N/m. Averaged over the phases of all frequencies for an element without memory; for one with memory, that of a
-        single sine whose amplitude is the root of the sum of squares.
+    Notes
+    -----
+    Quadratic springs and parting teeth push the mean of the motion aside, and their stiffness there is another: of a
+    quadratic spring's shift of a frequency this is all but a sixth.
     """
-    law = element.law
-    if law is None:
-        return _from_table(element, np.sqrt(np.sum(np.abs(motion) ** 2, axis=1)), omega)
-    force = _vectorised(law)
-    own = 2 * np.pi * (np.arange(OWN_PHASES) + 0.5) / OWN_PHASES
-    amplitude = np.abs(motion)
-    others = _phases(motion.shape[1])
-    stretch = amplitude[:, :, None] * np.cos(others)
-    rate = -(omega[:, None] * amplitude[:, :, None]) * np.sin(others)
-    rest = stretch.sum(axis=1, keepdims=True) - stretch
-    rest_rate = rate.sum(axis=1, keepdims=True) - rate
-    size = amplitude[:, :, None, None]
-    x = rest[..., None] + size * np.cos(own)
-    v = rest_rate[..., None] - omega[:, None, None] * size * np.sin(own)
-    mean = np.einsum("sfkj,j->sf", force(x, v), np.exp(-1j * own)) / (OWN_PHASES * OTHER_PHASES)
-    return np.asarray(2 * mean / np.maximum(amplitude, 1e-300))
+    offset = np.zeros((len(elements), len(motions[0].amplitude)))
+    own = np.diag(flexibility)[:, None]
+    for _ in range(_OFFSET_STEPS):
+        force = np.array([m.mean_force(e, o) for e, m, o in zip(elements, motions, offset, strict=True)])
+        if not np.any(force):
+            break
+        step = 1e-3 * np.array([np.linalg.norm(m.amplitude, axis=1) for m in motions]) + _LEAST
+        moved = np.array(
+            [m.mean_force(e, o) for e, m, o in zip(elements, motions, offset + step, strict=True)]
+        )
+        slope = np.maximum(1 + own * (moved - force) / step, _LEAST_SLOPE)
+        offset = offset - (offset + flexibility @ force) / slope
+    return offset
 
 
 def _phases(count: int) -> Real:

@@ -9,6 +9,7 @@ on one point count: whatever a linear model has wrong is alike in all of them.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
@@ -22,7 +23,7 @@ from ema_pipeline.mechanics.nonlinear import element_rows
 from ema_pipeline.observations.hit_modes import HitData, Linear, comparable, shifted_poles
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem, Paired, stacked
 from ema_pipeline.observations.parts import part_key
-from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.observations.rig_model import LOG_STD, RigModel, SizeMap
 
 DRIFT = "drift"
 HIT_FREQUENCY = "hit_frequency_scatter"
@@ -33,6 +34,9 @@ AMPLITUDE_STD = 0.02
 
 _STEP = 1e-3
 """Step of the differences by sizes, in units of their prior σ."""
+_DECADES = 6.0
+_ALONG, _ACROSS = 19, 3
+"""Sizes that are tried to begin with: their range, and their number for an effect's first size and the others."""
 _QUASI_STATIC = 0.5
 """Modes below the lowest measured frequency times this take no part in static flexibility: they are slower than the
 decay of the motion that pushes the mean aside."""
@@ -137,6 +141,28 @@ class AmplitudeProblem:
         names = [n for n in self.sizes if n.rpartition(".")[0] in self._nonlinear]
         return tuple(self.unknowns.index[n] for n in names)
 
+    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64]:
+        """`x` with the sizes of the effect added last at the best of a grid, where it depends on the amplitude.
+
+        From far off there is often no slope that leads to the right size: teeth that never part, friction that locks,
+        and a quadratic spring of no size change nothing.
+        """
+        names = [n for n in self.sizes if self._nonlinear and n.rpartition(".")[0] == self._nonlinear[-1]]
+        if not names or not self.observations.hits:
+            return x
+        at = [self.unknowns.index[n] for n in names]
+        grids = [_grid(self.sizes[n], _ALONG if i == 0 else _ACROSS) for i, n in enumerate(names)]
+        matching = self.residuals(x, scatters, derivatives=False).matching
+        best, least = x, np.inf
+        for values in itertools.product(*grids):
+            trial = x.copy()
+            trial[at] = values
+            found = self.residuals(trial, scatters, matching=matching, derivatives=False)
+            cost = found.cost + 0.5 * float(np.sum(np.square(values)))
+            if cost < least:
+                best, least = trial, cost
+        return best
+
     def residuals(
         self,
         x: NDArray[np.float64],
@@ -175,6 +201,18 @@ class AmplitudeProblem:
         if paired is None:
             return Residuals(np.full(1, np.inf), np.zeros((1, len(x))))
         return _Hits(self, data, paired, x, scatters, heat).residuals(derivatives)
+
+
+def _grid(size: SizeMap, points: int) -> NDArray[np.float64]:
+    """Unknowns of a size to try: evenly over `_DECADES` decades of it, of both signs where it has two."""
+    low, high = size.bounds
+    if size.logarithmic:
+        reach = 0.5 * _DECADES * np.log(10) / LOG_STD
+        grid = np.linspace(-reach, reach, points) if points > 1 else np.zeros(1)
+    else:
+        one = np.logspace(1 - _DECADES, 1, points)
+        grid = np.concatenate([one, -one])
+    return np.asarray(grid[(grid >= low) & (grid <= high)])
 
 
 def _left_name(data: HitData, sheet: int, mode: int) -> str:

@@ -35,8 +35,10 @@ weight of one mode's force in the other's pole, 1/|1 - jΔω/2σ|², is 0.2."""
 
 _FIRST, _LAST = 0.03, 8.0
 """First and last instant, in units of 1/2σ of the fastest and the slowest mode; all but 0.3 % of the weight is between."""
-_PER_EFOLD = 1.5
+_PER_EFOLD = 1.1
 _STILL = 1e-300
+_HEARD = 0.1
+"""Motion of a mode over that of the largest that moves in step with it, below which a hit does not tell its pole."""
 _FINE = 400
 """Instants at which the weight of a mode's fit is found before it is put together to few."""
 
@@ -92,9 +94,17 @@ class HitData:
         """Name of the configuration."""
         return self.reference.configuration
 
-    @property
+    @cached_property
     def used(self) -> NDArray[np.bool_]:
         """Mask of hits and modes that can be compared, (h, m)."""
+        known = self._known.copy()
+        size = np.nan_to_num(np.abs(self.motion)) * np.max(np.abs(self.shapes), axis=1, initial=0.0)
+        for group in self.groups:
+            known[:, group] &= size[:, group] >= _HEARD * size[:, group].max(axis=1, keepdims=True)
+        return known
+
+    @cached_property
+    def _known(self) -> NDArray[np.bool_]:
         known = np.isfinite(self.log_frequency_std) & np.isfinite(self.damping_std)
         known &= np.isfinite(self.log_frequency) & (self.damping > 0)
         return np.asarray(known & np.isfinite(self.motion))
@@ -111,8 +121,8 @@ class HitData:
     def poles(self) -> Complex:
         """Of every mode in every hit, 1/s, (h, m); the reference's where a hit tells none."""
         own = self.reference
-        omega = np.where(self.used, self.log_frequency, own.log_frequency[self.modes])
-        decay = np.where(self.used, self.damping, np.exp(own.log_damping[self.modes]))
+        omega = np.where(self._known, self.log_frequency, own.log_frequency[self.modes])
+        decay = np.where(self._known, self.damping, np.exp(own.log_damping[self.modes]))
         return np.asarray(2 * np.pi * np.exp(omega) * (1j - np.nan_to_num(decay, nan=1e-3)))
 
     @cached_property
