@@ -25,12 +25,13 @@ from ema_pipeline.mechanics.laws import BoucWen, Nonlinear
 
 OWN_PHASES = 8
 """Phases of the frequency itself; the describing function of a sign alone is then 3 % off."""
-OTHER_PHASES = 12
-"""Sets of phases of all other frequencies, which are in no fixed ratio to it."""
+_PRIMES = (11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61)
+_GOLDEN = 0.6180339887498949
 _OFFSET_STEPS = 4
 _LEAST_SLOPE = 0.3
 """Newton steps to an offset, and the least slope they take: a spring about to buckle has none."""
-_LEAST = 1e-300
+_LEAST = 1e-30
+"""Amplitude, m, below which there is no motion."""
 _TABLE_POINTS = 25
 _TABLE_SAMPLES = 256
 _DECADES = 6.0
@@ -58,7 +59,7 @@ class Motions:
 
     @cached_property
     def _each(self) -> tuple[Real, Real]:
-        """Stretch and rate of each frequency at sets of phases, (n_states, n_frequencies, `OTHER_PHASES`)."""
+        """Stretch and rate of each frequency at sets of phases, (n_states, n_frequencies, n_sets)."""
         phases = _phases(len(self.omega))
         size = self.amplitude[:, :, None]
         return size * np.cos(phases), -self.omega[:, None] * size * np.sin(phases)
@@ -127,15 +128,15 @@ def settled_offsets(
 
 
 def _phases(count: int) -> Real:
-    """Sets of phases that fill the cube of `count` dimensions evenly, (count, `OTHER_PHASES`).
+    """Sets of phases of `count` frequencies, (count, n_sets).
 
-    Multiples of the powers of the generalised golden ratio, the root of g^(count + 1) = g + 1.
+    A lattice whose first and second moments are exact: of any prime number of sets above twice that of the
+    frequencies, each frequency with a step of its own. Offsets in golden ratios keep sums of steps from meeting.
     """
-    g = 2.0
-    for _ in range(30):
-        g = (1 + g) ** (1 / (count + 1))
-    steps = g ** -np.arange(1.0, count + 1)
-    return np.asarray(2 * np.pi * (0.5 + np.outer(steps, np.arange(1, OTHER_PHASES + 1)) % 1))
+    sets = next(p for p in _PRIMES if p > 2 * count) if 2 * count < _PRIMES[-1] else 2 * count + 1
+    steps = np.arange(1, count + 1)
+    turns = np.outer(steps, np.arange(sets)) / sets + _GOLDEN * steps[:, None] ** 2
+    return np.asarray(2 * np.pi * (turns % 1))
 
 
 def _vectorised(law: tuple[int, float, float, float]) -> Force:
