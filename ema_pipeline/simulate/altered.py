@@ -2,65 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from functools import partial
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ema_pipeline.dof import Dof
+from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.mechanics.assembly import Assembly
-from ema_pipeline.mechanics.system import LinearSystem
-from ema_pipeline.rigs.types import Parameter, Rig
+from ema_pipeline.rigs.base import Build, ParametricRig
+from ema_pipeline.rigs.types import Rig
+
+Change = Callable[[str, Assembly], Assembly]
+"""``change(configuration, assembly) -> assembly``"""
 
 
-@dataclass(frozen=True)
-class AlteredRig:
-    """A rig like another one, but for `change`.
+def altered(rig: Rig, change: Change) -> ParametricRig:
+    """A rig like another one, but for what `change` does to its assemblies."""
+    like = rig if isinstance(rig, ParametricRig) else rig_with_effects(rig, [])
+    return dataclasses.replace(like, build=partial(_build, like.build, change))
 
-    Attributes
-    ----------
-    rig : Rig
-    change : callable
-        ``change(configuration, assembly) -> assembly``.
-    """
 
-    rig: Rig
-    change: Callable[[str, Assembly], Assembly]
-
-    @property
-    def name(self) -> str:
-        """Name of the unchanged rig."""
-        return self.rig.name
-
-    @property
-    def configurations(self) -> tuple[str, ...]:
-        """Those of the unchanged rig."""
-        return self.rig.configurations
-
-    @property
-    def parameters(self) -> Mapping[str, Parameter]:
-        """Those of the unchanged rig."""
-        return self.rig.parameters
-
-    def used(self, configuration: str) -> tuple[str, ...]:
-        """See `Rig.used`."""
-        return self.rig.used(configuration)
-
-    def assembly(self, configuration: str, values: Mapping[str, float] | None = None) -> Assembly:
-        """See `Rig.assembly`; changed."""
-        return self.change(configuration, self.rig.assembly(configuration, values))
-
-    def system(self, configuration: str, values: Mapping[str, float] | None = None) -> LinearSystem:
-        """See `Rig.system`; changed."""
-        return self.assembly(configuration, values).system()
-
-    def knows(self, configuration: str, dof: Dof) -> bool:
-        """See `Rig.knows`."""
-        return self.rig.knows(configuration, dof)
-
-    def classify(
-        self, system: LinearSystem, frequency_hz: NDArray[np.float64], shapes: NDArray[np.float64]
-    ) -> tuple[tuple[str, ...], NDArray[np.float64]]:
-        """See `Rig.classify`."""
-        return self.rig.classify(system, frequency_hz, shapes)
+def _build(build: Build, change: Change, configuration: str, values: Mapping[str, float]) -> Assembly:
+    return change(configuration, build(configuration, values))

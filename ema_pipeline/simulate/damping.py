@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from ema_pipeline.mechanics.assembly import Assembly, Damper
 from ema_pipeline.mechanics.modes import eigen_solution
+from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.types import Rig
-from ema_pipeline.simulate.altered import AlteredRig
+from ema_pipeline.simulate.altered import altered
 from ema_pipeline.simulate.imperfections import deviations, generator
 
 
@@ -26,7 +27,7 @@ def draw_damping(rig: Rig, scatter: float, seed: int) -> dict[str, tuple[float, 
     return drawn
 
 
-def damped_rig(rig: Rig, base: Rig, factors: Mapping[str, tuple[float, ...]]) -> AlteredRig:
+def damped_rig(rig: Rig, base: Rig, factors: Mapping[str, tuple[float, ...]]) -> ParametricRig:
     """The rig whose modes have their own damping.
 
     Parameters
@@ -42,7 +43,7 @@ def damped_rig(rig: Rig, base: Rig, factors: Mapping[str, tuple[float, ...]]) ->
         c: frozenset(e.name for e in base.assembly(c).elements if isinstance(e, Damper))
         for c in base.configurations
     }
-    return AlteredRig(rig, partial(_of_configuration, own, dict(factors)))
+    return altered(rig, partial(_of_configuration, own, dict(factors)))
 
 
 def _of_configuration(

@@ -10,8 +10,9 @@ from functools import partial
 import numpy as np
 
 from ema_pipeline.mechanics.assembly import Assembly, Element, Mass, Spring
+from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.types import Rig
-from ema_pipeline.simulate.altered import AlteredRig
+from ema_pipeline.simulate.altered import altered
 from ema_pipeline.simulate.imperfections import deviations, generator
 
 MASS_SHARE = 0.25
@@ -24,16 +25,19 @@ TRANSLATIONS = ("x", "y", "z", "zeta", "eta")
 def parts_of(assembly: Assembly) -> dict[str, tuple[str, ...]]:
     """Parts by name, each with the names of its elements.
 
-    Every spring is a part of its own. The masses of one body in its directions of translation are one part,
-    ``"carrier mass"``; a second mass at the same DOF is another one. Springs without stiffness are no parts.
+    An element may itself say which part it belongs to. Else every spring is a part of its own, and the masses of one
+    body in its directions of translation are one part, ``"carrier mass"``; a second mass at the same DOF is another
+    one. Springs without stiffness are no parts.
     """
     found: dict[str, tuple[str, ...]] = {}
     times: Counter[str] = Counter()
     for element in assembly.elements:
+        stated = str(getattr(element, "part", ""))
         if isinstance(element, Spring) and element.stiffness != 0.0:
-            found[element.name] = (element.name,)
+            part = stated or element.name
+            found[part] = (*found.get(part, ()), element.name)
         elif isinstance(element, Mass):
-            part = _mass_part(element, times)
+            part = stated or _mass_part(element, times)
             found[part] = (*found.get(part, ()), element.name)
     return found
 
@@ -76,9 +80,9 @@ def draw_parts(rig: Rig, scatter: float, seed: int) -> dict[str, float]:
     }
 
 
-def scattered_rig(rig: Rig, factors: Mapping[str, float]) -> AlteredRig:
+def scattered_rig(rig: Rig, factors: Mapping[str, float]) -> ParametricRig:
     """The rig with every part changed by its factor."""
-    return AlteredRig(rig, partial(_scattered, dict(factors)))
+    return altered(rig, partial(_scattered, dict(factors)))
 
 
 def _scattered(factors: Mapping[str, float], configuration: str, assembly: Assembly) -> Assembly:
