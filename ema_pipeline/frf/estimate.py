@@ -13,6 +13,7 @@ from scipy.ndimage import uniform_filter1d
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
+from ema_pipeline.frf.channels import ChannelQuality, merged
 from ema_pipeline.frf.checks import check_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
@@ -112,6 +113,8 @@ class _Total:
     quantities: dict[str, str] = field(default_factory=dict)
     masses: dict[str, float] = field(default_factory=dict)
     delays: dict[str, list[float]] = field(default_factory=dict)
+    channels: dict[str, ChannelQuality] = field(default_factory=dict)
+    hammer: ChannelQuality | None = None
     first: HitSamples | None = None
 
     def sheet_of(self, hit: HitSamples) -> _Sheet:
@@ -138,6 +141,13 @@ class _Total:
                 )
             self.outputs.setdefault(point, replace(channel.dof, sign=1))
             self.masses[point] = max(self.masses.get(point, 0.0), channel.sensor_mass_kg)
+            self.channels[point] = merged(
+                self.channels.get(point),
+                ChannelQuality(channel.name, channel.calibration_std, channel.transverse),
+            )
+        self.hammer = merged(
+            self.hammer, ChannelQuality(hit.force_name, hit.force_calibration_std, hit.force_transverse)
+        )
         impact = hit.hit.impact
         self.inputs.setdefault(impact.point, replace(impact, sign=1))
         self.delays.setdefault(impact.point, []).append((hit.hit.peak - hit.hit.start) / hit.sample_rate_hz)
@@ -264,6 +274,8 @@ def _finish(total: _Total, first: HitSamples, settings: FrfSettings, pool: Threa
         band_hz=_band(forces, frequency, rate, settings.band_drop_db),
         force_calibrated=first.force_calibrated,
         sensor_mass_kg=np.array([total.masses[p] for p in outputs]),
+        channels=tuple(total.channels[p] for p in outputs),
+        hammer=total.hammer,
     )
 
 

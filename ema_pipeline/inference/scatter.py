@@ -29,6 +29,9 @@ class Scatter:
         1 σ of its logarithm; 0 for a scatter that is known.
     wide : float
         Value from which learning begins. Begun too narrow, a fit takes scatter for effects.
+    most : float
+        Largest value, in units of the default. A model that needs more does not explain the data: without this bound
+        its failure would be hidden as scatter.
     """
 
     name: str
@@ -36,6 +39,7 @@ class Scatter:
     default: float
     spread: float = 0.5
     wide: float = 0.0
+    most: float = 2.5
 
     @property
     def start(self) -> float:
@@ -115,4 +119,4 @@ def _mode_of_log(squares: float, count: int, now: float, scatter: Scatter) -> fl
         excess = squares / np.exp(2 * log)
         slope = -count + excess - (log - np.log(scatter.default)) * weight
         log -= float(np.clip(slope / (-2 * excess - weight), -0.5, 0.5))
-    return float(np.exp(log))
+    return float(np.exp(min(log, np.log(scatter.most * scatter.default))))

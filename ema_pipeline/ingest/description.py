@@ -9,10 +9,11 @@ from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.ingest.records import CALIBRATION_STD, TRANSVERSE
 from ema_pipeline.settings import Settings, parse
 from ema_pipeline.units import SI_SYMBOL, Unit, parse_unit
 
@@ -36,6 +37,15 @@ def _parse_dof(value: Any) -> Dof:
 DofText = Annotated[Dof, BeforeValidator(_parse_dof)]
 
 
+def _check_share(value: float) -> float:
+    if not 0 <= value < 1:
+        raise ValueError("give a share from 0 to below 1, e.g. 0.02 for 2 %")
+    return value
+
+
+Share = Annotated[float, AfterValidator(_check_share)]
+
+
 class ChannelDescription(Settings):
     """One ``[[channels]]`` table: a column, dataset or channel of the record files."""
 
@@ -54,6 +64,10 @@ class ChannelDescription(Settings):
     )
     full_scale_v: float | None = Field(
         default=None, gt=0, description="Largest voltage that the converter can carry"
+    )
+    calibration_std: Share = Field(default=CALIBRATION_STD, description="Relative 1 sigma of the sensitivity")
+    transverse: Share = Field(
+        default=TRANSVERSE, description="Transverse sensitivity as a share of the main one, 1 sigma"
     )
     uncalibrated: bool = Field(
         default=False, description="Force channel left in volts on purpose: FRFs and shapes are unscaled"

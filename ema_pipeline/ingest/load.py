@@ -132,6 +132,8 @@ def load_record(test: TestDescription, entry: RecordDescription) -> Record:
                 quantity=channel.quantity,
                 sensor_mass_kg=channel.sensor_mass_kg,
                 full_scale=responses[channel.name].full_scale,
+                calibration_std=channel.calibration_std,
+                transverse=channel.transverse,
             )
         )
     return Record(
@@ -145,6 +147,8 @@ def load_record(test: TestDescription, entry: RecordDescription) -> Record:
         force_full_scale=hammer.full_scale,
         force_calibrated=not test.force.uncalibrated,
         window_decay_rad_s=test.exponential_window_rad_s,
+        force_calibration_std=test.force.calibration_std,
+        force_transverse=test.force.transverse,
     )
 
 
