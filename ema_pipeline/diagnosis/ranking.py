@@ -113,8 +113,11 @@ def _first_fit(
 ) -> Fit:
     """The fit begun at the size that its score tells; annealed from several sizes where the base model fails."""
     model = base.model.plus(hypothesis.placed, hypothesis.scales)
-    unknowns = model.problem(observations).unknowns
+    problem = model.problem(observations)
+    unknowns = problem.unknowns
     begin = transferred(base.posterior, unknowns, np.zeros(len(unknowns)))
+    if not hypothesis.placed.effect.linear:
+        return refined(observations, model, problem.begun(begin, base.posterior.scatters))
     score = promise.get(hypothesis.label)
     if score is not None and len(score.size) == 1:
         at = unknowns.index[hypothesis.placed.parameter_name(hypothesis.placed.effect.parameters[0].name)]

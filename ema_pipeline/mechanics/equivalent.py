@@ -94,9 +94,7 @@ class Motions:
         return np.asarray(2 * mean / np.maximum(self.amplitude, _LEAST))
 
 
-def settled_offsets(
-    elements: Sequence[Nonlinear], motions: Sequence[Motions], flexibility: Real
-) -> Real:
+def settled_offsets(elements: Sequence[Nonlinear], motions: Sequence[Motions], flexibility: Real) -> Real:
     """Offsets about which elements move whose mean force is not zero, m, (n_elements, n_states).
 
     Parameters

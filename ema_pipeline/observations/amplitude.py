@@ -254,8 +254,14 @@ class _Hits:
             for i in (*self.problem.nonlinear_sizes, self.scale):
                 ahead = x.copy()
                 ahead[i] += _STEP if ahead[i] + _STEP <= self.problem.unknowns.upper[i] else -_STEP
-                change = (self._moved(ahead) - moved) / (ahead[i] - x[i]) if np.any(moved) or i != self.scale else 0
-                jacobian[:, i] = -_read(left * change + np.zeros_like(moved), omega, data)[:, hit, mode].ravel()
+                change = (
+                    (self._moved(ahead) - moved) / (ahead[i] - x[i])
+                    if np.any(moved) or i != self.scale
+                    else 0
+                )
+                jacobian[:, i] = -_read(left * change + np.zeros_like(moved), omega, data)[
+                    :, hit, mode
+                ].ravel()
             rows = np.arange(2 * len(hit))
             jacobian[rows[: len(hit)], self.drift[hit]] = -1.0
             predicted = _read(left * moved, omega, data)[:, hit, mode].ravel()
@@ -333,7 +339,9 @@ class _Hits:
         if len(jacobian):
             j = _without_mean(jacobian / sigma[:, None], 1 / sigma, group)
         scale = 0.5 * float(np.sum(np.log(variance / default)))
-        scale += 0.5 * float(np.sum(np.log(np.bincount(group, 1 / variance) / np.bincount(group, 1 / default))))
+        scale += 0.5 * float(
+            np.sum(np.log(np.bincount(group, 1 / variance) / np.bincount(group, 1 / default)))
+        )
         first = np.arange(2 * count) < count
         share = {HIT_FREQUENCY: np.where(first, added / variance, 0.0)}
         share[HIT_DAMPING] = np.where(first, 0.0, added / variance)

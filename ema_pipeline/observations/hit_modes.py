@@ -1,10 +1,10 @@
 """Modes of single hits at several force levels, and how far nonlinear elements move them.
 
-A blow excites all modes at once, and their amplitudes fall while they are observed. A fit of one pole to the spectrum of
-a whole decay finds a mean of the momentary pole over time. Fitted to all lines its weight were (2σ)²t·exp(-2σt), which
-leaves a quarter of the shift that a cubic spring makes at the blow; the band and the smooth terms of the fit leave
-less, so the weight is taken from that fit itself. Modes so near to each other that their beat is slower than their
-decay move in step, so their motions add before an element's force is found; far ones meet in all phases.
+A blow excites all modes at once, and their amplitudes fall while they are observed. A fit of one pole to the spectrum
+of a whole decay finds a mean of the momentary pole over time. Fitted to all lines its weight were (2σ)²t·exp(-2σt),
+which leaves a quarter of the shift that a cubic spring makes at the blow; the band and the smooth terms of the fit
+leave less, so the weight is taken from that fit itself. Modes so near to each other that their beat is slower than
+their decay move in step, so their motions add before an element's force is found; far ones meet in all phases.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ IN_STEP = 4.0
 weight of one mode's force in the other's pole, 1/|1 - jΔω/2σ|², is 0.2."""
 
 _FIRST, _LAST = 0.03, 8.0
-"""First and last instant, in units of 1/2σ of the fastest and the slowest mode; all but 0.3 % of the weight is between."""
+"""First and last instant, in units of 1/2σ of the fastest and the slowest mode; 99.7 % of the weight is between."""
 _PER_EFOLD = 1.1
 _STILL = 1e-300
 _HEARD = 0.1
@@ -154,8 +154,8 @@ class HitData:
         instants = np.exp(np.linspace(first, last, int(_PER_EFOLD * (last - first)) + 2))
         omega = np.median(self.poles.imag, axis=0)
         columns = [
-            _fit_weights(instants, complex(-s, w), np.arange(*band, self.line_hz))
-            for s, w, band in zip(decay, omega, self.band_hz, strict=True)
+            _fit_weights(instants, complex(-s, w), np.arange(low, high, self.line_hz))
+            for s, w, (low, high) in zip(decay, omega, self.band_hz.tolist(), strict=True)
         ]
         return instants, np.stack(columns, axis=1)
 

@@ -253,6 +253,10 @@ class ModeProblem:
         """See `EffectProblem`."""
         return np.concatenate([self.model.start(sizes), np.zeros(len(self.unknowns) - self.offset)])
 
+    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64]:
+        """See `EffectProblem`: modes change with every size."""
+        return x
+
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""
         return self.model.parameter_values(x[: self.offset])
