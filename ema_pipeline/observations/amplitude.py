@@ -37,18 +37,15 @@ _STEP = 1e-3
 _DECADES = 6.0
 _ALONG, _ACROSS = 19, 3
 """Sizes that are tried to begin with: their range, and their number for an effect's first size and the others."""
-_QUASI_STATIC = 0.5
-"""Modes below the lowest measured frequency times this take no part in static flexibility: they are slower than the
-decay of the motion that pushes the mean aside."""
 
 
 def hit_scatters() -> dict[str, Scatter]:
     """The hyper-parameters that single hits add to those of measured modes."""
     known = (
-        Scatter(DRIFT, "ln f of all modes from hit to hit", 1e-4, 1.0, 1e-4),
-        Scatter(HIT_FREQUENCY, "ln f of one mode from hit to hit", 3e-5, 1.0, 3e-5),
-        Scatter(HIT_DAMPING, "ln ζ of one mode from hit to hit", 5e-3, 1.0, 5e-3),
-        Scatter(LINEARISATION, "equivalent linearisation", 0.15, 0.3, 0.15),
+        Scatter(DRIFT, "ln f of all modes from hit to hit", 1e-4, 1.0, 1e-4, 20.0),
+        Scatter(HIT_FREQUENCY, "ln f of one mode from hit to hit", 3e-5, 1.0, 3e-5, 5.0),
+        Scatter(HIT_DAMPING, "ln ζ of one mode from hit to hit", 5e-3, 1.0, 5e-3, 15.0),
+        Scatter(LINEARISATION, "equivalent linearisation", 0.15, 0.3, 0.15, 2.0),
     )
     return {s.name: s for s in known}
 
@@ -285,14 +282,9 @@ class _Hits:
         if not elements or not len(on):
             return total
         rows = element_rows(assembly, elements)
-        shapes = self.paired.solution.shapes[: rows.shape[1]]
-        stretch = rows @ shapes
-        frequency = self.paired.solution.frequency_hz
-        slow = frequency < _QUASI_STATIC * float(np.exp(data.log_frequency[:, on].min()))
-        flexible = np.where(slow, 0.0, 1 / self.paired.solution.eigenvalues)
-        along = np.zeros((len(elements), len(match)))
-        along[:, on] = stretch[:, match[on]]
-        linear = Linear(along, (stretch * flexible) @ stretch.T, self._displacement(x, match, on))
+        solution = self.paired.solution
+        stretch = rows @ solution.shapes[: rows.shape[1]]
+        linear = Linear.of(data, stretch, match, solution.eigenvalues, self._displacement(x, match, on))
         return shifted_poles(data, [self._scaled(e, x) for e in elements], linear)
 
     def _displacement(
