@@ -9,21 +9,26 @@ from __future__ import annotations
 import contextlib
 import datetime
 import os
+import platform
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import Any, TypeVar
 
 import h5py
+from filelock import FileLock, Timeout
 
 from ema_pipeline import __version__, codec
 from ema_pipeline.errors import EmaError
+from ema_pipeline.processes import workers_die_with_us
 
 T = TypeVar("T")
 
 ALL = "all"
 """Name that stands for all configurations together."""
+
+LOCK_FILE = ".lock"
 
 _FORMAT = 1
 
@@ -83,17 +88,28 @@ class Store:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep a second process from writing to the same results folder."""
+        """Keep a second process from writing to the same results folder.
+
+        The lock belongs to this process alone: the system gives it up when the process ends, and processes
+        forked from it neither inherit it nor outlive it.
+        """
+        path = self.folder / LOCK_FILE
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            handle = (self.folder / ".lock").open("w")
+            lock = FileLock(path, timeout=0)
+            held = lock.acquire()
+        except Timeout:
+            raise EmaError(f"{self.folder}: {_holder(path)} is writing there; wait for it to end") from None
         except OSError as error:
             raise EmaError(
                 f"{self.folder}: cannot write results there ({_reason(error)}); choose another with --out"
             ) from None
-        with handle:
-            if not _try_lock(handle):
-                raise EmaError(f"{self.folder}: another ema process is writing there; wait for it to end")
+        with held, workers_die_with_us():
+            if (
+                type(lock) is FileLock
+            ):  # where a file system knows no locks, filelock writes a mark of its own
+                with contextlib.suppress(OSError):  # only a help to whoever finds the folder locked
+                    path.write_text(f"{os.getpid()} {platform.node()}", encoding="utf-8")
             for left_over in self.folder.glob(".ema.h5.*.tmp"):
                 left_over.unlink(missing_ok=True)
             yield
@@ -208,13 +224,12 @@ def _reason(error: OSError) -> str:
     return error.strerror or str(error).split("\n")[0]
 
 
-def _try_lock(handle: IO[str]) -> bool:
+def _holder(path: Path) -> str:
+    """Who holds the lock, as far as the lock file tells."""
     try:
-        import fcntl
-    except ImportError:  # no advisory locks on this platform
-        return True
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
+        process, _, machine = path.read_text(encoding="utf-8").partition(" ")
+    except (OSError, UnicodeDecodeError):
+        return "another ema process"
+    if not process.isdecimal() or len(process) > 20:
+        return "another ema process"
+    return f"another ema process (number {process} on {machine[:64]})"

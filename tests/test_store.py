@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -165,6 +166,55 @@ with Store(Path({str(tmp_path)!r})).lock():
     free = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "another ema process" in blocked.stderr
     assert free.stdout.strip() == "locked"
+
+
+def test_workers_of_a_killed_process_die_and_leave_no_lock(tmp_path: Path) -> None:
+    code = f"""
+import os, time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from ema_pipeline.store import Store
+
+def work(seconds):
+    print("worker", os.getpid(), flush=True)
+    time.sleep(seconds)
+
+with Store(Path({str(tmp_path)!r})).lock(), ProcessPoolExecutor(2, mp_context=get_context("fork")) as pool:
+    list(pool.map(work, [60, 60]))
+"""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    workers = [int(process.stdout.readline().split()[1]) for _ in range(2)]
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    with Store(tmp_path).lock():
+        pass
+    deadline = time.monotonic() + 5
+    while any(_alive(worker) for worker in workers):
+        assert time.monotonic() < deadline, "workers outlive their parent"
+        time.sleep(0.01)
+
+
+def _alive(pid: int) -> bool:
+    """True for a process that runs; one that is dead and only waits to be counted does not."""
+    try:
+        return ") Z" not in Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
+    except OSError:
+        return False
+
+
+def test_the_message_about_a_lock_says_who_holds_it(tmp_path: Path) -> None:
+    code = f"""
+from pathlib import Path
+from ema_pipeline.store import Store
+with Store(Path({str(tmp_path)!r})).lock():
+    pass
+"""
+    with Store(tmp_path).lock():
+        blocked = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert f"number {os.getpid()} on" in blocked.stderr
 
 
 def test_a_process_killed_while_it_writes_leaves_a_readable_store(tmp_path: Path) -> None:
