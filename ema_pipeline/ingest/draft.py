@@ -12,6 +12,7 @@ from pathlib import Path
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
+from ema_pipeline.files import replace_file
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE
 from ema_pipeline.ingest.readers import read_raw, reader_of
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord
@@ -76,12 +77,7 @@ def write_drafts(raw: Path) -> list[Path]:
         )
     drafts = {folder / DESCRIPTION_FILE: draft_description(folder) for folder in missing}
     for path, text in drafts.items():
-        try:
-            path.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise EmaError(
-                f"{path}: cannot be written ({error.strerror}); check the folder's rights"
-            ) from None
+        replace_file(path, text)
     return list(drafts)
 
 

@@ -212,6 +212,6 @@ def load_info(store: Store) -> RunInfo | None:
             return None
         try:
             info: RunInfo = codec.read(file, "run", RunInfo)
-        except KeyError:  # written by a version that knew less; a new run writes it again
+        except codec.MissingError:  # written by a version that knew less; a new run writes it again
             return None
         return info
