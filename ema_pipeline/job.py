@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,6 @@ from ema_pipeline.ingest.description import Campaign, TestDescription, read_camp
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.pipeline import (
-    PipelineSettings,
     ShowStage,
     describe_run,
     existing_run,
@@ -27,7 +25,9 @@ from ema_pipeline.pipeline import (
     override,
     run_stages,
     shipped_pipelines,
+    stored_settings,
     toml_value,
+    with_effect_files,
 )
 from ema_pipeline.rigs import Rig, load_rig, model_modes, rig_names
 from ema_pipeline.stages.base import Run, RunInfo, load_info, save_info
@@ -52,6 +52,7 @@ def run_raw(
     overrides: Iterable[str] = (),
     show: ShowStage | None = None,
     describe_source: DescribeSource | None = None,
+    effect_files: Iterable[str] = (),
 ) -> tuple[Run, list[str]]:
     """Run a whole pipeline on a raw folder, or on a table of modes.
 
@@ -72,6 +73,8 @@ def run_raw(
         Display of progress.
     describe_source : callable
         `describe` for raw folders, `describe_modes` for a table of modes.
+    effect_files : iterable of str
+        Python files with the user's own effects.
 
     Returns
     -------
@@ -85,17 +88,22 @@ def run_raw(
         Whatever is wrong with data or settings, in one line.
     """
     info = (describe_source or describe)(raw, rig, pipeline, overrides)
-    store = Store(out)
+    store, effect_files = Store(out), tuple(effect_files)
+    info = with_effect_files(store, info, effect_files)
     with _tidy(out), store.lock():
         info = _with_effects_of(store, info)
         save_info(store, info)
-        run = new_run(store, info)
-        stages = PipelineSettings.model_validate_json(info.pipeline).stages
+        run = new_run(store, info, effect_files)
+        stages = stored_settings(store, info).stages
         return run, run_stages(run, stages, show)
 
 
 def run_on(
-    folder: Path, stages: Iterable[str], overrides: Iterable[str] = (), show: ShowStage | None = None
+    folder: Path,
+    stages: Iterable[str],
+    overrides: Iterable[str] = (),
+    show: ShowStage | None = None,
+    effect_files: Iterable[str] = (),
 ) -> tuple[Run, list[str]]:
     """Run single stages on a results folder; settings changed by `overrides` stay changed there.
 
@@ -104,13 +112,14 @@ def run_on(
     EmaError
         Whatever is wrong with the folder or the settings, in one line.
     """
-    info = existing_run(folder).info
-    settings = override(PipelineSettings.model_validate_json(info.pipeline), overrides, folder)
+    effect_files = tuple(effect_files)
+    info = existing_run(folder, effect_files).info
     store = Store(folder)
+    settings = override(stored_settings(store, info), overrides, folder)
     with store.lock():
         info = dataclasses.replace(info, pipeline=settings.model_dump_json())
         save_info(store, info)
-        run = new_run(store, info)
+        run = new_run(store, info, effect_files)
         return run, run_stages(run, stages, show)
 
 
@@ -119,6 +128,7 @@ def change_effects(
     change: Callable[[tuple[str, ...]], tuple[str, ...]],
     overrides: Iterable[str] = (),
     show: ShowStage | None = None,
+    effect_files: Iterable[str] = (),
 ) -> Run:
     """Change the effects that were added to the model, and refit, compare and report.
 
@@ -131,35 +141,30 @@ def change_effects(
     overrides : iterable of str
         ``stage.key=value``.
     show : ShowStage or None
+    effect_files : iterable of str
+        Python files with the user's own effects.
 
     Raises
     ------
     EmaError
         For effects or places that do not exist; nothing is changed then.
     """
-    run = existing_run(folder)
+    effect_files = tuple(effect_files)
+    run = existing_run(folder, effect_files)
     run.require_model("add")
-    settings = override(PipelineSettings.model_validate_json(run.info.pipeline), overrides, folder)
     store = Store(folder)
+    settings = override(stored_settings(store, run.info), overrides, folder)
     with store.lock():
         info = dataclasses.replace(
             run.info, effects=change(run.info.effects), pipeline=settings.model_dump_json()
         )
-        run = new_run(store, info)
+        run = new_run(store, info, effect_files)
         run.require_model("add")  # refuses unknown effects and places before anything is written
         if info.kind == "hysteresis":
             effect_ids(info.effects)
         save_info(store, info)
         run_stages(run, ("ladder", "fit", "correlate", "report"), show)
     return run
-
-
-def with_effect_files(known: Iterable[str], files: Iterable[str], overrides: Iterable[str]) -> list[str]:
-    """Overrides that also name files with the user's own effects, in addition to the `known` ones."""
-    new = [str(Path(f).resolve()) for f in files]
-    if not new:
-        return list(overrides)
-    return [*overrides, f"effect_files={json.dumps(list(dict.fromkeys((*known, *new))))}"]
 
 
 def adding(labels: Iterable[str]) -> Callable[[tuple[str, ...]], tuple[str, ...]]:
@@ -331,7 +336,7 @@ def report_path(out: Path) -> Path:
     return path.resolve()
 
 
-def export_results(out: Path, folder: Path) -> list[Path]:
+def export_results(out: Path, folder: Path, effect_files: Iterable[str] = ()) -> list[Path]:
     """Write FRFs, modes and shapes of every configuration as universal file and as CSV.
 
     Raises
@@ -343,7 +348,7 @@ def export_results(out: Path, folder: Path) -> list[Path]:
     from ema_pipeline.exchange.uff import write_uff
     from ema_pipeline.stages.modes import measured_frfs, modes_of_structure
 
-    run = existing_run(out)
+    run = existing_run(out, effect_files)
     measured = measured_frfs(run)
     written = []
     try:

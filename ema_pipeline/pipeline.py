@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib
 import json
@@ -13,7 +14,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from ema_pipeline.correlate.settings import CompareSettings, PairingSettings
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -34,6 +35,7 @@ from ema_pipeline.stages.base import (
     Stage,
     code_fingerprint,
     configurations_of,
+    file_hash,
     load_info,
     silent,
     versions,
@@ -172,14 +174,69 @@ def toml_value(text: str) -> Any:
         return text
 
 
-def new_run(store: Store, info: RunInfo) -> Run:
-    """A run with the settings that its description holds."""
-    settings = PipelineSettings.model_validate_json(info.pipeline)
-    return Run(store, info, {name: settings.of(name) for name in STAGES}, settings.effect_files)
+def new_run(store: Store, info: RunInfo, effect_files: Iterable[str] = ()) -> Run:
+    """A run with the settings that its description holds.
+
+    Parameters
+    ----------
+    store : Store
+    info : RunInfo
+    effect_files : iterable of str
+        Files with the user's own effects that are named in this call: only their code may run.
+    """
+    settings = stored_settings(store, info)
+    stages = {name: settings.of(name) for name in STAGES}
+    return Run(store, info, stages, settings.effect_files, frozenset(map(_absolute, effect_files)))
 
 
-def existing_run(folder: Path) -> Run:
+def with_effect_files(store: Store, info: RunInfo, effect_files: Iterable[str]) -> RunInfo:
+    """The description with the named files of the user's own effects, and their hashes, added.
+
+    A file that is known already but has moved replaces what stood under its name.
+    """
+    named = [_absolute(file) for file in effect_files]
+    if not named:
+        return info
+    settings = stored_settings(store, info)
+    names = {Path(file).name for file in named}
+    known = [file for file in settings.effect_files if Path(file).name not in names]
+    files = tuple(dict.fromkeys((*known, *named)))
+    hashes = info.effect_hashes | {file: file_hash(Path(file)) for file in named}
+    return dataclasses.replace(
+        info,
+        pipeline=settings.model_copy(update={"effect_files": files}).model_dump_json(),
+        effect_hashes={file: hashes[file] for file in files if file in hashes},
+    )
+
+
+def _absolute(file: str) -> str:
+    return str(Path(file).resolve())
+
+
+def stored_settings(store: Store, info: RunInfo) -> PipelineSettings:
+    """The settings that a run's description holds.
+
+    Raises
+    ------
+    EmaError
+        If this version of the program cannot read them.
+    """
+    try:
+        return PipelineSettings.model_validate_json(info.pipeline)
+    except ValidationError:
+        raise EmaError(
+            f"{store.path}: holds settings that this version of ema does not know; delete it and run again"
+        ) from None
+
+
+def existing_run(folder: Path, effect_files: Iterable[str] = ()) -> Run:
     """The run that a results folder belongs to.
+
+    Parameters
+    ----------
+    folder : Path
+    effect_files : iterable of str
+        As in `new_run`.
 
     Raises
     ------
@@ -190,7 +247,8 @@ def existing_run(folder: Path) -> Run:
     info = load_info(store)
     if info is None:
         raise EmaError(f"{store.path}: holds no run; make one with 'ema run RAW --out {folder}'")
-    return new_run(store, info)
+    effect_files = tuple(effect_files)
+    return new_run(store, with_effect_files(store, info, effect_files), effect_files)
 
 
 def describe_run(

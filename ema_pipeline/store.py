@@ -211,9 +211,10 @@ class Store:
         found: dict[tuple[str, str], Provenance] = {}
         with self.reading() as file:
             stages = _find(file, "stages")
-            for stage in stages or ():
-                for configuration in codec.member(stages, stage):
-                    group = codec.member(stages[stage], configuration)
+            for stage in () if stages is None else stages:
+                configurations = codec.member(stages, stage)
+                for configuration in configurations:
+                    group = codec.member(configurations, configuration)
                     found[stage, configuration] = codec.read(group, "provenance", Provenance)
         return found
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -50,7 +51,7 @@ def progress(quiet: bool) -> Iterator[ShowStage | None]:
         from ema_pipeline.report.listings import progress_bars
 
         with progress_bars() as show_stage:
-            yield lambda label: _cleaned(show_stage(_shown(label)))
+            yield partial(_cleaned_stage, show_stage)
 
 
 def _shown(text: str) -> str:
@@ -61,9 +62,13 @@ def _shown(text: str) -> str:
 
 
 @contextmanager
-def _cleaned(stage: AbstractContextManager[Progress]) -> Iterator[Progress]:
-    with stage as tell:
-        yield lambda done, text="": tell(done, _shown(text))
+def _cleaned_stage(show_stage: ShowStage, label: str) -> Iterator[Progress]:
+    with show_stage(_shown(label)) as bar:
+
+        def tell(done: float, text: str = "") -> None:
+            bar(done, _shown(text))
+
+        yield tell
 
 
 @contextmanager
