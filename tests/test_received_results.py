@@ -53,7 +53,7 @@ def with_effect_file(results: Path, folder: Path, file: Path) -> Path:
     info = load_info(Store(results))
     assert info is not None
     pipeline = json.loads(info.pipeline) | {"effect_files": [str(file)]}
-    return received(results, folder, pipeline=json.dumps(pipeline), effects=("film@sun",))
+    return received(results, folder, pipeline=json.dumps(pipeline), effects=("film@sun.y",))
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_the_code_that_received_results_name_does_not_run(results: Path, tmp_pat
     marker, file = tmp_path / "it_ran", tmp_path / "film.py"
     file.write_text(EFFECT.format(marker=str(marker)), encoding="utf-8")
     out = with_effect_file(results, tmp_path, file)
-    more = ["film@sun"] if verb in ("add", "remove") else []
+    more = ["film@sun.y"] if verb in ("add", "remove") else []
     done = CliRunner().invoke(app, [verb, str(out), *more])
     assert not marker.exists()
     if verb != "export":  # what was measured is exported without a model
@@ -103,7 +103,7 @@ def test_an_effect_file_that_ends_the_program_is_one_clear_line(tmp_path: Path) 
     file.write_text("import sys\nsys.exit(0)\n", encoding="utf-8")
     out = tmp_path / "raw"
     done = CliRunner().invoke(
-        app, ["simulate", str(out), "--effect", "film@sun:mass=1", "--effect-file", str(file)]
+        app, ["simulate", str(out), "--effect", "film@sun.y:mass=1", "--effect-file", str(file)]
     )
     assert isinstance(done.exception, EmaError)
     assert "does not run: SystemExit" in str(done.exception)
