@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,10 +13,12 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.isolators import isolators
 from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.files import read_bounded
 from ema_pipeline.hysteresis.effects import effect_ids
 from ema_pipeline.ingest.description import Campaign, TestDescription, read_campaign
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Hit
+from ema_pipeline.names import check_name
 from ema_pipeline.pipeline import (
     ShowStage,
     describe_run,
@@ -32,6 +35,7 @@ from ema_pipeline.pipeline import (
 from ema_pipeline.rigs import Rig, load_rig, model_modes, rig_names
 from ema_pipeline.stages.base import Run, RunInfo, load_info, save_info
 from ema_pipeline.store import Store
+from ema_pipeline.toml_text import LARGEST_BYTES, read_toml, read_toml_text
 
 if TYPE_CHECKING:
     from ema_pipeline.simulate.campaign import SimulatedCampaign
@@ -204,7 +208,7 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
     if kinds == {"hysteresis"}:
         return _describe_loops(campaign, rig, pipeline, overrides)
     source = rig or _rig_of(campaign)
-    model = None if source is None else load_rig(source)
+    model = None if source is None else _load_rig(source)
     names = tuple(_configuration(test, model) for test in campaign.tests)
     if model is not None:
         for test, name in zip(campaign.tests, names, strict=True):
@@ -223,7 +227,7 @@ def _describe_loops(
 ) -> RunInfo:
     """Hysteresis tests: the base model is the linear spring of an isolator, which the loops themselves determine."""
     source = rig or _rig_of(campaign) or LOOPS_RIG
-    model = load_rig(source)
+    model = _load_rig(source)
     if not any(isolators(model.assembly(name)) for name in model.configurations):
         raise EmaError(f"{source}: has no isolator that loops could be measured on; leave --rig out")
     names = tuple(test.configuration or "default" for test in campaign.tests)
@@ -238,7 +242,12 @@ def describe_modes(file: Path, rig: str | None, pipeline: str | None, overrides:
 
     if rig is None:
         raise EmaError(f"{file}: a table of modes needs a model to compare with; name it with --rig")
-    model = load_rig(rig)
+    model = _load_rig(rig)
+    # Within limits, before the table's own reader sees it.
+    if file.suffix.lower() == ".toml":
+        read_toml(file)
+    else:
+        read_bounded(file, LARGEST_BYTES)
     names = tuple(read_mode_table(file, model))
     settings = load_pipeline(pipeline or _pipeline_for(model), overrides)
     return describe_run("modes", file, file.stem, _rig_text(rig), rig, names, (), settings)
@@ -285,7 +294,17 @@ def _rig_text(source: str | None) -> str:
     """Name of a shipped rig, or the text of the user's file, which then lives on in the store."""
     if source is None or source in rig_names():
         return source or ""
-    return Path(source).read_text(encoding="utf-8-sig").rstrip() + "\n"
+    return read_toml_text(Path(source)).rstrip() + "\n"
+
+
+def _load_rig(source: str) -> Rig:
+    """A rig by its name or from its file, which is checked before the rig's own reader sees it."""
+    if source not in rig_names() and os.path.exists(source):
+        read_toml(Path(source))
+    rig = load_rig(source)
+    for name in rig.configurations:
+        check_name(name, f"{source}: configuration")
+    return rig
 
 
 def _configuration(test: TestDescription, rig: Rig | None) -> str:
@@ -368,7 +387,7 @@ def export_results(out: Path, folder: Path, effect_files: Iterable[str] = ()) ->
 
 def list_model_modes(rig: str, configuration: str | None) -> dict[str, list[dict[str, Any]]]:
     """The model's own modes for one configuration, or for all of them."""
-    loaded = load_rig(rig)
+    loaded = _load_rig(rig)
     return {
         name: [
             {"frequency_hz": m.frequency_hz, "damping_ratio": m.damping_ratio, "family": m.family}
@@ -382,7 +401,7 @@ def list_effects(rig: str) -> list[dict[str, Any]]:
     """Effects that can sit on a rig, with places, parameters and tell-tale signs."""
     from ema_pipeline.effects.library import shipped_effects
 
-    loaded = load_rig(rig)
+    loaded = _load_rig(rig)
     listed = []
     for effect in shipped_effects().values():
         places = dict.fromkeys(p for c in loaded.configurations for p in effect.places(loaded, c))

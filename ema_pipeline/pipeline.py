@@ -6,8 +6,8 @@ import dataclasses
 import hashlib
 import importlib
 import json
+import os
 import time
-import tomllib
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from functools import cached_property
@@ -23,9 +23,11 @@ from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.hysteresis.settings import HysteresisSettings
 from ema_pipeline.ingest.hit_settings import HitSettings
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.levels.settings import LevelSettings
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.names import check_name
 from ema_pipeline.report.settings import ReportSettings
 from ema_pipeline.settings import Settings, parse
 from ema_pipeline.stages.base import (
@@ -41,6 +43,7 @@ from ema_pipeline.stages.base import (
     versions,
 )
 from ema_pipeline.store import ALL, Store
+from ema_pipeline.toml_text import parse_toml, read_toml
 
 STAGES = (
     "ingest", "hits", "frf", "modal", "levels", "loops", "ladder", "fit", "correlate", "diagnose", "report",
@@ -55,8 +58,8 @@ STAGES_OF_KIND = {
 """Stages that have something to do, by kind of test."""
 
 
-class IngestSettings(Settings):
-    """Reading raw folders has nothing to set: everything is said in test.toml."""
+class IngestSettings(ReadLimits):
+    """Reading raw folders: all but the limits is said in test.toml."""
 
 
 class CorrelateSettings(Settings):
@@ -130,15 +133,11 @@ def load_pipeline(name_or_path: str, overrides: Iterable[str] = ()) -> PipelineS
     """
     shipped = shipped_pipelines()
     path = shipped.get(name_or_path, Path(name_or_path))
-    if not path.is_file():
+    if not os.path.exists(path):
         raise EmaError(
             f"no pipeline '{name_or_path}'{did_you_mean(name_or_path, shipped)}; or give a TOML file"
         )
-    try:
-        data: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise EmaError(f"{path}: is not valid TOML: {error}") from None
-    return _settings(data, overrides, str(path))
+    return _settings(read_toml(path), overrides, str(path))
 
 
 def override(settings: PipelineSettings, overrides: Iterable[str], where: str | Path) -> PipelineSettings:
@@ -169,8 +168,8 @@ def _settings(data: dict[str, Any], overrides: Iterable[str], where: str) -> Pip
 def toml_value(text: str) -> Any:
     """A value as TOML would read it; text that is no TOML is taken as it stands."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return parse_toml(f"value = {text}", text)["value"]
+    except EmaError:
         return text
 
 
@@ -261,7 +260,15 @@ def describe_run(
     effects: tuple[str, ...],
     settings: PipelineSettings,
 ) -> RunInfo:
-    """Description of a run, for the store."""
+    """Description of a run, for the store.
+
+    Raises
+    ------
+    EmaError
+        If a configuration has a name that no file can have.
+    """
+    for name in configurations:
+        check_name(name, f"{raw}: configuration")
     return RunInfo(
         kind=kind,
         raw=str(raw),

@@ -18,7 +18,7 @@ from ema_pipeline.store import Store
 EFFECT = """
 from pathlib import Path
 Path({marker!r}).touch()
-from ema_pipeline.effects.mass import EFFECT as SHIPPED
+from ema_pipeline.effects.spring import EFFECT as SHIPPED
 from dataclasses import replace
 EFFECT = replace(SHIPPED, id="film")
 """
@@ -103,7 +103,7 @@ def test_an_effect_file_that_ends_the_program_is_one_clear_line(tmp_path: Path) 
     file.write_text("import sys\nsys.exit(0)\n", encoding="utf-8")
     out = tmp_path / "raw"
     done = CliRunner().invoke(
-        app, ["simulate", str(out), "--effect", "film@sun.y:mass=1", "--effect-file", str(file)]
+        app, ["simulate", str(out), "--effect", "film@sun.y:stiffness=1", "--effect-file", str(file)]
     )
     assert isinstance(done.exception, EmaError)
     assert "does not run: SystemExit" in str(done.exception)

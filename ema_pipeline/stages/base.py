@@ -17,6 +17,7 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.errors import EmaError
+from ema_pipeline.names import check_name
 from ema_pipeline.rigs import Rig, load_rig, rig_kinds
 from ema_pipeline.rigs.files import rig_from_text
 from ema_pipeline.settings import Settings
@@ -237,4 +238,6 @@ def load_info(store: Store) -> RunInfo | None:
             info: RunInfo = codec.read(file, "run", RunInfo)
         except codec.MissingError:  # written by a version that knew less; a new run writes it again
             return None
-        return info
+    for name in info.configurations:
+        check_name(name, f"{store.path}: configuration")
+    return info
