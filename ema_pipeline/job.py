@@ -330,15 +330,24 @@ def _pipeline_for(rig: Rig | None) -> str:
     return name if name in shipped_pipelines() else DEFAULT_PIPELINE
 
 
-def check_raw(raw: Path) -> dict[str, tuple[Hit, ...]]:
+def check_raw(raw: Path, overrides: Iterable[str] = ()) -> dict[str, tuple[Hit, ...]]:
     """Hits of every configuration of a raw folder with their verdicts; nothing is written."""
     from ema_pipeline.ingest.quality import hits_of_test
 
-    settings = load_pipeline(DEFAULT_PIPELINE).hits
+    settings = load_pipeline(DEFAULT_PIPELINE, overrides)
     judged = {}
     for test in read_campaign(raw).tests:
-        judged[test.configuration or "default"] = hits_of_test(list(load_records(test)), settings)
+        judged[test.configuration or "default"] = hits_of_test(
+            list(load_records(test, settings.ingest)), settings.hits
+        )
     return judged
+
+
+def draft_raw(raw: Path, overrides: Iterable[str] = ()) -> list[Path]:
+    """Draft test.toml from what the record files of a folder say; returns the files written."""
+    from ema_pipeline.ingest.draft import write_drafts
+
+    return write_drafts(raw, load_pipeline(DEFAULT_PIPELINE, overrides).ingest)
 
 
 def report_path(out: Path) -> Path:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers.preamble import Preamble, read_preamble
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord
 from ema_pipeline.ingest.readers.timebase import (
@@ -103,7 +104,7 @@ def decode(data: bytes) -> str:
         return data.decode("cp1252", errors="replace")
 
 
-def read(path: Path) -> RawRecord:
+def read(path: Path, limits: ReadLimits) -> RawRecord:
     """Read the table; a time column or the preamble gives the sample rate."""
     lines = re.split(r"\r\n|\n|\r", decode(path.read_bytes()))
     rows = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
