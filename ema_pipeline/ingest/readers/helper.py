@@ -75,10 +75,19 @@ def _restrain(unpacked_bytes: int, seconds: float) -> None:
     except OSError:
         return
     memory = pages * resource.getpagesize() + _SPARE_BYTES + _COPIES * unpacked_bytes
-    resource.setrlimit(resource.RLIMIT_AS, (memory, resource.RLIM_INFINITY))
+    _lower(resource.RLIMIT_AS, memory)
     used = resource.getrusage(resource.RUSAGE_SELF)
     spent = used.ru_utime + used.ru_stime
-    resource.setrlimit(resource.RLIMIT_CPU, (int(spent + seconds) + 1, resource.RLIM_INFINITY))
+    _lower(resource.RLIMIT_CPU, int(spent + seconds) + 1)
+
+
+def _lower(what: int, limit: int) -> None:
+    """Set a limit for the next file, within those that the user's own system sets."""
+    import resource
+
+    _, most = resource.getrlimit(what)
+    limit = limit if most == resource.RLIM_INFINITY else min(limit, most)
+    resource.setrlimit(what, (limit, most))
 
 
 def _try_stored(record: RawRecord) -> None:
