@@ -208,7 +208,7 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
     if kinds == {"hysteresis"}:
         return _describe_loops(campaign, rig, pipeline, overrides)
     source = rig or _rig_of(campaign)
-    model = None if source is None else _load_rig(source)
+    model = None if source is None else checked_rig(source)
     names = tuple(_configuration(test, model) for test in campaign.tests)
     if model is not None:
         for test, name in zip(campaign.tests, names, strict=True):
@@ -227,7 +227,7 @@ def _describe_loops(
 ) -> RunInfo:
     """Hysteresis tests: the base model is the linear spring of an isolator, which the loops themselves determine."""
     source = rig or _rig_of(campaign) or LOOPS_RIG
-    model = _load_rig(source)
+    model = checked_rig(source)
     if not any(isolators(model.assembly(name)) for name in model.configurations):
         raise EmaError(f"{source}: has no isolator that loops could be measured on; leave --rig out")
     names = tuple(test.configuration or "default" for test in campaign.tests)
@@ -242,7 +242,7 @@ def describe_modes(file: Path, rig: str | None, pipeline: str | None, overrides:
 
     if rig is None:
         raise EmaError(f"{file}: a table of modes needs a model to compare with; name it with --rig")
-    model = _load_rig(rig)
+    model = checked_rig(rig)
     # Within limits, before the table's own reader sees it.
     if file.suffix.lower() == ".toml":
         read_toml(file)
@@ -297,8 +297,14 @@ def _rig_text(source: str | None) -> str:
     return read_toml_text(Path(source)).rstrip() + "\n"
 
 
-def _load_rig(source: str) -> Rig:
-    """A rig by its name or from its file, which is checked before the rig's own reader sees it."""
+def checked_rig(source: str) -> Rig:
+    """A rig by its name or from its file, which is checked before the rig's own reader sees it.
+
+    Raises
+    ------
+    EmaError
+        Whatever is wrong with the file, in one line.
+    """
     if source not in rig_names() and os.path.exists(source):
         read_toml(Path(source))
     rig = load_rig(source)
@@ -396,7 +402,7 @@ def export_results(out: Path, folder: Path, effect_files: Iterable[str] = ()) ->
 
 def list_model_modes(rig: str, configuration: str | None) -> dict[str, list[dict[str, Any]]]:
     """The model's own modes for one configuration, or for all of them."""
-    loaded = _load_rig(rig)
+    loaded = checked_rig(rig)
     return {
         name: [
             {"frequency_hz": m.frequency_hz, "damping_ratio": m.damping_ratio, "family": m.family}
@@ -410,7 +416,7 @@ def list_effects(rig: str) -> list[dict[str, Any]]:
     """Effects that can sit on a rig, with places, parameters and tell-tale signs."""
     from ema_pipeline.effects.library import shipped_effects
 
-    loaded = _load_rig(rig)
+    loaded = checked_rig(rig)
     listed = []
     for effect in shipped_effects().values():
         places = dict.fromkeys(p for c in loaded.configurations for p in effect.places(loaded, c))
