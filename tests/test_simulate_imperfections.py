@@ -404,6 +404,9 @@ def test_hits_of_one_record_of_a_nonlinear_rig_are_alike(tmp_path: Path) -> None
     assert together == [((hits[0][0], hits[1][0]), draws[0])]
     linear = TestFolder._together(RIG.assembly("no_ring"), hits, draws)
     assert [h for _, h in linear] == list(draws)
+    series = HitSeries(LEVELS["normal"], "independent", np.random.default_rng(0))
+    one, other = TestFolder._draws(assembly, series, 2)
+    assert one == other
     history = ForceHistory(together[0][0], 5120.0, 2560)
     struck, place = as_struck(assembly, Dof("sun", "y"), draws[0], 0.0)
     ((force, _),) = integrated_response(struck, (history,), place, (Dof("sun", "x"),))
