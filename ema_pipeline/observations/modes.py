@@ -16,6 +16,7 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.correlate.settings import UncertaintySettings
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
@@ -106,8 +107,14 @@ class ModeData:
         return dataclasses.replace(self, complete=False, **{n: getattr(self, n)[keep] for n in names})
 
 
-def prepare(measured: MeasuredModes) -> ModeData:
-    """Measured modes in the form that residuals need."""
+def _known_or(std: NDArray[np.float64], assumed: float) -> NDArray[np.float64]:
+    """Standard deviations, the assumed one where none is known."""
+    return np.where(np.isfinite(std) & (std > 0), std, assumed)
+
+
+def prepare(measured: MeasuredModes, settings: UncertaintySettings | None = None) -> ModeData:
+    """Measured modes in the form that residuals need; where no scatter is known, `settings` say what is assumed."""
+    settings = settings or UncertaintySettings()
     m, f = len(measured), measured.frequency_hz
     shapes = np.zeros((m, 0))
     std = np.zeros((m, 0))
