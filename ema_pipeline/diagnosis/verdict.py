@@ -9,7 +9,7 @@ from ema_pipeline.diagnosis.claims import Judged
 from ema_pipeline.diagnosis.selection import Selection
 from ema_pipeline.diagnosis.settings import DiagnoseSettings
 from ema_pipeline.observations.fitting import Fit
-from ema_pipeline.observations.parts import PART_SCATTER
+from ema_pipeline.observations.parts import MASS_SCATTER, PART_SCATTER
 
 
 def explains(fit: Fit, settings: DiagnoseSettings) -> bool:
@@ -19,7 +19,7 @@ def explains(fit: Fit, settings: DiagnoseSettings) -> bool:
 
 def outlying_parts(fit: Fit, settings: DiagnoseSettings) -> dict[str, float]:
     """Relative deviation of every part that lies further out than the scatter of parts allows, furthest first."""
-    governed = fit.posterior.unknowns.governed(PART_SCATTER)
+    governed = fit.posterior.unknowns.governed(PART_SCATTER) | fit.posterior.unknowns.governed(MASS_SCATTER)
     far = np.abs(fit.posterior.x) > settings.part_limit * fit.posterior.prior_std
     found = {
         fit.posterior.unknowns.names[i]: float(np.expm1(fit.posterior.x[i]))
