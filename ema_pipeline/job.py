@@ -13,10 +13,10 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.isolators import isolators
 from ema_pipeline.errors import EmaError, did_you_mean
-from ema_pipeline.hysteresis.effects import effect_ids
 from ema_pipeline.ingest.description import Campaign, TestDescription, read_campaign
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Hit
+from ema_pipeline.loops.effects import effect_ids
 from ema_pipeline.pipeline import (
     PipelineSettings,
     ShowStage,

@@ -10,14 +10,14 @@ import pytest
 
 from ema_pipeline import codec
 from ema_pipeline.errors import EmaError
-from ema_pipeline.hysteresis.closed_form import bouc_wen_steps, damping_from_energies, hysteresis_force
-from ema_pipeline.hysteresis.figures import isolator_figures
-from ema_pipeline.hysteresis.identify import identify_isolator
-from ema_pipeline.hysteresis.loops import measure_loop
-from ema_pipeline.hysteresis.simulate import PRINTED, simulate_sine_test, write_sine_tests
-from ema_pipeline.hysteresis.stage import analyse_hysteresis
-from ema_pipeline.hysteresis.types import IsolatorResult, Loop
 from ema_pipeline.ingest.description import read_campaign
+from ema_pipeline.loops.closed_form import bouc_wen_steps, damping_from_energies, hysteresis_force
+from ema_pipeline.loops.extract import measure_loop
+from ema_pipeline.loops.figures import isolator_figures
+from ema_pipeline.loops.identify import identify_isolator
+from ema_pipeline.loops.simulate import PRINTED, simulate_sine_test, write_sine_tests
+from ema_pipeline.loops.stage import analyse_hysteresis
+from ema_pipeline.loops.types import IsolatorResult, Loop
 
 TRUE = {**PRINTED, "hysteresis_stiffness": PRINTED["hysteresis_force"] * PRINTED["hysteresis_rho"]}
 
@@ -194,7 +194,7 @@ def test_friction_device_is_fitted_and_its_play_is_named(test_data: Path) -> Non
 def test_summary_is_plain_json_and_the_terminal_says_what_was_found(identified: IsolatorResult) -> None:
     import json
 
-    from ema_pipeline.hysteresis.summary import summary, terminal_lines
+    from ema_pipeline.loops.summary import summary, terminal_lines
 
     numbers = json.loads(json.dumps(summary(identified), allow_nan=False))
     assert numbers["parameters"]["viscous_damping"]["value"] == identified.parameters["viscous_damping"].value

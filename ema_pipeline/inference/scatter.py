@@ -72,13 +72,15 @@ def learn(
 
 
 def _learned(found: Posterior, scatter: Scatter) -> float:
-    """One step of expectation-maximisation for one scatter."""
+    """One step of expectation-maximisation for one scatter; the unknowns are what is averaged over."""
     now = found.scatters[scatter.name]
     if not scatter.spread:
         return now
     squares, count = _of_unknowns(found, scatter.name, now)
-    more, number = _of_residuals(found, scatter.name, now)
-    return _mode_of_log(squares + more, count + number, now, scatter)
+    part, square = _of_residuals(found, scatter.name)
+    if count == 0 and len(part) == 0:
+        return scatter.default
+    return _mode_of_log(squares / now**2, count, part, square, now, scatter)
 
 
 def _of_unknowns(found: Posterior, name: str, now: float) -> tuple[float, int]:
@@ -90,29 +92,38 @@ def _of_unknowns(found: Posterior, name: str, now: float) -> tuple[float, int]:
     return float(np.sum((x**2 + variance) / found.unknowns.std[governed] ** 2)), int(np.sum(governed))
 
 
-def _of_residuals(found: Posterior, name: str, now: float) -> tuple[float, int]:
-    """Expected sum of squares of the discrepancies that the scatter adds to residuals.
-
-    A residual e = discrepancy + noise has the discrepancy's mean `share`·e and variance σ²·share·(1 - share).
-    """
+def _of_residuals(found: Posterior, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Share of the scatter in the variance of every residual that has one, and the residual's expected square."""
     share = found.residuals.share.get(name)
     if share is None or not np.any(share > 0):
-        return 0.0, 0
+        return np.zeros(0), np.zeros(0)
     rows = share > 0
     jacobian = found.residuals.jacobian[rows]
     uncertain = np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian)
-    square = found.residuals.values[rows] ** 2 + uncertain
-    part = share[rows]
-    return float(now**2 * np.sum(part * square + 1.0 - part)), int(np.sum(rows))
+    return share[rows], found.residuals.values[rows] ** 2 + uncertain
 
 
-def _mode_of_log(squares: float, count: int, now: float, scatter: Scatter) -> float:
-    """Scatter that maximises its expected log density, by Newton's method in its logarithm."""
-    if count == 0:
-        return scatter.default
+def _mode_of_log(
+    squares: float,
+    count: int,
+    part: NDArray[np.float64],
+    square: NDArray[np.float64],
+    now: float,
+    scatter: Scatter,
+) -> float:
+    """Scatter that maximises its expected log density, by Newton's method in its logarithm.
+
+    With t = (scatter/now)², a residual's variance becomes 1 - part + part·t times what it is, and the sum of squares
+    of the unknowns that it governs `squares`/t.
+    """
     log, weight = np.log(now), scatter.spread**-2.0
     for _ in range(_NEWTON_STEPS):
-        excess = squares / np.exp(2 * log)
-        slope = -count + excess - (log - np.log(scatter.default)) * weight
-        log -= float(np.clip(slope / (-2 * excess - weight), -0.5, 0.5))
+        t = np.exp(2 * (log - np.log(now)))
+        variance = 1 - part + part * t
+        moved, excess = part * t / variance, square / variance
+        slope = -count + squares / t + float(np.sum(moved * (excess - 1)))
+        slope -= (log - np.log(scatter.default)) * weight
+        # Where the density is not concave in the logarithm, the expected curvature serves.
+        curvature = 2 * squares / t + weight + 2 * float(np.sum(moved**2 * np.maximum(excess, 1.0)))
+        log += float(np.clip(slope / curvature, -0.5, 0.5))
     return float(np.exp(log))

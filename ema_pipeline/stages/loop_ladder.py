@@ -6,15 +6,15 @@ import dataclasses
 from typing import cast
 
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.hysteresis.settings import HysteresisSettings
-from ema_pipeline.hysteresis.types import IsolatorResult, Loop, LoopModel
+from ema_pipeline.loops.settings import HysteresisSettings
+from ema_pipeline.loops.types import IsolatorResult, Loop, LoopModel
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.store import ALL
 
 
 def diagnose_run(run: Run, progress: Progress) -> dict[str, object]:
     """Every set of effects on top of the model as it stands, judged by all loops together."""
-    from ema_pipeline.hysteresis.diagnosis import diagnose_loops
+    from ema_pipeline.loops.diagnosis import diagnose_loops
 
     settings = cast(DiagnoseSettings, run.settings["diagnose"])
     found, models = diagnose_loops(loops_of(run), run.info.effects, settings, loop_settings(run), progress)
@@ -23,7 +23,7 @@ def diagnose_run(run: Run, progress: Progress) -> dict[str, object]:
 
 def climb_run(run: Run, progress: Progress) -> dict[str, object]:
     """The effects that the user added, rung by rung; the linear spring alone is no ladder, but can be compared."""
-    from ema_pipeline.hysteresis.ladder import make_loop_ladder
+    from ema_pipeline.loops.ladder import make_loop_ladder
 
     ladder, models = make_loop_ladder(loops_of(run), run.info.effects, loop_settings(run), progress)
     return {"models": models, **({"ladder": ladder} if run.info.effects else {})}

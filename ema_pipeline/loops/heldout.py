@@ -7,10 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from ema_pipeline.hysteresis.closed_form import SAME_AMPLITUDE
-from ema_pipeline.hysteresis.fitting import Fitted, fit, predict
-from ema_pipeline.hysteresis.loop_set import LoopSet
-from ema_pipeline.hysteresis.types import Loop
+from ema_pipeline.loops.closed_form import SAME_AMPLITUDE
+from ema_pipeline.loops.fitting import Fitted, fit, predict
+from ema_pipeline.loops.loop_set import LoopSet
+from ema_pipeline.loops.types import Loop
 
 SAME_FREQUENCY = 0.02
 """Loops whose frequencies agree to this share are taken as tests at one frequency."""

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ema_pipeline.hysteresis.effects import DISSIPATIVE
-from ema_pipeline.hysteresis.fitting import Fitted
-from ema_pipeline.hysteresis.loop_set import LoopSet
-from ema_pipeline.hysteresis.search import Ranking
-from ema_pipeline.hysteresis.types import LoopModel
-from ema_pipeline.hysteresis.visible import Limit, best_loop
-from ema_pipeline.hysteresis.words import failures
+from ema_pipeline.loops.effects import DISSIPATIVE
+from ema_pipeline.loops.fitting import Fitted
+from ema_pipeline.loops.loop_set import LoopSet
+from ema_pipeline.loops.search import Ranking
+from ema_pipeline.loops.types import LoopModel
+from ema_pipeline.loops.visible import Limit, best_loop
+from ema_pipeline.loops.words import failures
 
 _TOLD = 2.0
 _FIRST_SHARE = 0.34

@@ -9,8 +9,8 @@ from ema_pipeline.diagnose.explain import label_text, size_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder, Localisation, VerdictWord
 from ema_pipeline.effects.library import shipped_effects
-from ema_pipeline.hysteresis.effects import PARAMETERS, effect_ids, label_of
-from ema_pipeline.hysteresis.explain import (
+from ema_pipeline.loops.effects import PARAMETERS, effect_ids, label_of
+from ema_pipeline.loops.explain import (
     limits_words,
     missing_words,
     next_loop,
@@ -18,9 +18,9 @@ from ema_pipeline.hysteresis.explain import (
     scales_words,
     where_it_falls,
 )
-from ema_pipeline.hysteresis.fitting import Fitted
-from ema_pipeline.hysteresis.heldout import heldout_error
-from ema_pipeline.hysteresis.ladder import (
+from ema_pipeline.loops.fitting import Fitted
+from ema_pipeline.loops.heldout import heldout_error
+from ema_pipeline.loops.ladder import (
     Progress,
     assemble,
     effect_sizes,
@@ -30,12 +30,12 @@ from ema_pipeline.hysteresis.ladder import (
     loop_model,
     together,
 )
-from ema_pipeline.hysteresis.loop_set import LoopSet
-from ema_pipeline.hysteresis.regions import regions
-from ema_pipeline.hysteresis.search import Ranking, rank
-from ema_pipeline.hysteresis.settings import HysteresisSettings
-from ema_pipeline.hysteresis.types import Loop, LoopModel
-from ema_pipeline.hysteresis.visible import Limit, smallest_visible
+from ema_pipeline.loops.loop_set import LoopSet
+from ema_pipeline.loops.regions import regions
+from ema_pipeline.loops.search import Ranking, rank
+from ema_pipeline.loops.settings import HysteresisSettings
+from ema_pipeline.loops.types import Loop, LoopModel
+from ema_pipeline.loops.visible import Limit, smallest_visible
 from ema_pipeline.threads import single_blas_thread
 
 NOTHING = "nothing"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ema_pipeline.diagnose.types import Localisation
-from ema_pipeline.hysteresis.fitting import Fitted
-from ema_pipeline.hysteresis.loop_set import LoopSet
+from ema_pipeline.loops.fitting import Fitted
+from ema_pipeline.loops.loop_set import LoopSet
 
 _THIRDS = ("first", "middle", "last")
 _LISTED = 3
@@ -20,7 +20,7 @@ def regions(loops: LoopSet, fitted: Fitted, widening: float) -> tuple[Localisati
     loops : LoopSet
     fitted : Fitted
     widening : float
-        See `ema_pipeline.hysteresis.search.widening_of`.
+        See `ema_pipeline.loops.search.widening_of`.
 
     Returns
     -------

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.hysteresis.effects import DISSIPATIVE, Structure
-from ema_pipeline.hysteresis.fitting import RANGES, SYSTEMATIC, Fitted, fit
-from ema_pipeline.hysteresis.loop_set import LoopSet
-from ema_pipeline.hysteresis.model import EXPONENT, GAP, GAPS, SPRING_GAP, STIFFNESS
+from ema_pipeline.loops.effects import DISSIPATIVE, Structure
+from ema_pipeline.loops.fitting import RANGES, SYSTEMATIC, Fitted, fit
+from ema_pipeline.loops.loop_set import LoopSet
+from ema_pipeline.loops.model import EXPONENT, GAP, GAPS, SPRING_GAP, STIFFNESS
 
 Progress = Callable[[float, str], None]
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.hysteresis.identify import identify_isolator
-from ema_pipeline.hysteresis.loops import measure_loop, share_noise
-from ema_pipeline.hysteresis.settings import HysteresisSettings
-from ema_pipeline.hysteresis.types import IsolatorResult, Loop
 from ema_pipeline.ingest.description import TestDescription
 from ema_pipeline.ingest.load import load_channels
+from ema_pipeline.loops.extract import measure_loop, share_noise
+from ema_pipeline.loops.identify import identify_isolator
+from ema_pipeline.loops.settings import HysteresisSettings
+from ema_pipeline.loops.types import IsolatorResult, Loop
 
 
 def analyse_hysteresis(

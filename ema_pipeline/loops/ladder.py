@@ -8,15 +8,15 @@ import numpy as np
 
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung
 from ema_pipeline.errors import EmaError
-from ema_pipeline.hysteresis.effects import PARAMETERS, Structure, effect_ids, label_of
-from ema_pipeline.hysteresis.fitting import Fitted, loop_set
-from ema_pipeline.hysteresis.heldout import folds, heldout_error, settings_differ
-from ema_pipeline.hysteresis.identify import loop_fits
-from ema_pipeline.hysteresis.loop_set import LoopSet
-from ema_pipeline.hysteresis.model import SPRING_GAP, STIFFNESS, UNITS
-from ema_pipeline.hysteresis.search import fit_variants, log_evidence, widening_of
-from ema_pipeline.hysteresis.settings import HysteresisSettings
-from ema_pipeline.hysteresis.types import Loop, LoopModel
+from ema_pipeline.loops.effects import PARAMETERS, Structure, effect_ids, label_of
+from ema_pipeline.loops.fitting import Fitted, loop_set
+from ema_pipeline.loops.heldout import folds, heldout_error, settings_differ
+from ema_pipeline.loops.identify import loop_fits
+from ema_pipeline.loops.loop_set import LoopSet
+from ema_pipeline.loops.model import SPRING_GAP, STIFFNESS, UNITS
+from ema_pipeline.loops.search import fit_variants, log_evidence, widening_of
+from ema_pipeline.loops.settings import HysteresisSettings
+from ema_pipeline.loops.types import Loop, LoopModel
 from ema_pipeline.threads import single_blas_thread
 
 Progress = Callable[[float, str], None]

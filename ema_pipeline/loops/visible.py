@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.hysteresis.effects import LINEAR, PARAMETERS
-from ema_pipeline.hysteresis.fitting import Fitted, fit
-from ema_pipeline.hysteresis.fourier import fourier, fourier_slope
-from ema_pipeline.hysteresis.loop_set import LoopSet
-from ema_pipeline.hysteresis.model import EXPONENT, GAP, RHO, SIGMA, TIME, UNITS, Motion
-from ema_pipeline.hysteresis.types import Loop
+from ema_pipeline.loops.effects import LINEAR, PARAMETERS
+from ema_pipeline.loops.fitting import Fitted, fit
+from ema_pipeline.loops.loop_set import LoopSet
+from ema_pipeline.loops.model import EXPONENT, GAP, RHO, SIGMA, TIME, UNITS, Motion
+from ema_pipeline.loops.types import Loop
+from ema_pipeline.mechanics.fourier import fourier, fourier_slope
 
 MARGIN = 1.6
 """Standard deviations above the threshold at which 19 of 20 tests show an effect."""

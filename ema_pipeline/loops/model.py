@@ -14,11 +14,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.hysteresis.branches import LimitCycle
-from ema_pipeline.hysteresis.fourier import fourier, fourier_slope
-from ema_pipeline.hysteresis.types import Loop
+from ema_pipeline.loops.types import Loop
 from ema_pipeline.mechanics.assembly import Damper, Element, Spring
+from ema_pipeline.mechanics.fourier import fourier, fourier_slope
 from ema_pipeline.mechanics.laws import BoucWen, Maxwell, PolynomialSpring
+from ema_pipeline.mechanics.limit_cycle import LimitCycle
 from ema_pipeline.mechanics.nonlinear import force_along, steady_deviation
 
 STIFFNESS, QUADRATIC, CUBIC = "stiffness", "quadratic_stiffness", "cubic_stiffness"

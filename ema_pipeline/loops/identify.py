@@ -9,20 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.hysteresis.closed_form import (
+from ema_pipeline.loops.closed_form import (
     bouc_wen_steps,
     closed_form,
     energy_lines,
     hysteresis_force,
 )
-from ema_pipeline.hysteresis.effects import Structure
-from ema_pipeline.hysteresis.fitting import Fitted, fit, loop_set
-from ema_pipeline.hysteresis.loop_set import LoopSet
-from ema_pipeline.hysteresis.model import CUBIC, DAMPING, FORCE, RELAXATION, RHO, STIFFNESS, UNITS
-from ema_pipeline.hysteresis.search import widening_of
-from ema_pipeline.hysteresis.settings import HysteresisSettings
-from ema_pipeline.hysteresis.types import Estimate, IsolatorResult, Loop, LoopFit, LossFactor
-from ema_pipeline.hysteresis.words import failures
+from ema_pipeline.loops.effects import Structure
+from ema_pipeline.loops.fitting import Fitted, fit, loop_set
+from ema_pipeline.loops.loop_set import LoopSet
+from ema_pipeline.loops.model import CUBIC, DAMPING, FORCE, RELAXATION, RHO, STIFFNESS, UNITS
+from ema_pipeline.loops.search import widening_of
+from ema_pipeline.loops.settings import HysteresisSettings
+from ema_pipeline.loops.types import Estimate, IsolatorResult, Loop, LoopFit, LossFactor
+from ema_pipeline.loops.words import failures
 from ema_pipeline.threads import single_blas_thread
 
 HYSTERESIS_STIFFNESS = "hysteresis_stiffness"

@@ -9,9 +9,9 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
-from ema_pipeline.hysteresis.effects import NEVER_NEGATIVE, Structure
-from ema_pipeline.hysteresis.loop_set import LoopSet
-from ema_pipeline.hysteresis.model import (
+from ema_pipeline.loops.effects import NEVER_NEGATIVE, Structure
+from ema_pipeline.loops.loop_set import LoopSet
+from ema_pipeline.loops.model import (
     EXPONENT,
     FORCE,
     GAP,
@@ -22,7 +22,7 @@ from ema_pipeline.hysteresis.model import (
     STIFFNESS,
     TIME,
 )
-from ema_pipeline.hysteresis.types import Loop
+from ema_pipeline.loops.types import Loop
 
 RANGES: Mapping[str, tuple[float, float]] = {
     RHO: (0.02, 200.0),
@@ -57,7 +57,7 @@ class Fitted:
     ----------
     structure : Structure
     values : dict of str to float
-        Parameters by the names of `ema_pipeline.hysteresis.model`.
+        Parameters by the names of `ema_pipeline.loops.model`.
     scales : ndarray, (n_loops,)
         Factors on the model's force; ones unless the loops have scales of their own.
     residual : ndarray, (n_points,)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from ema_pipeline.errors import EmaError, did_you_mean
-from ema_pipeline.hysteresis.model import (
+from ema_pipeline.loops.model import (
     CUBIC,
     DAMPING,
     EXPONENT,

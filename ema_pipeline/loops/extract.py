@@ -10,9 +10,9 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.hysteresis.fourier import fourier, fourier_slope
-from ema_pipeline.hysteresis.settings import HysteresisSettings
-from ema_pipeline.hysteresis.types import Loop
+from ema_pipeline.loops.settings import HysteresisSettings
+from ema_pipeline.loops.types import Loop
+from ema_pipeline.mechanics.fourier import fourier, fourier_slope
 
 FEWEST_SAMPLES = 32
 """Samples per cycle below which a loop has no shape."""

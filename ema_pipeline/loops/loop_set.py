@@ -13,9 +13,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.hysteresis.effects import Structure
-from ema_pipeline.hysteresis.fourier import fourier
-from ema_pipeline.hysteresis.model import (
+from ema_pipeline.loops.effects import Structure
+from ema_pipeline.loops.model import (
     CUBIC,
     DAMPING,
     FORCE,
@@ -29,7 +28,8 @@ from ema_pipeline.hysteresis.model import (
     TIME,
     Motion,
 )
-from ema_pipeline.hysteresis.types import Loop
+from ema_pipeline.loops.types import Loop
+from ema_pipeline.mechanics.fourier import fourier
 
 _CERTAIN = 1e8
 
