@@ -39,6 +39,10 @@ class EffectParameter:
     description: str = ""
 
 
+def _library_scales(assembly: Assembly, place: str) -> Mapping[str, float]:
+    return {}
+
+
 def _no_other_place(assembly: Assembly, place: str) -> bool:
     return False
 
@@ -67,6 +71,11 @@ class Effect:
         False where the response is not proportional to the force.
     other_places : callable
         ``other_places(assembly, place)``: True for places that are valid but too many to be listed.
+    generic : bool
+        True where the effect is known from no rig in particular: a rig's own name for the same physics comes first.
+    scales : callable
+        ``scales(assembly, place) -> dict``: prior 1 σ of sizes that depend on the rig; the parameters' own where left
+        out.
     """
 
     id: str
@@ -78,6 +87,8 @@ class Effect:
     reference: str = ""
     linear: bool = True
     other_places: Callable[[Assembly, str], bool] = _no_other_place
+    generic: bool = False
+    scales: Callable[[Assembly, str], Mapping[str, float]] = _library_scales
 
     def places(self, rig: Rig, configuration: str) -> tuple[str, ...]:
         """Places of `rig` where the effect can sit in this configuration."""

@@ -17,7 +17,8 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
     angle = np.deg2rad(values["angle_deg"])
     row = {f"{place}.x": float(np.cos(angle)), f"{place}.y": float(np.sin(angle))}
     extra = values["relative_stiffness"] * bearing.stiffness
-    return assembly.add(Spring(f"{place} bearing principal axis", row, extra))
+    axis = Spring(f"{place} bearing principal axis", row, extra, part=bearing.part or bearing.name)
+    return assembly.add(axis)
 
 
 EFFECT = Effect(

@@ -1,32 +1,106 @@
-"""Places of the generic effects: one DOF (to ground), or two (``carrier.x-sun.x``, between them)."""
+"""Places and usual sizes of the generic effects: a DOF, a body (all its directions alike), or between two of them."""
 
 from __future__ import annotations
 
-from ema_pipeline.mechanics.assembly import Assembly, Row, difference
+from collections.abc import Mapping
+from itertools import combinations
+
+import numpy as np
+
+from ema_pipeline.mechanics.assembly import Assembly, Mass, Row, difference
 
 
-def coordinates(assembly: Assembly) -> tuple[str, ...]:
-    """Single DOFs that are listed as places."""
-    return (*assembly.dofs, *assembly.sensors)
+def bodies_and_dofs(assembly: Assembly) -> tuple[str, ...]:
+    """Bodies first, then single DOFs: what is simpler to say comes first."""
+    return (*assembly.bodies, *assembly.dofs)
 
 
-def is_pair(assembly: Assembly, place: str) -> bool:
-    """True for two DOFs of the assembly joined by ``-``."""
-    return _split(assembly, place) is not None
+def bodies_pairs_and_dofs(assembly: Assembly) -> tuple[str, ...]:
+    """Bodies, pairs of bodies that share a direction, then single DOFs."""
+    pairs = (f"{a}-{b}" for a, b in combinations(assembly.bodies, 2) if _shared(assembly, a, b))
+    return (*assembly.bodies, *pairs, *assembly.dofs)
 
 
-def place_row(assembly: Assembly, place: str) -> Row:
-    """Row of the motion at a DOF, or of the motion between two."""
+def is_place(assembly: Assembly, place: str) -> bool:
+    """True for a sensor's DOF, or two bodies or DOFs of the assembly joined by ``-``."""
+    return assembly.has_dof(place) or _split(assembly, place) is not None
+
+
+def place_rows(assembly: Assembly, place: str) -> tuple[Row, ...]:
+    """Rows of the motions at a place: of a DOF, of all directions of a body, or of what lies between two."""
+    if assembly.has_dof(place):
+        return (assembly.row(place),)
+    if place in assembly.bodies:
+        return tuple(assembly.row(d) for d in _directions(assembly, place))
     pair = _split(assembly, place)
     if pair is None:
-        return assembly.row(place)
-    return difference(assembly.row(pair[0]), assembly.row(pair[1]))
+        return (assembly.row(place),)  # raises with a hint
+    a, b = pair
+    if assembly.has_dof(a):
+        return (difference(assembly.row(a), assembly.row(b)),)
+    return tuple(
+        difference(assembly.row(f"{a}.{d}"), assembly.row(f"{b}.{d}")) for d in _shared(assembly, a, b)
+    )
+
+
+def usual_stiffness(assembly: Assembly) -> float:
+    """Half of the median stiffness of the model's springs, N/m."""
+    known = [s.stiffness for s in assembly.springs() if s.stiffness > 0]
+    return 0.5 * float(np.median(known)) if known else 1e5
+
+
+def usual_mass(assembly: Assembly, place: str) -> float:
+    """Three tenths of the mass that moves at a place, kg."""
+    rows = place_rows(assembly, place)
+    masses = [e for e in assembly.elements if isinstance(e, Mass)]
+    moved = [sum(m.value * (m.row.get(d, 0.0) * v) ** 2 for m in masses for d, v in row.items()) for row in rows]
+    return 0.3 * max(float(np.mean(moved)), 1e-6)
+
+
+def usual_damping(assembly: Assembly, place: str) -> float:
+    """A tenth of √(k m) of usual stiffness and mass, N·s/m: a few per cent of critical."""
+    return 0.1 * float(np.sqrt(2 * usual_stiffness(assembly) * usual_mass(assembly, place) / 0.3))
+
+
+def stiffness_scale(assembly: Assembly, place: str) -> Mapping[str, float]:
+    """Prior 1 σ of an added spring."""
+    return {"stiffness": usual_stiffness(assembly)}
+
+
+def mass_scale(assembly: Assembly, place: str) -> Mapping[str, float]:
+    """Prior 1 σ of an added mass."""
+    return {"mass": usual_mass(assembly, place)}
+
+
+def damping_scale(assembly: Assembly, place: str) -> Mapping[str, float]:
+    """Prior 1 σ of an added damper."""
+    return {"coefficient": usual_damping(assembly, place)}
+
+
+def _directions(assembly: Assembly, body: str) -> tuple[str, ...]:
+    """Coordinates along which a body is displaced; those about which it turns where it does nothing else."""
+    own = assembly.coordinates(body)
+    return tuple(d for d in own if not d.endswith(".u")) or own
+
+
+def _shared(assembly: Assembly, a: str, b: str) -> tuple[str, ...]:
+    """Directions that both bodies have, in the fixed frame where they have it."""
+    for directions in (("x", "y", "z"), ("u",)):
+        shared = tuple(d for d in directions if assembly.has_dof(f"{a}.{d}") and assembly.has_dof(f"{b}.{d}"))
+        if shared:
+            return shared
+    own = [d.rpartition(".")[2] for d in assembly.coordinates(a)]
+    return tuple(d for d in own if assembly.has_dof(f"{b}.{d}"))
 
 
 def _split(assembly: Assembly, place: str) -> tuple[str, str] | None:
     # Names of bodies may hold "-" themselves, so every one is tried.
     for i, character in enumerate(place):
         a, b = place[:i], place[i + 1 :]
-        if character == "-" and a != b and assembly.has_dof(a) and assembly.has_dof(b):
+        if character != "-" or a == b:
+            continue
+        if assembly.has_dof(a) and assembly.has_dof(b):
+            return a, b
+        if a in assembly.bodies and b in assembly.bodies and _shared(assembly, a, b):
             return a, b
     return None

@@ -11,6 +11,7 @@ from functools import cache
 from pathlib import Path
 
 import ema_pipeline.effects as package
+from ema_pipeline.effects import out_of_tolerance
 from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.rigs.types import Rig
@@ -127,8 +128,10 @@ def parse_effect(
     effect_id, at, place = text.strip().partition("@")
     if not at or not effect_id or not place:
         raise EmaError(f"'{text}' is not of the form effect@place, e.g. 'sensor_mass@all'")
-    effect = get_effect(effect_id.strip(), library)
     place = place.strip()
+    if effect_id.strip() == out_of_tolerance.ID:
+        return out_of_tolerance.tolerance_effect(rig, place)
+    effect = get_effect(effect_id.strip(), library)
     configurations = rig.configurations if configuration is None else (configuration,)
     assemblies = [rig.assembly(c) for c in configurations]
     if not any(effect.fits(a, place) for a in assemblies):

@@ -356,88 +356,102 @@ class _Configuration:
         match: NDArray[np.int64],
         derivatives: bool,
     ) -> Residuals:
-        d, h = self.data, self.scatters
         on = np.flatnonzero(match >= 0)
-        model_mode = match[on]
-        slopes = (
-            ModeDerivatives.of(matrices, solution, model_mode, self.problem.model.has_ratio)
-            if derivatives
-            else None
+        slopes = None
+        if derivatives:
+            slopes = ModeDerivatives.of(matrices, solution, match[on], self.problem.model.has_ratio)
+        rows = (
+            self._frequencies(solution, on, match[on], slopes),
+            self._damping(solution, on, match[on], slopes),
+            self._shapes(solution, predicted, on, match[on], slopes),
         )
-        n = len(self.x)
-        values: list[NDArray[np.float64]] = []
-        jacobians: list[NDArray[np.float64]] = []
-        shares: dict[str, list[NDArray[np.float64]]] = {FREQUENCY: [], DAMPING_SCATTER: [], SHAPE: []}
-        log_scale = 0.0
         defaults = {k: s.default for k, s in self.problem.observations.scatters.items()}
-
-        def block(
-            difference: NDArray[np.float64],
-            own: NDArray[np.float64],
-            unit: NDArray[np.float64] | float,
-            scatter: str,
-            factor: float,
-            slope: NDArray[np.float64] | None,
-        ) -> None:
-            nonlocal log_scale
-            added = (h[scatter] * unit) ** 2 + np.zeros(len(difference))
-            variance = own**2 + added
-            sigma = np.sqrt(variance) * factor
-            log_scale += 0.5 * float(np.sum(np.log(variance / (own**2 + (defaults[scatter] * unit) ** 2))))
-            values.append(difference / sigma)
-            jacobians.append(np.zeros((0, n)) if slope is None else -slope / sigma[:, None])
-            for name, store in shares.items():
-                store.append(added / variance if name == scatter else np.zeros(len(difference)))
-
-        block(
-            d.log_frequency[on] - np.log(np.maximum(solution.frequency_hz[model_mode], 1e-6)),
-            d.log_frequency_std[on],
-            1.0,
-            FREQUENCY,
-            self.heat,
-            None if slopes is None else self._padded(slopes.log_frequency),
-        )
-        measured = np.isfinite(d.log_damping[on])
-        ratio = np.maximum(solution.damping_ratio[model_mode], 1e-6)
-        block(
-            (d.log_damping[on] - np.log(ratio))[measured],
-            d.log_damping_std[on][measured],
-            1.0,
-            DAMPING_SCATTER,
-            1.0,
-            None if slopes is None else self._padded(slopes.damping_ratio / ratio[:, None])[measured],
-        )
-        for k, r in enumerate(on):
-            y, p = d.shapes[r], predicted[:, match[r]]
-            seen = np.isfinite(y)
-            if not np.any(seen):
-                continue
-            unit = np.maximum(_SHAPE_REACH, np.abs(y[seen]))
-            weight = 1.0 / (d.shape_std[r][seen] ** 2 + (h[SHAPE] * unit) ** 2)
-            squared = max(float(p[seen] @ (weight * p[seen])), 1e-300)
-            scale = float(p[seen] @ (weight * y[seen])) / squared
-            slope = None
-            if slopes is not None:
-                dp = self._shape_slopes(slopes.shapes[:, k], solution.shapes[:, match[r]], p)[seen]
-                towards = weight * (y[seen] - 2 * scale * p[seen])
-                slope = scale * dp + np.outer(p[seen], towards @ dp / squared)
-            block(
-                y[seen] - scale * p[seen],
-                d.shape_std[r][seen],
-                unit,
-                SHAPE,
-                1 + 0.1 * (self.heat - 1),
-                slope,
-            )
+        done = [r.whitened(self.scatters, defaults) for r in rows]
         return Residuals(
-            values=np.concatenate(values),
-            jacobian=np.concatenate(jacobians),
-            share={k: np.concatenate(s) for k, s in shares.items()},
-            log_scale=log_scale,
+            values=np.concatenate([v for v, _, _, _ in done]),
+            jacobian=np.concatenate([j for _, j, _, _ in done]),
+            share={
+                r.scatter: np.concatenate(
+                    [
+                        s if other is r else np.zeros(len(s))
+                        for other, (_, _, s, _) in zip(rows, done, strict=True)
+                    ]
+                )
+                for r in rows
+            },
+            log_scale=sum(c for _, _, _, c in done),
             penalty=UNEXPLAINED * float(np.sum(match < 0)) + UNSEEN * self._unseen(solution, match),
             matching=match,
-            projected=len(on) if d.shapes.shape[1] else 0,
+            projected=len(on) if self.data.shapes.shape[1] else 0,
         )
+
+    def _frequencies(
+        self,
+        solution: EigenSolution,
+        on: NDArray[np.int64],
+        match: NDArray[np.int64],
+        slopes: ModeDerivatives | None,
+    ) -> _Rows:
+        d = self.data
+        return _Rows(
+            d.log_frequency[on] - np.log(np.maximum(solution.frequency_hz[match], 1e-6)),
+            d.log_frequency_std[on],
+            np.ones(len(on)),
+            FREQUENCY,
+            self.heat,
+            self._none if slopes is None else self._padded(slopes.log_frequency),
+        )
+
+    def _damping(
+        self,
+        solution: EigenSolution,
+        on: NDArray[np.int64],
+        match: NDArray[np.int64],
+        slopes: ModeDerivatives | None,
+    ) -> _Rows:
+        d = self.data
+        measured = np.isfinite(d.log_damping[on])
+        on, ratio = on[measured], solution.damping_ratio[match][measured]
+        slope = self._none
+        if slopes is not None:
+            slope = self._padded(slopes.damping_ratio[measured] / ratio[:, None])
+        return _Rows(
+            d.log_damping[on] - np.log(ratio),
+            d.log_damping_std[on],
+            np.ones(len(on)),
+            DAMPING_SCATTER,
+            1.0,
+            slope,
+        )
+
+    def _shapes(
+        self,
+        solution: EigenSolution,
+        predicted: NDArray[np.float64],
+        on: NDArray[np.int64],
+        match: NDArray[np.int64],
+        slopes: ModeDerivatives | None,
+    ) -> _Rows:
+        """Shapes with the factor projected out that fits them best."""
+        d, p = self.data, predicted[:, match].T
+        seen = np.isfinite(d.shapes[on])
+        y, own = np.nan_to_num(d.shapes[on]), d.shape_std[on]
+        unit = np.maximum(_SHAPE_REACH, np.abs(y))
+        weight = seen / (own**2 + (self.scatters[SHAPE] * unit) ** 2)
+        squared = np.maximum(np.sum(weight * p**2, axis=1), 1e-300)
+        scale = np.sum(weight * p * y, axis=1) / squared
+        slope = self._none
+        if slopes is not None:
+            dp = self._shape_slopes(slopes.shapes, solution.shapes[:, match], p)
+            towards = weight * (y - 2 * scale[:, None] * p) / squared[:, None]
+            factor = np.einsum("ks,ksn->kn", towards, dp)
+            slope = (scale[:, None, None] * dp + p[:, :, None] * factor[:, None, :])[seen]
+        difference = (y - scale[:, None] * p)[seen]
+        return _Rows(difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), slope)
+
+    @property
+    def _none(self) -> NDArray[np.float64]:
+        return np.zeros((0, len(self.x)))
 
     def _unseen(self, solution: EigenSolution, match: NDArray[np.int64]) -> int:
         """Model modes well inside the band that no measured mode is paired with."""
@@ -451,15 +465,40 @@ class _Configuration:
         return np.pad(by_model, ((0, 0), (0, len(self.x) - by_model.shape[1])))
 
     def _shape_slopes(
-        self, by_model: NDArray[np.float64], shape: NDArray[np.float64], predicted: NDArray[np.float64]
+        self, by_model: NDArray[np.float64], shapes: NDArray[np.float64], predicted: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Derivatives of what the sensors read of one shape by all unknowns, (s, n)."""
-        width = self.reading.shape[1]
-        slope = self._padded(self.reading @ by_model[:width])
-        rows = np.arange(len(predicted))
-        s = self.sensing
-        has = s.gain >= 0
-        slope[rows[has], s.gain[has]] += predicted[has]
-        has = s.transverse >= 0
-        slope[rows[has], s.transverse[has]] += (self.gain * (s.across @ shape[:width]))[has]
+        """Derivatives of what the sensors read of some shapes by all unknowns, (k, s, n)."""
+        width, s = self.reading.shape[1], self.sensing
+        k, count = predicted.shape
+        slope = np.zeros((k, count, len(self.x)))
+        read = self.reading @ by_model[:width].reshape(width, -1)
+        slope[:, :, : by_model.shape[2]] = read.reshape(count, k, -1).transpose(1, 0, 2)
+        has = np.flatnonzero(s.gain >= 0)
+        slope[:, has, s.gain[has]] += predicted[:, has]
+        has = np.flatnonzero(s.transverse >= 0)
+        slope[:, has, s.transverse[has]] += (self.gain[:, None] * (s.across @ shapes[:width])).T[:, has]
         return slope
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Differences of one kind: own 1 σ, the unit of the scatter that adds to it, heat, and derivatives of the model."""
+
+    difference: NDArray[np.float64]
+    own: NDArray[np.float64]
+    unit: NDArray[np.float64]
+    scatter: str
+    heat: float
+    slope: NDArray[np.float64]
+
+    def whitened(
+        self, scatters: Mapping[str, float], defaults: Mapping[str, float]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], float]:
+        """Values, derivatives, share of the scatter in the variance, and the price of its width."""
+        added = (scatters[self.scatter] * self.unit) ** 2
+        variance = self.own**2 + added
+        usual = self.own**2 + (defaults[self.scatter] * self.unit) ** 2
+        sigma = np.sqrt(variance) * self.heat
+        jacobian = -self.slope / sigma[:, None] if len(self.slope) else self.slope
+        price = 0.5 * float(np.sum(np.log(variance / usual)))
+        return self.difference / sigma, jacobian, added / variance, price

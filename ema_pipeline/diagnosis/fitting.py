@@ -1,0 +1,99 @@
+"""Fits of one model to the data, begun at what other fits have learned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.effects.base import PlacedEffect
+from ema_pipeline.inference import Posterior, Unknowns, anneal, descend, learn
+from ema_pipeline.observations.base import EffectProblem, Observations
+
+QUICK = ((30.0, 5), (5.0, 5), (1.0, 8))
+"""Annealing of a hypothesis that begins at the base model's fit."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """Effects on top of the rig, with the prior 1 σ of their sizes by ``id@place.name``."""
+
+    effects: tuple[PlacedEffect, ...] = ()
+    scales: Mapping[str, float] = field(default_factory=dict)
+
+    def plus(self, placed: PlacedEffect, scales: Mapping[str, float]) -> Model:
+        """With one effect more."""
+        return Model((*self.effects, placed), {**self.scales, **scales})
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """``id@place`` of the effects."""
+        return tuple(e.label for e in self.effects)
+
+    def problem(self, observations: Observations) -> EffectProblem:
+        """The problem of fitting it to data."""
+        return observations.problem(self.effects, self.scales)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model and its posterior."""
+
+    model: Model
+    posterior: Posterior
+
+    @property
+    def log_evidence(self) -> float:
+        """Of the model, up to a constant of the data."""
+        return self.posterior.log_evidence
+
+
+def transferred(
+    posterior: Posterior, unknowns: Unknowns, otherwise: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Values of unknowns that have the same names, `otherwise` for the rest, (n,)."""
+    x = otherwise.copy()
+    known = posterior.unknowns.index
+    for i, name in enumerate(unknowns.names):
+        if name in known:
+            x[i] = posterior.x[known[name]]
+    return unknowns.clipped(x)
+
+
+def wide(observations: Observations) -> dict[str, float]:
+    """The scatters at which fits begin."""
+    return {name: s.start for name, s in observations.scatters.items()}
+
+
+def annealed(
+    observations: Observations, model: Model, start: NDArray[np.float64], schedule: Sequence[tuple[float, int]]
+) -> Fit:
+    """A fit from far off, at wide scatters."""
+    return Fit(model, anneal(model.problem(observations), wide(observations), start, schedule))
+
+
+def refined(
+    observations: Observations,
+    model: Model,
+    start: NDArray[np.float64],
+    scatters: Mapping[str, float] | None = None,
+    steps: int = 12,
+) -> Fit:
+    """A fit from a good start."""
+    problem = model.problem(observations)
+    return Fit(model, descend(problem, scatters or wide(observations), start, steps=steps))
+
+
+def learned(observations: Observations, fit: Fit) -> Fit:
+    """The fit with scatters learned."""
+    problem = fit.model.problem(observations)
+    scatters = {n: s.default if fit.posterior.scatters[n] == s.start else fit.posterior.scatters[n] for n, s in observations.scatters.items()}
+    start = descend(problem, scatters, fit.posterior.x, steps=10)
+    return replace(fit, posterior=learn(problem, start, observations.scatters))
+
+
+def at_scatters(observations: Observations, fit: Fit, scatters: Mapping[str, float]) -> Fit:
+    """The fit at given scatters, so that the errors of several models compare."""
+    return refined(observations, fit.model, fit.posterior.x, scatters)

@@ -1,0 +1,192 @@
+"""What may be missing: every effect at every place, with identical physics as one hypothesis of several names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.effects.out_of_tolerance import proportional_elements, tolerance_effect
+from ema_pipeline.mechanics.assembly import Assembly
+from ema_pipeline.mechanics.terms import assemble_terms
+from ema_pipeline.observations.rig_model import SizeMap
+from ema_pipeline.rigs.types import Rig
+
+_SAME = 1 - 1e-9
+"""Correlation of two changes of all matrices from which they are the same physics."""
+_MOST_STARTS = 4
+
+
+@dataclass(frozen=True)
+class Name:
+    """One name of a hypothesis, and the prior 1 σ of its size in units of the representative's."""
+
+    placed: PlacedEffect
+    scales: Mapping[str, float]
+    relative: float = 1.0
+
+    @property
+    def label(self) -> str:
+        """``id@place``."""
+        return self.placed.label
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect at a place, and the other names of the same physics.
+
+    Attributes
+    ----------
+    names : tuple of Name
+        A rig's own effects first, then generic ones.
+    """
+
+    names: tuple[Name, ...]
+
+    @property
+    def representative(self) -> Name:
+        """The name with the widest prior, whose fit serves for all."""
+        return max(self.names, key=lambda n: n.relative)
+
+    @property
+    def placed(self) -> PlacedEffect:
+        """The effect that is fitted."""
+        return self.representative.placed
+
+    @property
+    def label(self) -> str:
+        """``id@place`` of the effect that is fitted."""
+        return self.representative.label
+
+    @property
+    def scales(self) -> dict[str, float]:
+        """Prior 1 σ of its sizes by ``id@place.name``."""
+        one = self.representative
+        return {one.placed.parameter_name(k): v for k, v in one.scales.items()}
+
+    @property
+    def generic(self) -> bool:
+        """True where no effect of the rig's own is among the names."""
+        return all(n.placed.effect.generic for n in self.names)
+
+    @property
+    def extends(self) -> bool:
+        """True where the size cannot be zero: the effect is absent at the end of its range only."""
+        return any(SizeMap.of(p, p.scale).logarithmic for p in self.placed.effect.parameters[:1])
+
+    def starts(self) -> list[dict[str, float]]:
+        """Unknowns of the sizes, by ``id@place.name``, from which a fit is begun."""
+        options = []
+        for p in self.placed.effect.parameters:
+            name = self.placed.parameter_name(p.name)
+            size = SizeMap.of(p, self.scales.get(name, p.scale))
+            options.append([(name, x) for x in _starts_of(p.unit, size)])
+        return [dict(combination) for combination in product(*options)][:_MOST_STARTS]
+
+
+def _starts_of(unit: str, size: SizeMap) -> tuple[float, ...]:
+    if unit == "deg":
+        return 0.0, 0.5, 1.0, -0.5
+    low, _ = size.bounds
+    if size.logarithmic:
+        return 0.5, -0.5
+    return (0.3, 2.0) if low == 0.0 else (0.5, -0.5)
+
+
+def list_hypotheses(
+    rig: Rig,
+    library: Mapping[str, Effect],
+    known: Iterable[str] = (),
+    linear: bool = True,
+) -> tuple[Hypothesis, ...]:
+    """Every effect of the library at every place of the rig, and every parameter that may be out of tolerance.
+
+    Parameters
+    ----------
+    rig : Rig
+        With the effects that it is known to have.
+    library : dict of str to Effect
+    known : sequence of str
+        Labels that are left out: the model has them already.
+    linear : bool
+        True for effects whose answer is in proportion to the force only.
+    """
+    skip = set(known)
+    assemblies = {c: rig.assembly(c) for c in rig.configurations}
+    found = [n for n in _names(rig, assemblies, library, linear) if n.label not in skip]
+    return tuple(_merged(found, assemblies))
+
+
+def _names(
+    rig: Rig, assemblies: Mapping[str, Assembly], library: Mapping[str, Effect], linear: bool
+) -> list[Name]:
+    own: list[Name] = []
+    generic: list[Name] = []
+    for effect in library.values():
+        if linear and not effect.linear:
+            continue
+        for place in dict.fromkeys(p for a in assemblies.values() for p in effect.find_places(a)):
+            assembly = next(a for a in assemblies.values() if effect.fits(a, place))
+            (generic if effect.generic else own).append(
+                Name(PlacedEffect(effect, place), dict(effect.scales(assembly, place)))
+            )
+    for parameter in rig.parameters.values():
+        known = parameter.tolerance > 0 and not parameter.free and parameter.value != 0
+        if known and proportional_elements(rig, parameter.name):
+            own.append(Name(tolerance_effect(rig, parameter.name), {}))
+    return own + generic
+
+
+def _merged(names: Sequence[Name], assemblies: Mapping[str, Assembly]) -> list[Hypothesis]:
+    """Names whose changes of all matrices are proportional to each other, as one hypothesis."""
+    groups: list[tuple[NDArray[np.float64] | None, list[Name]]] = []
+    for name in names:
+        change = _change(name, assemblies)
+        if change is not None and not np.any(change):
+            continue
+        size = 0.0 if change is None else float(np.linalg.norm(change))
+        for known, members in groups:
+            if known is not None and change is not None and known.shape == change.shape:
+                reference = float(np.linalg.norm(known))
+                if float(known @ change) > _SAME * reference * size:
+                    members.append(Name(name.placed, name.scales, size / reference))
+                    break
+        else:
+            groups.append((change, [name]))
+    return [Hypothesis(tuple(members)) for _, members in groups]
+
+
+def _change(name: Name, assemblies: Mapping[str, Assembly]) -> NDArray[np.float64] | None:
+    """Change of all matrices by one prior 1 σ of the size; None where it is not in proportion to one size."""
+    effect, place = name.placed.effect, name.placed.place
+    if len(effect.parameters) != 1:
+        return None
+    p = effect.parameters[0]
+    size = SizeMap.of(p, name.scales.get(p.name, p.scale))
+    if size.logarithmic or not effect.linear:
+        return None
+    changes = []
+    for assembly in assemblies.values():
+        before = _matrices(assembly)
+        for x in (0.5, 1.0):
+            value = size.value(x * min(1.0, 0.5 * size.bounds[1]))
+            after = before
+            if effect.fits(assembly, place):
+                after = _matrices(effect.edit(assembly, place, {p.name: value}))
+            if after.shape != before.shape:
+                return None
+            changes.append((after - before) / max(abs(value - p.null), 1e-300) * size.scale)
+    half, full = np.concatenate(changes[0::2]), np.concatenate(changes[1::2])
+    if float(np.linalg.norm(full - half)) > 1e-6 * float(np.linalg.norm(full)):
+        return None
+    return full
+
+
+def _matrices(assembly: Assembly) -> NDArray[np.float64]:
+    terms = assemble_terms(assembly, {}, lambda e: e.name)
+    dense = terms.dense(terms.coefficient)
+    return np.concatenate([dense.ravel(), terms.skew.ravel()])

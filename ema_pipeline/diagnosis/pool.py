@@ -1,0 +1,44 @@
+"""Hypotheses over a few processes, in a fixed order, so that the result does not depend on their number."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import TypeVar, cast
+
+from ema_pipeline.threads import single_blas_thread
+
+A = TypeVar("A")
+R = TypeVar("R")
+
+_job: Callable[..., object] | None = None
+
+
+def spread(job: Callable[[A], R], items: Sequence[A], processes: int) -> Iterator[R]:
+    """``map(job, items)`` over forked processes; in this one where the system cannot fork or it is not worth it.
+
+    The job goes over by forking, so it may hold what cannot be pickled (a user's effect file).
+    """
+    can_fork = sys.platform == "linux" and "fork" in multiprocessing.get_all_start_methods()
+    daemon = multiprocessing.current_process().daemon
+    if processes < 2 or len(items) < 4 or not can_fork or daemon:
+        with single_blas_thread():
+            for item in items:
+                yield job(item)
+        return
+    global _job
+    _job = job
+    try:
+        context = multiprocessing.get_context("fork")
+        with ProcessPoolExecutor(min(processes, len(items)), mp_context=context) as pool:
+            yield from cast("Iterator[R]", pool.map(_run, range(len(items)), [list(items)] * len(items)))
+    finally:
+        _job = None
+
+
+def _run(index: int, items: Sequence[A]) -> object:
+    assert _job is not None
+    with single_blas_thread():
+        return _job(items[index])

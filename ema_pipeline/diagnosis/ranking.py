@@ -1,0 +1,230 @@
+"""Every hypothesis fitted on top of the model as it stands, and ranked by its evidence.
+
+Local optima are the only cause of wrong names: a base model that is stuck lends fake gains to whatever frees it. So
+fits are annealed, and the base and every hypothesis are begun again from the best values known of all else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+
+import numpy as np
+
+from ema_pipeline.diagnosis.fitting import (
+    QUICK,
+    Fit,
+    Model,
+    annealed,
+    at_scatters,
+    learned,
+    refined,
+    transferred,
+    wide,
+)
+from ema_pipeline.diagnosis.hypotheses import Hypothesis
+from ema_pipeline.diagnosis.pool import spread
+from ema_pipeline.diagnosis.score import scores
+from ema_pipeline.inference.maximise import ANNEALING
+from ema_pipeline.observations.base import Observations
+
+Progress = Callable[[float, str], None]
+
+FINALISTS = 5
+"""Hypotheses for which the scatters are learned."""
+_SCREENED = 14
+"""Generic hypotheses, best first by their score, that are fitted in full."""
+_FREE_STARTS = (0.0, 1.2, -1.2)
+"""Start values of the logarithm of a free parameter: a decade to either side of its nominal value is reached."""
+_MOST_FREE = 2
+_ALONE = 0.4
+"""Prior 1 σ of a family from which several starts are worth their time."""
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """One hypothesis on top of the model.
+
+    Attributes
+    ----------
+    hypothesis : Hypothesis
+    fit : Fit
+    gain : float
+        Log evidence against the model without it, both with learned scatters where it is a finalist.
+    final : bool
+        True where its scatters were learned.
+    """
+
+    hypothesis: Hypothesis
+    fit: Fit
+    gain: float
+    final: bool
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """The model as it stands, and all hypotheses by evidence.
+
+    Attributes
+    ----------
+    base : Fit
+        With learned scatters.
+    ranked : tuple of Ranked
+        Best first.
+    """
+
+    base: Fit
+    ranked: tuple[Ranked, ...]
+
+
+def fit_base(observations: Observations, model: Model, start: Fit | None = None) -> Fit:
+    """Annealed fit of a model, from several values of what is free."""
+    problem = model.problem(observations)
+    begin = problem.start()
+    if start is not None:
+        begin = transferred(start.posterior, problem.unknowns, begin)
+    free = [i for i, s in enumerate(problem.unknowns.std) if not problem.unknowns.scatter[i] and s >= _ALONE]
+    free = [i for i in free if problem.unknowns.names[i] not in problem.sizes][:_MOST_FREE]
+    best = None
+    for values in product(_FREE_STARTS, repeat=0 if start is not None else len(free)):
+        x = begin.copy()
+        x[free[: len(values)]] += values
+        fit = annealed(observations, model, x, ANNEALING)
+        if best is None or fit.log_evidence > best.log_evidence:
+            best = fit
+    assert best is not None
+    return best
+
+
+def rank(
+    observations: Observations,
+    base: Fit,
+    hypotheses: Sequence[Hypothesis],
+    processes: int = 1,
+    progress: Progress = lambda share, text: None,
+) -> Ranking:
+    """Fit every hypothesis and rank it.
+
+    Parameters
+    ----------
+    observations : Observations
+    base : Fit
+        The model as it stands, from `fit_base`.
+    hypotheses : sequence of Hypothesis
+    processes : int
+        Processes that share the fits; the result does not depend on their number.
+    progress : callable
+    """
+    chosen = _screened(observations, base, hypotheses)
+    job = partial(_first_fit, observations, base)
+    found: dict[str, tuple[Hypothesis, Fit]] = {}
+    for i, (hypothesis, fit) in enumerate(zip(chosen, spread(job, chosen, processes), strict=True)):
+        found[hypothesis.label] = (hypothesis, fit)
+        progress(0.6 * (i + 1) / len(chosen), hypothesis.label)
+    for _ in range(2):
+        base, found = _begun_again(observations, base, found, processes)
+    progress(0.8, "scatter of parts and channels")
+    return _finals(observations, base, found, processes)
+
+
+def _screened(observations: Observations, base: Fit, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """The rig's own hypotheses, and the generic ones that promise most."""
+    generic = [h for h in hypotheses if h.generic]
+    if len(generic) <= _SCREENED:
+        return list(hypotheses)
+    promise = sorted(scores(observations, base, generic), key=lambda s: -s.gain)
+    kept = {s.hypothesis.label for s in promise[:_SCREENED]}
+    return [h for h in hypotheses if not h.generic or h.label in kept]
+
+
+def _first_fit(observations: Observations, base: Fit, hypothesis: Hypothesis) -> Fit:
+    """Best of the fits begun at several sizes."""
+    model = base.model.plus(hypothesis.placed, hypothesis.scales)
+    unknowns = model.problem(observations).unknowns
+    begin = transferred(base.posterior, unknowns, np.zeros(len(unknowns)))
+    fits = []
+    for start in hypothesis.starts():
+        x = begin.copy()
+        for name, value in start.items():
+            x[unknowns.index[name]] = value
+        fits.append(annealed(observations, model, unknowns.clipped(x), QUICK))
+    return max(fits, key=lambda f: f.log_evidence)
+
+
+Found = dict[str, tuple[Hypothesis, Fit]]
+
+
+def _begun_again(observations: Observations, base: Fit, found: Found, processes: int) -> tuple[Fit, Found]:
+    """The base model and all hypotheses, begun at what the best hypothesis knows of everything else."""
+    top = max((f for _, f in found.values()), key=lambda f: f.log_evidence, default=base)
+    again = refined(observations, base.model, _on(observations, base.model, top, base), steps=20)
+    if again.log_evidence > base.log_evidence:
+        base = again
+    job = partial(_better, observations, (base, top))
+    items = list(found.values())
+    better = spread(job, [fit for _, fit in items], processes)
+    return base, {h.label: (h, fit) for (h, _), fit in zip(items, better, strict=True)}
+
+
+def _on(observations: Observations, model: Model, source: Fit, sizes: Fit) -> np.ndarray:
+    """Everything that `source` knows, and the effects' sizes of `sizes`."""
+    problem = model.problem(observations)
+    x = transferred(sizes.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+    moved = transferred(source.posterior, problem.unknowns, x)
+    for name in problem.sizes:
+        i = problem.unknowns.index[name]
+        if name in sizes.posterior.unknowns.index:
+            moved[i] = x[i]
+    return moved
+
+
+def _better(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Fit:
+    best = fit
+    for source in sources:
+        x = _on(observations, fit.model, source, fit)
+        if np.allclose(x, best.posterior.x):
+            continue
+        again = refined(observations, fit.model, x)
+        if again.log_evidence > best.log_evidence:
+            best = again
+    return best
+
+
+def _finals(observations: Observations, base: Fit, found: Found, processes: int) -> Ranking:
+    """Scatters learned for the base model and the best hypotheses, each from what the others know."""
+    order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
+    best = [fit for _, fit in order[:FINALISTS]]
+    job = partial(_final, observations, (base, *best[:2]))
+    first = list(spread(job, [base, *best], processes))
+    leaders = sorted(first[1:], key=lambda f: -f.log_evidence)[:2]
+    job = partial(_final, observations, (first[0], *leaders))
+    second = list(spread(job, first, processes))
+    final_base = second[0]
+    ranked = []
+    for i, (hypothesis, fit) in enumerate(order):
+        if i < FINALISTS:
+            fit = second[1 + i]
+            ranked.append(Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True))
+        else:
+            ranked.append(Ranked(hypothesis, fit, fit.log_evidence - base.log_evidence, False))
+    finals = sorted(ranked[:FINALISTS], key=lambda r: -r.gain)
+    least = finals[-1].gain if finals else 0.0
+    # An effect that is no finalist was behind at wide scatters; it cannot lead at learned ones.
+    rest = [Ranked(r.hypothesis, r.fit, min(r.gain, least), False) for r in ranked[FINALISTS:]]
+    return Ranking(final_base, (*finals, *rest))
+
+
+def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Fit:
+    candidates = [learned(observations, fit)]
+    for source in sources:
+        x = _on(observations, fit.model, source, fit)
+        if not np.allclose(x, fit.posterior.x):
+            scatters: Mapping[str, float] = source.posterior.scatters
+            start = refined(observations, fit.model, x, scatters, steps=10)
+            candidates.append(learned(observations, start))
+    return max(candidates, key=lambda f: f.log_evidence)
+
+
+__all__ = ["Ranked", "Ranking", "at_scatters", "fit_base", "rank", "wide"]
