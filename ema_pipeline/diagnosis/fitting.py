@@ -68,7 +68,10 @@ def wide(observations: Observations) -> dict[str, float]:
 
 
 def annealed(
-    observations: Observations, model: Model, start: NDArray[np.float64], schedule: Sequence[tuple[float, int]]
+    observations: Observations,
+    model: Model,
+    start: NDArray[np.float64],
+    schedule: Sequence[tuple[float, int]],
 ) -> Fit:
     """A fit from far off, at wide scatters."""
     return Fit(model, anneal(model.problem(observations), wide(observations), start, schedule))
@@ -89,7 +92,10 @@ def refined(
 def learned(observations: Observations, fit: Fit) -> Fit:
     """The fit with scatters learned."""
     problem = fit.model.problem(observations)
-    scatters = {n: s.default if fit.posterior.scatters[n] == s.start else fit.posterior.scatters[n] for n, s in observations.scatters.items()}
+    scatters = {
+        n: s.default if fit.posterior.scatters[n] == s.start else fit.posterior.scatters[n]
+        for n, s in observations.scatters.items()
+    }
     start = descend(problem, scatters, fit.posterior.x, steps=10)
     return replace(fit, posterior=learn(problem, start, observations.scatters))
 

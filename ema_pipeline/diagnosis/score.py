@@ -47,7 +47,9 @@ def scores(observations: Observations, base: Fit, hypotheses: Sequence[Hypothesi
         names = [n for n in problem.unknowns.names if n.startswith(hypothesis.label + ".")]
         start = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
         at = [problem.unknowns.index[n] for n in names]
-        residuals = problem.residuals(start, base.posterior.scatters, matching=base.posterior.residuals.matching)
+        residuals = problem.residuals(
+            start, base.posterior.scatters, matching=base.posterior.residuals.matching
+        )
         if residuals.jacobian.shape[0] != factor.count:
             continue
         found.append(factor.score(hypothesis, residuals.jacobian[:, at], problem.unknowns.lower[at]))
@@ -71,7 +73,9 @@ class _Marginal:
         solved = scipy.linalg.cho_solve(self.factor, shared, check_finite=False)
         return np.asarray(columns.T @ columns - shared.T @ solved)
 
-    def score(self, hypothesis: Hypothesis, columns: NDArray[np.float64], lower: NDArray[np.float64]) -> Score:
+    def score(
+        self, hypothesis: Hypothesis, columns: NDArray[np.float64], lower: NDArray[np.float64]
+    ) -> Score:
         """At the maximum the residual is orthogonal to what was fitted, so that it needs no correction."""
         information = self.information(columns)
         precision = information + np.eye(len(information))

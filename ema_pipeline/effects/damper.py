@@ -11,7 +11,9 @@ from ema_pipeline.mechanics.assembly import Assembly, Damper
 
 def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
     rows = place_rows(assembly, place)
-    return assembly.add(*(Damper(f"damper {i} at {place}", r, values["coefficient"]) for i, r in enumerate(rows)))
+    return assembly.add(
+        *(Damper(f"damper {i} at {place}", r, values["coefficient"]) for i, r in enumerate(rows))
+    )
 
 
 EFFECT = Effect(

@@ -53,7 +53,9 @@ def usual_mass(assembly: Assembly, place: str) -> float:
     """Three tenths of the mass that moves at a place, kg."""
     rows = place_rows(assembly, place)
     masses = [e for e in assembly.elements if isinstance(e, Mass)]
-    moved = [sum(m.value * (m.row.get(d, 0.0) * v) ** 2 for m in masses for d, v in row.items()) for row in rows]
+    moved = [
+        sum(m.value * (m.row.get(d, 0.0) * v) ** 2 for m in masses for d, v in row.items()) for row in rows
+    ]
     return 0.3 * max(float(np.mean(moved)), 1e-6)
 
 

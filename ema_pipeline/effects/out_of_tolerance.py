@@ -25,7 +25,9 @@ def tolerance_effect(rig: Rig, parameter: str) -> PlacedEffect:
         If the rig has no such parameter, or no mass, stiffness or damper is proportional to it.
     """
     if parameter not in rig.parameters:
-        raise EmaError(f"rig '{rig.name}' has no parameter '{parameter}'{did_you_mean(parameter, rig.parameters)}")
+        raise EmaError(
+            f"rig '{rig.name}' has no parameter '{parameter}'{did_you_mean(parameter, rig.parameters)}"
+        )
     names = proportional_elements(rig, parameter)
     if not names:
         raise EmaError(f"no element of rig '{rig.name}' is proportional to parameter '{parameter}'")

@@ -11,7 +11,9 @@ from ema_pipeline.mechanics.assembly import Assembly, Spring
 
 def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
     rows = place_rows(assembly, place)
-    return assembly.add(*(Spring(f"spring {i} at {place}", r, values["stiffness"]) for i, r in enumerate(rows)))
+    return assembly.add(
+        *(Spring(f"spring {i} at {place}", r, values["stiffness"]) for i, r in enumerate(rows))
+    )
 
 
 EFFECT = Effect(

@@ -165,7 +165,8 @@ class Cycles:
         p = self.points
         for f, s, part, basis in zip(p.frequency_hz, self.series, p.parts, p.bases, strict=True):
             n = len(s) // 2
-            c = (s[1 : n + 1] - 1j * s[n + 1 :]) * factor(2 * np.pi * f * np.arange(1, n + 1))
+            omega = np.asarray(2 * np.pi * f * np.arange(1, n + 1), dtype=np.float64)
+            c = (s[1 : n + 1] - 1j * s[n + 1 :]) * factor(omega)
             found[part] = basis @ np.concatenate([[0.0], c.real, -c.imag])
         return found
 

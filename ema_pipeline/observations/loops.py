@@ -21,7 +21,7 @@ from ema_pipeline.inference import Residuals, Scatter, Unknowns, descend, joined
 from ema_pipeline.loops.types import Loop
 from ema_pipeline.mechanics.assembly import Spring
 from ema_pipeline.mechanics.cycles import Cycles
-from ema_pipeline.observations.loop_data import LoopData, left_out
+from ema_pipeline.observations.loop_data import LoopData, Typical, left_out
 from ema_pipeline.observations.loop_forces import ForceAtPoint, Isolator, IsolatorForce
 from ema_pipeline.observations.parts import Dependence, dependence, part_key
 from ema_pipeline.observations.rig_model import RigModel, SizeMap
@@ -45,8 +45,6 @@ SIZE_SHARE = 0.5
 """Prior 1 σ of an effect's force as a share of the measured one."""
 START_SHARE = 0.1
 """Share of the measured force from which a fit of an effect starts."""
-FRICTION_RATE = 0.02
-"""Rate, as a share of the largest, at which dry friction has reached most of its force: a regularisation."""
 
 _SPREAD = 1.5
 """Unknowns of shapes from which fits are started: this much below and above their centre, and at it."""
@@ -75,8 +73,8 @@ class LoopObservations:
         e.g. tensions.
     calibration : dict of str to float, optional
         Relative 1 σ of the sensitivities of ``force`` and ``displacement``.
-    named : sequence of str, optional
-        Loops whose scales are unknown, those among them that are left out of `loops` too.
+    whole : LoopObservations, optional
+        What these loops are a part of: unknowns and their units are then the same as of the whole.
 
     Raises
     ------
@@ -91,14 +89,17 @@ class LoopObservations:
         *,
         own_scales: bool = False,
         calibration: Mapping[str, float] | None = None,
-        named: Sequence[str] | None = None,
+        whole: LoopObservations | None = None,
     ) -> None:
         if not loops:
             raise EmaError("no loops to explain; record steady sine tests")
-        self.rig, self.loops, self.own_scales = rig, tuple(loops), own_scales and len(loops) > 1
+        self.rig, self.loops, self.own_scales = rig, tuple(loops), own_scales
         self.calibration = dict(calibration or {})
-        self.named = tuple(named or (loop.name for loop in loops))
-        self.isolator = Isolator.of(rig)
+        self.isolator: Isolator = whole.isolator if whole else Isolator.of(rig)
+        self.named: tuple[str, ...] = whole.named if whole else tuple(loop.name for loop in loops)
+        self.typical: Typical = whole.typical if whole else Typical.of(self.data)
+        self.shared: Dependence = whole.shared if whole else self._dependence()
+        self.starts: dict[tuple[str, ...], NDArray[np.float64]] = whole.starts if whole else {}
 
     @property
     def scatters(self) -> Mapping[str, Scatter]:
@@ -140,8 +141,7 @@ class LoopObservations:
             [d.phase for d in self.loops],
         )
 
-    @cached_property
-    def shared(self) -> Dependence:
+    def _dependence(self) -> Dependence:
         """Families that the isolator's elements depend on. One isolator is tested: it is its family's only part."""
         whole = dependence(self.rig)
         mine = {
@@ -165,30 +165,13 @@ class LoopObservations:
         edited = effect.effect.edit(assembly, effect.place, values)
         return self.isolator.elements(edited) != self.isolator.elements(assembly)
 
-    def typical(self, unit: str) -> float | None:
-        """Size of a quantity that makes a force as large as the measured one; None where its unit does not tell."""
-        x = max(loop.amplitude_m for loop in self.loops)
-        omega = 2 * np.pi * float(np.mean([loop.frequency_hz for loop in self.loops]))
-        force = x * float(np.median([d.stiffness for d in self.data]))
-        return {
-            "N": force,
-            "N/m": force / x,
-            "N/m²": force / x**2,
-            "N/m³": force / x**3,
-            "N·s/m": force / (x * omega),
-            "m": x,
-            "1/m": 1 / x,
-            "m/s": FRICTION_RATE * x * omega,
-            "s": 1 / omega,
-        }.get(unit)
-
     def scaled(self, effect: PlacedEffect) -> PlacedEffect:
         """The effect with the starts and prior scales of its sizes as these loops' force and motion suggest."""
         parameters = tuple(self._scaled(p) for p in effect.effect.parameters)
         return dataclasses.replace(effect, effect=dataclasses.replace(effect.effect, parameters=parameters))
 
     def _scaled(self, p: EffectParameter) -> EffectParameter:
-        typical = self.typical(p.unit)
+        typical = self.typical.size(p.unit)
         if typical is None:
             return p
         if SizeMap.of(p, p.scale).logarithmic:
@@ -209,7 +192,7 @@ class LoopObservations:
             [self.loops[i] for i in kept],
             own_scales=self.own_scales,
             calibration=self.calibration,
-            named=self.named,
+            whole=self,
         )
 
     def folds(self) -> list[tuple[LoopObservations, LoopObservations]]:
@@ -250,16 +233,22 @@ class LoopProblem:
         return self.model.parameter_values(x[: self.offset])
 
     def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
-        """See `EffectProblem`: the spring as stiff as the loops, and the best of several shapes of what is not given.
+        """See `EffectProblem`: the spring as stiff as the loops, and the best of several shapes where none is given.
 
         Laws with memory have local optima in their shapes (yield, exponent, relaxation time, play), so several are
         tried by a few steps each.
         """
         x = np.concatenate([self.model.start(sizes), np.zeros(len(self.unknowns) - self.offset)])
-        self._match_stiffness(x)
-        scatters = {n: s.start for n, s in self.observations.scatters.items()}
-        tried = [descend(self, scatters, shape, steps=_TRIAL_STEPS) for shape in self._shapes(x, sizes or {})]
-        return min(tried, key=lambda found: found.cost).x if len(tried) > 1 else x
+        if sizes is not None or not self.model.effects:
+            self._match_stiffness(x)
+            return x
+        known, labels = self.observations.starts, tuple(e.label for e in self.model.effects)
+        if labels not in known:
+            self._match_stiffness(x)
+            scatters = {n: s.start for n, s in self.observations.scatters.items()}
+            tried = [descend(self, scatters, shape, steps=_TRIAL_STEPS) for shape in self._shapes(x)]
+            known[labels] = min(tried, key=lambda found: found.cost).x
+        return known[labels].copy()
 
     def _match_stiffness(self, x: NDArray[np.float64]) -> None:
         """Make the springs as stiff as the loops are at their first harmonic."""
@@ -270,12 +259,12 @@ class LoopProblem:
             families = slice(0, len(self.model.dependence.families))
             x[families] = np.log(measured / stiffness)
 
-    def _shapes(self, x: NDArray[np.float64], known: Mapping[str, float]) -> Iterator[NDArray[np.float64]]:
+    def _shapes(self, x: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
         """Points that differ from `x` in the shapes of one effect each."""
         yield x
         for one in self.model.effects:
             names = [one.parameter_name(p.name) for p in one.effect.parameters]
-            shapes = [n for n in names if n not in known and self._is_shape(n)]
+            shapes = [n for n in names if self._is_shape(n)]
             options = [self._options(n) for n in shapes]
             for values in product(*options) if shapes else ():
                 moved = x.copy()
