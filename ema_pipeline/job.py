@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.isolators import isolators
 from ema_pipeline.errors import EmaError, did_you_mean
@@ -177,7 +176,13 @@ def adding(labels: Iterable[str]) -> Callable[[tuple[str, ...]], tuple[str, ...]
 
 def removing(label: str) -> Callable[[tuple[str, ...]], tuple[str, ...]]:
     """The change that takes one effect away."""
-    return lambda effects: Hypothesis(effects).without(label).labels
+
+    def change(effects: tuple[str, ...]) -> tuple[str, ...]:
+        if label not in effects:
+            raise EmaError(f"effect '{label}' is not in the model{did_you_mean(label, effects)}")
+        return tuple(x for x in effects if x != label)
+
+    return change
 
 
 def _with_effects_of(store: Store, info: RunInfo) -> RunInfo:

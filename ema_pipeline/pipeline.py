@@ -16,7 +16,7 @@ from typing import Any, Literal, cast
 from pydantic import Field
 
 from ema_pipeline.correlate.settings import CompareSettings, PairingSettings
-from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnosis.settings import DiagnoseSettings
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.frf.settings import FrfSettings
@@ -41,7 +41,7 @@ from ema_pipeline.stages.base import (
 from ema_pipeline.store import ALL, Store
 
 STAGES = (
-    "ingest", "hits", "frf", "modal", "levels", "loops", "ladder", "fit", "correlate", "diagnose", "report",
+    "ingest", "hits", "frf", "modal", "levels", "loops", "ladder", "diagnose", "fit", "correlate", "report",
 )  # fmt: skip
 """All stages, in the order in which the data flow."""
 

@@ -2,80 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.correlate.evidence import Evidence, gather
 from ema_pipeline.correlate.measured import MeasuredModes
-from ema_pipeline.correlate.residuals import Modes, matrices, mode_residuals, observable_modes
 from ema_pipeline.correlate.settings import CompareSettings
 from ema_pipeline.correlate.types import BandDifference, Comparison, DofDifference, ModeDifference, Pairing
+from ema_pipeline.fit.parameters import FittedModes
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.mechanics.frf import receptance
 from ema_pipeline.mechanics.modes import total_damping
 from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
-from ema_pipeline.rigs.types import Rig
+from ema_pipeline.observations.modes import ModeRows
 
 
 def compare(
-    rig: Rig,
-    values: Mapping[str, float] | None,
+    fitted: FittedModes,
     measured: Mapping[str, MeasuredModes],
     frfs: Mapping[str, FrfSet] | None,
     pairings: Mapping[str, Pairing],
     settings: CompareSettings | None = None,
 ) -> Comparison:
-    """Compare a rig at parameter `values` with what was measured.
+    """Compare a fitted model with what was measured.
 
     Parameters
     ----------
-    rig : Rig
-    values : mapping of parameter to value, optional
-        Nominal where left out.
+    fitted : FittedModes
     measured : mapping of configuration to MeasuredModes
     frfs : mapping of configuration to FrfSet, optional
         Compared by band where given.
     pairings : mapping of configuration to Pairing
-        Made at the same `values`.
+        Of the same fitted model.
     settings : CompareSettings, optional
 
     Returns
     -------
     Comparison
-        Errors are measurement minus model over the standard uncertainty (the test's scatter and the floors of
-        `settings`, root sum of squares). Modes without a partner take no part; the pairing lists them.
+        Differences are measurement minus model over the standard uncertainty, which holds the test's own scatter and
+        what was learned of damping and of the model itself; `error` is the fit's. Modes without a partner take no part.
     """
     settings = settings or CompareSettings()
-    modes: list[ModeDifference] = []
-    dofs: list[DofDifference] = []
+    rows = fitted.problem.rows(fitted.posterior.residuals)
     bands: list[BandDifference] = []
-    squares, count, epsilon = 0.0, 0.0, 0.0
-    for configuration, pairing in pairings.items():
-        if configuration not in measured or not len(measured[configuration]):
-            continue
-        system = rig.system(configuration, values)
-        evidence = gather(measured[configuration], system, settings)
-        model = observable_modes(matrices(system))
-        pairs = _pairs(pairing, len(evidence.measured))
-        residual = mode_residuals(evidence, pairs, model, settings.mode_mixing)[0]
-        squares += float(np.sum(residual**2))
-        count += float(np.sum(evidence.counts[pairs >= 0]))
-        modes += _mode_differences(evidence, pairing, model, residual)
-        dofs += _dof_differences(evidence, pairs, residual)
-        epsilon += sum(
-            ((p.measured_frequency_hz - p.model_frequency_hz) / p.model_frequency_hz) ** 2
-            for p in pairing.pairs
-        )
+    for configuration in pairings:
         if frfs is not None and configuration in frfs:
+            system = fitted.system(configuration)
             bands += band_differences(configuration, system, frfs[configuration], settings)
     return Comparison(
-        error=float(np.sqrt(squares / count)) if count else float("nan"),
-        frequency_error=float(epsilon),
-        modes=tuple(modes),
-        dofs=tuple(dofs),
+        error=fitted.posterior.error,
+        frequency_error=sum(
+            ((p.measured_frequency_hz - p.model_frequency_hz) / p.model_frequency_hz) ** 2
+            for pairing in pairings.values()
+            for p in pairing.pairs
+        ),
+        modes=tuple(d for r in rows if (d := _mode_difference(fitted, r, measured, pairings)) is not None),
+        dofs=tuple(_dof_differences(fitted, rows)),
         bands=tuple(bands),
     )
 
@@ -171,57 +155,45 @@ def _lines(
     return np.concatenate(lines).astype(np.int64), np.concatenate(number).astype(np.int64)
 
 
-def _pairs(pairing: Pairing, count: int) -> NDArray[np.int64]:
-    pairs = np.full(count, -1, dtype=np.int64)
-    for p in pairing.pairs:
-        pairs[p.measured] = p.model
-    return pairs
+def _mode_difference(
+    fitted: FittedModes,
+    row: ModeRows,
+    measured: Mapping[str, MeasuredModes],
+    pairings: Mapping[str, Pairing],
+) -> ModeDifference | None:
+    m = measured[row.configuration]
+    pairing = pairings[row.configuration]
+    model = fitted.problem.solution(row.configuration, fitted.posterior.x)
+    pair = next((p for p in pairing.pairs if p.measured == row.measured), None)
+    mac = pair.mac if pair is not None else float(np.nan_to_num(pairing.mac[row.measured, row.model]))
+    shape = row.shape[np.isfinite(row.shape)]
+    return ModeDifference(
+        configuration=row.configuration,
+        measured=row.measured,
+        family=pairing.model_modes[row.model].family,
+        measured_frequency_hz=float(m.frequency_hz[row.measured]),
+        frequency_std_hz=float(m.frequency_std_hz[row.measured]),
+        model_frequency_hz=float(model.frequency_hz[row.model]),
+        frequency_z=row.frequency,
+        measured_damping_ratio=float(m.damping_ratio[row.measured]),
+        damping_std=float(m.damping_std[row.measured]),
+        model_damping_ratio=float(model.damping_ratio[row.model]),
+        damping_z=row.damping,
+        mac=mac,
+        shape_z=float(np.sqrt(np.mean(shape**2))) if len(shape) else float("nan"),
+    )
 
 
-def _mode_differences(
-    e: Evidence, pairing: Pairing, model: Modes, residual: NDArray[np.float64]
-) -> list[ModeDifference]:
-    m = e.measured
-    out = []
-    for p in pairing.pairs:
-        r, k = p.measured, p.model
-        shape_data = e.shape_counts[r]
-        out.append(
-            ModeDifference(
-                configuration=m.configuration,
-                measured=r,
-                family=p.family,
-                measured_frequency_hz=float(m.frequency_hz[r]),
-                frequency_std_hz=float(m.frequency_std_hz[r]),
-                model_frequency_hz=float(model.omega[0, k] / (2 * np.pi)),
-                # the residual is model minus measurement
-                frequency_z=float(-residual[r, 0]),
-                measured_damping_ratio=float(m.damping_ratio[r]),
-                damping_std=float(m.damping_std[r]),
-                model_damping_ratio=float(model.damping_ratio[0, k]),
-                damping_z=float(-residual[r, 1]) if e.damping_weight[r] > 0 else float("nan"),
-                mac=p.mac,
-                shape_z=float(np.sqrt(np.sum(residual[r, 2:-1] ** 2) / shape_data))
-                if shape_data > 0
-                else float("nan"),
-            )
-        )
-    return out
-
-
-def _dof_differences(
-    e: Evidence, pairs: NDArray[np.int64], residual: NDArray[np.float64]
-) -> list[DofDifference]:
-    n = len(e.measured.dofs)
-    has = pairs >= 0
-    if not e.has_shapes or not np.any(has):
-        return []
-    power = residual[has][:, 2 : 2 + n] ** 2 + residual[has][:, 2 + n : 2 + 2 * n] ** 2
-    parts = 2.0 if np.any(e.shapes.imag) else 1.0
-    used = np.sum(e.shape_weight[has] > 0, axis=0)
-    z = np.sqrt(np.sum(power, axis=0) / np.maximum(parts * used, 1.0))
-    return [
-        DofDifference(e.measured.configuration, dof.point, float(z[i]))
-        for i, dof in enumerate(e.measured.dofs)
-        if used[i] > 0
-    ]
+def _dof_differences(fitted: FittedModes, rows: Sequence[ModeRows]) -> list[DofDifference]:
+    """Root mean square over all modes of what each sensor is off."""
+    found = []
+    for data in fitted.observations.data:
+        here = [r.shape for r in rows if r.configuration == data.configuration]
+        if not here or not data.dofs:
+            continue
+        z = np.array(here)
+        for i, dof in enumerate(data.dofs):
+            seen = z[np.isfinite(z[:, i]), i]
+            if len(seen):
+                found.append(DofDifference(data.configuration, dof.point, float(np.sqrt(np.mean(seen**2)))))
+    return found

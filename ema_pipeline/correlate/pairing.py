@@ -13,7 +13,7 @@ from ema_pipeline.correlate.settings import PairingSettings
 from ema_pipeline.correlate.types import Pair, Pairing, Unpaired
 from ema_pipeline.mechanics.system import LinearSystem, sensor_row
 from ema_pipeline.modal.assurance import mac, subspace_mac
-from ema_pipeline.rigs.base import model_modes
+from ema_pipeline.rigs.base import modes_of
 from ema_pipeline.rigs.types import ModelMode, Rig
 
 # Modes below this are rigid-body modes to any hammer test.
@@ -29,8 +29,14 @@ def pair_rig(
     settings: PairingSettings,
 ) -> Pairing:
     """Pair measured modes with the rig's modes at parameter `values`; see `pair`."""
-    system = rig.system(configuration, values)
-    return pair(measured, model_modes(rig, configuration, values), system, settings)
+    return pair_system(rig, rig.system(configuration, values), measured, settings)
+
+
+def pair_system(
+    rig: Rig, system: LinearSystem, measured: MeasuredModes, settings: PairingSettings
+) -> Pairing:
+    """Pair measured modes with those of a system of the rig; see `pair`."""
+    return pair(measured, modes_of(rig, system), system, settings)
 
 
 def pair(

@@ -71,6 +71,8 @@ class Candidate:
         not fitted, without and with it; NaN where there are none.
     frf_impacts_better, frf_impacts : int
         Impact points whose FRFs come nearer with it, and how many there are.
+    equivalents : tuple of str
+        Other names of the same physics.
     """
 
     effect: str
@@ -91,6 +93,7 @@ class Candidate:
     frf_error_after: float = float("nan")
     frf_impacts_better: int = 0
     frf_impacts: int = 0
+    equivalents: tuple[str, ...] = ()
 
     @property
     def label(self) -> str:
@@ -168,6 +171,25 @@ class TimeTrace:
 
 
 @dataclass(frozen=True)
+class LearnedScatter:
+    """A standard deviation (1 σ) of everything that is not exactly as stated.
+
+    Attributes
+    ----------
+    name, title : str
+    stated : float
+        What was stated, or the default.
+    learned : float
+        What the data say of it.
+    """
+
+    name: str
+    title: str
+    stated: float
+    learned: float
+
+
+@dataclass(frozen=True)
 class Ladder:
     """Rungs from the base model upwards, all at one noise level.
 
@@ -189,6 +211,8 @@ class Ladder:
         Length of what was compared of each hit, where that is only the first part of its window; else NaN.
     left_out : tuple of str
         Hits, as ``file#number``, that were not compared because their motion hangs on the last thousandth of the force.
+    scatters : tuple of LearnedScatter
+        What σ holds beside the test's own scatter.
     """
 
     rungs: tuple[Rung, ...]
@@ -201,6 +225,7 @@ class Ladder:
     traces: tuple[TimeTrace, ...] = ()
     compared_s: float = float("nan")
     left_out: tuple[str, ...] = ()
+    scatters: tuple[LearnedScatter, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -9,26 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 
 import numpy as np
 
-from ema_pipeline.diagnosis.fitting import (
-    QUICK,
-    Fit,
-    Model,
-    annealed,
-    at_scatters,
-    learned,
-    refined,
-    transferred,
-    wide,
-)
 from ema_pipeline.diagnosis.hypotheses import Hypothesis
 from ema_pipeline.diagnosis.pool import spread
-from ema_pipeline.diagnosis.score import scores
-from ema_pipeline.inference.maximise import ANNEALING
+from ema_pipeline.diagnosis.score import Score, scores
 from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import QUICK, Fit, Model, annealed, learned, refined, transferred
 
 Progress = Callable[[float, str], None]
 
@@ -36,11 +24,10 @@ FINALISTS = 5
 """Hypotheses for which the scatters are learned."""
 _SCREENED = 14
 """Generic hypotheses, best first by their score, that are fitted in full."""
-_FREE_STARTS = (0.0, 1.2, -1.2)
-"""Start values of the logarithm of a free parameter: a decade to either side of its nominal value is reached."""
-_MOST_FREE = 2
-_ALONE = 0.4
-"""Prior 1 σ of a family from which several starts are worth their time."""
+_CONTENDERS = 12
+"""Hypotheses that are worth a second refinement."""
+_EXPLAINED = 1.3
+"""Error up to which the base model is near enough for hypotheses to begin at its fit."""
 
 
 @dataclass(frozen=True)
@@ -79,25 +66,6 @@ class Ranking:
     ranked: tuple[Ranked, ...]
 
 
-def fit_base(observations: Observations, model: Model, start: Fit | None = None) -> Fit:
-    """Annealed fit of a model, from several values of what is free."""
-    problem = model.problem(observations)
-    begin = problem.start()
-    if start is not None:
-        begin = transferred(start.posterior, problem.unknowns, begin)
-    free = [i for i, s in enumerate(problem.unknowns.std) if not problem.unknowns.scatter[i] and s >= _ALONE]
-    free = [i for i in free if problem.unknowns.names[i] not in problem.sizes][:_MOST_FREE]
-    best = None
-    for values in product(_FREE_STARTS, repeat=0 if start is not None else len(free)):
-        x = begin.copy()
-        x[free[: len(values)]] += values
-        fit = annealed(observations, model, x, ANNEALING)
-        if best is None or fit.log_evidence > best.log_evidence:
-            best = fit
-    assert best is not None
-    return best
-
-
 def rank(
     observations: Observations,
     base: Fit,
@@ -117,33 +85,43 @@ def rank(
         Processes that share the fits; the result does not depend on their number.
     progress : callable
     """
-    chosen = _screened(observations, base, hypotheses)
-    job = partial(_first_fit, observations, base)
+    promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses)}
+    chosen = _screened(hypotheses, promise)
+    stuck = base.posterior.error > _EXPLAINED or base.posterior.residuals.penalty > 0
+    job = partial(_first_fit, observations, base, {} if stuck else promise)
     found: dict[str, tuple[Hypothesis, Fit]] = {}
     for i, (hypothesis, fit) in enumerate(zip(chosen, spread(job, chosen, processes), strict=True)):
         found[hypothesis.label] = (hypothesis, fit)
         progress(0.6 * (i + 1) / len(chosen), hypothesis.label)
-    for _ in range(2):
-        base, found = _begun_again(observations, base, found, processes)
+    for contenders, steps in ((len(found), 5), (_CONTENDERS, 12)):
+        base, found = _begun_again(observations, base, found, processes, contenders, steps)
     progress(0.8, "scatter of parts and channels")
     return _finals(observations, base, found, processes)
 
 
-def _screened(observations: Observations, base: Fit, hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) -> list[Hypothesis]:
     """The rig's own hypotheses, and the generic ones that promise most."""
-    generic = [h for h in hypotheses if h.generic]
-    if len(generic) <= _SCREENED:
-        return list(hypotheses)
-    promise = sorted(scores(observations, base, generic), key=lambda s: -s.gain)
-    kept = {s.hypothesis.label for s in promise[:_SCREENED]}
+    generic = sorted(
+        (promise[h.label] for h in hypotheses if h.generic and h.label in promise), key=lambda s: -s.gain
+    )
+    kept = {s.hypothesis.label for s in generic[:_SCREENED]}
     return [h for h in hypotheses if not h.generic or h.label in kept]
 
 
-def _first_fit(observations: Observations, base: Fit, hypothesis: Hypothesis) -> Fit:
-    """Best of the fits begun at several sizes."""
+def _first_fit(
+    observations: Observations, base: Fit, promise: Mapping[str, Score], hypothesis: Hypothesis
+) -> Fit:
+    """The fit begun at the size that its score tells; annealed from several sizes where the base model fails."""
     model = base.model.plus(hypothesis.placed, hypothesis.scales)
     unknowns = model.problem(observations).unknowns
     begin = transferred(base.posterior, unknowns, np.zeros(len(unknowns)))
+    score = promise.get(hypothesis.label)
+    if score is not None and len(score.size) == 1:
+        at = unknowns.index[hypothesis.placed.parameter_name(hypothesis.placed.effect.parameters[0].name)]
+        begin[at] = float(np.clip(0.5 * score.size[0], -1.0, 1.0))
+        fit = refined(observations, model, unknowns.clipped(begin))
+        if fit.posterior.cost <= base.posterior.cost:
+            return fit
     fits = []
     for start in hypothesis.starts():
         x = begin.copy()
@@ -156,16 +134,18 @@ def _first_fit(observations: Observations, base: Fit, hypothesis: Hypothesis) ->
 Found = dict[str, tuple[Hypothesis, Fit]]
 
 
-def _begun_again(observations: Observations, base: Fit, found: Found, processes: int) -> tuple[Fit, Found]:
-    """The base model and all hypotheses, begun at what the best hypothesis knows of everything else."""
+def _begun_again(
+    observations: Observations, base: Fit, found: Found, processes: int, contenders: int, steps: int
+) -> tuple[Fit, Found]:
+    """The base model and the best hypotheses, begun at what the best of all knows of everything else."""
     top = max((f for _, f in found.values()), key=lambda f: f.log_evidence, default=base)
     again = refined(observations, base.model, _on(observations, base.model, top, base), steps=20)
     if again.log_evidence > base.log_evidence:
         base = again
-    job = partial(_better, observations, (base, top))
-    items = list(found.values())
+    job = partial(_better, observations, (base, top), steps)
+    items = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)[:contenders]
     better = spread(job, [fit for _, fit in items], processes)
-    return base, {h.label: (h, fit) for (h, _), fit in zip(items, better, strict=True)}
+    return base, found | {h.label: (h, fit) for (h, _), fit in zip(items, better, strict=True)}
 
 
 def _on(observations: Observations, model: Model, source: Fit, sizes: Fit) -> np.ndarray:
@@ -180,13 +160,13 @@ def _on(observations: Observations, model: Model, source: Fit, sizes: Fit) -> np
     return moved
 
 
-def _better(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Fit:
+def _better(observations: Observations, sources: Sequence[Fit], steps: int, fit: Fit) -> Fit:
     best = fit
     for source in sources:
         x = _on(observations, fit.model, source, fit)
         if np.allclose(x, best.posterior.x):
             continue
-        again = refined(observations, fit.model, x)
+        again = refined(observations, fit.model, x, steps=steps)
         if again.log_evidence > best.log_evidence:
             best = again
     return best
@@ -225,6 +205,3 @@ def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Fit:
             start = refined(observations, fit.model, x, scatters, steps=10)
             candidates.append(learned(observations, start))
     return max(candidates, key=lambda f: f.log_evidence)
-
-
-__all__ = ["Ranked", "Ranking", "at_scatters", "fit_base", "rank", "wide"]

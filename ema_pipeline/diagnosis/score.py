@@ -9,9 +9,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from ema_pipeline.diagnosis.fitting import Fit, transferred
 from ema_pipeline.diagnosis.hypotheses import Hypothesis
 from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import Fit, transferred
 
 
 @dataclass(frozen=True)
@@ -85,4 +85,4 @@ class _Marginal:
             size = np.zeros_like(size)
         gain = 0.5 * float(slope @ size) - 0.5 * float(np.linalg.slogdet(precision)[1])
         std = float(1 / np.sqrt(max(information[0, 0], 1e-300)))
-        return Score(hypothesis, size, std, gain)
+        return Score(hypothesis, np.asarray(size, float), std, gain)

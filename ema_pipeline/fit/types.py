@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,6 +130,10 @@ class FitResult:
     sweeps : tuple of ErrorSweep
     two_step : TwoStep or None
     notes : tuple of str
+    unknowns : dict of str to float
+        Every unknown at the maximum of the posterior: logarithms of families and parts, calibrations, effects' sizes.
+    scatters : dict of str to float
+        What parts, channels, damping and the model scatter, as learned.
     objective : float
         -2 log posterior at the data's own uncertainties, up to a constant that is the same for all models of
         the same data: the smaller, the better.
@@ -151,6 +155,8 @@ class FitResult:
     sweeps: tuple[ErrorSweep, ...] = ()
     two_step: TwoStep | None = None
     notes: tuple[str, ...] = ()
+    unknowns: dict[str, float] = field(default_factory=dict)
+    scatters: dict[str, float] = field(default_factory=dict)
     objective: float = float("nan")
     outlier_share: float = 0.0
     misfit_scale: float = 1.0

@@ -29,6 +29,9 @@ class Scatter:
         1 σ of its logarithm; 0 for a scatter that is known.
     wide : float
         Value from which learning begins. Begun too narrow, a fit takes scatter for effects.
+    most : float
+        Largest value, in units of the default. A model that needs more does not explain the data: without this bound
+        its failure would be hidden as scatter.
     """
 
     name: str
@@ -36,6 +39,8 @@ class Scatter:
     default: float
     spread: float = 0.5
     wide: float = 0.0
+    most: float = 2.5
+    at_once: bool = False
 
     @property
     def start(self) -> float:
@@ -72,15 +77,15 @@ def learn(
 
 
 def _learned(found: Posterior, scatter: Scatter) -> float:
-    """One step of expectation-maximisation for one scatter; the unknowns are what is averaged over."""
+    """One step of expectation-maximisation for one scatter."""
     now = found.scatters[scatter.name]
     if not scatter.spread:
         return now
+    if scatter.at_once:
+        return _of_residuals_at_once(found, scatter)
     squares, count = _of_unknowns(found, scatter.name, now)
-    part, square = _of_residuals(found, scatter.name)
-    if count == 0 and len(part) == 0:
-        return scatter.default
-    return _mode_of_log(squares / now**2, count, part, square, now, scatter)
+    more, number = _of_residuals(found, scatter.name, now)
+    return _mode_of_log(squares + more, count + number, now, scatter)
 
 
 def _of_unknowns(found: Posterior, name: str, now: float) -> tuple[float, int]:
@@ -92,38 +97,50 @@ def _of_unknowns(found: Posterior, name: str, now: float) -> tuple[float, int]:
     return float(np.sum((x**2 + variance) / found.unknowns.std[governed] ** 2)), int(np.sum(governed))
 
 
-def _of_residuals(found: Posterior, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Share of the scatter in the variance of every residual that has one, and the residual's expected square."""
+def _of_residuals(found: Posterior, name: str, now: float) -> tuple[float, int]:
+    """Expected sum of squares of the discrepancies that the scatter adds to residuals.
+
+    A residual e = discrepancy + noise has the discrepancy's mean `share`·e and variance σ²·share·(1 - share).
+    """
     share = found.residuals.share.get(name)
     if share is None or not np.any(share > 0):
-        return np.zeros(0), np.zeros(0)
+        return 0.0, 0
     rows = share > 0
     jacobian = found.residuals.jacobian[rows]
     uncertain = np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian)
-    return share[rows], found.residuals.values[rows] ** 2 + uncertain
+    square = found.residuals.values[rows] ** 2 + uncertain
+    part = share[rows]
+    return float(now**2 * np.sum(part * square + 1.0 - part)), int(np.sum(rows))
 
 
-def _mode_of_log(
-    squares: float,
-    count: int,
-    part: NDArray[np.float64],
-    square: NDArray[np.float64],
-    now: float,
-    scatter: Scatter,
-) -> float:
-    """Scatter that maximises its expected log density, by Newton's method in its logarithm.
-
-    With t = (scatter/now)², a residual's variance becomes 1 - part + part·t times what it is, and the sum of squares
-    of the unknowns that it governs `squares`/t.
-    """
+def _mode_of_log(squares: float, count: int, now: float, scatter: Scatter) -> float:
+    """Scatter that maximises its expected log density, by Newton's method in its logarithm."""
+    if count == 0:
+        return scatter.default
     log, weight = np.log(now), scatter.spread**-2.0
     for _ in range(_NEWTON_STEPS):
-        t = np.exp(2 * (log - np.log(now)))
-        variance = 1 - part + part * t
-        moved, excess = part * t / variance, square / variance
-        slope = -count + squares / t + float(np.sum(moved * (excess - 1)))
-        slope -= (log - np.log(scatter.default)) * weight
-        # Where the density is not concave in the logarithm, the expected curvature serves.
-        curvature = 2 * squares / t + weight + 2 * float(np.sum(moved**2 * np.maximum(excess, 1.0)))
-        log += float(np.clip(slope / curvature, -0.5, 0.5))
-    return float(np.exp(log))
+        excess = squares / np.exp(2 * log)
+        slope = -count + excess - (log - np.log(scatter.default)) * weight
+        log -= float(np.clip(slope / (-2 * excess - weight), -0.5, 0.5))
+    return float(np.exp(min(log, np.log(scatter.most * scatter.default))))
+
+
+def _of_residuals_at_once(found: Posterior, scatter: Scatter) -> float:
+    """Scatter that maximises the expected log density of the residuals, the unknowns being what is averaged over.
+
+    With t = (scatter/now)², a residual's variance is 1 - share + share·t times what it is now.
+    """
+    now = found.scatters[scatter.name]
+    share = found.residuals.share[scatter.name]
+    jacobian = found.residuals.jacobian
+    uncertain = np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian)
+    square = found.residuals.values**2 + uncertain
+    log, weight = 0.0, scatter.spread**-2.0
+    for _ in range(_NEWTON_STEPS):
+        t = np.exp(2 * log)
+        variance = 1 - share + share * t
+        moved, excess = share * t / variance, square / variance
+        slope = float(np.sum(moved * (excess - 1))) - (log + np.log(now / scatter.default)) * weight
+        # Where the density is not concave in the logarithm, its expected curvature serves.
+        log += float(np.clip(slope / (weight + 2 * np.sum(moved**2 * np.maximum(excess, 1.0))), -1.0, 1.0))
+    return float(min(now * np.exp(log), scatter.most * scatter.default))

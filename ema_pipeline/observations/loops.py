@@ -35,6 +35,8 @@ NOISE_SCATTER = "noise_scatter"
 """Noise of the force beyond what its cycles show, as a share of that: few cycles, chatter that differs each time."""
 UNSEEN_NOISE = 0.1
 """Default of `NOISE_SCATTER`: half a per cent of the variance, about what ten cycles leave open of it."""
+MOST = 1e3
+"""Factor by which these scatters may exceed their defaults: the error is counted in measured noise all the same."""
 FORCE, DISPLACEMENT = "calibration of force", "calibration of displacement"
 CALIBRATION_STD = 0.02
 """Relative 1 σ of a channel's sensitivity where none is stated."""
@@ -105,8 +107,8 @@ class LoopObservations:
     def scatters(self) -> Mapping[str, Scatter]:
         """See `Observations`."""
         known = (
-            Scatter(FORCE_SCATTER, "force that no model explains", DISCREPANCY, 1.5),
-            Scatter(NOISE_SCATTER, "noise that the cycles do not show", UNSEEN_NOISE, 1.5),
+            Scatter(FORCE_SCATTER, "force that no model explains", DISCREPANCY, 1.5, most=MOST, at_once=True),
+            Scatter(NOISE_SCATTER, "noise that the cycles do not show", UNSEEN_NOISE, 1.5, most=MOST, at_once=True),
         )
         return {s.name: s for s in known}
 

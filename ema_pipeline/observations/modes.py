@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import PlacedEffect
+from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
 from ema_pipeline.mechanics.terms import Matrices
@@ -63,8 +64,8 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
         Scatter(PART_SCATTER, "parts", STIFFNESS_SCATTER, 0.7, 0.04),
         Scatter(CALIBRATION, "calibration", CALIBRATION_STD, 0.7, 0.04),
         Scatter(DAMPING_SCATTER, "ln ζ from mode to mode", rig.modal_damping_scatter, 0.5, 0.5),
-        Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3),
-        Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03),
+        Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 5.0),
+        Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03, 3.0),
     )
     return {s.name: s for s in known}
 
@@ -83,6 +84,8 @@ class ModeData:
         NaN where not measured; s may be 0.
     dofs : tuple of Dof
     band_hz : tuple of float
+    complete : bool
+        False where modes of the band were taken out on purpose: what the model has besides is then no contradiction.
     """
 
     configuration: str
@@ -94,6 +97,7 @@ class ModeData:
     shape_std: NDArray[np.float64]
     dofs: tuple[Dof, ...]
     band_hz: tuple[float, float]
+    complete: bool = True
 
     def __len__(self) -> int:
         return len(self.log_frequency)
@@ -108,7 +112,7 @@ class ModeData:
             "shapes",
             "shape_std",
         )
-        return dataclasses.replace(self, **{n: getattr(self, n)[keep] for n in names})
+        return dataclasses.replace(self, complete=False, **{n: getattr(self, n)[keep] for n in names})
 
 
 def prepare(measured: MeasuredModes) -> ModeData:
@@ -149,6 +153,10 @@ class ModeObservations:
     data : sequence of ModeData
     channels : dict of str to ChannelUncertainty, optional
         By DOF; the defaults where left out.
+    shared : Dependence, optional
+        Of the rig, where it is known already.
+    sensors : tuple of str, optional
+        DOFs whose calibration is unknown; those of `data` where left out.
     """
 
     def __init__(
@@ -157,12 +165,22 @@ class ModeObservations:
         data: Sequence[ModeData],
         channels: Mapping[str, ChannelUncertainty] | None = None,
         shared: Dependence | None = None,
+        sensors: tuple[str, ...] = (),
     ) -> None:
         self.rig = rig
         self.data = tuple(d for d in data if len(d))
+        self.sensors = sensors or tuple(dict.fromkeys(d.point for one in data for d in one.dofs))
         self.channels = dict(channels or {})
         self.shared = shared or dependence(rig)
         self.scatters = scatters_of(rig)
+        self._has: dict[tuple[str, Dof], bool] = {}
+
+    def has(self, configuration: str, dof: Dof) -> bool:
+        """True where the rig can be measured at `dof`; asked for every model, so remembered."""
+        key = (configuration, dof)
+        if key not in self._has:
+            self._has[key] = self.rig.knows(configuration, dof)
+        return self._has[key]
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> ModeProblem:
         """See `Observations`."""
@@ -170,7 +188,7 @@ class ModeObservations:
 
     def with_data(self, data: Sequence[ModeData]) -> ModeObservations:
         """The same rig and channels with other modes."""
-        return ModeObservations(self.rig, data, self.channels, self.shared)
+        return ModeObservations(self.rig, data, self.channels, self.shared, self.sensors)
 
     def folds(self, count: int = 4) -> list[tuple[ModeObservations, ModeObservations]]:
         """Every `count`-th mode held out in turn, over all configurations."""
@@ -186,11 +204,6 @@ class ModeObservations:
             pairs.append((self.with_data(kept), self.with_data(out)))
         return pairs
 
-    @cached_property
-    def sensors(self) -> tuple[str, ...]:
-        """DOFs at which shapes are given in any configuration."""
-        return tuple(dict.fromkeys(d.point for data in self.data for d in data.dofs))
-
 
 @dataclass(frozen=True)
 class Sensing:
@@ -200,6 +213,27 @@ class Sensing:
     across: NDArray[np.float64]
     gain: NDArray[np.int64]
     transverse: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ModeRows:
+    """Measurement minus model over 1 σ of one mode; NaN where not measured.
+
+    Attributes
+    ----------
+    configuration : str
+    measured, model : int
+        Indices of the measured mode and of its model mode.
+    frequency, damping : float
+    shape : ndarray, (n_sensors,)
+    """
+
+    configuration: str
+    measured: int
+    model: int
+    frequency: float
+    damping: float
+    shape: NDArray[np.float64]
 
 
 class ModeProblem:
@@ -247,8 +281,7 @@ class ModeProblem:
         other = _ACROSS.get(direction)
         if other is None:
             return False
-        dof = Dof(body, other)
-        return any(self.observations.rig.knows(d.configuration, dof) for d in self.observations.data)
+        return any(self.observations.has(d.configuration, Dof(body, other)) for d in self.observations.data)
 
     @cached_property
     def sensing(self) -> tuple[Sensing, ...]:
@@ -264,10 +297,55 @@ class ModeProblem:
                 transverse[i] = self.unknowns.index.get(f"transverse sensitivity of {dof.point}", -1)
                 if transverse[i] >= 0:
                     other = Dof(dof.body, _ACROSS[dof.direction])
-                    if self.observations.rig.knows(d.configuration, other):
+                    if self.observations.has(d.configuration, other):
                         across[i] = self.model.sensor_rows(d.configuration, (other,))[0]
             found.append(Sensing(along, across, gain, transverse))
         return tuple(found)
+
+    def solution(self, configuration: str, x: NDArray[np.float64]) -> EigenSolution:
+        """Modes of the model at `x`.
+
+        Raises
+        ------
+        EmaError
+            If the model has none there.
+        """
+        matrices = self.model.matrices(configuration, x[: self.offset], derivatives=False)
+        solution = EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio)
+        if solution is None:
+            raise EmaError(
+                f"{configuration}: the model has no modes at the fitted values; check the rig's masses"
+            )
+        return solution
+
+    def rows(self, found: Residuals) -> list[ModeRows]:
+        """Residuals sorted by the mode that they belong to, every measured mode that has a model mode."""
+        assert isinstance(found.matching, tuple)
+        out, at = [], 0
+        for data, match in zip(self.observations.data, found.matching, strict=True):
+            on = np.flatnonzero(match >= 0)
+            frequency = found.values[at : at + len(on)]
+            at += len(on)
+            damped = np.isfinite(data.log_damping[on])
+            damping = np.full(len(on), np.nan)
+            damping[damped] = found.values[at : at + int(np.sum(damped))]
+            at += int(np.sum(damped))
+            seen = np.isfinite(data.shapes[on])
+            shape = np.full(seen.shape, np.nan)
+            shape[seen] = found.values[at : at + int(np.sum(seen))]
+            at += int(np.sum(seen))
+            out += [
+                ModeRows(
+                    data.configuration,
+                    int(r),
+                    int(match[r]),
+                    float(frequency[k]),
+                    float(damping[k]),
+                    shape[k],
+                )
+                for k, r in enumerate(on)
+            ]
+        return out
 
     def residuals(
         self,
@@ -455,6 +533,8 @@ class _Configuration:
 
     def _unseen(self, solution: EigenSolution, match: NDArray[np.int64]) -> int:
         """Model modes well inside the band that no measured mode is paired with."""
+        if not self.data.complete:
+            return 0
         low, high = self.data.band_hz
         inside = (solution.frequency_hz > 1.05 * low) & (solution.frequency_hz < 0.95 * high)
         inside[match[match >= 0]] = False
@@ -471,8 +551,8 @@ class _Configuration:
         width, s = self.reading.shape[1], self.sensing
         k, count = predicted.shape
         slope = np.zeros((k, count, len(self.x)))
-        read = self.reading @ by_model[:width].reshape(width, -1)
-        slope[:, :, : by_model.shape[2]] = read.reshape(count, k, -1).transpose(1, 0, 2)
+        read = self.reading @ by_model[:width].reshape(width, k * by_model.shape[2])
+        slope[:, :, : by_model.shape[2]] = read.reshape(count, k, by_model.shape[2]).transpose(1, 0, 2)
         has = np.flatnonzero(s.gain >= 0)
         slope[:, has, s.gain[has]] += predicted[:, has]
         has = np.flatnonzero(s.transverse >= 0)

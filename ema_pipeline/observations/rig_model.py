@@ -17,6 +17,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import EffectParameter, PlacedEffect
 from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Assembly, Row
+from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.mechanics.terms import Matrices, Terms, assemble_terms
 from ema_pipeline.observations.parts import DAMPING, Dependence, dependence, part_key
 from ema_pipeline.rigs.types import Rig
@@ -218,6 +219,25 @@ class RigModel:
             }
             self._nominal[key] = self.rig.assembly(configuration, values)
         return self._nominal[key]
+
+    def system(self, configuration: str, x: NDArray[np.float64]) -> LinearSystem:
+        """The linear system of a configuration at `x`, every part with its own deviation."""
+        matrices = self.matrices(configuration, x, derivatives=False)
+        assembly = self.assembly(configuration, x[self.shape_start :])
+        mass, damping, stiffness, structural = matrices.dense
+        return LinearSystem(
+            dofs=matrices.terms.dofs,
+            mass=mass,
+            stiffness=stiffness,
+            damping=damping + matrices.skew,
+            structural=structural,
+            modal_damping_ratio=matrices.damping_ratio,
+            sensors={name: _row(row, matrices.terms.dofs) for name, row in assembly.sensors.items()},
+        )
+
+    def named(self, values: Mapping[str, float]) -> NDArray[np.float64]:
+        """Unknowns by name as an array; zero where left out, (n,)."""
+        return np.array([values.get(name, 0.0) for name in self.unknowns.names])
 
     def sensor_rows(self, configuration: str, dofs: Sequence[Dof]) -> NDArray[np.float64]:
         """What sensors at `dofs` read of the rig's own coordinates, (n_dofs, n)."""

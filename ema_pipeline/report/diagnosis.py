@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Mapping, Sequence
 
 from ema_pipeline.diagnose.explain import compared_text, label_text
-from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import (
     NOT_TOLD,
     OUT_OF_TOLERANCE,
@@ -19,7 +18,6 @@ from ema_pipeline.diagnose.types import (
 )
 from ema_pipeline.report.limits import FAR_SIGMA
 from ema_pipeline.report.numbers import format_value, plain, prefixed, words
-from ema_pipeline.report.results import RunResults
 
 NOTHING = "nothing"
 _COUNTS = {2: "Two", 3: "Three", 4: "Four", 5: "Five", 6: "Six"}
@@ -286,16 +284,6 @@ def next_commands(found: Diagnosis, out: str = "OUT", added: Sequence[str] = ())
     if found.verdict == "unknown_effect":
         return (f"ema compare {folder}", f"ema diagnose {folder} --effect-file my_effect.py")
     return ()
-
-
-def probability_threshold(results: RunResults) -> float:
-    """Probability that a claim needs: as the diagnosis was set, or else by default."""
-    default = float(DiagnoseSettings().probability_least)
-    text = results.settings.get("diagnose", {}).get("probability_least", "")
-    try:
-        return float(text)
-    except ValueError:
-        return default
 
 
 def _capital(text: str) -> str:

@@ -296,9 +296,7 @@ def _images(
     if found is not None:
         # Sets are listed one by one in summary.json; the picture shows effects.
         alone = dataclasses.replace(found, probabilities={})
-        drawn["candidates"] = partial(
-            candidate_probabilities, alone, diagnosis.probability_threshold(results)
-        )
+        drawn["candidates"] = partial(candidate_probabilities, alone)
     if ladder is not None and ladder.rungs:
         drawn["ladder"] = partial(ladder_errors, ladder)
     figures = {name: draw() for name, draw in drawn.items()}

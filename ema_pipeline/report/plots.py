@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report import style
-from ema_pipeline.report.diagnosis import probability_threshold
 from ema_pipeline.report.figures import (
     comparison,
     diagnosis,
@@ -176,7 +175,7 @@ def _diagnosed(results: RunResults) -> Iterator[FigureSpec]:
             "diagnosis",
             "",
             "What may be missing: probabilities of the candidates and of nothing missing",
-            partial(diagnosis.candidate_probabilities, found, probability_threshold(results)),
+            partial(diagnosis.candidate_probabilities, found),
         )
     if ladder is not None and ladder.rungs:
         yield FigureSpec(

@@ -117,7 +117,11 @@ def model_modes(
     damped system's own poles are taken: frequency |s|/2π and the complex shape, of which `shape` is the
     real part after rotation to the real axis.
     """
-    system = rig.system(configuration, values)
+    return modes_of(rig, rig.system(configuration, values))
+
+
+def modes_of(rig: Rig, system: LinearSystem) -> tuple[ModelMode, ...]:
+    """Modes of a system of the rig, see `model_modes`."""
     frequency_hz, shapes = normal_modes(system)
     families, shapes = rig.classify(system, frequency_hz, shapes)
     if not np.any(system.damping) and not np.any(system.structural):

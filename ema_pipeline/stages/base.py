@@ -9,13 +9,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Protocol, cast
+from typing import Protocol
 
 from ema_pipeline import __version__, codec
-from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
-from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import effect_library
+from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.errors import EmaError
 from ema_pipeline.rigs import Rig, load_rig, rig_kinds
 from ema_pipeline.rigs.files import rig_from_text
@@ -98,8 +97,7 @@ class Run:
         """The rig with the effects that the user added."""
         if self.rig is None or not self.info.effects:
             return self.rig
-        settings = cast(DiagnoseSettings, self.settings["diagnose"])
-        return make_rig(self.rig, Hypothesis(self.info.effects), self.library, settings.parameter_range)
+        return rig_with_effects(self.rig, self.info.effects, self.library)
 
     @cached_property
     def rig(self) -> Rig | None:

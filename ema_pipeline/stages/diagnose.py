@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
-from ema_pipeline.correlate.measured import MeasuredModes
-from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
+from ema_pipeline.correlate.types import Comparison
 from ema_pipeline.diagnose.progress import part
-from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.settings import DiagnoseSettings as LevelSettings
+from ema_pipeline.diagnosis.settings import DiagnoseSettings
 from ema_pipeline.effects.library import depends_on_level
+from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.stages import loop_ladder
-from ema_pipeline.stages.base import Progress, Run, code_fingerprint
+from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.correlate import correlate
 from ema_pipeline.stages.level_case import all_tests, level_case, linear_part
-from ema_pipeline.stages.modes import measured_frfs, measured_modes
 
 if TYPE_CHECKING:
     from ema_pipeline.diagnose.levels.prepare import LevelTest
@@ -57,23 +57,38 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     results: dict[str, object] = {"diagnosis": found, "on_top_of": run.info.effects}
     top = found.ladder.rungs[-1]
     if top.effects and not any(depends_on_level(x, run.library) for x in top.effects):
-        settings = cast(DiagnoseSettings, run.settings[NAME])
-        mended = make_rig(model, Hypothesis(top.effects), run.library, settings.parameter_range)
-        values = {name: size.value for name, size in top.parameters.items()}
-        _, results["comparison_after"] = correlate(run, mended, values)
+        results["comparison_after"] = _compared_with(run, top.effects)
     return results
+
+
+def _compared_with(run: Run, labels: Sequence[str]) -> Comparison:
+    """Where model and measurement part once these effects are in the model."""
+    from ema_pipeline.fit.parameters import fit_modes
+    from ema_pipeline.stages.models import mode_observations, model_with
+
+    assert run.rig is not None
+    mended = rig_with_effects(run.rig, labels, run.library)
+    fitted = fit_modes(mode_observations(run), model_with(run, mended, labels))
+    return correlate(run, mended, fitted)[1]
 
 
 def by_modes(run: Run, model: Rig, progress: Progress) -> Diagnosis:
     """The diagnosis where the answer does not depend on the force level."""
-    from ema_pipeline.diagnose import diagnose
+    from ema_pipeline.diagnosis.diagnosis import diagnose
+    from ema_pipeline.stages.models import known_model, mode_observations
+    from ema_pipeline.threads import single_blas_thread
 
     settings = cast(DiagnoseSettings, run.settings[NAME])
-    measured = measured_modes(run)
-    limits, tell = own_thresholds(run, settings, model, measured, progress)
-    return diagnose(
-        model, measured, settings, run.library, tell, failed_checks(run), limits, measured_frfs(run)
-    )
+    with single_blas_thread():
+        return diagnose(
+            mode_observations(run),
+            model,
+            run.library,
+            known_model(run),
+            settings,
+            progress,
+            failed_checks(run),
+        )
 
 
 _EXACT = 0.002
@@ -133,7 +148,7 @@ def by_hits(run: Run, tests: Sequence[LevelTest], progress: Progress) -> Diagnos
     from ema_pipeline.diagnose.levels.linear_claims import without, without_time_response
     from ema_pipeline.diagnose.levels.prepare import soft_and_hard
 
-    settings = cast(DiagnoseSettings, run.settings[NAME])
+    settings = LevelSettings()
     linear = linear_part(run)
     found: list[Diagnosis] = []
     for i, modes in enumerate(soft_and_hard(tests)):
@@ -186,31 +201,6 @@ _LIKELY = 3
 
 _TRUSTED = ("adequate", "not_enough_data", "effect", "ambiguous", "unknown_effect")
 """Verdicts on the modes of one level, those first that speak for a level near to a linear rig."""
-
-
-def own_thresholds(
-    run: Run,
-    settings: DiagnoseSettings,
-    model: Rig,
-    measured: Mapping[str, MeasuredModes],
-    progress: Progress,
-) -> tuple[dict[str, float] | None, Progress]:
-    """Thresholds from this test's own fitted null where the settings ask for it, and progress of what is left."""
-    from ema_pipeline.diagnose import bootstrap
-
-    if not settings.bootstrap:
-        return None, progress
-    share = settings.bootstrap / (settings.bootstrap + 1)
-    limits = bootstrap.own_thresholds(
-        model,
-        measured,
-        settings,
-        run.library,
-        run.store.folder / "bootstrap.jsonl",
-        code_fingerprint() + run.effect_hashes(),
-        lambda done, text: progress(share * done, text),
-    )
-    return limits, lambda done, text="": progress(share + (1 - share) * done, text)
 
 
 def failed_checks(run: Run) -> tuple[str, ...]:

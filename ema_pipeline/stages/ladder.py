@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, cast
 
-from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.stages import loop_ladder
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.level_case import all_tests, level_case, linear_part
-from ema_pipeline.stages.modes import measured_frfs, measured_modes
 
 if TYPE_CHECKING:
     from ema_pipeline.diagnose.types import Ladder
@@ -32,26 +30,27 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit the base model and every rung above it; without added effects there is no ladder to climb."""
     if run.info.kind == "hysteresis":
         return loop_ladder.climb_run(run, progress)
-    from ema_pipeline.diagnose import make_ladder
-
     if not run.info.effects:
         return {}
     if run.rig is None:
         raise EmaError(f"{run.store.folder}: a ladder needs a model; run again with --rig")
-    settings = cast(DiagnoseSettings, run.settings["diagnose"])
     if any(depends_on_level(label, run.library) for label in run.info.effects):
         return {"ladder": by_hits(run, progress)}
-    return {
-        "ladder": make_ladder(
-            run.rig,
-            measured_modes(run),
-            run.info.effects,
-            settings,
-            run.library,
-            progress,
-            measured_frfs(run),
-        )
-    }
+    return {"ladder": by_modes(run)}
+
+
+def by_modes(run: Run) -> Ladder:
+    """The ladder of the effects that the user added, measured by the modes."""
+    from ema_pipeline.diagnosis.rungs import make_ladder
+    from ema_pipeline.observations.fitting import Model
+    from ema_pipeline.stages.models import mode_observations, model_with
+    from ema_pipeline.threads import single_blas_thread
+
+    models = [Model()]
+    for label in run.info.effects:
+        models.append(model_with(run, run.require_model(NAME), [label], models[-1]))
+    with single_blas_thread():
+        return make_ladder(mode_observations(run), models)
 
 
 def by_hits(run: Run, progress: Progress) -> Ladder:

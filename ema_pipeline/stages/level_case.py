@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis, make_rig
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -38,7 +38,7 @@ def level_case(run: Run, tests: Sequence[LevelTest], starts: Sequence[Mapping[st
     from ema_pipeline.diagnose.levels.prepare import common_levels, highest_mode, windows_of
 
     assert run.rig is not None
-    settings = cast(DiagnoseSettings, run.settings["diagnose"])
+    settings = DiagnoseSettings()
     forces = common_levels(tests)
     windows = []
     for test in tests:
@@ -54,7 +54,7 @@ def level_case(run: Run, tests: Sequence[LevelTest], starts: Sequence[Mapping[st
 def linear_part(run: Run) -> Rig:
     """The rig with those of the added effects that do not depend on the level."""
     assert run.rig is not None
-    settings = cast(DiagnoseSettings, run.settings["diagnose"])
+    settings = DiagnoseSettings()
     kept = tuple(x for x in run.info.effects if not depends_on_level(x, run.library))
     return make_rig(run.rig, Hypothesis(kept), run.library, settings.parameter_range)
 

@@ -16,7 +16,7 @@ def diagnose_run(run: Run, progress: Progress) -> dict[str, object]:
     """Every set of effects on top of the model as it stands, judged by all loops together."""
     from ema_pipeline.loops.diagnosis import diagnose_loops
 
-    settings = cast(DiagnoseSettings, run.settings["diagnose"])
+    settings = DiagnoseSettings()
     found, models = diagnose_loops(loops_of(run), run.info.effects, settings, loop_settings(run), progress)
     return {"diagnosis": found, "models": models, "on_top_of": run.info.effects}
 

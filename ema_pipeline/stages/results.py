@@ -11,9 +11,11 @@ from ema_pipeline.ingest.records import Hit
 from ema_pipeline.levels.linear import structure
 from ema_pipeline.levels.words import flagged
 from ema_pipeline.loops.types import IsolatorResult
+from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.stages.base import Run
+from ema_pipeline.stages.models import fitted_modes
 from ema_pipeline.stages.modes import level_study, measured_frfs
 from ema_pipeline.store import ALL
 
@@ -34,7 +36,7 @@ def load_results(run: Run) -> RunResults:
                 frfs=frfs.get(name),
                 modal=modal if modal is None or levels is None else flagged(structure(modal, levels), levels),
                 pairing=run.store.find("correlate", ALL, f"pairing {name}", Pairing),
-                system=None if run.model is None or loops else run.model.system(name, values),
+                system=None if run.model is None or loops else _system(run, name, fit, values),
                 levels=levels,
             )
         )
@@ -51,6 +53,14 @@ def load_results(run: Run) -> RunResults:
         provenance=provenance(run),
         settings={name: _flat(json.loads(s.model_dump_json())) for name, s in run.settings.items()},
     )
+
+
+def _system(run: Run, name: str, fit: FitResult | None, values: dict[str, float]) -> LinearSystem:
+    """The model as it was fitted, every part with its own deviation; at nominal values before the fit."""
+    assert run.model is not None
+    if fit is None or not fit.unknowns:
+        return run.model.system(name, values)
+    return fitted_modes(run, fit).system(name)
 
 
 def isolators(run: Run) -> dict[str, IsolatorResult]:

@@ -51,7 +51,7 @@ _QUANTITIES = (
 
 
 @styled
-def candidate_probabilities(found: Diagnosis, threshold: float) -> Figure:
+def candidate_probabilities(found: Diagnosis) -> Figure:
     """Probabilities of the candidates, of all others together, and of nothing missing.
 
     What the data support has a full bar and says so; the rest is hatched.
@@ -91,8 +91,7 @@ def candidate_probabilities(found: Diagnosis, threshold: float) -> Figure:
             color="white" if inside and supported else BLACK,
             bbox={"fc": "white", "ec": "none", "pad": 0.8} if not (inside and supported) else None,
         )
-    ax.axvline(threshold, color=VERMILLION, lw=1.0, ls="--", zorder=0.5 if threshold < 0.5 else 3)
-    ax.set_title(f"Probability (◆ supported; dashed: {threshold:g} needed)", x=-0.62, ha="left", fontsize=7.6)
+    ax.set_title("Probability (◆ supported by the data)", x=-0.62, ha="left", fontsize=7.6)
     ax.set_yticks(at, [textwrap.fill(name, 29, break_on_hyphens=False) for name, _, _ in bars], fontsize=6.2)
     ax.set_ylim(len(bars) - 0.4, -0.6)
     ax.set_xlim(0, 1)

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Posterior, Unknowns, anneal, descend, learn
+from ema_pipeline.inference.maximise import ANNEALING
 from ema_pipeline.observations.base import EffectProblem, Observations
 
 QUICK = ((30.0, 5), (5.0, 5), (1.0, 8))
 """Annealing of a hypothesis that begins at the base model's fit."""
+
+
+_FREE_STARTS = (0.0, 1.2, -1.2)
+"""Start values of the logarithm of a free parameter: a decade to either side of its nominal value is reached."""
+_MOST_FREE = 2
+_ALONE = 0.4
+"""Prior 1 σ of a family from which several starts are worth their time."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +99,10 @@ def refined(
 
 
 def learned(observations: Observations, fit: Fit) -> Fit:
-    """The fit with scatters learned."""
+    """The fit with scatters learned, beginning at the stated ones where none were learned before."""
     problem = fit.model.problem(observations)
-    scatters = {
-        n: s.default if fit.posterior.scatters[n] == s.start else fit.posterior.scatters[n]
-        for n, s in observations.scatters.items()
-    }
+    known = fit.posterior.scatters
+    scatters = {n: s.default if known[n] == s.start else known[n] for n, s in observations.scatters.items()}
     start = descend(problem, scatters, fit.posterior.x, steps=10)
     return replace(fit, posterior=learn(problem, start, observations.scatters))
 
@@ -103,3 +110,22 @@ def learned(observations: Observations, fit: Fit) -> Fit:
 def at_scatters(observations: Observations, fit: Fit, scatters: Mapping[str, float]) -> Fit:
     """The fit at given scatters, so that the errors of several models compare."""
     return refined(observations, fit.model, fit.posterior.x, scatters)
+
+
+def fit_base(observations: Observations, model: Model, start: Fit | None = None) -> Fit:
+    """Annealed fit of a model, from several values of what is free."""
+    problem = model.problem(observations)
+    begin = problem.start()
+    if start is not None:
+        begin = transferred(start.posterior, problem.unknowns, begin)
+    free = [i for i, s in enumerate(problem.unknowns.std) if not problem.unknowns.scatter[i] and s >= _ALONE]
+    free = [i for i in free if problem.unknowns.names[i] not in problem.sizes][:_MOST_FREE]
+    best = None
+    for values in product(_FREE_STARTS, repeat=0 if start is not None else len(free)):
+        x = begin.copy()
+        x[free[: len(values)]] += values
+        fit = annealed(observations, model, x, ANNEALING)
+        if best is None or fit.log_evidence > best.log_evidence:
+            best = fit
+    assert best is not None
+    return best

@@ -1,0 +1,169 @@
+"""From observations to the diagnosis: what is missing, how sure that is, and what these data could have shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder
+from ema_pipeline.diagnosis import sentences
+from ema_pipeline.diagnosis.claims import Judged
+from ema_pipeline.diagnosis.hypotheses import list_hypotheses
+from ema_pipeline.diagnosis.limits import detection_limits
+from ema_pipeline.diagnosis.localise import localise
+from ema_pipeline.diagnosis.next_test import next_measurement
+from ema_pipeline.diagnosis.rungs import learned_scatters, noise, rungs_of
+from ema_pipeline.diagnosis.score import scores
+from ema_pipeline.diagnosis.selection import NOTHING, Progress, Selection, select
+from ema_pipeline.diagnosis.settings import DiagnoseSettings
+from ema_pipeline.diagnosis.verdict import alike, explains, scattered, verdict_of
+from ema_pipeline.effects.base import Effect
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import Fit, Model
+from ema_pipeline.observations.parts import PART_SCATTER
+from ema_pipeline.rigs.types import Rig
+
+
+def diagnose(
+    observations: Observations,
+    rig: Rig,
+    library: Mapping[str, Effect],
+    known: Model | None = None,
+    settings: DiagnoseSettings | None = None,
+    progress: Progress = lambda share, text: None,
+    notes: Sequence[str] = (),
+    linear: bool = True,
+) -> Diagnosis:
+    """Which physics is the model missing?
+
+    Parameters
+    ----------
+    observations : Observations
+        What was measured.
+    rig : Rig
+        The model, with the effects that it has already.
+    library : dict of str to Effect
+    known : Model, optional
+        The effects that it has already; none where left out.
+    settings : DiagnoseSettings, optional
+    progress : callable, optional
+    notes : sequence of str
+        Remarks on the data that a reader should see beside the verdict.
+    linear : bool
+        True for effects whose answer is in proportion to the force only.
+
+    Returns
+    -------
+    Diagnosis
+        Deterministic, whatever the number of processes.
+
+    References
+    ----------
+    D. J. C. MacKay, Neural Computation 4 (1992) 415-447 (evidence); I. Behmanesh et al., Mech. Syst. Signal Process.
+    64-65 (2015) 360-376 (hierarchical model updating); R. E. Kass, A. E. Raftery, J. Am. Stat. Assoc. 90 (1995)
+    773-795 (Bayes factors).
+    """
+    settings, known = settings or DiagnoseSettings(), known or Model()
+    hypotheses = list_hypotheses(rig, library, known.labels, linear)
+    found = select(observations, known, hypotheses, settings, progress)
+    verdict = verdict_of(observations, found, settings)
+    start = found.rounds[0].ranking.base
+    fits = [start, *(j.ranked.fit for j in found.claimed)]
+    if found.claimed:
+        fits[-1] = found.final
+    rungs = rungs_of(observations, fits)
+    left = scores(observations, found.final, hypotheses)
+    group = alike(found, settings)
+    candidates = _candidates(found, settings, group)
+    fails = not explains(observations, found.final, settings)
+    told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.claimed]
+    if verdict == "ambiguous":
+        names = [j.named.label for j in group]
+        told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.label in names]
+    nothing = found.rounds[0].probabilities[NOTHING]
+    scatter = learned_scatters(observations, found.final)
+    ladder = Ladder(rungs, *noise(found.final), note=_ended(found), scatters=scatter)
+    remarks = [*notes, sentences.scatter_text(scatter)]
+    if scattered(observations, found.final, settings):
+        remarks.insert(0, sentences.standing_out(_parts(found.final), settings.scatter_limit))
+    return Diagnosis(
+        verdict=verdict,
+        summary=sentences.summary(verdict, told, (rungs[0].error, rungs[-1].error), nothing),
+        null_probability=nothing,
+        candidates=candidates,
+        indistinguishable=_groups(found, group),
+        next_measurement=next_measurement(observations, found, group, verdict),
+        localisation=localise(left) if fails else (),
+        probabilities=dict(found.rounds[0].probabilities),
+        error=rungs[0].error,
+        heldout_error=rungs[0].heldout_error,
+        ladder=ladder,
+        notes=tuple(r for r in remarks if r),
+        detection_limits=() if fails else detection_limits(left, settings.claim, settings.sigmas),
+    )
+
+
+def _candidates(
+    found: Selection, settings: DiagnoseSettings, group: Sequence[Judged]
+) -> tuple[Candidate, ...]:
+    """What is claimed, in the order in which it was added, then the best of the rest."""
+    last = found.rounds[min(len(found.claimed), len(found.rounds)) - 1] if found.claimed else found.rounds[0]
+    mine = [_candidate(j, found.rounds[k].probabilities, settings, True) for k, j in enumerate(found.claimed)]
+    taken = {c.label for c in mine}
+    rest = [j for j in last.judged if j.named.label not in taken]
+    rest.sort(key=lambda j: (j not in group, -j.gain))
+    others = [_candidate(j, last.probabilities, settings, False) for j in rest]
+    return (*mine, *others)[: max(settings.candidates, len(mine) + len(group))]
+
+
+def _candidate(
+    j: Judged, probabilities: Mapping[str, float], settings: DiagnoseSettings, claimed: bool
+) -> Candidate:
+    effect = j.named.name.placed.effect
+    why = f"Its signs: {effect.signs}." if claimed or j.claimed else f"Not claimed: {j.doubt}."
+    return Candidate(
+        effect=effect.id,
+        at=j.named.name.placed.place,
+        title=effect.title,
+        probability=probabilities.get(j.named.label, 0.0),
+        parameters=dict(j.named.sizes),
+        error_before=j.base.posterior.error,
+        error_after=j.ranked.fit.posterior.error,
+        heldout_before=j.held_before.error,
+        heldout_error_after=j.held_after.error,
+        gain=j.gain,
+        threshold=settings.claim,
+        log_evidence=j.gain,
+        claimed=claimed,
+        why=why,
+        equivalents=j.named.equivalents,
+    )
+
+
+def _groups(found: Selection, group: Sequence[Judged]) -> tuple[tuple[str, ...], ...]:
+    """What cannot be told apart: several effects, or several names of one."""
+    groups = [tuple(j.named.label for j in group)] if len(group) > 1 else []
+    for j in found.claimed:
+        if j.named.equivalents:
+            groups.append((j.named.label, *j.named.equivalents))
+    return tuple(groups)
+
+
+def _ended(found: Selection) -> str:
+    best = found.rounds[-1].judged[0] if found.rounds[-1].judged else None
+    if best is None:
+        return "no further effect to try"
+    if best.claimed:
+        return "the most effects that are added by themselves"
+    return f"the best further effect is {sentences.label_text(best.named.label)}, and {best.doubt}"
+
+
+def _parts(fit: Fit) -> dict[str, float]:
+    """Relative deviations of all parts."""
+    governed = fit.posterior.unknowns.governed(PART_SCATTER)
+    return {
+        name: float(np.expm1(fit.posterior.x[i]))
+        for i, name in enumerate(fit.posterior.unknowns.names)
+        if governed[i]
+    }

@@ -1,0 +1,70 @@
+"""How well a model foretells what its fit has not seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from ema_pipeline.inference import Posterior
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import Fit, refined, transferred
+
+_STEPS = 8
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Prediction of all parts that were held out in turn.
+
+    Attributes
+    ----------
+    error : float
+        Root mean square of (measurement - prediction)/σ, σ with the uncertainty of the fit; about 1 where the model
+        holds.
+    log_density : float
+        Natural logarithm of the predictive density, up to a constant of the data.
+    """
+
+    error: float
+    log_density: float
+
+
+NOTHING_HELD_OUT = HeldOut(float("nan"), float("nan"))
+
+
+def held_out(observations: Observations, fit: Fit) -> HeldOut:
+    """Fit to all but one part, foretell that part, in turn; scatters as they are in `fit`."""
+    squares, count, density = 0.0, 0, 0.0
+    for kept, out in observations.folds():
+        problem = fit.model.problem(kept)
+        start = transferred(fit.posterior, problem.unknowns, problem.start())
+        trained = refined(kept, fit.model, start, fit.posterior.scatters, steps=_STEPS).posterior
+        part = _predicted(out, fit, trained)
+        squares, count, density = squares + part[0], count + part[1], density + part[2]
+    if not count:
+        return NOTHING_HELD_OUT
+    return HeldOut(float(np.sqrt(squares / count)), density)
+
+
+def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, int, float]:
+    """Sum of squares, its number of terms, and log density of one part."""
+    problem = fit.model.problem(out)
+    x = transferred(trained, problem.unknowns, np.zeros(len(problem.unknowns)))
+    found = problem.residuals(x, trained.scatters)
+    if not np.all(np.isfinite(found.values)):
+        return 0.0, 0, -np.inf
+    prior = problem.unknowns.prior_std(trained.scatters)
+    covariance = np.diag(prior**2)
+    known = [trained.unknowns.index.get(n, -1) for n in problem.unknowns.names]
+    at = np.array([i for i, k in enumerate(known) if k >= 0], int)
+    to = np.array([k for k in known if k >= 0], int)
+    covariance[np.ix_(at, at)] = trained.covariance[np.ix_(to, to)]
+    total = np.eye(len(found.values)) + found.jacobian @ covariance @ found.jacobian.T
+    factor = scipy.linalg.cholesky(total, lower=True, check_finite=False)
+    z = scipy.linalg.solve_triangular(factor, found.values, lower=True, check_finite=False)
+    count = len(z) - found.projected
+    squares = float(z @ z) + 2 * found.penalty
+    density = -0.5 * float(z @ z) - float(np.sum(np.log(np.diag(factor)))) - found.log_scale - found.penalty
+    return squares, max(count, 1), density

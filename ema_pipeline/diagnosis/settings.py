@@ -1,0 +1,49 @@
+"""Settings of the diagnosis."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from ema_pipeline.settings import Settings
+
+
+class DiagnoseSettings(Settings):
+    """How missing physics is looked for."""
+
+    null_prior: float = Field(
+        default=0.3, gt=0, lt=1, description="Prior probability that nothing is missing."
+    )
+    generic_prior: float = Field(
+        default=0.3,
+        gt=0,
+        le=1,
+        description="Prior weight of a generic effect (a spring somewhere) against one of the rig's own.",
+    )
+    claim: float = Field(
+        default=5.0,
+        gt=0,
+        description="Log evidence gained from which an effect is claimed: a Bayes factor of 150, strong evidence after "
+        "Kass and Raftery (1995).",
+    )
+    sigmas: float = Field(
+        default=2.0, gt=0, description="Distance of a claimed size from nothing, in its standard deviations."
+    )
+    alike: float = Field(
+        default=3.0,
+        gt=0,
+        description="Difference of log evidence within which two effects explain the data alike (a factor of 20).",
+    )
+    error_limit: float = Field(
+        default=1.5, gt=1, description="Error up to which a model counts as one that explains the data."
+    )
+    scatter_limit: float = Field(
+        default=5.0,
+        gt=1,
+        description="Ratio of a learned scatter of parts to the stated one from which it is itself a finding.",
+    )
+    folds: int = Field(default=4, ge=2, le=20, description="Parts that the modes are held out in, in turn.")
+    most_effects: int = Field(default=3, ge=1, le=6, description="Most effects that are added in turn.")
+    candidates: int = Field(default=5, ge=1, description="Number of candidates that are reported.")
+    processes: int = Field(
+        default=2, ge=1, le=64, description="Processes that share the hypotheses; 1 for none but this one."
+    )

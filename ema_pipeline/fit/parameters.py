@@ -1,0 +1,223 @@
+"""Fitted parameters, read from the posterior of everything uncertain, and the seed's error function beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.errors import EmaError
+from ema_pipeline.fit.error_function import RING_PLANET, SUN_PLANET, error_sweep, mode_counts, two_step
+from ema_pipeline.fit.settings import FitSettings
+from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate, TwoStep
+from ema_pipeline.inference import Posterior
+from ema_pipeline.mechanics.system import LinearSystem
+from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned
+from ema_pipeline.observations.modes import UNEXPLAINED, ModeObservations, ModeProblem
+from ema_pipeline.rigs.types import Parameter, Rig
+
+_OUT_OF_TOLERANCE = 3.0
+"""Prior standard deviations from the stated value from which a parameter is remarked."""
+
+
+@dataclass(frozen=True)
+class FittedModes:
+    """A model fitted to measured modes: what fit, comparison and report share.
+
+    Attributes
+    ----------
+    observations : ModeObservations
+    problem : ModeProblem
+    fit : Fit
+    """
+
+    observations: ModeObservations
+    problem: ModeProblem
+    fit: Fit
+
+    @property
+    def posterior(self) -> Posterior:
+        """Posterior of everything uncertain."""
+        return self.fit.posterior
+
+    def system(self, configuration: str) -> LinearSystem:
+        """The fitted model's system, every part with its own deviation."""
+        model = self.problem.model
+        return model.system(configuration, self.posterior.x[: len(model.unknowns)])
+
+
+def fit_modes(
+    observations: ModeObservations, model: Model, scatters: Mapping[str, float] | None = None
+) -> FittedModes:
+    """Fit a model to measured modes.
+
+    Parameters
+    ----------
+    observations : ModeObservations
+    model : Model
+    scatters : dict of str to float, optional
+        What parts, channels, damping and the model scatter; learned where left out.
+
+    Raises
+    ------
+    EmaError
+        If the rig has nothing that is uncertain, or there is no mode.
+    """
+    if not observations.data:
+        raise EmaError("no measured mode lies in the band: nothing to fit")
+    problem = observations.problem(model.effects, model.scales)
+    if not len(problem.model.unknowns):
+        raise EmaError(
+            f"rig '{observations.rig.name}' has no parameter with a tolerance or marked free: nothing to fit; "
+            "add 'tolerance' or 'free = true' in the rig file"
+        )
+    fit = fit_base(observations, model)
+    done = learned(observations, fit) if scatters is None else at_scatters(observations, fit, scatters)
+    return FittedModes(observations, problem, done)
+
+
+def restored(observations: ModeObservations, model: Model, found: FitResult) -> FittedModes:
+    """The fitted model of stored results."""
+    problem = observations.problem(model.effects, model.scales)
+    x = np.array([found.unknowns.get(n, 0.0) for n in problem.unknowns.names])
+    residuals = problem.residuals(x, found.scatters)
+    return FittedModes(
+        observations, problem, Fit(model, Posterior(problem.unknowns, x, found.scatters, residuals))
+    )
+
+
+def fit_result(
+    fitted: FittedModes, rig: Rig, measured: Mapping[str, MeasuredModes], settings: FitSettings
+) -> FitResult:
+    """Parameters with uncertainty and identifiability, and the seed's error function.
+
+    Parameters
+    ----------
+    fitted : FittedModes
+    rig : Rig
+        With the effects of the model.
+    measured : dict of str to MeasuredModes
+    settings : FitSettings
+    """
+    posterior = fitted.posterior
+    estimates = _estimates(fitted, rig, settings)
+    names = tuple(n for n in estimates if n in posterior.unknowns.index)
+    at = [posterior.unknowns.index[n] for n in names]
+    covariance = posterior.covariance[np.ix_(at, at)]
+    deviation = np.sqrt(np.diag(covariance))
+    sweeps, steps = seed_route(rig, measured, settings)
+    count = len(posterior.residuals.values) - posterior.residuals.projected
+    return FitResult(
+        parameters=estimates,
+        names=names,
+        correlation=covariance / np.outer(deviation, deviation) if len(names) else np.zeros((0, 0)),
+        error=posterior.error,
+        chi2_per_dof=posterior.error**2,
+        frequency_error=_frequency_error(fitted),
+        data_count=count,
+        stop_reason="converged",
+        sweeps=sweeps,
+        two_step=steps,
+        notes=_notes(fitted),
+        unknowns={n: float(v) for n, v in zip(posterior.unknowns.names, posterior.x, strict=True)},
+        scatters={k: float(v) for k, v in posterior.scatters.items()},
+    )
+
+
+def _estimates(fitted: FittedModes, rig: Rig, settings: FitSettings) -> dict[str, ParameterEstimate]:
+    values = fitted.problem.parameter_values(fitted.posterior.x)
+    found = {}
+    for name, value in values.items():
+        parameter = rig.parameters.get(name)
+        if parameter is not None and (parameter.free or parameter.tolerance > 0):
+            found[name] = _estimate(fitted, parameter, value, settings)
+    return found
+
+
+def _estimate(fitted: FittedModes, p: Parameter, value: float, settings: FitSettings) -> ParameterEstimate:
+    posterior = fitted.posterior
+    i = posterior.unknowns.index.get(p.name)
+    prior = float("nan") if p.free else abs(p.tolerance * p.value)
+    if i is None:
+        std = abs(p.tolerance * p.value)
+        return ParameterEstimate(
+            p.name, value, std, value - std, value + std, p.unit, p.free, p.value, prior, False,
+            float("nan") if p.free else 0.0, "not measured: nothing that was measured depends on it",
+        )  # fmt: skip
+    size = fitted.problem.sizes.get(p.name)
+    slope = abs(value) if size is None else abs(size.slope(float(posterior.x[i])))
+    std = float(posterior.std[i]) * slope
+    narrowing = posterior.narrowing(p.name)
+    identified = narrowing < settings.narrowed
+    if p.free and size is None:
+        identified = identified and float(posterior.std[i]) < settings.relative_std_limit
+    shift = float("nan") if p.free else float(posterior.x[i] / posterior.prior_std[i])
+    notes = []
+    if np.isfinite(shift) and abs(shift) > _OUT_OF_TOLERANCE:
+        notes.append(
+            f"out of tolerance: the data put it {shift:+.1f} standard deviations from its stated value"
+        )
+    if not identified:
+        notes.append(
+            f"not identified: the data narrow it to {100 * narrowing:.0f} % of what was known before"
+            if p.free
+            else "the data say little: the tolerance determines it"
+        )
+    return ParameterEstimate(
+        p.name, value, std, value - std, value + std, p.unit, p.free, p.value, prior, identified, shift,
+        "; ".join(notes),
+    )  # fmt: skip
+
+
+def _notes(fitted: FittedModes) -> tuple[str, ...]:
+    notes = []
+    left = round(fitted.posterior.residuals.penalty // UNEXPLAINED)
+    for data, match in zip(fitted.observations.data, _matching(fitted), strict=True):
+        alone = np.exp(data.log_frequency[match < 0])
+        if len(alone):
+            which = ", ".join(f"{f:.1f}" for f in alone)
+            notes.append(f"{data.configuration}: no model mode for {which} Hz")
+    if left and not notes:
+        notes.append(f"{left} measured modes have no model mode")
+    if not any(d.shapes.shape[1] for d in fitted.observations.data):
+        notes.append("frequencies only: which measured mode is which model mode rests on nearness alone")
+    return tuple(notes)
+
+
+def _matching(fitted: FittedModes) -> tuple[np.ndarray, ...]:
+    matching = fitted.posterior.residuals.matching
+    assert isinstance(matching, tuple)
+    return matching
+
+
+def _frequency_error(fitted: FittedModes) -> float:
+    """The seed's ε (its Eq. 10) over all modes that have a model mode."""
+    total = 0.0
+    for data, match in zip(fitted.observations.data, _matching(fitted), strict=True):
+        modes = fitted.problem.solution(data.configuration, fitted.posterior.x)
+        on = match >= 0
+        total += float(np.sum((np.exp(data.log_frequency[on]) / modes.frequency_hz[match[on]] - 1) ** 2))
+    return total
+
+
+def seed_route(
+    rig: Rig, measured: Mapping[str, MeasuredModes], settings: FitSettings
+) -> tuple[tuple[ErrorSweep, ...], TwoStep | None]:
+    """The seed's error function over every free stiffness, each in the first configuration that depends on it."""
+    sweeps: list[ErrorSweep] = []
+    held: dict[str, float] = {}
+    for p in rig.parameters.values():
+        if not p.free or "@" in p.name or not 0 < p.minimum < p.maximum < np.inf:
+            continue
+        configuration = next((c for c in rig.configurations if c in measured and p.name in rig.used(c)), None)
+        if configuration is None:
+            continue
+        frequency = measured[configuration].frequency_hz
+        for count in mode_counts(frequency.size):
+            sweeps.append(error_sweep(rig, configuration, p.name, frequency, count, settings, held))
+        if sweeps:
+            held[p.name] = sweeps[-1].minimum
+    known = SUN_PLANET in rig.parameters and RING_PLANET in rig.parameters
+    return tuple(sweeps), two_step(rig, measured, settings) if known else None
