@@ -23,7 +23,7 @@ from ema_pipeline.loops.ladder import make_loop_ladder
 from ema_pipeline.loops.loop_set import LoopSet
 from ema_pipeline.loops.model import Motion, loop_force
 from ema_pipeline.loops.simulate import simulate_sine_test, steady_force, write_sine_tests
-from ema_pipeline.loops.stage import load_loops
+from ema_pipeline.loops.read import load_loops
 from ema_pipeline.loops.types import Loop, LoopModel
 from ema_pipeline.mechanics.limit_cycle import LimitCycle
 

@@ -1,4 +1,4 @@
-"""The whole identification: the source's steps, then least squares on whole loops."""
+"""The whole identification: the source's steps, then the posterior of its model on whole loops."""
 
 from __future__ import annotations
 
@@ -8,31 +8,43 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.errors import EmaError
-from ema_pipeline.loops.closed_form import (
-    bouc_wen_steps,
-    closed_form,
-    energy_lines,
-    hysteresis_force,
+from ema_pipeline.inference import Posterior, anneal, descend, learn
+from ema_pipeline.loops.closed_form import bouc_wen_steps, closed_form, energy_lines, hysteresis_force
+from ema_pipeline.loops.compare import loop_fits
+from ema_pipeline.loops.model import (
+    CUBIC,
+    DAMPING,
+    EFFECTS,
+    EXPONENT,
+    FORCE,
+    RELAXATION,
+    RHO,
+    STIFFNESS,
+    UNITS,
 )
-from ema_pipeline.loops.effects import Structure
-from ema_pipeline.loops.fitting import Fitted, fit, loop_set
-from ema_pipeline.loops.loop_set import LoopSet
-from ema_pipeline.loops.model import CUBIC, DAMPING, FORCE, RELAXATION, RHO, STIFFNESS, UNITS
-from ema_pipeline.loops.search import widening_of
-from ema_pipeline.loops.settings import HysteresisSettings
+from ema_pipeline.loops.sentences import failures
+from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.loops.types import Estimate, IsolatorResult, Loop, LoopFit, LossFactor
-from ema_pipeline.loops.words import failures
+from ema_pipeline.observations.loops import CHANNELS, LoopObservations, LoopProblem
+from ema_pipeline.rigs.isolator import PLACE, isolator
 from ema_pipeline.threads import single_blas_thread
 
 HYSTERESIS_STIFFNESS = "hysteresis_stiffness"
-SOURCE_MODEL = Structure(("quadratic_stiffness", "cubic_stiffness", "viscous_damping", "hysteresis"))
-"""The published model of a metal-mesh isolator."""
+SOURCE_MODEL = ("quadratic_stiffness", "cubic_stiffness", "viscous_damping", "hysteresis")
+"""Effects of the published model of a metal-mesh isolator."""
 
 ONE_FREQUENCY = "not fitted: tests at one frequency do not part viscous from hysteretic loss"
+_ALONE_STEPS = 30
+_REASONS = {
+    DAMPING: "a negative damper cannot be: the loss falls with frequency (relaxation), or friction with rate",
+    RELAXATION: "a negative relaxation cannot be: the loss does not fall as a Maxwell branch's does",
+}
 
 
-def identify_isolator(loops: Sequence[Loop], settings: HysteresisSettings | None = None) -> IsolatorResult:
+def identify_isolator(loops: Sequence[Loop], settings: LoopSettings | None = None) -> IsolatorResult:
     """Identify stiffness, viscous damping and hysteresis from force loops.
 
     Parameters
@@ -40,7 +52,7 @@ def identify_isolator(loops: Sequence[Loop], settings: HysteresisSettings | None
     loops : sequence of Loop
         See `measure_loop`. Several amplitudes part stiffness from hysteresis, several frequencies viscous
         damping from hysteresis.
-    settings : HysteresisSettings, optional
+    settings : LoopSettings, optional
 
     Returns
     -------
@@ -54,114 +66,175 @@ def identify_isolator(loops: Sequence[Loop], settings: HysteresisSettings | None
     Notes
     -----
     The closed-form steps use a few points of single loops, and the backbone of a loop still holds the middle
-    line of its hysteresis. They are therefore shown, but the parameters come from least squares on all points of
-    all loops, whose covariance is widened where the model does not reach the data's own accuracy.
+    line of its hysteresis. They are therefore shown, but the parameters come from the posterior of all points of
+    all loops, which holds the calibration of both channels and what the model leaves.
     """
     if not loops:
         raise EmaError("no loops to identify an isolator from; record steady sine tests")
-    s = settings or HysteresisSettings()
+    s = settings or LoopSettings()
     with single_blas_thread():
         lines = energy_lines(loops, s.significance)
-        start = closed_form(loops, lines)
-        structure = SOURCE_MODEL if _several_frequencies(loops) else SOURCE_MODEL.without("viscous_damping")
-        together = loop_set(loops, structure)
-        fitted = fit(together, structure, physical=False)
-        parameters, covariance, scale = _estimates(fitted, together, s.significance)
-        if DAMPING not in fitted.values:
+        several = _several_frequencies(loops)
+        effects = [e for e in SOURCE_MODEL if several or e != "viscous_damping"]
+        together = LoopObservations(isolator(), loops)
+        published = Published.fitted(together, effects)
+        parameters = published.estimates(s.significance)
+        if not several:
             parameters[DAMPING] = Estimate(float("nan"), float("nan"), UNITS[DAMPING], False, ONE_FREQUENCY)
-        alone = tuple(_alone(loop, structure, fitted) for loop in loops)
         flags = [f"{_frequencies(line.frequency_hz)} at {_mm(line.amplitude_m)}: {line.reason}"
                  for line in lines if not line.possible]  # fmt: skip
         flags += _giving(loops, s.significance) + _impossible(parameters, s.significance)
         relaxation: dict[str, Estimate] = {}
         if any(not line.possible for line in lines) or parameters[DAMPING].value < 0:
-            branch = fit(together, structure.plus("relaxation"), fitted.values, physical=False)
-            relaxation = _estimates(branch, together, s.significance)[0]
-        fits = loop_fits(together, fitted)
+            relaxation = Published.fitted(together, [*effects, "relaxation"]).estimates(s.significance)
+        fits = published.fits()
+        alone = tuple(published.alone(i) for i in range(len(loops)))
+        error = published.posterior.error
         largest = max(loops, key=lambda loop: loop.amplitude_m)
         return IsolatorResult(
             loops=tuple(loops),
             parameters=parameters,
-            names=fitted.names,
-            covariance=covariance,
-            closed_form=start,
+            names=published.names,
+            covariance=published.covariance(),
+            closed_form=closed_form(loops, lines),
             closed_form_hysteresis=bouc_wen_steps(
-                largest, hysteresis_force(largest, {DAMPING: 0.0, **fitted.values})
+                largest, hysteresis_force(largest, {DAMPING: 0.0, **published.values})
             ),
             energy=lines,
-            loss=_loss_factors(loops, fitted, covariance),
+            loss=_loss_factors(loops, published),
             fits=fits,
             alone=alone,
-            misfit_scale=scale,
+            misfit_scale=max(1.0, error),
             relaxation=relaxation,
             flags=tuple(flags),
-            notes=failures(loops, fits, alone, scale),
+            notes=failures(loops, fits, alone, error),
         )
 
 
-def loop_fits(loops: LoopSet, fitted: Fitted) -> tuple[LoopFit, ...]:
-    """The model's force, offset included, beside that of every loop."""
-    force, _ = loops.motion.force(fitted.values, fitted.structure.terms)
-    fits = []
-    for loop, part, scale in zip(loops.loops, loops.parts, fitted.scales, strict=True):
-        model = scale * force[part]
-        model = model + float(np.mean(loop.force - model))
-        energy = float(np.mean(model * loop.velocity)) / loop.frequency_hz
-        difference = float(np.sqrt(np.mean((model - loop.force) ** 2)))
-        fits.append(
-            LoopFit(
-                name=loop.name,
-                force=model,
-                energy_j=energy,
-                energy_error=energy / loop.energy_j - 1 if loop.energy_j else float("nan"),
-                misfit=difference / max(0.5 * float(np.ptp(loop.force)), 1e-300),
+@dataclasses.dataclass(frozen=True)
+class Published:
+    """The published model, or one near it, with its posterior.
+
+    Attributes
+    ----------
+    problem : LoopProblem
+    posterior : Posterior
+    """
+
+    problem: LoopProblem
+    posterior: Posterior
+
+    @classmethod
+    def fitted(cls, observations: LoopObservations, effects: Sequence[str]) -> Published:
+        """Fitted to loops, with learned scatters."""
+        problem = _problem(observations, effects)
+        scatters = {n: s.start for n, s in observations.scatters.items()}
+        found = anneal(problem, scatters, problem.start())
+        return cls(problem, learn(problem, found, observations.scatters))
+
+    @property
+    def unknown_of(self) -> dict[str, int]:
+        """Position of each parameter's unknown."""
+        index = self.problem.unknowns.index
+        known = {STIFFNESS: index[STIFFNESS]}
+        for effect, names in EFFECTS.items():
+            full = {name: f"{effect}@{PLACE}.{own}" for own, name in names.items()}
+            known |= {name: index[f] for name, f in full.items() if f in index}
+        return known
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Parameters in the order of `covariance`."""
+        return tuple(self.unknown_of)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameters by name."""
+        given = self.problem.parameter_values(self.posterior.x)
+        unknowns = self.problem.unknowns.names
+        return {name: given[unknowns[i]] for name, i in self.unknown_of.items()}
+
+    def covariance(self, *, as_read: bool = False) -> NDArray[np.float64]:
+        """Covariance of the parameters, (n, n).
+
+        Parameters
+        ----------
+        as_read : bool
+            True for parameters in the channels' own units, their calibration taken as exact.
+        """
+        whole = self.posterior.covariance
+        if as_read:
+            fixed = [self.problem.unknowns.index[c] for c in CHANNELS]
+            reach = whole[:, fixed]
+            whole = whole - reach @ np.linalg.solve(whole[np.ix_(fixed, fixed)], reach.T)
+        at = list(self.unknown_of.values())
+        slope = np.array([self._slope(i) for i in at])
+        return np.asarray(slope[:, None] * whole[np.ix_(at, at)] * slope)
+
+    def _slope(self, i: int) -> float:
+        """Derivative of a parameter by its unknown."""
+        name, x = self.problem.unknowns.names[i], float(self.posterior.x[i])
+        size = self.problem.sizes.get(name)
+        return self.values[STIFFNESS] if size is None else size.slope(x)
+
+    def estimates(self, significance: float) -> dict[str, Estimate]:
+        """All parameters with 1 σ, and k_w·ρ."""
+        values, covariance = self.values, self.covariance()
+        found = {
+            name: _estimate(
+                values[name], float(np.sqrt(max(covariance[i, i], 0.0))), UNITS[name], significance
             )
-        )
-    return tuple(fits)
+            for i, name in enumerate(self.names)
+        }
+        slope = np.zeros(len(values))
+        slope[self.names.index(FORCE)], slope[self.names.index(RHO)] = values[RHO], values[FORCE]
+        std = float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
+        found[HYSTERESIS_STIFFNESS] = _estimate(values[FORCE] * values[RHO], std, "N/m", significance)
+        for name, reason in _REASONS.items():
+            e = found.get(name)
+            if e is not None and e.value < -significance * e.std:
+                found[name] = dataclasses.replace(e, note=reason)
+        return found
+
+    def fits(self) -> tuple[LoopFit, ...]:
+        """All loops with the one set of parameters."""
+        o = self.problem.observations
+        return loop_fits(o.loops, self.problem.forces(self.posterior.x))
+
+    def alone(self, i: int) -> LoopFit:
+        """One loop with parameters of its own."""
+        o = self.problem.observations
+        one = o.with_loops([i])
+        effects = [e.effect.id for e in self.problem.model.effects]
+        problem = _problem(one, effects)
+        scatters = {n: s.default for n, s in one.scatters.items()}
+        found = descend(problem, scatters, self.posterior.x, steps=_ALONE_STEPS)
+        return loop_fits(one.loops, problem.forces(found.x))[0]
 
 
-def _alone(loop: Loop, structure: Structure, together: Fitted) -> LoopFit:
-    one = loop_set((loop,), structure)
-    return loop_fits(one, fit(one, structure, together.values, physical=False))[0]
+def _problem(observations: LoopObservations, effects: Sequence[str]) -> LoopProblem:
+    library = shipped_effects()
+    return observations.problem([PlacedEffect(_as_published(library[e]), PLACE) for e in effects], {})
 
 
-def _estimates(
-    fitted: Fitted, loops: LoopSet, significance: float
-) -> tuple[dict[str, Estimate], NDArray[np.float64], float]:
-    """Estimates of all parameters, their covariance, and the factor that it was widened by."""
-    names = fitted.names
-    widening = widening_of(fitted, loops)
-    covariance = fitted.covariance(widening)
-    result = {}
-    for i, name in enumerate(names):
-        value, std = fitted.values[name], float(np.sqrt(np.maximum(covariance[i, i], 0.0)))
-        identified = abs(value) > significance * std
-        note = "" if identified else "not told from zero by these loops"
-        result[name] = Estimate(value, std, UNITS[name], bool(identified), note)
-    if FORCE in names:
-        a, b = names.index(FORCE), names.index(RHO)
-        slope = np.zeros(len(names))
-        slope[a], slope[b] = fitted.values[RHO], fitted.values[FORCE]
-        product = fitted.values[FORCE] * fitted.values[RHO]
-        std = float(np.sqrt(np.maximum(slope @ covariance @ slope, 0.0)))
-        known = abs(product) > significance * std
-        result[HYSTERESIS_STIFFNESS] = Estimate(
-            product, std, "N/m", bool(known), "" if known else "not told from zero by these loops"
-        )
-    for name, reason in _REASONS.items():
-        e = result.get(name)
-        if e is not None and e.value < -significance * e.std:
-            result[name] = dataclasses.replace(e, note=reason)
-    reduced = fitted.chi2 / max(loops.freedom - len(names), 1)
-    return result, covariance, float(np.sqrt(max(1.0, reduced)))
+def _as_published(effect: Effect) -> Effect:
+    """The effect as the source has it: Bouc-Wen with n = 1, and a damper of either sign."""
+    if effect.id == "viscous_damping":
+        (p,) = effect.parameters
+        return dataclasses.replace(effect, parameters=(dataclasses.replace(p, minimum=-p.maximum),))
+    if effect.id != "hysteresis":
+        return effect
+    rest = tuple(p for p in effect.parameters if EFFECTS["hysteresis"][p.name] != EXPONENT)
+    return dataclasses.replace(
+        effect,
+        parameters=rest,
+        edit=lambda assembly, place, values: effect.edit(assembly, place, {**values, "exponent": 1.0}),
+    )
 
 
-_REASONS = {
-    DAMPING: "a negative damper cannot be: the loss falls with frequency (relaxation), or friction with rate",
-    FORCE: "a negative hysteresis force would give energy out every cycle: it cannot be",
-    STIFFNESS: "a negative stiffness cannot be: check the sign of force or displacement",
-    RELAXATION: "a negative relaxation cannot be: the loss does not fall as a Maxwell branch's does",
-}
+def _estimate(value: float, std: float, unit: str, significance: float) -> Estimate:
+    identified = bool(abs(value) > significance * std)
+    return Estimate(value, std, unit, identified, "" if identified else "not told from zero by these loops")
 
 
 def _giving(loops: Sequence[Loop], significance: float) -> list[str]:
@@ -181,15 +254,14 @@ def _impossible(parameters: Mapping[str, Estimate], significance: float) -> list
     ]
 
 
-def _loss_factors(
-    loops: Sequence[Loop], fitted: Fitted, covariance: NDArray[np.float64]
-) -> tuple[LossFactor, ...]:
+def _loss_factors(loops: Sequence[Loop], published: Published) -> tuple[LossFactor, ...]:
     """η = E/(2πW) of every loop.
 
     W is the energy stored by the stiffness and by the linear term k_wρ of the hysteresis, averaged over both
-    sides (source's Eq. 16), in which the quadratic term cancels: W = ½(K1 + k_wρ)X² + ¼K3X⁴.
+    sides (source's Eq. 16), in which the quadratic term cancels: W = ½(K1 + k_wρ)X² + ¼K3X⁴. Errors of calibration
+    are the same in E and in W.
     """
-    v, names = fitted.values, fitted.names
+    v, names, covariance = published.values, published.names, published.covariance(as_read=True)
     found = []
     for loop in loops:
         x = loop.amplitude_m
@@ -202,7 +274,7 @@ def _loss_factors(
             (RHO, 0.5 * v[FORCE] * x**2),
         ):
             slope[names.index(name)] = value
-        stored_std = float(np.sqrt(np.maximum(slope @ covariance @ slope, 0.0)))
+        stored_std = float(np.sqrt(max(float(slope @ covariance @ slope), 0.0)))
         if stored <= 0:
             found.append(LossFactor(loop.name, loop.frequency_hz, x, float("nan"), float("nan")))
             continue

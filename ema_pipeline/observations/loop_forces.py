@@ -7,13 +7,15 @@ effects' sizes and by the displacement's calibration are differences of the elem
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.effects.isolators import isolator_row, isolators
+from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Gyroscopic, Mass, Row, Spring
 from ema_pipeline.mechanics.cycles import Contact, Cycles
@@ -68,6 +70,34 @@ class Isolator:
             if factor is not None:
                 found.append((e, factor))
         return found
+
+    def shows(self, rig: Rig, placed: PlacedEffect) -> bool:
+        """True for an effect that changes the elements along the isolator's stretch."""
+        assembly = rig.assembly(self.configuration)
+        if not placed.effect.fits(assembly, placed.place):
+            return False
+        values = {p.name: p.start for p in placed.effect.parameters}
+        edited = placed.effect.edit(assembly, placed.place, values)
+        return self.elements(edited) != self.elements(assembly)
+
+
+def effects_of_loops(
+    rig: Rig, labels: Iterable[str], library: Mapping[str, Effect]
+) -> tuple[PlacedEffect, ...]:
+    """Effects ``id@place`` that change the force of an isolator's loops.
+
+    Raises
+    ------
+    EmaError
+        For effects and places that the rig has not, and for effects that a force loop does not show.
+    """
+    isolator, found = Isolator.of(rig), []
+    for label in labels:
+        placed = parse_effect(label, rig, isolator.configuration, library)
+        if not isolator.shows(rig, placed):
+            raise EmaError(f"effect '{label}' cannot be judged by force-displacement loops")
+        found.append(placed)
+    return tuple(found)
 
 
 class IsolatorForce:

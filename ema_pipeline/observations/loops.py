@@ -38,6 +38,8 @@ UNSEEN_NOISE = 0.1
 MOST = 1e3
 """Factor by which these scatters may exceed their defaults: the error is counted in measured noise all the same."""
 FORCE, DISPLACEMENT = "calibration of force", "calibration of displacement"
+CHANNELS = (FORCE, DISPLACEMENT)
+"""Unknowns of the two channels: logarithms of what is read over what is."""
 CALIBRATION_STD = 0.02
 """Relative 1 σ of a channel's sensitivity where none is stated."""
 
@@ -51,6 +53,7 @@ START_SHARE = 0.1
 _SPREAD = 1.5
 """Unknowns of shapes from which fits are started: this much below and above their centre, and at it."""
 _TRIAL_STEPS = 4
+_NEAR_STEPS = 10
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,8 @@ class LoopObservations:
             raise EmaError("no loops to explain; record steady sine tests")
         self.rig, self.loops, self.own_scales = rig, tuple(loops), own_scales
         self.calibration = dict(calibration or {})
+        known = {d.loop.name: d for d in whole.data} if whole else {}
+        self.data: tuple[LoopData, ...] = tuple(known.get(loop.name) or LoopData.of(loop) for loop in loops)
         self.isolator: Isolator = whole.isolator if whole else Isolator.of(rig)
         self.named: tuple[str, ...] = whole.named if whole else tuple(loop.name for loop in loops)
         self.typical: Typical = whole.typical if whole else Typical.of(self.data)
@@ -108,24 +113,26 @@ class LoopObservations:
         """See `Observations`."""
         known = (
             Scatter(FORCE_SCATTER, "force that no model explains", DISCREPANCY, 1.5, most=MOST, at_once=True),
-            Scatter(NOISE_SCATTER, "noise that the cycles do not show", UNSEEN_NOISE, 1.5, most=MOST, at_once=True),
+            Scatter(
+                NOISE_SCATTER, "noise that the cycles do not show", UNSEEN_NOISE, 1.5, most=MOST, at_once=True
+            ),
         )
         return {s.name: s for s in known}
-
-    @cached_property
-    def data(self) -> tuple[LoopData, ...]:
-        """The loops, prepared."""
-        return tuple(LoopData.of(loop) for loop in self.loops)
 
     @cached_property
     def measured(self) -> NDArray[np.float64]:
         """Coefficients of all loops' forces, N, (n_rows,)."""
         return np.concatenate([d.measured for d in self.data])
 
+    @cached_property
+    def _variances(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Own variance of all coefficients, and what a discrepancy of 1 adds, N², (n_rows,)."""
+        own = np.concatenate([d.own_std for d in self.data]) ** 2
+        return own, np.concatenate([d.unit for d in self.data]) ** 2
+
     def spread(self, scatters: Mapping[str, float]) -> Spread:
         """Variance of all coefficients at these scatters."""
-        own = np.concatenate([d.own_std for d in self.data]) ** 2
-        unit = np.concatenate([d.unit for d in self.data]) ** 2
+        own, unit = self._variances
         added = {
             FORCE_SCATTER: scatters[FORCE_SCATTER] ** 2 * unit,
             NOISE_SCATTER: scatters[NOISE_SCATTER] ** 2 * own,
@@ -158,15 +165,6 @@ class LoopObservations:
             (),
         )
 
-    def shows(self, effect: PlacedEffect) -> bool:
-        """True for an effect that changes the force of the loops."""
-        assembly = self.rig.assembly(self.isolator.configuration)
-        if not effect.effect.fits(assembly, effect.place):
-            return False
-        values = {p.name: p.start for p in effect.effect.parameters}
-        edited = effect.effect.edit(assembly, effect.place, values)
-        return self.isolator.elements(edited) != self.isolator.elements(assembly)
-
     def scaled(self, effect: PlacedEffect) -> PlacedEffect:
         """The effect with the starts and prior scales of its sizes as these loops' force and motion suggest."""
         parameters = tuple(self._scaled(p) for p in effect.effect.parameters)
@@ -187,6 +185,18 @@ class LoopObservations:
         mine = [self.scaled(e) for e in effects]
         return LoopProblem(self, RigModel(self.rig, mine, scales, self.shared))
 
+    def fitted_near(
+        self, effects: Sequence[PlacedEffect], values: Mapping[str, float]
+    ) -> tuple[LoopProblem, NDArray[np.float64]]:
+        """The problem of a model, and its fit begun at known values of its parameters, (n,)."""
+        problem = self.problem(effects, {})
+        x = problem.start({n: v for n, v in values.items() if n in problem.sizes})
+        for name in problem.model.dependence.families:
+            if name in values:
+                x[problem.unknowns.index[name]] = np.log(values[name] / self.rig.parameters[name].value)
+        scatters = {n: s.default for n, s in self.scatters.items()}
+        return problem, descend(problem, scatters, x, steps=_NEAR_STEPS).x
+
     def with_loops(self, kept: Sequence[int]) -> LoopObservations:
         """The same rig and channels with some of the loops."""
         return LoopObservations(
@@ -199,6 +209,10 @@ class LoopObservations:
 
     def folds(self) -> list[tuple[LoopObservations, LoopObservations]]:
         """Each amplitude held out in turn, each frequency, and each setting where there are several."""
+        return self._folds
+
+    @cached_property
+    def _folds(self) -> list[tuple[LoopObservations, LoopObservations]]:
         pairs = []
         for out in left_out(self.loops, settings_differ=self.own_scales):
             kept = [i for i in range(len(self.loops)) if i not in out]
@@ -289,9 +303,16 @@ class LoopProblem:
         """Force of the isolator along the measured motion."""
         return IsolatorForce(self.observations.isolator, self.model, self.observations.cycles)
 
-    def force(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Force that the channel reads at the loops' points, offsets left out, N, (n_points,)."""
-        return self._gains(x) * self._at(x).total
+    def forces(self, x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """Force that the channel reads along every loop, offsets left out, N, each (n_points,)."""
+        whole = self._gains(x) * self._at(x).total
+        return [whole[part] for part in self.observations.cycles.points.parts]
+
+    def force_scales(self, x: NDArray[np.float64]) -> dict[str, float]:
+        """Force scale of every loop by its name; empty unless loops have scales of their own."""
+        index = self.unknowns.index
+        names = [loop.name for loop in self.observations.loops] if self.observations.own_scales else []
+        return {name: float(np.exp(x[index[f"force scale of {name}"]])) for name in names}
 
     def _at(self, x: NDArray[np.float64]) -> ForceAtPoint:
         return self.force_law.at(x[: self.offset], float(x[self.unknowns.index[DISPLACEMENT]]))
