@@ -15,8 +15,8 @@ from ema_pipeline.loops.closed_form import bouc_wen_steps, damping_from_energies
 from ema_pipeline.loops.extract import measure_loop
 from ema_pipeline.loops.figures import isolator_figures
 from ema_pipeline.loops.identify import identify_isolator
-from ema_pipeline.loops.simulate import PRINTED, simulate_sine_test, write_sine_tests
 from ema_pipeline.loops.read import analyse_loops
+from ema_pipeline.loops.simulate import PRINTED, simulate_sine_test, write_sine_tests
 from ema_pipeline.loops.types import IsolatorResult, Loop
 
 TRUE = {**PRINTED, "hysteresis_stiffness": PRINTED["hysteresis_force"] * PRINTED["hysteresis_rho"]}

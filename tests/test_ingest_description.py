@@ -73,6 +73,18 @@ WRONG = {
         DESCRIPTION.replace('unit = "N"', 'unit = "N"\nuncalibrated = true'),
         "channel 'hammer': uncalibrated = true means volts",
     ),
+    "negative calibration": (
+        DESCRIPTION.replace('unit = "N"', 'unit = "N"\ncalibration_std = -0.1'),
+        "calibration_std = -0.1: give a share from 0 to below 1, e.g. 0.02 for 2 %",
+    ),
+    "calibration in percent": (
+        DESCRIPTION.replace('dof = "tip.z"', 'dof = "tip.z"\ncalibration_std = 2'),
+        "calibration_std = 2: give a share",
+    ),
+    "transverse in percent": (
+        DESCRIPTION.replace('dof = "tip.z"', 'dof = "tip.z"\ntransverse = 3'),
+        "transverse = 3: give a share",
+    ),
     "zero sensitivity": (
         DESCRIPTION.replace('unit = "N"', 'unit = "N"\nsensitivity_mv = 0'),
         "sensitivity_mv = 0: Input should be greater than 0",

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
+from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.verdict import Verdict
 
 ALL_LINES = slice(None)
@@ -51,6 +52,11 @@ class FrfSet:
     force_calibrated : bool
         False where the force is in volts: the FRF is then unscaled.
     sensor_mass_kg : ndarray, (n_outputs,)
+    channels : tuple of ChannelQuality
+        What is known of the sensor of each output; empty where nothing is. `frf.channels.channel_uncertainty`
+        answers in either case.
+    hammer : ChannelQuality or None
+        The same of the force channel.
     verdicts : tuple of Verdict
         Checks that need several hits or several points: coherence, driving point, reciprocity.
     """
@@ -71,6 +77,8 @@ class FrfSet:
     force_calibrated: bool
     sensor_mass_kg: NDArray[np.float64]
     verdicts: tuple[Verdict, ...] = ()
+    channels: tuple[ChannelQuality, ...] = ()
+    hammer: ChannelQuality | None = None
 
     def accelerance(self, lines: slice = ALL_LINES) -> NDArray[np.complex128]:
         """All FRFs as acceleration over force, (m/s²)/N, shape (n_outputs, n_inputs, n_lines)."""

@@ -3,35 +3,31 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.effects.library import Library, parse_sized
-from ema_pipeline.effects.rig import rig_with_effects
+from ema_pipeline.effects.library import Library
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.rigs import load_rig, model_modes, rig_names
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.settings import parse
-from ema_pipeline.simulate.hammer import ForceHistory, Pulse
-from ema_pipeline.simulate.recorder import clip_peak, record_channel
-from ema_pipeline.simulate.response import Respond, response
+from ema_pipeline.simulate.folder import BAD_HIT, TestFolder
+from ema_pipeline.simulate.hits import HitSeries
+from ema_pipeline.simulate.imperfections import generator
+from ema_pipeline.simulate.response import Respond, response, response_by_poles
+from ema_pipeline.simulate.sensing import draw_channels
 from ema_pipeline.simulate.settings import SimulationSettings
-from ema_pipeline.simulate.writers import SUFFIX, WRITERS
+from ema_pipeline.simulate.truth import TrueRig, true_rig
 from ema_pipeline.threads import single_blas_thread
 
 TRUTH_FILE = "truth.json"
-_BOUNCE_DELAY_S = (0.006, 0.012)
-_BOUNCE_SIZE = (0.25, 0.5)
-_HIT = re.compile(r"^(?:(?P<configuration>[^:#]+):)?(?P<dof>[^:#]+)#(?P<number>\d+)$")
 
 
 @dataclass(frozen=True)
@@ -64,7 +60,7 @@ def simulate_campaign(
     sensors: Sequence[str] = (),
     impacts: Sequence[str] = (),
     library: Library | None = None,
-    respond: Respond = response,
+    respond: Respond | None = None,
     **settings: Any,
 ) -> SimulatedCampaign:
     """Simulate hammer tests of a rig and write them as raw folders.
@@ -87,8 +83,8 @@ def simulate_campaign(
         its directions where left out, impacts on every body in turns of direction.
     library : dict of str to Effect, optional
         The shipped effects where left out.
-    respond : callable
-        Makes the ideal signals, see `simulate.response.Respond`.
+    respond : callable, optional
+        Makes the ideal signals, see `simulate.response.Respond`; exact where left out.
     **settings
         Fields of `SimulationSettings`.
 
@@ -107,9 +103,9 @@ def simulate_campaign(
         raise EmaError(f"{out}: holds a test already; name another folder or delete it")
     base = rig if not isinstance(rig, str | Path) else load_rig(rig)
     chosen = _known(configurations or base.configurations, base.configurations, "configuration")
-    truth_rig = rig_with_effects(base, [parse_sized(e) for e in effects], library)
+    made = true_rig(base, effects, library, options)
     random = np.random.default_rng(options.seed)
-    true = true_values(truth_rig, values or {}, options.scatter, random)
+    true = true_values(made.rig, values or {}, options.scatter, random)
     _check_bad_hits(options, chosen)
 
     out.mkdir(parents=True, exist_ok=True)
@@ -117,32 +113,21 @@ def simulate_campaign(
     if isinstance(rig, str | Path) and str(rig) not in rig_names():
         shutil.copyfile(rig, out / "rig.toml")
         rig_name = ""
+    _check_dofs(base, chosen, (*sensors, *impacts))
+    tests = _tests(out, base, rig_name, chosen, sensors, impacts, options)
+    with single_blas_thread():
+        written = _write(tests, made, true, options, respond, random)
     truth: dict[str, Any] = {
         "rig": base.name,
         "effects": list(effects),
         "values": true,
         "settings": options.model_dump(mode="json"),
-        "configurations": {},
+        "configurations": written,
     }
-    records = 0
-    _check_dofs(base, chosen, (*sensors, *impacts))
-    with single_blas_thread():
-        for configuration in chosen:
-            folder = out / configuration if len(chosen) > 1 else out
-            folder.mkdir(exist_ok=True)
-            plain = base.assembly(configuration)
-            places = _places(sensors, plain) or default_sensors(plain)
-            points = _places(impacts, plain) or default_impacts(places)
-            test = _Test(base.name, rig_name, configuration, folder, places, points, options)
-            records += test.write(truth_rig.assembly(configuration, true), respond, random)
-            modes = model_modes(truth_rig, configuration, true)
-            truth["configurations"][configuration] = {
-                "modes": [
-                    {"frequency_hz": m.frequency_hz, "damping_ratio": m.damping_ratio, "family": m.family}
-                    for m in modes
-                ]
-            }
+    if not options.imperfections.none:
+        truth["imperfections"] = _drawn(made, tests, options)
     (out / TRUTH_FILE).write_text(json.dumps(truth, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    records = sum(len(c["records"]) for c in written.values())
     return SimulatedCampaign(out, tuple(chosen), true, records)
 
 
@@ -183,125 +168,74 @@ def default_impacts(sensors: tuple[Dof, ...]) -> tuple[Dof, ...]:
     return tuple(result)
 
 
-@dataclass(frozen=True)
-class _Test:
-    """One configuration's test: its folder, its channels and its blows."""
+def _tests(
+    out: Path,
+    base: Rig,
+    rig_key: str,
+    configurations: Sequence[str],
+    sensors: Sequence[str],
+    impacts: Sequence[str],
+    options: SimulationSettings,
+) -> tuple[TestFolder, ...]:
+    """The test of each configuration, all with the same sensors."""
+    tests = []
+    for configuration in configurations:
+        folder = out / configuration if len(configurations) > 1 else out
+        places = _sensors_of(base, configuration, sensors)
+        points = _places(impacts, base.assembly(configuration)) or default_impacts(places)
+        tests.append(TestFolder(base.name, rig_key, configuration, folder, places, points, options))
+    if options.imperfections.none:
+        return tuple(tests)
+    measured = [dof.point for c in base.configurations for dof in _sensors_of(base, c, sensors)]
+    channels = draw_channels(measured, options.imperfections, options.seed)
+    return tuple(replace(test, channels=channels) for test in tests)
 
-    rig: str
-    rig_key: str
-    configuration: str
-    folder: Path
-    sensors: tuple[Dof, ...]
-    impacts: tuple[Dof, ...]
-    options: SimulationSettings
 
-    def write(self, assembly: Assembly, respond: Respond, random: np.random.Generator) -> int:
-        """Write all record files and test.toml; return the number of records."""
-        o = self.options
-        names = self._channel_names()
-        lines = self._header(names)
-        offsets = o.offset_v * random.standard_normal(len(names))
-        count = 0
-        for impact in self.impacts:
-            plan = [
-                (level, first)
-                for level in o.peak_force_n
-                for first in range(1, o.hits + 1, o.hits_per_record)
-            ]
-            blows = [self._pulses(impact, level, first, random) for level, first in plan]
-            longest = o.hits_per_record * round(o.duration_s * o.sample_rate_hz)
-            histories = tuple(ForceHistory(p, o.sample_rate_hz, longest) for p in blows)
-            signals = respond(assembly, histories, impact, self.sensors)
-            for (level, first), (force, accelerations) in zip(plan, signals, strict=True):
-                hits = range(first, min(first + o.hits_per_record, o.hits + 1))
-                if any(self._is_bad(o.overloads, impact, k) for k in hits):
-                    force = clip_peak(force)
-                volts = self._volts(force, accelerations, names, offsets, random)
-                stem = str(impact).replace(".", "_").replace("-", "minus_")
-                file = f"{stem}_{level:g}N_{first}{SUFFIX[o.format]}"
-                WRITERS[o.format](self.folder / file, volts, o.sample_rate_hz)
-                lines += ["", "[[records]]", f'file = "{file}"', f'impact = "{impact}"']
-                count += 1
-        (self.folder / "test.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
-        return count
+def _sensors_of(base: Rig, configuration: str, sensors: Sequence[str]) -> tuple[Dof, ...]:
+    plain = base.assembly(configuration)
+    return _places(sensors, plain) or default_sensors(plain)
 
-    def _pulses(
-        self, impact: Dof, level: float, first: int, random: np.random.Generator
-    ) -> tuple[Pulse, ...]:
-        o = self.options
-        pulses = []
-        for i, number in enumerate(range(first, min(first + o.hits_per_record, o.hits + 1))):
-            time = i * o.duration_s + o.pretrigger_s + random.uniform(0, 0.01)
-            peak = level * max(0.2, 1 + o.force_spread * random.standard_normal())
-            pulses.append(Pulse(time, peak, o.contact_s * random.uniform(0.95, 1.05)))
-            if self._is_bad(o.double_hits, impact, number):
-                pulses.append(
-                    Pulse(
-                        time + random.uniform(*_BOUNCE_DELAY_S),
-                        peak * random.uniform(*_BOUNCE_SIZE),
-                        o.contact_s,
-                    )
-                )
-        return tuple(pulses)
 
-    def _is_bad(self, hits: tuple[str, ...], impact: Dof, number: int) -> bool:
-        for text in hits:
-            match = _HIT.match(text)
-            assert match is not None  # checked at the start
-            if match["dof"] == str(impact) and int(match["number"]) == number:
-                return match["configuration"] in (None, self.configuration)
-        return False
+def _write(
+    tests: Sequence[TestFolder],
+    made: TrueRig,
+    true: Mapping[str, float],
+    options: SimulationSettings,
+    respond: Respond | None,
+    random: np.random.Generator,
+) -> dict[str, Any]:
+    """Write all tests; return modes and hits by configuration."""
+    sizes = options.imperfections
+    respond = respond or (response if sizes.none else response_by_poles)
+    written = {}
+    for test in tests:
+        test.folder.mkdir(exist_ok=True)
+        number = made.rig.configurations.index(test.configuration)
+        series = HitSeries(sizes, options.drift_kind, generator(options.seed, "hits", number))
+        hits = test.write(made.rig.assembly(test.configuration, true), respond, random, series)
+        written[test.configuration] = _test_truth(made.rig, test, true, hits)
+    return written
 
-    def _channel_names(self) -> tuple[str, ...]:
-        named = ("hammer", *(s.point.replace(".", "_") for s in self.sensors))
-        if self.options.format == "wav":
-            return tuple(f"ch{i}" for i in range(1, len(named) + 1))
-        return named
 
-    def _volts(
-        self,
-        force: NDArray[np.float64],
-        accelerations: NDArray[np.float64],
-        names: tuple[str, ...],
-        offsets: NDArray[np.float64],
-        random: np.random.Generator,
-    ) -> dict[str, NDArray[np.float64]]:
-        o = self.options
-        signals = np.vstack([force, accelerations])
-        return {
-            name: record_channel(
-                signals[i],
-                o.hammer_sensitivity_mv if i == 0 else o.accelerometer_sensitivity_mv,
-                o.force_noise_n if i == 0 else o.acceleration_noise,
-                float(offsets[i]),
-                o.converter_bits,
-                o.converter_range_v,
-                random,
-            )
-            for i, name in enumerate(names)
-        }
+def _drawn(made: TrueRig, tests: Sequence[TestFolder], options: SimulationSettings) -> dict[str, Any]:
+    """What was drawn for the whole campaign."""
+    return {
+        **asdict(options.imperfections),
+        "parts": made.parts,
+        "damping_factors": made.damping,
+        "channels": {point: asdict(channel) for point, channel in tests[0].channels.items()},
+    }
 
-    def _header(self, names: tuple[str, ...]) -> list[str]:
-        o = self.options
-        lines = ["schema = 1", f'title = "Simulated {self.rig} rig, {self.configuration}"']
-        if self.rig_key:
-            lines.append(f'rig = "{self.rig_key}"')
-        lines += [f'configuration = "{self.configuration}"', f"sample_rate_hz = {o.sample_rate_hz}"]
-        for i, name in enumerate(names):
-            force = i == 0
-            sensitivity = o.hammer_sensitivity_mv if force else o.accelerometer_sensitivity_mv
-            lines += [
-                "",
-                "[[channels]]",
-                f'name = "{name}"',
-                f'quantity = "{"force" if force else "acceleration"}"',
-                f'unit = "{"N" if force else "m/s^2"}"',
-                f"sensitivity_mv = {sensitivity}",
-                f"full_scale_v = {o.converter_range_v}",
-            ]
-            if not force:
-                lines.append(f'dof = "{self.sensors[i - 1]}"')
-        return lines
+
+def _test_truth(
+    rig: Rig, test: TestFolder, true: Mapping[str, float], written: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """Modes and records of one configuration."""
+    modes = [
+        {"frequency_hz": m.frequency_hz, "damping_ratio": m.damping_ratio, "family": m.family}
+        for m in model_modes(rig, test.configuration, true)
+    ]
+    return {"modes": modes, "records": written}
 
 
 def _known(names: Sequence[str], known: Sequence[str], what: str) -> list[str]:
@@ -324,7 +258,7 @@ def _check_dofs(rig: Rig, configurations: Sequence[str], texts: Sequence[str]) -
 
 def _check_bad_hits(options: SimulationSettings, configurations: Sequence[str]) -> None:
     for text in (*options.double_hits, *options.overloads):
-        match = _HIT.match(text)
+        match = BAD_HIT.match(text)
         if match is None:
             raise EmaError(f"hit '{text}' is not of the form [configuration:]dof#number, e.g. 'sun.y#2'")
         if match["configuration"] is not None:

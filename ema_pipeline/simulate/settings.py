@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from typing import Literal
 
 from pydantic import Field, field_validator
 
 from ema_pipeline.settings import Settings
+from ema_pipeline.simulate.imperfections import LEVELS, DriftKind, Imperfections, Level
 
 RecordFormat = Literal["uff", "csv", "hdf5", "mat", "wav", "tdms"]
 
@@ -32,6 +34,30 @@ class SimulationSettings(Settings):
     scatter: float = Field(
         0.0, ge=0, description="true parameters deviate by this many tolerances (1 σ), at random"
     )
+    imperfection: Level = Field(
+        "none",
+        description="rig and test as in a good or a normal laboratory: part_scatter, calibration, transverse, "
+        "aim_deg, drift and damping_scatter at once; each of these can still be given",
+    )
+    part_scatter: float | None = Field(
+        None, ge=0, lt=0.5, description="1 σ of ln stiffness of every spring; masses scatter by a quarter"
+    )
+    calibration: float | None = Field(
+        None, ge=0, lt=0.5, description="1 σ of ln gain of every channel, the hammer's too"
+    )
+    transverse: float | None = Field(
+        None, ge=0, lt=1, description="share of the perpendicular motion that accelerometers read, 1 σ"
+    )
+    aim_deg: float | None = Field(None, ge=0, lt=45, description="hits off in direction, degrees, 1 σ")
+    drift: float | None = Field(
+        None, ge=0, lt=0.1, description="relative change of all frequencies from hit to hit, 1 σ"
+    )
+    drift_kind: DriftKind = Field(
+        "independent", description="hits deviate each by itself, or each adds to the last ('walk')"
+    )
+    damping_scatter: float | None = Field(
+        None, ge=0, lt=2, description="1 σ of ln damping ratio from mode to mode"
+    )
     double_hits: tuple[str, ...] = Field((), description="hits that bounce: '[configuration:]dof#number'")
     overloads: tuple[str, ...] = Field((), description="hits that clip the hammer channel, written alike")
     format: RecordFormat = Field("uff", description="format of the record files")
@@ -44,3 +70,10 @@ class SimulationSettings(Settings):
         if isinstance(given, str):
             return [part.strip() for part in given.split(",") if part.strip()]
         return given if isinstance(given, list | tuple) else [given]
+
+    @property
+    def imperfections(self) -> Imperfections:
+        """Those of the named level, but for the ones that are given themselves."""
+        names = [f.name for f in fields(Imperfections)]
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return replace(LEVELS[self.imperfection], **given)

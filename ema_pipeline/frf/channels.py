@@ -1,0 +1,78 @@
+"""How well each channel of a test is calibrated, as a later stage asks for it: by DOF, or for the hammer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.ingest.records import CALIBRATION_STD, TRANSVERSE
+
+if TYPE_CHECKING:
+    from ema_pipeline.frf.types import FrfSet
+
+SEVERAL = " + "
+"""Stands between the names of sensors that have measured one and the same DOF."""
+
+
+@dataclass(frozen=True)
+class ChannelQuality:
+    """Uncertainty of one channel.
+
+    Attributes
+    ----------
+    name : str
+        Name of the channel. The same name at several DOFs is one roving sensor, which has one gain; where several
+        sensors have measured a DOF, all their names; empty where unknown.
+    calibration_std : float
+        Relative 1 σ of the sensitivity.
+    transverse : float
+        Transverse sensitivity as a share of the main one, 1 σ.
+    """
+
+    name: str = ""
+    calibration_std: float = CALIBRATION_STD
+    transverse: float = TRANSVERSE
+
+
+def channel_uncertainty(frfs: FrfSet | None, dof: Dof) -> ChannelQuality:
+    """Uncertainty of what was measured at a DOF of one configuration.
+
+    Parameters
+    ----------
+    frfs : FrfSet or None
+        FRFs of the configuration; None for a table of modes, of whose sensors nothing is known.
+    dof : Dof
+        A DOF of the FRFs or of the modes that were identified from them; its sign does not matter.
+
+    Returns
+    -------
+    ChannelQuality
+        Of the sensor at that DOF; of the hammer where the DOF was struck but carried no sensor (a roving hammer,
+        whose one gain is common to all such DOFs); the defaults where nothing is known.
+    """
+    if frfs is None:
+        return ChannelQuality()
+    for output, channel in zip(frfs.outputs, frfs.channels, strict=False):
+        if output.point == dof.point:
+            return channel
+    if dof.point in {d.point for d in frfs.inputs} - {d.point for d in frfs.outputs}:
+        return hammer_uncertainty(frfs)
+    return ChannelQuality()
+
+
+def hammer_uncertainty(frfs: FrfSet | None) -> ChannelQuality:
+    """Uncertainty of the force channel of one configuration; the defaults where nothing is known."""
+    return ChannelQuality() if frfs is None or frfs.hammer is None else frfs.hammer
+
+
+def merged(one: ChannelQuality | None, other: ChannelQuality) -> ChannelQuality:
+    """Uncertainty of a DOF at which two records were taken: never better than that of either sensor."""
+    if one is None or one == other:
+        return other
+    names = list(dict.fromkeys([*one.name.split(SEVERAL), other.name]))
+    return ChannelQuality(
+        SEVERAL.join(names),
+        max(one.calibration_std, other.calibration_std),
+        max(one.transverse, other.transverse),
+    )
