@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder
 from ema_pipeline.diagnosis import sentences
 from ema_pipeline.diagnosis.claims import Judged
-from ema_pipeline.diagnosis.hypotheses import list_hypotheses
+from ema_pipeline.diagnosis.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnosis.limits import detection_limits
 from ema_pipeline.diagnosis.localise import localise
 from ema_pipeline.diagnosis.next_test import next_measurement
@@ -32,6 +32,7 @@ def diagnose(
     progress: Progress = lambda share, text: None,
     notes: Sequence[str] = (),
     linear: bool = True,
+    hypotheses: Sequence[Hypothesis] | None = None,
 ) -> Diagnosis:
     """Which physics is the model missing?
 
@@ -50,6 +51,8 @@ def diagnose(
         Remarks on the data that a reader should see beside the verdict.
     linear : bool
         True for effects whose answer is in proportion to the force only.
+    hypotheses : sequence of Hypothesis, optional
+        What may be missing; every effect at every place of the rig where left out.
 
     Returns
     -------
@@ -63,7 +66,8 @@ def diagnose(
     773-795 (Bayes factors).
     """
     settings, known = settings or DiagnoseSettings(), known or Model()
-    hypotheses = list_hypotheses(rig, library, known.labels, linear)
+    if hypotheses is None:
+        hypotheses = list_hypotheses(rig, library, known.labels, linear)
     found = select(observations, known, hypotheses, settings, progress)
     verdict = verdict_of(found, settings)
     start = found.rounds[0].ranking.base

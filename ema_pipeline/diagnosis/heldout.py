@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
@@ -61,10 +62,20 @@ def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, 
     at = np.array([i for i, k in enumerate(known) if k >= 0], int)
     to = np.array([k for k in known if k >= 0], int)
     covariance[np.ix_(at, at)] = trained.covariance[np.ix_(to, to)]
-    total = np.eye(len(found.values)) + found.jacobian @ covariance @ found.jacobian.T
-    factor = scipy.linalg.cholesky(total, lower=True, check_finite=False)
-    z = scipy.linalg.solve_triangular(factor, found.values, lower=True, check_finite=False)
-    count = len(z) - found.projected
-    squares = float(z @ z) + 2 * found.penalty
-    density = -0.5 * float(z @ z) - float(np.sum(np.log(np.diag(factor)))) - found.log_scale - found.penalty
-    return squares, max(count, 1), density
+    squares, half_log_det = _marginal(found.values, found.jacobian, covariance)
+    density = -0.5 * squares - half_log_det - found.log_scale - found.penalty
+    if found.relative is not None:
+        squares, _ = _marginal(found.stated, found.jacobian * found.relative[:, None], covariance)
+    count = len(found.values) - found.projected
+    return squares + 2 * found.penalty, max(count, 1), density
+
+
+def _marginal(
+    values: NDArray[np.float64], jacobian: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> tuple[float, float]:
+    """vᵀ(I + J C Jᵀ)⁻¹v and half the log determinant, by the smaller matrix of as many rows as unknowns."""
+    size, directions = np.linalg.eigh(covariance)
+    reach = jacobian @ (directions * np.sqrt(np.maximum(size, 0.0)))
+    factor = scipy.linalg.cholesky(np.eye(len(size)) + reach.T @ reach, lower=True, check_finite=False)
+    taken = scipy.linalg.solve_triangular(factor, reach.T @ values, lower=True, check_finite=False)
+    return float(values @ values - taken @ taken), float(np.sum(np.log(np.diag(factor))))

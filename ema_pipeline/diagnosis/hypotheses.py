@@ -43,9 +43,12 @@ class Hypothesis:
     ----------
     names : tuple of Name
         A rig's own effects first, then generic ones.
+    begun : tuple of dict of str to float
+        Unknowns of the sizes, by ``id@place.name``, from which fits begin; a few usual ones where left out.
     """
 
     names: tuple[Name, ...]
+    begun: tuple[Mapping[str, float], ...] = ()
 
     @property
     def representative(self) -> Name:
@@ -80,6 +83,8 @@ class Hypothesis:
 
     def starts(self) -> list[dict[str, float]]:
         """Unknowns of the sizes, by ``id@place.name``, from which a fit is begun."""
+        if self.begun:
+            return [dict(one) for one in self.begun]
         options = []
         for p in self.placed.effect.parameters:
             name = self.placed.parameter_name(p.name)

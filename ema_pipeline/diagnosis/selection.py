@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ema_pipeline.diagnosis.backward import reconsidered
 from ema_pipeline.diagnosis.claims import Judged, judge
 from ema_pipeline.diagnosis.hypotheses import Hypothesis
 from ema_pipeline.diagnosis.naming import named
@@ -18,6 +19,8 @@ from ema_pipeline.observations.fitting import Fit, Model, fit_base
 Progress = Callable[[float, str], None]
 
 NOTHING = "nothing"
+_SAME = 0.3
+"""Distance of two predictions, in standard deviations of all data together, that shows in no test."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,19 @@ class Round:
         if best is None:
             return ()
         near = [j for j in self.judged if j.claimed and best.gain - j.gain < settings.alike]
-        return tuple(sorted(near, key=lambda j: (j.hypothesis.generic, -j.gain)))
+        different: list[Judged] = []
+        for j in sorted(near, key=lambda j: (j.hypothesis.generic, -j.gain)):
+            if not any(_same_prediction(j, other) for other in different):
+                different.append(j)
+        return tuple(different)
+
+
+def _same_prediction(one: Judged, other: Judged) -> bool:
+    """True for fits that no data of this kind could tell apart: two names of the same physics."""
+    a, b = one.ranked.fit.posterior.residuals, other.ranked.fit.posterior.residuals
+    if len(a.values) != len(b.values):
+        return False
+    return float(np.linalg.norm(a.stated - b.stated)) < _SAME
 
 
 @dataclass(frozen=True)
@@ -87,10 +102,10 @@ def select(
     settings : DiagnoseSettings
     progress : callable
     """
-    base = fit_base(observations, known)
+    base = start = fit_base(observations, known)
     rounds: list[Round] = []
     claimed: list[Judged] = []
-    left = list(hypotheses)
+    left: Sequence[Hypothesis] = hypotheses
     while True:
         low = len(rounds) / (settings.most_effects + 1)
         ranking = rank(
@@ -105,8 +120,11 @@ def select(
         if not near or len(claimed) == settings.most_effects:
             return Selection(tuple(rounds), tuple(claimed), ranking.base)
         claimed.append(near[0])
-        left = [h for h in left if h.label != near[0].hypothesis.label]
-        base = fit_base(observations, near[0].ranked.fit.model, near[0].ranked.fit)
+        if len(claimed) > 1:
+            claimed = reconsidered(observations, start, claimed, hypotheses, settings)
+        taken = {j.hypothesis.label for j in claimed}
+        left = [h for h in hypotheses if h.label not in taken]
+        base = fit_base(observations, claimed[-1].ranked.fit.model, claimed[-1].ranked.fit)
 
 
 def _round(observations: Observations, ranking: Ranking, settings: DiagnoseSettings) -> Round:

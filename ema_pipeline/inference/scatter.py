@@ -40,6 +40,7 @@ class Scatter:
     spread: float = 0.5
     wide: float = 0.0
     most: float = 2.5
+    at_once: bool = False
 
     @property
     def start(self) -> float:
@@ -102,6 +103,8 @@ def _relaxed(found: Posterior, scatter: Scatter) -> float:
     now = found.scatters[scatter.name]
     if not scatter.spread:
         return now
+    if scatter.at_once:
+        return _of_residuals_at_once(found, scatter)
     step = _RELAXATION * np.log(_learned(found, scatter) / now)
     return float(min(now * np.exp(step), scatter.most * scatter.default))
 
@@ -149,3 +152,24 @@ def _mode_of_log(squares: float, count: int, now: float, scatter: Scatter) -> fl
         slope = -count + excess - (log - np.log(scatter.default)) * weight
         log -= float(np.clip(slope / (-2 * excess - weight), -0.5, 0.5))
     return float(np.exp(min(log, np.log(scatter.most * scatter.default))))
+
+
+def _of_residuals_at_once(found: Posterior, scatter: Scatter) -> float:
+    """Scatter that maximises the expected log density of the residuals, the unknowns being what is averaged over.
+
+    With t = (scatter/now)², a residual's variance is 1 - share + share·t times what it is now.
+    """
+    now = found.scatters[scatter.name]
+    share = found.residuals.share[scatter.name]
+    jacobian = found.residuals.jacobian
+    uncertain = np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian)
+    square = found.residuals.values**2 + uncertain
+    log, weight = 0.0, scatter.spread**-2.0
+    for _ in range(_NEWTON_STEPS):
+        t = np.exp(2 * log)
+        variance = 1 - share + share * t
+        moved, excess = share * t / variance, square / variance
+        slope = float(np.sum(moved * (excess - 1))) - (log + np.log(now / scatter.default)) * weight
+        # Where the density is not concave in the logarithm, its expected curvature serves.
+        log += float(np.clip(slope / (weight + 2 * np.sum(moved**2 * np.maximum(excess, 1.0))), -1.0, 1.0))
+    return float(min(now * np.exp(log), scatter.most * scatter.default))

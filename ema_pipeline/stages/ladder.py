@@ -29,7 +29,7 @@ def inputs(run: Run, configuration: str) -> str:
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit the base model and every rung above it; without added effects there is no ladder to climb."""
     if run.info.kind == "hysteresis":
-        return loop_ladder.climb_run(run, progress)
+        return loop_ladder.ladder_run(run, progress)
     if not run.info.effects:
         return {}
     if run.rig is None:

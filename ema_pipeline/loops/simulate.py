@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.hysteresis.model import (
+from ema_pipeline.loops.model import (
     CUBIC,
     DAMPING,
     FORCE,

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ema_pipeline.hysteresis.types import IsolatorResult, Loop, LoopFit, LoopModel
+from ema_pipeline.loops.types import IsolatorResult, Loop, LoopFit, LoopModel
 from ema_pipeline.report.style import (
     GREY,
     LINES,

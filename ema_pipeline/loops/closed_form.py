@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.hysteresis.model import CUBIC, DAMPING, FORCE, QUADRATIC, RHO, SIGMA, STIFFNESS
-from ema_pipeline.hysteresis.types import EnergyLine, Estimate, Loop
+from ema_pipeline.loops.model import CUBIC, DAMPING, FORCE, QUADRATIC, RHO, SIGMA, STIFFNESS
+from ema_pipeline.loops.types import EnergyLine, Estimate, Loop
 
 SAME_AMPLITUDE = 0.05
 """Loops whose amplitudes agree to this share are taken as tests at one amplitude."""

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.hysteresis.identify import identify_isolator
-from ema_pipeline.hysteresis.loops import measure_loop, share_noise
-from ema_pipeline.hysteresis.settings import HysteresisSettings
-from ema_pipeline.hysteresis.types import IsolatorResult, Loop
 from ema_pipeline.ingest.description import TestDescription
 from ema_pipeline.ingest.load import load_channels
+from ema_pipeline.loops.extract import measure_loop, share_noise
+from ema_pipeline.loops.identify import identify_isolator
+from ema_pipeline.loops.settings import LoopSettings
+from ema_pipeline.loops.types import IsolatorResult, Loop
 
 
-def analyse_hysteresis(
+def analyse_loops(
     test: TestDescription,
-    settings: HysteresisSettings | None = None,
+    settings: LoopSettings | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> IsolatorResult:
     """Read all records of a hysteresis test and identify the isolator.
@@ -31,7 +31,7 @@ def analyse_hysteresis(
     return identify_isolator(loops, settings)
 
 
-def load_loops(test: TestDescription, settings: HysteresisSettings | None = None) -> tuple[Loop, ...]:
+def load_loops(test: TestDescription, settings: LoopSettings | None = None) -> tuple[Loop, ...]:
     """Averaged loops of all records."""
     if test.kind != "hysteresis":
         raise EmaError(f'{test.file}: is a hammer test; loops need kind = "hysteresis"')

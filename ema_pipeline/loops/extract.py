@@ -10,9 +10,9 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.hysteresis.fourier import fourier, fourier_slope
-from ema_pipeline.hysteresis.settings import HysteresisSettings
-from ema_pipeline.hysteresis.types import Loop
+from ema_pipeline.loops.settings import LoopSettings
+from ema_pipeline.loops.types import Loop
+from ema_pipeline.mechanics.fourier import fourier, fourier_slope
 
 FEWEST_SAMPLES = 32
 """Samples per cycle below which a loop has no shape."""
@@ -30,7 +30,7 @@ def measure_loop(
     amplitude_m: float | None = None,
     *,
     name: str = "loop",
-    settings: HysteresisSettings | None = None,
+    settings: LoopSettings | None = None,
 ) -> Loop:
     """Average the steady cycles of a sine test.
 
@@ -44,7 +44,7 @@ def measure_loop(
         The amplitude as set, which the measured one is held against.
     name : str
         Named in error messages.
-    settings : HysteresisSettings, optional
+    settings : LoopSettings, optional
 
     Returns
     -------
@@ -61,7 +61,7 @@ def measure_loop(
     out its noise: each small reversal of a noisy displacement would otherwise start a small loop in the
     model. The force is averaged in bins of phase.
     """
-    s = settings or HysteresisSettings()
+    s = settings or LoopSettings()
     x, f = np.asarray(displacement, dtype=float), np.asarray(force, dtype=float)
     per_cycle = sample_rate_hz / frequency_hz
     if per_cycle < FEWEST_SAMPLES:

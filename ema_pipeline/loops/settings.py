@@ -9,7 +9,7 @@ from pydantic import Field
 from ema_pipeline.settings import Settings
 
 
-class HysteresisSettings(Settings):
+class LoopSettings(Settings):
     """How loops are measured and fitted."""
 
     points_per_cycle: int = Field(256, ge=32, le=2048, description="points of an averaged loop")
@@ -24,9 +24,6 @@ class HysteresisSettings(Settings):
     )
     amplitude_tolerance: float = Field(
         0.2, gt=0, description="largest difference between the stated and the measured amplitude"
-    )
-    held_out_parts: int = Field(
-        3, ge=2, le=10, description="parts into which the loops are dealt for held-out errors"
     )
     own_scales: Literal["auto", "yes", "no"] = Field(
         "auto",

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.hysteresis.types import Loop, LoopFit
+from ema_pipeline.loops.types import Loop, LoopFit
 
 PLAY = 0.04
 """Share of the amplitude by which the idle travel must exceed the model's to be called play."""

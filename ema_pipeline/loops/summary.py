@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from ema_pipeline.hysteresis.types import Estimate, IsolatorResult
+from ema_pipeline.loops.types import Estimate, IsolatorResult
 
 
 def terminal_lines(result: IsolatorResult) -> list[str]:
