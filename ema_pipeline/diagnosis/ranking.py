@@ -116,8 +116,12 @@ def _first_fit(
 ) -> Fit:
     """The fit begun at the size that its score tells; annealed from several sizes where the base model fails."""
     model = base.model.plus(hypothesis.placed, hypothesis.scales)
-    unknowns = model.problem(observations).unknowns
+    problem = model.problem(observations)
+    unknowns = problem.unknowns
     begin = transferred(base.posterior, unknowns, np.zeros(len(unknowns)))
+    begun = problem.begun(begin, base.posterior.scatters)
+    if begun is not None:
+        return refined(observations, model, begun)
     score = promise.get(hypothesis.label)
     if score is not None and len(score.size) == 1:
         at = unknowns.index[hypothesis.placed.parameter_name(hypothesis.placed.effect.parameters[0].name)]
