@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -53,9 +53,7 @@ def linear(seed: int = 0, rows: int = 12, columns: int = 4) -> tuple[Linear, Arr
     std = np.array([0.1, 0.4, 1.0, 2.0])[:columns]
     a = rng.normal(size=(rows, columns))
     x = std * rng.normal(size=columns)
-    return Linear(
-        Unknowns.plain([f"x{i}" for i in range(columns)], std), a, a @ x + rng.normal(size=rows)
-    ), x
+    return Linear(Unknowns.plain([f"x{i}" for i in range(columns)], std), a, a @ x + rng.normal(size=rows)), x
 
 
 def marginal(problem: Linear) -> Array:
@@ -63,7 +61,7 @@ def marginal(problem: Linear) -> Array:
     return np.eye(len(problem.y)) + problem.a @ np.diag(problem.unknowns.std**2) @ problem.a.T
 
 
-# --- the linear Gaussian problem, whose posterior is known ------------------------------------------------------
+# --- the linear Gaussian problem, whose posterior is known ------------------------------------------------
 
 
 def test_the_maximum_of_a_linear_problem_is_its_ridge_solution() -> None:
@@ -86,9 +84,7 @@ def test_the_bayes_factor_of_nested_models_is_the_ratio_of_their_densities() -> 
     full, _ = linear(2)
     part = Linear(Unknowns.plain(full.unknowns.names[:3], full.unknowns.std[:3]), full.a[:, :3], full.y)
     found = [descend(p, {}, np.zeros(len(p.unknowns)), steps=60).log_evidence for p in (full, part)]
-    known = [
-        scipy.stats.multivariate_normal(np.zeros(12), marginal(p)).logpdf(p.y) for p in (full, part)
-    ]
+    known = [scipy.stats.multivariate_normal(np.zeros(12), marginal(p)).logpdf(p.y) for p in (full, part)]
     assert found[0] - found[1] == pytest.approx(known[0] - known[1], abs=2e-3)
 
 
@@ -127,7 +123,7 @@ def test_an_unknown_that_no_datum_depends_on_keeps_its_prior() -> None:
     assert found.narrowing("x3") < 0.5
 
 
-# --- nonlinear problems, starts and bounds ----------------------------------------------------------------------
+# --- nonlinear problems, starts and bounds ----------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -198,7 +194,7 @@ def test_a_fit_is_never_worse_than_its_start() -> None:
 class Valleys:
     """One datum on a rippled slope: cold descents end in the nearest ripple."""
 
-    unknowns: Unknowns = Unknowns.plain(("x",), 10.0)
+    unknowns: Unknowns = field(default_factory=lambda: Unknowns.plain(("x",), 10.0))
 
     def residuals(
         self,
@@ -222,7 +218,7 @@ def test_annealing_leaves_the_local_optimum_that_a_cold_descent_ends_in() -> Non
     assert anneal(problem, {}, np.zeros(1)).x[0] == pytest.approx(4.0, abs=0.05)
 
 
-# --- learned scatter ---------------------------------------------------------------------------------------------
+# --- learned scatter --------------------------------------------------------------------------------------
 
 
 def parts(seed: int, true: float, count: int = 200) -> Linear:
@@ -293,7 +289,7 @@ def test_a_learned_scatter_far_from_its_default_costs_evidence() -> None:
     )
 
 
-# --- data that break careless algebra -----------------------------------------------------------------------------
+# --- data that break careless algebra ---------------------------------------------------------------------
 
 
 def checked(found: Posterior) -> Posterior:
@@ -337,7 +333,7 @@ def test_contradictory_data_give_their_mean_and_an_error_above_one() -> None:
 class Cliff:
     """A model without an answer beyond x = 1, as a trial mass below zero has none."""
 
-    unknowns: Unknowns = Unknowns.plain(("x",), 1.0)
+    unknowns: Unknowns = field(default_factory=lambda: Unknowns.plain(("x",), 1.0))
 
     def residuals(
         self,
