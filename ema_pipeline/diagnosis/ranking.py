@@ -25,6 +25,8 @@ FINALISTS = 5
 """Hypotheses for which the scatters are learned."""
 _SCREENED = 14
 """Generic hypotheses, best first by their score, that are fitted in full."""
+_UNSEEN = 1e6
+"""1 σ of a size, in units of its prior, from which the data hold nothing of it: it cannot be told from nothing."""
 _CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
 _EXPLAINED = 1.3
@@ -87,6 +89,7 @@ def rank(
     progress : callable
     """
     promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses)}
+    hypotheses = [h for h in hypotheses if h.label not in promise or promise[h.label].std < _UNSEEN]
     chosen = _screened(hypotheses, promise)
     stuck = base.posterior.error > _EXPLAINED or base.posterior.residuals.penalty > 0
     job = partial(_first_fit, observations, base, {} if stuck else promise)

@@ -20,9 +20,9 @@ class DiagnoseSettings(Settings):
         description="Prior weight of a generic effect (a spring somewhere) against one of the rig's own.",
     )
     claim: float = Field(
-        default=5.0,
+        default=3.5,
         gt=0,
-        description="Log evidence gained from which an effect is claimed: a Bayes factor of 150, strong evidence after "
+        description="Log evidence gained from which an effect is claimed: a Bayes factor of 33, strong evidence after "
         "Kass and Raftery (1995).",
     )
     sigmas: float = Field(

@@ -9,10 +9,18 @@ import numpy as np
 
 from ema_pipeline.mechanics.assembly import Assembly, Mass, Row, difference
 
+_PLANE = ({"x", "y"}, {"zeta", "eta"})
 
-def bodies_and_dofs(assembly: Assembly) -> tuple[str, ...]:
-    """Bodies first, then single DOFs: what is simpler to say comes first."""
-    return (*assembly.bodies, *assembly.dofs)
+
+def bodies_and_lone_dofs(assembly: Assembly) -> tuple[str, ...]:
+    """Bodies, then single DOFs but for those of a plane: a mass on a body moves with it in both of its directions."""
+    lone = []
+    for dof in assembly.dofs:
+        body, _, direction = dof.rpartition(".")
+        own = {d.rpartition(".")[2] for d in assembly.coordinates(body)}
+        if not any(direction in plane and plane <= own for plane in _PLANE):
+            lone.append(dof)
+    return (*assembly.bodies, *lone)
 
 
 def bodies_pairs_and_dofs(assembly: Assembly) -> tuple[str, ...]:

@@ -24,6 +24,7 @@ from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, free_participations, normalised, solve_linear
 from ema_pipeline.modal.missed import Search, missed
 from ema_pipeline.modal.noise import NoiseLaw
+from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.segment import SegmentFit, fit_segment, measured_noise
 from ema_pipeline.modal.selection import link, votes
@@ -148,6 +149,7 @@ def refined(
     weak: Estimate,
     search: Search,
     iterations: int,
+    peaks: KnownPeaks = NO_PEAKS,
 ) -> FittedModes:
     """Final fit, sub-band by sub-band, with the modes of the other sub-bands taken off the data."""
     parts: list[FittedModes] = []
@@ -163,7 +165,7 @@ def refined(
             window.lines(part.first, part.stop), far=sure.take(~near), far_shapes=everywhere[:, ~near]
         )
         few = compress(lines)
-        fit = _fit_part(few, sure.take(near), weak.take(also), _voters(chart), search, iterations)
+        fit = _fit_part(few, sure.take(near), weak.take(also), _voters(chart), search, iterations, peaks)
         if len(fit.estimate.poles):
             parts.append(_final(lines, few.data, fit, part))
     n_rows, n_ref = data.measured.shape
@@ -203,11 +205,14 @@ def _fit_part(
     voters: Callable[[Estimate], Real],
     search: Search,
     iterations: int,
+    peaks: KnownPeaks,
 ) -> SegmentFit:
     """Sure modes first, then weak and missed ones on top."""
     small, hits = few.data, few.hits
-    judge = partial(credible, hits=hits, votes=voters)
-    fitted = partial(fit_segment, judge=judge, iterations=iterations, evident=partial(evident, votes=voters))
+    judge = partial(credible, hits=hits, votes=voters, peaks=peaks)
+    fitted = partial(
+        fit_segment, judge=judge, iterations=iterations, evident=partial(evident, votes=voters), peaks=peaks
+    )
     fit = fitted(small, hits, few.noise, sure)
     free = _apart(weak, fit.estimate)
     if free.any():

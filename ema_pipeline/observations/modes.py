@@ -19,7 +19,9 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
+from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
+from ema_pipeline.ingest.records import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
 from ema_pipeline.mechanics.terms import Matrices
 from ema_pipeline.observations.parts import PART_SCATTER, STIFFNESS_SCATTER, Dependence, dependence
@@ -30,9 +32,6 @@ CALIBRATION = "calibration"
 DAMPING_SCATTER = "damping_scatter"
 FREQUENCY = "frequency_scatter"
 SHAPE = "shape_scatter"
-
-CALIBRATION_STD = 0.02
-TRANSVERSE_STD = 0.03
 
 UNEXPLAINED = 12.0
 """Cost, in the log posterior, of a measured mode without a model mode."""
@@ -48,14 +47,6 @@ _LEAVE = 0.3
 """Cost above the best at which an assignment leaves a measured mode without a partner."""
 
 _ACROSS = {"x": "y", "y": "x", "zeta": "eta", "eta": "zeta"}
-
-
-@dataclass(frozen=True)
-class ChannelUncertainty:
-    """Relative 1 σ of a channel's sensitivity, and its transverse sensitivity."""
-
-    calibration: float = CALIBRATION_STD
-    transverse: float = TRANSVERSE_STD
 
 
 def scatters_of(rig: Rig) -> dict[str, Scatter]:
@@ -151,7 +142,7 @@ class ModeObservations:
     rig : Rig
         Without effects.
     data : sequence of ModeData
-    channels : dict of str to ChannelUncertainty, optional
+    channels : dict of str to ChannelQuality, optional
         By DOF; the defaults where left out.
     shared : Dependence, optional
         Of the rig, where it is known already.
@@ -163,7 +154,7 @@ class ModeObservations:
         self,
         rig: Rig,
         data: Sequence[ModeData],
-        channels: Mapping[str, ChannelUncertainty] | None = None,
+        channels: Mapping[str, ChannelQuality] | None = None,
         shared: Dependence | None = None,
         sensors: tuple[str, ...] = (),
     ) -> None:
@@ -174,6 +165,10 @@ class ModeObservations:
         self.shared = shared or dependence(rig)
         self.scatters = scatters_of(rig)
         self._has: dict[tuple[str, Dof], bool] = {}
+
+    def channel(self, sensor: str) -> ChannelQuality:
+        """What is known of the channel that measures a DOF; the defaults where nothing was stated."""
+        return self.channels.get(sensor, ChannelQuality())
 
     def has(self, configuration: str, dof: Dof) -> bool:
         """True where the rig can be measured at `dof`; asked for every model, so remembered."""
@@ -203,6 +198,15 @@ class ModeObservations:
                 out.append(d.only(held))
             pairs.append((self.with_data(kept), self.with_data(out)))
         return pairs
+
+
+def _calibration(sensor: str, channel: ChannelQuality) -> str:
+    """Name of the unknown: one channel that was moved from DOF to DOF has one calibration."""
+    return f"calibration of {channel.name or sensor}"
+
+
+def _transverse(sensor: str) -> str:
+    return f"transverse sensitivity at {sensor}"
 
 
 @dataclass(frozen=True)
@@ -259,21 +263,14 @@ class ModeProblem:
     @cached_property
     def unknowns(self) -> Unknowns:
         """The model's unknowns, every sensor's calibration, and its transverse sensitivity where it has one."""
-        sensors = self.observations.sensors
-        known = [self.observations.channels.get(s, ChannelUncertainty()) for s in sensors]
-        stated = [k.calibration / CALIBRATION_STD for k in known]
-        uncertain = [(s, c) for s, c in zip(sensors, stated, strict=True) if c > 0]
-        across = [
-            (s, k.transverse)
-            for s, k in zip(sensors, known, strict=True)
-            if k.transverse > 0 and self._has_across(s)
-        ]
+        sensors = {s: self.observations.channel(s) for s in self.observations.sensors}
+        gains = {_calibration(s, c): c.calibration_std / CALIBRATION_STD for s, c in sensors.items()}
+        gains = {name: std for name, std in gains.items() if std > 0}
+        across = {s: c.transverse for s, c in sensors.items() if c.transverse > 0 and self._has_across(s)}
         return joined(
             self.model.unknowns,
-            Unknowns.plain(
-                [f"calibration of {s}" for s, _ in uncertain], [c for _, c in uncertain], CALIBRATION
-            ),
-            Unknowns.plain([f"transverse sensitivity of {s}" for s, _ in across], [t for _, t in across]),
+            Unknowns.plain(tuple(gains), list(gains.values()), CALIBRATION),
+            Unknowns.plain([_transverse(s) for s in across], list(across.values())),
         )
 
     def _has_across(self, sensor: str) -> bool:
@@ -293,8 +290,10 @@ class ModeProblem:
             gain = np.full(len(d.dofs), -1)
             transverse = np.full(len(d.dofs), -1)
             for i, dof in enumerate(d.dofs):
-                gain[i] = self.unknowns.index.get(f"calibration of {dof.point}", -1)
-                transverse[i] = self.unknowns.index.get(f"transverse sensitivity of {dof.point}", -1)
+                gain[i] = self.unknowns.index.get(
+                    _calibration(dof.point, self.observations.channel(dof.point)), -1
+                )
+                transverse[i] = self.unknowns.index.get(_transverse(dof.point), -1)
                 if transverse[i] >= 0:
                     other = Dof(dof.body, _ACROSS[dof.direction])
                     if self.observations.has(d.configuration, other):
