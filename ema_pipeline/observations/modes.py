@@ -456,11 +456,30 @@ class _Configuration:
                 )
                 for r in rows
             },
-            log_scale=sum(c for _, _, _, c in done),
+            log_scale=sum(c for _, _, _, c in done) + self._usual(np.flatnonzero(match < 0), defaults),
             penalty=UNEXPLAINED * float(np.sum(match < 0)) + UNSEEN * self._unseen(solution, match),
             matching=match,
             projected=len(on) if self.data.shapes.shape[1] else 0,
         )
+
+    def _usual(self, alone: NDArray[np.int64], defaults: Mapping[str, float]) -> float:
+        """What modes without a partner would cost on average if they were explained.
+
+        Without it, leaving a mode out would gain what its rows cost, and no effect would ever bring it back.
+        """
+        d = self.data
+        seen = np.isfinite(d.shapes[alone])
+        reach = np.maximum(_SHAPE_REACH, np.abs(d.shapes[alone]))[seen]
+        damped = alone[np.isfinite(d.log_damping[alone])]
+        total = -0.5 * int(np.sum(np.any(seen, axis=1)))
+        for own, unit, name in (
+            (d.log_frequency_std[alone], 1.0, FREQUENCY),
+            (d.log_damping_std[damped], 1.0, DAMPING_SCATTER),
+            (d.shape_std[alone][seen], reach, SHAPE),
+        ):
+            now, usual = (own**2 + (at[name] * unit) ** 2 for at in (self.scatters, defaults))
+            total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
+        return total
 
     def _frequencies(
         self,
