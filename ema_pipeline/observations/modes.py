@@ -419,7 +419,8 @@ class _Configuration:
             norm = np.sum(y**2, axis=1)[:, None] * (seen @ predicted**2)
             cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / _FREQUENCY_REACH, 3.0)
         else:
-            cost = np.minimum(apart / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
+            # convex, so that close modes keep their order: two crossed pairs would cost as much as two straight ones
+            cost = np.minimum(apart * (1 + apart) / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
         m = len(d)
         padded = np.hstack([cost, np.full((m, m), _LEAVE)])
         column = scipy.optimize.linear_sum_assignment(padded)[1]
