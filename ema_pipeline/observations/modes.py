@@ -16,6 +16,7 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.correlate.settings import UncertaintySettings
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
@@ -24,7 +25,14 @@ from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
 from ema_pipeline.ingest.records import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
 from ema_pipeline.mechanics.terms import Matrices
-from ema_pipeline.observations.parts import PART_SCATTER, STIFFNESS_SCATTER, Dependence, dependence
+from ema_pipeline.observations.parts import (
+    MASS_SCATTER,
+    MASS_STD,
+    PART_SCATTER,
+    STIFFNESS_STD,
+    Dependence,
+    dependence,
+)
 from ema_pipeline.observations.rig_model import RigModel, SizeMap
 from ema_pipeline.rigs.types import Rig
 
@@ -52,7 +60,9 @@ _ACROSS = {"x": "y", "y": "x", "zeta": "eta", "eta": "zeta"}
 def scatters_of(rig: Rig) -> dict[str, Scatter]:
     """The hyper-parameters of measured modes, with the defaults that the rig states."""
     known = (
-        Scatter(PART_SCATTER, "parts", STIFFNESS_SCATTER, 0.7, 0.04),
+        Scatter(PART_SCATTER, "stiffness of parts", STIFFNESS_STD, 0.7, 0.04),
+        # Drawings and scales are trusted more than masses deserve (fasteners, oil, cables): a wide prior.
+        Scatter(MASS_SCATTER, "mass of parts", MASS_STD, 1.0, 0.02, 8.0),
         Scatter(CALIBRATION, "calibration", CALIBRATION_STD, 0.7, 0.04),
         Scatter(DAMPING_SCATTER, "ln ζ from mode to mode", rig.modal_damping_scatter, 0.5, 0.5),
         Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 5.0),
@@ -106,8 +116,14 @@ class ModeData:
         return dataclasses.replace(self, complete=False, **{n: getattr(self, n)[keep] for n in names})
 
 
-def prepare(measured: MeasuredModes) -> ModeData:
-    """Measured modes in the form that residuals need."""
+def _known_or(std: NDArray[np.float64], assumed: float) -> NDArray[np.float64]:
+    """Standard deviations, the assumed one where none is known."""
+    return np.where(np.isfinite(std) & (std > 0), std, assumed)
+
+
+def prepare(measured: MeasuredModes, settings: UncertaintySettings | None = None) -> ModeData:
+    """Measured modes in the form that residuals need; where no scatter is known, `settings` say what is assumed."""
+    settings = settings or UncertaintySettings()
     m, f = len(measured), measured.frequency_hz
     shapes = np.zeros((m, 0))
     std = np.zeros((m, 0))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 from ema_pipeline.effects.library import depends_on_level, parse_effect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.parameters import FittedModes, restored
+from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.channels import ChannelQuality, channel_uncertainty, merged
 from ema_pipeline.observations.fitting import Model
@@ -26,6 +28,7 @@ def mode_observations(run: Run) -> ModeObservations:
     """
     if run.rig is None:
         raise EmaError(f"{run.store.folder}: this needs a model; run again with --rig")
+    settings = cast(FitSettings, run.settings["fit"])
     measured = measured_modes(run)
     frfs = measured_frfs(run)
     channels: dict[str, ChannelQuality] = {}
@@ -33,7 +36,7 @@ def mode_observations(run: Run) -> ModeObservations:
         for dof in modes.dofs:
             quality = channel_uncertainty(frfs.get(name), dof)
             channels[dof.point] = merged(channels.get(dof.point), quality)
-    return ModeObservations(run.rig, [prepare(m) for m in measured.values()], channels)
+    return ModeObservations(run.rig, [prepare(m, settings) for m in measured.values()], channels)
 
 
 def model_with(run: Run, rig: Rig, labels: Sequence[str], model: Model | None = None) -> Model:
