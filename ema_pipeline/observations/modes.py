@@ -49,7 +49,7 @@ UNSEEN = 3.0
 _SHAPE_REACH = 0.3
 """Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
 _FREQUENCY_REACH = 0.1
-"""Difference of ln f that costs a pair as much as shapes that have nothing in common."""
+"""Difference of ln f that costs a pair as much as shapes that have nothing in common; wider while a fit is annealed."""
 _FREQUENCY_REACH_ALONE = 0.3
 _LEAVE = 0.3
 """Cost above the best at which an assignment leaves a measured mode without a partner."""
@@ -134,7 +134,7 @@ def prepare(measured: MeasuredModes, settings: UncertaintySettings | None = None
         for r in range(m):
             y = measured.shapes[r]
             real = np.real(y * np.exp(-0.5j * np.angle(np.nansum(y**2))))
-            size = max(float(np.nanmax(np.abs(real), initial=0.0)), 1e-300)
+            size = float(np.nanmax(np.abs(real), initial=0.0)) or 1.0
             shapes[r] = real / size
             given = (
                 np.zeros(len(dofs)) if measured.shape_std is None else np.nan_to_num(measured.shape_std[r])
@@ -433,7 +433,8 @@ class _Configuration:
             seen = np.isfinite(d.shapes).astype(float)
             cross = (y @ predicted) ** 2
             norm = np.sum(y**2, axis=1)[:, None] * (seen @ predicted**2)
-            cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / _FREQUENCY_REACH, 3.0)
+            reach = _FREQUENCY_REACH * (1 + 0.1 * (self.heat - 1))
+            cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / reach, 3.0)
         else:
             # convex, so that close modes keep their order: two crossed pairs would cost as much as two straight ones
             cost = np.minimum(apart * (1 + apart) / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
