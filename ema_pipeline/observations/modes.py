@@ -49,7 +49,7 @@ UNSEEN = 3.0
 _SHAPE_REACH = 0.3
 """Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
 _FREQUENCY_REACH = 0.1
-"""Difference of ln f that costs a pair as much as shapes that have nothing in common."""
+"""Difference of ln f that costs a pair as much as shapes that have nothing in common; wider while a fit is annealed."""
 _FREQUENCY_REACH_ALONE = 0.3
 _LEAVE = 0.3
 """Cost above the best at which an assignment leaves a measured mode without a partner."""
@@ -134,7 +134,7 @@ def prepare(measured: MeasuredModes, settings: UncertaintySettings | None = None
         for r in range(m):
             y = measured.shapes[r]
             real = np.real(y * np.exp(-0.5j * np.angle(np.nansum(y**2))))
-            size = max(float(np.nanmax(np.abs(real), initial=0.0)), 1e-300)
+            size = float(np.nanmax(np.abs(real), initial=0.0)) or 1.0
             shapes[r] = real / size
             given = (
                 np.zeros(len(dofs)) if measured.shape_std is None else np.nan_to_num(measured.shape_std[r])
@@ -474,9 +474,11 @@ class _Configuration:
             seen = np.isfinite(d.shapes).astype(float)
             cross = (y @ predicted) ** 2
             norm = np.sum(y**2, axis=1)[:, None] * (seen @ predicted**2)
-            cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / _FREQUENCY_REACH, 3.0)
+            reach = _FREQUENCY_REACH * (1 + 0.1 * (self.heat - 1))
+            cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / reach, 3.0)
         else:
-            cost = np.minimum(apart / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
+            # convex, so that close modes keep their order: two crossed pairs would cost as much as two straight ones
+            cost = np.minimum(apart * (1 + apart) / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
         m = len(d)
         padded = np.hstack([cost, np.full((m, m), _LEAVE)])
         column = scipy.optimize.linear_sum_assignment(padded)[1]
@@ -513,11 +515,30 @@ class _Configuration:
                 )
                 for r in rows
             },
-            log_scale=sum(c for _, _, _, c in done),
+            log_scale=sum(c for _, _, _, c in done) + self._usual(np.flatnonzero(match < 0), defaults),
             penalty=UNEXPLAINED * float(np.sum(match < 0)) + UNSEEN * self._unseen(solution, match),
             matching=match,
             projected=len(on) if self.data.shapes.shape[1] else 0,
         )
+
+    def _usual(self, alone: NDArray[np.int64], defaults: Mapping[str, float]) -> float:
+        """What modes without a partner would cost on average if they were explained.
+
+        Without it, leaving a mode out would gain what its rows cost, and no effect would ever bring it back.
+        """
+        d = self.data
+        seen = np.isfinite(d.shapes[alone])
+        reach = np.maximum(_SHAPE_REACH, np.abs(d.shapes[alone]))[seen]
+        damped = alone[np.isfinite(d.log_damping[alone])]
+        total = -0.5 * int(np.sum(np.any(seen, axis=1)))
+        for own, unit, name in (
+            (d.log_frequency_std[alone], 1.0, FREQUENCY),
+            (d.log_damping_std[damped], 1.0, DAMPING_SCATTER),
+            (d.shape_std[alone][seen], reach, SHAPE),
+        ):
+            now, usual = (own**2 + (at[name] * unit) ** 2 for at in (self.scatters, defaults))
+            total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
+        return total
 
     def _frequencies(
         self,
