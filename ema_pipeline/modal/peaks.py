@@ -26,7 +26,7 @@ FEWEST_LINES = 10
 STRAYED = 0.5
 """A pole is no longer that of its peak when it lies farther off than so many decay rates, or than hits scatter."""
 
-STRAYED_DECAY = 0.4
+STRAYED_DECAY = 0.3
 """The same for the logarithm of its decay rate."""
 
 
@@ -74,7 +74,7 @@ class KnownPeaks:
             for r in np.flatnonzero(owners & near):
                 far = abs(after.poles[r].imag - pole.imag) > max(-STRAYED * pole.real, 3 * std[1])
                 change = abs(np.log(max(after.poles[r].real / pole.real, 1e-9)))
-                lost = far or change > max(STRAYED_DECAY, -3 * std[0] / pole.real)
+                lost = far or change > STRAYED_DECAY
                 out[r], poles[r] = lost, pole if lost else poles[r]
         return out, poles
 
