@@ -86,7 +86,7 @@ def _weighed(mode: Mode, peak: PeakMovement | None, record_s: float, decay_rad_s
         dampings.append(Witness("circles", circle.damping_ratio, circle.damping_std))
     if peak is not None and ANCHORED not in mode.flags:
         pole = peak.pole + decay_rad_s
-        few = np.sqrt(max(np.count_nonzero(np.isfinite(peak.shift)), 1))
+        few = float(np.sqrt(max(int(np.count_nonzero(np.isfinite(peak.shift))), 1)))
         frequencies.append(
             Witness("single hits", abs(pole) / (2 * np.pi), peak.spread[1] / (2 * np.pi * few))
         )
@@ -97,7 +97,7 @@ def _weighed(mode: Mode, peak: PeakMovement | None, record_s: float, decay_rad_s
     if not f_text and not z_text:
         return mode
     texts = "; ".join(t for t in (f_text, z_text) if t)
-    pole = 2 * np.pi * f * complex(-z, np.sqrt(max(1 - z**2, 0.0)))
+    pole = 2 * np.pi * f * complex(-z, max(1 - z**2, 0.0) ** 0.5)
     return replace(
         mode,
         frequency_hz=f,
