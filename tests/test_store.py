@@ -363,3 +363,13 @@ except EmaError as error:
         assert int(done.stdout.split()[0]) < 50  # making what cannot be written would be lost time
         assert (tmp_path / "ema.h5").read_bytes() == before
         assert {p.name for p in tmp_path.iterdir()} == {"ema.h5", ".lock"}
+
+
+def test_an_array_that_states_more_than_is_stored_is_damage(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key", "{}", 0.1, result=np.zeros(8))
+    with h5py.File(store.path, "r+") as file:
+        del file["stages/frf/all/result"]
+        file["stages/frf/all"].create_dataset("result", (1_000_000_000_000,), "f8", chunks=(1024,))
+    with pytest.raises(EmaError, match="states 8000000000000 bytes where 0 are stored"):
+        store.find("frf", ALL, "result", np.ndarray)
