@@ -177,15 +177,19 @@ from pathlib import Path
 from ema_pipeline.store import Store
 
 def work(seconds):
-    print("worker", os.getpid(), flush=True)
+    os.write(1, f"worker {{os.getpid()}}\\n".encode())  # at once, whoever else writes
     time.sleep(seconds)
 
 with Store(Path({str(tmp_path)!r})).lock(), ProcessPoolExecutor(2, mp_context=get_context("fork")) as pool:
     list(pool.map(work, [60, 60]))
 """
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     assert process.stdout is not None
-    workers = [int(process.stdout.readline().split()[1]) for _ in range(2)]
+    lines = [process.stdout.readline() for _ in range(2)]
+    assert all(line.startswith("worker ") for line in lines), lines
+    workers = [int(line.split()[1]) for line in lines]
     process.kill()
     process.wait()
     process.stdout.close()
