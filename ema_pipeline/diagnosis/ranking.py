@@ -123,7 +123,7 @@ def _first_fit(
     begin = transferred(base.posterior, unknowns, np.zeros(len(unknowns)))
     begun = problem.begun(begin, base.posterior.scatters)
     if begun is not None:
-        return refined(observations, model, begun)
+        return refined(observations, model, begun).posterior
     score = promise.get(hypothesis.label)
     if score is not None and len(score.size) == 1:
         at = unknowns.index[hypothesis.placed.parameter_name(hypothesis.placed.effect.parameters[0].name)]
