@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ema_pipeline.diagnosis.claims import Judged, judge
-from ema_pipeline.diagnosis.hypotheses import Hypothesis
-from ema_pipeline.diagnosis.ranking import Ranked, Ranking
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
+from ema_pipeline.diagnose.claims import Judged, judge
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.ranking import Ranked, Ranking
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, learned, refined, transferred
 
