@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
-from typing import Annotated
+import traceback
+from typing import Annotated, NoReturn
 
 import typer
 
 from ema_pipeline import __version__
 from ema_pipeline.commands import diagnosis, listings, raw, runs
+from ema_pipeline.crash import write_crash_report
 from ema_pipeline.errors import EmaError
+from ema_pipeline.files import reason
+from ema_pipeline.plain_text import printable
 
 app = typer.Typer(
     name="ema",
@@ -35,6 +40,9 @@ STAGE_HELP = {
 def main() -> None:
     """Entry point: every problem with data or settings is one line on stderr and exit code 1."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # see ema_pipeline.threads
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a character gets its escape
+            stream.reconfigure(errors="backslashreplace")
     try:
         app()
     except EmaError as error:
@@ -43,15 +51,28 @@ def main() -> None:
         _stop("ema: interrupted; what was finished is kept, the same command goes on from there", 130)
     except BrokenPipeError:
         os._exit(1)
+    except MemoryError:
+        _stop("ema: the memory does not suffice; close other programs, or analyse fewer records at once", 1)
+    except OSError as error:
+        if error.errno is None:
+            _stop_for_crash(error)
+        where = f"{error.filename}: " if error.filename else ""
+        _stop(f"ema: {where}{reason(error)}; check the disk's free space and the folder's rights", 1)
     except Exception as error:
-        if "--verbose" in sys.argv or "-v" in sys.argv:
-            raise
-        kind = type(error).__name__
-        _stop(f"ema: unexpected {kind}: {' '.join(str(error).split())}; --verbose shows where", 1)
+        _stop_for_crash(error)
 
 
-def _stop(line: str, code: int) -> None:
-    typer.echo(line, err=True)
+def _stop_for_crash(error: Exception) -> NoReturn:
+    """End with a crash report; with --verbose the traceback is shown as well."""
+    path = write_crash_report(error)
+    if "--verbose" in sys.argv or "-v" in sys.argv:
+        typer.echo(printable("".join(traceback.format_exception(error))), err=True)
+    kept = f"the details are in {path}, please send that file to the developers" if path else "see --verbose"
+    _stop(f"ema: a fault in ema itself, not in your data ({type(error).__name__}): {kept}", 1)
+
+
+def _stop(line: str, code: int) -> NoReturn:
+    typer.echo(printable(line), err=True)
     raise SystemExit(code)
 
 

@@ -5,6 +5,11 @@ dataclasses and dictionaries are groups, a tuple of plain records is a table (co
 anything else is a group with members ``0``, ``1``, … An iterator is written like a tuple, one item at a
 time, and `Rows` like an array, one row at a time, so that they need not fit into memory. DOFs are written as
 text (``"sun.x"``).
+
+Damage is seen when it is read: every array carries a Fletcher-32 checksum, and text is stored with its length
+fixed, because HDF5 keeps text of variable length in a heap without one. Attributes are guarded by the checksums
+of the file format itself (HDF5 1.10 and later). Files come from strangers too, so links and arrays that lead out
+of the file are refused.
 """
 
 from __future__ import annotations
@@ -21,6 +26,8 @@ import h5py
 import numpy as np
 
 from ema_pipeline.dof import Dof
+from ema_pipeline.errors import EmaError
+from ema_pipeline.files import reason
 from ema_pipeline.rows import Rows
 
 T = TypeVar("T")
@@ -28,22 +35,40 @@ T = TypeVar("T")
 _SCALARS = (bool, int, float, complex, str)
 _NONE = "__none__"
 _COMPRESS_FROM_BYTES = 16_384
-_STRING = h5py.string_dtype()
+_ROW_CHUNK = 65_536
+"""Samples of a row that are checked together, 0.5 MB: a hit is cut out without reading the whole row."""
+
+_SMALL_BYTES, _BEST_PACKING = 64_000_000, 300
+"""Even zeros are packed no better than 1:300 by the filter that is used here."""
+
+_LONGEST_ATTRIBUTE = 32_768
+"""Longer text, bytes, becomes an array: HDF5 keeps attributes of more than 64 KiB apart from their object."""
+
+
+class MissingError(KeyError):
+    """The file was written by a version of the program that did not store this."""
+
+
+class DamagedError(OSError):
+    """The file holds something else than what was written."""
 
 
 def write(parent: h5py.Group, name: str, value: Any) -> None:
     """Write `value` (see the module's description for what is allowed) as member `name` of `parent`."""
     if value is None:
-        parent.attrs[name] = _NONE
-    elif isinstance(value, Dof | Path):
-        parent.attrs[name] = str(value)
+        _write_text(parent, name, _NONE)
+    elif isinstance(value, Dof | Path | str):
+        _write_text(parent, name, str(value))
     elif isinstance(value, (*_SCALARS, np.generic)):
         parent.attrs[name] = value
     elif isinstance(value, np.ndarray):
         _write_array(parent, name, value)
     elif isinstance(value, Rows):
         # Not compressed: measured samples gain a twentieth and would take ten times as long to read.
-        dataset = parent.create_dataset(name, shape=value.shape, dtype=np.float64)
+        chunk = (1, min(_ROW_CHUNK, value.shape[1]))
+        dataset = parent.create_dataset(
+            name, shape=value.shape, dtype=np.float64, chunks=chunk, fletcher32=True
+        )
         for row in range(len(value)):
             dataset[row] = value[row]
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -65,16 +90,32 @@ def write(parent: h5py.Group, name: str, value: Any) -> None:
 
 
 def read(parent: h5py.Group, name: str, annotation: Any) -> Any:
-    """Read member `name` of `parent` as the annotated type."""
+    """Read member `name` of `parent` as the annotated type.
+
+    Raises
+    ------
+    MissingError
+        If it is not there.
+    EmaError
+        If it leads out of the file.
+    DamagedError
+        If it is not what `write` has written.
+    """
+    try:
+        return _read(parent, name, annotation)
+    except (EmaError, MissingError, DamagedError):
+        raise
+    except Exception as error:  # h5py and the types to be made raise anything on damaged content
+        where = f"{parent.name}/{name}" if parent else name
+        raise DamagedError(f"'{where}': {reason(error)}") from error
+
+
+def _read(parent: h5py.Group, name: str, annotation: Any) -> Any:
     annotation, optional = _strip_optional(annotation)
     if name in parent.attrs:
         raw = parent.attrs[name]
-        if optional and isinstance(raw, str) and raw == _NONE:
-            return None
-        return _scalar(raw, annotation)
-    if name not in parent:
-        raise KeyError(f"{parent.name}/{name}")
-    node = parent[name]
+        return None if optional and _is_none(raw) else _scalar(raw, annotation)
+    node = member(parent, name)
     origin = typing.get_origin(annotation)
     if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
         return _read_dataclass(node, annotation)
@@ -82,24 +123,81 @@ def read(parent: h5py.Group, name: str, annotation: Any) -> Any:
         return _read_tuple(node, typing.get_args(annotation))
     if origin is dict:
         _, item = typing.get_args(annotation)
-        return {_unescape(k): read(node, k, item) for k in (*node.attrs, *node)}
+        return {_unescape(k): _read(node, k, item) for k in (*node.attrs, *node)}
+    if annotation in (str, Path):
+        return _scalar(node[()].tobytes(), annotation)
     return node[()]
 
 
+def member(parent: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
+    """A group or dataset that lies in this file itself.
+
+    Raises
+    ------
+    MissingError
+        If there is none of that name.
+    EmaError
+        If it leads to another file, so that reading it would show whatever file its maker chose.
+    DamagedError
+        If what describes it is damaged.
+    """
+    try:
+        link = parent.get(name, getlink=True)
+        node = parent[name] if isinstance(link, h5py.HardLink) else None
+    except Exception as error:  # h5py raises anything on damaged content
+        raise DamagedError(f"'{parent.name}/{name}': {reason(error)}") from error
+    if link is None:
+        raise MissingError(f"{parent.name}/{name}")
+    if node is None or (isinstance(node, h5py.Dataset) and (node.external or node.is_virtual)):
+        raise EmaError(
+            f"'{parent.name}/{name}' leads out of the file, which ema never writes; do not trust it"
+        )
+    if isinstance(node, h5py.Dataset) and node.shape is not None:
+        stated, stored = node.size * node.dtype.itemsize, node.id.get_storage_size()
+        if stated > _SMALL_BYTES + _BEST_PACKING * stored:
+            raise DamagedError(f"'{parent.name}/{name}': states {stated} bytes where {stored} are stored")
+    return node
+
+
+def _write_text(parent: h5py.Group, name: str, text: str) -> None:
+    encoded = _encoded(text)
+    if len(encoded) > _LONGEST_ATTRIBUTE or encoded.endswith(b"\0"):  # a fixed length drops zeros at the end
+        _write_array(parent, name, np.frombuffer(encoded, dtype=np.uint8))
+    else:
+        parent.attrs.create(name, np.bytes_(encoded), dtype=_text_dtype(encoded))
+
+
+def _text_dtype(*texts: bytes) -> Any:
+    return h5py.string_dtype("utf-8", max(1, *map(len, texts)))
+
+
 def _write_array(parent: h5py.Group, name: str, value: np.ndarray[Any, Any]) -> None:
+    if (
+        value.size == 0 or value.ndim == 0
+    ):  # nothing that a checksum could guard, or stored with its description
+        parent.create_dataset(name, data=value)
+        return
     large = value.nbytes >= _COMPRESS_FROM_BYTES
-    parent.create_dataset(name, data=value, compression="lzf" if large else None, shuffle=large)
+    parent.create_dataset(
+        name,
+        data=value,
+        chunks=True if large else value.shape,
+        compression="lzf" if large else None,
+        shuffle=large,
+        fletcher32=True,
+    )
 
 
 def _write_tuple(parent: h5py.Group, name: str, value: tuple[Any, ...]) -> None:
     if not value:
         parent.create_group(name)
     elif all(isinstance(v, str | Dof) for v in value):
-        parent.create_dataset(name, data=[str(v) for v in value], dtype=_STRING)
+        texts = [_encoded(v) for v in value]
+        _write_array(parent, name, np.array(texts, dtype=_text_dtype(*texts)))
     elif all(isinstance(v, bool | int | float | complex) for v in value):
-        parent.create_dataset(name, data=np.asarray(value))
+        _write_array(parent, name, np.asarray(value))
     elif _is_plain(type(value[0])) and all(type(v) is type(value[0]) for v in value):
-        parent.create_dataset(name, data=_table(value))
+        _write_array(parent, name, _table(value))
     else:
         group = parent.create_group(name)
         for index, item in enumerate(value):
@@ -109,19 +207,24 @@ def _write_tuple(parent: h5py.Group, name: str, value: tuple[Any, ...]) -> None:
 def _table(rows: tuple[Any, ...]) -> np.ndarray[Any, Any]:
     cls = type(rows[0])
     hints = _hints(cls)
-    fields = [f.name for f in dataclasses.fields(cls)]
-    dtype = np.dtype([(f, _column_dtype(hints[f])) for f in fields])
-    table = np.empty(len(rows), dtype=dtype)
-    for f in fields:
-        values = [getattr(row, f) for row in rows]
-        table[f] = [str(v) if isinstance(v, Dof) else v for v in values]
+    columns: dict[str, list[Any]] = {}
+    dtypes: list[tuple[str, Any]] = []
+    for f in dataclasses.fields(cls):
+        values = [getattr(row, f.name) for row in rows]
+        if hints[f.name] in (bool, int, float, complex):
+            dtypes.append((f.name, np.dtype(hints[f.name])))
+        else:
+            values = [_encoded(v) for v in values]
+            dtypes.append((f.name, _text_dtype(*values)))
+        columns[f.name] = values
+    table = np.empty(len(rows), dtype=np.dtype(dtypes))
+    for name, values in columns.items():
+        table[name] = values
     return table
 
 
-def _column_dtype(annotation: Any) -> Any:
-    if annotation in (bool, int, float, complex):
-        return np.dtype(annotation)
-    return _STRING
+def _encoded(text: str | Dof) -> bytes:
+    return str(text).encode("utf-8", errors="surrogateescape")
 
 
 def _is_plain(cls: Any) -> bool:
@@ -144,7 +247,7 @@ def _resolved_hints(cls: Any) -> dict[str, Any]:
 
 def _read_dataclass(node: h5py.Group, cls: type[T]) -> T:
     hints = _hints(cls)
-    return cls(**{f.name: read(node, f.name, hints[f.name]) for f in dataclasses.fields(cast(Any, cls))})
+    return cls(**{f.name: _read(node, f.name, hints[f.name]) for f in dataclasses.fields(cast(Any, cls))})
 
 
 def _read_tuple(node: h5py.Group | h5py.Dataset, args: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -159,12 +262,16 @@ def _read_tuple(node: h5py.Group | h5py.Dataset, args: tuple[Any, ...]) -> tuple
             )
         return tuple(_scalar(v, args[0] if variadic else args[i]) for i, v in enumerate(node[()]))
     size = len(node) + len(node.attrs)
-    return tuple(read(node, str(i), args[0] if variadic else args[i]) for i in range(size))
+    return tuple(_read(node, str(i), args[0] if variadic else args[i]) for i in range(size))
+
+
+def _is_none(raw: Any) -> bool:
+    return isinstance(raw, str | bytes) and raw in (_NONE, _NONE.encode())
 
 
 def _scalar(raw: Any, annotation: Any) -> Any:
     if isinstance(raw, bytes):
-        raw = raw.decode("utf-8")
+        raw = raw.decode("utf-8", errors="surrogateescape")
     if annotation is Dof:
         return Dof.parse(str(raw))
     if annotation is Path:

@@ -5,6 +5,11 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from ema_pipeline.plain_text import printable
+
+_LONGEST = 2000
+"""Characters of a message; names in a damaged file can be longer than any screen."""
+
 
 class EmaError(Exception):
     """The data or the settings are wrong.
@@ -14,7 +19,10 @@ class EmaError(Exception):
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(str(message).split()))
+        line = printable(" ".join(str(message).split()))
+        if len(line) > _LONGEST:
+            line = f"{line[: _LONGEST * 2 // 3]} … {line[-_LONGEST // 3 :]}"
+        super().__init__(line)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
+import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.isolators import isolators
 from ema_pipeline.errors import EmaError, did_you_mean
-from ema_pipeline.hysteresis.effects import effect_ids
+from ema_pipeline.files import read_bounded
 from ema_pipeline.ingest.description import Campaign, TestDescription, read_campaign
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Hit
+from ema_pipeline.names import check_name
+from ema_pipeline.observations.loop_forces import effects_of_loops
 from ema_pipeline.pipeline import (
-    PipelineSettings,
     ShowStage,
     describe_run,
     existing_run,
@@ -26,11 +27,14 @@ from ema_pipeline.pipeline import (
     override,
     run_stages,
     shipped_pipelines,
+    stored_settings,
     toml_value,
+    with_effect_files,
 )
 from ema_pipeline.rigs import Rig, load_rig, model_modes, rig_names
 from ema_pipeline.stages.base import Run, RunInfo, load_info, save_info
 from ema_pipeline.store import Store
+from ema_pipeline.toml_text import LARGEST_BYTES, read_toml, read_toml_text
 
 if TYPE_CHECKING:
     from ema_pipeline.simulate.campaign import SimulatedCampaign
@@ -51,6 +55,7 @@ def run_raw(
     overrides: Iterable[str] = (),
     show: ShowStage | None = None,
     describe_source: DescribeSource | None = None,
+    effect_files: Iterable[str] = (),
 ) -> tuple[Run, list[str]]:
     """Run a whole pipeline on a raw folder, or on a table of modes.
 
@@ -71,6 +76,8 @@ def run_raw(
         Display of progress.
     describe_source : callable
         `describe` for raw folders, `describe_modes` for a table of modes.
+    effect_files : iterable of str
+        Python files with the user's own effects.
 
     Returns
     -------
@@ -84,17 +91,22 @@ def run_raw(
         Whatever is wrong with data or settings, in one line.
     """
     info = (describe_source or describe)(raw, rig, pipeline, overrides)
-    store = Store(out)
+    store, effect_files = Store(out), tuple(effect_files)
+    info = with_effect_files(store, info, effect_files)
     with _tidy(out), store.lock():
         info = _with_effects_of(store, info)
         save_info(store, info)
-        run = new_run(store, info)
-        stages = PipelineSettings.model_validate_json(info.pipeline).stages
+        run = new_run(store, info, effect_files)
+        stages = stored_settings(store, info).stages
         return run, run_stages(run, stages, show)
 
 
 def run_on(
-    folder: Path, stages: Iterable[str], overrides: Iterable[str] = (), show: ShowStage | None = None
+    folder: Path,
+    stages: Iterable[str],
+    overrides: Iterable[str] = (),
+    show: ShowStage | None = None,
+    effect_files: Iterable[str] = (),
 ) -> tuple[Run, list[str]]:
     """Run single stages on a results folder; settings changed by `overrides` stay changed there.
 
@@ -103,13 +115,14 @@ def run_on(
     EmaError
         Whatever is wrong with the folder or the settings, in one line.
     """
-    info = existing_run(folder).info
-    settings = override(PipelineSettings.model_validate_json(info.pipeline), overrides, folder)
+    effect_files = tuple(effect_files)
+    info = existing_run(folder, effect_files).info
     store = Store(folder)
+    settings = override(stored_settings(store, info), overrides, folder)
     with store.lock():
         info = dataclasses.replace(info, pipeline=settings.model_dump_json())
         save_info(store, info)
-        run = new_run(store, info)
+        run = new_run(store, info, effect_files)
         return run, run_stages(run, stages, show)
 
 
@@ -118,6 +131,7 @@ def change_effects(
     change: Callable[[tuple[str, ...]], tuple[str, ...]],
     overrides: Iterable[str] = (),
     show: ShowStage | None = None,
+    effect_files: Iterable[str] = (),
 ) -> Run:
     """Change the effects that were added to the model, and refit, compare and report.
 
@@ -130,35 +144,30 @@ def change_effects(
     overrides : iterable of str
         ``stage.key=value``.
     show : ShowStage or None
+    effect_files : iterable of str
+        Python files with the user's own effects.
 
     Raises
     ------
     EmaError
         For effects or places that do not exist; nothing is changed then.
     """
-    run = existing_run(folder)
+    effect_files = tuple(effect_files)
+    run = existing_run(folder, effect_files)
     run.require_model("add")
-    settings = override(PipelineSettings.model_validate_json(run.info.pipeline), overrides, folder)
     store = Store(folder)
+    settings = override(stored_settings(store, run.info), overrides, folder)
     with store.lock():
         info = dataclasses.replace(
             run.info, effects=change(run.info.effects), pipeline=settings.model_dump_json()
         )
-        run = new_run(store, info)
+        run = new_run(store, info, effect_files)
         run.require_model("add")  # refuses unknown effects and places before anything is written
-        if info.kind == "hysteresis":
-            effect_ids(info.effects)
+        if info.kind == "hysteresis" and run.rig is not None:
+            effects_of_loops(run.rig, info.effects, run.library)  # refuses what a loop does not show
         save_info(store, info)
         run_stages(run, ("ladder", "fit", "correlate", "report"), show)
     return run
-
-
-def with_effect_files(known: Iterable[str], files: Iterable[str], overrides: Iterable[str]) -> list[str]:
-    """Overrides that also name files with the user's own effects, in addition to the `known` ones."""
-    new = [str(Path(f).resolve()) for f in files]
-    if not new:
-        return list(overrides)
-    return [*overrides, f"effect_files={json.dumps(list(dict.fromkeys((*known, *new))))}"]
 
 
 def adding(labels: Iterable[str]) -> Callable[[tuple[str, ...]], tuple[str, ...]]:
@@ -204,7 +213,7 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
     if kinds == {"hysteresis"}:
         return _describe_loops(campaign, rig, pipeline, overrides)
     source = rig or _rig_of(campaign)
-    model = None if source is None else load_rig(source)
+    model = None if source is None else checked_rig(source)
     names = tuple(_configuration(test, model) for test in campaign.tests)
     if model is not None:
         for test, name in zip(campaign.tests, names, strict=True):
@@ -223,7 +232,7 @@ def _describe_loops(
 ) -> RunInfo:
     """Hysteresis tests: the base model is the linear spring of an isolator, which the loops themselves determine."""
     source = rig or _rig_of(campaign) or LOOPS_RIG
-    model = load_rig(source)
+    model = checked_rig(source)
     if not any(isolators(model.assembly(name)) for name in model.configurations):
         raise EmaError(f"{source}: has no isolator that loops could be measured on; leave --rig out")
     names = tuple(test.configuration or "default" for test in campaign.tests)
@@ -238,7 +247,12 @@ def describe_modes(file: Path, rig: str | None, pipeline: str | None, overrides:
 
     if rig is None:
         raise EmaError(f"{file}: a table of modes needs a model to compare with; name it with --rig")
-    model = load_rig(rig)
+    model = checked_rig(rig)
+    # Within limits, before the table's own reader sees it.
+    if file.suffix.lower() == ".toml":
+        read_toml(file)
+    else:
+        read_bounded(file, LARGEST_BYTES)
     names = tuple(read_mode_table(file, model))
     settings = load_pipeline(pipeline or _pipeline_for(model), overrides)
     return describe_run("modes", file, file.stem, _rig_text(rig), rig, names, (), settings)
@@ -285,7 +299,23 @@ def _rig_text(source: str | None) -> str:
     """Name of a shipped rig, or the text of the user's file, which then lives on in the store."""
     if source is None or source in rig_names():
         return source or ""
-    return Path(source).read_text(encoding="utf-8-sig").rstrip() + "\n"
+    return read_toml_text(Path(source)).rstrip() + "\n"
+
+
+def checked_rig(source: str) -> Rig:
+    """A rig by its name or from its file, which is checked before the rig's own reader sees it.
+
+    Raises
+    ------
+    EmaError
+        Whatever is wrong with the file, in one line.
+    """
+    if source not in rig_names() and os.path.exists(source):
+        read_toml(Path(source))
+    rig = load_rig(source)
+    for name in rig.configurations:
+        check_name(name, f"{source}: configuration")
+    return rig
 
 
 def _configuration(test: TestDescription, rig: Rig | None) -> str:
@@ -311,15 +341,24 @@ def _pipeline_for(rig: Rig | None) -> str:
     return name if name in shipped_pipelines() else DEFAULT_PIPELINE
 
 
-def check_raw(raw: Path) -> dict[str, tuple[Hit, ...]]:
+def check_raw(raw: Path, overrides: Iterable[str] = ()) -> dict[str, tuple[Hit, ...]]:
     """Hits of every configuration of a raw folder with their verdicts; nothing is written."""
     from ema_pipeline.ingest.quality import hits_of_test
 
-    settings = load_pipeline(DEFAULT_PIPELINE).hits
+    settings = load_pipeline(DEFAULT_PIPELINE, overrides)
     judged = {}
     for test in read_campaign(raw).tests:
-        judged[test.configuration or "default"] = hits_of_test(list(load_records(test)), settings)
+        judged[test.configuration or "default"] = hits_of_test(
+            list(load_records(test, settings.ingest)), settings.hits
+        )
     return judged
+
+
+def draft_raw(raw: Path, overrides: Iterable[str] = ()) -> list[Path]:
+    """Draft test.toml from what the record files of a folder say; returns the files written."""
+    from ema_pipeline.ingest.draft import write_drafts
+
+    return write_drafts(raw, load_pipeline(DEFAULT_PIPELINE, overrides).ingest)
 
 
 def report_path(out: Path) -> Path:
@@ -336,7 +375,7 @@ def report_path(out: Path) -> Path:
     return path.resolve()
 
 
-def export_results(out: Path, folder: Path) -> list[Path]:
+def export_results(out: Path, folder: Path, effect_files: Iterable[str] = ()) -> list[Path]:
     """Write FRFs, modes and shapes of every configuration as universal file and as CSV.
 
     Raises
@@ -348,7 +387,7 @@ def export_results(out: Path, folder: Path) -> list[Path]:
     from ema_pipeline.exchange.uff import write_uff
     from ema_pipeline.stages.modes import measured_frfs, modes_of_structure
 
-    run = existing_run(out)
+    run = existing_run(out, effect_files)
     measured = measured_frfs(run)
     written = []
     try:
@@ -368,7 +407,7 @@ def export_results(out: Path, folder: Path) -> list[Path]:
 
 def list_model_modes(rig: str, configuration: str | None) -> dict[str, list[dict[str, Any]]]:
     """The model's own modes for one configuration, or for all of them."""
-    loaded = load_rig(rig)
+    loaded = checked_rig(rig)
     return {
         name: [
             {"frequency_hz": m.frequency_hz, "damping_ratio": m.damping_ratio, "family": m.family}
@@ -382,7 +421,7 @@ def list_effects(rig: str) -> list[dict[str, Any]]:
     """Effects that can sit on a rig, with places, parameters and tell-tale signs."""
     from ema_pipeline.effects.library import shipped_effects
 
-    loaded = load_rig(rig)
+    loaded = checked_rig(rig)
     listed = []
     for effect in shipped_effects().values():
         places = dict.fromkeys(p for c in loaded.configurations for p in effect.places(loaded, c))

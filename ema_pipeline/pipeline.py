@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib
 import json
+import os
 import time
-import tomllib
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 
 from ema_pipeline.correlate.settings import CompareSettings, PairingSettings
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.frf.settings import FrfSettings
-from ema_pipeline.hysteresis.settings import HysteresisSettings
 from ema_pipeline.ingest.hit_settings import HitSettings
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.levels.settings import LevelSettings
+from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.names import check_name
 from ema_pipeline.report.settings import ReportSettings
 from ema_pipeline.settings import Settings, parse
 from ema_pipeline.stages.base import (
@@ -34,11 +37,13 @@ from ema_pipeline.stages.base import (
     Stage,
     code_fingerprint,
     configurations_of,
+    file_hash,
     load_info,
     silent,
     versions,
 )
 from ema_pipeline.store import ALL, Store
+from ema_pipeline.toml_text import parse_toml, read_toml
 
 STAGES = (
     "ingest", "hits", "frf", "modal", "levels", "loops", "ladder", "diagnose", "fit", "correlate", "report",
@@ -53,8 +58,8 @@ STAGES_OF_KIND = {
 """Stages that have something to do, by kind of test."""
 
 
-class IngestSettings(Settings):
-    """Reading raw folders has nothing to set: everything is said in test.toml."""
+class IngestSettings(ReadLimits):
+    """Reading raw folders: all but the limits is said in test.toml."""
 
 
 class CorrelateSettings(Settings):
@@ -93,7 +98,7 @@ class PipelineSettings(Settings):
     fit: FitSettings = Field(FitSettings(), description="fitting the model's parameters")
     correlate: CorrelateSettings = Field(CorrelateSettings(), description="pairing and comparison")
     diagnose: DiagnoseSettings = Field(DiagnoseSettings(), description="search for missing physics")
-    loops: HysteresisSettings = Field(HysteresisSettings(), description="force-displacement loops")
+    loops: LoopSettings = Field(LoopSettings(), description="force-displacement loops")
     ladder: LadderSettings = Field(LadderSettings(), description="the ladder of added effects")
     report: ReportSettings = Field(ReportSettings(), description="tables, plots and the report")
 
@@ -128,15 +133,11 @@ def load_pipeline(name_or_path: str, overrides: Iterable[str] = ()) -> PipelineS
     """
     shipped = shipped_pipelines()
     path = shipped.get(name_or_path, Path(name_or_path))
-    if not path.is_file():
+    if not os.path.exists(path):
         raise EmaError(
             f"no pipeline '{name_or_path}'{did_you_mean(name_or_path, shipped)}; or give a TOML file"
         )
-    try:
-        data: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise EmaError(f"{path}: is not valid TOML: {error}") from None
-    return _settings(data, overrides, str(path))
+    return _settings(read_toml(path), overrides, str(path))
 
 
 def override(settings: PipelineSettings, overrides: Iterable[str], where: str | Path) -> PipelineSettings:
@@ -167,19 +168,74 @@ def _settings(data: dict[str, Any], overrides: Iterable[str], where: str) -> Pip
 def toml_value(text: str) -> Any:
     """A value as TOML would read it; text that is no TOML is taken as it stands."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+        return parse_toml(f"value = {text}", text)["value"]
+    except EmaError:
         return text
 
 
-def new_run(store: Store, info: RunInfo) -> Run:
-    """A run with the settings that its description holds."""
-    settings = PipelineSettings.model_validate_json(info.pipeline)
-    return Run(store, info, {name: settings.of(name) for name in STAGES}, settings.effect_files)
+def new_run(store: Store, info: RunInfo, effect_files: Iterable[str] = ()) -> Run:
+    """A run with the settings that its description holds.
+
+    Parameters
+    ----------
+    store : Store
+    info : RunInfo
+    effect_files : iterable of str
+        Files with the user's own effects that are named in this call: only their code may run.
+    """
+    settings = stored_settings(store, info)
+    stages = {name: settings.of(name) for name in STAGES}
+    return Run(store, info, stages, settings.effect_files, frozenset(map(_absolute, effect_files)))
 
 
-def existing_run(folder: Path) -> Run:
+def with_effect_files(store: Store, info: RunInfo, effect_files: Iterable[str]) -> RunInfo:
+    """The description with the named files of the user's own effects, and their hashes, added.
+
+    A file that is known already but has moved replaces what stood under its name.
+    """
+    named = [_absolute(file) for file in effect_files]
+    if not named:
+        return info
+    settings = stored_settings(store, info)
+    names = {Path(file).name for file in named}
+    known = [file for file in settings.effect_files if Path(file).name not in names]
+    files = tuple(dict.fromkeys((*known, *named)))
+    hashes = info.effect_hashes | {file: file_hash(Path(file)) for file in named}
+    return dataclasses.replace(
+        info,
+        pipeline=settings.model_copy(update={"effect_files": files}).model_dump_json(),
+        effect_hashes={file: hashes[file] for file in files if file in hashes},
+    )
+
+
+def _absolute(file: str) -> str:
+    return str(Path(file).resolve())
+
+
+def stored_settings(store: Store, info: RunInfo) -> PipelineSettings:
+    """The settings that a run's description holds.
+
+    Raises
+    ------
+    EmaError
+        If this version of the program cannot read them.
+    """
+    try:
+        return PipelineSettings.model_validate_json(info.pipeline)
+    except ValidationError:
+        raise EmaError(
+            f"{store.path}: holds settings that this version of ema does not know; delete it and run again"
+        ) from None
+
+
+def existing_run(folder: Path, effect_files: Iterable[str] = ()) -> Run:
     """The run that a results folder belongs to.
+
+    Parameters
+    ----------
+    folder : Path
+    effect_files : iterable of str
+        As in `new_run`.
 
     Raises
     ------
@@ -190,7 +246,8 @@ def existing_run(folder: Path) -> Run:
     info = load_info(store)
     if info is None:
         raise EmaError(f"{store.path}: holds no run; make one with 'ema run RAW --out {folder}'")
-    return new_run(store, info)
+    effect_files = tuple(effect_files)
+    return new_run(store, with_effect_files(store, info, effect_files), effect_files)
 
 
 def describe_run(
@@ -203,7 +260,15 @@ def describe_run(
     effects: tuple[str, ...],
     settings: PipelineSettings,
 ) -> RunInfo:
-    """Description of a run, for the store."""
+    """Description of a run, for the store.
+
+    Raises
+    ------
+    EmaError
+        If a configuration has a name that no file can have.
+    """
+    for name in configurations:
+        check_name(name, f"{raw}: configuration")
     return RunInfo(
         kind=kind,
         raw=str(raw),

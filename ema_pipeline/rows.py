@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.errors import EmaError
+from ema_pipeline.files import reason
+
 if TYPE_CHECKING:
     import h5py
 
@@ -90,5 +93,8 @@ class StoredRows(Rows):
             return np.asarray(self._dataset[row, start:stop])
         import h5py
 
-        with h5py.File(self._path, "r") as file:
-            return np.asarray(file[self._name][row, start:stop])
+        try:
+            with h5py.File(self._path, "r") as file:
+                return np.asarray(file[self._name][row, start:stop])
+        except (OSError, KeyError) as error:
+            raise EmaError(f"{self._path}: is damaged ({reason(error)}); delete it and run again") from None

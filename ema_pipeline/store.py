@@ -9,23 +9,30 @@ from __future__ import annotations
 import contextlib
 import datetime
 import os
+import platform
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeVar
+from typing import Any, TypeVar
 
 import h5py
+from filelock import FileLock, Timeout
 
 from ema_pipeline import __version__, codec
 from ema_pipeline.errors import EmaError
+from ema_pipeline.files import ScratchFile, reason, replacing
+from ema_pipeline.processes import workers_die_with_us
 
 T = TypeVar("T")
 
 ALL = "all"
 """Name that stands for all configurations together."""
 
+LOCK_FILE = ".lock"
+
 _FORMAT = 1
+_LIBRARY = ("v110", "v110")
 
 
 @dataclass(frozen=True)
@@ -83,18 +90,29 @@ class Store:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep a second process from writing to the same results folder."""
+        """Keep a second process from writing to the same results folder.
+
+        The lock belongs to this process alone: the system gives it up when the process ends, and processes
+        forked from it neither inherit it nor outlive it.
+        """
+        path = self.folder / LOCK_FILE
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            handle = (self.folder / ".lock").open("w")
+            lock = FileLock(path, timeout=0)
+            held = lock.acquire()
+        except Timeout:
+            raise EmaError(f"{self.folder}: {_holder(path)} is writing there; wait for it to end") from None
         except OSError as error:
             raise EmaError(
-                f"{self.folder}: cannot write results there ({_reason(error)}); choose another with --out"
+                f"{self.folder}: cannot write results there ({reason(error)}); choose another with --out"
             ) from None
-        with handle:
-            if not _try_lock(handle):
-                raise EmaError(f"{self.folder}: another ema process is writing there; wait for it to end")
-            for left_over in self.folder.glob(".ema.h5.*.tmp"):
+        with held, workers_die_with_us():
+            if (
+                type(lock) is FileLock
+            ):  # where a file system knows no locks, filelock writes a mark of its own
+                with contextlib.suppress(OSError):  # only a help to whoever finds the folder locked
+                    path.write_text(f"{os.getpid()} {platform.node()}", encoding="utf-8")
+            for left_over in self.folder.glob(".*.[0-9]*.tmp"):
                 left_over.unlink(missing_ok=True)
             yield
 
@@ -102,49 +120,62 @@ class Store:
     def reading(self) -> Iterator[h5py.File]:
         """The HDF5 file, open for reading."""
         try:
-            file = h5py.File(self.path, "r")
+            with h5py.File(self.path, "r") as file:
+                yield file
         except OSError as error:
-            raise EmaError(
-                f"{self.path}: is not a readable HDF5 file ({_reason(error)}); delete it and run again"
-            ) from None
-        with file:
-            yield file
+            raise self._damaged(error) from None
 
     @contextlib.contextmanager
     def changing(self) -> Iterator[h5py.File]:
         """A copy of the HDF5 file to change; it replaces the file when the block ends without an error."""
-        scratch = self.folder / f".ema.h5.{os.getpid()}.tmp"
-        try:
-            if self.path.exists():
+        with self._changing() as (file, _):
+            yield file
+
+    @contextlib.contextmanager
+    def _changing(self) -> Iterator[tuple[h5py.File, ScratchFile]]:
+        with replacing(self.path) as scratch:
+            new = not self.path.exists()
+            if not new:
                 shutil.copyfile(self.path, scratch)
-                file = h5py.File(scratch, "r+")
-            else:
-                file = h5py.File(scratch, "w", fs_strategy="fsm", fs_persist=True)
-                file.attrs["format"] = _FORMAT
-            with file:
-                yield file
-            os.replace(scratch, self.path)
+            with contextlib.closing(ScratchFile(scratch)) as disk, self._open_to_change(disk, new) as file:
+                yield file, disk
+            disk.check()
+
+    def _open_to_change(self, disk: ScratchFile, new: bool) -> h5py.File:
+        """The newer file format guards all that describes the data by checksums."""
+        try:
+            if not new:
+                return h5py.File(disk, "r+", libver=_LIBRARY)
+            file = h5py.File(disk, "w", libver=_LIBRARY, fs_strategy="fsm", fs_persist=True)
         except OSError as error:
-            raise EmaError(
-                f"{self.path}: cannot be written ({_reason(error)}); free space or use --out"
-            ) from None
-        finally:
-            scratch.unlink(missing_ok=True)
+            disk.check()
+            raise self._damaged(error) from None
+        file.attrs["format"] = _FORMAT
+        return file
+
+    def _damaged(self, error: OSError) -> EmaError:
+        if not h5py.is_hdf5(self.path) and self.path.is_file():
+            return EmaError(f"{self.path}: is not a readable HDF5 file; delete it and run again")
+        return EmaError(f"{self.path}: is damaged ({reason(error)}); delete it and run again")
 
     def key(self, stage: str, configuration: str = ALL) -> str:
         """Key of the stored result, empty where there is none."""
         if not self.path.is_file():
             return ""
         with self.reading() as file:
-            group = file.get(_group(stage, configuration))
+            group = _find(file, _group(stage, configuration))
             return "" if group is None else str(codec.read(group, "provenance", Provenance).key)
 
     def save(
         self, stage: str, configuration: str, key: str, settings: str, seconds: float, **results: Any
     ) -> None:
         """Replace a stage's results by new ones in one step."""
-        with self.changing() as file:
-            write_stage(file, stage, configuration, key, settings, seconds, **results)
+        with self._changing() as (file, disk):
+            watched = {
+                name: _until_full(value, disk) if isinstance(value, Iterator) else value
+                for name, value in results.items()
+            }
+            write_stage(file, stage, configuration, key, settings, seconds, **watched)
 
     def load(self, stage: str, configuration: str, name: str, cls: type[T]) -> T:
         """Load one result of a stage.
@@ -164,12 +195,12 @@ class Store:
         if not self.path.is_file():
             return None
         with self.reading() as file:
-            group = file.get(_group(stage, configuration))
+            group = _find(file, _group(stage, configuration))
             if group is None or (name not in group and name not in group.attrs):
                 return None
             try:
                 result: T = codec.read(group, name, cls)
-            except KeyError:
+            except codec.MissingError:
                 raise EmaError(
                     f"{self.path}: stage '{stage}' was written by another version of ema; run it again"
                 ) from None
@@ -179,8 +210,11 @@ class Store:
         """Provenance of everything in the store, by stage and configuration."""
         found: dict[tuple[str, str], Provenance] = {}
         with self.reading() as file:
-            for stage, configurations in file.get("stages", {}).items():
-                for configuration, group in configurations.items():
+            stages = _find(file, "stages")
+            for stage in () if stages is None else stages:
+                configurations = codec.member(stages, stage)
+                for configuration in configurations:
+                    group = codec.member(configurations, configuration)
                     found[stage, configuration] = codec.read(group, "provenance", Provenance)
         return found
 
@@ -204,17 +238,30 @@ def _group(stage: str, configuration: str) -> str:
     return f"stages/{stage}/{configuration}"
 
 
-def _reason(error: OSError) -> str:
-    return error.strerror or str(error).split("\n")[0]
+def _find(file: h5py.File, path: str) -> h5py.Group | None:
+    """The group at `path`, None where there is none."""
+    group = file
+    for step in path.split("/"):
+        try:
+            group = codec.member(group, step)
+        except codec.MissingError:
+            return None
+    return group
 
 
-def _try_lock(handle: IO[str]) -> bool:
+def _until_full(items: Iterator[T], disk: ScratchFile) -> Iterator[T]:
+    """The items, as long as there is room for them: making them takes longer than writing them."""
+    for item in items:
+        disk.check()
+        yield item
+
+
+def _holder(path: Path) -> str:
+    """Who holds the lock, as far as the lock file tells."""
     try:
-        import fcntl
-    except ImportError:  # no advisory locks on this platform
-        return True
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
+        process, _, machine = path.read_text(encoding="utf-8").partition(" ")
+    except (OSError, UnicodeDecodeError):
+        return "another ema process"
+    if not process.isdecimal() or len(process) > 20:
+        return "another ema process"
+    return f"another ema process (number {process} on {machine[:64]})"

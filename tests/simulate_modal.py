@@ -6,7 +6,7 @@ records (half-sine blow, anti-alias filter, noise on every channel), and turned 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -64,8 +64,15 @@ def simulate_hits(
     rng: np.random.Generator,
     pretrigger: int = 20,
     decay_rad_s: float = 0.0,
+    drift: float = 0.0,
+    softening: float = 0.0,
+    calibration: float = 0.0,
 ) -> Hits:
     """Simulate hits; noise levels are rms of the noise over rms of the channel's signal in the record.
+
+    `drift` is the standard deviation of a factor on all frequencies of a hit; `softening` the relative drop of the
+    first half of the modes from the softest hit (80 N) to the hardest (160 N), zero in their middle;
+    `calibration` the standard deviation of a constant factor on each channel.
 
     Response noise is set per channel from its signal averaged over inputs, as a sensor's noise floor is.
     """
@@ -78,13 +85,20 @@ def simulate_hits(
     f = np.fft.rfftfreq(n_long, 1 / rate)
     taper = np.clip((0.5 * rate - f) / (0.5 * rate - 1.05 * f_max), 0, 1)
     taper = 0.5 - 0.5 * np.cos(np.pi * taper)
-    accelerance = system.accelerance(f, dofs_out, dofs_in)
+    still = system.accelerance(f, dofs_out, dofs_in) if not (drift or softening) else None
+    soft = np.arange(len(system.frequency_hz)) < len(system.frequency_hz) // 2
     width = 0.9 / f_max  # half-sine: first zero of the spectrum at 1.67 f_max
     force = np.zeros((len(dofs_in), n_hits, n))
     resp = np.zeros((len(dofs_in), n_hits, len(dofs_out), n))
     for i in range(len(dofs_in)):
         for h in range(n_hits):
             peak = rng.uniform(80, 160)
+            if still is None:
+                moved = (1 + drift * rng.standard_normal()) * (1 - softening * soft * (peak - 120) / 80)
+                here = replace(system, frequency_hz=system.frequency_hz * moved)
+                column = here.accelerance(f, dofs_out, [dofs_in[i]])[:, 0]
+            else:
+                column = still[:, i]
             tau = width * rng.uniform(0.9, 1.1)
             a = np.pi * f * tau
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -93,7 +107,9 @@ def simulate_hits(
             start = (pretrigger + rng.uniform(-0.5, 0.5)) / rate - tau / 2
             spectrum = spectrum * np.exp(-1j * (a + 2 * np.pi * f * start)) * taper
             force[i, h] = np.fft.irfft(spectrum, n_long)[:n] * rate
-            resp[i, h] = np.fft.irfft(accelerance[:, i] * spectrum, n_long)[:, :n] * rate
+            resp[i, h] = np.fft.irfft(column * spectrum, n_long)[:, :n] * rate
+    if calibration:
+        resp = resp * (1 + calibration * rng.standard_normal(len(dofs_out)))[:, None]
     sigma_f = force_noise * np.sqrt(np.mean(force**2))
     sigma_y = response_noise * np.sqrt(np.mean(resp**2, axis=(0, 1, 3)))
     force = force + sigma_f * rng.standard_normal(force.shape)

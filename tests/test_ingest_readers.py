@@ -504,7 +504,7 @@ DAMAGE = {
     "zip.mat": "looks like a zip archive",
     "half.h5": "cannot be read as HDF5",
     "half.mat": "cannot be read as MAT",
-    "half.wav": "cannot be read as WAV",
+    "half.wav": "cut short",
     "half.tdms": "cut short",
     "half.lvm": "holds 1000 of the 2048 samples",
     "half.gz": "cannot be unpacked",

@@ -84,8 +84,8 @@ def test_effect_of_the_page_is_diagnosed_and_laddered_by_its_file(
     assert first.label == "oil_film@storey2"
     assert first.probability > 0.9
 
-    ema("add", "out", "oil_film@storey2")  # the folder remembers the file
-    ladder = load_results(existing_run(Path("out"))).ladder
+    ema("add", "out", "oil_film@storey2", "--effect-file", "oil_film.py")
+    ladder = load_results(existing_run(Path("out"), ["oil_film.py"])).ladder
     assert ladder is not None
     base, added = ladder.rungs
     assert added.effects == ("oil_film@storey2",)

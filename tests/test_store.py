@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -167,6 +168,59 @@ with Store(Path({str(tmp_path)!r})).lock():
     assert free.stdout.strip() == "locked"
 
 
+def test_workers_of_a_killed_process_die_and_leave_no_lock(tmp_path: Path) -> None:
+    code = f"""
+import os, time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from ema_pipeline.store import Store
+
+def work(seconds):
+    os.write(1, f"worker {{os.getpid()}}\\n".encode())  # at once, whoever else writes
+    time.sleep(seconds)
+
+with Store(Path({str(tmp_path)!r})).lock(), ProcessPoolExecutor(2, mp_context=get_context("fork")) as pool:
+    list(pool.map(work, [60, 60]))
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    assert process.stdout is not None
+    lines = [process.stdout.readline() for _ in range(2)]
+    assert all(line.startswith("worker ") for line in lines), lines
+    workers = [int(line.split()[1]) for line in lines]
+    process.kill()
+    process.wait()
+    process.stdout.close()
+    with Store(tmp_path).lock():
+        pass
+    deadline = time.monotonic() + 5
+    while any(_alive(worker) for worker in workers):
+        assert time.monotonic() < deadline, "workers outlive their parent"
+        time.sleep(0.01)
+
+
+def _alive(pid: int) -> bool:
+    """True for a process that runs; one that is dead and only waits to be counted does not."""
+    try:
+        return ") Z" not in Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
+    except OSError:
+        return False
+
+
+def test_the_message_about_a_lock_says_who_holds_it(tmp_path: Path) -> None:
+    code = f"""
+from pathlib import Path
+from ema_pipeline.store import Store
+with Store(Path({str(tmp_path)!r})).lock():
+    pass
+"""
+    with Store(tmp_path).lock():
+        blocked = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert f"number {os.getpid()} on" in blocked.stderr
+
+
 def test_a_process_killed_while_it_writes_leaves_a_readable_store(tmp_path: Path) -> None:
     Store(tmp_path).save("frf", ALL, "first", "{}", 0.1, result=np.zeros(10))
     code = f"""
@@ -204,3 +258,122 @@ def test_results_of_another_version_are_refused_in_one_line(tmp_path: Path) -> N
         del file["stages/frf/all/result"].attrs["note"]
     with pytest.raises(EmaError, match="written by another version of ema"):
         store.load("frf", ALL, "result", Nested)
+
+
+def small_stages(store: Store) -> None:
+    """A store with the kinds of content that stages write: arrays, tables, texts, samples."""
+    store.save(
+        "frf", ALL, "key", "{}", 0.1, result=example(), samples=np.random.default_rng(1).normal(size=9000)
+    )
+    store.save("ingest", "default", "key", "{}", 0.1, records=iter([example(), example()]))
+
+
+def read_all(store: Store) -> str:
+    """All of the store as text."""
+    return repr(
+        (
+            store.provenance(),
+            store.find("frf", ALL, "result", Everything),
+            store.find("ingest", "default", "records", tuple[Everything, ...]),
+            np.asarray(store.find("frf", ALL, "samples", np.ndarray)).tobytes(),
+        )
+    )
+
+
+def fault(store: Store, good: str) -> str | None:
+    """What is said about a damaged store; None where unused space was hit, which does no harm."""
+    try:
+        assert read_all(store) == good
+    except EmaError as error:
+        return str(error)
+    return None
+
+
+@pytest.mark.parametrize("damaged_bytes", [1, 64, 4096])
+def test_damage_anywhere_in_the_file_is_seen_and_said_in_one_line(tmp_path: Path, damaged_bytes: int) -> None:
+    store = Store(tmp_path)
+    small_stages(store)
+    whole, good = store.path.read_bytes(), read_all(store)
+    rng = np.random.default_rng(damaged_bytes)
+    seen = 0
+    for _ in range(40):
+        at = int(rng.integers(0, len(whole) - damaged_bytes))
+        content = bytearray(whole)
+        content[at : at + damaged_bytes] = rng.bytes(damaged_bytes)
+        store.path.write_bytes(content)
+        error = fault(store, good)
+        assert error is None or "delete it and run again" in error or "run it" in error
+        seen += error is not None
+    assert seen > 20
+
+
+@pytest.mark.parametrize("lure", ["external", "soft", "raw", "virtual"])
+def test_a_store_that_leads_out_of_its_file_is_refused(tmp_path: Path, lure: str) -> None:
+    (tmp_path / "secret").write_bytes(b"x" * 64)
+    with h5py.File(tmp_path / "other.h5", "w") as other:
+        other["secret"] = np.zeros(8)
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key", "{}", 0.1, result=np.zeros(8))
+    with h5py.File(store.path, "r+") as file:
+        group = file["stages/frf/all"]
+        del group["result"]
+        if lure == "external":
+            group["result"] = h5py.ExternalLink(str(tmp_path / "other.h5"), "secret")
+        elif lure == "soft":
+            group["result"] = h5py.SoftLink("/elsewhere")
+        elif lure == "raw":
+            group.create_dataset("result", (8,), "f8", external=[(str(tmp_path / "secret"), 0, 64)])
+        else:
+            layout = h5py.VirtualLayout((8,), "f8")
+            layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "secret", (8,))
+            group.create_virtual_dataset("result", layout)
+    with pytest.raises(EmaError, match="leads out of the file"):
+        store.find("frf", ALL, "result", np.ndarray)
+
+
+def test_a_full_disk_leaves_the_store_as_it_was_and_nothing_else(tmp_path: Path) -> None:
+    small_stages(Store(tmp_path))
+    before = (tmp_path / "ema.h5").read_bytes()
+    # A limit on the size of files fails in the same place as a disk without room, and needs no rights.
+    code = f"""
+import resource, signal, sys
+import numpy as np
+from pathlib import Path
+from ema_pipeline.errors import EmaError
+from ema_pipeline.store import Store
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+store = Store(Path({str(tmp_path)!r}))
+limit = int(sys.argv[1])
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+made = 0
+def arrays():
+    global made
+    for made in range(100):
+        yield np.random.default_rng(made).normal(size=20_000)
+try:
+    with store.lock():
+        store.save("hits", "all", "key", "{{}}", 0.1, result=arrays(), more=np.ones(10))
+except EmaError as error:
+    print(f"{{made}} EmaError: {{error}}")
+"""
+    for limit in (100_000, 300_000, 1_000_000, 2_345_678):
+        done = subprocess.run(
+            [sys.executable, "-c", code, str(limit)], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0
+        assert done.stderr == ""
+        assert "EmaError" in done.stdout
+        assert "cannot be written" in done.stdout
+        assert int(done.stdout.split()[0]) < 50  # making what cannot be written would be lost time
+        assert (tmp_path / "ema.h5").read_bytes() == before
+        assert {p.name for p in tmp_path.iterdir()} == {"ema.h5", ".lock"}
+
+
+def test_an_array_that_states_more_than_is_stored_is_damage(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key", "{}", 0.1, result=np.zeros(8))
+    with h5py.File(store.path, "r+") as file:
+        del file["stages/frf/all/result"]
+        file["stages/frf/all"].create_dataset("result", (1_000_000_000_000,), "f8", chunks=(1024,))
+    with pytest.raises(EmaError, match="states 8000000000000 bytes where 0 are stored"):
+        store.find("frf", ALL, "result", np.ndarray)

@@ -14,14 +14,15 @@ if TYPE_CHECKING:
     from ema_pipeline.stages.base import Run
 
 
-def compare(out: Out) -> None:
+def compare(out: Out, effect_file: EffectFiles = None) -> None:
     """Show where model and measurement part, in units of the measurement's uncertainty."""
     from ema_pipeline.job import run_on
     from ema_pipeline.report import terminal
     from ema_pipeline.stages.results import load_results
 
     with progress(False) as show_stage:
-        run, _ = run_on(out, ["correlate", "ladder"] if _of_loops(out) else ["correlate"], show=show_stage)
+        stages = ["correlate", "ladder"] if _of_loops(out) else ["correlate"]
+        run, _ = run_on(out, stages, show=show_stage, effect_files=effect_file or [])
     run.require_model("compare")
     if run.info.kind == "hysteresis":
         from ema_pipeline.report.loops import comparison_screen
@@ -44,20 +45,18 @@ def diagnose(
     quiet: Quiet = False,
 ) -> None:
     """Say which physical effect the model is missing, how sure that is, and what to measure next."""
-    from ema_pipeline.job import adding, change_effects, run_on, with_effect_files
-    from ema_pipeline.pipeline import existing_run
+    from ema_pipeline.job import adding, change_effects, run_on
     from ema_pipeline.report import terminal
     from ema_pipeline.stages.results import load_results
 
     with progress(quiet) as show_stage:
-        changes = with_effect_files(existing_run(out).effect_files, effect_file or [], set_ or [])
-        run, _ = run_on(out, ["diagnose", "report"], changes, show_stage)
+        run, _ = run_on(out, ["diagnose", "report"], set_ or [], show_stage, effect_file or [])
         run.require_model("diagnose")
         found = load_results(run).diagnosis
         assert found is not None  # the stage has just run
         supported = found.ladder.rungs[-1].effects
         if auto and supported:
-            run = change_effects(out, adding(supported), (), show_stage)
+            run = change_effects(out, adding(supported), (), show_stage, effect_file or [])
     if quiet:
         return
     show(terminal.diagnosis_screen(found, str(out)))
@@ -73,12 +72,10 @@ def add(
     quiet: Quiet = False,
 ) -> None:
     """Add a physical effect to the model, refit, and show the error before and after."""
-    from ema_pipeline.job import adding, change_effects, with_effect_files
-    from ema_pipeline.pipeline import existing_run
+    from ema_pipeline.job import adding, change_effects
 
     with progress(quiet) as show_stage:
-        changes = with_effect_files(existing_run(out).effect_files, effect_file or [], set_ or [])
-        run = change_effects(out, adding(effect), changes, show_stage)
+        run = change_effects(out, adding(effect), set_ or [], show_stage, effect_file or [])
     if not quiet:
         _show_ladder(run)
 
@@ -86,22 +83,23 @@ def add(
 def remove(
     out: Out,
     effect: Annotated[str, typer.Argument(metavar="EFFECT@PLACE", help="An effect that was added.")],
+    effect_file: EffectFiles = None,
     quiet: Quiet = False,
 ) -> None:
     """Take an added effect out of the model again."""
     from ema_pipeline.job import change_effects, removing
 
     with progress(quiet) as show_stage:
-        run = change_effects(out, removing(effect), (), show_stage)
+        run = change_effects(out, removing(effect), (), show_stage, effect_file or [])
     if not quiet:
         _show_ladder(run)
 
 
-def ladder(out: Out) -> None:
+def ladder(out: Out, effect_file: EffectFiles = None) -> None:
     """Show the models so far, each with its error on the data fitted and on data held out."""
     from ema_pipeline.pipeline import existing_run
 
-    _show_ladder(existing_run(out))
+    _show_ladder(existing_run(out, effect_file or []))
 
 
 def _of_loops(out: Path) -> bool:

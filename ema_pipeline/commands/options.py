@@ -16,7 +16,11 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but er
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say more; show where a bug happened.")]
 EffectFiles = Annotated[
     list[str] | None,
-    typer.Option("--effect-file", metavar="FILE.py", help="A file with an effect of your own."),
+    typer.Option(
+        "--effect-file",
+        metavar="FILE.py",
+        help="A file with an effect of your own; its code runs in this call.",
+    ),
 ]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override one setting of the pipeline.")

@@ -7,25 +7,25 @@ from typing import Annotated
 
 import typer
 
-from ema_pipeline.commands.options import EffectFiles, Quiet, Raw
+from ema_pipeline.commands.options import EffectFiles, Overrides, Quiet, Raw
 from ema_pipeline.commands.screen import show
 
 
-def check(raw: Raw) -> None:
+def check(raw: Raw, set_: Overrides = None) -> None:
     """Judge every hit of a raw folder: value, limit and clause of each check."""
     from ema_pipeline.job import check_raw
     from ema_pipeline.report import terminal
 
-    for name, hits in check_raw(raw).items():
+    for name, hits in check_raw(raw, set_ or []).items():
         show(terminal.verdict_table(hits, name))
         show(terminal.hits_table(hits, name))
 
 
-def init(raw: Raw) -> None:
+def init(raw: Raw, set_: Overrides = None) -> None:
     """Draft test.toml from what the record files say."""
-    from ema_pipeline.ingest.draft import write_drafts
+    from ema_pipeline.job import draft_raw
 
-    for path in write_drafts(raw):
+    for path in draft_raw(raw, set_ or []):
         show(f"Wrote {path}; look for the lines marked CHECK, then: ema check {raw}")
 
 

@@ -37,16 +37,23 @@ def run(
     verbose: Verbose = False,
 ) -> None:
     """Go from raw hits to modes and, with a rig, to a fitted model. Unchanged stages are skipped."""
-    from ema_pipeline.job import describe_modes, run_raw, with_effect_files
+    from ema_pipeline.job import describe_modes, run_raw
 
     source = modes or raw
     if source is None or (modes is not None and raw is not None):
         raise typer.BadParameter("give either RAW or --modes FILE")
     folder = out or Path("results") / (source.stem if modes else source.resolve().name)
     with progress(quiet) as show_stage:
-        changes = with_effect_files((), effect_file or [], set_ or [])
-        describe_source = describe_modes if modes else None
-        result, computed = run_raw(source, rig, folder, pipeline, changes, show_stage, describe_source)
+        result, computed = run_raw(
+            source,
+            rig,
+            folder,
+            pipeline,
+            set_ or [],
+            show_stage,
+            describe_modes if modes else None,
+            effect_file or [],
+        )
     if not quiet:
         _show_summary(result)
         if not computed:
@@ -74,6 +81,7 @@ def stage_command(name: str) -> Callable[..., None]:
 
     def command(
         out: Out,
+        effect_file: EffectFiles = None,
         set_: Overrides = None,
         quiet: Quiet = False,
         verbose: Verbose = False,
@@ -81,21 +89,21 @@ def stage_command(name: str) -> Callable[..., None]:
         from ema_pipeline.job import run_on
 
         with progress(quiet) as show_stage:
-            _, computed = run_on(out, [name], set_ or [], show_stage)
+            _, computed = run_on(out, [name], set_ or [], show_stage, effect_file or [])
         if not quiet:
             show(f"Computed: {', '.join(computed)}" if computed else "Nothing had changed.")
 
     return command
 
 
-def levels(out: Out, set_: Overrides = None) -> None:
+def levels(out: Out, effect_file: EffectFiles = None, set_: Overrides = None) -> None:
     """Show what moves with the force of the hits: frequency and damping of every mode by force level."""
     from ema_pipeline.job import run_on
     from ema_pipeline.report import terminal
     from ema_pipeline.stages.results import load_results
 
     with progress(False) as show_stage:
-        run, _ = run_on(out, ["levels", "report"], set_ or [], show_stage)
+        run, _ = run_on(out, ["levels", "report"], set_ or [], show_stage, effect_file or [])
     for found in load_results(run).configurations:
         if found.levels is not None and found.modal is not None:
             show(terminal.levels_tables(found.levels, found.modal, found.name))
@@ -118,11 +126,12 @@ def export(
     to: Annotated[
         Path | None, typer.Option("--to", metavar="FOLDER", help="Folder to write; OUT/export if left out.")
     ] = None,
+    effect_file: EffectFiles = None,
 ) -> None:
     """Write FRFs, modes and shapes as universal file (58, 55) and CSV for other programs."""
     from ema_pipeline.job import export_results
 
-    for path in export_results(out, to or out / "export"):
+    for path in export_results(out, to or out / "export", effect_file or []):
         show(str(path))
 
 

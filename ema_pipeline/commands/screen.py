@@ -6,9 +6,12 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import typer
+
+from ema_pipeline.plain_text import printable
 
 if TYPE_CHECKING:
     from ema_pipeline.pipeline import ShowStage
@@ -16,20 +19,25 @@ if TYPE_CHECKING:
 
 
 def show(what: Any) -> None:
-    """Show text, or what rich can render."""
+    """Show text, or what rich can render; names from files cannot steer the terminal."""
     if isinstance(what, str):
-        typer.echo(what)
+        typer.echo(printable(what))
         return
     from rich.console import Console
+    from rich.segment import Segment, Segments
 
-    Console(highlight=False, soft_wrap=False).print(what)
+    console = Console(highlight=False, soft_wrap=False)
+    # Cleaned only once it is rendered: before, nobody can tell names from the colours that rich puts around them.
+    rendered = [Segment(printable(s.text), s.style, s.control) for s in console.render(what)]
+    console.print(Segments(rendered), end="")
 
 
 def show_json(content: Any) -> None:
-    """Show JSON."""
+    """Show JSON, with every character that could steer a terminal escaped."""
     import json
 
-    typer.echo(json.dumps(content, indent=2, ensure_ascii=False))
+    text = json.dumps(content, indent=2, ensure_ascii=False)
+    typer.echo("".join(c if printable(c) == c else json.dumps(c)[1:-1] for c in text))
 
 
 @contextmanager
@@ -43,7 +51,24 @@ def progress(quiet: bool) -> Iterator[ShowStage | None]:
         from ema_pipeline.report.listings import progress_bars
 
         with progress_bars() as show_stage:
-            yield show_stage
+            yield partial(_cleaned_stage, show_stage)
+
+
+def _shown(text: str) -> str:
+    """Text that rich shows as it stands, square brackets and all."""
+    from rich.markup import escape
+
+    return escape(printable(text))
+
+
+@contextmanager
+def _cleaned_stage(show_stage: ShowStage, label: str) -> Iterator[Progress]:
+    with show_stage(_shown(label)) as bar:
+
+        def tell(done: float, text: str = "") -> None:
+            bar(done, _shown(text))
+
+        yield tell
 
 
 @contextmanager
@@ -54,4 +79,4 @@ def _stage_lines(label: str) -> Iterator[Progress]:
         """Show nothing until the stage is done."""
 
     yield tell
-    typer.echo(f"{label}: {time.perf_counter() - start:.1f} s", err=True)
+    typer.echo(f"{printable(label)}: {time.perf_counter() - start:.1f} s", err=True)

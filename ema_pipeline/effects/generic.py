@@ -15,6 +15,20 @@ def bodies_and_dofs(assembly: Assembly) -> tuple[str, ...]:
     return (*assembly.bodies, *assembly.dofs)
 
 
+_PLANE = ({"x", "y"}, {"zeta", "eta"})
+
+
+def bodies_and_lone_dofs(assembly: Assembly) -> tuple[str, ...]:
+    """Bodies, then single DOFs but for those of a plane: a mass on a body moves with it in both of its directions."""
+    lone = []
+    for dof in assembly.dofs:
+        body, _, direction = dof.rpartition(".")
+        own = {d.rpartition(".")[2] for d in assembly.coordinates(body)}
+        if not any(direction in plane and plane <= own for plane in _PLANE):
+            lone.append(dof)
+    return (*assembly.bodies, *lone)
+
+
 def bodies_pairs_and_dofs(assembly: Assembly) -> tuple[str, ...]:
     """Bodies, pairs of bodies that share a direction, then single DOFs."""
     pairs = (f"{a}-{b}" for a, b in combinations(assembly.bodies, 2) if _shared(assembly, a, b))

@@ -48,7 +48,7 @@ def load_effect_file(path: str | Path) -> Effect:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # whatever a user's file raises is shown as one line
+    except (Exception, SystemExit) as error:  # whatever a user's file raises is shown as one line
         raise EmaError(f"{path}: does not run: {type(error).__name__}: {error}") from None
     effect = getattr(module, "EFFECT", None)
     if not isinstance(effect, Effect):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ema_pipeline.effects.base import Effect, EffectParameter
-from ema_pipeline.effects.generic import bodies_and_dofs, is_place, mass_scale, place_rows
+from ema_pipeline.effects.generic import bodies_and_lone_dofs, is_place, mass_scale, place_rows
 from ema_pipeline.mechanics.assembly import Assembly, Mass
 
 
@@ -18,7 +18,7 @@ EFFECT = Effect(
     id="mass",
     title="mass at a DOF or a body, or an inerter between two",
     parameters=(EffectParameter("mass", "kg", 0.0, 0.05, 0.1, -10.0, 1e3, "added mass"),),
-    find_places=bodies_and_dofs,
+    find_places=bodies_and_lone_dofs,
     edit=_edit,
     signs="frequencies of modes that move it fall",
     other_places=is_place,

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ema_pipeline.correlate.types import Pairing
-from ema_pipeline.errors import EmaError
+from ema_pipeline.files import replace_file, replacing
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.types import ModalModel
 
@@ -83,10 +83,7 @@ def write_table(path: Path | str, rows: Sequence[Mapping[str, object]]) -> None:
     EmaError
         If the file cannot be written.
     """
-    try:
-        Path(path).write_text(csv_text(rows), encoding="utf-8", newline="")
-    except OSError as error:
-        raise _unwritable(path, error) from None
+    replace_file(Path(path), csv_text(rows))
 
 
 def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
@@ -122,9 +119,9 @@ def write_frf_csv(path: Path | str, frfs: FrfSet) -> None:
         if np.any(np.isfinite(frfs.coherence[o, i])):
             names.append(f"{pair} coherence")
             columns.append(frfs.coherence[o, i])
-    try:
+    with replacing(Path(path)) as scratch:
         np.savetxt(
-            path,
+            scratch,
             np.stack(columns, axis=1),
             fmt="%.12g",
             delimiter=",",
@@ -132,9 +129,3 @@ def write_frf_csv(path: Path | str, frfs: FrfSet) -> None:
             comments="",
             encoding="utf-8",
         )
-    except OSError as error:
-        raise _unwritable(path, error) from None
-
-
-def _unwritable(path: Path | str, error: OSError) -> EmaError:
-    return EmaError(f"{path}: cannot be written ({error.strerror}); check folder and permissions")

@@ -18,6 +18,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.exchange.geometry import Geometry
 from ema_pipeline.exchange.nodes import NodeTable, node_table
+from ema_pipeline.files import replacing
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.assurance import real_shape
 from ema_pipeline.modal.types import ModalModel, Mode
@@ -65,14 +66,12 @@ def write_uff(
     if geometry is not None:
         dofs += [Dof(body, "x") for body in geometry.positions_m]
     table = node_table(dofs)
-    try:
-        with Path(path).open("w", encoding="ascii", errors="replace", newline="\n") as file:
-            for line in _lines(frfs, modal, geometry, table):
-                file.write(line + "\n")
-    except OSError as error:
-        raise EmaError(
-            f"{path}: cannot be written ({error.strerror}); check folder and permissions"
-        ) from None
+    with (
+        replacing(Path(path)) as scratch,
+        scratch.open("w", encoding="ascii", errors="replace", newline="\n") as file,
+    ):
+        for line in _lines(frfs, modal, geometry, table):
+            file.write(line + "\n")
     return table
 
 

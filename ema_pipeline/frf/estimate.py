@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -17,8 +17,12 @@ from ema_pipeline.frf.channels import ChannelQuality, merged
 from ema_pipeline.frf.checks import check_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.frf.warp import WarpedTransform
 from ema_pipeline.frf.windows import Windows, decay_rate
 from ema_pipeline.ingest.records import HitSamples
+
+Shifts = Callable[[HitSamples], NDArray[np.float64]]
+"""Relative shift of frequency of a hit at every line, (n_lines,): line k is read at k·(1 + shift)."""
 
 BLOCK = 2
 """Channels transformed at a time: their spectra stay in the processor's cache."""
@@ -39,7 +43,9 @@ STRONG_SHARE = 0.8
 """Least share of lines with enough force up to the band's end; the rest lies in zeros of the spectrum."""
 
 
-def estimate_frfs(hits: Iterable[HitSamples], settings: FrfSettings | None = None) -> FrfSet:
+def estimate_frfs(
+    hits: Iterable[HitSamples], settings: FrfSettings | None = None, shifts: Shifts | None = None
+) -> FrfSet:
     """Estimate FRFs, coherence and variance from hits.
 
     With F the force and Y the response spectra (rectangular window unless set otherwise) and sums over hits,
@@ -62,6 +68,9 @@ def estimate_frfs(hits: Iterable[HitSamples], settings: FrfSettings | None = Non
     hits : iterable of HitSamples
         Accepted hits of one configuration, gone through once, one at a time.
     settings : FrfSettings, optional
+    shifts : callable, optional
+        Gives the shift of frequency of each hit, so that hits whose frequencies have moved are averaged where
+        they belong together.
 
     Returns
     -------
@@ -83,7 +92,7 @@ def estimate_frfs(hits: Iterable[HitSamples], settings: FrfSettings | None = Non
     total = _Total()
     with ThreadPoolExecutor(settings.threads) as pool:
         for hit in hits:
-            _accumulate(total.sheet_of(hit), hit, Windows(hit, settings), pool)
+            _accumulate(total.sheet_of(hit), hit, settings, shifts, pool)
         first = total.first
         if first is None:
             raise EmaError("no accepted hit: there is nothing to estimate FRFs from; see the hits' verdicts")
@@ -189,9 +198,17 @@ class _Total:
             )
 
 
-def _accumulate(sheet: _Sheet, hit: HitSamples, windows: Windows, pool: ThreadPoolExecutor) -> None:
+def _accumulate(
+    sheet: _Sheet, hit: HitSamples, settings: FrfSettings, shifts: Shifts | None, pool: ThreadPoolExecutor
+) -> None:
     """Add one hit to the sums; blocks of channels go to the threads."""
-    spectrum = np.asarray(rfft(windows.force(hit.force)))
+    shift = None if shifts is None else shifts(hit)
+    moved = shift is not None and bool(np.any(shift))
+    windows = Windows(hit, settings, offsets=moved)
+    transform: Callable[[NDArray[np.float64]], NDArray[np.complex128]] = (
+        WarpedTransform(hit.force.size, shift) if shift is not None and moved else rfft
+    )
+    spectrum = np.asarray(transform(windows.force(hit.force)))
     power = spectrum.real**2 + spectrum.imag**2
     if not power[1:].any():
         raise EmaError(f"{hit.hit.file}, hit {hit.hit.number}: the force is constant; leave the hit out")
@@ -202,7 +219,7 @@ def _accumulate(sheet: _Sheet, hit: HitSamples, windows: Windows, pool: ThreadPo
 
     def add(start: int) -> None:
         rows = slice(start, min(start + BLOCK, signs.size))
-        response = np.asarray(rfft(windows.responses(hit.responses[rows]), axis=-1))
+        response = np.ascontiguousarray(transform(windows.responses(hit.responses[rows])))
         product = response * conjugate
         if (signs[rows] < 0).any():
             product *= signs[rows, None]

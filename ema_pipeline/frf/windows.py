@@ -62,15 +62,18 @@ class Windows:
     ----------
     hit : HitSamples
     settings : FrfSettings
+    offsets : bool
+        True where offsets are taken off without a window too: between the lines of a transform they leak.
     """
 
-    def __init__(self, hit: HitSamples, settings: FrfSettings) -> None:
+    def __init__(self, hit: HitSamples, settings: FrfSettings, *, offsets: bool = False) -> None:
         n = hit.force.size
         decay = decay_rate(settings, n / hit.sample_rate_hz)
         self._decay = np.exp(-decay * np.arange(n) / hit.sample_rate_hz) if decay > 0 else None
         peak = hit.hit.peak - hit.hit.start
         self._shape = force_window(hit.force, peak) if settings.force_window == "auto" else None
-        self.active = self._decay is not None or self._shape is not None
+        self.active = self._decay is not None or self._shape is not None or offsets
+        self._offsets = offsets
         self._rest = find_pulse(hit.force, peak).start if self.active else 0
 
     def force(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -85,7 +88,7 @@ class Windows:
     def responses(self, block: NDArray[np.float64]) -> NDArray[np.float64]:
         """The windowed responses (n_channels, n_samples); the block itself without an exponential window."""
         if self._decay is None:
-            return block
+            return block - self._offset(block) if self._offsets else block
         return np.asarray((block - self._offset(block)) * self._decay)
 
     def _offset(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:

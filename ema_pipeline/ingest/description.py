@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tomllib
+import os
 from collections import Counter
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -13,12 +13,19 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.files import check_regular, read_bounded
 from ema_pipeline.ingest.records import CALIBRATION_STD, TRANSVERSE
+from ema_pipeline.names import check_name
+from ema_pipeline.plain_text import has_control_characters
 from ema_pipeline.settings import Settings, parse
+from ema_pipeline.toml_text import LARGEST_BYTES, read_toml
 from ema_pipeline.units import SI_SYMBOL, Unit, parse_unit
 
 DESCRIPTION_FILE = "test.toml"
 RIG_FILE = "rig.toml"
+
+_LONGEST_TEXT = 1000
+"""Characters of a title or name."""
 
 Quantity = Literal["force", "acceleration", "velocity", "displacement"]
 
@@ -227,25 +234,28 @@ def read_description(folder: Path) -> TestDescription:
         files that are not there.
     """
     path = folder / DESCRIPTION_FILE
-    keys = parse(_TestFile, _read_toml(path), path)
+    keys = parse(_TestFile, read_toml(path), path)
     test = TestDescription.model_construct(folder=folder, **dict(keys))
+    _check_texts(test)
     _check_channels(test)
     _check_records(test)
     return test
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise EmaError(f"{path}: cannot be read ({error.strerror})") from None
-    try:
-        return tomllib.loads(data.decode("utf-8-sig"))
-    except UnicodeDecodeError as error:
-        line = data[: error.start].count(b"\n") + 1
-        raise EmaError(f"{path}: line {line} is not UTF-8 text; save the file as UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise EmaError(f"{path}: not valid TOML: {error}") from None
+def _check_texts(test: TestDescription) -> None:
+    """Texts end up on screens and in reports, names in file names too."""
+    if test.configuration is not None:
+        check_name(test.configuration, f"{test.file}: configuration")
+    texts = {"title": test.title, "rig": test.rig or ""}
+    texts |= {f"name of channel {i + 1}": c.name for i, c in enumerate(test.channels)}
+    texts |= {f"file of record {i + 1}": r.file for i, r in enumerate(test.records)}
+    for what, text in texts.items():
+        if has_control_characters(text):
+            raise EmaError(f"{test.file}: {what} '{text[:40]}' holds control characters; remove them")
+        if len(text) > _LONGEST_TEXT:
+            raise EmaError(
+                f"{test.file}: {what} has {len(text)} characters, at most {_LONGEST_TEXT}; shorten it"
+            )
 
 
 def _check_channels(test: TestDescription) -> None:
@@ -323,7 +333,7 @@ def _check_file(test: TestDescription, record: RecordDescription, where: str) ->
     if relative.is_absolute() or ".." in relative.parts:
         raise EmaError(f"{where}: lies outside {test.folder}; copy it there and name it without '..'")
     path = test.path_of(record)
-    if not path.exists():
+    if not os.path.exists(path):  # False for names that no file can have, where Path.exists raises
         try:
             others = [p.name for p in path.parent.iterdir() if p.is_file() and p.name != DESCRIPTION_FILE]
         except OSError:
@@ -331,8 +341,10 @@ def _check_file(test: TestDescription, record: RecordDescription, where: str) ->
         close = get_close_matches(path.name, others, n=1, cutoff=0.6)
         hint = f" (did you mean '{close[0]}'?)" if close else ""
         raise EmaError(f"{where}: there is no such file{hint}; correct 'file' or remove the record")
-    if not path.is_file():
-        raise EmaError(f"{where}: is a folder, not a file; name one record file")
+    try:
+        check_regular(path)
+    except EmaError as error:
+        raise EmaError(f"{where}: {error}") from None
 
 
 def _check_hammer(test: TestDescription, record: RecordDescription, where: str) -> None:
@@ -383,6 +395,6 @@ def _find_rig_file(raw: Path, folders: list[Path]) -> Path | None:
         return raw / RIG_FILE
     found = [folder / RIG_FILE for folder in folders if (folder / RIG_FILE).is_file()]
     for other in found[1:]:
-        if other.read_bytes() != found[0].read_bytes():
+        if read_bounded(other, LARGEST_BYTES) != read_bounded(found[0], LARGEST_BYTES):
             raise EmaError(f"{found[0]} and {other} differ; put one rig.toml into {raw}")
     return found[0] if found else None

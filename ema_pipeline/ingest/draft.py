@@ -12,10 +12,13 @@ from pathlib import Path
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
+from ema_pipeline.files import replace_file
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers import read_raw, reader_of
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord
 from ema_pipeline.ingest.swap import is_pulse
+from ema_pipeline.plain_text import printable
 from ema_pipeline.units import SI_SYMBOL, Unit, find_unit
 
 _HAMMER_NAME = re.compile(r"hammer|hmr|impact|impuls|force|kraft|(^|[^a-z])ham([^a-z]|$)", re.IGNORECASE)
@@ -45,8 +48,14 @@ class _Found:
     raw: RawRecord
 
 
-def write_drafts(raw: Path) -> list[Path]:
+def write_drafts(raw: Path, limits: ReadLimits | None = None) -> list[Path]:
     """Write a drafted ``test.toml`` into `raw`, or into each of its sub-folders that holds record files.
+
+    Parameters
+    ----------
+    raw : Path
+    limits : ReadLimits, optional
+        How large a record file may be.
 
     Returns
     -------
@@ -74,18 +83,13 @@ def write_drafts(raw: Path) -> list[Path]:
         raise EmaError(
             f"{folders[0] / DESCRIPTION_FILE}: exists already and is kept; rename it to draft anew"
         )
-    drafts = {folder / DESCRIPTION_FILE: draft_description(folder) for folder in missing}
+    drafts = {folder / DESCRIPTION_FILE: draft_description(folder, limits) for folder in missing}
     for path, text in drafts.items():
-        try:
-            path.write_text(text, encoding="utf-8")
-        except OSError as error:
-            raise EmaError(
-                f"{path}: cannot be written ({error.strerror}); check the folder's rights"
-            ) from None
+        replace_file(path, text)
     return list(drafts)
 
 
-def draft_description(raw: Path) -> str:
+def draft_description(raw: Path, limits: ReadLimits | None = None) -> str:
     """Draft the text of ``test.toml`` for the record files that lie in folder `raw`.
 
     Channels, units and sample rate come from the files; the hammer is known by its name, its unit or its
@@ -99,7 +103,7 @@ def draft_description(raw: Path) -> str:
     """
     if (raw / DESCRIPTION_FILE).exists():
         raise EmaError(f"{raw / DESCRIPTION_FILE}: exists already and is kept; rename it to draft anew")
-    found, problems = _read_all(raw)
+    found, problems = _read_all(raw, limits)
     if not found:
         reason = f"; {problems[0]}" if problems else ""
         raise EmaError(f"{raw}: no record file that can be read{reason}")
@@ -136,11 +140,11 @@ def _candidates(folder: Path) -> list[Path]:
     ]
 
 
-def _read_all(folder: Path) -> tuple[list[_Found], list[str]]:
+def _read_all(folder: Path, limits: ReadLimits | None) -> tuple[list[_Found], list[str]]:
     found, problems = [], []
     for path in _candidates(folder):
         try:
-            found.append(_Found(path.name, read_raw(path)))
+            found.append(_Found(path.name, read_raw(path, limits)))
         except EmaError as error:
             problems.append(str(error))
     return found, problems
@@ -280,7 +284,7 @@ def _body(name: str) -> str:
 def _presence_comment(name: str, found: list[_Found]) -> list[str]:
     lacking = [f.file for f in found if name not in f.raw.channels]
     return (
-        [f"# CHECK: not in {', '.join(lacking[:3])}{' and others' if len(lacking) > 3 else ''}"]
+        [f"# CHECK: not in {', '.join(map(_quoted, lacking[:3]))}{' and others' if len(lacking) > 3 else ''}"]
         if lacking
         else []
     )
@@ -336,4 +340,4 @@ def _blow_key(stem: str) -> str:
 
 def _quoted(text: str) -> str:
     """A TOML basic string; JSON escapes the same characters in the same way."""
-    return json.dumps(text, ensure_ascii=False)
+    return json.dumps(printable(text), ensure_ascii=False)

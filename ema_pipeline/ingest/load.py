@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.ingest.description import ChannelDescription, RecordDescription, TestDescription
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers import read_raw
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord, Samples, split_unit
 from ema_pipeline.ingest.records import Record, ResponseChannel
@@ -19,6 +20,15 @@ from ema_pipeline.units import Unit, find_unit
 
 MINIMUM_SAMPLES = 64
 """A shorter record holds no hit with a spectrum worth the name."""
+
+LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 1e-3, 1e9
+"""From one sample in a quarter of an hour, slower than any structure, to the fastest converters."""
+
+LARGEST_VOLTAGE = 1000.0
+"""V; inputs for vibration sensors take 10 V, the largest of measuring systems some hundred."""
+
+LARGEST_VALUE = 1e15
+"""SI units; far beyond every force and motion, and its square is still far from the largest number."""
 
 RATE_TOLERANCE = 1e-4
 """Relative difference up to which two statements of a sample rate mean the same."""
@@ -65,8 +75,14 @@ class _ScaledRows(Rows):
         return self._sources[row].scaled(start, stop)
 
 
-def load_records(test: TestDescription) -> Iterator[Record]:
+def load_records(test: TestDescription, limits: ReadLimits | None = None) -> Iterator[Record]:
     """Load the records of a hammer test one after the other.
+
+    Parameters
+    ----------
+    test : TestDescription
+    limits : ReadLimits, optional
+        How large a record file may be.
 
     Raises
     ------
@@ -75,7 +91,7 @@ def load_records(test: TestDescription) -> Iterator[Record]:
     """
     first: Record | None = None
     for entry in test.records:
-        record = load_record(test, entry)
+        record = load_record(test, entry, limits)
         if first is None:
             first = record
         elif abs(record.sample_rate_hz / first.sample_rate_hz - 1) > RATE_TOLERANCE:
@@ -86,7 +102,7 @@ def load_records(test: TestDescription) -> Iterator[Record]:
         yield record
 
 
-def load_record(test: TestDescription, entry: RecordDescription) -> Record:
+def load_record(test: TestDescription, entry: RecordDescription, limits: ReadLimits | None = None) -> Record:
     """Load one record of a hammer test and scale it to SI.
 
     Parameters
@@ -95,6 +111,8 @@ def load_record(test: TestDescription, entry: RecordDescription) -> Record:
         The description that `entry` belongs to.
     entry : RecordDescription
         Which record.
+    limits : ReadLimits, optional
+        How large its file may be.
 
     Returns
     -------
@@ -110,7 +128,7 @@ def load_record(test: TestDescription, entry: RecordDescription) -> Record:
     """
     if entry.impact is None:
         raise EmaError(f"{test.file}: record '{entry.file}' has no impact: it is no hammer record")
-    rate, sources = _open(test, entry)
+    rate, sources = _open(test, entry, limits)
     hammer, responses = sources[test.force.name], {c.name: sources[c.name] for c in test.responses}
     force = hammer.scaled()
     swap = find_swap(force, {name: source.samples for name, source in responses.items()})
@@ -152,7 +170,9 @@ def load_record(test: TestDescription, entry: RecordDescription) -> Record:
     )
 
 
-def load_channels(test: TestDescription, entry: RecordDescription) -> ScaledChannels:
+def load_channels(
+    test: TestDescription, entry: RecordDescription, limits: ReadLimits | None = None
+) -> ScaledChannels:
     """Load the described channels of one record of any kind of test and scale them to SI.
 
     Raises
@@ -160,7 +180,7 @@ def load_channels(test: TestDescription, entry: RecordDescription) -> ScaledChan
     EmaError
         As `load_record`, but for what is special to hammer tests.
     """
-    rate, sources = _open(test, entry)
+    rate, sources = _open(test, entry, limits)
     return ScaledChannels(
         rate,
         {name: source.scaled() for name, source in sources.items()},
@@ -168,10 +188,12 @@ def load_channels(test: TestDescription, entry: RecordDescription) -> ScaledChan
     )
 
 
-def _open(test: TestDescription, entry: RecordDescription) -> tuple[float, dict[str, _Source]]:
+def _open(
+    test: TestDescription, entry: RecordDescription, limits: ReadLimits | None
+) -> tuple[float, dict[str, _Source]]:
     """Sample rate and described channels of a record file, checked."""
     path = test.path_of(entry)
-    raw = read_raw(path)
+    raw = read_raw(path, limits)
     rate = _sample_rate(test, raw, str(path))
     found = {c.name: _find_channel(c.name, raw, str(path)) for c in test.channels}
     _check_lengths(found, str(path))
@@ -179,8 +201,11 @@ def _open(test: TestDescription, entry: RecordDescription) -> tuple[float, dict[
     for channel in test.channels:
         where = f"{path}: channel '{channel.name}'"
         source = found[channel.name]
-        _check_finite(np.asarray(source.samples), rate, where)
-        sources[channel.name] = _Source(source.samples, _factor(channel, source, where), _full_scale(channel))
+        samples = np.asarray(source.samples)
+        factor, in_volts = _factor(channel, source, where), _in_volts(channel, source)
+        _check_finite(samples, rate, where)
+        _check_believable(samples, rate, factor, in_volts, where)
+        sources[channel.name] = _Source(source.samples, factor, _full_scale(channel))
     return rate, sources
 
 
@@ -194,7 +219,13 @@ def _sample_rate(test: TestDescription, raw: RawRecord, where: str) -> float:
             f"{where}: sample rate is {found:.10g} Hz in the file but {stated:.10g} Hz in {test.file}; "
             "correct sample_rate_hz or remove it"
         )
-    return float(stated if stated is not None else found or 0.0)
+    rate = float(stated if stated is not None else found or 0.0)
+    if not LOWEST_RATE_HZ <= rate <= HIGHEST_RATE_HZ:
+        source = "the file" if stated is None else str(test.file)
+        raise EmaError(
+            f"{where}: no recorder has a sample rate of {rate:.4g} Hz, as {source} states; correct it"
+        )
+    return rate
 
 
 def _find_channel(name: str, raw: RawRecord, where: str) -> RawChannel:
@@ -236,6 +267,32 @@ def _check_finite(samples: NDArray[np.float64], rate: float, where: str) -> None
             f"{where}: {samples[at]} at sample {at} ({at / rate:.4g} s), {count} such in all; "
             "export the record again or leave it out"
         )
+
+
+def _check_believable(
+    samples: NDArray[np.float64], rate: float, factor: float, in_volts: float | None, where: str
+) -> None:
+    """Refuse values that no converter can have recorded; a single one would drown all others."""
+    at = int(np.argmax(np.abs(samples)))
+    largest = abs(float(samples[at]))
+    if in_volts is not None and largest * in_volts > LARGEST_VOLTAGE:
+        raise EmaError(
+            f"{where}: {samples[at] * in_volts:.4g} V at sample {at} ({at / rate:.4g} s) is more than any "
+            f"converter takes ({LARGEST_VOLTAGE:g} V); export the record again or leave it out"
+        )
+    if largest > LARGEST_VALUE / max(abs(factor), np.finfo(float).tiny):
+        raise EmaError(
+            f"{where}: {samples[at]:.4g} at sample {at} ({at / rate:.4g} s) is beyond all measurement once scaled "
+            f"(factor {factor:.4g}); correct unit and sensitivity_mv, or export the record again"
+        )
+
+
+def _in_volts(channel: ChannelDescription, source: RawChannel) -> float | None:
+    """Volts of one number of the file; None where it is no voltage, or one in name only (uncalibrated)."""
+    if source.unit == FULL_SCALE or channel.sensitivity_mv is None:
+        return None
+    stated = find_unit(source.unit) if source.unit is not None else None
+    return 1.0 if stated is None else stated.scale
 
 
 def _factor(channel: ChannelDescription, source: RawChannel, where: str) -> float:

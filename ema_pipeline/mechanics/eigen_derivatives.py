@@ -47,16 +47,38 @@ class EigenSolution:
         mass, damping, stiffness, structural = dense
         if not np.all(np.isfinite(dense)):
             return None
-        try:
-            values, shapes = scipy.linalg.eigh(stiffness, mass, check_finite=False)
-        except (np.linalg.LinAlgError, ValueError):
+        solved = _solved(stiffness, mass)
+        if solved is None:
             return None
+        values, shapes = solved
         values = np.maximum(values, 1.0)  # rigid bodies, and trial stiffnesses below zero: far under any band
         omega = np.sqrt(values)
-        viscous = np.einsum("ir,ij,jr->r", shapes, damping, shapes)
-        loss = np.einsum("ir,ij,jr->r", shapes, structural, shapes)
-        ratio = damping_ratio + viscous / (2 * omega) + loss / (2 * values)
+        ratio = np.full(len(values), damping_ratio)
+        if np.any(damping):
+            ratio += np.sum(shapes * (damping @ shapes), axis=0) / (2 * omega)
+        if np.any(structural):
+            ratio += np.sum(shapes * (structural @ shapes), axis=0) / (2 * values)
         return cls(values, shapes, omega / (2 * np.pi), np.maximum(ratio, _LEAST_DAMPING_RATIO))
+
+
+def _solved(
+    stiffness: NDArray[np.float64], mass: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Eigenvalues and mass-normalised shapes; None where the mass is not positive."""
+    diagonal = np.diag(mass)
+    if np.any(diagonal <= 0):
+        return None
+    try:
+        if np.count_nonzero(mass) == len(diagonal):
+            root = np.sqrt(diagonal)
+            values, vectors = np.linalg.eigh(stiffness / root / root[:, None])
+            return values, vectors / root[:, None]
+        found: tuple[NDArray[np.float64], NDArray[np.float64]] = scipy.linalg.eigh(
+            stiffness, mass, check_finite=False
+        )
+        return found
+    except (np.linalg.LinAlgError, ValueError):
+        return None
 
 
 @dataclass(frozen=True)
@@ -101,7 +123,7 @@ class ModeDerivatives:
         own = stiffness[:, modes, here] - values * mass[:, modes, here]
         weight[:, modes, here] = -0.5 * mass[:, modes, here]
         log_frequency = own / (2 * values)
-        shapes = np.einsum("is,jsr->irj", solution.shapes, weight)
+        shapes = (solution.shapes @ weight).transpose(1, 2, 0)
         ratio = _damping(matrices, solution, modes, log_frequency, weight)
         if has_ratio:
             at = matrices.terms.log.shape[1]
@@ -115,15 +137,18 @@ def _forms(
     matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64], kind: int
 ) -> NDArray[np.float64]:
     """φ_sᵀ(∂A/∂x_j)φ_r of one kind of matrix, (n_unknowns, n, m)."""
-    terms = matrices.terms
-    on = terms.matrix == kind
-    along = terms.rows[on] @ solution.shapes
-    weighted = matrices.coefficient[on, None] * along[:, modes]
-    products = along[:, :, None] * weighted[:, None, :]
-    by_log = np.tensordot(terms.log[on], products, axes=(0, 0))
-    phi = solution.shapes
-    by_shape = phi.T @ (matrices.by_shape[:, kind] @ phi[:, modes]) if len(matrices.by_shape) else by_log[:0]
-    return np.concatenate([by_log, by_shape])
+    terms, phi = matrices.terms, solution.shapes
+    logs, m, n = terms.log.shape[1], len(modes), phi.shape[1]
+    forms = np.zeros((logs + len(matrices.by_shape), n, m))
+    if kind in terms.by_kind:
+        on, rows = terms.by_kind[kind]
+        along = rows @ phi
+        weighted = matrices.coefficient[on, None] * along[:, modes]
+        products = (along[:, :, None] * weighted[:, None, :]).reshape(len(on), n * m)
+        forms[:logs] = (terms.log[on].T @ products).reshape(logs, n, m)
+    if len(matrices.by_shape):
+        forms[logs:] = phi.T @ (matrices.by_shape[:, kind] @ phi[:, modes])
+    return forms
 
 
 def _damping(

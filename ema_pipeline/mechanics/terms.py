@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -57,11 +58,19 @@ class Terms:
         """M, C without its skew part, K and the structural part, (4, n, n)."""
         n = len(self.dofs)
         result = np.zeros((4, n, n))
-        for k in range(4):
-            on = self.matrix == k
-            v = self.rows[on]
-            result[k] = (v * coefficient[on, None]).T @ v
+        for kind, (on, v) in self.by_kind.items():
+            result[kind] = v.T @ (coefficient[on, None] * v)
         return result
+
+    @cached_property
+    def by_kind(self) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+        """Positions and rows of the terms of each kind of matrix that has any."""
+        found = {}
+        for kind in range(4):
+            on = np.flatnonzero(self.matrix == kind)
+            if len(on):
+                found[kind] = (on, self.rows[on])
+        return found
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from ema_pipeline.modal.assurance import mac, mpc
 from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.earned import unearned
 from ema_pipeline.modal.fit import Estimate, LinearSolution, newton_step, synthesis
 from ema_pipeline.modal.missed import left_over
 from ema_pipeline.modal.noise import Noise
+from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
 from ema_pipeline.modal.segment import SegmentFit, impossible
 from ema_pipeline.modal.uncertainty import evidence
 from ema_pipeline.modal.windowed import likeness
@@ -81,7 +83,9 @@ def significant(data: FitData, fit: SegmentFit) -> NDArray[np.bool_]:
     return out if out.any() else _next(_strength_over_noise(data, fit))
 
 
-def credible(data: FitData, fit: SegmentFit, hits: Noise | None, votes: Votes) -> NDArray[np.bool_]:
+def credible(
+    data: FitData, fit: SegmentFit, hits: Noise | None, votes: Votes, peaks: KnownPeaks = NO_PEAKS
+) -> NDArray[np.bool_]:
     """Candidates to drop from a converged fit: impossible ones, else doubles, else the least credible.
 
     Parameters
@@ -91,9 +95,11 @@ def credible(data: FitData, fit: SegmentFit, hits: Noise | None, votes: Votes) -
     hits : Noise or None
         Noise from the scatter over hits, where known.
     votes : callable
+    peaks : KnownPeaks
+        Peaks of which single hits show that one mode is there.
     """
     estimate, solution = fit.estimate, fit.solution
-    out = impossible(data, estimate)
+    out = impossible(data, estimate) | peaks.echoes(estimate)
     if out.any():
         return out
     explained = np.zeros(len(out), dtype=bool)
@@ -113,6 +119,9 @@ def credible(data: FitData, fit: SegmentFit, hits: Noise | None, votes: Votes) -
     support = np.where(explained, np.maximum(support, 1.0), support)
     # where the polish finds no place for a mode, it is one only if most orders and the FRFs show it plainly
     support = np.where(fit.held, np.minimum(plain, share / SURE_VOTES), support)
+    weight = fit.noise.weight(data.measured)
+    support = np.where(unearned(data, weight, estimate, solution, share, explained), 0.0, support)
+    support = np.where(peaks.owners(estimate), np.maximum(support, 1.0), support)
     return _next(np.minimum(_strength_over_noise(data, fit), support))
 
 

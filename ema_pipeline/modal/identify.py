@@ -12,6 +12,7 @@ from ema_pipeline.modal.assurance import mpc
 from ema_pipeline.modal.bands import SubBand, indicator, split
 from ema_pipeline.modal.compress import Window
 from ema_pipeline.modal.data import FitData, analysis_band, arrange
+from ema_pipeline.modal.drift.plain import plain_peaks
 from ema_pipeline.modal.engines import poles_of_all_orders
 from ema_pipeline.modal.fit import (
     Estimate,
@@ -19,6 +20,7 @@ from ema_pipeline.modal.fit import (
     synthesis,
 )
 from ema_pipeline.modal.noise import Noise, fit_law, flat_law, second_difference_power
+from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, seeded
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.scaling import scale_shapes, scaling_note
 from ema_pipeline.modal.selection import link, votes
@@ -46,10 +48,17 @@ RINGS_ON = 0.05
 """Share of a mode that may be left at the end of the record: three time constants have passed."""
 
 UNPOLISHED = "polish failed: pole as the model orders give it, with a wider uncertainty"
+AT_PEAK = "pole as its peak alone shows it: a fit with the other modes loses it"
+ANCHORED = "pole as single hits show it: a fit of all hits together leaves the peak"
 RESTLESS = "polish has not come to rest: what is left to go is in the uncertainty"
 
 
-def identify(frfs: FrfSet, settings: ModalSettings, progress: Progress | None = None) -> ModalModel:
+def identify(
+    frfs: FrfSet,
+    settings: ModalSettings,
+    progress: Progress | None = None,
+    peaks: KnownPeaks = NO_PEAKS,
+) -> ModalModel:
     """Identify the modes that the FRFs show, with uncertainties.
 
     Parameters
@@ -58,6 +67,8 @@ def identify(frfs: FrfSet, settings: ModalSettings, progress: Progress | None = 
     settings : ModalSettings
     progress : callable, optional
         Called with the share done, 0…1, and a few words.
+    peaks : KnownPeaks, optional
+        Peaks of which single hits show that one mode is there.
 
     Returns
     -------
@@ -71,10 +82,10 @@ def identify(frfs: FrfSet, settings: ModalSettings, progress: Progress | None = 
     """
     tell = progress or (lambda share, text: None)
     with single_blas_thread():
-        return _identify(frfs, settings, tell)
+        return _identify(frfs, settings, tell, peaks)
 
 
-def _identify(frfs: FrfSet, settings: ModalSettings, tell: Progress) -> ModalModel:
+def _identify(frfs: FrfSet, settings: ModalSettings, tell: Progress, peaks: KnownPeaks) -> ModalModel:
     band = analysis_band(frfs, settings)
     data = arrange(frfs, band)
     window, level = _first_noise(data)
@@ -86,19 +97,20 @@ def _identify(frfs: FrfSet, settings: ModalSettings, tell: Progress) -> ModalMod
         tell(0.1 + 0.3 * k / len(bands), f"poles of sub-band {k + 1} of {len(bands)}")
         charts.append(_chart_of(window.lines(part.first, part.stop), part, settings))
     found = candidates(charts, bands, data.measured.shape[1])
-    sure = found.sure
+    sure, weak = seeded(found.sure, found.weak, peaks, data)
     if len(bands) > 1:
         tell(0.4, f"first fit of {len(sure.poles)} candidates")
         sure = first_guess(window, bands, sure, iterations)
-    tell(0.6, f"refining {len(sure.poles)} modes, trying {len(found.weak.poles)} more")
+    tell(0.6, f"refining {len(sure.poles)} modes, trying {len(weak.poles)} more")
 
     def search(window: FitData, known: Noise) -> Estimate:
         return tracked(poles_of_all_orders(window, known.variance, 2, settings))
 
-    modes = refined(window, bands, charts, sure, found.weak, search, iterations)
+    plain = plain_peaks(frfs, band)
+    modes = refined(window, bands, charts, sure, weak, search, iterations, peaks, plain)
     tell(0.9, "shapes and synthesis")
     cores = [chart.take(between(chart.pole, b.low, b.high)) for chart, b in zip(charts, bands, strict=True)]
-    return _model(frfs, settings, band, window, modes, cores)
+    return _model(frfs, settings, band, window, modes, cores, peaks, plain)
 
 
 def _first_noise(data: FitData) -> tuple[Window, Real]:
@@ -121,8 +133,15 @@ def _model(
     window: Window,
     modes: FittedModes,
     charts: list[PoleSet],
+    peaks: KnownPeaks,
+    plain: KnownPeaks,
 ) -> ModalModel:
     data = window.data
+    estimate = Estimate(modes.poles, modes.participation)
+    anchored = modes.held & np.isin(modes.poles, peaks.poles)
+    at_peak = modes.held & np.isin(modes.poles, plain.poles)
+    pole_cov = np.where(anchored[:, None, None], _scatter_at(peaks, modes.poles), modes.pole_cov)
+    pole_cov = np.where(at_peak[:, None, None], _scatter_at(plain, modes.poles), pole_cov)
     order = np.argsort(np.abs(modes.poles))
     rows, references = frfs.outputs, frfs.inputs
     if data.transposed:
@@ -144,7 +163,7 @@ def _model(
     result = tuple(
         _mode(
             complex(physical[j]),
-            modes.pole_cov[j],
+            pole_cov[j],
             scaled.shapes[k],
             scaled.stds[k],
             settings.engine,
@@ -152,7 +171,7 @@ def _model(
             float(scaled.scale_std[k]),
             [
                 *_record_flags(float(np.exp(modes.poles[j].real * data.rest_s))),
-                *([UNPOLISHED] if modes.held[j] else []),
+                *_held_flags(modes.held[j], anchored[j], at_peak[j]),
                 *([RESTLESS] if settings.polish and modes.restless[j] and not modes.held[j] else []),
             ],
         )
@@ -170,8 +189,17 @@ def _model(
         outputs=frfs.outputs,
         inputs=frfs.inputs,
         chart=chart,
-        notes=_notes(data, note),
+        notes=(*_notes(data, note), *_peaks_without_mode(plain.absent(estimate), frfs.response_decay_rad_s)),
     )
+
+
+def _scatter_at(peaks: KnownPeaks, poles: Complex) -> Real:
+    """Covariance of (Re s, Im s) over hits of the peak nearest to each pole, (n_modes, 2, 2)."""
+    out = np.zeros((len(poles), 2, 2))
+    if len(peaks.poles):
+        nearest = np.argmin(np.abs(poles[:, None] - peaks.poles[None]), axis=1)
+        out[:, [0, 1], [0, 1]] = peaks.std[nearest] ** 2
+    return out
 
 
 def _mode(
@@ -205,6 +233,15 @@ def _mode(
         stability=stability,
         flags=tuple(flags),
     )
+
+
+def _held_flags(held: bool, anchored: bool, at_peak: bool) -> list[str]:
+    """Why a pole is not where the fit of all FRFs would have it."""
+    if anchored:
+        return [ANCHORED]
+    if at_peak:
+        return [AT_PEAK]
+    return [UNPOLISHED] if held else []
 
 
 def _record_flags(left: float) -> list[str]:
@@ -248,6 +285,15 @@ def _synthesis(window: Window, modes: FittedModes) -> Complex:
         fitted += residual_fit(some, noise.weight(some.measured), fitted)
         total[rows] = np.where(some.measured[..., None], fitted, np.nan)
     return np.asarray(total.swapaxes(0, 1) if data.transposed else total)
+
+
+def _peaks_without_mode(absent: KnownPeaks, decay: float) -> list[str]:
+    """A sentence on each plain peak that no mode makes."""
+    return [
+        f"a plain peak at {abs(p + decay) / (2 * np.pi):.5g} Hz has no mode: with the other modes in the fit, the FRFs "
+        "do not need it; look at it in the FRFs"
+        for p in absent.poles
+    ]
 
 
 def _chart_of(window: Window, part: SubBand, settings: ModalSettings) -> PoleSet:

@@ -18,6 +18,7 @@ from ema_pipeline.modal.fit import (
     synthesis,
 )
 from ema_pipeline.modal.noise import Noise, fit_noise, larger
+from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
 from ema_pipeline.modal.polish import polish
 
 Real = NDArray[np.float64]
@@ -64,6 +65,8 @@ def fit_segment(
     judge: Judge,
     iterations: int,
     evident: Evident | None = None,
+    peaks: KnownPeaks = NO_PEAKS,
+    placed: NDArray[np.bool_] | None = None,
 ) -> SegmentFit:
     """Polish the candidates of a sub-band until the judge drops none.
 
@@ -83,15 +86,25 @@ def fit_segment(
         Of the polish; 0 keeps the engine's poles.
     evident : callable, optional
         Tells which modes are beyond doubt, whatever the polish makes of them; none where left out.
+    peaks : KnownPeaks, optional
+        Peaks whose modes are held there where the polish would drive them away.
+    placed : ndarray of bool, (n_candidates,), optional
+        Candidates that are held where they are from the start.
     """
     estimate = Estimate(candidates.poles, normalised(candidates.participation))
     noise = start
-    held = np.zeros(len(estimate.poles), dtype=bool)
+    held = np.zeros(len(estimate.poles), dtype=bool) if placed is None else placed
     budget = min(iterations, ROUGH)
     while True:
         weight = noise.weight(data.measured)
         before = estimate
         estimate, solution = polish(data, weight, before, budget, held)
+        strayed, places = peaks.strayed(before, estimate)
+        if (strayed & ~held).any():
+            strayed &= ~held
+            before = Estimate(np.where(strayed, places, before.poles), before.participation)
+            estimate, held = _put_back(estimate, before, strayed), held | strayed
+            continue
         lost = impossible(data, estimate) & ~impossible(data, before)
         if evident is not None and lost.any():
             back = _put_back(estimate, before, lost)

@@ -138,7 +138,7 @@ class AmplitudeProblem:
         names = [n for n in self.sizes if n.rpartition(".")[0] in self._nonlinear]
         return tuple(self.unknowns.index[n] for n in names)
 
-    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64]:
+    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
         """`x` with the sizes of the effect added last at the best of a grid, where it depends on the amplitude.
 
         From far off there is often no slope that leads to the right size: teeth that never part, friction that locks,
@@ -146,7 +146,7 @@ class AmplitudeProblem:
         """
         names = [n for n in self.sizes if self._nonlinear and n.rpartition(".")[0] == self._nonlinear[-1]]
         if not names or not self.observations.hits:
-            return x
+            return None
         at = [self.unknowns.index[n] for n in names]
         grids = [_grid(self.sizes[n], _ALONG if i == 0 else _ACROSS) for i, n in enumerate(names)]
         matching = self.residuals(x, scatters, derivatives=False).matching

@@ -16,13 +16,23 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.correlate.settings import UncertaintySettings
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
+from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
+from ema_pipeline.ingest.records import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
 from ema_pipeline.mechanics.terms import Matrices
-from ema_pipeline.observations.parts import PART_SCATTER, STIFFNESS_SCATTER, Dependence, dependence
+from ema_pipeline.observations.parts import (
+    MASS_SCATTER,
+    MASS_STD,
+    PART_SCATTER,
+    STIFFNESS_STD,
+    Dependence,
+    dependence,
+)
 from ema_pipeline.observations.rig_model import RigModel, SizeMap
 from ema_pipeline.rigs.types import Rig
 
@@ -30,9 +40,6 @@ CALIBRATION = "calibration"
 DAMPING_SCATTER = "damping_scatter"
 FREQUENCY = "frequency_scatter"
 SHAPE = "shape_scatter"
-
-CALIBRATION_STD = 0.02
-TRANSVERSE_STD = 0.03
 
 UNEXPLAINED = 12.0
 """Cost, in the log posterior, of a measured mode without a model mode."""
@@ -42,7 +49,7 @@ UNSEEN = 3.0
 _SHAPE_REACH = 0.3
 """Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
 _FREQUENCY_REACH = 0.1
-"""Difference of ln f that costs a pair as much as shapes that have nothing in common."""
+"""Difference of ln f that costs a pair as much as shapes that have nothing in common; wider while a fit is annealed."""
 _FREQUENCY_REACH_ALONE = 0.3
 _LEAVE = 0.3
 """Cost above the best at which an assignment leaves a measured mode without a partner."""
@@ -50,18 +57,12 @@ _LEAVE = 0.3
 _ACROSS = {"x": "y", "y": "x", "zeta": "eta", "eta": "zeta"}
 
 
-@dataclass(frozen=True)
-class ChannelUncertainty:
-    """Relative 1 σ of a channel's sensitivity, and its transverse sensitivity."""
-
-    calibration: float = CALIBRATION_STD
-    transverse: float = TRANSVERSE_STD
-
-
 def scatters_of(rig: Rig) -> dict[str, Scatter]:
     """The hyper-parameters of measured modes, with the defaults that the rig states."""
     known = (
-        Scatter(PART_SCATTER, "parts", STIFFNESS_SCATTER, 0.7, 0.04),
+        Scatter(PART_SCATTER, "stiffness of parts", STIFFNESS_STD, 0.7, 0.04),
+        # Drawings and scales are trusted more than masses deserve (fasteners, oil, cables): a wide prior.
+        Scatter(MASS_SCATTER, "mass of parts", MASS_STD, 1.0, 0.02, 8.0),
         Scatter(CALIBRATION, "calibration", CALIBRATION_STD, 0.7, 0.04),
         Scatter(DAMPING_SCATTER, "ln ζ from mode to mode", rig.modal_damping_scatter, 0.5, 0.5),
         Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 5.0),
@@ -115,8 +116,14 @@ class ModeData:
         return dataclasses.replace(self, complete=False, **{n: getattr(self, n)[keep] for n in names})
 
 
-def prepare(measured: MeasuredModes) -> ModeData:
-    """Measured modes in the form that residuals need."""
+def _known_or(std: NDArray[np.float64], assumed: float) -> NDArray[np.float64]:
+    """Standard deviations, the assumed one where none is known."""
+    return np.where(np.isfinite(std) & (std > 0), std, assumed)
+
+
+def prepare(measured: MeasuredModes, settings: UncertaintySettings | None = None) -> ModeData:
+    """Measured modes in the form that residuals need; where no scatter is known, `settings` say what is assumed."""
+    settings = settings or UncertaintySettings()
     m, f = len(measured), measured.frequency_hz
     shapes = np.zeros((m, 0))
     std = np.zeros((m, 0))
@@ -127,7 +134,7 @@ def prepare(measured: MeasuredModes) -> ModeData:
         for r in range(m):
             y = measured.shapes[r]
             real = np.real(y * np.exp(-0.5j * np.angle(np.nansum(y**2))))
-            size = max(float(np.nanmax(np.abs(real), initial=0.0)), 1e-300)
+            size = float(np.nanmax(np.abs(real), initial=0.0)) or 1.0
             shapes[r] = real / size
             given = (
                 np.zeros(len(dofs)) if measured.shape_std is None else np.nan_to_num(measured.shape_std[r])
@@ -151,7 +158,7 @@ class ModeObservations:
     rig : Rig
         Without effects.
     data : sequence of ModeData
-    channels : dict of str to ChannelUncertainty, optional
+    channels : dict of str to ChannelQuality, optional
         By DOF; the defaults where left out.
     shared : Dependence, optional
         Of the rig, where it is known already.
@@ -163,7 +170,7 @@ class ModeObservations:
         self,
         rig: Rig,
         data: Sequence[ModeData],
-        channels: Mapping[str, ChannelUncertainty] | None = None,
+        channels: Mapping[str, ChannelQuality] | None = None,
         shared: Dependence | None = None,
         sensors: tuple[str, ...] = (),
     ) -> None:
@@ -174,6 +181,10 @@ class ModeObservations:
         self.shared = shared or dependence(rig)
         self.scatters = scatters_of(rig)
         self._has: dict[tuple[str, Dof], bool] = {}
+
+    def channel(self, sensor: str) -> ChannelQuality:
+        """What is known of the channel that measures a DOF; the defaults where nothing was stated."""
+        return self.channels.get(sensor, ChannelQuality())
 
     def has(self, configuration: str, dof: Dof) -> bool:
         """True where the rig can be measured at `dof`; asked for every model, so remembered."""
@@ -203,6 +214,15 @@ class ModeObservations:
                 out.append(d.only(held))
             pairs.append((self.with_data(kept), self.with_data(out)))
         return pairs
+
+
+def _calibration(sensor: str, channel: ChannelQuality) -> str:
+    """Name of the unknown: one channel that was moved from DOF to DOF has one calibration."""
+    return f"calibration of {channel.name or sensor}"
+
+
+def _transverse(sensor: str) -> str:
+    return f"transverse sensitivity at {sensor}"
 
 
 @dataclass(frozen=True)
@@ -253,9 +273,9 @@ class ModeProblem:
         """See `EffectProblem`."""
         return np.concatenate([self.model.start(sizes), np.zeros(len(self.unknowns) - self.offset)])
 
-    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64]:
+    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
         """See `EffectProblem`: modes change with every size."""
-        return x
+        return None
 
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""
@@ -264,21 +284,14 @@ class ModeProblem:
     @cached_property
     def unknowns(self) -> Unknowns:
         """The model's unknowns, every sensor's calibration, and its transverse sensitivity where it has one."""
-        sensors = self.observations.sensors
-        known = [self.observations.channels.get(s, ChannelUncertainty()) for s in sensors]
-        stated = [k.calibration / CALIBRATION_STD for k in known]
-        uncertain = [(s, c) for s, c in zip(sensors, stated, strict=True) if c > 0]
-        across = [
-            (s, k.transverse)
-            for s, k in zip(sensors, known, strict=True)
-            if k.transverse > 0 and self._has_across(s)
-        ]
+        sensors = {s: self.observations.channel(s) for s in self.observations.sensors}
+        gains = {_calibration(s, c): c.calibration_std / CALIBRATION_STD for s, c in sensors.items()}
+        gains = {name: std for name, std in gains.items() if std > 0}
+        across = {s: c.transverse for s, c in sensors.items() if c.transverse > 0 and self._has_across(s)}
         return joined(
             self.model.unknowns,
-            Unknowns.plain(
-                [f"calibration of {s}" for s, _ in uncertain], [c for _, c in uncertain], CALIBRATION
-            ),
-            Unknowns.plain([f"transverse sensitivity of {s}" for s, _ in across], [t for _, t in across]),
+            Unknowns.plain(tuple(gains), list(gains.values()), CALIBRATION),
+            Unknowns.plain([_transverse(s) for s in across], list(across.values())),
         )
 
     def _has_across(self, sensor: str) -> bool:
@@ -301,8 +314,10 @@ class ModeProblem:
         gain = np.full(len(d.dofs), -1)
         transverse = np.full(len(d.dofs), -1)
         for i, dof in enumerate(d.dofs):
-            gain[i] = self.unknowns.index.get(f"calibration of {dof.point}", -1)
-            transverse[i] = self.unknowns.index.get(f"transverse sensitivity of {dof.point}", -1)
+            gain[i] = self.unknowns.index.get(
+                _calibration(dof.point, self.observations.channel(dof.point)), -1
+            )
+            transverse[i] = self.unknowns.index.get(_transverse(dof.point), -1)
             if transverse[i] >= 0:
                 other = Dof(dof.body, _ACROSS[dof.direction])
                 if self.observations.has(d.configuration, other):
@@ -459,9 +474,11 @@ class _Configuration:
             seen = np.isfinite(d.shapes).astype(float)
             cross = (y @ predicted) ** 2
             norm = np.sum(y**2, axis=1)[:, None] * (seen @ predicted**2)
-            cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / _FREQUENCY_REACH, 3.0)
+            reach = _FREQUENCY_REACH * (1 + 0.1 * (self.heat - 1))
+            cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / reach, 3.0)
         else:
-            cost = np.minimum(apart / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
+            # convex, so that close modes keep their order: two crossed pairs would cost as much as two straight ones
+            cost = np.minimum(apart * (1 + apart) / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
         m = len(d)
         padded = np.hstack([cost, np.full((m, m), _LEAVE)])
         column = scipy.optimize.linear_sum_assignment(padded)[1]
@@ -498,11 +515,30 @@ class _Configuration:
                 )
                 for r in rows
             },
-            log_scale=sum(c for _, _, _, c in done),
+            log_scale=sum(c for _, _, _, c in done) + self._usual(np.flatnonzero(match < 0), defaults),
             penalty=UNEXPLAINED * float(np.sum(match < 0)) + UNSEEN * self._unseen(solution, match),
             matching=match,
             projected=len(on) if self.data.shapes.shape[1] else 0,
         )
+
+    def _usual(self, alone: NDArray[np.int64], defaults: Mapping[str, float]) -> float:
+        """What modes without a partner would cost on average if they were explained.
+
+        Without it, leaving a mode out would gain what its rows cost, and no effect would ever bring it back.
+        """
+        d = self.data
+        seen = np.isfinite(d.shapes[alone])
+        reach = np.maximum(_SHAPE_REACH, np.abs(d.shapes[alone]))[seen]
+        damped = alone[np.isfinite(d.log_damping[alone])]
+        total = -0.5 * int(np.sum(np.any(seen, axis=1)))
+        for own, unit, name in (
+            (d.log_frequency_std[alone], 1.0, FREQUENCY),
+            (d.log_damping_std[damped], 1.0, DAMPING_SCATTER),
+            (d.shape_std[alone][seen], reach, SHAPE),
+        ):
+            now, usual = (own**2 + (at[name] * unit) ** 2 for at in (self.scatters, defaults))
+            total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
+        return total
 
     def _frequencies(
         self,

@@ -7,7 +7,7 @@ is one product. Only what an effect edits is differentiated by small differences
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -67,6 +67,49 @@ class SizeMap:
         return low, self.unknown(p.maximum)
 
 
+@dataclass(frozen=True)
+class LinearTerms:
+    """Terms whose coefficients are linear functions of the effects' unknowns.
+
+    Attributes
+    ----------
+    start : Terms
+        At `begin`.
+    begin : ndarray, (k,)
+    slopes : ndarray, (k, t)
+        Derivatives of the coefficients.
+    skew_slopes : ndarray, (k, n, n)
+    """
+
+    start: Terms
+    begin: NDArray[np.float64]
+    slopes: NDArray[np.float64]
+    skew_slopes: NDArray[np.float64]
+
+    def at(self, shape: NDArray[np.float64]) -> Terms:
+        """Terms at other unknowns."""
+        if not len(self.begin):
+            return self.start
+        moved = shape - self.begin
+        found = replace(
+            self.start,
+            coefficient=self.start.coefficient + moved @ self.slopes,
+            skew=self.start.skew + np.tensordot(moved, self.skew_slopes, axes=1),
+        )
+        found.__dict__["by_kind"] = self.start.by_kind  # the rows are the same ones
+        return found
+
+
+def _same_rows(a: Terms, b: Terms) -> bool:
+    return (
+        a.dofs == b.dofs
+        and a.rows.shape == b.rows.shape
+        and bool(np.array_equal(a.rows, b.rows))
+        and bool(np.array_equal(a.matrix, b.matrix))
+        and bool(np.array_equal(a.log, b.log))
+    )
+
+
 class RigModel:
     """A rig, with effects on top of it, as a function of unknowns.
 
@@ -100,6 +143,7 @@ class RigModel:
             for p in one.effect.parameters
         }
         self._terms: dict[tuple[object, ...], Terms] = {}
+        self._linear: dict[str, LinearTerms | None] = {}
         self._nominal: dict[tuple[object, ...], Assembly] = {}
 
     @cached_property
@@ -163,22 +207,41 @@ class RigModel:
         logs, ratio = x[: self._logs], self._damping_ratio(x)
         shape = x[self.shape_start :]
         terms = self.terms(configuration, shape)
-        coefficient = terms.scaled(logs)
+        factor = np.exp(terms.log @ logs)
+        coefficient = terms.coefficient * factor
         dense = terms.dense(coefficient)
+        by_shape, skew = self._by_shape(
+            configuration, terms, factor, logs, shape if derivatives else shape[:0]
+        )
+        return Matrices(terms, coefficient, dense, terms.skew, ratio, by_shape, skew)
+
+    def _by_shape(
+        self,
+        configuration: str,
+        terms: Terms,
+        factor: NDArray[np.float64],
+        logs: NDArray[np.float64],
+        shape: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Derivatives of the matrices by effects' unknowns and geometry: exact where they are linear in the sizes."""
         n = len(terms.dofs)
-        count = len(shape) if derivatives else 0
-        by_shape, skew = np.zeros((count, 4, n, n)), np.zeros((count, n, n))
-        for i in range(count):
+        by_shape, skew = np.zeros((len(shape), 4, n, n)), np.zeros((len(shape), n, n))
+        linear = self._linear_terms(configuration)
+        for i in range(len(shape)):
+            if linear is not None:
+                by_shape[i] = terms.dense(linear.slopes[i] * factor)
+                skew[i] = linear.skew_slopes[i]
+                continue
             ends = []
             for h in (-_DIFFERENCE, _DIFFERENCE):
                 moved = shape.copy()
                 moved[i] += h
                 other = self.terms(configuration, moved)
                 ends.append((other.dense(other.scaled(logs)), other.skew))
-            if ends[0][0].shape == dense.shape == ends[1][0].shape:
+            if ends[0][0].shape == by_shape[i].shape == ends[1][0].shape:
                 by_shape[i] = (ends[1][0] - ends[0][0]) / (2 * _DIFFERENCE)
                 skew[i] = (ends[1][1] - ends[0][1]) / (2 * _DIFFERENCE)
-        return Matrices(terms, coefficient, dense, terms.skew, ratio, by_shape, skew)
+        return by_shape, skew
 
     def _damping_ratio(self, x: NDArray[np.float64]) -> float:
         parameter = self.rig.parameters.get(DAMPING)
@@ -189,6 +252,10 @@ class RigModel:
 
     def terms(self, configuration: str, shape: NDArray[np.float64]) -> Terms:
         """Elements of a configuration with geometry and effects' unknowns at `shape`."""
+        linear = self._linear_terms(configuration)
+        return self._assembled(configuration, shape) if linear is None else linear.at(shape)
+
+    def _assembled(self, configuration: str, shape: NDArray[np.float64]) -> Terms:
         key = (configuration, shape.tobytes())
         if key not in self._terms:
             if len(self._terms) > 64:
@@ -197,6 +264,42 @@ class RigModel:
                 self.assembly(configuration, shape), self.dependence.elements[configuration], part_key
             )
         return self._terms[key]
+
+    def _linear_terms(self, configuration: str) -> LinearTerms | None:
+        """The terms as linear functions of the effects' unknowns; None where they are not."""
+        if configuration not in self._linear:
+            possible = not self.dependence.geometric and not any(s.logarithmic for s in self.sizes.values())
+            self._linear[configuration] = self._tried(configuration) if possible else None
+        return self._linear[configuration]
+
+    def _tried(self, configuration: str) -> LinearTerms | None:
+        """Find the linear function from a few points, and try it at another."""
+        unknowns = self.unknowns
+        low, high = unknowns.lower[self.shape_start :], unknowns.upper[self.shape_start :]
+        begin = np.clip(np.full(len(low), 0.2), 0.5 * low, 0.5 * high)
+        start = self._assembled(configuration, begin)
+        slopes, skews = [], []
+        for i in range(len(begin)):
+            other = self._assembled(configuration, begin * np.where(np.arange(len(begin)) == i, 1.5, 1.0))
+            if not _same_rows(start, other):
+                return None
+            slopes.append((other.coefficient - start.coefficient) / (0.5 * begin[i]))
+            skews.append((other.skew - start.skew) / (0.5 * begin[i]))
+        n = len(start.dofs)
+        linear = LinearTerms(
+            start,
+            begin,
+            np.array(slopes).reshape(len(begin), len(start.coefficient)),
+            np.array(skews).reshape(len(begin), n, n),
+        )
+        if len(begin):
+            trial = self._assembled(configuration, 0.6 * begin)
+            told = linear.at(0.6 * begin)
+            if not _same_rows(start, trial) or not np.allclose(
+                told.coefficient, trial.coefficient, rtol=1e-9
+            ):
+                return None
+        return linear
 
     def assembly(self, configuration: str, shape: NDArray[np.float64]) -> Assembly:
         """Nominal elements with the effects applied."""

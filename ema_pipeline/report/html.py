@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ema_pipeline.files import replace_file
 from ema_pipeline.report import diagnosis, diagnosis_tables, levels, summary, tables
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.moving_gear import fill_of, moving_gears
@@ -55,7 +56,7 @@ def write_report(
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     drawn = render(results, None, progress) if plots is None else plots
-    target.write_text(report_html(results, drawn), encoding="utf-8")
+    replace_file(target, report_html(results, drawn))
 
 
 def report_html(results: RunResults, plots: Sequence[Plot]) -> str:

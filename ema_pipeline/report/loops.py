@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ema_pipeline.hysteresis.summary import summary, terminal_lines
-from ema_pipeline.hysteresis.types import Estimate, IsolatorResult, Loop, LoopModel
+from ema_pipeline.files import replace_file
+from ema_pipeline.loops.summary import summary, terminal_lines
+from ema_pipeline.loops.types import Estimate, IsolatorResult, Loop, LoopModel
 from ema_pipeline.report import diagnosis, diagnosis_tables, style, summary_files
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.pages import page_templates
@@ -64,14 +65,14 @@ def write_loops_report(
     content = summary_files.summary(results)
     content["configurations"] = {name: summary(one) for name, one in isolators.items()}
     text = json.dumps(summary_files.finite(content), indent=2, ensure_ascii=False)
-    summary_files.replace_file(folder / "summary.json", text + "\n")
+    replace_file(folder / "summary.json", text + "\n")
     images = _images(isolators, results, loops, models, folder / "plots")
     page = (
         page_templates()
         .get_template("loops.html.j2")
         .render(_context(isolators, results, loops, models) | {"images": images})
     )
-    summary_files.replace_file(folder / "report.html", page)
+    replace_file(folder / "report.html", page)
 
 
 def run_screen(isolators: Mapping[str, IsolatorResult], results: RunResults, out: str) -> str:
@@ -285,7 +286,7 @@ def _images(
     plots: Path,
 ) -> dict[str, dict[str, str]]:
     """Figures by name, drawn into `plots` and embedded in the page."""
-    from ema_pipeline.hysteresis.figures import isolator_figures, misfit_figure, models_figure
+    from ema_pipeline.loops.figures import isolator_figures, misfit_figure, models_figure
     from ema_pipeline.report.figures.diagnosis import candidate_probabilities, ladder_errors
 
     drawn = {}

@@ -11,6 +11,7 @@ from typing import Literal
 from matplotlib.figure import Figure
 
 from ema_pipeline.diagnose.types import Ladder
+from ema_pipeline.files import replace_file
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report import style
 from ema_pipeline.report.figures import (
@@ -129,12 +130,12 @@ def write_plots(
     for plot in plots:
         for suffix, content in plot.files.items():
             names.append(f"{plot.spec.name}.{suffix}")
-            (target / names[-1]).write_bytes(content)
+            replace_file(target / names[-1], content)
     for stale in before - set(names):
         # names come from a file that a user can edit: never leave the folder
         if Path(stale).name == stale and stale.endswith((".png", ".svg")):
             (target / stale).unlink(missing_ok=True)
-    index.write_text("\n".join(names) + "\n", encoding="utf-8")
+    replace_file(index, "\n".join(names) + "\n")
     return plots
 
 

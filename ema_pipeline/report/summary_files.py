@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Rung
 from ema_pipeline.exchange.tables import csv_text, modes_table
+from ema_pipeline.files import replace_file
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.report import levels
 from ema_pipeline.report.results import ConfigurationResults, RunResults
@@ -186,16 +186,6 @@ def _modes(c: ConfigurationResults) -> list[dict[str, Any]]:
         {k: v for k, v in row.items() if k not in ("configuration", "mode")} | {"flags": list(mode.flags)}
         for row, mode in zip(rows, c.modal.modes, strict=True)
     ]
-
-
-def replace_file(path: Path, text: str) -> None:
-    """Write a text file in one step: a reader sees the old one or the new one, never half of one."""
-    scratch = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        scratch.write_text(text, encoding="utf-8")
-        os.replace(scratch, path)
-    finally:
-        scratch.unlink(missing_ok=True)
 
 
 def finite(value: Any) -> Any:

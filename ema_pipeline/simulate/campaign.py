@@ -115,26 +115,19 @@ def simulate_campaign(
         rig_name = ""
     _check_dofs(base, chosen, (*sensors, *impacts))
     tests = _tests(out, base, rig_name, chosen, sensors, impacts, options)
+    with single_blas_thread():
+        written = _write(tests, made, true, options, respond, random)
     truth: dict[str, Any] = {
         "rig": base.name,
         "effects": list(effects),
         "values": true,
         "settings": options.model_dump(mode="json"),
-        "configurations": {},
+        "configurations": written,
     }
     if not options.imperfections.none:
         truth["imperfections"] = _drawn(made, tests, options)
-    respond = respond or (response if options.imperfections.none else response_by_poles)
-    with single_blas_thread():
-        for test in tests:
-            test.folder.mkdir(exist_ok=True)
-            number = base.configurations.index(test.configuration)
-            hits = generator(options.seed, "hits", number)
-            series = HitSeries(options.imperfections, options.drift_kind, hits)
-            written = test.write(made.rig.assembly(test.configuration, true), respond, random, series)
-            truth["configurations"][test.configuration] = _test_truth(made.rig, test, true, written)
     (out / TRUTH_FILE).write_text(json.dumps(truth, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    records = sum(len(c["records"]) for c in truth["configurations"].values())
+    records = sum(len(c["records"]) for c in written.values())
     return SimulatedCampaign(out, tuple(chosen), true, records)
 
 
@@ -188,9 +181,8 @@ def _tests(
     tests = []
     for configuration in configurations:
         folder = out / configuration if len(configurations) > 1 else out
-        plain = base.assembly(configuration)
-        places = _places(sensors, plain) or default_sensors(plain)
-        points = _places(impacts, plain) or default_impacts(places)
+        places = _sensors_of(base, configuration, sensors)
+        points = _places(impacts, base.assembly(configuration)) or default_impacts(places)
         tests.append(TestFolder(base.name, rig_key, configuration, folder, places, points, options))
     if options.imperfections.none:
         return tuple(tests)
@@ -202,6 +194,27 @@ def _tests(
 def _sensors_of(base: Rig, configuration: str, sensors: Sequence[str]) -> tuple[Dof, ...]:
     plain = base.assembly(configuration)
     return _places(sensors, plain) or default_sensors(plain)
+
+
+def _write(
+    tests: Sequence[TestFolder],
+    made: TrueRig,
+    true: Mapping[str, float],
+    options: SimulationSettings,
+    respond: Respond | None,
+    random: np.random.Generator,
+) -> dict[str, Any]:
+    """Write all tests; return modes and hits by configuration."""
+    sizes = options.imperfections
+    respond = respond or (response if sizes.none else response_by_poles)
+    written = {}
+    for test in tests:
+        test.folder.mkdir(exist_ok=True)
+        number = made.rig.configurations.index(test.configuration)
+        series = HitSeries(sizes, options.drift_kind, generator(options.seed, "hits", number))
+        hits = test.write(made.rig.assembly(test.configuration, true), respond, random, series)
+        written[test.configuration] = _test_truth(made.rig, test, true, hits)
+    return written
 
 
 def _drawn(made: TrueRig, tests: Sequence[TestFolder], options: SimulationSettings) -> dict[str, Any]:
@@ -217,7 +230,7 @@ def _drawn(made: TrueRig, tests: Sequence[TestFolder], options: SimulationSettin
 def _test_truth(
     rig: Rig, test: TestFolder, true: Mapping[str, float], written: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    """Modes and hits of one configuration."""
+    """Modes and records of one configuration."""
     modes = [
         {"frequency_hz": m.frequency_hz, "damping_ratio": m.damping_ratio, "family": m.family}
         for m in model_modes(rig, test.configuration, true)

@@ -75,7 +75,7 @@ class TestFolder:
                 for first in range(1, o.hits + 1, o.hits_per_record)
             ]
             blows = [self._blows(impact, level, first, random) for level, first in plan]
-            draws = [tuple(series.draw() for _ in record) for record in blows]
+            draws = [self._draws(assembly, series, len(record)) for record in blows]
             signals = self._signals(assembly, respond, impact, blows, draws)
             for (level, first), drawn, (force, accelerations) in zip(plan, draws, signals, strict=True):
                 hits = range(first, min(first + o.hits_per_record, o.hits + 1))
@@ -126,14 +126,16 @@ class TestFolder:
         return tuple(records)
 
     @staticmethod
+    def _draws(assembly: Assembly, series: HitSeries, count: int) -> tuple[HitDraw, ...]:
+        """Draws of the hits of one record; those of a nonlinear rig are alike, because they are simulated at once."""
+        drawn = tuple(series.draw() for _ in range(count))
+        return drawn[:1] * count if assembly.nonlinear else drawn
+
+    @staticmethod
     def _together(
         assembly: Assembly, record: tuple[Blow, ...], drawn: tuple[HitDraw, ...]
     ) -> list[tuple[tuple[Pulse, ...], HitDraw]]:
-        """Blows of one record that are simulated at once, each with its draw.
-
-        Responses of a linear rig add up, so each hit is simulated by itself. Those of a nonlinear one do not: all
-        hits of its record have the direction and the frequencies of the first.
-        """
+        """Blows of one record that are simulated at once, each with its draw: one by one where responses add up."""
         if assembly.nonlinear:
             return [(tuple(chain(*record)), drawn[0])]
         return list(zip(record, drawn, strict=True))

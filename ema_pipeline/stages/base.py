@@ -6,7 +6,7 @@ import hashlib
 import importlib.metadata
 import platform
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Protocol
@@ -16,6 +16,7 @@ from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.errors import EmaError
+from ema_pipeline.names import check_name
 from ema_pipeline.rigs import Rig, load_rig, rig_kinds
 from ema_pipeline.rigs.files import rig_from_text
 from ema_pipeline.settings import Settings
@@ -51,6 +52,8 @@ class RunInfo:
         Settings of the pipeline, JSON.
     versions : dict of str to str
         Versions of the program, Python and the libraries that compute.
+    effect_hashes : dict of str to str
+        SHA-256 of the files with the user's own effects, by path, as they were when they last ran.
     """
 
     kind: str
@@ -62,6 +65,7 @@ class RunInfo:
     effects: tuple[str, ...]
     pipeline: str
     versions: dict[str, str]
+    effect_hashes: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -75,22 +79,42 @@ class Run:
     settings : mapping of str to Settings
         The settings of each stage.
     effect_files : tuple of str
-        Python files with the user's own effects.
+        Python files with the user's own effects, as the results remember them.
+    named_files : frozenset of str
+        Those of them that the user has named in this call: only their code may run, as the results folder may
+        come from somebody else.
     """
 
     store: Store
     info: RunInfo
     settings: Mapping[str, Settings]
     effect_files: tuple[str, ...] = ()
+    named_files: frozenset[str] = frozenset()
 
     @cached_property
     def library(self) -> dict[str, Effect]:
-        """The effects that ship with the program and those of the user's files."""
+        """The effects that ship with the program and those of the user's files.
+
+        Raises
+        ------
+        EmaError
+            If the results remember a file that the user has not named in this call.
+        """
+        for path in self.effect_files:
+            if path not in self.named_files:
+                raise EmaError(
+                    f"{self.store.folder}: was made with effects of the Python file '{path}', SHA-256 "
+                    f"{self.info.effect_hashes.get(path, 'unknown')[:12]}; code runs only if you name it: "
+                    f"look at it, then add --effect-file {path}"
+                )
         return effect_library(self.effect_files)
 
     def effect_hashes(self) -> str:
         """Fingerprint of the files with the user's own effects."""
-        return " ".join(file_hash(Path(path)) for path in self.effect_files)
+        return " ".join(
+            file_hash(Path(path)) if path in self.named_files else self.info.effect_hashes.get(path, "")
+            for path in self.effect_files
+        )
 
     @cached_property
     def model(self) -> Rig | None:
@@ -210,6 +234,8 @@ def load_info(store: Store) -> RunInfo | None:
             return None
         try:
             info: RunInfo = codec.read(file, "run", RunInfo)
-        except KeyError:  # written by a version that knew less; a new run writes it again
+        except codec.MissingError:  # written by a version that knew less; a new run writes it again
             return None
-        return info
+    for name in info.configurations:
+        check_name(name, f"{store.path}: configuration")
+    return info

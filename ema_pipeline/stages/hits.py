@@ -66,11 +66,11 @@ class StoredRecords(Sequence[Record]):
     def __getitem__(self, index: Any) -> Any:
         if not 0 <= index < len(self):
             raise IndexError(index)
-        group, hints = self._group[str(index)], get_type_hints(Record)
+        group, hints = codec.member(self._group, str(index)), get_type_hints(Record)
         small = {
             f.name: codec.read(group, f.name, hints[f.name]) for f in fields(Record) if f.name != "responses"
         }
-        return Record(responses=StoredRows(group["responses"]), **small)
+        return Record(responses=StoredRows(codec.member(group, "responses")), **small)
 
 
 @contextlib.contextmanager

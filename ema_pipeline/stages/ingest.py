@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 from ema_pipeline.ingest.description import TestDescription, read_campaign
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Record
 from ema_pipeline.stages.base import Progress, Run, file_hash
@@ -25,10 +27,11 @@ def inputs(run: Run, configuration: str) -> str:
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Read every record, check it against the description, and scale it to SI."""
     test = test_of(run, configuration)
+    limits = cast(ReadLimits, run.settings[NAME])
     return {
         "sources": file_hashes(test),
         "title": test.title,
-        "records": _with_progress(load_records(test), len(test.records), progress),
+        "records": _with_progress(load_records(test, limits), len(test.records), progress),
     }
 
 

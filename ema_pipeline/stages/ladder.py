@@ -27,7 +27,7 @@ def inputs(run: Run, configuration: str) -> str:
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit the base model and every rung above it; without added effects there is no ladder."""
     if run.info.kind == "hysteresis":
-        return loop_ladder.climb_run(run, progress)
+        return loop_ladder.ladder_run(run, progress)
     if not run.info.effects:
         return {}
     if run.rig is None:
@@ -43,7 +43,7 @@ def _measured(run: Run) -> Ladder:
     EmaError
         For an effect that shows in hits at several levels only, where there are none.
     """
-    from ema_pipeline.diagnosis.rungs import make_ladder
+    from ema_pipeline.diagnose.rungs import make_ladder
     from ema_pipeline.observations.fitting import Model
     from ema_pipeline.stages.amplitude import amplitude_observations
     from ema_pipeline.stages.models import mode_observations, model_with

@@ -5,14 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.stages.base import Progress, Run, file_hash
+from ema_pipeline.stages.hits import accepted_hits
 
 if TYPE_CHECKING:
     from ema_pipeline.pipeline import ModalStageSettings
 
 NAME = "modal"
-NEEDS = ("frf",)
+NEEDS = ("ingest", "hits", "frf")
 PER_CONFIGURATION = True
 NEEDS_RIG = False
 
@@ -27,7 +29,8 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     from ema_pipeline.correlate.measured import to_modal_model
     from ema_pipeline.correlate.mode_table import read_mode_table
     from ema_pipeline.modal.circle import attach_circles, identify_by_circle
-    from ema_pipeline.modal.identify import identify
+    from ema_pipeline.modal.moving import identify_hits
+    from ema_pipeline.modal.pooling import pooled
 
     if run.info.kind == "modes":
         measured = read_mode_table(Path(run.info.raw), run.require_model(NAME))
@@ -36,5 +39,12 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     frfs = run.store.load("frf", configuration, "frfs", FrfSet)
     if settings.method == "circle":
         return {"modal": identify_by_circle(frfs, settings.circle)}
-    modal = identify(frfs, settings.identify, progress)
-    return {"modal": attach_circles(frfs, modal, settings.circle)}
+    found = identify_hits(
+        lambda: accepted_hits(run.store, configuration),
+        frfs,
+        cast(FrfSettings, run.settings["frf"]),
+        settings.identify,
+        progress,
+    )
+    modal = attach_circles(found.frfs, found.modal, settings.circle)
+    return {"modal": pooled(modal, found.alignment, frfs.record_s, frfs.response_decay_rad_s)}

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 from ema_pipeline.effects.library import depends_on_level, parse_effect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.parameters import FittedModes, restored
+from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.types import FitResult
+from ema_pipeline.frf.channels import ChannelQuality, channel_uncertainty, merged
 from ema_pipeline.observations.fitting import Model
 from ema_pipeline.observations.modes import ModeObservations, prepare
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.stages.base import Run
-from ema_pipeline.stages.modes import measured_modes
+from ema_pipeline.stages.modes import measured_frfs, measured_modes
 
 
 def mode_observations(run: Run) -> ModeObservations:
@@ -25,7 +28,15 @@ def mode_observations(run: Run) -> ModeObservations:
     """
     if run.rig is None:
         raise EmaError(f"{run.store.folder}: this needs a model; run again with --rig")
-    return ModeObservations(run.rig, [prepare(m) for m in measured_modes(run).values()])
+    settings = cast(FitSettings, run.settings["fit"])
+    measured = measured_modes(run)
+    frfs = measured_frfs(run)
+    channels: dict[str, ChannelQuality] = {}
+    for name, modes in measured.items():
+        for dof in modes.dofs:
+            quality = channel_uncertainty(frfs.get(name), dof)
+            channels[dof.point] = merged(channels.get(dof.point), quality)
+    return ModeObservations(run.rig, [prepare(m, settings) for m in measured.values()], channels)
 
 
 def model_with(

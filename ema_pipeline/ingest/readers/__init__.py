@@ -14,10 +14,15 @@ from pathlib import Path
 from typing import Protocol
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.files import check_regular
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers import hdf5, lvm, mat, tdms, text, uff, wav
+from ema_pipeline.ingest.readers.apart import read_apart
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord
 
 __all__ = ["READERS", "RawChannel", "RawRecord", "Reader", "read_raw", "reader_of"]
+
+_PIECE_BYTES = 1 << 20
 
 HEAD_BYTES = 8192
 """What `recognise` gets to see of a file."""
@@ -33,7 +38,7 @@ class Reader(Protocol):
     def recognise(self, path: Path, head: bytes) -> bool:
         """True where the first bytes of the file are of this format."""
 
-    def read(self, path: Path) -> RawRecord:
+    def read(self, path: Path, limits: ReadLimits) -> RawRecord:
         """Read the whole file. EmaErrors need not name the file: `read_raw` puts its name in front."""
 
 
@@ -52,13 +57,15 @@ _FOREIGN = {
 }
 
 
-def read_raw(path: Path) -> RawRecord:
+def read_raw(path: Path, limits: ReadLimits | None = None) -> RawRecord:
     """Read a record file of any supported format; gzip is unpacked on the way.
 
     Parameters
     ----------
     path : Path
         Record file.
+    limits : ReadLimits, optional
+        How large it may be.
 
     Returns
     -------
@@ -68,12 +75,13 @@ def read_raw(path: Path) -> RawRecord:
     Raises
     ------
     EmaError
-        Where the file cannot be opened, is of an unknown format, is damaged, or holds no channels.
+        Where the file cannot be opened, is of an unknown format, is too large, is damaged, or holds no channels.
     """
+    limits = limits or ReadLimits()
     head = _head(path)
     if head.startswith(b"\x1f\x8b"):
-        return _read_gzip(path)
-    return _read(path, head, str(path))
+        return _read_gzip(path, limits)
+    return _read(path, head, str(path), limits)
 
 
 def reader_of(path: Path) -> Reader | None:
@@ -89,6 +97,7 @@ def reader_of(path: Path) -> Reader | None:
 
 
 def _head(path: Path) -> bytes:
+    check_regular(path)
     try:
         with path.open("rb") as file:
             head = file.read(HEAD_BYTES)
@@ -99,7 +108,7 @@ def _head(path: Path) -> bytes:
     return head
 
 
-def _read(path: Path, head: bytes, shown: str) -> RawRecord:
+def _read(path: Path, head: bytes, shown: str, limits: ReadLimits) -> RawRecord:
     reader = next((r for r in READERS if r.recognise(path, head)), None)
     if reader is None:
         foreign = next(
@@ -111,9 +120,15 @@ def _read(path: Path, head: bytes, shown: str) -> RawRecord:
         with warnings.catch_warnings():
             # Readers' warnings would be lines on stderr that nobody can act on.
             warnings.simplefilter("ignore")
-            record = reader.read(path)
+            limits.check_file(path.stat().st_size, text=reader in (text, lvm))
+            apart = getattr(reader, "APART", None)
+            record = reader.read(path, limits) if apart is None else read_apart(apart, path, limits)
     except EmaError as error:
         raise EmaError(f"{shown}: {error}") from None
+    except MemoryError:
+        raise EmaError(
+            f"{shown}: takes more memory to read than there is; cut it into shorter ones"
+        ) from None
     except Exception as error:
         # Third-party readers raise anything on damaged files; the user gets one line whatever it is.
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
@@ -126,12 +141,25 @@ def _read(path: Path, head: bytes, shown: str) -> RawRecord:
     return record
 
 
-def _read_gzip(path: Path) -> RawRecord:
+def _read_gzip(path: Path, limits: ReadLimits) -> RawRecord:
     with tempfile.TemporaryDirectory() as folder:
-        plain = Path(folder) / path.stem
-        try:
-            with gzip.open(path) as packed:
-                plain.write_bytes(packed.read())
-        except (OSError, EOFError, zlib.error) as error:
-            raise EmaError(f"{path}: cannot be unpacked ({error}); copy it again") from None
-        return _read(plain, _head(plain) if plain.stat().st_size else b"", str(path)).in_memory()
+        plain = Path(folder) / "unpacked"
+        _unpack(path, plain, limits)
+        return _read(plain, _head(plain), str(path), limits).in_memory()
+
+
+def _unpack(path: Path, plain: Path, limits: ReadLimits) -> None:
+    """Unpack piece by piece, so that no more is written than the limits allow."""
+    size, unpacked = path.stat().st_size, 0
+    try:
+        with gzip.open(path) as packed, plain.open("wb") as file:
+            while piece := packed.read(_PIECE_BYTES):
+                unpacked += len(piece)
+                limits.check_unpacked(unpacked, size, "what is packed")
+                file.write(piece)
+    except EmaError as error:
+        raise EmaError(f"{path}: {error}") from None
+    except (OSError, EOFError, zlib.error) as error:
+        raise EmaError(f"{path}: cannot be unpacked ({error}); copy it again") from None
+    if unpacked == 0:
+        raise EmaError(f"{path}: is empty once unpacked; copy or export it again")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, Samples, StoredSamples, clean_unit
 from ema_pipeline.ingest.readers.timebase import (
     is_time_name,
@@ -64,7 +65,11 @@ class _Column:
     axis_rate: float | None = None
 
 
-def assemble(arrays: Sequence[NamedArray], file_attributes: Mapping[str, Any] | None = None) -> RawRecord:
+def assemble(
+    arrays: Sequence[NamedArray],
+    file_attributes: Mapping[str, Any] | None = None,
+    limits: ReadLimits | None = None,
+) -> RawRecord:
     """Sort named arrays into channels, time axes and sample rates.
 
     Vectors are channels; the columns of a matrix (its longer side is time) become ``NAME_1``, ``NAME_2``
@@ -74,8 +79,9 @@ def assemble(arrays: Sequence[NamedArray], file_attributes: Mapping[str, Any] | 
     Raises
     ------
     EmaError
-        Where the file contradicts itself about the sample rate.
+        Where the file contradicts itself about the sample rate, or holds more channels than anybody measures.
     """
+    limits = limits or ReadLimits()
     rates = _Rates()
     rates.read("file attributes", file_attributes or {})
     column_names: tuple[str, ...] = ()
@@ -112,9 +118,11 @@ def assemble(arrays: Sequence[NamedArray], file_attributes: Mapping[str, Any] | 
         elif values.ndim == 1:
             columns.append(_Column(array.path, numbers, array.attributes))
         elif values.ndim == 2:
+            limits.check_channels(min(values.shape))
             columns.extend(_split_matrix(array, numbers))
         else:
             notes.append(f"'{label}' has {values.ndim} dimensions and is left out")
+    limits.check_channels(len(columns))
     columns = _without_housekeeping(columns, notes)
     columns, axis_rate = _one_axis(columns, rates.value, notes)
     rates.add("axis columns", axis_rate)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, clean_unit, split_unit
 from ema_pipeline.ingest.readers.text import decode
 from ema_pipeline.ingest.readers.timebase import rate_from_times, whole_rate
@@ -20,7 +21,7 @@ def recognise(path: Path, head: bytes) -> bool:
     return head.removeprefix(b"\xef\xbb\xbf").startswith(b"LabVIEW Measurement")
 
 
-def read(path: Path) -> RawRecord:
+def read(path: Path, limits: ReadLimits) -> RawRecord:
     """Read the one segment of the file."""
     import lvm_read
 
@@ -36,6 +37,11 @@ def read(path: Path) -> RawRecord:
     units = _per_column(segment.get("Y_Unit_Label"), names)
     steps = [s for s in segment.get("Delta_X", []) if isinstance(s, int | float) and s > 0]
     stated = [s for s in segment.get("Samples", []) if isinstance(s, int | float) and s > 0]
+    if stated and table.shape[0] > max(stated):
+        raise EmaError(
+            f"holds {table.shape[0]} rows where its header states {int(max(stated))} samples; "
+            "the file is damaged, export it again"
+        )
     if stated and table.shape[0] < max(stated):
         raise EmaError(
             f"holds {table.shape[0]} of the {int(max(stated))} samples that its header states; "

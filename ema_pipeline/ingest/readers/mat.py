@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 import itertools
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers.arrays import NamedArray, assemble
+from ema_pipeline.ingest.readers.hdf5 import Budget, small_attributes, walk
 from ema_pipeline.ingest.readers.raw import RawRecord
 
 NAME = "MAT"
+
+APART = "mat"
+"""Read in a process apart: version 7.3 is HDF5, and version 5 may unpack to anything."""
+
+_HEADER_BYTES = 128
+_PACKED = 15  # miCOMPRESSED
+_LONGEST_TEXT = 10_000
 
 _NUMERIC = {"double", "single", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"}
 
@@ -22,16 +33,18 @@ def recognise(path: Path, head: bytes) -> bool:
     return head.startswith((b"MATLAB 5.0 MAT-file", b"MATLAB 7.3 MAT-file"))
 
 
-def read(path: Path) -> RawRecord:
+def read(path: Path, limits: ReadLimits) -> RawRecord:
     """Read every numeric variable, and the fields of structs one level down."""
     with path.open("rb") as file:
         newer = file.read(10) == b"MATLAB 7.3"
-    return assemble(_with_label_units(_read_73(path) if newer else _read_5(path)))
+    arrays = _read_73(path, limits) if newer else _read_5(path, limits)
+    return assemble(_with_label_units(arrays), limits=limits)
 
 
-def _read_5(path: Path) -> list[NamedArray]:
+def _read_5(path: Path, limits: ReadLimits) -> list[NamedArray]:
     from scipy.io import loadmat
 
+    _check_variables(path, limits)
     arrays: list[NamedArray] = []
     for name, value in loadmat(str(path), struct_as_record=False).items():
         if name.startswith("__"):
@@ -46,31 +59,52 @@ def _read_5(path: Path) -> list[NamedArray]:
     return arrays
 
 
-def _read_73(path: Path) -> list[NamedArray]:
+def _check_variables(path: Path, limits: ReadLimits) -> None:
+    """Add up what the variables say of their sizes; packed ones say it at the start of what is packed."""
+    size, unpacked, count = path.stat().st_size, 0, 0
+    with path.open("rb") as file:
+        order = "<" if file.read(_HEADER_BYTES)[-2:] == b"IM" else ">"
+        while len(tag := file.read(8)) == 8:
+            kind, length = struct.unpack(f"{order}II", tag)
+            start = file.tell()
+            if kind == _PACKED:
+                inner = zlib.decompressobj().decompress(file.read(min(length, 256)), 8)
+                unpacked += struct.unpack(f"{order}II", inner)[1] if len(inner) == 8 else 0
+            else:
+                unpacked += length
+            count += 1
+            limits.check_channels(count)
+            limits.check_unpacked(unpacked, size, f"variable {count}")
+            file.seek(start + length)
+
+
+def _read_73(path: Path, limits: ReadLimits) -> list[NamedArray]:
     import h5py
 
     arrays: list[NamedArray] = []
     with h5py.File(path, "r") as file:
-
-        def visit(name: str, item: Any) -> None:
-            if name.startswith("#") or not isinstance(item, h5py.Dataset):
-                return
-            kind = item.attrs.get("MATLAB_class", b"double")
-            kind = kind.decode() if isinstance(kind, bytes) else str(kind)
-            steps = tuple(name.split("/"))
-            if kind in _NUMERIC and "MATLAB_empty" not in item.attrs and item.dtype.kind in "fiu":
+        budget = Budget(path, limits)
+        for steps, item in walk(file, limits):
+            if steps[0].startswith("#") or not isinstance(item, h5py.Dataset) or item.shape is None:
+                continue
+            budget.take(item)
+            attributes = small_attributes(item)
+            kind = attributes.get("MATLAB_class", b"double")
+            kind = kind.decode(errors="replace") if isinstance(kind, bytes) else str(kind)
+            if kind in _NUMERIC and "MATLAB_empty" not in attributes and item.dtype.kind in "fiu":
                 arrays.append(NamedArray(steps, item[()].T))
             elif kind == "char" and item.dtype.kind == "u":
                 arrays.append(NamedArray(steps, np.asarray(_characters(item))))
             elif kind == "cell" and item.dtype == h5py.ref_dtype:
+                limits.check_channels(item.size)
                 texts = [_characters(file[reference]) for reference in np.ravel(item[()])]
                 arrays.append(NamedArray(steps, np.asarray(texts)))
-
-        file.visititems(visit)
     return arrays
 
 
 def _characters(dataset: Any) -> str:
+    if dataset.size > _LONGEST_TEXT:
+        return ""
     return "".join(chr(int(code)) for code in np.ravel(dataset[()]) if dataset.dtype.kind == "u")
 
 

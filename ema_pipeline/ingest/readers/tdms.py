@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers.arrays import NamedArray, assemble
 from ema_pipeline.ingest.readers.raw import RawRecord
 
 NAME = "TDMS"
+
+APART = "tdms"
+"""Read in a process apart: a damaged file can keep its reader busy for ever."""
 
 
 def recognise(path: Path, head: bytes) -> bool:
@@ -18,7 +23,7 @@ def recognise(path: Path, head: bytes) -> bool:
     return head.startswith(b"TDSm")
 
 
-def read(path: Path) -> RawRecord:
+def read(path: Path, limits: ReadLimits) -> RawRecord:
     """Read every channel that holds numbers, scaled as its properties say."""
     import logging
 
@@ -29,13 +34,20 @@ def read(path: Path) -> RawRecord:
     with TdmsFile.open(str(path)) as file:
         if file.file_status.incomplete_final_segment:
             raise EmaError("is cut short: its last segment is incomplete; copy or export it again")
-        arrays = [
-            NamedArray((group.name, channel.name), np.asarray(channel[:]), dict(channel.properties))
-            for group in file.groups()
-            for channel in group.channels()
-            if len(channel)
-        ]
-        return assemble(arrays, {**file.properties, **_group_properties(file)})
+        channels = [c for group in file.groups() for c in group.channels() if len(c) and _is_numeric(c)]
+        limits.check_channels(len(channels))
+        stated = sum(len(c) * c.data_type.size for c in channels)
+        if stated > path.stat().st_size:  # nothing in it is packed
+            raise EmaError(
+                f"states {stated} bytes of samples, more than the whole file has; copy or export it again"
+            )
+        arrays = [NamedArray((c.group_name, c.name), np.asarray(c[:]), dict(c.properties)) for c in channels]
+        return assemble(arrays, {**file.properties, **_group_properties(file)}, limits)
+
+
+def _is_numeric(channel: Any) -> bool:
+    kind = getattr(channel.data_type, "nptype", None)
+    return kind is not None and np.dtype(kind).kind in "fiuc" and bool(channel.data_type.size)
 
 
 def _group_properties(file: object) -> dict[str, object]:

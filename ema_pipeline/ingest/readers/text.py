@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.readers.lines import Lines
 from ema_pipeline.ingest.readers.preamble import Preamble, read_preamble
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord
 from ema_pipeline.ingest.readers.timebase import (
@@ -42,6 +44,13 @@ _NOT_A_NUMBER = {
     "1.#qnan",
     "-1.#ind",
 }
+_LONGEST_PREAMBLE = 10_000
+_LONGEST_FOOTER = 1000
+"""Lines; vendors write some dozens."""
+
+_CELLS_AT_ONCE = 2_000_000
+"""Cells that are parsed together; one that is odd slows only those beside it."""
+
 _CLOCK = re.compile(r"\d{1,4}[-/.:]\d{1,2}[-/.:]\d{1,4}.*")
 
 
@@ -103,15 +112,15 @@ def decode(data: bytes) -> str:
         return data.decode("cp1252", errors="replace")
 
 
-def read(path: Path) -> RawRecord:
+def read(path: Path, limits: ReadLimits) -> RawRecord:
     """Read the table; a time column or the preamble gives the sample rate."""
-    lines = re.split(r"\r\n|\n|\r", decode(path.read_bytes()))
-    rows = [(number, line) for number, line in enumerate(lines, start=1) if line.strip()]
-    dialect, first = _find_table(rows)
-    width = _width(rows, first, dialect)
-    blank = len(dialect.split(rows[first][1])) - width
-    preamble = read_preamble([line for _, line in rows[:first]], dialect.split, width, blank)
-    table = _numbers(rows[first:], dialect, preamble.names)
+    lines = Lines(_utf8(path.read_bytes()))
+    dialect, first = _find_table(lines)
+    width = _width(lines, first, dialect)
+    limits.check_channels(width)
+    blank = len(dialect.split(lines[first])) - width
+    preamble = read_preamble(list(lines.some(0, first)), dialect.split, width, blank)
+    table = _numbers(lines, first, dialect, preamble.names)
     if preamble.samples is not None and table.shape[0] < preamble.samples:
         raise EmaError(
             f"holds {table.shape[0]} of the {preamble.samples} samples that its header states; "
@@ -120,17 +129,24 @@ def read(path: Path) -> RawRecord:
     return _channels(table, preamble)
 
 
-def _find_table(rows: list[tuple[int, str]]) -> tuple[Dialect, int]:
+def _utf8(data: bytes) -> bytes:
+    return data if data.isascii() else decode(data).encode("utf-8", errors="replace")
+
+
+def _find_table(lines: Lines) -> tuple[Dialect, int]:
     """Dialect of the table and the index of its first row."""
     # The middle of the file lies in the table unless the preamble is longer than it.
-    for probe in (len(rows) // 2, 3 * len(rows) // 4, len(rows) - 2, len(rows) - 1):
-        dialect = _dialect_of(rows[probe][1]) if 0 <= probe < len(rows) else None
+    for probe in (len(lines) // 2, 3 * len(lines) // 4, len(lines) - 2, len(lines) - 1):
+        dialect = _dialect_of(lines[probe]) if 0 <= probe < len(lines) else None
         if dialect is None:
             continue
-        width = len(_drop_trailing_blank(dialect.split(rows[probe][1])))
-        first = next(i for i, (_, line) in enumerate(rows) if _is_table_row(line, dialect, width))
+        width = len(_drop_trailing_blank(dialect.split(lines[probe])))
+        above = enumerate(lines.some(0, min(probe + 1, _LONGEST_PREAMBLE)))
+        first = next((i for i, line in above if _is_table_row(line, dialect, width)), None)
+        if first is None:
+            continue
         # Rows above that start with a number are table rows with a bad cell: they are reported, not skipped.
-        while first > 0 and _starts_like_table(rows[first - 1][1], dialect, width):
+        while first > 0 and _starts_like_table(lines[first - 1], dialect, width):
             first -= 1
         return dialect, first
     raise EmaError("no table of numbers found; export a header row and one column of numbers per channel")
@@ -175,63 +191,84 @@ def _starts_like_table(line: str, dialect: Dialect, width: int) -> bool:
     return front and all(c == "" or c.casefold() in _NOT_A_NUMBER or _CLOCK.fullmatch(c) for c in bad)
 
 
-def _width(rows: list[tuple[int, str]], first: int, dialect: Dialect) -> int:
+def _width(lines: Lines, first: int, dialect: Dialect) -> int:
     """Number of columns: what most of the first rows have."""
-    widths = Counter(len(_drop_trailing_blank(dialect.split(line))) for _, line in rows[first : first + 20])
+    widths = Counter(len(_drop_trailing_blank(dialect.split(line))) for line in lines.some(first, first + 20))
     return widths.most_common(1)[0][0]
 
 
-def _numbers(rows: list[tuple[int, str]], dialect: Dialect, names: tuple[str, ...]) -> NDArray[np.float64]:
+def _numbers(lines: Lines, first: int, dialect: Dialect, names: tuple[str, ...]) -> NDArray[np.float64]:
     """The table (n_samples, n_columns); a column of dates or clock times becomes NaN."""
-    width = len(names)
-    clock = _CLOCK.fullmatch(dialect.split(rows[0][1])[0]) is not None
-    if not clock and dialect.delimiter != " ":
-        table = _fast_numbers(rows, dialect, width)
-        if table is not None:
-            return table
-    return _careful_numbers(rows, dialect, names, clock)
+    stop = _without_footer(lines, first, dialect)
+    clock = _CLOCK.fullmatch(dialect.split(lines[first])[0]) is not None
+    table = np.empty((stop - first, len(names)))
+    step = max(1, _CELLS_AT_ONCE // len(names))
+    for start in range(first, stop, step):
+        end = min(start + step, stop)
+        block = _fast_numbers(lines, start, end, dialect, len(names), clock)
+        if block is None:
+            block = _careful_numbers(lines, start, end, dialect, names, clock)
+        table[start - first : end - first] = block
+    return table
 
 
-def _fast_numbers(rows: list[tuple[int, str]], dialect: Dialect, width: int) -> NDArray[np.float64] | None:
+def _without_footer(lines: Lines, first: int, dialect: Dialect) -> int:
+    """Index behind the last row: a footer such as "End of data" is none."""
+    stop = len(lines)
+    while stop > max(first + 1, len(lines) - _LONGEST_FOOTER):
+        cells = dialect.split(lines[stop - 1])
+        if any(c.isdigit() for c in lines[stop - 1]) or cells[0] == "":
+            break
+        if any(cell.casefold() in _NOT_A_NUMBER for cell in cells):
+            break
+        stop -= 1
+    return stop
+
+
+def _fast_numbers(
+    lines: Lines, start: int, stop: int, dialect: Dialect, width: int, clock: bool
+) -> NDArray[np.float64] | None:
     """Parse in one go; None where anything is odd, so that the careful way can say what."""
     import pandas
 
-    separators = {line.count(dialect.delimiter) for _, line in rows}
-    if len(separators) != 1 or next(iter(separators)) not in (width - 1, width):
+    blanks = dialect.delimiter == " "
+    if not blanks:
+        separators = lines.counts(dialect.delimiter, start, stop)
+        if np.ptp(separators) > 0 or separators[0] not in (width - 1, width):
+            return None
+    elif clock:
         return None
     try:
         frame = pandas.read_csv(
-            io.StringIO("\n".join(line for _, line in rows)),
-            sep=dialect.delimiter,
+            io.BytesIO(lines.block(start, stop)),
+            sep=r"\s+" if blanks else dialect.delimiter,
             decimal=dialect.decimal,
             header=None,
-            usecols=range(width),
+            usecols=None if blanks else range(int(clock), width),
             dtype=np.float64,
             skipinitialspace=True,
         )
     except (ValueError, OverflowError):
         return None
     table = frame.to_numpy(dtype=np.float64)
-    return table if table.shape == (len(rows), width) and np.all(np.isfinite(table)) else None
+    if table.shape != (stop - start, width - int(clock)) or not np.all(np.isfinite(table)):
+        return None
+    return np.insert(table, 0, np.nan, axis=1) if clock else table
 
 
 def _careful_numbers(
-    rows: list[tuple[int, str]], dialect: Dialect, names: tuple[str, ...], clock: bool
+    lines: Lines, start: int, stop: int, dialect: Dialect, names: tuple[str, ...], clock: bool
 ) -> NDArray[np.float64]:
     """Parse cell by cell and name the first cell that is no number."""
     width = len(names)
-    while rows and not any(c.isdigit() for c in rows[-1][1]) and dialect.split(rows[-1][1])[0] != "":
-        if any(cell.casefold() in _NOT_A_NUMBER for cell in dialect.split(rows[-1][1])):
-            break
-        rows = rows[:-1]  # a footer such as "End of data"
     convert = _converter(dialect)
-    table = np.empty((len(rows), width))
-    for i, (number, line) in enumerate(rows):
+    table = np.empty((stop - start, width))
+    for i, line in enumerate(lines.some(start, stop)):
         cells = dialect.split(line)
         cells = cells if len(cells) == width else _drop_trailing_blank(cells)
         if len(cells) != width:
             raise EmaError(
-                f"line {number} has {len(cells)} cells where the table has {width}; "
+                f"line {lines.number(start + i)} has {len(cells)} cells where the table has {width}; "
                 "the file is damaged or cut short, export it again"
             )
         for j, cell in enumerate(cells):
@@ -242,7 +279,8 @@ def _careful_numbers(
             else:
                 shown = "is blank" if cell == "" else f"'{cell}' is not a number"
                 raise EmaError(
-                    f"line {number}, channel '{names[j]}': {shown}; export the record again or leave it out"
+                    f"line {lines.number(start + i)}, channel '{names[j]}': {shown}; "
+                    "export the record again or leave it out"
                 )
     return table
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 import numpy as np
@@ -18,6 +19,10 @@ _TIME_NAME = re.compile(
 _INDEX_NAME = re.compile(
     r"(index|samples?|no\.?|nr\.?|n|#|points?|scans?)([ _-]?(no\.?|nr\.?|number|index))?", re.IGNORECASE
 )
+
+
+_SHORTEST_STEP = 1e-300
+"""s; one divided by less is no number."""
 
 
 def is_time_name(name: str) -> bool:
@@ -102,6 +107,8 @@ def whole_rate(step: float, relative_rounding: float) -> float:
     relative_rounding : float
         Relative size of the rounding error of `step`.
     """
-    rate = 1.0 / step
+    rate = 1.0 / step if step >= _SHORTEST_STEP else math.inf
+    if not math.isfinite(rate) or rate <= 0:
+        raise EmaError(f"states a time step of {step:.4g} s, which no recorder has; correct the file")
     whole = round(rate)
     return float(whole) if whole > 0 and abs(rate / whole - 1) <= relative_rounding else float(rate)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, clean_unit
 from ema_pipeline.ingest.readers.timebase import rate_from_times, whole_rate
 
@@ -45,12 +46,14 @@ def recognise(path: Path, head: bytes) -> bool:
     return len(lines) == 2 and lines[0] == b"-1" and re.match(rb"\d+b?\b", lines[1]) is not None
 
 
-def read(path: Path) -> RawRecord:
+def read(path: Path, limits: ReadLimits) -> RawRecord:
     """Read every time history of the file; id line 1 is the channel's name."""
     import pyuff
 
     data = path.read_bytes()
     blocks = _find_blocks(data)
+    limits.check_file(len(data), text=not any(block.binary for block in blocks))
+    limits.check_channels(sum(block.number == 58 for block in blocks))
     channels: dict[str, RawChannel] = {}
     rates: list[float] = []
     notes: list[str] = []

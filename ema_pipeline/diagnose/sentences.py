@@ -1,0 +1,76 @@
+"""The diagnosis in plain sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from ema_pipeline.diagnose.types import NOT_TOLD, EffectSize, LearnedScatter, VerdictWord
+from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
+
+_SHOWN = 3
+"""Parts that a sentence names."""
+
+
+def label_text(label: str) -> str:
+    """A label as a phrase."""
+    effect, _, place = label.partition("@")
+    if effect == OUT_OF_TOLERANCE:
+        return f"parameter {place} out of tolerance"
+    return f"{effect.replace('_', ' ')} at {place}"
+
+
+def size_text(sizes: Mapping[str, EffectSize]) -> str:
+    """``fraction 0.350 ± 0.002, …``."""
+    return ", ".join(f"{n.rpartition('.')[2]} {_one_size(s)}" for n, s in sizes.items())
+
+
+def _one_size(s: EffectSize) -> str:
+    if not s.told:
+        return NOT_TOLD
+    return f"{s.value:.4g} ± {s.std:.2g}{'' if s.unit in ('', '1') else ' ' + s.unit}"
+
+
+def summary(
+    verdict: VerdictWord, claimed: Sequence[tuple[str, str]], error: tuple[float, float], nothing: float
+) -> str:
+    """One or two sentences.
+
+    Parameters
+    ----------
+    verdict : str
+    claimed : sequence of (label, size)
+        What is claimed, or explains the data alike.
+    error : (float, float)
+        Before and after.
+    nothing : float
+        Probability that nothing is missing.
+    """
+    before, after = error
+    named = "; ".join(f"{label_text(label)}, {size}" for label, size in claimed)
+    if verdict == "effect":
+        return f"The model lacks {named}. With it the error falls from {before:.2f} to {after:.2f}."
+    if verdict == "ambiguous":
+        return f"Several effects explain the data alike: {named}. The error falls from {before:.2f} to {after:.2f}."
+    if verdict == "adequate":
+        odds = f"Probability that nothing is missing: {100 * nothing:.0f} %."
+        return f"The model explains the data: error {before:.2f}. {odds}"
+    if verdict == "unknown_effect":
+        best = f" The best that the library has is {named}." if named else ""
+        return f"The model does not explain the data (error {after:.2f}), and no effect in the library mends it.{best}"
+    return "These data do not suffice to tell what is missing."
+
+
+def scatter_text(scatters: Sequence[LearnedScatter]) -> str:
+    """What was stated of everything that scatters, and what was learned."""
+    told = ", ".join(f"{s.title} {100 * s.learned:.2g} % (stated {100 * s.stated:.2g} %)" for s in scatters)
+    return f"Scatter (1 σ) learned from the data: {told}." if told else ""
+
+
+def standing_out(parts: Mapping[str, float], scatter: float) -> str:
+    """Parts that deviate more than parts do; empty without any."""
+    if not parts:
+        return ""
+    named = ", ".join(f"{name} {100 * value:+.0f} %" for name, value in list(parts.items())[:_SHOWN])
+    return (
+        f"Parts that stand out from their like: {named}; all others scatter by {100 * scatter:.1f} % (1 σ)."
+    )

@@ -1,0 +1,235 @@
+"""FRFs of hits whose frequencies have moved, brought to where they belong together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.frf.estimate import estimate_frfs
+from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.ingest.records import HitSamples
+from ema_pipeline.modal.drift.local import PeakPoles, peak_poles
+from ema_pipeline.modal.drift.shifts import Movement, movement
+from ema_pipeline.modal.drift.windows import HitKey, Hits, peak_windows, spectra_of_hits
+from ema_pipeline.modal.peaks import KnownPeaks
+
+Real = NDArray[np.float64]
+
+FEWEST_HITS = 2
+
+NOTICED = 0.03
+"""Movement in half-power half-widths from which hits are aligned: a smaller one widens a peak by less than a
+thousandth."""
+
+MOVES = 0.05
+"""Movement of one peak beyond that of all, in half-power half-widths, from which a fit makes twins of it."""
+
+ONE_MODE = 0.02
+"""Second over first singular value of the residues of a peak over hits, above which more than one mode shows in
+it: hits on other points then excite another mixture, which looks like movement."""
+
+REACH = 2.0
+"""Decay rates within which no second mode is looked for at a peak that one mode makes."""
+
+PLATEAU = 0.4
+"""Share of the way to the next peak that moves with a peak: its flanks too must stay where it is."""
+
+
+@dataclass(frozen=True)
+class PeakMovement:
+    """How the frequency and damping of one peak differ from hit to hit.
+
+    Attributes
+    ----------
+    frequency_hz, damping_ratio : float
+        That all hits share, as the FRFs show them.
+    pole : complex
+        That fits all hits best, rad/s, as the FRFs show it: hits that show the peak best count most.
+    spread : ndarray, (2,)
+        Standard deviations of decay and frequency over hits, rad/s, what all modes share taken off.
+    single : bool
+        True where one mode alone makes the peak, as far as the hits can tell.
+    proven : bool
+        True where hits on several points show it.
+    shift : ndarray, (n_hits,)
+        Relative movement of the frequency in every hit, what is common to all modes included; NaN where a hit
+        does not show the peak.
+    common : ndarray, (n_hits,)
+        The part of it that all modes share.
+    shift_std : ndarray, (n_hits,)
+        From noise alone.
+    force : ndarray, (n_hits,)
+        Size of the force peak.
+    own_spread : float
+        Standard deviation of the movement beyond the common one.
+    """
+
+    frequency_hz: float
+    damping_ratio: float
+    pole: complex
+    spread: Real
+    single: bool
+    proven: bool
+    shift: Real
+    common: Real
+    shift_std: Real
+    force: Real
+    own_spread: float
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """FRFs brought together, and what had moved.
+
+    Attributes
+    ----------
+    frfs : FrfSet
+        Of the hits at common frequencies; the measured ones where nothing moves.
+    common_spread : float
+        Standard deviation over hits of the factor that all frequencies share.
+    n_hits : int
+    peaks : tuple of PeakMovement
+    aligned : bool
+        True where FRFs were brought together.
+    """
+
+    frfs: FrfSet
+    common_spread: float
+    n_hits: int
+    peaks: tuple[PeakMovement, ...]
+    aligned: bool
+
+    def known_peaks(self) -> KnownPeaks:
+        """Peaks that move, and of which hits on several points show that one mode is there.
+
+        Peaks that stay where they are need no such help, and may hide a second mode.
+        """
+        proven = [p for p in self.peaks if p.proven and p.own_spread > MOVES * p.damping_ratio]
+        poles = np.array([p.pole for p in proven], dtype=np.complex128)
+        spread = np.array([p.own_spread for p in proven])
+        std = np.array([p.spread for p in proven]).reshape(-1, 2)
+        return KnownPeaks(poles, REACH * -poles.real + 2 * spread * poles.imag, std)
+
+
+def align(
+    hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float, float], *, move: bool = True
+) -> Alignment:
+    """Estimate what moves from hit to hit, and estimate the FRFs anew without it.
+
+    Parameters
+    ----------
+    hits : callable
+        Gives the accepted hits.
+    frfs : FrfSet
+        Of these hits.
+    settings : FrfSettings
+        With which they were estimated.
+    band_hz : tuple of float
+        Band in which peaks are looked at.
+    move : bool
+        False to look at the movement only.
+    """
+    nothing = Alignment(frfs, 0.0, int(frfs.hits.max(initial=0)), (), aligned=False)
+    windows = peak_windows(frfs, band_hz)
+    if not windows:
+        return nothing
+    keys, spectra = spectra_of_hits(hits, frfs, settings, windows)
+    rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
+    found = [
+        peak_poles(w, frf, 2 * np.pi * frfs.frequency_hz[w.lines], rest_s)
+        for w, frf in zip(windows, spectra, strict=True)
+    ]
+    peaks = [p for p in found if p is not None and 2 * np.isfinite(p.std).sum() >= len(keys)]
+    if len(keys) < FEWEST_HITS or not peaks:
+        return nothing
+    moved, looked_at = _movements(peaks, keys)
+    warps = _warps(peaks, looked_at, moved, frfs.frequency_hz) if move else {}
+    if warps is None or not warps:
+        return Alignment(frfs, moved.spread, len(keys), looked_at, aligned=False)
+    by_hit = {key.name: warps[k] for k, key in enumerate(keys)}
+
+    def shift_of(hit: HitSamples) -> Real:
+        return by_hit[hit.hit.file, hit.hit.number]
+
+    return Alignment(
+        estimate_frfs(hits(), settings, shift_of), moved.spread, len(keys), looked_at, aligned=True
+    )
+
+
+def _movements(peaks: list[PeakPoles], keys: tuple[HitKey, ...]) -> tuple[Movement, tuple[PeakMovement, ...]]:
+    """What all peaks have in common, and each peak by itself."""
+    size = np.array([np.linalg.norm(p.residues, axis=1) for p in peaks]).T
+    shift = np.array([p.poles.imag / p.pole.imag - 1 for p in peaks]).T
+    std = np.array([p.std / p.pole.imag for p in peaks]).T
+    points = sorted({k.point for k in keys})
+    place = np.array([points.index(k.point) for k in keys])
+    typical = np.array([np.median(s[np.isfinite(e)]) for s, e in zip(size.T, std.T, strict=True)])
+    moved = movement(shift, std, size / np.maximum(typical, 1e-300), place)
+    force = np.array([k.force for k in keys])
+    looked_at = tuple(
+        PeakMovement(
+            frequency_hz=abs(p.pole) / (2 * np.pi),
+            damping_ratio=-p.pole.real / abs(p.pole),
+            pole=p.pole,
+            spread=_spread(p, float(moved.own_spread[c])),
+            single=_is_single(p, one_point=len(points) == 1),
+            proven=len(points) > 1 and _is_single(p, one_point=False),
+            shift=np.where(np.isfinite(p.std), moved.common + moved.own[:, c], np.nan),
+            common=moved.common,
+            shift_std=std[:, c],
+            force=force,
+            own_spread=float(moved.own_spread[c]),
+        )
+        for c, p in enumerate(peaks)
+    )
+    return moved, looked_at
+
+
+def _spread(peak: PeakPoles, own_spread: float) -> Real:
+    """Standard deviations of decay and frequency over hits, rad/s, (2,).
+
+    Decays are weighted as the shared pole weighs them, by the power with which a hit shows the peak.
+    """
+    power = np.where(np.isfinite(peak.std), np.sum(np.abs(peak.residues) ** 2, axis=1), 0.0)
+    off = peak.poles.real - peak.pole.real
+    decay = np.sqrt(np.sum(power * off**2) / max(float(power.sum()), 1e-300))
+    return np.array([float(decay), own_spread * peak.pole.imag])
+
+
+def _is_single(peak: PeakPoles, *, one_point: bool) -> bool:
+    """True where hits on different points show one and the same shape, or all hits struck one point."""
+    if one_point:
+        return True
+    shown = np.isfinite(peak.std)
+    if peak.residues.shape[1] < 2:
+        return False
+    scaled = peak.residues[shown] / peak.std[shown, None]
+    values = np.linalg.svd(scaled, compute_uv=False)
+    return bool(values[1] < ONE_MODE * values[0])
+
+
+def _warps(
+    peaks: list[PeakPoles], looked_at: tuple[PeakMovement, ...], moved: Movement, frequency_hz: Real
+) -> dict[int, Real]:
+    """Shift of every line of every hit; empty where nothing moves enough to be noticed."""
+    damping = np.array([p.damping_ratio for p in looked_at])
+    common = moved.common if moved.spread > NOTICED * float(damping.min()) else np.zeros(len(moved.common))
+    alone = np.array(
+        [p.single and p.own_spread > NOTICED * p.damping_ratio for p in looked_at], dtype=np.bool_
+    )
+    if not common.any() and not alone.any():
+        return {}
+    # brought to the pole that fits all hits best, not to the mean over hits
+    own = np.where(alone, moved.own + moved.mean, 0.0)
+    order = np.argsort([p.frequency_hz for p in looked_at])
+    centre = np.array([looked_at[c].frequency_hz for c in order])
+    gap = np.diff(centre, prepend=0.0, append=float(frequency_hz[-1]))
+    nodes = np.stack([centre - PLATEAU * gap[:-1], centre + PLATEAU * gap[1:]], axis=1)
+    out = {}
+    for h in range(len(common)):
+        values = np.repeat(own[h, order], 2)
+        out[h] = common[h] + np.interp(frequency_hz, nodes.ravel(), values, left=0.0, right=0.0)
+    return out

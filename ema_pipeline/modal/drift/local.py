@@ -1,0 +1,207 @@
+"""Pole of one peak in every single hit, from the lines around it, residues free in every FRF.
+
+No mode shape is needed for it: a wrong one, as a fit of hits that do not belong together gives, would hide
+the movement that is looked for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.modal.basis import pole_functions
+from ema_pipeline.modal.drift.windows import PeakWindow
+
+Complex = NDArray[np.complex128]
+Real = NDArray[np.float64]
+
+SHARED_STEPS = 8
+"""Steps of the pole that all hits share."""
+
+OWN_STEPS = 4
+"""Steps from there to the pole of each hit."""
+
+LARGEST_STEP = 0.5
+"""Largest step of a pole, in its decay rate."""
+
+FARTHEST = 3.0
+"""A hit whose pole lies farther from that of all, in decay rates, does not show the mode."""
+
+RINGS_ON = 0.7
+"""Share of a peak left at the end of the record above which it is a tone, not a decay."""
+
+EXPLAINED = 0.9
+"""Share of what a straight background leaves of the lines around a peak that one pole must explain."""
+
+MAX_DAMPING = 0.2
+"""A pole with more is no peak."""
+
+
+@dataclass(frozen=True)
+class PeakPoles:
+    """Poles of one peak.
+
+    Attributes
+    ----------
+    pole : complex
+        That all hits share, rad/s.
+    poles : complex ndarray, (n_hits,)
+        Of every hit.
+    std : ndarray, (n_hits,)
+        Standard deviation of real and imaginary part, rad/s; ``inf`` where a hit does not show the peak.
+    residues : complex ndarray, (n_hits, n_outputs)
+        0 where a channel was left out.
+    """
+
+    pole: complex
+    poles: Complex
+    std: Real
+    residues: Complex
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Linear fit of some FRFs: residues (n_frfs,), what is left (n_frfs, n_lines), and the derivative."""
+
+    residues: Complex
+    left: Complex
+    derivative: Complex
+    free: int
+
+
+def peak_poles(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> PeakPoles | None:
+    """Pole of a peak in every hit; None where no pole is found at the peak.
+
+    Parameters
+    ----------
+    window : PeakWindow
+    frf : complex ndarray, (n_hits, n_outputs, n_lines)
+        Accelerance of single hits on the lines of the window; NaN where not measured.
+    omega : ndarray, (n_lines,)
+    rest_s : float
+        Time from hit to end of the record.
+    """
+    known = np.asarray(np.isfinite(frf).all(axis=-1))
+    data = np.where(known[..., None], frf, 0.0)
+    shared = _shared_pole(window, data, known, omega, rest_s)
+    if shared is None:
+        return None
+    pole, noise = shared
+    n_hits, n_outputs = known.shape
+    poles, std = np.full(n_hits, pole), np.full(n_hits, np.inf)
+    residues = np.zeros((n_hits, n_outputs), dtype=np.complex128)
+    weight = np.where(known, 1.0 / noise, 0.0)
+    for h in range(n_hits):
+        poles[h], std[h], residues[h] = _own_pole(window, data[h], weight[h], pole, omega, rest_s)
+    return PeakPoles(pole, poles, std, residues)
+
+
+def plain_pole(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> complex | None:
+    """Pole that all FRFs share at a peak; None where one pole does not explain the peak.
+
+    Parameters
+    ----------
+    window : PeakWindow
+    frf : complex ndarray, (n_inputs, n_outputs, n_lines)
+        Accelerance on the lines of the window; NaN where not measured.
+    omega : ndarray, (n_lines,)
+    rest_s : float
+        Time from hit to end of the record.
+    """
+    known = np.asarray(np.isfinite(frf).all(axis=-1))
+    data = np.where(known[..., None], frf, 0.0)
+    shared = _shared_pole(window, data, known, omega, rest_s)
+    if shared is None:
+        return None
+    flat = data.reshape(-1, len(omega))
+    fit = _linear_fit(shared[0], window.neighbours, flat, omega, rest_s)
+    if fit is None:
+        return None
+    line = np.linspace(-1, 1, len(omega))
+    basis = np.linalg.qr(np.stack([np.ones(len(omega)), line]).T)[0]
+    without = flat - (flat @ basis) @ basis.T
+    left = float(np.sum(np.abs(fit.left) ** 2))
+    return shared[0] if left < (1 - EXPLAINED) * float(np.sum(np.abs(without) ** 2)) else None
+
+
+def _shared_pole(
+    window: PeakWindow, data: Complex, known: NDArray[np.bool_], omega: Real, rest_s: float
+) -> tuple[complex, Real] | None:
+    """Pole that fits all hits best, and the noise power of every output."""
+    pole = window.pole
+    flat = data.reshape(-1, len(omega))
+    noise = np.ones(data.shape[1])
+    for _ in range(SHARED_STEPS):
+        fit = _linear_fit(pole, window.neighbours, flat, omega, rest_s)
+        if fit is None:
+            return None
+        noise = _noise_of_outputs(fit, known)
+        weight = np.where(known, 1.0 / noise, 0.0).ravel()
+        step, _ = _step(fit, weight)
+        pole = _moved(pole, step)
+        if not omega[0] < pole.imag < omega[-1] or not 0 < -pole.real < MAX_DAMPING * abs(pole):
+            return None
+    return None if np.exp(pole.real * rest_s) > RINGS_ON else (pole, noise)
+
+
+def _own_pole(
+    window: PeakWindow, data: Complex, weight: Real, start: complex, omega: Real, rest_s: float
+) -> tuple[complex, float, Complex]:
+    """Pole of one hit, its standard deviation, and its residues."""
+    lost = start, np.inf, np.zeros(len(data), dtype=np.complex128)
+    fit = _linear_fit(start, window.neighbours, data, omega, rest_s)
+    if fit is None:
+        return lost
+    pole, information = start, 0.0
+    for _ in range(OWN_STEPS):
+        step, information = _step(fit, weight)
+        pole = _moved(pole, step)
+        fit = _linear_fit(pole, window.neighbours * (pole.imag / start.imag), data, omega, rest_s)
+        if fit is None or abs(pole - start) > FARTHEST * -start.real or pole.real >= 0 or information <= 0:
+            return lost
+    outputs = max(int(np.count_nonzero(weight)), 1)
+    dof = max(outputs * (len(omega) - fit.free) - 1, 1)
+    spread = float(np.sum(weight[:, None] * np.abs(fit.left) ** 2)) / dof
+    return pole, float(np.sqrt(0.5 * spread / information)), np.where(weight > 0, fit.residues, 0.0)
+
+
+def _linear_fit(pole: complex, others: Complex, data: Complex, omega: Real, rest_s: float) -> _Fit | None:
+    """Residues of a pole, its neighbours, and a straight background that fit best, FRF by FRF."""
+    u, derivative = pole_functions(omega, np.concatenate([[pole], others]), rest_s)
+    line = np.linspace(-1, 1, len(omega))
+    columns = np.concatenate([u, np.ones((1, len(omega))), line[None]])
+    if len(columns) + 2 > len(omega):
+        return None
+    columns = columns / np.linalg.norm(columns, axis=1, keepdims=True)
+    size = float(np.linalg.norm(u[0]))
+    basis, triangle = np.linalg.qr(columns.T)
+    inside = data @ basis.conj()
+    solved = np.linalg.lstsq(triangle, inside.T, rcond=1e-10)[0]
+    left = data - inside @ basis.T
+    across = derivative[0] - basis @ (basis.conj().T @ derivative[0])
+    return _Fit(solved[0] / size, left, across, len(columns))
+
+
+def _noise_of_outputs(fit: _Fit, known: NDArray[np.bool_]) -> Real:
+    """Power that the fit leaves of every output, relative to the largest: only the ratios serve as weights."""
+    power = np.sum(np.abs(fit.left) ** 2, axis=-1).reshape(known.shape)
+    mean = np.where(known, power, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+    top = float(mean.max())
+    return np.maximum(mean / top if top > 0 else np.ones(len(mean)), 1e-6)
+
+
+def _step(fit: _Fit, weight: Real) -> tuple[complex, float]:
+    """Gauss-Newton step of the pole, and the information it rests on."""
+    information = float(np.sum(weight * np.abs(fit.residues) ** 2)) * float(
+        np.sum(np.abs(fit.derivative) ** 2)
+    )
+    along = fit.left @ fit.derivative.conj()
+    slope = complex(np.sum(weight * fit.residues.conj() * along))
+    return (slope / information if information > 0 else 0j), information
+
+
+def _moved(pole: complex, step: complex) -> complex:
+    limit = LARGEST_STEP * abs(pole.real)
+    return pole + step * min(1.0, limit / max(abs(step), 1e-300))

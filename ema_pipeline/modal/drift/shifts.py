@@ -1,0 +1,169 @@
+"""One factor per hit, common to all modes, and what single modes move beyond it: a mixed model.
+
+The frequency of peak c in hit h on point p, relative to its own mean, is taken as
+
+    e_hc = m_c + d_h + k_pc + x_hc + noise ,
+
+d_h what all peaks have in common, k_pc what the peak shows alike in all hits of a point, x_hc its own movement.
+k_pc is mostly no movement but a second mode under the peak, or the flank of a stronger one, which another point
+excites in another ratio: it grows as the peak itself gets weaker, and so may x_hc. The variances of d, k and x
+are estimated with them (expectation-maximisation).
+
+References
+----------
+Laird, N. M. & Ware, J. H., "Random-effects models for longitudinal data", Biometrics 38, 1982.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Real = NDArray[np.float64]
+
+ITERATIONS = 80
+
+TAIL = 4.0
+"""Degrees of freedom of the t distribution that stands for errors: single hits may be far off."""
+
+FLOOR = 1e-12
+"""Least variance of a relative frequency."""
+
+
+@dataclass(frozen=True)
+class Movement:
+    """What moves from hit to hit, relative to the mean over hits.
+
+    Attributes
+    ----------
+    common, common_std : ndarray, (n_hits,)
+        Factor d of every hit, shrunk towards 0 by its own variance.
+    spread : float
+        Standard deviation of d.
+    mean : ndarray, (n_peaks,)
+        m, the mean over hits of every peak.
+    own : ndarray, (n_hits, n_peaks)
+        Movement x of single peaks beyond it, shrunk; 0 where a hit does not show the peak.
+    own_spread : ndarray, (n_peaks,)
+        Standard deviation of x.
+    point_spread : ndarray, (n_peaks,)
+        Standard deviation of k; 0 where no point was hit twice.
+    """
+
+    common: Real
+    common_std: Real
+    spread: float
+    mean: Real
+    own: Real
+    own_spread: Real
+    point_spread: Real
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    mean: Real
+    variance: Real
+    fitted: Real
+    fitted_variance: Real
+
+
+def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -> Movement:
+    """Estimate what moves.
+
+    Parameters
+    ----------
+    shift, std : ndarray, (n_hits, n_peaks)
+        Relative frequency of every peak in every hit; std ``inf`` where a hit does not show the peak.
+    strength : ndarray, (n_hits, n_peaks)
+        Size of the peak in the hit over its median.
+    point : ndarray of int, (n_hits,)
+    """
+    n_hits, n_peaks = shift.shape
+    known = np.isfinite(std)
+    repeated = np.bincount(point, minlength=int(point.max()) + 1)[point] > 1
+    design, groups = _design(known, point, repeated)
+    hit, peak = np.nonzero(known)
+    value = shift[hit, peak]
+    noise = std[hit, peak] ** 2
+    weak = 1.0 / np.clip(strength[hit, peak], 1e-2, 3.0) ** 2
+    start = np.array([_robust_variance(value[peak == c]) for c in range(n_peaks)])
+    common = float(np.median(start[start > 0])) if np.any(start > 0) else FLOOR
+    own, per_point = 0.5 * start + FLOOR, 0.5 * start + FLOOR
+    tail = np.ones(len(value))
+    for _ in range(ITERATIONS):
+        error = (noise + own[peak] * weak) / tail
+        prior = np.concatenate([np.full(n_peaks, np.inf), np.full(n_hits, common), per_point[groups]])
+        found = _posterior(design, value, error, prior)
+        left = value - found.fitted
+        square = left**2 + found.fitted_variance
+        tail = (TAIL + 1) / (TAIL + square / (error * tail))
+        hits = slice(n_peaks, n_peaks + n_hits)
+        common = max(float(np.mean(found.mean[hits] ** 2 + found.variance[hits])), FLOOR)
+        for c in range(n_peaks):
+            mine = n_peaks + n_hits + np.flatnonzero(groups == c)
+            if len(mine):
+                per_point[c] = max(float(np.mean(found.mean[mine] ** 2 + found.variance[mine])), FLOOR)
+            own[c] = _own_variance(
+                own[c], square[peak == c], noise[peak == c], weak[peak == c], tail[peak == c]
+            )
+    hits = slice(n_peaks, n_peaks + n_hits)
+    single = np.zeros(shift.shape)
+    spread = own[peak] * weak
+    single[hit, peak] = (value - found.fitted) * spread / (spread + noise)
+    return Movement(
+        common=found.mean[hits],
+        common_std=np.sqrt(found.variance[hits]),
+        spread=float(np.sqrt(common)),
+        mean=found.mean[:n_peaks],
+        own=single,
+        own_spread=np.sqrt(own),
+        point_spread=np.sqrt(np.where(np.isin(np.arange(n_peaks), groups), per_point, 0.0)),
+    )
+
+
+def _design(
+    known: NDArray[np.bool_], point: NDArray[np.int64], repeated: NDArray[np.bool_]
+) -> tuple[Real, NDArray[np.int64]]:
+    """Columns of m, d and k for every value, and the peak of each k."""
+    n_hits, n_peaks = known.shape
+    hit, peak = np.nonzero(known)
+    pairs = sorted({(int(point[h]), int(c)) for h, c in zip(hit, peak, strict=True) if repeated[h]})
+    place = {pair: k for k, pair in enumerate(pairs)}
+    design = np.zeros((len(hit), n_peaks + n_hits + len(pairs)))
+    row = np.arange(len(hit))
+    design[row, peak] = 1.0
+    design[row, n_peaks + hit] = 1.0
+    for k, (h, c) in enumerate(zip(hit, peak, strict=True)):
+        if repeated[h]:
+            design[k, n_peaks + n_hits + place[int(point[h]), int(c)]] = 1.0
+    return design, np.array([c for _, c in pairs], dtype=np.int64)
+
+
+def _posterior(design: Real, value: Real, error: Real, prior: Real) -> _Posterior:
+    """Mean and variance of the unknowns, and of what they add up to for each value."""
+    scaled = design / error[:, None]
+    precision = design.T @ scaled + np.diag(np.where(np.isfinite(prior), 1.0 / prior, 1e-6))
+    scale = 1.0 / np.sqrt(np.diag(precision))
+    covariance = np.linalg.inv(precision * scale[:, None] * scale) * scale[:, None] * scale
+    mean = covariance @ (scaled.T @ value)
+    return _Posterior(
+        mean, np.diag(covariance), design @ mean, np.einsum("ka,ab,kb->k", design, covariance, design)
+    )
+
+
+def _own_variance(old: float, square: Real, noise: Real, weak: Real, tail: Real) -> float:
+    """Next estimate of the variance of x from the squares that are left of one peak."""
+    if not len(square):
+        return old
+    total = noise / weak + old
+    ratio = float(np.mean(tail * square / weak / total**2) / np.mean(1.0 / total))
+    return max(old * np.sqrt(ratio), FLOOR)
+
+
+def _robust_variance(values: Real) -> float:
+    """Variance from the median absolute deviation."""
+    if len(values) < 2:
+        return 0.0
+    return float((1.4826 * np.median(np.abs(values - np.median(values)))) ** 2)

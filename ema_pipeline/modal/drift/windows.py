@@ -1,0 +1,186 @@
+"""Plain peaks of the FRFs, and the lines around each of them cut out of every single hit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+import scipy.signal
+from numpy.typing import NDArray
+from scipy.fft import rfft
+
+from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.frf.windows import Windows
+from ema_pipeline.ingest.records import HitSamples
+
+Complex = NDArray[np.complex128]
+Real = NDArray[np.float64]
+Hits = Callable[[], Iterable[HitSamples]]
+"""Gives the accepted hits, as often as it is called."""
+
+PROMINENCE_DB = 6.0
+"""A peak rises by so much out of the response of all FRFs: lower ones tell little of single hits."""
+
+MAX_PEAKS = 24
+"""Peaks looked at, the most prominent first: more do not tell more of what moves."""
+
+REACH = 4.0
+"""Lines on either side of a peak, in half-power half-widths."""
+
+FEWEST_LINES = 8
+"""Lines on either side at least."""
+
+MOST_LINES = 60
+"""Lines on either side at most."""
+
+MAX_OUTPUTS = 16
+"""Responses kept of every hit, those that show the peak best."""
+
+
+@dataclass(frozen=True)
+class PeakWindow:
+    """Lines around a peak.
+
+    Attributes
+    ----------
+    lines : slice
+        Of the FRFs' axis.
+    pole : complex
+        First guess, rad/s, under the exponential window.
+    neighbours : complex ndarray
+        Poles of other peaks that reach into the lines.
+    outputs : ndarray of int
+        Outputs of the FRF set that show the peak best.
+    """
+
+    lines: slice
+    pole: complex
+    neighbours: Complex
+    outputs: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class HitKey:
+    """A hit by its file and number, with what the study of movement asks of it.
+
+    Attributes
+    ----------
+    file : str
+    number : int
+    point : str
+    force : float
+        Size of the force peak.
+    """
+
+    file: str
+    number: int
+    point: str
+    force: float
+
+    @property
+    def name(self) -> tuple[str, int]:
+        """What tells a hit from all others."""
+        return self.file, self.number
+
+
+def peak_windows(frfs: FrfSet, band_hz: tuple[float, float]) -> tuple[PeakWindow, ...]:
+    """The plain peaks of all FRFs together.
+
+    Parameters
+    ----------
+    frfs : FrfSet
+    band_hz : tuple of float
+    """
+    curve = response_curve(frfs)
+    low, high = (int(k) for k in np.searchsorted(frfs.frequency_hz, band_hz))
+    smooth = scipy.ndimage.gaussian_filter1d(curve, 1.0)
+    found, known = scipy.signal.find_peaks(smooth[: high + 1], prominence=PROMINENCE_DB)
+    inside = found > max(low, 1)
+    found, rise = found[inside], known["prominences"][inside]
+    kept = np.sort(found[np.argsort(-rise, kind="stable")[:MAX_PEAKS]])
+    step = 2 * np.pi * float(frfs.frequency_hz[1])
+    decay = np.array([max(_half_width(curve, k), 0.3) for k in kept]) * step
+    poles = np.asarray(-decay + 1j * step * kept, dtype=np.complex128)
+    return tuple(_window(frfs, poles, r, step) for r in range(len(poles)))
+
+
+def response_curve(frfs: FrfSet) -> Real:
+    """Power of all FRFs, each over its own median, in dB over the lines."""
+    power = np.zeros(len(frfs.frequency_hz))
+    for row in frfs.frf.reshape(-1, len(power)):
+        square = np.abs(row) ** 2
+        middle = float(np.median(square[1:]))
+        if np.isfinite(middle) and middle > 0:
+            power += square / middle
+    return np.asarray(10 * np.log10(np.maximum(power, 1e-30)))
+
+
+def _half_width(curve: Real, peak: int) -> float:
+    """Half the width of a peak at half its power, in lines."""
+    low = high = float(peak)
+    target = curve[peak] - 10 * np.log10(2.0)
+    for k in range(peak, 0, -1):
+        if curve[k - 1] <= target:
+            low = k - (curve[k] - target) / max(curve[k] - curve[k - 1], 1e-12)
+            break
+    for k in range(peak, len(curve) - 1):
+        if curve[k + 1] <= target:
+            high = k + (curve[k] - target) / max(curve[k] - curve[k + 1], 1e-12)
+            break
+    return 0.5 * (high - low)
+
+
+def _window(frfs: FrfSet, poles: Complex, index: int, step: float) -> PeakWindow:
+    pole = complex(poles[index])
+    half = int(np.clip(REACH * -pole.real / step, FEWEST_LINES, MOST_LINES))
+    centre = round(pole.imag / step)
+    lines = slice(max(1, centre - half), min(len(frfs.frequency_hz), centre + half + 1))
+    distance = np.abs(poles.imag - pole.imag) / step
+    near = (distance < 2 * half) & (np.arange(len(poles)) != index)
+    power = np.nan_to_num(np.abs(frfs.frf[..., lines]) ** 2).sum(axis=-1)
+    level = np.nan_to_num(np.median(np.abs(frfs.frf) ** 2, axis=-1))
+    shown = np.where(level > 0, power / np.where(level > 0, level, 1.0), 0.0).sum(axis=1)
+    outputs = np.sort(np.argsort(-shown, kind="stable")[:MAX_OUTPUTS])
+    return PeakWindow(lines, pole, poles[near], outputs.astype(np.int64))
+
+
+def spectra_of_hits(
+    hits: Hits, frfs: FrfSet, settings: FrfSettings, windows: tuple[PeakWindow, ...]
+) -> tuple[tuple[HitKey, ...], list[Complex]]:
+    """Single-hit FRFs around every peak.
+
+    Returns
+    -------
+    keys : tuple of HitKey
+    spectra : list of complex ndarray, (n_hits, n_outputs, n_lines)
+        Per window, as accelerance; NaN where a channel was left out.
+    """
+    keys, parts = [], []
+    place = {d.point: k for k, d in enumerate(frfs.outputs)}
+    for hit in hits():
+        keys.append(
+            HitKey(hit.hit.file, hit.hit.number, hit.hit.impact.point, float(abs(hit.hit.peak_force)))
+        )
+        frf = _one_hit(hit, frfs, settings, place)
+        parts.append([frf[np.ix_(w.outputs, np.arange(w.lines.start, w.lines.stop))] for w in windows])
+    stacked = [np.array([p[k] for p in parts]) for k in range(len(windows))]
+    power = {"acceleration": 0, "velocity": 1, "displacement": 2}
+    for window, values in zip(windows, stacked, strict=True):
+        jw = 2j * np.pi * frfs.frequency_hz[window.lines]
+        values *= np.array([jw ** power[frfs.quantities[o]] for o in window.outputs])
+    return tuple(keys), stacked
+
+
+def _one_hit(hit: HitSamples, frfs: FrfSet, settings: FrfSettings, place: dict[str, int]) -> Complex:
+    """Response over force of one hit, (n_outputs, n_lines); NaN where a channel was left out."""
+    prepared = Windows(hit, settings)
+    force = np.asarray(rfft(prepared.force(hit.force))) * hit.hit.impact.sign
+    safe = np.where(np.abs(force) > 0, force, 1.0)
+    out = np.full((len(frfs.outputs), len(force)), np.nan, dtype=np.complex128)
+    for row, channel in enumerate(hit.channels):
+        samples = prepared.responses(np.asarray(hit.responses[row : row + 1]))[0]
+        out[place[channel.dof.point]] = channel.dof.sign * np.asarray(rfft(samples)) / safe
+    return out

@@ -1,0 +1,161 @@
+"""Hits in, modes out: what moves from hit to hit is estimated first, aligned, and then carried by the modes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.stats
+from numpy.typing import NDArray
+
+from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.modal.data import analysis_band
+from ema_pipeline.modal.drift.align import NOTICED, Alignment, PeakMovement, align
+from ema_pipeline.modal.drift.windows import Hits
+from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.modal.types import ModalModel, Mode
+from ema_pipeline.threads import single_blas_thread
+
+Progress = Callable[[float, str], None]
+Real = NDArray[np.float64]
+
+CHANCE = 0.01
+"""Probability by chance of a trend with the force that is taken for one."""
+
+COVERED = 0.95
+"""Quantile at which the intervals of a mean of few hits are to hold as those of many."""
+
+FEWEST_HITS = 6
+"""Hits without which a trend with the force is not looked for."""
+
+WORTH_SAYING = 0.5
+"""A mode is flagged for its movement where that makes up so much of its standard deviation."""
+
+
+@dataclass(frozen=True)
+class HitModes:
+    """Modes identified from hits.
+
+    Attributes
+    ----------
+    modal : ModalModel
+    frfs : FrfSet
+        From which they were identified: aligned, where hits differ in frequency.
+    alignment : Alignment
+    """
+
+    modal: ModalModel
+    frfs: FrfSet
+    alignment: Alignment
+
+
+def identify_hits(
+    hits: Hits,
+    frfs: FrfSet,
+    frf_settings: FrfSettings,
+    settings: ModalSettings,
+    progress: Progress | None = None,
+) -> HitModes:
+    """Identify modes from hits whose frequencies may differ from hit to hit.
+
+    Parameters
+    ----------
+    hits : callable
+        Gives the accepted hits, as often as it is called.
+    frfs : FrfSet
+        Of these hits, as measured.
+    frf_settings : FrfSettings
+        With which they were estimated.
+    settings : ModalSettings
+    progress : callable, optional
+
+    Returns
+    -------
+    HitModes
+        The intervals of frequencies hold their scatter over hits.
+    """
+    with single_blas_thread():
+        alignment = align(hits, frfs, frf_settings, analysis_band(frfs, settings))
+    modal = identify(alignment.frfs, settings, progress, alignment.known_peaks())
+    return HitModes(with_movement(modal, alignment, frfs.response_decay_rad_s), alignment.frfs, alignment)
+
+
+def with_movement(modal: ModalModel, alignment: Alignment, decay_rad_s: float = 0.0) -> ModalModel:
+    """The modes with intervals that hold the scatter over hits, and with a word where a mode moves.
+
+    Parameters
+    ----------
+    modal : ModalModel
+    alignment : Alignment
+    decay_rad_s : float
+        Decay of the exponential window, which the peaks still hold.
+    """
+    if not alignment.peaks:
+        return modal
+    modes = tuple(_moving(m, alignment, decay_rad_s) for m in modal.modes)
+    note = _common_note(alignment)
+    return replace(modal, modes=modes, notes=(*modal.notes, *([note] if note else [])))
+
+
+def _moving(mode: Mode, alignment: Alignment, decay_rad_s: float) -> Mode:
+    peak = peak_of(mode, alignment, decay_rad_s)
+    n = alignment.n_hits
+    common = alignment.common_spread
+    own = peak.own_spread if peak is not None and peak.single else 0.0
+    mean_std = float(np.hypot(common, own)) * _of_few(n) / np.sqrt(n)
+    trend = _with_force(peak) if peak is not None and own > 0 else 0.0
+    if trend:
+        # a mode that moves with the force has no one frequency: the interval holds what it moves by
+        mean_std = float(np.hypot(mean_std, own))
+    added = mode.frequency_hz * mean_std
+    std = float(np.hypot(mode.frequency_std_hz, added))
+    flags = mode.flags
+    worth = bool(trend) or added > WORTH_SAYING * std
+    if peak is not None and own > NOTICED * peak.damping_ratio and worth:
+        flags = (*flags, _words(own, trend))
+    return replace(mode, frequency_std_hz=std, flags=flags)
+
+
+def peak_of(mode: Mode, alignment: Alignment, decay_rad_s: float) -> PeakMovement | None:
+    """The peak that a mode makes, None where it makes none that was looked at."""
+    seen = mode.pole - decay_rad_s
+    near = [p for p in alignment.peaks if abs(p.pole.imag - seen.imag) < -(p.pole.real + seen.real)]
+    return min(near, key=lambda p: abs(p.pole - seen), default=None)
+
+
+def _with_force(peak: PeakMovement) -> float:
+    """Relative movement from the softest to the hardest third of the hits; 0 where it is no trend."""
+    moved = peak.shift - peak.common
+    shown = np.isfinite(moved)
+    if np.count_nonzero(shown) < FEWEST_HITS or np.ptp(peak.force[shown]) == 0:
+        return 0.0
+    force, moved = peak.force[shown], moved[shown]
+    if scipy.stats.spearmanr(force, moved).pvalue > CHANCE:
+        return 0.0
+    low, high = np.quantile(force, [1 / 3, 2 / 3])
+    return float(moved[force >= high].mean() - moved[force <= low].mean())
+
+
+def _of_few(n_hits: int) -> float:
+    """How much wider than a normal one the interval of a mean of few values is."""
+    return float(scipy.stats.t.ppf(COVERED, max(n_hits - 1, 1)) / scipy.stats.norm.ppf(COVERED))
+
+
+def _words(spread: float, trend: float) -> str:
+    if trend:
+        way = "falls" if trend < 0 else "rises"
+        return f"moves with the force: {way} by {100 * abs(trend):.2g} % from soft to hard hits"
+    return f"moves by {100 * spread:.2g} % (1 sigma) from hit to hit"
+
+
+def _common_note(alignment: Alignment) -> str:
+    damping = min(p.damping_ratio for p in alignment.peaks)
+    if alignment.common_spread <= NOTICED * damping:
+        return ""
+    return (
+        f"all frequencies move together by {100 * alignment.common_spread:.2g} % (1 sigma) from hit to hit: hits "
+        "were aligned, and the intervals of frequencies hold it"
+    )

@@ -1,0 +1,81 @@
+"""No file, however it is made, crashes a reader, hangs it, fills the memory, or is taken for a record."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hostile_files import SIGNAL, TRAPS
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.readers import apart, read_raw
+from ema_pipeline.ingest.readers.apart import read_apart
+
+SECONDS, MEGABYTES = 10.0, 500.0
+"""What any trap may take: time of this process (its helper has a limit of its own), memory of each of the two."""
+
+READ = """
+import sys, time
+from pathlib import Path
+from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.readers import apart, read_raw
+try:
+    record = read_raw(Path(sys.argv[1]))
+    said = "read"
+except EmaError as error:
+    said = str(error)
+seconds, used = time.process_time(), 0.0
+helper = apart._running
+for process in ["self"] if helper is None else ["self", str(helper._process.pid)]:
+    status = Path(f"/proc/{process}/status").read_text()
+    used = max(used, int(status.partition("VmHWM:")[2].split()[0]) / 1e3) if "VmHWM" in status else used
+print(seconds)
+print(used)
+print(said)
+"""
+
+MAY_BE_READ = {"many_lines.csv"}
+"""Large, but what they say."""
+
+
+@pytest.mark.parametrize("name", list(TRAPS))
+def test_a_trap_is_refused_in_one_line_fast_and_without_filling_the_memory(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    TRAPS[name](path)
+    done = subprocess.run(
+        [sys.executable, "-c", READ, str(path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    seconds, megabytes, *said = done.stdout.splitlines()
+    assert len(said) == 1
+    assert said == ["read"] if name in MAY_BE_READ else str(path) in said[0]
+    assert "unexpected" not in said[0]
+    assert float(seconds) < SECONDS
+    assert float(megabytes) < MEGABYTES
+
+
+def test_a_helper_that_dies_harms_only_the_file_it_read(tmp_path: Path) -> None:
+    path = tmp_path / "good.h5"
+    with h5py.File(path, "w") as file:
+        file["hammer"] = SIGNAL
+    with pytest.raises(EmaError, match="crashes the library that reads it"):
+        read_apart("no_reader", path, ReadLimits())
+    assert read_raw(path).channels
+    apart._helper().close()
+    assert read_raw(path).channels
+
+
+def test_a_limit_is_a_setting(tmp_path: Path) -> None:
+    path = tmp_path / "zeros.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("hammer", data=np.zeros(10_000_000), chunks=True, compression="gzip")
+    with pytest.raises(EmaError, match=r"--set ingest\.unpack_ratio"):
+        read_raw(path)
+    assert read_raw(path, ReadLimits(unpack_ratio=2000)).channels["hammer"].samples.size == 10_000_000
+    with pytest.raises(EmaError, match=r"--set ingest\.largest_mb"):
+        read_raw(path, ReadLimits(largest_mb=0.01))

@@ -1,0 +1,108 @@
+"""Frequencies that move from hit to hit: spectra between lines, factors of hits, modes without twins."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from simulate_modal import TrueSystem, random_system, records_of, simulate_hits
+
+from ema_pipeline.frf.estimate import estimate_frfs
+from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.frf.warp import WarpedTransform
+from ema_pipeline.ingest.quality import hits_of_test
+from ema_pipeline.ingest.records import HitSamples, cut_hit
+from ema_pipeline.modal.drift.shifts import movement
+from ema_pipeline.modal.moving import HitModes, identify_hits
+from ema_pipeline.modal.settings import ModalSettings
+
+SYSTEM = random_system(
+    np.random.default_rng(3),
+    n_modes=6,
+    n_dofs=8,
+    low_hz=40,
+    high_hz=380,
+    min_spacing=0.06,
+    damping=(0.002, 0.006),
+)
+
+
+def identified(system: TrueSystem, n_hits: int, references: list[int], **moves: float) -> HitModes:
+    dofs = list(range(system.shapes.shape[1]))
+    made = simulate_hits(
+        system,
+        dofs,
+        references,
+        f_max=400,
+        record_s=4.0,
+        n_hits=n_hits,
+        force_noise=0.01,
+        response_noise=0.01,
+        rng=np.random.default_rng(11),
+        **moves,
+    )
+    hits = source(records_of(made, dofs, references))
+    frfs = estimate_frfs(hits(), FrfSettings())
+    return identify_hits(hits, frfs, FrfSettings(), ModalSettings())
+
+
+def source(records: list) -> Callable[[], Iterator[HitSamples]]:
+    by_file = {r.file: r for r in records}
+    found = [h for h in hits_of_test(records) if h.accepted]
+    return lambda: (cut_hit(by_file[h.file], h) for h in found)
+
+
+@pytest.mark.parametrize("n", [200, 201])
+def test_a_spectrum_between_lines_is_that_of_the_definition(n: int) -> None:
+    samples = np.random.default_rng(0).standard_normal((2, n))
+    shift = 1e-2 * np.sin(np.arange(n // 2 + 1))
+    place = np.arange(n // 2 + 1) * (1 + shift)
+    exact = samples @ np.exp(-2j * np.pi * np.outer(np.arange(n), place) / n)
+    np.testing.assert_allclose(WarpedTransform(n, shift)(samples), exact, atol=1e-7 * np.abs(exact).max())
+
+
+def test_common_factors_are_told_from_movement_of_one_mode_and_from_what_a_point_shows() -> None:
+    rng = np.random.default_rng(5)
+    point = np.repeat(np.arange(4), 3)
+    common = 1e-3 * rng.standard_normal(12)
+    own = np.zeros((12, 5))
+    own[:, 2] = 2e-3 * rng.standard_normal(12)
+    mixture = np.zeros((4, 5))
+    mixture[:, 4] = 2e-3 * rng.standard_normal(4)
+    noise = np.full((12, 5), 3e-5)
+    shift = common[:, None] + own + mixture[point] + noise * rng.standard_normal((12, 5))
+    found = movement(shift, noise, np.ones((12, 5)), point)
+    assert found.common - found.common.mean() == pytest.approx(common - common.mean(), abs=1e-4)
+    assert np.argmax(found.own_spread) == 2
+    assert np.argmax(found.point_spread) == 4
+
+
+def test_drift_of_all_frequencies_makes_no_twins_and_is_in_the_intervals() -> None:
+    found = identified(SYSTEM, 2, [0, 3, 5], drift=1.5e-3)
+    modes = found.modal.modes
+    assert found.alignment.aligned
+    assert len(modes) == len(SYSTEM.frequency_hz)
+    for mode, f, z in zip(modes, SYSTEM.frequency_hz, SYSTEM.damping_ratio, strict=True):
+        assert abs(mode.frequency_hz - f) < 3 * mode.frequency_std_hz
+        # six hits: the mean of the drift is known to 1.5e-3/√6
+        assert 2e-4 * f < mode.frequency_std_hz < 2e-3 * f
+        assert mode.damping_ratio == pytest.approx(z, rel=0.1)
+    assert any("from hit to hit" in note for note in found.modal.notes)
+
+
+def test_modes_that_soften_say_so_and_are_not_split() -> None:
+    found = identified(SYSTEM, 6, [0, 3, 5], softening=2e-3)
+    modes = found.modal.modes
+    assert len(modes) == len(SYSTEM.frequency_hz)
+    soft, stiff = modes[: len(modes) // 2], modes[len(modes) // 2 :]
+    assert all(any("falls by" in flag for flag in mode.flags) for mode in soft)
+    assert not any("falls by" in flag for mode in stiff for flag in mode.flags)
+    for mode, f in zip(modes, SYSTEM.frequency_hz, strict=True):
+        assert abs(mode.frequency_hz - f) < 3 * mode.frequency_std_hz
+
+
+def test_hits_that_do_not_move_are_left_as_they_are() -> None:
+    found = identified(SYSTEM, 3, [0, 3])
+    assert not found.alignment.aligned
+    assert not any("moves" in flag for mode in found.modal.modes for flag in mode.flags)

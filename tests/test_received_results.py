@@ -1,0 +1,109 @@
+"""A results folder that somebody else has sent: nothing in it runs, leads elsewhere or steers the terminal."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from ema_pipeline.cli import app
+from ema_pipeline.errors import EmaError
+from ema_pipeline.stages.base import load_info, save_info
+from ema_pipeline.store import Store
+
+EFFECT = """
+from pathlib import Path
+Path({marker!r}).touch()
+from ema_pipeline.effects.spring import EFFECT as SHIPPED
+from dataclasses import replace
+EFFECT = replace(SHIPPED, id="film")
+"""
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of a small table of modes."""
+    folder = tmp_path_factory.mktemp("modes")
+    table = folder / "case1.toml"
+    table.write_text("schema = 1\n[no_ring]\nfrequency_hz = [62.5, 85.7, 134.0]\n", encoding="utf-8")
+    out = folder / "out"
+    command = ["run", "--modes", str(table), "--rig", "planetary", "--out", str(out), "--set"]
+    done = CliRunner().invoke(app, [*command, 'stages=["modal", "ladder", "fit", "correlate"]'])
+    assert done.exit_code == 0, done.output
+    return out
+
+
+def received(results: Path, folder: Path, **changes: object) -> Path:
+    """A copy of the results whose description says something else."""
+    out = folder / "received"
+    shutil.copytree(results, out)
+    store = Store(out)
+    info = load_info(store)
+    assert info is not None
+    save_info(store, dataclasses.replace(info, **changes))
+    return out
+
+
+def with_effect_file(results: Path, folder: Path, file: Path) -> Path:
+    """A copy of the results that remembers a Python file, and has its effect in the model."""
+    info = load_info(Store(results))
+    assert info is not None
+    pipeline = json.loads(info.pipeline) | {"effect_files": [str(file)]}
+    return received(results, folder, pipeline=json.dumps(pipeline), effects=("film@sun.y",))
+
+
+@pytest.mark.parametrize(
+    "verb", ["ladder", "compare", "fit", "diagnose", "report", "export", "add", "remove"]
+)
+def test_the_code_that_received_results_name_does_not_run(results: Path, tmp_path: Path, verb: str) -> None:
+    marker, file = tmp_path / "it_ran", tmp_path / "film.py"
+    file.write_text(EFFECT.format(marker=str(marker)), encoding="utf-8")
+    out = with_effect_file(results, tmp_path, file)
+    more = ["film@sun.y"] if verb in ("add", "remove") else []
+    done = CliRunner().invoke(app, [verb, str(out), *more])
+    assert not marker.exists()
+    if verb != "export":  # what was measured is exported without a model
+        assert isinstance(done.exception, EmaError)
+        assert f"--effect-file {file}" in str(done.exception)
+
+
+def test_a_file_that_is_named_in_the_call_runs(results: Path, tmp_path: Path) -> None:
+    marker, file = tmp_path / "it_ran", tmp_path / "film.py"
+    file.write_text(EFFECT.format(marker=str(marker)), encoding="utf-8")
+    # the results remember the path that it had on its maker's computer
+    out = with_effect_file(results, tmp_path, Path("/home/maker/film.py"))
+    done = CliRunner().invoke(app, ["fit", str(out), "--effect-file", str(file)])
+    assert done.exit_code == 0, done.exception
+    assert marker.exists()
+    info = load_info(Store(out))
+    assert info is not None
+    assert json.loads(info.pipeline)["effect_files"] == [str(file)]
+    assert list(info.effect_hashes) == [str(file)]
+
+
+def test_a_pipeline_file_cannot_make_code_run(tmp_path: Path) -> None:
+    marker, file = tmp_path / "it_ran", tmp_path / "film.py"
+    file.write_text(EFFECT.format(marker=str(marker)), encoding="utf-8")
+    pipeline = tmp_path / "pipeline.toml"
+    pipeline.write_text(f'stages = ["modal", "diagnose"]\neffect_files = ["{file}"]\n', encoding="utf-8")
+    table = tmp_path / "case1.toml"
+    table.write_text("schema = 1\n[no_ring]\nfrequency_hz = [62.5, 85.7, 134.0]\n", encoding="utf-8")
+    command = ["run", "--modes", str(table), "--rig", "planetary", "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, [*command, "--pipeline", str(pipeline)])
+    assert not marker.exists()
+    assert f"--effect-file {file}" in str(done.exception)
+
+
+def test_an_effect_file_that_ends_the_program_is_one_clear_line(tmp_path: Path) -> None:
+    file = tmp_path / "film.py"
+    file.write_text("import sys\nsys.exit(0)\n", encoding="utf-8")
+    out = tmp_path / "raw"
+    done = CliRunner().invoke(
+        app, ["simulate", str(out), "--effect", "film@sun.y:stiffness=1", "--effect-file", str(file)]
+    )
+    assert isinstance(done.exception, EmaError)
+    assert "does not run: SystemExit" in str(done.exception)
