@@ -83,7 +83,7 @@ def fitted(observations: AmplitudeObservations, base: Fit, label: str) -> tuple[
 CASES = {
     "bearing_cubic@hub": ([PolynomialSpring(f"c{a}", {f"hub.{a}": 1.0}, cubic=8e9) for a in "xy"], "stiffness", 8e9),
     "bearing_quadratic@rim": (
-        [PolynomialSpring(f"q{a}", {f"rim.{a}": 1.0}, quadratic=-5e6) for a in "xy"], "stiffness", 5e6,
+        [PolynomialSpring(f"q{a}", {f"rim.{a}": 1.0}, quadratic=-1.2e7) for a in "xy"], "stiffness", 1.2e7,
     ),
     "dry_friction@hub": ([DryFriction(f"f{a}", {f"hub.{a}": 1.0}, 0.02) for a in "xy"], "force", 0.02),
     "mesh_backlash@hub-rim": (

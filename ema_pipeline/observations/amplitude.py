@@ -139,14 +139,15 @@ class AmplitudeProblem:
         return tuple(self.unknowns.index[n] for n in names)
 
     def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
-        """`x` with the sizes of the effect added last at the best of a grid, where it depends on the amplitude.
+        """`x` with the sizes of the effect added last at the best of a grid; None where it is linear.
 
         From far off there is often no slope that leads to the right size: teeth that never part, friction that locks,
         and a quadratic spring of no size change nothing.
         """
-        names = [n for n in self.sizes if self._nonlinear and n.rpartition(".")[0] == self._nonlinear[-1]]
-        if not names or not self.observations.hits:
+        last = self.model.effects[-1] if self.model.effects else None
+        if last is None or last.effect.linear or not self.observations.hits:
             return None
+        names = [last.parameter_name(p.name) for p in last.effect.parameters]
         at = [self.unknowns.index[n] for n in names]
         grids = [_grid(self.sizes[n], _ALONG if i == 0 else _ACROSS) for i, n in enumerate(names)]
         matching = self.residuals(x, scatters, derivatives=False).matching
