@@ -32,6 +32,8 @@ LINEARISATION = "linearisation"
 AMPLITUDE_STD = 0.02
 """1 σ of the logarithm of all amplitudes: the sensors' calibration, less what their number averages out."""
 
+_BEYOND = 3.0
+"""Growth of what linearisation leaves out per decay rate by which a pole moves: it is of first order in that."""
 _STEP = 1e-3
 """Step of the differences by sizes, in units of their prior σ."""
 _DECADES = 6.0
@@ -124,12 +126,16 @@ class AmplitudeProblem:
         """Those of the modes, the scale of all amplitudes, every hit's drift and what linearisation leaves out."""
         hits = self.observations.hits
         drift = [f"drift of {h.configuration} {n}" for h in hits for n in h.names]
-        left = [_left_name(h, s, r) for h in hits for s in np.unique(h.sheet) for r in range(len(h.modes))]
+        sheets = [(h, s) for h in hits for s in np.unique(h.sheet)]
+        left = [_left_name(h, s, r) for h, s in sheets for r in range(len(h.modes))]
+        beyond = [1 + _BEYOND * h.reach(s) for h, s in sheets]
         return joined(
             self.modes.unknowns,
             Unknowns.plain(("amplitude of all modes",), AMPLITUDE_STD),
             Unknowns.plain(drift, 1.0, DRIFT),
-            Unknowns.plain(left, 1.0, LINEARISATION, lower=-1.0, upper=1.0),
+            Unknowns.plain(
+                left, np.concatenate([*beyond, np.zeros(0)]), LINEARISATION, lower=-1.5, upper=1.5
+            ),
         )
 
     @cached_property

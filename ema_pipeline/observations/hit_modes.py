@@ -155,6 +155,16 @@ class HitData:
                 groups.append([int(r)])
         return tuple(np.array(g) for g in groups)
 
+    def reach(self, sheet: int) -> Real:
+        """Largest measured change of each mode's pole between hits of a sheet, in its decay rates, (m,)."""
+        poles = np.where(self.used, self.poles, np.nan)[self.sheet == sheet]
+        known = np.isfinite(poles).any(axis=0)
+        middle = np.nanmedian(np.where(known, poles.real, 0.0), axis=0)
+        centre = middle + 1j * np.nanmedian(np.where(known, poles.imag, 0.0), axis=0)
+        apart = np.nan_to_num(np.abs(poles - centre))
+        usual = np.median(-self.poles.real, axis=0)
+        return np.where(known, apart.max(axis=0, initial=0.0) / usual, 0.0)
+
     @cached_property
     def weights(self) -> tuple[Real, Complex]:
         """Instants after the blow, (t,), and the weight of each in the pole that is read of every mode, (t, m)."""
