@@ -157,7 +157,7 @@ class IsolatorResult:
     loops : tuple of Loop
         The measurement.
     parameters : dict of str to Estimate
-        From least squares on all loops: ``stiffness`` K1, ``quadratic_stiffness`` K2, ``cubic_stiffness`` K3,
+        From the posterior of all loops: ``stiffness`` K1, ``quadratic_stiffness`` K2, ``cubic_stiffness`` K3,
         ``viscous_damping`` c, ``hysteresis_force`` k_w, ``hysteresis_rho`` ρ, ``hysteresis_sigma`` σ, and
         ``hysteresis_stiffness`` k_w·ρ.
     names : tuple of str
