@@ -140,7 +140,7 @@ def test_stages_run_alone_on_a_results_folder_without_the_raw_data(
     assert code == 0
     assert text == "Computed: frf (no_ring)\n"
     with h5py.File(out / "ema.h5") as file:
-        assert file["stages/frf/no_ring/frfs"].attrs["estimator"] == "H2"
+        assert file["stages/frf/no_ring/frfs"].attrs["estimator"] == b"H2"
 
 
 def test_compare_shows_each_mode_with_its_difference(

@@ -230,7 +230,7 @@ def test_a_changed_toml_is_understood_or_refused_in_one_line(tmp_path: Path, kin
     check()
 
 
-@pytest.mark.parametrize("kept", sorted(p.name for p in CORPUS.glob("*.*")))
+@pytest.mark.parametrize("kept", sorted(p.name for p in CORPUS.iterdir() if p.name != "README.md"))
 def test_what_once_found_a_fault_finds_none_any_more(tmp_path: Path, kept: str) -> None:
     kind = kept.partition("-")[0]
     path = _write(tmp_path / kept, (CORPUS / kept).read_bytes())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -279,3 +280,15 @@ def test_a_fault_of_the_program_writes_a_report_and_says_where(
     assert "ZeroDivisionError: a bug" in content
     assert "Traceback" in content
     assert report.stat().st_mode & 0o077 == 0
+
+
+def test_a_full_disk_is_one_line_wherever_it_is_met(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "truth.json"))
+
+    monkeypatch.setattr("ema_pipeline.job.check_raw", fail)
+    code, _, err = ema(capsys, "check", tmp_path)
+    assert code == 1
+    assert "truth.json: No space left on device" in one_line(err)

@@ -253,14 +253,6 @@ def test_bars_of_the_candidates_are_their_probabilities_and_add_up_to_one(run: R
     assert sum(widths) == pytest.approx(1.0)
     assert next(t.get_text() for t in ax.texts) == "97 % ◆"
     assert not any("◆" in t.get_text() for t in ax.texts[1:])
-    (limit,) = [line for line in ax.lines if len(set(np.asarray(line.get_xdata()))) == 1]
-    assert np.asarray(limit.get_xdata())[0] == 0.9
-
-
-def test_threshold_in_the_figure_is_the_one_that_was_set(run: RunResults) -> None:
-    own = replace(run, settings={"diagnose": {"probability_least": "0.95"}})
-    assert diagnosis.probability_threshold(own) == 0.95
-    assert "0.95 needed" in drawn(own)["diagnosis_candidates"].axes[0].get_title()
 
 
 def test_ladder_figure_shows_both_errors_with_differing_marks(run: RunResults) -> None:

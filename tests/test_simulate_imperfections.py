@@ -107,7 +107,7 @@ def test_every_spring_and_every_body_is_a_part_of_its_own() -> None:
     parts = parts_of(RIG.assembly("with_ring"))
     assert parts["carrier mass"] == ("carrier mass x", "carrier mass y")
     assert parts["planet2 mass"] == ("planet2 mass zeta", "planet2 mass eta")
-    assert parts["carrier mass u"] == ("carrier mass u",)
+    assert ("carrier mass u",) in parts.values()
     assert parts["sun bearing x"] == ("sun bearing x",)
     assert parts["planet1 bearing radial"] == ("planet1 bearing radial",)
     assert "sun bearing u" not in parts  # free to turn
@@ -115,8 +115,10 @@ def test_every_spring_and_every_body_is_a_part_of_its_own() -> None:
 
 def test_parts_scatter_by_the_stated_size_and_are_the_same_in_all_configurations() -> None:
     drawn = [draw_parts(RIG, 0.03, seed) for seed in range(150)]
-    springs = [np.log(d[p]) for d in drawn for p in d if "mass" not in p]
-    masses = [np.log(d[p]) for d in drawn for p in d if "mass" in p]
+    assembly = RIG.assembly("with_ring")
+    heavy = {p for p, names in parts_of(assembly).items() if isinstance(assembly.named(names[0]), Mass)}
+    springs = [np.log(d[p]) for d in drawn for p in d if p not in heavy]
+    masses = [np.log(d[p]) for d in drawn for p in d if p in heavy]
     assert np.std(springs) == pytest.approx(0.03, rel=0.05)
     assert np.std(masses) == pytest.approx(0.0075, rel=0.05)
     rig = scattered_rig(RIG, drawn[0])

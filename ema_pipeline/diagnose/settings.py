@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from ema_pipeline.diagnose.levels.settings import LevelDiagnosisSettings
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.settings import Settings
 
@@ -15,10 +14,6 @@ class DiagnoseSettings(Settings):
     fit: FitSettings = Field(
         default=FitSettings(convergence=1e-5, starts_per_decade=1),
         description="How each hypothesis is fitted; its floors cap the noise level.",
-    )
-    levels: LevelDiagnosisSettings = Field(
-        default=LevelDiagnosisSettings(),
-        description="How effects that depend on the force level are told apart.",
     )
     noise_least: float = Field(
         default=0.1,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ema_pipeline.diagnosis.heldout import HeldOut, held_out
 from ema_pipeline.diagnosis.hypotheses import Hypothesis
-from ema_pipeline.diagnosis.naming import Named, named
+from ema_pipeline.diagnosis.naming import Named, named, sizes_of
 from ema_pipeline.diagnosis.ranking import Ranked, Ranking
 from ema_pipeline.diagnosis.settings import DiagnoseSettings
+from ema_pipeline.inference import widened
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters
 
@@ -61,7 +62,13 @@ def judge(observations: Observations, ranking: Ranking, ranked: Ranked, settings
     if not doubt:
         before, after = held_out(observations, base), held_out(observations, ranked.fit)
         doubt = _contradicted(ranked, base, before, after)
+        name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, _widened(observations, ranked.fit)))
     return Judged(ranked, name, gain, base, before, after, doubt)
+
+
+def _widened(observations: Observations, fit: Fit) -> Fit:
+    """The fit at scatters that hold how well they are known, for intervals that are true."""
+    return at_scatters(observations, fit, widened(fit.posterior, observations.scatters))
 
 
 def _weak(ranked: Ranked, gain: float, settings: DiagnoseSettings) -> str:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder
 from ema_pipeline.diagnosis import sentences
 from ema_pipeline.diagnosis.claims import Judged
@@ -17,10 +15,10 @@ from ema_pipeline.diagnosis.rungs import learned_scatters, noise, rungs_of
 from ema_pipeline.diagnosis.score import scores
 from ema_pipeline.diagnosis.selection import NOTHING, Progress, Selection, select
 from ema_pipeline.diagnosis.settings import DiagnoseSettings
-from ema_pipeline.diagnosis.verdict import alike, explains, scattered, verdict_of
+from ema_pipeline.diagnosis.verdict import alike, explains, outlying_parts, verdict_of
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, Model
+from ema_pipeline.observations.fitting import Model
 from ema_pipeline.observations.parts import PART_SCATTER
 from ema_pipeline.rigs.types import Rig
 
@@ -71,7 +69,7 @@ def diagnose(
     if hypotheses is None:
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
     found = select(observations, known, hypotheses, settings, progress)
-    verdict = verdict_of(observations, found, settings)
+    verdict = verdict_of(found, settings)
     start = found.rounds[0].ranking.base
     fits = [start, *(j.ranked.fit for j in found.claimed)]
     if found.claimed:
@@ -80,7 +78,7 @@ def diagnose(
     left = scores(observations, found.final, hypotheses)
     group = alike(found, settings)
     candidates = _candidates(found, settings, group)
-    fails = not explains(observations, found.final, settings)
+    fails = not explains(found.final, settings)
     told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.claimed]
     if verdict == "ambiguous":
         names = [j.named.label for j in group]
@@ -89,8 +87,8 @@ def diagnose(
     scatter = learned_scatters(observations, found.final)
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found), scatters=scatter)
     remarks = [*notes, sentences.scatter_text(scatter)]
-    if scattered(observations, found.final, settings):
-        remarks.insert(0, sentences.standing_out(_parts(found.final), settings.scatter_limit))
+    outlying = outlying_parts(found.final, settings)
+    remarks.insert(0, sentences.standing_out(outlying, found.final.posterior.scatters.get(PART_SCATTER, 0.0)))
     return Diagnosis(
         verdict=verdict,
         summary=sentences.summary(verdict, told, (rungs[0].error, rungs[-1].error), nothing),
@@ -161,13 +159,3 @@ def _ended(found: Selection) -> str:
     if best.claimed:
         return "the most effects that are added by themselves"
     return f"the best further effect is {sentences.label_text(best.named.label)}, and {best.doubt}"
-
-
-def _parts(fit: Fit) -> dict[str, float]:
-    """Relative deviations of all parts."""
-    governed = fit.posterior.unknowns.governed(PART_SCATTER)
-    return {
-        name: float(np.expm1(fit.posterior.x[i]))
-        for i, name in enumerate(fit.posterior.unknowns.names)
-        if governed[i]
-    }

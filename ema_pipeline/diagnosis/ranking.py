@@ -15,6 +15,7 @@ import numpy as np
 from ema_pipeline.diagnosis.hypotheses import Hypothesis
 from ema_pipeline.diagnosis.pool import spread
 from ema_pipeline.diagnosis.score import Score, scores
+from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import QUICK, Fit, Model, annealed, learned, refined, transferred
 
@@ -93,8 +94,9 @@ def rank(
     stuck = base.posterior.error > _EXPLAINED or base.posterior.residuals.penalty > 0
     job = partial(_first_fit, observations, base, {} if stuck else promise)
     found: dict[str, tuple[Hypothesis, Fit]] = {}
-    for i, (hypothesis, fit) in enumerate(zip(chosen, spread(job, chosen, processes), strict=True)):
-        found[hypothesis.label] = (hypothesis, fit)
+    for i, (hypothesis, posterior) in enumerate(zip(chosen, spread(job, chosen, processes), strict=True)):
+        model = base.model.plus(hypothesis.placed, hypothesis.scales)
+        found[hypothesis.label] = (hypothesis, Fit(model, posterior))
         progress(0.6 * (i + 1) / len(chosen), hypothesis.label)
     for contenders, steps in ((len(found), 5), (_CONTENDERS, 12)):
         base, found = _begun_again(observations, base, found, processes, contenders, steps)
@@ -113,25 +115,29 @@ def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) ->
 
 def _first_fit(
     observations: Observations, base: Fit, promise: Mapping[str, Score], hypothesis: Hypothesis
-) -> Fit:
+) -> Posterior:
     """The fit begun at the size that its score tells; annealed from several sizes where the base model fails."""
     model = base.model.plus(hypothesis.placed, hypothesis.scales)
-    unknowns = model.problem(observations).unknowns
+    problem = model.problem(observations)
+    unknowns = problem.unknowns
     begin = transferred(base.posterior, unknowns, np.zeros(len(unknowns)))
+    begun = problem.begun(begin, base.posterior.scatters)
+    if begun is not None:
+        return refined(observations, model, begun)
     score = promise.get(hypothesis.label)
     if score is not None and len(score.size) == 1:
         at = unknowns.index[hypothesis.placed.parameter_name(hypothesis.placed.effect.parameters[0].name)]
         begin[at] = float(np.clip(0.5 * score.size[0], -1.0, 1.0))
         fit = refined(observations, model, unknowns.clipped(begin))
         if fit.posterior.cost <= base.posterior.cost:
-            return fit
+            return fit.posterior
     fits = []
     for start in hypothesis.starts():
         x = begin.copy()
         for name, value in start.items():
             x[unknowns.index[name]] = value
         fits.append(annealed(observations, model, unknowns.clipped(x), QUICK))
-    return max(fits, key=lambda f: f.log_evidence)
+    return max(fits, key=lambda f: f.log_evidence).posterior
 
 
 Found = dict[str, tuple[Hypothesis, Fit]]
@@ -147,7 +153,7 @@ def _begun_again(
         base = again
     job = partial(_better, observations, (base, top), steps)
     items = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)[:contenders]
-    better = spread(job, [fit for _, fit in items], processes)
+    better = _spread_fits(job, [fit for _, fit in items], processes)
     return base, found | {h.label: (h, fit) for (h, _), fit in zip(items, better, strict=True)}
 
 
@@ -163,7 +169,7 @@ def _on(observations: Observations, model: Model, source: Fit, sizes: Fit) -> np
     return moved
 
 
-def _better(observations: Observations, sources: Sequence[Fit], steps: int, fit: Fit) -> Fit:
+def _better(observations: Observations, sources: Sequence[Fit], steps: int, fit: Fit) -> Posterior:
     best = fit
     for source in sources:
         x = _on(observations, fit.model, source, fit)
@@ -172,7 +178,12 @@ def _better(observations: Observations, sources: Sequence[Fit], steps: int, fit:
         again = refined(observations, fit.model, x, steps=steps)
         if again.log_evidence > best.log_evidence:
             best = again
-    return best
+    return best.posterior
+
+
+def _spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes: int) -> list[Fit]:
+    """Better fits of the same models; only posteriors go between processes, a user's effects cannot."""
+    return [Fit(fit.model, p) for fit, p in zip(fits, spread(job, fits, processes), strict=True)]
 
 
 def _finals(observations: Observations, base: Fit, found: Found, processes: int) -> Ranking:
@@ -180,10 +191,10 @@ def _finals(observations: Observations, base: Fit, found: Found, processes: int)
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     best = [fit for _, fit in order[:FINALISTS]]
     job = partial(_final, observations, (base, *best[:2]))
-    first = list(spread(job, [base, *best], processes))
+    first = _spread_fits(job, [base, *best], processes)
     leaders = sorted(first[1:], key=lambda f: -f.log_evidence)[:2]
     job = partial(_final, observations, (first[0], *leaders))
-    second = list(spread(job, first, processes))
+    second = _spread_fits(job, first, processes)
     final_base = second[0]
     ranked = []
     for i, (hypothesis, fit) in enumerate(order):
@@ -199,7 +210,7 @@ def _finals(observations: Observations, base: Fit, found: Found, processes: int)
     return Ranking(final_base, (*finals, *rest))
 
 
-def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Fit:
+def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:
     candidates = [learned(observations, fit)]
     for source in sources:
         x = _on(observations, fit.model, source, fit)
@@ -207,4 +218,4 @@ def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Fit:
             scatters: Mapping[str, float] = source.posterior.scatters
             start = refined(observations, fit.model, x, scatters, steps=10)
             candidates.append(learned(observations, start))
-    return max(candidates, key=lambda f: f.log_evidence)
+    return max(candidates, key=lambda f: f.log_evidence).posterior

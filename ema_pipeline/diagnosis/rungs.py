@@ -9,7 +9,7 @@ from ema_pipeline.diagnosis.heldout import HeldOut, held_out
 from ema_pipeline.inference import Posterior
 from ema_pipeline.inference.maximise import ANNEALING, anneal
 from ema_pipeline.observations.base import EffectProblem, Observations
-from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned, transferred
+from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned, refined, transferred
 from ema_pipeline.observations.modes import UNEXPLAINED
 
 
@@ -73,6 +73,10 @@ def _best_of(observations: Observations, model: Model, before: Fit) -> Fit:
     """A model with one effect more, begun at several sizes of it."""
     problem = model.problem(observations)
     new = [n for n in problem.sizes if n not in before.posterior.unknowns.index]
+    scatters = before.posterior.scatters
+    begun = problem.begun(transferred(before.posterior, problem.unknowns, problem.start()), scatters)
+    if begun is not None:
+        return refined(observations, model, begun, scatters)
     fits = []
     for factor in (1.0, 0.3, -0.5):
         x = transferred(before.posterior, problem.unknowns, problem.start())

@@ -7,6 +7,9 @@ from collections.abc import Mapping, Sequence
 from ema_pipeline.diagnose.types import NOT_TOLD, EffectSize, LearnedScatter, VerdictWord
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
 
+_SHOWN = 3
+"""Parts that a sentence names."""
+
 
 def label_text(label: str) -> str:
     """A label as a phrase."""
@@ -63,14 +66,11 @@ def scatter_text(scatters: Sequence[LearnedScatter]) -> str:
     return f"Scatter (1 σ) learned from the data: {told}." if told else ""
 
 
-def standing_out(parts: Mapping[str, float], limit: float) -> str:
-    """The part that deviates most, where parts scatter far more than was stated; empty without parts."""
+def standing_out(parts: Mapping[str, float], scatter: float) -> str:
+    """Parts that deviate more than parts do; empty without any."""
     if not parts:
         return ""
-    name = max(parts, key=lambda p: abs(parts[p]))
-    others = [abs(v) for p, v in parts.items() if p != name]
-    rest = f", all others within {100 * max(others):.0f} %" if others else ""
+    named = ", ".join(f"{name} {100 * value:+.0f} %" for name, value in list(parts.items())[:_SHOWN])
     return (
-        f"The parts would have to scatter more than {limit:g} times as much as stated. Furthest off: {name}, "
-        f"{100 * parts[name]:+.0f} %{rest}."
+        f"Parts that stand out from their like: {named}; all others scatter by {100 * scatter:.1f} % (1 σ)."
     )

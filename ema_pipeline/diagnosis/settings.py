@@ -36,10 +36,11 @@ class DiagnoseSettings(Settings):
     error_limit: float = Field(
         default=1.5, gt=1, description="Error up to which a model counts as one that explains the data."
     )
-    scatter_limit: float = Field(
-        default=5.0,
+    part_limit: float = Field(
+        default=4.0,
         gt=1,
-        description="Ratio of a learned scatter of parts to the stated one from which it is itself a finding.",
+        description="Deviation of a single part, in units of the learned scatter of parts, from which it is itself a "
+        "finding: one healthy rig of 40 parts in 400 has such a part.",
     )
     folds: int = Field(default=4, ge=2, le=20, description="Parts that the modes are held out in, in turn.")
     most_effects: int = Field(default=3, ge=1, le=6, description="Most effects that are added in turn.")

@@ -2,34 +2,35 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ema_pipeline.diagnose.types import VerdictWord
 from ema_pipeline.diagnosis.claims import Judged
 from ema_pipeline.diagnosis.selection import Selection
 from ema_pipeline.diagnosis.settings import DiagnoseSettings
-from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit
-from ema_pipeline.observations.parts import PART_SCATTER
-
-_UNEXPLAINED_SHARE = 0.15
-"""Share of the measured modes that may stay without a partner in a model that explains the data."""
+from ema_pipeline.observations.parts import MASS_SCATTER, PART_SCATTER
 
 
-def explains(observations: Observations, fit: Fit, settings: DiagnoseSettings) -> bool:
-    """True where the model explains the data with parts that scatter no more than such parts do."""
-    return fit.posterior.error <= settings.error_limit and not scattered(observations, fit, settings)
+def explains(fit: Fit, settings: DiagnoseSettings) -> bool:
+    """True where the model explains the data, and no part deviates more than parts do."""
+    return fit.posterior.error <= settings.error_limit and not outlying_parts(fit, settings)
 
 
-def scattered(observations: Observations, fit: Fit, settings: DiagnoseSettings) -> bool:
-    """True where the parts would have to scatter far more than was stated."""
-    stated = observations.scatters.get(PART_SCATTER)
-    if stated is None or not stated.spread:
-        return False
-    return fit.posterior.scatters[PART_SCATTER] > settings.scatter_limit * stated.default
+def outlying_parts(fit: Fit, settings: DiagnoseSettings) -> dict[str, float]:
+    """Relative deviation of every part that lies further out than the scatter of parts allows, furthest first."""
+    governed = fit.posterior.unknowns.governed(PART_SCATTER) | fit.posterior.unknowns.governed(MASS_SCATTER)
+    far = np.abs(fit.posterior.x) > settings.part_limit * fit.posterior.prior_std
+    found = {
+        fit.posterior.unknowns.names[i]: float(np.expm1(fit.posterior.x[i]))
+        for i in np.flatnonzero(governed & far)
+    }
+    return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
 
 
-def verdict_of(observations: Observations, found: Selection, settings: DiagnoseSettings) -> VerdictWord:
+def verdict_of(found: Selection, settings: DiagnoseSettings) -> VerdictWord:
     """What the data support."""
-    if not explains(observations, found.final, settings):
+    if not explains(found.final, settings):
         return "unknown_effect"
     if not found.claimed:
         return "adequate"

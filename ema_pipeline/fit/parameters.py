@@ -20,6 +20,10 @@ from ema_pipeline.rigs.types import Parameter, Rig
 
 _OUT_OF_TOLERANCE = 3.0
 """Prior standard deviations from the stated value from which a parameter is remarked."""
+_UNTOUCHED = 0.999
+"""Posterior over prior standard deviation from which nothing that was measured depends on a parameter."""
+_FAILS = 1.5
+"""Error from which a reader is told that the standard deviations rest on a model that does not explain the data."""
 
 
 @dataclass(frozen=True)
@@ -140,15 +144,19 @@ def _estimate(fitted: FittedModes, p: Parameter, value: float, settings: FitSett
     posterior = fitted.posterior
     i = posterior.unknowns.index.get(p.name)
     prior = float("nan") if p.free else abs(p.tolerance * p.value)
-    if i is None:
-        std = abs(p.tolerance * p.value)
+    if i is None or (p.free and posterior.narrowing(p.name) > _UNTOUCHED):
+        std = float("nan") if p.free else abs(p.tolerance * p.value)
         return ParameterEstimate(
-            p.name, value, std, value - std, value + std, p.unit, p.free, p.value, prior, False,
-            float("nan") if p.free else 0.0, "not measured: nothing that was measured depends on it",
+            p.name, value, std, p.minimum if p.free else value - std, p.maximum if p.free else value + std,
+            p.unit, p.free, p.value, prior, False, float("nan") if p.free else 0.0, "not measured: nothing that was measured depends on it",
         )  # fmt: skip
     size = fitted.problem.sizes.get(p.name)
     slope = abs(value) if size is None else abs(size.slope(float(posterior.x[i])))
     std = float(posterior.std[i]) * slope
+    low, high = value - std, value + std
+    if size is None:  # a logarithm: the interval is one of factors
+        factor = float(np.exp(posterior.std[i]))
+        low, high = max(value / factor, p.minimum), min(value * factor, p.maximum)
     narrowing = posterior.narrowing(p.name)
     identified = narrowing < settings.narrowed
     if p.free and size is None:
@@ -166,13 +174,17 @@ def _estimate(fitted: FittedModes, p: Parameter, value: float, settings: FitSett
             else "the data say little: the tolerance determines it"
         )
     return ParameterEstimate(
-        p.name, value, std, value - std, value + std, p.unit, p.free, p.value, prior, identified, shift,
-        "; ".join(notes),
+        p.name, value, std, low, high, p.unit, p.free, p.value, prior, identified, shift, "; ".join(notes),
     )  # fmt: skip
 
 
 def _notes(fitted: FittedModes) -> tuple[str, ...]:
     notes = []
+    if fitted.posterior.error > _FAILS:
+        notes.append(
+            f"the model does not explain the data (error {fitted.posterior.error:.1f}): standard deviations of "
+            "parameters hold for a model that does"
+        )
     left = round(fitted.posterior.residuals.penalty // UNEXPLAINED)
     for data, match in zip(fitted.observations.data, _matching(fitted), strict=True):
         alone = np.exp(data.log_frequency[match < 0])

@@ -65,7 +65,7 @@ def descend(
     here = problem.residuals(x, scatters, heat=heat)
     cost = here.cost + _prior_cost(x, std)
     damping = 1e-2
-    for _ in range(steps):
+    for _ in range(steps if np.isfinite(cost) else 0):
         step_from = _Step(unknowns, x, std, here.jacobian, here.values)
         for _ in range(_MOST_TRIALS):
             trial = step_from.to(damping)

@@ -244,6 +244,10 @@ class LoopProblem:
             Unknowns.plain([f"force scale of {name}" for name in scales], SETTING_STD),
         )
 
+    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
+        """See `EffectProblem`: forces change with every size."""
+        return None
+
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""
         return self.model.parameter_values(x[: self.offset])

@@ -16,6 +16,7 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.correlate.settings import UncertaintySettings
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
@@ -24,7 +25,14 @@ from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
 from ema_pipeline.ingest.records import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
 from ema_pipeline.mechanics.terms import Matrices
-from ema_pipeline.observations.parts import PART_SCATTER, STIFFNESS_SCATTER, Dependence, dependence
+from ema_pipeline.observations.parts import (
+    MASS_SCATTER,
+    MASS_STD,
+    PART_SCATTER,
+    STIFFNESS_STD,
+    Dependence,
+    dependence,
+)
 from ema_pipeline.observations.rig_model import RigModel, SizeMap
 from ema_pipeline.rigs.types import Rig
 
@@ -41,7 +49,7 @@ UNSEEN = 3.0
 _SHAPE_REACH = 0.3
 """Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
 _FREQUENCY_REACH = 0.1
-"""Difference of ln f that costs a pair as much as shapes that have nothing in common."""
+"""Difference of ln f that costs a pair as much as shapes that have nothing in common; wider while a fit is annealed."""
 _FREQUENCY_REACH_ALONE = 0.3
 _LEAVE = 0.3
 """Cost above the best at which an assignment leaves a measured mode without a partner."""
@@ -52,7 +60,9 @@ _ACROSS = {"x": "y", "y": "x", "zeta": "eta", "eta": "zeta"}
 def scatters_of(rig: Rig) -> dict[str, Scatter]:
     """The hyper-parameters of measured modes, with the defaults that the rig states."""
     known = (
-        Scatter(PART_SCATTER, "parts", STIFFNESS_SCATTER, 0.7, 0.04),
+        Scatter(PART_SCATTER, "stiffness of parts", STIFFNESS_STD, 0.7, 0.04),
+        # Drawings and scales are trusted more than masses deserve (fasteners, oil, cables): a wide prior.
+        Scatter(MASS_SCATTER, "mass of parts", MASS_STD, 1.0, 0.02, 8.0),
         Scatter(CALIBRATION, "calibration", CALIBRATION_STD, 0.7, 0.04),
         Scatter(DAMPING_SCATTER, "ln ζ from mode to mode", rig.modal_damping_scatter, 0.5, 0.5),
         Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 5.0),
@@ -106,8 +116,14 @@ class ModeData:
         return dataclasses.replace(self, complete=False, **{n: getattr(self, n)[keep] for n in names})
 
 
-def prepare(measured: MeasuredModes) -> ModeData:
-    """Measured modes in the form that residuals need."""
+def _known_or(std: NDArray[np.float64], assumed: float) -> NDArray[np.float64]:
+    """Standard deviations, the assumed one where none is known."""
+    return np.where(np.isfinite(std) & (std > 0), std, assumed)
+
+
+def prepare(measured: MeasuredModes, settings: UncertaintySettings | None = None) -> ModeData:
+    """Measured modes in the form that residuals need; where no scatter is known, `settings` say what is assumed."""
+    settings = settings or UncertaintySettings()
     m, f = len(measured), measured.frequency_hz
     shapes = np.zeros((m, 0))
     std = np.zeros((m, 0))
@@ -118,7 +134,7 @@ def prepare(measured: MeasuredModes) -> ModeData:
         for r in range(m):
             y = measured.shapes[r]
             real = np.real(y * np.exp(-0.5j * np.angle(np.nansum(y**2))))
-            size = max(float(np.nanmax(np.abs(real), initial=0.0)), 1e-300)
+            size = float(np.nanmax(np.abs(real), initial=0.0)) or 1.0
             shapes[r] = real / size
             given = (
                 np.zeros(len(dofs)) if measured.shape_std is None else np.nan_to_num(measured.shape_std[r])
@@ -246,6 +262,7 @@ class ModeProblem:
     def __init__(self, observations: ModeObservations, model: RigModel) -> None:
         self.observations, self.model = observations, model
         self.offset = len(model.unknowns)
+        self._sensing: dict[tuple[str, tuple[Dof, ...]], Sensing] = {}
 
     @property
     def sizes(self) -> Mapping[str, SizeMap]:
@@ -255,6 +272,10 @@ class ModeProblem:
     def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
         """See `EffectProblem`."""
         return np.concatenate([self.model.start(sizes), np.zeros(len(self.unknowns) - self.offset)])
+
+    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
+        """See `EffectProblem`: modes change with every size."""
+        return None
 
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""
@@ -280,26 +301,45 @@ class ModeProblem:
             return False
         return any(self.observations.has(d.configuration, Dof(body, other)) for d in self.observations.data)
 
-    @cached_property
-    def sensing(self) -> tuple[Sensing, ...]:
-        """Of every configuration."""
-        found = []
-        for d in self.observations.data:
-            along = self.model.sensor_rows(d.configuration, d.dofs)
-            across = np.zeros_like(along)
-            gain = np.full(len(d.dofs), -1)
-            transverse = np.full(len(d.dofs), -1)
-            for i, dof in enumerate(d.dofs):
-                gain[i] = self.unknowns.index.get(
-                    _calibration(dof.point, self.observations.channel(dof.point)), -1
-                )
-                transverse[i] = self.unknowns.index.get(_transverse(dof.point), -1)
-                if transverse[i] >= 0:
-                    other = Dof(dof.body, _ACROSS[dof.direction])
-                    if self.observations.has(d.configuration, other):
-                        across[i] = self.model.sensor_rows(d.configuration, (other,))[0]
-            found.append(Sensing(along, across, gain, transverse))
-        return tuple(found)
+    def sensing(self, data: ModeData) -> Sensing:
+        """What the sensors of one configuration's modes read."""
+        key = (data.configuration, data.dofs)
+        if key not in self._sensing:
+            self._sensing[key] = self._found_sensing(data)
+        return self._sensing[key]
+
+    def _found_sensing(self, d: ModeData) -> Sensing:
+        along = self.model.sensor_rows(d.configuration, d.dofs)
+        across = np.zeros_like(along)
+        gain = np.full(len(d.dofs), -1)
+        transverse = np.full(len(d.dofs), -1)
+        for i, dof in enumerate(d.dofs):
+            gain[i] = self.unknowns.index.get(
+                _calibration(dof.point, self.observations.channel(dof.point)), -1
+            )
+            transverse[i] = self.unknowns.index.get(_transverse(dof.point), -1)
+            if transverse[i] >= 0:
+                other = Dof(dof.body, _ACROSS[dof.direction])
+                if self.observations.has(d.configuration, other):
+                    across[i] = self.model.sensor_rows(d.configuration, (other,))[0]
+        return Sensing(along, across, gain, transverse)
+
+    def paired(
+        self, data: ModeData, x: NDArray[np.float64], match: NDArray[np.int64] | None = None
+    ) -> Paired | None:
+        """Modes of the model at `x` and their partners among `data`, found anew where `match` is left out.
+
+        None where the model has no modes there.
+        """
+        solution = self._modes(data.configuration, x)
+        if solution is None:
+            return None
+        at = _Configuration(self, data, self.sensing(data), x, {}, 1.0)
+        return Paired(solution, at.matched(solution) if match is None else match)
+
+    def _modes(self, configuration: str, x: NDArray[np.float64]) -> EigenSolution | None:
+        matrices = self.model.matrices(configuration, x[: self.offset], derivatives=False)
+        return EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio)
 
     def solution(self, configuration: str, x: NDArray[np.float64]) -> EigenSolution:
         """Modes of the model at `x`.
@@ -309,8 +349,7 @@ class ModeProblem:
         EmaError
             If the model has none there.
         """
-        matrices = self.model.matrices(configuration, x[: self.offset], derivatives=False)
-        solution = EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio)
+        solution = self._modes(configuration, x)
         if solution is None:
             raise EmaError(
                 f"{configuration}: the model has no modes at the fitted values; check the rig's masses"
@@ -358,13 +397,29 @@ class ModeProblem:
         """See `Problem`."""
         given = matching if isinstance(matching, tuple) else (None,) * len(self.observations.data)
         parts = [
-            _Configuration(self, d, s, x, scatters, heat).residuals(m, derivatives)
-            for d, s, m in zip(self.observations.data, self.sensing, given, strict=True)
+            _Configuration(self, d, self.sensing(d), x, scatters, heat).residuals(m, derivatives)
+            for d, m in zip(self.observations.data, given, strict=True)
         ]
-        return _stacked(parts, len(x))
+        return stacked(parts, len(x))
 
 
-def _stacked(parts: Sequence[Residuals], n: int) -> Residuals:
+@dataclass(frozen=True)
+class Paired:
+    """Modes of the model at one point, and which of them each measured mode belongs to.
+
+    Attributes
+    ----------
+    solution : EigenSolution
+    match : ndarray of int, (m,)
+        -1 for a measured mode without a partner.
+    """
+
+    solution: EigenSolution
+    match: NDArray[np.int64]
+
+
+def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
+    """Residuals of several parts of the data as one."""
     names = dict.fromkeys(k for p in parts for k in p.share)
     return Residuals(
         values=np.concatenate([p.values for p in parts] or [np.zeros(0)]),
@@ -402,14 +457,16 @@ class _Configuration:
         solution = EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio)
         if solution is None:
             return Residuals(np.full(1, np.inf), np.zeros((1, len(self.x))), matching=matching)
-        width = self.reading.shape[1]
-        predicted = self.reading @ solution.shapes[:width]
-        match = matching if isinstance(matching, np.ndarray) else self._matched(solution, predicted)
-        return self._compared(matrices, solution, predicted, match, derivatives)
+        match = matching if isinstance(matching, np.ndarray) else self.matched(solution)
+        return self._compared(matrices, solution, self._seen(solution), match, derivatives)
 
-    def _matched(self, solution: EigenSolution, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _seen(self, solution: EigenSolution) -> NDArray[np.float64]:
+        """What the sensors read of every shape, (s, n)."""
+        return np.asarray(self.reading @ solution.shapes[: self.reading.shape[1]])
+
+    def matched(self, solution: EigenSolution) -> NDArray[np.int64]:
         """Index of the model mode of every measured one, -1 for none, (m,)."""
-        d = self.data
+        d, predicted = self.data, self._seen(solution)
         log = np.log(np.maximum(solution.frequency_hz, 1e-6))
         apart = np.abs(log[None] - d.log_frequency[:, None])
         if d.shapes.shape[1]:
@@ -417,9 +474,11 @@ class _Configuration:
             seen = np.isfinite(d.shapes).astype(float)
             cross = (y @ predicted) ** 2
             norm = np.sum(y**2, axis=1)[:, None] * (seen @ predicted**2)
-            cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / _FREQUENCY_REACH, 3.0)
+            reach = _FREQUENCY_REACH * (1 + 0.1 * (self.heat - 1))
+            cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / reach, 3.0)
         else:
-            cost = np.minimum(apart / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
+            # convex, so that close modes keep their order: two crossed pairs would cost as much as two straight ones
+            cost = np.minimum(apart * (1 + apart) / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
         m = len(d)
         padded = np.hstack([cost, np.full((m, m), _LEAVE)])
         column = scipy.optimize.linear_sum_assignment(padded)[1]
@@ -456,11 +515,30 @@ class _Configuration:
                 )
                 for r in rows
             },
-            log_scale=sum(c for _, _, _, c in done),
+            log_scale=sum(c for _, _, _, c in done) + self._usual(np.flatnonzero(match < 0), defaults),
             penalty=UNEXPLAINED * float(np.sum(match < 0)) + UNSEEN * self._unseen(solution, match),
             matching=match,
             projected=len(on) if self.data.shapes.shape[1] else 0,
         )
+
+    def _usual(self, alone: NDArray[np.int64], defaults: Mapping[str, float]) -> float:
+        """What modes without a partner would cost on average if they were explained.
+
+        Without it, leaving a mode out would gain what its rows cost, and no effect would ever bring it back.
+        """
+        d = self.data
+        seen = np.isfinite(d.shapes[alone])
+        reach = np.maximum(_SHAPE_REACH, np.abs(d.shapes[alone]))[seen]
+        damped = alone[np.isfinite(d.log_damping[alone])]
+        total = -0.5 * int(np.sum(np.any(seen, axis=1)))
+        for own, unit, name in (
+            (d.log_frequency_std[alone], 1.0, FREQUENCY),
+            (d.log_damping_std[damped], 1.0, DAMPING_SCATTER),
+            (d.shape_std[alone][seen], reach, SHAPE),
+        ):
+            now, usual = (own**2 + (at[name] * unit) ** 2 for at in (self.scatters, defaults))
+            total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
+        return total
 
     def _frequencies(
         self,

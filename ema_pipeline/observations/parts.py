@@ -18,10 +18,11 @@ from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Mass, Spr
 from ema_pipeline.rigs.types import Parameter, Rig
 
 PART_SCATTER = "part_scatter"
-STIFFNESS_SCATTER = 0.02
-"""1 σ from part to part where a rig states none, relative; the scatter of all parts is learned in its units."""
-MASS_SCATTER = 0.005
-DAMPER_SCATTER = 0.3
+MASS_SCATTER = "mass_scatter"
+STIFFNESS_STD = 0.02
+"""1 σ of stiffnesses from part to part where a rig states none, relative; their scatter is learned in its units."""
+MASS_STD = 0.005
+DAMPER_STD = 0.3
 
 FREE_STD = (0.5, 2.5)
 """Least and largest prior 1 σ of the logarithm of a free parameter."""
@@ -92,7 +93,10 @@ def dependence(rig: Rig) -> Dependence:
     names = (*families, *(f"{key[1]} ({key[0].__name__.lower()})" for key in parts))
     unknowns = joined(
         Unknowns.plain(families, [prior_std(rig.parameters[f]) for f in families]),
-        Unknowns.plain(names[len(families) :], list(parts.values()), PART_SCATTER),
+        *(
+            Unknowns.plain((name,), std, MASS_SCATTER if key[0] is Mass else PART_SCATTER)
+            for name, (key, std) in zip(names[len(families) :], parts.items(), strict=True)
+        ),
     )
     return Dependence(
         unknowns, _rows(nominal, exponents, families, tuple(parts), len(names)), families, tuple(geometric)
@@ -146,7 +150,7 @@ def _power(before: Element, after: Element, factor: float) -> float | None:
 def _parts(
     rig: Rig, nominal: Mapping[str, Assembly], exponents: Mapping[str, Mapping[str, Mapping[PartKey, float]]]
 ) -> dict[PartKey, float]:
-    """Every part with the 1 σ of its deviation, in units of the part scatter; identical parts have none."""
+    """Every part with the 1 σ of its deviation, in units of its kind's scatter; identical parts have none."""
     parts: dict[PartKey, float] = {}
     for configuration, assembly in nominal.items():
         for element in assembly.elements:
@@ -158,10 +162,10 @@ def _parts(
                 for name, powers in exponents.items()
                 if powers[configuration].get(key) and rig.parameters[name].scatter is not None
             ]
-            default = {Mass: MASS_SCATTER, Spring: STIFFNESS_SCATTER}.get(key[0], DAMPER_SCATTER)
+            default = {Mass: MASS_STD, Spring: STIFFNESS_STD}.get(key[0], DAMPER_STD)
             scatter = stated[0] if stated and stated[0] is not None else default
             if scatter > 0:
-                parts[key] = scatter / STIFFNESS_SCATTER
+                parts[key] = scatter / (MASS_STD if key[0] is Mass else STIFFNESS_STD)
     return parts
 
 

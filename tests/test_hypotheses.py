@@ -1,0 +1,277 @@
+"""What may be missing, how it is called, what it promises, and what the data would have shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from imperfect_modes import GOOD, NORMAL, Hidden, chain, chain_modes
+
+from ema_pipeline.diagnosis.hypotheses import Hypothesis, list_hypotheses
+from ema_pipeline.diagnosis.limits import detection_limits
+from ema_pipeline.diagnosis.localise import localise
+from ema_pipeline.diagnosis.naming import named, sizes_of
+from ema_pipeline.diagnosis.score import Score, scores
+from ema_pipeline.effects.library import parse_effect, shipped_effects
+from ema_pipeline.effects.rig import rig_with_effects
+from ema_pipeline.mechanics.assembly import Damper, Mass, Spring
+from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, refined
+from ema_pipeline.observations.modes import ModeObservations, prepare
+from ema_pipeline.rigs import load_rig
+from ema_pipeline.rigs.base import ParametricRig
+from ema_pipeline.rigs.planetary import planetary
+from ema_pipeline.rigs.types import Parameter, Rig
+
+
+def by_name(rig: Rig) -> dict[str, Hypothesis]:
+    """Hypotheses by each of their names."""
+    return {n.label: h for h in list_hypotheses(rig, shipped_effects()) for n in h.names}
+
+
+@cache
+def of_planetary() -> dict[str, Hypothesis]:
+    return by_name(planetary())
+
+
+@cache
+def of_chain() -> dict[str, Hypothesis]:
+    return by_name(chain())
+
+
+# --- identical physics ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("own", "generic"),
+    [
+        ("shaft_torsion@sun", "spring@sun.u"),
+        ("local_damper@sun", "damper@sun"),
+        ("planet_mass_mistune@planet1", "mass@planet1"),
+    ],
+)
+def test_a_rigs_own_effect_and_the_generic_one_of_the_same_physics_are_one_hypothesis(
+    own: str, generic: str
+) -> None:
+    one = of_planetary()[own]
+    assert one is of_planetary()[generic]
+    assert one.names[0].label == own
+    assert not one.generic
+
+
+def test_no_physics_is_listed_twice_and_every_name_once() -> None:
+    hypotheses = list_hypotheses(planetary(), shipped_effects())
+    labels = [n.label for h in hypotheses for n in h.names]
+    assert len(labels) == len(set(labels))
+    assert len({h.label for h in hypotheses}) == len(hypotheses)
+
+
+def test_a_body_of_one_direction_and_its_dof_are_one_place() -> None:
+    assert of_chain()["spring@m2"] is of_chain()["spring@m2.z"]
+    assert of_chain()["mass@m2"] is of_chain()["mass@m2.z"]
+    assert of_chain()["spring@m2"] is not of_chain()["spring@m3"]
+    assert of_chain()["spring@m2-m3"] is not of_chain()["damper@m2-m3"]
+
+
+def test_a_loss_and_a_spring_of_opposite_sign_are_different_hypotheses_or_names_of_one() -> None:
+    # what is said follows the sign, see the tests of names
+    loss = of_planetary()["mesh_stiffness_loss@sun-planet1"]
+    assert all(n.placed.effect.id != "spring" for n in loss.names)
+
+
+def test_parameters_that_are_known_may_be_out_of_tolerance_and_free_ones_may_not() -> None:
+    assert "out_of_tolerance@sun_bearing_stiffness" in of_planetary()
+    assert "out_of_tolerance@sun_planet_mesh_stiffness" not in of_planetary()
+    assert "out_of_tolerance@pressure_angle_deg" not in of_planetary()
+
+
+def test_effects_that_the_model_has_and_those_that_depend_on_the_level_are_left_out() -> None:
+    rig = rig_with_effects(planetary(), ["shaft_torsion@sun"])
+    listed = list_hypotheses(rig, shipped_effects(), ["shaft_torsion@sun"])
+    labels = {n.label for h in listed for n in h.names}
+    assert "shaft_torsion@sun" not in labels
+    assert "shaft_torsion@carrier" in labels
+    assert not any(x.startswith(("bearing_cubic", "dry_friction", "cubic_spring")) for x in labels)
+
+
+@pytest.mark.parametrize("name", ["planetary", "gearbox", "frame"])
+def test_every_rig_has_generic_springs_masses_and_dampers_at_its_bodies(name: str) -> None:
+    rig = load_rig(name)
+    known = by_name(rig)
+    body = rig.assembly(rig.configurations[0]).bodies[0]
+    for effect in ("spring", "mass", "damper"):
+        assert f"{effect}@{body}" in known
+
+
+def test_starts_lie_within_the_range_of_the_size() -> None:
+    for hypothesis in of_planetary().values():
+        starts = hypothesis.starts()
+        assert 1 <= len(starts) <= 4
+        assert len({tuple(s.values()) for s in starts}) == len(starts)
+
+
+# --- names ------------------------------------------------------------------------------------------------
+
+
+def fitted_on_top(hypothesis: Hypothesis, size: float, rig: Rig, observations: ModeObservations) -> Fit:
+    """A fit whose only merit is that the first unknown of the hypothesis has this value."""
+    model = Model().plus(hypothesis.placed, hypothesis.scales)
+    problem = model.problem(observations)
+    x = np.zeros(len(problem.unknowns))
+    first = hypothesis.placed.effect.parameters[0]
+    x[problem.unknowns.index[hypothesis.placed.parameter_name(first.name)]] = size
+    return refined(observations, model, x, steps=0)
+
+
+def chain_data(seed: int = 0, hidden: Hidden | None = None, lab=GOOD) -> ModeObservations:
+    return ModeObservations(chain(), [prepare(m) for m in chain_modes(seed, lab, hidden).values()])
+
+
+def test_a_stiffer_spring_is_a_spring_added_and_a_softer_one_a_part_out_of_tolerance() -> None:
+    # a chain whose first spring has a parameter of its own: 'spring at m1' and the parameter are one physics
+    parameters = dict(chain().parameters) | {"first": Parameter("first", 4e5, "N/m", 0.05)}
+
+    def build(configuration: str, values: Mapping[str, float]):
+        return (
+            chain()
+            .build(configuration, values)
+            .edit(["spring 0"], lambda e: Spring(e.name, e.row, values["first"]))
+        )
+
+    rig = ParametricRig("chain", ("all",), parameters, build)
+    known = by_name(rig)
+    one = known["out_of_tolerance@first"]
+    assert one is known["spring@m1"]
+    observations = ModeObservations(rig, [prepare(m) for m in chain_modes(0, GOOD).values()])
+    added = named(one, fitted_on_top(one, 0.5, rig, observations))
+    assert added.label == "spring@m1"
+    assert "out_of_tolerance@first" in added.equivalents
+    taken = named(one, fitted_on_top(one, -0.3, rig, observations))
+    assert taken.label == "out_of_tolerance@first"
+    assert taken.sizes["relative_change"].value < 0
+
+
+def test_sizes_under_several_names_are_the_same_change_of_the_model() -> None:
+    rig = planetary()
+    one = of_planetary()["shaft_torsion@sun"]
+    observations = ModeObservations(rig, [])
+    fit = fitted_on_top(one, 0.4, rig, observations)
+    assemblies = []
+    for name in one.names:
+        sizes = {k: s.value for k, s in sizes_of(one, name, fit).items()}
+        if name.placed.effect.id == "out_of_tolerance":
+            continue
+        edited = name.placed.effect.edit(rig.assembly("with_ring"), name.placed.place, sizes)
+        assemblies.append(edited.system().stiffness)
+    assert len(assemblies) >= 2
+    for other in assemblies[1:]:
+        np.testing.assert_allclose(other, assemblies[0], rtol=1e-9, atol=1e-3)
+
+
+# --- scores and limits against a refit in full ------------------------------------------------------------
+
+
+@cache
+def scored(seed: int = 1) -> tuple[ModeObservations, Fit, dict[str, Score]]:
+    observations = chain_data(seed, Hidden({"spring 2": 1.06}))
+    base = learned(observations, fit_base(observations, Model()))
+    found = scores(observations, base, list_hypotheses(chain(), shipped_effects()))
+    return observations, base, {n.label: s for s in found for n in s.hypothesis.names}
+
+
+def refit(label: str) -> tuple[Score, Fit, Fit]:
+    observations, base, found = scored()
+    score = found[label]
+    model = Model().plus(score.hypothesis.placed, score.hypothesis.scales)
+    problem = model.problem(observations)
+    x = np.zeros(len(problem.unknowns))
+    for i, name in enumerate(problem.unknowns.names):
+        if name in base.posterior.unknowns.index:
+            x[i] = base.posterior.value(name)
+    return score, base, refined(observations, model, x, base.posterior.scatters, steps=40)
+
+
+@pytest.mark.parametrize("label", ["spring@m2-m3", "spring@m4", "mass@m2", "spring@m1-m5"])
+def test_a_score_is_what_a_refit_in_full_finds_where_the_effect_is_small(label: str) -> None:
+    score, base, fit = refit(label)
+    placed = score.hypothesis.placed
+    i = fit.posterior.unknowns.index[placed.parameter_name(placed.effect.parameters[0].name)]
+    scale = fit.posterior.std[i]
+    bounded = score.size[0] <= fit.posterior.unknowns.lower[i]
+    if not bounded:
+        assert score.size[0] == pytest.approx(fit.posterior.x[i], abs=0.6 * scale)
+    assert 1 / np.sqrt(1 + score.std**-2) == pytest.approx(scale, rel=0.25)
+    assert score.gain == pytest.approx(fit.log_evidence - base.log_evidence, abs=1.2)
+
+
+def test_the_best_score_is_that_of_the_spring_that_was_made_stiffer() -> None:
+    _, _, found = scored()
+    best = max(found.values(), key=lambda s: s.gain)
+    assert "spring@m2-m3" in {n.label for n in best.hypothesis.names}
+    places = localise(found.values())
+    assert places[0].place.replace(".z", "") == "m2-m3"
+    assert places[0].acts_like == "stiffness"
+    assert places[0].size == pytest.approx(0.06 * 4e5, rel=0.4)
+
+
+@pytest.mark.parametrize("label", ["spring@m2-m3", "mass@m3"])
+def test_an_effect_at_its_limit_is_seen_in_nine_tests_of_ten_and_one_far_below_it_is_not(label: str) -> None:
+    claim, sigmas = 5.0, 2.0
+    healthy = chain_data(3, lab=NORMAL)
+    base = learned(healthy, fit_base(healthy, Model()))
+    found = scores(healthy, base, list_hypotheses(chain(), shipped_effects()))
+    limit = {d.label: d for d in detection_limits(found, claim, sigmas)}[label]
+    assert 0 < limit.size < np.inf
+    effect, _, place = label.partition("@")
+    rows = {"m2-m3": {"m2.z": -1.0, "m3.z": 1.0}, "m3": {"m3.z": 1.0}, "m2": {"m2.z": 1.0}}
+    make = {"spring": Spring, "mass": Mass, "damper": Damper}[effect]
+
+    def seen(size: float, seed: int) -> bool:
+        hidden = Hidden(added=(make("added", rows[place], size),))
+        observations = chain_data(seed, hidden, NORMAL)
+        start = learned(observations, fit_base(observations, Model()))
+        one = [s for s in scores(observations, start, [h]) if s.gain >= claim]
+        return bool(one)
+
+    h = of_chain()[label]
+    at = np.mean([seen(1.3 * limit.size, 20 + i) for i in range(5)])
+    below = np.mean([seen(0.2 * limit.size, 40 + i) for i in range(5)])
+    assert at >= 0.6
+    assert below <= 0.2
+
+
+def test_limits_of_several_names_are_the_same_change() -> None:
+    _, _, found = scored()
+    limits = {
+        d.label: d.size for d in detection_limits({id(s): s for s in found.values()}.values(), 5.0, 2.0)
+    }
+    assert limits["spring@m2"] == pytest.approx(limits["spring@m2.z"])
+    assert all(v > 0 for v in limits.values())
+
+
+def test_a_sensor_less_lets_less_be_seen() -> None:
+    limits = []
+    for sensors in (5, 2):
+        measured = chain_modes(5, NORMAL)["all"]
+        assert measured.shapes is not None
+        assert measured.shape_std is not None
+        fewer = replace(
+            measured,
+            dofs=measured.dofs[:sensors],
+            shapes=measured.shapes[:, :sensors],
+            shape_std=measured.shape_std[:, :sensors],
+        )
+        observations = ModeObservations(chain(), [prepare(fewer)])
+        base = fit_base(observations, Model())
+        found = scores(observations, base, [of_chain()["spring@m4"]])
+        limits.append(detection_limits(found, 5.0, 2.0)[0].size)
+    assert limits[1] > limits[0]
+
+
+def test_effects_of_the_library_can_all_be_placed() -> None:
+    rig = planetary()
+    for label in of_planetary():
+        if not label.startswith("out_of_tolerance"):
+            assert parse_effect(label, rig).label == label

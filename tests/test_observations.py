@@ -1,0 +1,361 @@
+"""Measured modes as observations: what depends on what, derivatives, assignment, and data that lack something."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from imperfect_modes import EXACT, GOOD, Hidden, chain, chain_modes, planetary_modes
+
+from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
+from ema_pipeline.dof import Dof
+from ema_pipeline.effects.library import parse_effect
+from ema_pipeline.errors import EmaError
+from ema_pipeline.inference import descend
+from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
+from ema_pipeline.observations.fitting import Model, fit_base, learned
+from ema_pipeline.observations.modes import UNEXPLAINED, UNSEEN, ModeObservations, prepare
+from ema_pipeline.observations.parts import (
+    MASS_SCATTER,
+    PART_SCATTER,
+    STIFFNESS_SCATTER,
+    dependence,
+    part_key,
+    value_of,
+)
+from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.rigs import load_rig
+from ema_pipeline.rigs.base import ParametricRig
+from ema_pipeline.rigs.planetary import planetary
+from ema_pipeline.rigs.types import Parameter, Rig
+
+SHIPPED = ("planetary", "gearbox", "frame")
+
+
+def observed(rig: Rig, measured: dict[str, MeasuredModes]) -> ModeObservations:
+    return ModeObservations(rig, [prepare(m) for m in measured.values()])
+
+
+def chain_observations(seed: int = 0, lab=GOOD) -> ModeObservations:
+    return observed(chain(), chain_modes(seed, lab))
+
+
+# --- families and parts -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_element_follows_its_families_as_the_rig_builds_it(name: str) -> None:
+    rig = load_rig(name)
+    known = dependence(rig)
+    rng = np.random.default_rng(0)
+    logs = {f: 0.2 * rng.normal() for f in known.families}
+    x = np.array([logs.get(n, 0.0) for n in known.unknowns.names])
+    values = {f: rig.parameters[f].value * float(np.exp(v)) for f, v in logs.items()}
+    for configuration in rig.configurations:
+        before, after = rig.assembly(configuration), rig.assembly(configuration, values)
+        for a, b in zip(before.elements, after.elements, strict=True):
+            row = known.elements[configuration].get(part_key(a), np.zeros(len(x)))
+            assert value_of(a) * np.exp(row @ x) == pytest.approx(value_of(b), rel=1e-9), a.name
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_every_part_of_a_rig_has_a_deviation_of_its_own(name: str) -> None:
+    rig = load_rig(name)
+    known = dependence(rig)
+    governed = known.unknowns.governed(PART_SCATTER)
+    for configuration in rig.configurations:
+        for element in rig.assembly(configuration).elements:
+            if isinstance(element, Mass | Spring | Damper) and value_of(element) > 0:
+                row = known.elements[configuration][part_key(element)]
+                assert np.sum(row[governed] == 1.0) == 1, element.name
+
+
+def test_one_body_has_one_mass_whichever_way_it_moves() -> None:
+    known = dependence(planetary())
+    names = [n for n in known.unknowns.names if n.startswith("planet1 mass")]
+    assert len(names) == 1
+    assert (Mass, "planet1 mass") in known.elements["no_ring"]
+
+
+def test_meshes_share_a_family_and_deviate_each_for_itself() -> None:
+    known = dependence(planetary(3))
+    rows = [known.elements["with_ring"][Spring, f"sun-planet{i} mesh"] for i in (1, 2, 3)]
+    family = known.unknowns.index["sun_planet_mesh_stiffness"]
+    assert [r[family] for r in rows] == [1.0, 1.0, 1.0]
+    own = [set(np.flatnonzero(r)) - {family} for r in rows]
+    assert len(set.union(*own)) == 3
+
+
+def test_parts_scatter_by_the_default_and_by_what_is_stated() -> None:
+    stated = {"carrier_mass": Parameter("carrier_mass", 1.0, "kg", 0.01, scatter=0.1),
+              "sun_bearing_stiffness": Parameter("sun_bearing_stiffness", 1e6, "N/m", 0.1, scatter=0.0)}  # fmt: skip
+    known = dependence(planetary(2, stated))
+    std = dict(zip(known.unknowns.names, known.unknowns.prior_std({PART_SCATTER: 0.02}), strict=True))
+    assert std["carrier mass (mass)"] == pytest.approx(0.1)
+    assert std["sun mass (mass)"] == pytest.approx(MASS_SCATTER)
+    assert std["sun-planet1 mesh (spring)"] == pytest.approx(STIFFNESS_SCATTER)
+    assert not any(n.startswith("sun bearing") for n in known.unknowns.names)
+
+
+def test_a_pressure_angle_that_is_uncertain_is_no_factor_on_elements() -> None:
+    angle = {"pressure_angle_deg": Parameter("pressure_angle_deg", 20.0, "deg", 0.05)}
+    known = dependence(planetary(2, angle))
+    assert known.geometric == ("pressure_angle_deg",)
+    assert "pressure_angle_deg" not in known.families
+
+
+def test_a_parameter_that_two_powers_follow_is_one_family() -> None:
+    # a beam's stiffness grows with the cube of its thickness, its mass with the thickness
+    def build(configuration, values):
+        t = values["thickness"]
+        row = {"tip.z": 1.0}
+        return Assembly(("tip.z",), (Mass("tip", row, 2.0 * t), Spring("beam", row, 1e5 * t**3)))
+
+    rig = ParametricRig("beam", ("all",), {"thickness": Parameter("thickness", 1.0, "mm", 0.05)}, build)
+    known = dependence(rig)
+    i = known.unknowns.index["thickness"]
+    assert known.elements["all"][Spring, "beam"][i] == pytest.approx(3.0)
+    assert known.elements["all"][Mass, "tip"][i] == pytest.approx(1.0)
+
+
+# --- sizes of effects -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "label", ["mesh_stiffness_loss@sun-planet1", "shaft_torsion@sun", "flexible_support@sun", "mass@sun"]
+)
+def test_sizes_stay_within_their_range_and_their_slopes_are_those_of_differences(label: str) -> None:
+    effect = parse_effect(label, planetary()).effect
+    for p in effect.parameters:
+        size = SizeMap.of(p, p.scale)
+        assert size.value(size.unknown(p.start)) == pytest.approx(p.start)
+        for x in (-50.0, 50.0):
+            assert p.minimum <= size.value(x) <= p.maximum
+        at = size.unknown(p.start)
+        assert size.slope(at) == pytest.approx(
+            (size.value(at + 1e-6) - size.value(at - 1e-6)) / 2e-6, rel=1e-4
+        )
+
+
+def test_an_effect_of_no_size_leaves_the_system_as_it_is() -> None:
+    rig = planetary()
+    effect = parse_effect("mesh_stiffness_loss@sun-planet1", rig)
+    with_it = RigModel(rig, [effect])
+    x = np.zeros(len(with_it.unknowns))
+    got, expected = with_it.system("with_ring", x), rig.system("with_ring")
+    np.testing.assert_allclose(got.stiffness, expected.stiffness, atol=1e-6)
+    np.testing.assert_allclose(got.mass, expected.mass)
+    assert with_it.size_values(x) == {"mesh_stiffness_loss@sun-planet1.fraction": 0.0}
+
+
+# --- residuals --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("labels", [(), ("spring@m2.z",), ("mass@m4.z", "damper@m1-m3")])
+def test_derivatives_of_the_residuals_are_those_of_differences(labels: tuple[str, ...]) -> None:
+    observations = chain_observations(1)
+    problem = observations.problem([parse_effect(x, observations.rig) for x in labels], {})
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    x = problem.start() + 0.02 * np.random.default_rng(1).normal(size=len(problem.unknowns))
+    here = problem.residuals(x, scatters)
+    for i, name in enumerate(problem.unknowns.names):
+        h = np.zeros(len(x))
+        h[i] = 1e-6
+        low, high = (problem.residuals(x + s * h, scatters, matching=here.matching).values for s in (-1, 1))
+        np.testing.assert_allclose(here.jacobian[:, i], (high - low) / 2e-6, atol=2e-3, err_msg=name)
+
+
+def test_derivatives_of_the_residuals_hold_for_two_configurations_with_transverse_sensors() -> None:
+    rig = planetary()
+    observations = observed(rig, planetary_modes(rig, 2, GOOD))
+    problem = observations.problem([parse_effect("mesh_stiffness_loss@ring-planet2", rig)], {})
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    x = problem.start() + 0.02 * np.random.default_rng(2).normal(size=len(problem.unknowns))
+    here = problem.residuals(x, scatters)
+    scale = np.abs(here.jacobian).max()
+    for i, name in enumerate(problem.unknowns.names):
+        h = np.zeros(len(x))
+        h[i] = 1e-6
+        low, high = (problem.residuals(x + s * h, scatters, matching=here.matching).values for s in (-1, 1))
+        np.testing.assert_allclose(here.jacobian[:, i], (high - low) / 2e-6, atol=1e-4 * scale, err_msg=name)
+
+
+def test_a_rig_that_is_as_drawn_has_residuals_of_nothing_but_noise() -> None:
+    observations = chain_observations(3, EXACT)
+    problem = observations.problem((), {})
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
+    assert np.max(np.abs(found.values)) < 0.1
+    assert found.penalty == 0.0
+    assert found.projected == 5
+
+
+def test_shapes_are_compared_up_to_a_factor_and_a_phase() -> None:
+    observations = chain_observations(4)
+    measured = chain_modes(4, GOOD)["all"]
+    assert measured.shapes is not None
+    turned = replace(measured, shapes=measured.shapes * np.array([2.0, -1.0, 3j, 0.1, 1 + 1j])[:, None])
+    assert measured.shape_std is not None
+    turned = replace(turned, shape_std=measured.shape_std * np.array([2, 1, 3, 0.1, np.sqrt(2)])[:, None])
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    values = [
+        np.abs(o.problem((), {}).residuals(np.zeros(len(o.problem((), {}).unknowns)), scatters).values)
+        for o in (observations, observed(chain(), {"all": turned}))
+    ]
+    np.testing.assert_allclose(values[0], values[1], rtol=1e-6, atol=1e-9)
+
+
+def test_a_reversed_sensor_reads_what_it_should() -> None:
+    measured = chain_modes(5, GOOD)["all"]
+    assert measured.shapes is not None
+    sign = np.array([1, 1, -1, 1, 1])
+    dofs = tuple(replace(d, sign=int(s)) for d, s in zip(measured.dofs, sign, strict=True))
+    reversed_one = replace(measured, dofs=dofs, shapes=measured.shapes * sign)
+    fits = [fit_base(observed(chain(), {"all": m}), Model()) for m in (measured, reversed_one)]
+    assert fits[0].posterior.error == pytest.approx(fits[1].posterior.error, rel=1e-6)
+
+
+def test_a_mode_that_the_model_lacks_and_one_that_was_not_measured_cost_what_they_cost() -> None:
+    measured = chain_modes(6, EXACT)["all"]
+    scatters = {n: s.default for n, s in chain_observations(6).scatters.items()}
+    keep = np.array([0, 1, 3, 4])
+    missed = replace(
+        measured,
+        frequency_hz=measured.frequency_hz[keep],
+        frequency_std_hz=measured.frequency_std_hz[keep],
+        damping_ratio=measured.damping_ratio[keep],
+        damping_std=measured.damping_std[keep],
+        shapes=measured.shapes[keep],  # type: ignore[index]
+        shape_std=measured.shape_std[keep],  # type: ignore[index]
+    )
+    problem = observed(chain(), {"all": missed}).problem((), {})
+    assert problem.residuals(np.zeros(len(problem.unknowns)), scatters).penalty == UNSEEN
+
+    def more(a: np.ndarray, value: np.ndarray | float) -> np.ndarray:
+        return np.concatenate([a, np.atleast_2d(value) if a.ndim > 1 else np.atleast_1d(value)])
+
+    odd = np.array([1.0, -1.0, -0.2, 1.0, 0.5])
+    twice = replace(
+        measured,
+        frequency_hz=more(measured.frequency_hz, 2.5 * measured.frequency_hz[-1]),
+        frequency_std_hz=more(measured.frequency_std_hz, 0.1),
+        damping_ratio=more(measured.damping_ratio, 0.01),
+        damping_std=more(measured.damping_std, 0.001),
+        shapes=more(measured.shapes, odd),  # type: ignore[arg-type]
+        shape_std=more(measured.shape_std, np.full(5, 0.01)),  # type: ignore[arg-type]
+        band_hz=(10.0, 2000.0),
+    )
+    problem = observed(chain(), {"all": twice}).problem((), {})
+    found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
+    assert found.penalty == UNEXPLAINED
+    assert [r.measured for r in problem.rows(found)] == [0, 1, 2, 3, 4]
+
+
+def test_rows_of_the_residuals_stand_by_their_mode_and_sensor() -> None:
+    measured = chain_modes(7, GOOD)["all"]
+    assert measured.shapes is not None
+    shapes = measured.shapes.copy()
+    shapes[2, 1] = np.nan
+    damping = measured.damping_ratio.copy()
+    damping[3] = np.nan
+    observations = observed(chain(), {"all": replace(measured, shapes=shapes, damping_ratio=damping)})
+    problem = observations.problem((), {})
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
+    rows = problem.rows(found)
+    assert len(rows) == 5
+    assert np.isnan(rows[3].damping)
+    assert not np.isnan(rows[2].damping)
+    assert [bool(np.any(np.isnan(r.shape))) for r in rows] == [False, False, True, False, False]
+    told = np.concatenate([[r.frequency, r.damping, *r.shape] for r in rows])
+    assert np.nansum(told**2) == pytest.approx(float(found.values @ found.values))
+
+
+def test_folds_hold_every_mode_out_once() -> None:
+    rig = planetary()
+    observations = observed(rig, planetary_modes(rig, 8, GOOD))
+    total = sum(len(d) for d in observations.data)
+    out = [np.concatenate([d.log_frequency for d in o.data]) for _, o in observations.folds()]
+    assert sorted(np.concatenate(out)) == pytest.approx(
+        sorted(np.concatenate([d.log_frequency for d in observations.data]))
+    )
+    for kept, held in observations.folds():
+        assert sum(map(len, kept.data)) + sum(map(len, held.data)) == total
+        assert kept.problem((), {}).unknowns.names == held.problem((), {}).unknowns.names
+
+
+# --- data that lack something -----------------------------------------------------------------------------
+
+
+def fitted(observations: ModeObservations):
+    found = learned(observations, fit_base(observations, Model()))
+    assert np.all(np.isfinite(found.posterior.x))
+    assert np.isfinite(found.log_evidence)
+    assert np.isfinite(found.posterior.error)
+    return found.posterior
+
+
+def test_frequencies_alone_can_be_fitted() -> None:
+    f = chain_modes(9, GOOD)["all"].frequency_hz
+    found = fitted(observed(chain(), {"all": from_frequencies("all", f)}))
+    assert found.error < 1.5
+
+
+def test_a_single_mode_no_mode_and_equal_modes_can_be_fitted() -> None:
+    one = from_frequencies("all", [18.0])
+    fitted(observed(chain(), {"all": one}))
+    none = observed(chain(), {"all": from_frequencies("all", [])})
+    assert none.data == ()
+    found = fit_base(none, Model())
+    assert np.all(found.posterior.x == 0.0)
+    twice = from_frequencies("all", [37.0, 37.0, 37.0])
+    fitted(observed(chain(), {"all": twice}))
+
+
+def test_a_sensor_that_was_dead_all_along_can_be_fitted() -> None:
+    measured = chain_modes(10, GOOD)["all"]
+    assert measured.shapes is not None
+    for value in (np.nan, 0.0):
+        shapes = measured.shapes.copy()
+        shapes[:, 2] = value
+        fitted(observed(chain(), {"all": replace(measured, shapes=shapes)}))
+
+
+def test_modes_of_quite_another_rig_are_contradicted_and_raise_nothing() -> None:
+    measured = chain_modes(11, GOOD)["all"]
+    far = replace(measured, frequency_hz=measured.frequency_hz * np.array([3.0, 0.2, 1.0, 5.0, 0.7]))
+    found = fitted(observed(chain(), {"all": far}))
+    assert found.error > 2
+
+
+def test_a_mass_that_is_taken_away_beyond_what_is_there_raises_nothing() -> None:
+    observations = chain_observations(12)
+    effect = parse_effect("mass@m3.z", observations.rig)
+    problem = observations.problem([effect], {"mass@m3.z.mass": 1.0})
+    x = problem.start()
+    x[problem.unknowns.index["mass@m3.z.mass"]] = -5.0
+    scatters = {n: s.start for n, s in observations.scatters.items()}
+    found = descend(problem, scatters, problem.unknowns.clipped(x))
+    assert np.all(np.isfinite(found.x))
+    assert not np.isnan(found.log_evidence)
+
+
+def test_what_was_put_in_is_found_within_its_uncertainty() -> None:
+    z = []
+    for seed in range(4):
+        rng = np.random.default_rng(100 + seed)
+        factor = float(np.exp(0.8 * rng.normal()))
+        rig = chain(free=True)
+        hidden = Hidden({f"spring {i}": factor for i in range(6)})
+        found = fitted(observed(rig, chain_modes(200 + seed, GOOD, hidden)))
+        z.append((found.value("stiffness") - np.log(factor)) / found.std[found.unknowns.index["stiffness"]])
+    assert np.max(np.abs(z)) < 3.5
+
+
+def test_sensors_of_another_rig_are_refused_in_one_line() -> None:
+    measured = chain_modes(13, GOOD)["all"]
+    dofs = (*measured.dofs[:-1], Dof("m9", "z"))
+    problem = observed(chain(), {"all": replace(measured, dofs=dofs)}).problem((), {})
+    with pytest.raises(EmaError, match=r"m9\.z"):
+        problem.residuals(np.zeros(len(problem.unknowns)), {})
