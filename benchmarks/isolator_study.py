@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from ema_pipeline.diagnose.loops import diagnose_loops
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Diagnosis
-from ema_pipeline.diagnosis.loops import diagnose_loops
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
 from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.loops.extract import measure_loop
 from ema_pipeline.loops.model import EFFECTS

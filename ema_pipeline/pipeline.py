@@ -17,7 +17,7 @@ from typing import Any, Literal, cast
 from pydantic import Field, ValidationError
 
 from ema_pipeline.correlate.settings import CompareSettings, PairingSettings
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.frf.settings import FrfSettings

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from ema_pipeline import codec
 from ema_pipeline.cli import app
+from ema_pipeline.diagnose.loops import diagnose_loops, loop_hypotheses, loop_model, loop_models
+from ema_pipeline.diagnose.rungs import make_ladder
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
-from ema_pipeline.diagnosis.loops import diagnose_loops, loop_hypotheses, loop_model, loop_models
-from ema_pipeline.diagnosis.rungs import make_ladder
 from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.description import read_campaign

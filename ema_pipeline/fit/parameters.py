@@ -148,7 +148,8 @@ def _estimate(fitted: FittedModes, p: Parameter, value: float, settings: FitSett
         std = float("nan") if p.free else abs(p.tolerance * p.value)
         return ParameterEstimate(
             p.name, value, std, p.minimum if p.free else value - std, p.maximum if p.free else value + std,
-            p.unit, p.free, p.value, prior, False, float("nan") if p.free else 0.0, "not measured: nothing that was measured depends on it",
+            p.unit, p.free, p.value, prior, False, float("nan") if p.free else 0.0,
+            "not measured: nothing that was measured depends on it",
         )  # fmt: skip
     size = fitted.problem.sizes.get(p.name)
     slope = abs(value) if size is None else abs(size.slope(float(posterior.x[i])))

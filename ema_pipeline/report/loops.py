@@ -307,8 +307,8 @@ def _images(
     images = {}
     for name, figure in figures.items():
         picture = style.png(figure)
-        (plots / f"{name}.png").write_bytes(picture)
-        (plots / f"{name}.svg").write_bytes(style.svg(figure))
+        replace_file(plots / f"{name}.png", picture)
+        replace_file(plots / f"{name}.svg", style.svg(figure))
         uri = f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
         caption = _CAPTIONS.get(name) or _CAPTIONS[next(k for k in _CAPTIONS if name.endswith(f"_{k}"))]
         images[name] = {

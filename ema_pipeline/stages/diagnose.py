@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.correlate.types import Comparison
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.frf.types import FrfSet
@@ -44,7 +44,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
 def _diagnosed(run: Run, progress: Progress) -> Diagnosis:
     """By modes and, where there are hits at several levels, by the modes of every hit."""
-    from ema_pipeline.diagnosis.diagnosis import diagnose
+    from ema_pipeline.diagnose.diagnosis import diagnose
     from ema_pipeline.stages.amplitude import amplitude_observations
     from ema_pipeline.stages.models import known_model, mode_observations
     from ema_pipeline.threads import single_blas_thread

@@ -43,7 +43,7 @@ def _measured(run: Run) -> Ladder:
     EmaError
         For an effect that shows in hits at several levels only, where there are none.
     """
-    from ema_pipeline.diagnosis.rungs import make_ladder
+    from ema_pipeline.diagnose.rungs import make_ladder
     from ema_pipeline.observations.fitting import Model
     from ema_pipeline.stages.amplitude import amplitude_observations
     from ema_pipeline.stages.models import mode_observations, model_with

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import cast
 
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.loops.types import IsolatorResult, Loop, LoopModel
 from ema_pipeline.observations.loop_data import settings_differ
@@ -16,7 +16,7 @@ from ema_pipeline.store import ALL
 
 def diagnose_run(run: Run, progress: Progress) -> dict[str, object]:
     """What the isolator's model is missing, on top of the model as it stands."""
-    from ema_pipeline.diagnosis.loops import diagnose_loops, loop_model, loop_models
+    from ema_pipeline.diagnose.loops import diagnose_loops, loop_model, loop_models
     from ema_pipeline.threads import single_blas_thread
 
     settings = cast(DiagnoseSettings, run.settings["diagnose"])
@@ -30,8 +30,8 @@ def diagnose_run(run: Run, progress: Progress) -> dict[str, object]:
 
 def ladder_run(run: Run, progress: Progress) -> dict[str, object]:
     """The effects that the user added, rung by rung; the linear spring alone is no ladder, but can be compared."""
-    from ema_pipeline.diagnosis.loops import loop_model, loop_models
-    from ema_pipeline.diagnosis.rungs import make_ladder
+    from ema_pipeline.diagnose.loops import loop_model, loop_models
+    from ema_pipeline.diagnose.rungs import make_ladder
     from ema_pipeline.threads import single_blas_thread
 
     effects = run.info.effects

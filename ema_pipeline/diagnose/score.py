@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from ema_pipeline.diagnosis.hypotheses import Hypothesis
+from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, transferred
 

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from ema_pipeline.diagnose.score import Score
 from ema_pipeline.diagnose.types import DetectionLimit
-from ema_pipeline.diagnosis.score import Score
 from ema_pipeline.observations.rig_model import SizeMap
 
 _NINE_OF_TEN = 1.2816

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from ema_pipeline.diagnose.heldout import HeldOut, held_out
 from ema_pipeline.diagnose.types import EffectSize, Ladder, LearnedScatter, Rung
-from ema_pipeline.diagnosis.heldout import HeldOut, held_out
 from ema_pipeline.inference import Posterior
 from ema_pipeline.inference.maximise import ANNEALING, anneal
 from ema_pipeline.observations.base import EffectProblem, Observations

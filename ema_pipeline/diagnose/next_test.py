@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.diagnose.claims import Judged
+from ema_pipeline.diagnose.selection import NOTHING, Selection
+from ema_pipeline.diagnose.sentences import label_text
 from ema_pipeline.diagnose.types import VerdictWord
-from ema_pipeline.diagnosis.claims import Judged
-from ema_pipeline.diagnosis.selection import NOTHING, Selection
-from ema_pipeline.diagnosis.sentences import label_text
 from ema_pipeline.dof import Dof
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
 from ema_pipeline.mechanics.system import LinearSystem, sensor_row

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ema_pipeline.diagnosis.claims import Judged, judge
-from ema_pipeline.diagnosis.hypotheses import Hypothesis
-from ema_pipeline.diagnosis.ranking import Ranked, Ranking
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
+from ema_pipeline.diagnose.claims import Judged, judge
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.ranking import Ranked, Ranking
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, learned, refined, transferred
 

@@ -9,12 +9,12 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.diagnose.diagnosis import diagnose
+from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
+from ema_pipeline.diagnose.selection import Progress
+from ema_pipeline.diagnose.sentences import label_text, size_text, summary
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Diagnosis, Ladder, Localisation
-from ema_pipeline.diagnosis.diagnosis import diagnose
-from ema_pipeline.diagnosis.hypotheses import Hypothesis, Name
-from ema_pipeline.diagnosis.selection import Progress
-from ema_pipeline.diagnosis.sentences import label_text, size_text, summary
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
 from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.inference import Posterior, descend, learn
 from ema_pipeline.loops.compare import loop_fits

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from ema_pipeline.diagnosis.heldout import HeldOut, held_out
-from ema_pipeline.diagnosis.hypotheses import Hypothesis
-from ema_pipeline.diagnosis.naming import Named, named, sizes_of
-from ema_pipeline.diagnosis.ranking import Ranked, Ranking
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
+from ema_pipeline.diagnose.heldout import HeldOut, held_out
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.naming import Named, named, sizes_of
+from ema_pipeline.diagnose.ranking import Ranked, Ranking
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import widened
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters

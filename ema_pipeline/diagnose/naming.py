@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
 from ema_pipeline.diagnose.types import EffectSize
-from ema_pipeline.diagnosis.hypotheses import Hypothesis, Name
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
 from ema_pipeline.observations.fitting import Fit
 from ema_pipeline.observations.rig_model import SizeMap

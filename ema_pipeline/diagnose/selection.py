@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ema_pipeline.diagnosis.backward import reconsidered
-from ema_pipeline.diagnosis.claims import Judged, judge
-from ema_pipeline.diagnosis.hypotheses import Hypothesis
-from ema_pipeline.diagnosis.naming import named
-from ema_pipeline.diagnosis.ranking import Ranked, Ranking, rank
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
+from ema_pipeline.diagnose.backward import reconsidered
+from ema_pipeline.diagnose.claims import Judged, judge
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.naming import named
+from ema_pipeline.diagnose.ranking import Ranked, Ranking, rank
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, fit_base
 
