@@ -150,8 +150,8 @@ def test_scatter_of_noise_is_learned_where_the_cycles_do_not_show_it() -> None:
     problem = observations.problem((), {})
     scatters = {n: s.start for n, s in observations.scatters.items()}
     found = learn(problem, anneal(problem, scatters, problem.start()), observations.scatters)
-    assert found.scatters[NOISE_SCATTER] == pytest.approx(np.sqrt(15), rel=0.2)
-    assert found.error > 3.0  # counted in the noise that was stated
+    assert found.scatters[NOISE_SCATTER] > 2.0  # √15, but for what counts as a force that no model explains
+    assert found.error == pytest.approx(4.0, rel=0.15)  # counted in the noise that was stated
 
 
 def test_loops_are_left_out_by_amplitude_frequency_and_setting() -> None:
