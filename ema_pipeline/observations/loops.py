@@ -58,7 +58,7 @@ _NEAR_STEPS = 10
 
 @dataclass(frozen=True)
 class Spread:
-    """Variance of the measured coefficients, N², each scatter's share in it, and its ratio to that of the measured noise."""
+    """Variance of the measured coefficients, N², each scatter's share in it, and its ratio to the noise's."""
 
     variance: NDArray[np.float64]
     share: Mapping[str, NDArray[np.float64]]
