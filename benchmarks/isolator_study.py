@@ -17,15 +17,15 @@ import time
 from pathlib import Path
 
 import numpy as np
+from ema_pipeline.loops.diagnosis import diagnose_loops
+from ema_pipeline.loops.effects import PARAMETERS, Structure
+from ema_pipeline.loops.fitting import LoopSet, fit
+from ema_pipeline.loops.visible import MARGIN
 from matplotlib.figure import Figure
 
-from ema_pipeline.hysteresis.diagnosis import diagnose_loops
-from ema_pipeline.hysteresis.effects import PARAMETERS, Structure
-from ema_pipeline.hysteresis.fitting import LoopSet, fit
-from ema_pipeline.hysteresis.loops import measure_loop
-from ema_pipeline.hysteresis.simulate import PRINTED, simulate_sine_test
-from ema_pipeline.hysteresis.types import Loop
-from ema_pipeline.hysteresis.visible import MARGIN
+from ema_pipeline.loops.extract import measure_loop
+from ema_pipeline.loops.simulate import PRINTED, simulate_sine_test
+from ema_pipeline.loops.types import Loop
 from ema_pipeline.threads import single_blas_thread
 
 FREQUENCIES_HZ, AMPLITUDES_M = (10.0, 12.0, 15.0), (1e-3, 1.5e-3, 2e-3)

@@ -275,7 +275,7 @@ def _levels(case: Case, raw: Path, random: np.random.Generator) -> Made:
 
 def _isolator(case: Case, raw: Path, random: np.random.Generator) -> Made:
     """Nine loops; force and displacement have a gain each."""
-    from ema_pipeline.hysteresis.simulate import PRINTED, write_sine_tests
+    from ema_pipeline.loops.simulate import PRINTED, write_sine_tests
 
     k, x, omega = PRINTED["stiffness"] * float(np.exp(0.2 * random.standard_normal())), 2e-3, 2 * np.pi * 12.0
     unit = {

@@ -38,6 +38,9 @@ _COMPRESS_FROM_BYTES = 16_384
 _ROW_CHUNK = 65_536
 """Samples of a row that are checked together, 0.5 MB: a hit is cut out without reading the whole row."""
 
+_SMALL_BYTES, _BEST_PACKING = 64_000_000, 300
+"""Even zeros are packed no better than 1:300 by the filter that is used here."""
+
 _LONGEST_ATTRIBUTE = 32_768
 """Longer text, bytes, becomes an array: HDF5 keeps attributes of more than 64 KiB apart from their object."""
 
@@ -149,6 +152,10 @@ def member(parent: h5py.Group, name: str) -> h5py.Group | h5py.Dataset:
         raise EmaError(
             f"'{parent.name}/{name}' leads out of the file, which ema never writes; do not trust it"
         )
+    if isinstance(node, h5py.Dataset) and node.shape is not None:
+        stated, stored = node.size * node.dtype.itemsize, node.id.get_storage_size()
+        if stated > _SMALL_BYTES + _BEST_PACKING * stored:
+            raise DamagedError(f"'{parent.name}/{name}': states {stated} bytes where {stored} are stored")
     return node
 
 

@@ -13,11 +13,11 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.isolators import isolators
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.files import read_bounded
-from ema_pipeline.hysteresis.effects import effect_ids
 from ema_pipeline.ingest.description import Campaign, TestDescription, read_campaign
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.names import check_name
+from ema_pipeline.observations.loop_forces import effects_of_loops
 from ema_pipeline.pipeline import (
     ShowStage,
     describe_run,
@@ -163,8 +163,8 @@ def change_effects(
         )
         run = new_run(store, info, effect_files)
         run.require_model("add")  # refuses unknown effects and places before anything is written
-        if info.kind == "hysteresis":
-            effect_ids(info.effects)
+        if info.kind == "hysteresis" and run.rig is not None:
+            effects_of_loops(run.rig, info.effects, run.library)  # refuses what a loop does not show
         save_info(store, info)
         run_stages(run, ("ladder", "fit", "correlate", "report"), show)
     return run

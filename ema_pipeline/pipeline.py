@@ -17,14 +17,14 @@ from typing import Any, Literal, cast
 from pydantic import Field, ValidationError
 
 from ema_pipeline.correlate.settings import CompareSettings, PairingSettings
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.frf.settings import FrfSettings
-from ema_pipeline.hysteresis.settings import HysteresisSettings
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.levels.settings import LevelSettings
+from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.names import check_name
@@ -98,7 +98,7 @@ class PipelineSettings(Settings):
     fit: FitSettings = Field(FitSettings(), description="fitting the model's parameters")
     correlate: CorrelateSettings = Field(CorrelateSettings(), description="pairing and comparison")
     diagnose: DiagnoseSettings = Field(DiagnoseSettings(), description="search for missing physics")
-    loops: HysteresisSettings = Field(HysteresisSettings(), description="force-displacement loops")
+    loops: LoopSettings = Field(LoopSettings(), description="force-displacement loops")
     ladder: LadderSettings = Field(LadderSettings(), description="the ladder of added effects")
     report: ReportSettings = Field(ReportSettings(), description="tables, plots and the report")
 

@@ -48,6 +48,11 @@ damping_ratio = [0.01, 0.02]
 band_hz = [10.0, 200.0]
 """
 
+MODES_TABLE = """configuration,frequency_hz,frequency_std_hz,damping_ratio
+no_ring,62.5,0.1,0.01
+no_ring,85.7,0.2,0.02
+"""
+
 PIPELINE = """stages = ["ingest", "hits", "frf", "modal", "report"]
 [ingest]
 largest_mb = 100.0
@@ -63,7 +68,8 @@ def tomls(docs: Path) -> dict[str, str]:
     page = (docs / "adding_a_rig.md").read_text(encoding="utf-8")
     elements = page.split("```toml\n")[2].split("```")[0]
     test = DESCRIPTION.replace("{file}", "hit1.csv")
-    return {"test": test, "rig": RIG_DERIVED, "elements": elements, "modes": MODES, "pipeline": PIPELINE}
+    kinds = {"rig": RIG_DERIVED, "modes": MODES, "table": MODES_TABLE, "pipeline": PIPELINE}
+    return {"test": test, "elements": elements, **kinds}
 
 
 def write_records(folder: Path) -> dict[str, bytes]:

@@ -17,7 +17,7 @@ import pytest
 import pyuff
 
 from ema_pipeline import cli
-from ema_pipeline.hysteresis.simulate import PRINTED, write_sine_tests
+from ema_pipeline.loops.simulate import PRINTED, write_sine_tests
 from ema_pipeline.pipeline import existing_run
 from ema_pipeline.simulate import simulate_campaign
 

@@ -14,15 +14,15 @@ from imperfect_modes import GOOD, NORMAL, Hidden, Lab, chain, chain_modes, plane
 
 from ema_pipeline import codec
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
+from ema_pipeline.diagnose.claims import judge
+from ema_pipeline.diagnose.diagnosis import diagnose
+from ema_pipeline.diagnose.heldout import held_out
+from ema_pipeline.diagnose.hypotheses import list_hypotheses
+from ema_pipeline.diagnose.ranking import rank
+from ema_pipeline.diagnose.rungs import make_ladder
+from ema_pipeline.diagnose.selection import NOTHING
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Diagnosis
-from ema_pipeline.diagnosis.claims import judge
-from ema_pipeline.diagnosis.diagnosis import diagnose
-from ema_pipeline.diagnosis.heldout import held_out
-from ema_pipeline.diagnosis.hypotheses import list_hypotheses
-from ema_pipeline.diagnosis.ranking import rank
-from ema_pipeline.diagnosis.rungs import make_ladder
-from ema_pipeline.diagnosis.selection import NOTHING
-from ema_pipeline.diagnosis.settings import DiagnoseSettings
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.mechanics.assembly import Damper, Element, Mass, Spring

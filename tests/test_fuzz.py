@@ -37,7 +37,7 @@ RECORDS = (
     "a.csv", "a.csv.gz", "a.lvm", "a.tdms", "ascii.uff", "binary.uff", "blanks.txt", "float.wav", "new.h5",
     "newer.mat", "old.h5", "packed.mat", "plain.mat", "whole.wav",
 )  # fmt: skip
-TOMLS = ("test", "rig", "elements", "modes", "pipeline")
+TOMLS = ("test", "rig", "elements", "modes", "table", "pipeline")
 
 fuzzed = settings(
     max_examples=20 * TIMES,
@@ -191,7 +191,7 @@ def read_toml_of(kind: str, path: Path) -> None:
         read_description(path.parent)
     elif kind in ("rig", "elements"):
         checked_rig(str(path))
-    elif kind == "modes":
+    elif kind in ("modes", "table"):
         describe_modes(path, "planetary", None, ())
     else:
         load_pipeline(str(path))
@@ -217,7 +217,7 @@ def test_a_damaged_record_is_read_or_refused_in_one_line(
 @pytest.mark.parametrize("kind", TOMLS)
 def test_a_changed_toml_is_understood_or_refused_in_one_line(tmp_path: Path, kind: str) -> None:
     write_csv(tmp_path / "hit1.csv", hammer_test())
-    path = tmp_path / f"{kind}.toml"
+    path = tmp_path / _file_of(kind)
     assert outcome(lambda: read_toml_of(kind, _write(path, texts()[kind].encode()))) == ""
 
     @seed(SEED)
@@ -236,10 +236,14 @@ def test_what_once_found_a_fault_finds_none_any_more(tmp_path: Path, kept: str) 
     path = _write(tmp_path / kept, (CORPUS / kept).read_bytes())
     if kind in TOMLS:
         write_csv(tmp_path / "hit1.csv", hammer_test())
-        path = path.rename(tmp_path / f"{kind}.toml")
+        path = path.rename(tmp_path / _file_of(kind))
         outcome(lambda: read_toml_of(kind, path))
     elif outcome(lambda: read_record(path)) == "":
         outcome(lambda: load_as_described(tmp_path, kept))
+
+
+def _file_of(kind: str) -> str:
+    return "table.csv" if kind == "table" else f"{kind}.toml"
 
 
 def _write(path: Path, content: bytes) -> Path:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from imperfect_modes import GOOD, NORMAL, Hidden, chain, chain_modes
 
-from ema_pipeline.diagnosis.hypotheses import Hypothesis, list_hypotheses
-from ema_pipeline.diagnosis.limits import detection_limits
-from ema_pipeline.diagnosis.localise import localise
-from ema_pipeline.diagnosis.naming import named, sizes_of
-from ema_pipeline.diagnosis.score import Score, scores
+from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
+from ema_pipeline.diagnose.limits import detection_limits
+from ema_pipeline.diagnose.localise import localise
+from ema_pipeline.diagnose.naming import named, sizes_of
+from ema_pipeline.diagnose.score import Score, scores
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.mechanics.assembly import Damper, Mass, Spring

@@ -7,25 +7,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ema_pipeline.loops.diagnosis import diagnose_loops
+from ema_pipeline.loops.effects import Structure
+from ema_pipeline.loops.fitting import fit, predict
+from ema_pipeline.loops.heldout import folds, settings_differ
+from ema_pipeline.loops.ladder import make_loop_ladder
+from ema_pipeline.loops.loop_set import LoopSet
 from typer.testing import CliRunner
 
 from ema_pipeline import codec
 from ema_pipeline.cli import app
 from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.errors import EmaError
-from ema_pipeline.hysteresis.branches import LimitCycle
-from ema_pipeline.hysteresis.diagnosis import diagnose_loops
-from ema_pipeline.hysteresis.effects import Structure
-from ema_pipeline.hysteresis.fitting import fit, predict
-from ema_pipeline.hysteresis.heldout import folds, settings_differ
-from ema_pipeline.hysteresis.ladder import make_loop_ladder
-from ema_pipeline.hysteresis.loop_set import LoopSet
-from ema_pipeline.hysteresis.loops import measure_loop, share_noise
-from ema_pipeline.hysteresis.model import Motion, loop_force
-from ema_pipeline.hysteresis.simulate import simulate_sine_test, steady_force, write_sine_tests
-from ema_pipeline.hysteresis.stage import load_loops
-from ema_pipeline.hysteresis.types import Loop, LoopModel
 from ema_pipeline.ingest.description import read_campaign
+from ema_pipeline.loops.extract import measure_loop, share_noise
+from ema_pipeline.loops.model import Motion, loop_force
+from ema_pipeline.loops.read import load_loops
+from ema_pipeline.loops.simulate import simulate_sine_test, steady_force, write_sine_tests
+from ema_pipeline.loops.types import Loop, LoopModel
+from ema_pipeline.mechanics.limit_cycle import LimitCycle
 
 SPRING = {"stiffness": 9e4}
 BOUC_WEN = {"hysteresis_force": 80.0, "hysteresis_rho": 900.0, "hysteresis_sigma": 0.6}

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from ema_pipeline.diagnose.explain import size_text
 
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung, TimeTrace
 from ema_pipeline.dof import Dof
-from ema_pipeline.report.diagnosis import hits_words, noise_words
+from ema_pipeline.report.diagnosis import hits_words, noise_words, size_words
 from ema_pipeline.report.figures import traces
 from ema_pipeline.report.plots import figure_specs
 from ema_pipeline.report.results import RunResults
@@ -78,3 +79,13 @@ def test_bars_say_fitted_and_held_out_by_hatching_and_number(ladder: Ladder) -> 
     assert "13" in numbers
     assert "–" in numbers
     assert {p.get_hatch() or "" for p in ax.patches} == {"", "////"}
+
+
+def test_a_size_that_the_data_do_not_tell_is_not_given() -> None:
+    sizes = {
+        "mesh_backlash@m.preload": EffectSize(2.7e-7, 6e-9, "m"),
+        "mesh_backlash@m.gap": EffectSize(1e-4, 3.2, "m"),
+    }
+    assert size_text(sizes) == "preload 2.7e-07 ± 6e-09 m, gap not told by these data"
+    assert "gap not told by these data" in size_words(sizes)
+    assert "force 0.0 ± 1.4 N" in size_words({"dry_friction@m.force": EffectSize(0.0, 1.4, "N")})

@@ -177,15 +177,19 @@ from pathlib import Path
 from ema_pipeline.store import Store
 
 def work(seconds):
-    print("worker", os.getpid(), flush=True)
+    os.write(1, f"worker {{os.getpid()}}\\n".encode())  # at once, whoever else writes
     time.sleep(seconds)
 
 with Store(Path({str(tmp_path)!r})).lock(), ProcessPoolExecutor(2, mp_context=get_context("fork")) as pool:
     list(pool.map(work, [60, 60]))
 """
-    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     assert process.stdout is not None
-    workers = [int(process.stdout.readline().split()[1]) for _ in range(2)]
+    lines = [process.stdout.readline() for _ in range(2)]
+    assert all(line.startswith("worker ") for line in lines), lines
+    workers = [int(line.split()[1]) for line in lines]
     process.kill()
     process.wait()
     process.stdout.close()
@@ -363,3 +367,13 @@ except EmaError as error:
         assert int(done.stdout.split()[0]) < 50  # making what cannot be written would be lost time
         assert (tmp_path / "ema.h5").read_bytes() == before
         assert {p.name for p in tmp_path.iterdir()} == {"ema.h5", ".lock"}
+
+
+def test_an_array_that_states_more_than_is_stored_is_damage(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key", "{}", 0.1, result=np.zeros(8))
+    with h5py.File(store.path, "r+") as file:
+        del file["stages/frf/all/result"]
+        file["stages/frf/all"].create_dataset("result", (1_000_000_000_000,), "f8", chunks=(1024,))
+    with pytest.raises(EmaError, match="states 8000000000000 bytes where 0 are stored"):
+        store.find("frf", ALL, "result", np.ndarray)

@@ -14,12 +14,14 @@ A = TypeVar("A")
 R = TypeVar("R")
 
 _job: Callable[..., object] | None = None
+_items: Sequence[object] = ()
 
 
 def spread(job: Callable[[A], R], items: Sequence[A], processes: int) -> Iterator[R]:
     """``map(job, items)`` over forked processes; in this one where the system cannot fork or it is not worth it.
 
-    The job goes over by forking, so it may hold what cannot be pickled (a user's effect file).
+    The job and its items go over by forking, so they may hold what cannot be pickled (effects of a user's own file);
+    results are pickled.
     """
     can_fork = sys.platform == "linux" and "fork" in multiprocessing.get_all_start_methods()
     daemon = multiprocessing.current_process().daemon
@@ -28,17 +30,17 @@ def spread(job: Callable[[A], R], items: Sequence[A], processes: int) -> Iterato
             for item in items:
                 yield job(item)
         return
-    global _job
-    _job = job
+    global _job, _items
+    _job, _items = job, items
     try:
         context = multiprocessing.get_context("fork")
         with ProcessPoolExecutor(min(processes, len(items)), mp_context=context) as pool:
-            yield from cast("Iterator[R]", pool.map(_run, range(len(items)), [list(items)] * len(items)))
+            yield from cast("Iterator[R]", pool.map(_run, range(len(items))))
     finally:
-        _job = None
+        _job, _items = None, ()
 
 
-def _run(index: int, items: Sequence[A]) -> object:
+def _run(index: int) -> object:
     assert _job is not None
     with single_blas_thread():
-        return _job(items[index])
+        return _job(_items[index])

@@ -1,199 +1,221 @@
-"""Fits of all hypotheses of one base model, and their probabilities."""
+"""Every hypothesis fitted on top of the model as it stands, and ranked by its evidence.
+
+Local optima are the only cause of wrong names: a base model that is stuck lends fake gains to whatever frees it. So
+fits are annealed, and the base and every hypothesis are begun again from the best values known of all else.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from ema_pipeline.diagnose.fitting import Case, Fitted, fit_hypothesis, follow, ground, holds, near, refit
-from ema_pipeline.diagnose.hypotheses import NOTHING, Hypothesis, extras, prior_probabilities
+from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.pool import spread
-from ema_pipeline.diagnose.progress import Progress
-from ema_pipeline.diagnose.types import OUT_OF_TOLERANCE
-from ema_pipeline.fit.settings import FitSettings
+from ema_pipeline.diagnose.score import Score, scores
+from ema_pipeline.inference import Posterior
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import QUICK, Fit, Model, annealed, learned, refined, transferred
 
-_NULL_FROM = 4
-_NULL_ROUNDS = 3
-_RACING = 8
-_OUT_OF_RACE = 60.0
-_NOTHING_GAINED = 4.0
+Progress = Callable[[float, str], None]
+
+FINALISTS = 5
+"""Hypotheses for which the scatters are learned."""
+_SCREENED = 14
+"""Generic hypotheses, best first by their score, that are fitted in full."""
+_UNSEEN = 1e6
+"""1 σ of a size, in units of its prior, from which the data hold nothing of it: it cannot be told from nothing."""
+_CONTENDERS = 12
+"""Hypotheses that are worth a second refinement."""
+_EXPLAINED = 1.3
+"""Error up to which the base model is near enough for hypotheses to begin at its fit."""
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """One hypothesis on top of the model.
+
+    Attributes
+    ----------
+    hypothesis : Hypothesis
+    fit : Fit
+    gain : float
+        Log evidence against the model without it, both with learned scatters where it is a finalist.
+    final : bool
+        True where its scatters were learned.
+    """
+
+    hypothesis: Hypothesis
+    fit: Fit
+    gain: float
+    final: bool
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """A base model and everything that was tried on top of it.
+    """The model as it stands, and all hypotheses by evidence.
 
     Attributes
     ----------
-    base : Fitted
-    fitted : tuple of Fitted
-        In the order of the hypotheses.
-    probabilities : dict of str to float
-        By label, ``"nothing"`` for the base model; adds up to 1.
+    base : Fit
+        With learned scatters.
+    ranked : tuple of Ranked
+        Best first.
     """
 
-    base: Fitted
-    fitted: tuple[Fitted, ...]
-    probabilities: dict[str, float]
-
-    def ordered(self) -> list[Fitted]:
-        """The most probable first."""
-        return sorted(self.fitted, key=lambda f: -self.probabilities[f.hypothesis.label])
-
-    def worthwhile(self) -> list[Fitted]:
-        """The base model, and what is better supported than it before prior odds count."""
-        return [self.base, *(f for f in self.fitted if f.evidence < self.base.evidence)]
-
-    def gain(self, f: Fitted) -> float:
-        """Fall of -2 log posterior, the mixing of near modes integrated out."""
-        return self.base.objective + self.base.volume - f.objective - f.volume
-
-    def log_evidence(self, f: Fitted) -> float:
-        """Natural logarithm of the Bayes factor against the base model."""
-        return -0.5 * (f.evidence - self.base.evidence)
+    base: Fit
+    ranked: tuple[Ranked, ...]
 
 
 def rank(
-    case: Case, base: Fitted, hypotheses: Sequence[Hypothesis], fit: FitSettings, tell: Progress
+    observations: Observations,
+    base: Fit,
+    hypotheses: Sequence[Hypothesis],
+    processes: int = 1,
+    progress: Progress = lambda share, text: None,
 ) -> Ranking:
-    """Fit all hypotheses on top of a base model, and the base model from all of their optima.
+    """Fit every hypothesis and rank it.
 
     Parameters
     ----------
-    case : Case
-    base : Fitted
+    observations : Observations
+    base : Fit
+        The model as it stands, from `fit_base`.
     hypotheses : sequence of Hypothesis
-    fit : FitSettings
-    tell : callable
+    processes : int
+        Processes that share the fits; the result does not depend on their number.
+    progress : callable
     """
-    below = ground(case, base, fit)
+    promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses)}
+    hypotheses = [h for h in hypotheses if h.label not in promise or promise[h.label].std < _UNSEEN]
+    chosen = _screened(hypotheses, promise)
+    stuck = base.posterior.error > _EXPLAINED or base.posterior.residuals.penalty > 0
+    job = partial(_first_fit, observations, base, {} if stuck else promise)
+    found: dict[str, tuple[Hypothesis, Fit]] = {}
+    for i, (hypothesis, posterior) in enumerate(zip(chosen, spread(job, chosen, processes), strict=True)):
+        model = base.model.plus(hypothesis.placed, hypothesis.scales)
+        found[hypothesis.label] = (hypothesis, Fit(model, posterior))
+        progress(0.6 * (i + 1) / len(chosen), hypothesis.label)
+    for contenders, steps in ((len(found), 5), (_CONTENDERS, 12)):
+        base, found = _begun_again(observations, base, found, processes, contenders, steps)
+    progress(0.8, "scatter of parts and channels")
+    return _finals(observations, base, found, processes)
 
-    def one(h: Hypothesis) -> Fitted:
-        return fit_hypothesis(case, h, fit, below)
 
-    return _ranked(case, base, hypotheses, one, fit, tell)
-
-
-def sharpen(case: Case, ranking: Ranking, base: Fitted, fit: FitSettings, tell: Progress) -> Ranking:
-    """The same ranking at another noise level, every fit started from its own optimum.
-
-    Hypotheses that are out of the race are not fitted again; they keep their distance from the base model.
-    """
-    best = min(f.evidence for f in (ranking.base, *ranking.fitted))
-    ordered = ranking.ordered()
-    racing = {f.hypothesis.label for f in ordered[:_RACING]}
-    racing |= {f.hypothesis.label for f in ordered if f.evidence < best + _OUT_OF_RACE}
-    found = {f.hypothesis.label: f for f in ranking.fitted}
-
-    def one(h: Hypothesis) -> Fitted:
-        return follow(case, found[h.label], fit)
-
-    sharp = _ranked(
-        case, base, [f.hypothesis for f in ranking.fitted if f.hypothesis.label in racing], one, fit, tell
+def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) -> list[Hypothesis]:
+    """The rig's own hypotheses, and the generic ones that promise most."""
+    generic = sorted(
+        (promise[h.label] for h in hypotheses if h.generic and h.label in promise), key=lambda s: -s.gain
     )
-    by_label = {f.hypothesis.label: f for f in sharp.fitted}
-    fitted = [
-        by_label.get(f.hypothesis.label) or _moved_along(f, ranking.base, sharp.base) for f in ranking.fitted
-    ]
-    return Ranking(sharp.base, tuple(fitted), probabilities(case, sharp.base, fitted))
+    kept = {s.hypothesis.label for s in generic[:_SCREENED]}
+    return [h for h in hypotheses if not h.generic or h.label in kept]
 
 
-def _moved_along(f: Fitted, old: Fitted, new: Fitted) -> Fitted:
-    return replace(
-        f,
-        objective=f.objective - old.objective + new.objective,
-        evidence=f.evidence - old.evidence + new.evidence,
-        costs=new.costs,
-        inlier=new.inlier,
-        prior_cost=new.prior_cost,
-        volume=f.volume - old.volume + new.volume,
-        alone=new.alone,
-    )
+def _first_fit(
+    observations: Observations, base: Fit, promise: Mapping[str, Score], hypothesis: Hypothesis
+) -> Posterior:
+    """The fit begun at the size that its score tells; annealed from several sizes where the base model fails."""
+    model = base.model.plus(hypothesis.placed, hypothesis.scales)
+    problem = model.problem(observations)
+    unknowns = problem.unknowns
+    begin = transferred(base.posterior, unknowns, np.zeros(len(unknowns)))
+    begun = problem.begun(begin, base.posterior.scatters)
+    if begun is not None:
+        return refined(observations, model, begun).posterior
+    score = promise.get(hypothesis.label)
+    if score is not None and len(score.size) == 1:
+        at = unknowns.index[hypothesis.placed.parameter_name(hypothesis.placed.effect.parameters[0].name)]
+        begin[at] = float(np.clip(0.5 * score.size[0], -1.0, 1.0))
+        fit = refined(observations, model, unknowns.clipped(begin))
+        if fit.posterior.cost <= base.posterior.cost:
+            return fit.posterior
+    fits = []
+    for start in hypothesis.starts():
+        x = begin.copy()
+        for name, value in start.items():
+            x[unknowns.index[name]] = value
+        fits.append(annealed(observations, model, unknowns.clipped(x), QUICK))
+    return max(fits, key=lambda f: f.log_evidence).posterior
 
 
-def _ranked(
-    case: Case,
-    base: Fitted,
-    hypotheses: Sequence[Hypothesis],
-    one: Callable[[Hypothesis], Fitted],
-    fit: FitSettings,
-    tell: Progress,
-) -> Ranking:
-    fitted = []
-    for f in spread(one, hypotheses, case.settings.processes):
-        fitted.append(f)
-        tell(len(fitted) / len(hypotheses), f.hypothesis.label)
-    base = settle_base(case, base, fitted, fit)
-    fitted = [_never_worse(f, base) for f in fitted]
-    return Ranking(base, tuple(fitted), probabilities(case, base, fitted))
+Found = dict[str, tuple[Hypothesis, Fit]]
 
 
-def settle_base(case: Case, base: Fitted, fitted: Sequence[Fitted], fit: FitSettings) -> Fitted:
-    """The base model refitted from the parameters of the best hypotheses, until it gets no better.
-
-    Otherwise the gain of a hypothesis may only be that its start led to a better optimum.
-    """
-    for _ in range(_NULL_ROUNDS):
-        best = base
-        for f in sorted(fitted, key=lambda f: f.objective)[:_NULL_FROM]:
-            other = refit(case, base.hypothesis, fit, f.values)
-            if other.objective < best.objective - 1e-6:
-                best = other
-        if best.objective > base.objective - 0.01:
-            return best
-        base = best
-    return base
+def _begun_again(
+    observations: Observations, base: Fit, found: Found, processes: int, contenders: int, steps: int
+) -> tuple[Fit, Found]:
+    """The base model and the best hypotheses, begun at what the best of all knows of everything else."""
+    top = max((f for _, f in found.values()), key=lambda f: f.log_evidence, default=base)
+    again = refined(observations, base.model, _on(observations, base.model, top, base), steps=20)
+    if again.log_evidence > base.log_evidence:
+        base = again
+    job = partial(_better, observations, (base, top), steps)
+    items = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)[:contenders]
+    better = _spread_fits(job, [fit for _, fit in items], processes)
+    return base, found | {h.label: (h, fit) for (h, _), fit in zip(items, better, strict=True)}
 
 
-def _never_worse(f: Fitted, base: Fitted) -> Fitted:
-    """A richer model holds the poorer one: where its fit ended higher, the poorer one's costs stand.
-
-    Evidence cannot grow by more than the likelihood does.
-    """
-    if f.objective <= base.objective:
-        return replace(f, evidence=max(f.evidence, base.evidence + f.objective - base.objective))
-    return replace(
-        f,
-        objective=base.objective,
-        evidence=max(f.evidence - (f.objective - base.objective), base.evidence + _NOTHING_GAINED),
-        costs=base.costs,
-        inlier=base.inlier,
-        prior_cost=base.prior_cost,
-        volume=base.volume,
-        alone=base.alone,
-    )
+def _on(observations: Observations, model: Model, source: Fit, sizes: Fit) -> np.ndarray:
+    """Everything that `source` knows, and the effects' sizes of `sizes`."""
+    problem = model.problem(observations)
+    x = transferred(sizes.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+    moved = transferred(source.posterior, problem.unknowns, x)
+    for name in problem.sizes:
+        i = problem.unknowns.index[name]
+        if name in sizes.posterior.unknowns.index:
+            moved[i] = x[i]
+    return moved
 
 
-def probabilities(case: Case, base: Fitted, fitted: Sequence[Fitted]) -> dict[str, float]:
-    """Posterior probabilities of the hypotheses and of ``"nothing"`` (more).
-
-    An effect so slight that parts made to one drawing differ by as much is no missing physics: on top of a model that
-    holds, or whose unexplained modes it does not explain either, its probability goes to ``"nothing"``.
-    """
-    settings = case.settings
-    prior = prior_probabilities([f.hypothesis for f in fitted], settings.null_prior, settings.parameter_prior)
-    evidence = {NOTHING: base.evidence} | {f.hypothesis.label: f.evidence for f in fitted}
-    logs = {label: np.log(max(prior[label], 1e-300)) - 0.5 * e for label, e in evidence.items()}
-    top = max(logs.values())
-    weights = {label: float(np.exp(v - top)) for label, v in logs.items()}
-    total = sum(weights.values())
-    shares = {label: w / total for label, w in weights.items()}
-    for f in fitted if near(base) else ():
-        idle = int(np.sum(f.explained)) <= int(np.sum(base.explained))
-        if (idle or holds(base)) and slight(case, f):
-            shares[NOTHING] += shares[f.hypothesis.label]
-            shares[f.hypothesis.label] = 0.0
-    return shares
+def _better(observations: Observations, sources: Sequence[Fit], steps: int, fit: Fit) -> Posterior:
+    best = fit
+    for source in sources:
+        x = _on(observations, fit.model, source, fit)
+        if np.allclose(x, best.posterior.x):
+            continue
+        again = refined(observations, fit.model, x, steps=steps)
+        if again.log_evidence > best.log_evidence:
+            best = again
+    return best.posterior
 
 
-def slight(case: Case, f: Fitted) -> bool:
-    """True for an effect added last all of whose sizes are below what is worth a claim."""
-    label = f.hypothesis.labels[-1]
-    if f.hypothesis.family == OUT_OF_TOLERANCE:
-        return False
-    sizes = [
-        e for e in extras(case.rig, Hypothesis((label,)), case.library) if e.slight > 0 and e.name in f.values
-    ]
-    return bool(sizes) and all(abs(f.values[e.name] - e.null) < e.slight for e in sizes)
+def _spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes: int) -> list[Fit]:
+    """Better fits of the same models; only posteriors go between processes, a user's effects cannot."""
+    return [Fit(fit.model, p) for fit, p in zip(fits, spread(job, fits, processes), strict=True)]
+
+
+def _finals(observations: Observations, base: Fit, found: Found, processes: int) -> Ranking:
+    """Scatters learned for the base model and the best hypotheses, each from what the others know."""
+    order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
+    best = [fit for _, fit in order[:FINALISTS]]
+    job = partial(_final, observations, (base, *best[:2]))
+    first = _spread_fits(job, [base, *best], processes)
+    leaders = sorted(first[1:], key=lambda f: -f.log_evidence)[:2]
+    job = partial(_final, observations, (first[0], *leaders))
+    second = _spread_fits(job, first, processes)
+    final_base = second[0]
+    ranked = []
+    for i, (hypothesis, fit) in enumerate(order):
+        if i < FINALISTS:
+            fit = second[1 + i]
+            ranked.append(Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True))
+        else:
+            ranked.append(Ranked(hypothesis, fit, fit.log_evidence - base.log_evidence, False))
+    finals = sorted(ranked[:FINALISTS], key=lambda r: -r.gain)
+    least = finals[-1].gain if finals else 0.0
+    # An effect that is no finalist was behind at wide scatters; it cannot lead at learned ones.
+    rest = [Ranked(r.hypothesis, r.fit, min(r.gain, least), False) for r in ranked[FINALISTS:]]
+    return Ranking(final_base, (*finals, *rest))
+
+
+def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:
+    candidates = [learned(observations, fit)]
+    for source in sources:
+        x = _on(observations, fit.model, source, fit)
+        if not np.allclose(x, fit.posterior.x):
+            scatters: Mapping[str, float] = source.posterior.scatters
+            start = refined(observations, fit.model, x, scatters, steps=10)
+            candidates.append(learned(observations, start))
+    return max(candidates, key=lambda f: f.log_evidence).posterior

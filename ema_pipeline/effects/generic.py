@@ -9,6 +9,12 @@ import numpy as np
 
 from ema_pipeline.mechanics.assembly import Assembly, Mass, Row, difference
 
+
+def bodies_and_dofs(assembly: Assembly) -> tuple[str, ...]:
+    """Bodies first, then single DOFs: what is simpler to say comes first."""
+    return (*assembly.bodies, *assembly.dofs)
+
+
 _PLANE = ({"x", "y"}, {"zeta", "eta"})
 
 

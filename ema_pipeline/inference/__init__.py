@@ -7,7 +7,7 @@ everything else that a user sees is read from the `Posterior`.
 from ema_pipeline.inference.maximise import anneal, descend
 from ema_pipeline.inference.posterior import Posterior
 from ema_pipeline.inference.problem import Problem, Residuals
-from ema_pipeline.inference.scatter import Scatter, learn
+from ema_pipeline.inference.scatter import Scatter, learn, widened
 from ema_pipeline.inference.unknowns import Unknowns, joined
 
 __all__ = [
@@ -20,4 +20,5 @@ __all__ = [
     "descend",
     "joined",
     "learn",
+    "widened",
 ]

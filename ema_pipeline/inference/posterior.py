@@ -86,9 +86,10 @@ class Posterior:
         The sum of squares at the maximum, priors included, is that of the residual whitened by the covariance of
         everything uncertain: what parts, channels and damping may scatter is in it.
         """
-        squares = float(self.residuals.values @ self.residuals.values)
+        stated = self.residuals.stated
+        squares = float(stated @ stated)
         squares += 2 * self.residuals.penalty + float(np.sum((self.x / self.prior_std) ** 2))
-        count = len(self.residuals.values) - self.residuals.projected
+        count = len(stated) - self.residuals.projected
         return float(np.sqrt(squares / max(count, 1)))
 
     def value(self, name: str) -> float:

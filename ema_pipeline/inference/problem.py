@@ -30,6 +30,8 @@ class Residuals:
         Further cost, in units of the log posterior: measured modes that the model does not explain.
     projected : int
         Number of values that were spent on factors of no interest (one per shape).
+    relative : ndarray, (m,), optional
+        σ over the σ that was measured or stated, in which errors count where data have one; 1 where left out.
     matching : object
         Whatever the problem wants to have back to evaluate the same assignment of data to model again.
     """
@@ -41,6 +43,12 @@ class Residuals:
     penalty: float = 0.0
     matching: object = None
     projected: int = 0
+    relative: NDArray[np.float64] | None = None
+
+    @property
+    def stated(self) -> NDArray[np.float64]:
+        """Values in units of the uncertainties that were measured or stated, (m,)."""
+        return self.values if self.relative is None else self.values * self.relative
 
     @property
     def cost(self) -> float:

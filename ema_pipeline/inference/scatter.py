@@ -40,6 +40,7 @@ class Scatter:
     spread: float = 0.5
     wide: float = 0.0
     most: float = 2.5
+    at_once: bool = False
 
     @property
     def start(self) -> float:
@@ -51,7 +52,7 @@ Descend = Callable[[Problem, Mapping[str, float], NDArray[np.float64]], Posterio
 
 
 def learn(
-    problem: Problem, found: Posterior, scatters: Mapping[str, Scatter], *, rounds: int = 3, steps: int = 8
+    problem: Problem, found: Posterior, scatters: Mapping[str, Scatter], *, rounds: int = 4, steps: int = 8
 ) -> Posterior:
     """Learn the scatters by expectation-maximisation, each with its log-normal prior, and the fit with them.
 
@@ -65,7 +66,7 @@ def learn(
         Rounds of learning, and most steps of the fit after each.
     """
     for _ in range(rounds):
-        learned = {name: _learned(found, scatters[name]) for name in found.scatters}
+        learned = {name: _relaxed(found, scatters[name]) for name in found.scatters}
         found = descend(problem, learned, found.x, steps=steps)
     cost = sum(
         0.5 * (np.log(found.scatters[n] / s.default) / s.spread) ** 2
@@ -75,11 +76,42 @@ def learn(
     return replace(found, scatter_cost=float(cost))
 
 
-def _learned(found: Posterior, scatter: Scatter) -> float:
-    """One step of expectation-maximisation for one scatter."""
+def widened(found: Posterior, scatters: Mapping[str, Scatter]) -> dict[str, float]:
+    """Root of the expected square of every scatter: what intervals must hold of how well a scatter is known.
+
+    The logarithm of a scatter that n unknowns or residuals determine has the variance 1/(2n + 1/spread²).
+    """
+    result = {}
+    for name, now in found.scatters.items():
+        scatter = scatters[name]
+        if not scatter.spread:
+            result[name] = now
+            continue
+        governed = found.unknowns.governed(name)
+        told = float(np.sum(1 - np.minimum(found.std[governed] / found.prior_std[governed], 1.0) ** 2))
+        share = found.residuals.share.get(name)
+        told += 0.0 if share is None else float(np.sum(share))
+        result[name] = now * float(np.exp(1 / (2 * told + scatter.spread**-2.0)))
+    return result
+
+
+_RELAXATION = 1.5
+"""Steps of expectation-maximisation are short where few parts are seen: longer ones converge to the same values."""
+
+
+def _relaxed(found: Posterior, scatter: Scatter) -> float:
     now = found.scatters[scatter.name]
     if not scatter.spread:
         return now
+    if scatter.at_once:
+        return _of_residuals_at_once(found, scatter)
+    step = _RELAXATION * np.log(_learned(found, scatter) / now)
+    return float(min(now * np.exp(step), scatter.most * scatter.default))
+
+
+def _learned(found: Posterior, scatter: Scatter) -> float:
+    """One step of expectation-maximisation for one scatter."""
+    now = found.scatters[scatter.name]
     squares, count = _of_unknowns(found, scatter.name, now)
     more, number = _of_residuals(found, scatter.name, now)
     return _mode_of_log(squares + more, count + number, now, scatter)
@@ -120,3 +152,24 @@ def _mode_of_log(squares: float, count: int, now: float, scatter: Scatter) -> fl
         slope = -count + excess - (log - np.log(scatter.default)) * weight
         log -= float(np.clip(slope / (-2 * excess - weight), -0.5, 0.5))
     return float(np.exp(min(log, np.log(scatter.most * scatter.default))))
+
+
+def _of_residuals_at_once(found: Posterior, scatter: Scatter) -> float:
+    """Scatter that maximises the expected log density of the residuals, the unknowns being what is averaged over.
+
+    With t = (scatter/now)², a residual's variance is 1 - share + share·t times what it is now.
+    """
+    now = found.scatters[scatter.name]
+    share = found.residuals.share[scatter.name]
+    jacobian = found.residuals.jacobian
+    uncertain = np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian)
+    square = found.residuals.values**2 + uncertain
+    log, weight = 0.0, scatter.spread**-2.0
+    for _ in range(_NEWTON_STEPS):
+        t = np.exp(2 * log)
+        variance = 1 - share + share * t
+        moved, excess = share * t / variance, square / variance
+        slope = float(np.sum(moved * (excess - 1))) - (log + np.log(now / scatter.default)) * weight
+        # Where the density is not concave in the logarithm, its expected curvature serves.
+        log += float(np.clip(slope / (weight + 2 * np.sum(moved**2 * np.maximum(excess, 1.0))), -1.0, 1.0))
+    return float(min(now * np.exp(log), scatter.most * scatter.default))

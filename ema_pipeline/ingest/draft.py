@@ -284,7 +284,7 @@ def _body(name: str) -> str:
 def _presence_comment(name: str, found: list[_Found]) -> list[str]:
     lacking = [f.file for f in found if name not in f.raw.channels]
     return (
-        [f"# CHECK: not in {', '.join(lacking[:3])}{' and others' if len(lacking) > 3 else ''}"]
+        [f"# CHECK: not in {', '.join(map(_quoted, lacking[:3]))}{' and others' if len(lacking) > 3 else ''}"]
         if lacking
         else []
     )

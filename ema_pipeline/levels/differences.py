@@ -66,7 +66,7 @@ def solve(
     m = len(poles)
     total = power.sum(axis=0)
     mean = np.einsum("hl,hol->ol", power / total, data)
-    smooth = _smooth(n_lines)
+    smooth = smooth_terms(n_lines)
     u, du = pole_functions(omega, poles, rest_s)
     difference = data - mean
     level = np.median(np.abs(difference) ** 2 * power[:, None], axis=(0, 2))
@@ -139,10 +139,10 @@ def participations(omega: Real, frf: Complex, poles: Complex, shapes: Complex, r
     """
     u, _ = pole_functions(omega, poles, rest_s)
     weight = np.ones((len(frf), len(omega)))
-    return _least_squares(*_whitened(shapes.T[:, :, None] * u, frf, weight, _smooth(len(omega))))
+    return _least_squares(*_whitened(shapes.T[:, :, None] * u, frf, weight, smooth_terms(len(omega))))
 
 
-def _smooth(n_lines: int) -> Real:
+def smooth_terms(n_lines: int) -> Real:
     """Orthonormal polynomials over the lines of a window, (n_terms, n_lines)."""
     return np.asarray(np.linalg.qr(np.vander(np.linspace(-1, 1, n_lines), SMOOTH_TERMS))[0].T)
 

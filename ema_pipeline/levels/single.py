@@ -58,6 +58,9 @@ class HitPoles:
         Peak force.
     frequency_hz, frequency_std_hz, damping_ratio, damping_std : ndarray, (n_hits, n_modes)
         Standard deviations from noise alone; ``inf`` where a hit tells nothing of the mode.
+    motion_m : complex ndarray, (n_hits, n_modes)
+        Displacement amplitude just after the hit where the mode's shape is 1, with the phase that it has then; NaN for
+        an uncalibrated hammer.
     amplitude_m : ndarray, (n_hits, n_modes)
         Largest displacement amplitude at any sensor just after the hit; NaN for an uncalibrated hammer.
     size : complex ndarray, (n_hits, n_modes)
@@ -74,6 +77,7 @@ class HitPoles:
     frequency_std_hz: Real
     damping_ratio: Real
     damping_std: Real
+    motion_m: Complex
     amplitude_m: Real
     size: Complex
     size_std: Real
@@ -90,7 +94,7 @@ class Window:
 @dataclass(frozen=True)
 class _Hit:
     """What is kept of one hit: accelerance and power of the force in each window; at each mode, the force and
-    whether it is clear of the hammer's noise.
+    whether it is clear of the hammer's noise. The force's phase counts from the blow.
     """
 
     name: str
@@ -131,7 +135,7 @@ def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSe
     names, force = [""] * count, np.zeros(count)
     point, sheet = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
     pole, std = np.tile(poles, (count, 1)), np.full(shape, np.inf)
-    amplitude = np.full(shape, np.nan)
+    amplitude, motion = np.full(shape, np.nan), np.full(shape, np.nan, dtype=np.complex128)
     size, size_std = np.zeros(shape, dtype=np.complex128), np.full(shape, np.inf)
     places = [d.point for d in frfs.inputs]
     dofs = [d.point for d in frfs.outputs]
@@ -156,16 +160,15 @@ def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSe
             size[np.ix_(index, m)] = solved.participation
             size_std[np.ix_(index, m)] = np.where(heard, solved.participation_std, np.inf)
             if members[0].calibrated:
-                impulse = np.array([np.abs(h.impulse[m]) for h in members])
-                largest = np.abs(seen[m]).max(axis=1)
-                amplitude[np.ix_(index, m)] = (
-                    2 * np.abs(solved.participation) * largest * impulse / np.abs(poles[m]) ** 2
-                )
+                impulse = np.array([h.impulse[m] for h in members])
+                moved = 2 * solved.participation * impulse / poles[m] ** 2
+                motion[np.ix_(index, m)] = moved
+                amplitude[np.ix_(index, m)] = np.abs(moved) * np.abs(seen[m]).max(axis=1)
     physical = pole + decay
     return HitPoles(
         tuple(names), point, sheet, force,
         np.abs(physical) / (2 * np.pi), std / (2 * np.pi),
-        -physical.real / np.abs(physical), std / np.abs(physical), amplitude, size, size_std,
+        -physical.real / np.abs(physical), std / np.abs(physical), motion, amplitude, size, size_std,
     )  # fmt: skip
 
 
@@ -240,7 +243,7 @@ def _spectra(
         max(one.record_s - float(one.delay_s[0]), 0.5 * one.record_s),
         tuple(acc[:, w.lines].copy() for w in windows),
         tuple(power[w.lines] for w in windows),
-        force[line],
+        force[line] * np.exp(2j * np.pi * frequency_hz * float(one.delay_s[0])),
         heard,
         hit.force_calibrated,
     )

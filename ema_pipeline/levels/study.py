@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels.settings import LevelSettings
-from ema_pipeline.levels.types import DecayCurve, ForceLevel, LevelStudy, ModeLevels
+from ema_pipeline.levels.types import DecayCurve, ForceLevel, HitModes, LevelStudy, ModeLevels
 from ema_pipeline.modal.settings import ModalSettings
 
 if TYPE_CHECKING:
@@ -100,10 +100,12 @@ def study_levels(
     progress(0.7, "modes of single hits")
     level_of = dict(zip(names, place.tolist(), strict=True))
 
-    def tested(model: ModalModel, one_at_least: bool) -> tuple[tuple[ModeLevels, ...], float]:
+    def tested(
+        model: ModalModel, one_at_least: bool
+    ) -> tuple[tuple[ModeLevels, ...], float, HitModes | None]:
         return _tested(model, levels, hits, frfs, frf_settings, level_of, settings, one_at_least)
 
-    modes, p_value = tested(modal, one_at_least=True)
+    modes, p_value, hit_modes = tested(modal, one_at_least=True)
     depends = bool(p_value < settings.false_alarm)
     linear: int | None = None
     products: tuple[str, ...] = ()
@@ -113,14 +115,17 @@ def study_levels(
         ):  # friction makes poles of all kinds: there the softest hits do not tell which are modes
             levels, products = without_products(levels, modes, modal)
         modal = levels[linear].modal or modal
-        modes, _ = tested(modal, one_at_least=not products)  # what was seen to move may have been left out
+        # what was seen to move may have been left out
+        modes, _, hit_modes = tested(modal, one_at_least=not products)
     elif not depends:
         modes = tuple(replace(m, depends=False, trend="") for m in modes)
     progress(0.9, "decays of single hits")
     base = _trusted(modal, modes)
     curves = _decays(modal, base, hits, frfs)
     verdicts = signs(levels, frfs, _only(modal, base)) if len(base) else ()
-    study = LevelStudy(levels, frfs.inputs, modes, curves, verdicts, depends, p_value, "", linear, products)
+    study = LevelStudy(
+        levels, frfs.inputs, modes, curves, verdicts, depends, p_value, "", linear, products, hit_modes
+    )
     return replace(study, summary=several_levels(study, modal, settings))
 
 
@@ -185,8 +190,8 @@ def _tested(
     place: dict[str, int],
     settings: LevelSettings,
     one_at_least: bool,
-) -> tuple[tuple[ModeLevels, ...], float]:
-    """The modes of a model with their tests, those that move if any does, and the p value of all tests together."""
+) -> tuple[tuple[ModeLevels, ...], float, HitModes | None]:
+    """The modes of a model with their tests, those that move if any does, the p value of all tests, and every hit's."""
     from ema_pipeline.levels.hit_trends import hit_trends
     from ema_pipeline.levels.single import single_hits
     from ema_pipeline.levels.sizes import NO_TREND
@@ -196,7 +201,7 @@ def _tested(
     modes = _modes(modal, levels, len(frfs.inputs))
     base = _trusted(modal, modes)
     if not len(base):
-        return modes, float("nan")
+        return modes, float("nan"), None
     found = single_hits(hits, _only(modal, base), frfs, frf_settings)
     level = np.array([place[name] for name in found.names], dtype=np.int64)
     changes = [_far(modes[k]) for k in base]
@@ -233,7 +238,36 @@ def _tested(
             size_std=tests.level_sizes[r][1],
             size_p=float("nan") if size[r].p == NO_TREND else size[r].p,
         )
-    return tuple(out), tests.p_value
+    return tuple(out), tests.p_value, _hit_modes(found, base, level, modal, frfs)
+
+
+def _hit_modes(found: HitPoles, base: Integers, level: Integers, modal: ModalModel, frfs: FrfSet) -> HitModes:
+    """What single hits tell, in the form that a comparison with a model needs."""
+    from ema_pipeline.levels.single import output_shapes, windows_about
+
+    chosen = _only(modal, base)
+    axis, poles = frfs.frequency_hz, np.array([m.pole for m in chosen.modes], dtype=np.complex128)
+    band = np.zeros((len(base), 2))
+    for window in windows_about(poles - frfs.response_decay_rad_s, axis):
+        band[window.modes] = axis[window.lines][[0, -1]]
+    with np.errstate(invalid="ignore"):
+        relative = found.frequency_std_hz / found.frequency_hz
+    return HitModes(
+        base,
+        frfs.outputs,
+        output_shapes(frfs, chosen),
+        found.names,
+        level,
+        found.sheet,
+        np.log(found.frequency_hz),
+        relative,
+        found.damping_ratio,
+        found.damping_std,
+        found.motion_m,
+        frfs.response_decay_rad_s,
+        band,
+        float(axis[1] - axis[0]),
+    )
 
 
 def _far(mode: ModeLevels) -> float:

@@ -130,6 +130,49 @@ class DecayCurve:
 
 
 @dataclass(frozen=True)
+class HitModes:
+    """Modes of a configuration in every single hit at several force levels.
+
+    Attributes
+    ----------
+    modes : ndarray of int, (n_modes,)
+        Indices into the modes of the configuration's `ModalModel`, see `LevelStudy.linear_level`.
+    outputs : tuple of Dof
+    shapes : complex ndarray, (n_modes, n_outputs)
+        Those with which the hits were read.
+    names : tuple of str
+        ``file#number`` of every hit.
+    level, sheet : ndarray of int, (n_hits,)
+        Force level; hits of one sheet share impact point and sensors, and only their differences mean something.
+    log_frequency, log_frequency_std, damping_ratio, damping_std : ndarray, (n_hits, n_modes)
+        Standard deviations from noise alone; ``inf`` where a hit tells nothing of the mode.
+    motion_m : complex ndarray, (n_hits, n_modes)
+        Displacement amplitude just after the hit where the shape is 1; NaN for an uncalibrated hammer.
+    window_decay_rad_s : float
+        Of the exponential window on the responses.
+    band_hz : ndarray, (n_modes, 2)
+        Lines from which each mode was read.
+    line_hz : float
+        Their distance.
+    """
+
+    modes: NDArray[np.int64]
+    outputs: tuple[Dof, ...]
+    shapes: NDArray[np.complex128]
+    names: tuple[str, ...]
+    level: NDArray[np.int64]
+    sheet: NDArray[np.int64]
+    log_frequency: NDArray[np.float64]
+    log_frequency_std: NDArray[np.float64]
+    damping_ratio: NDArray[np.float64]
+    damping_std: NDArray[np.float64]
+    motion_m: NDArray[np.complex128]
+    window_decay_rad_s: float
+    band_hz: NDArray[np.float64]
+    line_hz: float
+
+
+@dataclass(frozen=True)
 class LevelStudy:
     """What moves with the force level in one configuration.
 
@@ -154,6 +197,8 @@ class LevelStudy:
         configuration, and `modes` counts them. None: the modes of all hits together.
     products : tuple of str
         Poles that the nonlinearity makes at multiples and sums of frequencies, left out of all levels' modes.
+    hit_modes : HitModes or None
+        Modes in single hits; None where all hits are of one level.
     """
 
     levels: tuple[ForceLevel, ...]
@@ -166,3 +211,4 @@ class LevelStudy:
     summary: str
     linear_level: int | None = None
     products: tuple[str, ...] = ()
+    hit_modes: HitModes | None = None

@@ -224,6 +224,15 @@ class PartingSpring(Spring, Nonlinear):
 
 
 @dataclass(frozen=True)
+class LooseSpring(PartingSpring):
+    """A spring with play in its middle position, which all elements along the same row share.
+
+    Where the motion is prescribed (`ema_pipeline.mechanics.cycles`) the play is in series with everything along the
+    row: no element of it acts until the play has been run through. In a time response only the spring parts.
+    """
+
+
+@dataclass(frozen=True)
 class BoucWen(Nonlinear):
     """Normalised Bouc-Wen hysteresis: force limit·w, ẇ = ρ(δ̇ - σ|δ̇||w|ⁿ⁻¹w + (σ - 1)δ̇|w|ⁿ).
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.modal.assurance import mac, mpc
 from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.earned import unearned
 from ema_pipeline.modal.fit import Estimate, LinearSolution, newton_step, synthesis
 from ema_pipeline.modal.missed import left_over
 from ema_pipeline.modal.noise import Noise
@@ -118,6 +119,8 @@ def credible(
     support = np.where(explained, np.maximum(support, 1.0), support)
     # where the polish finds no place for a mode, it is one only if most orders and the FRFs show it plainly
     support = np.where(fit.held, np.minimum(plain, share / SURE_VOTES), support)
+    weight = fit.noise.weight(data.measured)
+    support = np.where(unearned(data, weight, estimate, solution, share, explained), 0.0, support)
     support = np.where(peaks.owners(estimate), np.maximum(support, 1.0), support)
     return _next(np.minimum(_strength_over_noise(data, fit), support))
 

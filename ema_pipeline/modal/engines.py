@@ -16,12 +16,18 @@ from ema_pipeline.modal.settings import ModalSettings
 MAX_REFERENCES = 6
 """More references are combined to this many, the strongest combinations first."""
 
+MODES_PER_PEAK = 3
+"""Modes that a model can hold for each peak seen: close ones make one peak."""
+
 SPARE_MODES = 12
-"""Modes that a model can hold beyond three times the peaks seen."""
+"""Modes that it can hold beyond that."""
 
 
 MIN_TOP_ORDER = 24
 """The highest order is at least this, so that the numerators can follow what lies outside the band."""
+
+MOST_OVER_WANTED = 1.5
+"""Highest order over that which the peaks ask for: orders beyond follow noise, with poles that are as stable."""
 
 MAX_ORDERS = 30
 """Orders computed per sub-band, about."""
@@ -48,7 +54,7 @@ def poles_of_all_orders(
         Shapes at all rows (0 at rows that lack a reference); participations at all references.
     """
     n_lines = len(data.omega)
-    modes = 3 * n_peaks + SPARE_MODES
+    modes = MODES_PER_PEAK * n_peaks + SPARE_MODES
     rows, refs = complete_block(data.measured)
     frf = data.frf[np.ix_(rows, refs)]
     row_scale = np.exp(0.5 * np.log(np.maximum(variance[np.ix_(rows, refs)], 1e-300)).mean(axis=(1, 2)))
@@ -81,7 +87,9 @@ def poles_of_all_orders(
 
 def _orders(settings: ModalSettings, wanted: int, n_lines: int, lowest: int, stride: int) -> list[int]:
     """Polynomial orders to compute."""
-    highest = settings.max_order or max(MIN_TOP_ORDER, wanted)
+    highest = max(MIN_TOP_ORDER, wanted)
+    if settings.max_order is not None:
+        highest = min(settings.max_order, int(MOST_OVER_WANTED * highest))
     highest = int(np.clip(highest, lowest + stride, max(lowest + stride, n_lines // 3)))
     step = stride * max(1, (highest - lowest) // (stride * MAX_ORDERS))
     return list(range(lowest, highest + 1, step))

@@ -12,6 +12,7 @@ from ema_pipeline.modal.assurance import mpc
 from ema_pipeline.modal.bands import SubBand, indicator, split
 from ema_pipeline.modal.compress import Window
 from ema_pipeline.modal.data import FitData, analysis_band, arrange
+from ema_pipeline.modal.drift.plain import plain_peaks
 from ema_pipeline.modal.engines import poles_of_all_orders
 from ema_pipeline.modal.fit import (
     Estimate,
@@ -47,6 +48,7 @@ RINGS_ON = 0.05
 """Share of a mode that may be left at the end of the record: three time constants have passed."""
 
 UNPOLISHED = "polish failed: pole as the model orders give it, with a wider uncertainty"
+AT_PEAK = "pole as its peak alone shows it: a fit with the other modes loses it"
 ANCHORED = "pole as single hits show it: a fit of all hits together leaves the peak"
 RESTLESS = "polish has not come to rest: what is left to go is in the uncertainty"
 
@@ -104,10 +106,11 @@ def _identify(frfs: FrfSet, settings: ModalSettings, tell: Progress, peaks: Know
     def search(window: FitData, known: Noise) -> Estimate:
         return tracked(poles_of_all_orders(window, known.variance, 2, settings))
 
-    modes = refined(window, bands, charts, sure, weak, search, iterations, peaks)
+    plain = plain_peaks(frfs, band)
+    modes = refined(window, bands, charts, sure, weak, search, iterations, peaks, plain)
     tell(0.9, "shapes and synthesis")
     cores = [chart.take(between(chart.pole, b.low, b.high)) for chart, b in zip(charts, bands, strict=True)]
-    return _model(frfs, settings, band, window, modes, cores, peaks)
+    return _model(frfs, settings, band, window, modes, cores, peaks, plain)
 
 
 def _first_noise(data: FitData) -> tuple[Window, Real]:
@@ -131,10 +134,14 @@ def _model(
     modes: FittedModes,
     charts: list[PoleSet],
     peaks: KnownPeaks,
+    plain: KnownPeaks,
 ) -> ModalModel:
     data = window.data
-    anchored = modes.held & peaks.owners(Estimate(modes.poles, modes.participation))
+    estimate = Estimate(modes.poles, modes.participation)
+    anchored = modes.held & np.isin(modes.poles, peaks.poles)
+    at_peak = modes.held & np.isin(modes.poles, plain.poles)
     pole_cov = np.where(anchored[:, None, None], _scatter_at(peaks, modes.poles), modes.pole_cov)
+    pole_cov = np.where(at_peak[:, None, None], _scatter_at(plain, modes.poles), pole_cov)
     order = np.argsort(np.abs(modes.poles))
     rows, references = frfs.outputs, frfs.inputs
     if data.transposed:
@@ -164,7 +171,7 @@ def _model(
             float(scaled.scale_std[k]),
             [
                 *_record_flags(float(np.exp(modes.poles[j].real * data.rest_s))),
-                *([ANCHORED] if anchored[j] else [UNPOLISHED] if modes.held[j] else []),
+                *_held_flags(modes.held[j], anchored[j], at_peak[j]),
                 *([RESTLESS] if settings.polish and modes.restless[j] and not modes.held[j] else []),
             ],
         )
@@ -182,7 +189,7 @@ def _model(
         outputs=frfs.outputs,
         inputs=frfs.inputs,
         chart=chart,
-        notes=_notes(data, note),
+        notes=(*_notes(data, note), *_peaks_without_mode(plain.absent(estimate), frfs.response_decay_rad_s)),
     )
 
 
@@ -228,6 +235,15 @@ def _mode(
     )
 
 
+def _held_flags(held: bool, anchored: bool, at_peak: bool) -> list[str]:
+    """Why a pole is not where the fit of all FRFs would have it."""
+    if anchored:
+        return [ANCHORED]
+    if at_peak:
+        return [AT_PEAK]
+    return [UNPOLISHED] if held else []
+
+
 def _record_flags(left: float) -> list[str]:
     """What is left of a mode at the end of the record, over its start, said where that is too much."""
     if left <= RINGS_ON:
@@ -269,6 +285,15 @@ def _synthesis(window: Window, modes: FittedModes) -> Complex:
         fitted += residual_fit(some, noise.weight(some.measured), fitted)
         total[rows] = np.where(some.measured[..., None], fitted, np.nan)
     return np.asarray(total.swapaxes(0, 1) if data.transposed else total)
+
+
+def _peaks_without_mode(absent: KnownPeaks, decay: float) -> list[str]:
+    """A sentence on each plain peak that no mode makes."""
+    return [
+        f"a plain peak at {abs(p + decay) / (2 * np.pi):.5g} Hz has no mode: with the other modes in the fit, the FRFs "
+        "do not need it; look at it in the FRFs"
+        for p in absent.poles
+    ]
 
 
 def _chart_of(window: Window, part: SubBand, settings: ModalSettings) -> PoleSet:

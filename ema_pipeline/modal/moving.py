@@ -101,7 +101,7 @@ def with_movement(modal: ModalModel, alignment: Alignment, decay_rad_s: float = 
 
 
 def _moving(mode: Mode, alignment: Alignment, decay_rad_s: float) -> Mode:
-    peak = _peak_of(mode, alignment, decay_rad_s)
+    peak = peak_of(mode, alignment, decay_rad_s)
     n = alignment.n_hits
     common = alignment.common_spread
     own = peak.own_spread if peak is not None and peak.single else 0.0
@@ -119,7 +119,7 @@ def _moving(mode: Mode, alignment: Alignment, decay_rad_s: float) -> Mode:
     return replace(mode, frequency_std_hz=std, flags=flags)
 
 
-def _peak_of(mode: Mode, alignment: Alignment, decay_rad_s: float) -> PeakMovement | None:
+def peak_of(mode: Mode, alignment: Alignment, decay_rad_s: float) -> PeakMovement | None:
     """The peak that a mode makes, None where it makes none that was looked at."""
     seen = mode.pole - decay_rad_s
     near = [p for p in alignment.peaks if abs(p.pole.imag - seen.imag) < -(p.pole.real + seen.real)]

@@ -23,10 +23,13 @@ WINDOW = 8.0
 
 FEWEST_LINES = 10
 
+ABSENT = 0.5
+"""Decay rates of a mode within which a peak may be its own."""
+
 STRAYED = 0.5
 """A pole is no longer that of its peak when it lies farther off than so many decay rates, or than hits scatter."""
 
-STRAYED_DECAY = 0.4
+STRAYED_DECAY = 0.3
 """The same for the logarithm of its decay rate."""
 
 
@@ -74,9 +77,27 @@ class KnownPeaks:
             for r in np.flatnonzero(owners & near):
                 far = abs(after.poles[r].imag - pole.imag) > max(-STRAYED * pole.real, 3 * std[1])
                 change = abs(np.log(max(after.poles[r].real / pole.real, 1e-9)))
-                lost = far or change > max(STRAYED_DECAY, -3 * std[0] / pole.real)
+                lost = far or change > STRAYED_DECAY
                 out[r], poles[r] = lost, pole if lost else poles[r]
         return out, poles
+
+    def absent(self, estimate: Estimate) -> KnownPeaks:
+        """Peaks near which no mode lies."""
+        distance = np.abs(self.poles[:, None] - estimate.poles[None])
+        reach = np.maximum(self.reach[:, None], -ABSENT * estimate.poles.real[None])
+        return self.take(np.asarray((distance > reach).all(axis=1)))
+
+    def between(self, low: float, high: float) -> KnownPeaks:
+        """Peaks between two frequencies, rad/s."""
+        return self.take(np.asarray((self.poles.imag >= low) & (self.poles.imag < high)))
+
+    def joined(self, other: KnownPeaks) -> KnownPeaks:
+        """Peaks of both."""
+        return KnownPeaks(
+            np.concatenate([self.poles, other.poles]),
+            np.concatenate([self.reach, other.reach]),
+            np.concatenate([self.std, other.std]),
+        )
 
     def take(self, keep: NDArray[np.bool_]) -> KnownPeaks:
         """Some of the peaks."""
@@ -105,12 +126,12 @@ def seeded(sure: Estimate, weak: Estimate, peaks: KnownPeaks, data: FitData) -> 
         one = peaks.take(np.arange(len(peaks.poles)) == k)
         near, also = one.near(sure)[0], one.near(weak)[0]
         if np.count_nonzero(near) != 1:
-            sure = sure.take(~near).joined(_at_peak(data, pole))
+            sure = sure.take(~near).joined(at_peak(data, pole))
         weak = weak.take(~also)
     return sure, weak
 
 
-def _at_peak(data: FitData, pole: complex) -> Estimate:
+def at_peak(data: FitData, pole: complex) -> Estimate:
     """A mode with the pole of a peak, and the participations that the lines around it show."""
     step = float(data.omega[1] - data.omega[0])
     half = max(int(-WINDOW * pole.real / step), FEWEST_LINES)

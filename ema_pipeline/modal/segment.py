@@ -66,6 +66,7 @@ def fit_segment(
     iterations: int,
     evident: Evident | None = None,
     peaks: KnownPeaks = NO_PEAKS,
+    placed: NDArray[np.bool_] | None = None,
 ) -> SegmentFit:
     """Polish the candidates of a sub-band until the judge drops none.
 
@@ -87,10 +88,12 @@ def fit_segment(
         Tells which modes are beyond doubt, whatever the polish makes of them; none where left out.
     peaks : KnownPeaks, optional
         Peaks whose modes are held there where the polish would drive them away.
+    placed : ndarray of bool, (n_candidates,), optional
+        Candidates that are held where they are from the start.
     """
     estimate = Estimate(candidates.poles, normalised(candidates.participation))
     noise = start
-    held = np.zeros(len(estimate.poles), dtype=bool)
+    held = np.zeros(len(estimate.poles), dtype=bool) if placed is None else placed
     budget = min(iterations, ROUGH)
     while True:
         weight = noise.weight(data.measured)

@@ -35,7 +35,8 @@ class ModalSettings(Settings):
         ge=4,
         le=400,
         description="Highest polynomial order per sub-band (half the number of poles per reference). Left "
-        "out: chosen from the number of peaks seen in the sub-band.",
+        "out: chosen from the number of peaks seen in the sub-band; at most half as much again is used, since "
+        "higher orders follow noise.",
     )
     polish: bool = Field(
         default=True,

@@ -21,10 +21,11 @@ from ema_pipeline.modal.credibility import (
     significant,
 )
 from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.engines import MODES_PER_PEAK, SPARE_MODES
 from ema_pipeline.modal.fit import Estimate, free_participations, normalised, solve_linear
 from ema_pipeline.modal.missed import Search, missed
 from ema_pipeline.modal.noise import NoiseLaw
-from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
+from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, at_peak
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.segment import SegmentFit, fit_segment, measured_noise
 from ema_pipeline.modal.selection import link, votes
@@ -101,7 +102,11 @@ def candidates(charts: list[PoleSet], bands: tuple[SubBand, ...], n_references: 
         index = tracks.representative
         core = between(poles.pole[index], part.low, part.high)
         slight = (poles.damping_ratio[index] > PLAIN_DAMPING) & (tracks.votes < MIN_VOTES)
-        index, share = index[core & ~slight], tracks.votes[core & ~slight]
+        chosen = np.flatnonzero(core & ~slight)
+        # the best supported: many more than peaks are no modes, and a fit of all of them takes minutes
+        best = np.argsort(-tracks.votes[chosen], kind="stable")[: MODES_PER_PEAK * part.n_peaks + SPARE_MODES]
+        chosen = np.sort(chosen[best])
+        index, share = index[chosen], tracks.votes[chosen]
         all_ = Estimate(poles.pole[index], normalised(poles.participation[index]))
         sure = _stitched(sure, all_.take(share >= SURE_VOTES))
         weak = weak.joined(all_.take(share < SURE_VOTES))
@@ -150,8 +155,12 @@ def refined(
     search: Search,
     iterations: int,
     peaks: KnownPeaks = NO_PEAKS,
+    plain: KnownPeaks = NO_PEAKS,
 ) -> FittedModes:
-    """Final fit, sub-band by sub-band, with the modes of the other sub-bands taken off the data."""
+    """Final fit, sub-band by sub-band, with the modes of the other sub-bands taken off the data.
+
+    `peaks` make one mode each, as single hits show; each of the `plain` ones makes a mode at least.
+    """
     parts: list[FittedModes] = []
     data = window.data
     everywhere = _shapes(window, sure)
@@ -159,13 +168,15 @@ def refined(
         low, high = float(data.omega[part.first]), float(data.omega[part.stop - 1])
         near, also = between(sure.poles, low, high), between(weak.poles, low, high)
         inside = np.concatenate([sure.poles[near], weak.poles[also]])
-        if not window.from_hits and not between(inside, part.low, part.high).any():
+        seen = plain.between(part.low, part.high)
+        if not window.from_hits and not len(seen.poles) and not between(inside, part.low, part.high).any():
             continue
         lines = replace(
             window.lines(part.first, part.stop), far=sure.take(~near), far_shapes=everywhere[:, ~near]
         )
         few = compress(lines)
         fit = _fit_part(few, sure.take(near), weak.take(also), _voters(chart), search, iterations, peaks)
+        fit = _with_peaks(few, fit, seen.absent(fit.estimate), _voters(chart), iterations, peaks)
         if len(fit.estimate.poles):
             parts.append(_final(lines, few.data, fit, part))
     n_rows, n_ref = data.measured.shape
@@ -230,6 +241,35 @@ def _fit_part(
             break
         fit = more
     return fit
+
+
+def _with_peaks(
+    few: Local,
+    fit: SegmentFit,
+    absent: KnownPeaks,
+    voters: Callable[[Estimate], Real],
+    iterations: int,
+    peaks: KnownPeaks,
+) -> SegmentFit:
+    """The fit with modes at plain peaks that it has lost, held where the peaks show them."""
+    if not len(absent.poles):
+        return fit
+    start = fit.estimate
+    for pole in absent.poles:
+        start = start.joined(at_peak(few.data, complex(pole)))
+    known = peaks.joined(absent)
+    more = fit_segment(
+        few.data,
+        few.hits,
+        fit.noise if len(fit.estimate.poles) else few.noise,
+        start,
+        partial(credible, hits=few.hits, votes=voters, peaks=known),
+        iterations,
+        evident=partial(evident, votes=voters),
+        peaks=known,
+        placed=np.isin(start.poles, absent.poles),
+    )
+    return more if len(more.estimate.poles) > len(fit.estimate.poles) else fit
 
 
 def _apart(weak: Estimate, known: Estimate) -> NDArray[np.bool_]:

@@ -25,6 +25,10 @@ class EffectProblem(Problem, Protocol):
         """Nominal values with the effects at `sizes`, or at their start values, (n,)."""
         ...
 
+    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
+        """`x` with the sizes of the effect added last where a descent finds its way; None where it does anyway."""
+        ...
+
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """Values of the rig's parameters and of the effects' sizes."""
         ...

@@ -262,6 +262,7 @@ class ModeProblem:
     def __init__(self, observations: ModeObservations, model: RigModel) -> None:
         self.observations, self.model = observations, model
         self.offset = len(model.unknowns)
+        self._sensing: dict[tuple[str, tuple[Dof, ...]], Sensing] = {}
 
     @property
     def sizes(self) -> Mapping[str, SizeMap]:
@@ -271,6 +272,10 @@ class ModeProblem:
     def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
         """See `EffectProblem`."""
         return np.concatenate([self.model.start(sizes), np.zeros(len(self.unknowns) - self.offset)])
+
+    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
+        """See `EffectProblem`: modes change with every size."""
+        return None
 
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""
@@ -296,26 +301,45 @@ class ModeProblem:
             return False
         return any(self.observations.has(d.configuration, Dof(body, other)) for d in self.observations.data)
 
-    @cached_property
-    def sensing(self) -> tuple[Sensing, ...]:
-        """Of every configuration."""
-        found = []
-        for d in self.observations.data:
-            along = self.model.sensor_rows(d.configuration, d.dofs)
-            across = np.zeros_like(along)
-            gain = np.full(len(d.dofs), -1)
-            transverse = np.full(len(d.dofs), -1)
-            for i, dof in enumerate(d.dofs):
-                gain[i] = self.unknowns.index.get(
-                    _calibration(dof.point, self.observations.channel(dof.point)), -1
-                )
-                transverse[i] = self.unknowns.index.get(_transverse(dof.point), -1)
-                if transverse[i] >= 0:
-                    other = Dof(dof.body, _ACROSS[dof.direction])
-                    if self.observations.has(d.configuration, other):
-                        across[i] = self.model.sensor_rows(d.configuration, (other,))[0]
-            found.append(Sensing(along, across, gain, transverse))
-        return tuple(found)
+    def sensing(self, data: ModeData) -> Sensing:
+        """What the sensors of one configuration's modes read."""
+        key = (data.configuration, data.dofs)
+        if key not in self._sensing:
+            self._sensing[key] = self._found_sensing(data)
+        return self._sensing[key]
+
+    def _found_sensing(self, d: ModeData) -> Sensing:
+        along = self.model.sensor_rows(d.configuration, d.dofs)
+        across = np.zeros_like(along)
+        gain = np.full(len(d.dofs), -1)
+        transverse = np.full(len(d.dofs), -1)
+        for i, dof in enumerate(d.dofs):
+            gain[i] = self.unknowns.index.get(
+                _calibration(dof.point, self.observations.channel(dof.point)), -1
+            )
+            transverse[i] = self.unknowns.index.get(_transverse(dof.point), -1)
+            if transverse[i] >= 0:
+                other = Dof(dof.body, _ACROSS[dof.direction])
+                if self.observations.has(d.configuration, other):
+                    across[i] = self.model.sensor_rows(d.configuration, (other,))[0]
+        return Sensing(along, across, gain, transverse)
+
+    def paired(
+        self, data: ModeData, x: NDArray[np.float64], match: NDArray[np.int64] | None = None
+    ) -> Paired | None:
+        """Modes of the model at `x` and their partners among `data`, found anew where `match` is left out.
+
+        None where the model has no modes there.
+        """
+        solution = self._modes(data.configuration, x)
+        if solution is None:
+            return None
+        at = _Configuration(self, data, self.sensing(data), x, {}, 1.0)
+        return Paired(solution, at.matched(solution) if match is None else match)
+
+    def _modes(self, configuration: str, x: NDArray[np.float64]) -> EigenSolution | None:
+        matrices = self.model.matrices(configuration, x[: self.offset], derivatives=False)
+        return EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio)
 
     def solution(self, configuration: str, x: NDArray[np.float64]) -> EigenSolution:
         """Modes of the model at `x`.
@@ -325,8 +349,7 @@ class ModeProblem:
         EmaError
             If the model has none there.
         """
-        matrices = self.model.matrices(configuration, x[: self.offset], derivatives=False)
-        solution = EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio)
+        solution = self._modes(configuration, x)
         if solution is None:
             raise EmaError(
                 f"{configuration}: the model has no modes at the fitted values; check the rig's masses"
@@ -374,13 +397,29 @@ class ModeProblem:
         """See `Problem`."""
         given = matching if isinstance(matching, tuple) else (None,) * len(self.observations.data)
         parts = [
-            _Configuration(self, d, s, x, scatters, heat).residuals(m, derivatives)
-            for d, s, m in zip(self.observations.data, self.sensing, given, strict=True)
+            _Configuration(self, d, self.sensing(d), x, scatters, heat).residuals(m, derivatives)
+            for d, m in zip(self.observations.data, given, strict=True)
         ]
-        return _stacked(parts, len(x))
+        return stacked(parts, len(x))
 
 
-def _stacked(parts: Sequence[Residuals], n: int) -> Residuals:
+@dataclass(frozen=True)
+class Paired:
+    """Modes of the model at one point, and which of them each measured mode belongs to.
+
+    Attributes
+    ----------
+    solution : EigenSolution
+    match : ndarray of int, (m,)
+        -1 for a measured mode without a partner.
+    """
+
+    solution: EigenSolution
+    match: NDArray[np.int64]
+
+
+def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
+    """Residuals of several parts of the data as one."""
     names = dict.fromkeys(k for p in parts for k in p.share)
     return Residuals(
         values=np.concatenate([p.values for p in parts] or [np.zeros(0)]),
@@ -418,14 +457,16 @@ class _Configuration:
         solution = EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio)
         if solution is None:
             return Residuals(np.full(1, np.inf), np.zeros((1, len(self.x))), matching=matching)
-        width = self.reading.shape[1]
-        predicted = self.reading @ solution.shapes[:width]
-        match = matching if isinstance(matching, np.ndarray) else self._matched(solution, predicted)
-        return self._compared(matrices, solution, predicted, match, derivatives)
+        match = matching if isinstance(matching, np.ndarray) else self.matched(solution)
+        return self._compared(matrices, solution, self._seen(solution), match, derivatives)
 
-    def _matched(self, solution: EigenSolution, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _seen(self, solution: EigenSolution) -> NDArray[np.float64]:
+        """What the sensors read of every shape, (s, n)."""
+        return np.asarray(self.reading @ solution.shapes[: self.reading.shape[1]])
+
+    def matched(self, solution: EigenSolution) -> NDArray[np.int64]:
         """Index of the model mode of every measured one, -1 for none, (m,)."""
-        d = self.data
+        d, predicted = self.data, self._seen(solution)
         log = np.log(np.maximum(solution.frequency_hz, 1e-6))
         apart = np.abs(log[None] - d.log_frequency[:, None])
         if d.shapes.shape[1]:

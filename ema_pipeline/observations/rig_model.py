@@ -22,7 +22,7 @@ from ema_pipeline.mechanics.terms import Matrices, Terms, assemble_terms
 from ema_pipeline.observations.parts import DAMPING, Dependence, dependence, part_key
 from ema_pipeline.rigs.types import Rig
 
-_LOG_STD = 1.2
+LOG_STD = 1.2
 """Prior 1 σ of the logarithm of a size that has no null: within a factor of three of its start, mostly."""
 _DIFFERENCE = 1e-4
 """Step of the differences by effects' sizes, in units of their prior σ."""
@@ -45,19 +45,19 @@ class SizeMap:
     def value(self, x: float) -> float:
         """Size at the unknown `x`, within its range."""
         p = self.parameter
-        value = p.start * np.exp(_LOG_STD * x) if self.logarithmic else p.null + self.scale * x
+        value = p.start * np.exp(LOG_STD * x) if self.logarithmic else p.null + self.scale * x
         return float(np.clip(value, p.minimum, p.maximum))
 
     def unknown(self, value: float) -> float:
         """The unknown at which the size is `value`."""
         p = self.parameter
         if self.logarithmic:
-            return float(np.log(max(value, 1e-300) / p.start) / _LOG_STD)
+            return float(np.log(max(value, 1e-300) / p.start) / LOG_STD)
         return (value - p.null) / self.scale
 
     def slope(self, x: float) -> float:
         """Derivative of the size by the unknown."""
-        return self.value(x) * _LOG_STD if self.logarithmic else self.scale
+        return self.value(x) * LOG_STD if self.logarithmic else self.scale
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -154,7 +154,7 @@ class RigModel:
         bounds = [s.bounds for s in self.sizes.values()]
         return joined(
             self.dependence.unknowns,
-            Unknowns.plain((DAMPING,), damping.tolerance or _LOG_STD) if loose and damping else _NOTHING,
+            Unknowns.plain((DAMPING,), damping.tolerance or LOG_STD) if loose and damping else _NOTHING,
             Unknowns.plain(
                 self.dependence.geometric,
                 [self.rig.parameters[g].tolerance for g in self.dependence.geometric],

@@ -6,7 +6,7 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 
-from ema_pipeline.diagnose.explain import compared_text, label_text
+from ema_pipeline.diagnose.sentences import label_text
 from ema_pipeline.diagnose.types import (
     NOT_TOLD,
     OUT_OF_TOLERANCE,
@@ -171,7 +171,7 @@ def noise_words(ladder: Ladder) -> str:
             "model that is alike at every force level. A linear model can therefore have an error of about 1 and "
             "still miss much of the hard hits: look at the shares that are missed."
         )
-        return " ".join(filter(None, (hits_words(ladder), compared_text(ladder), of_sigma)))
+        return " ".join(filter(None, (hits_words(ladder), of_sigma)))
     if not of_modes(ladder):
         return "σ: the scatter of the measured signals."
     return (

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from ema_pipeline.files import replace_file
-from ema_pipeline.hysteresis.summary import summary, terminal_lines
-from ema_pipeline.hysteresis.types import Estimate, IsolatorResult, Loop, LoopModel
+from ema_pipeline.loops.summary import summary, terminal_lines
+from ema_pipeline.loops.types import Estimate, IsolatorResult, Loop, LoopModel
 from ema_pipeline.report import diagnosis, diagnosis_tables, style, summary_files
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.pages import page_templates
@@ -286,7 +286,7 @@ def _images(
     plots: Path,
 ) -> dict[str, dict[str, str]]:
     """Figures by name, drawn into `plots` and embedded in the page."""
-    from ema_pipeline.hysteresis.figures import isolator_figures, misfit_figure, models_figure
+    from ema_pipeline.loops.figures import isolator_figures, misfit_figure, models_figure
     from ema_pipeline.report.figures.diagnosis import candidate_probabilities, ladder_errors
 
     drawn = {}
@@ -307,8 +307,8 @@ def _images(
     images = {}
     for name, figure in figures.items():
         picture = style.png(figure)
-        (plots / f"{name}.png").write_bytes(picture)
-        (plots / f"{name}.svg").write_bytes(style.svg(figure))
+        replace_file(plots / f"{name}.png", picture)
+        replace_file(plots / f"{name}.svg", style.svg(figure))
         uri = f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
         caption = _CAPTIONS.get(name) or _CAPTIONS[next(k for k in _CAPTIONS if name.endswith(f"_{k}"))]
         images[name] = {

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes, from_modal_model
 from ema_pipeline.dof import Dof
+from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.effects.rig import rig_with_effects
-from ema_pipeline.fit.map_fit import fit_rig
+from ema_pipeline.fit.parameters import fit_modes, fit_result
+from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.frf import estimate_frfs
 from ema_pipeline.ingest.description import read_campaign
 from ema_pipeline.ingest.load import load_records
@@ -23,6 +25,8 @@ from ema_pipeline.mechanics.frf import accelerance
 from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.observations.fitting import Model
+from ema_pipeline.observations.modes import ModeObservations, prepare
 from ema_pipeline.report.style import GREY, LINES, SERIES, log_y, margins, new_figure, styled
 from ema_pipeline.reproduce.backlash import (
     PRELOAD_M,
@@ -102,7 +106,11 @@ def recover_crack(healthy: Rig, seed: int = 1) -> tuple[float, float, float]:
         truth = simulate_campaign(
             raw, healthy, effects=[f"{CRACK}:fraction={LOSS}"], scatter=1.0, seed=seed, format="hdf5"
         )
-        fit = fit_rig(rig_with_effects(healthy, [CRACK]), {"default": measure(raw)})
+        measured = {"default": measure(raw)}
+    cracked = rig_with_effects(healthy, [CRACK])
+    crack = Model((parse_effect(CRACK, healthy),))
+    fitted = fit_modes(ModeObservations(healthy, [prepare(m) for m in measured.values()]), crack)
+    fit = fit_result(fitted, cracked, measured, FitSettings())
     name = "sun_planet_mesh_stiffness"
     fraction, mesh = fit.parameters[f"{CRACK}.fraction"], fit.parameters[name]
     true = truth.values[name] * (1 - LOSS)

@@ -1,7 +1,7 @@
 """A mass on a metal-mesh isolator, which the base model takes as a linear spring.
 
 The effects at ``isolator`` add what the spring is missing. The same elements give the force loop where the
-displacement is prescribed (see `ema_pipeline.hysteresis`).
+displacement is prescribed (see `ema_pipeline.loops`).
 
 References
 ----------

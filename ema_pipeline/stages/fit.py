@@ -42,10 +42,13 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
 def _scatters(run: Run) -> dict[str, float] | None:
     """The scatters at which the diagnosis compares models, so that an error is the same wherever it stands."""
+    from ema_pipeline.stages.models import mode_observations
+
     found = run.store.find("diagnose", ALL, "diagnosis", Diagnosis)
     if found is None or not found.ladder.scatters:
         return None
-    return {s.name: s.learned for s in found.ladder.scatters}
+    own = mode_observations(run).scatters
+    return {s.name: s.learned for s in found.ladder.scatters if s.name in own}
 
 
 def _with_sizes(found: FitResult, ladder: Ladder) -> FitResult:

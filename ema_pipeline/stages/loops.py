@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import cast
 
-from ema_pipeline.hysteresis.settings import HysteresisSettings
+from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.ingest import file_hashes, test_of
 
@@ -22,8 +22,8 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Measure the loops and identify the isolator that makes them."""
-    from ema_pipeline.hysteresis import analyse_hysteresis
+    from ema_pipeline.loops import analyse_loops
 
     test = test_of(run, configuration)
-    result = analyse_hysteresis(test, cast(HysteresisSettings, run.settings[NAME]), progress)
+    result = analyse_loops(test, cast(LoopSettings, run.settings[NAME]), progress)
     return {"sources": file_hashes(test), "isolator": result}

@@ -30,6 +30,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     from ema_pipeline.correlate.mode_table import read_mode_table
     from ema_pipeline.modal.circle import attach_circles, identify_by_circle
     from ema_pipeline.modal.moving import identify_hits
+    from ema_pipeline.modal.pooling import pooled
 
     if run.info.kind == "modes":
         measured = read_mode_table(Path(run.info.raw), run.require_model(NAME))
@@ -45,4 +46,5 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
         settings.identify,
         progress,
     )
-    return {"modal": attach_circles(found.frfs, found.modal, settings.circle)}
+    modal = attach_circles(found.frfs, found.modal, settings.circle)
+    return {"modal": pooled(modal, found.alignment, frfs.record_s, frfs.response_decay_rad_s)}

@@ -39,8 +39,10 @@ def mode_observations(run: Run) -> ModeObservations:
     return ModeObservations(run.rig, [prepare(m, settings) for m in measured.values()], channels)
 
 
-def model_with(run: Run, rig: Rig, labels: Sequence[str], model: Model | None = None) -> Model:
-    """A model with effects ``id@place`` added, those left out that depend on the force level.
+def model_with(
+    run: Run, rig: Rig, labels: Sequence[str], model: Model | None = None, with_hits: bool = False
+) -> Model:
+    """A model with effects ``id@place`` added.
 
     Parameters
     ----------
@@ -51,10 +53,12 @@ def model_with(run: Run, rig: Rig, labels: Sequence[str], model: Model | None = 
     labels : sequence of str
     model : Model, optional
         What the effects are added to; the base model where left out.
+    with_hits : bool
+        False leaves out effects that depend on the force level: modes of one level do not show them.
     """
     model = model or Model()
     for label in labels:
-        if depends_on_level(label, run.library):
+        if not with_hits and depends_on_level(label, run.library):
             continue
         placed = parse_effect(label, rig, library=run.library)
         scales: dict[str, float] = {}
@@ -70,10 +74,10 @@ def model_with(run: Run, rig: Rig, labels: Sequence[str], model: Model | None = 
     return model
 
 
-def known_model(run: Run) -> Model:
-    """The model with the effects that the user added."""
+def known_model(run: Run, with_hits: bool = False) -> Model:
+    """The model with the effects that the user added, see `model_with`."""
     assert run.model is not None
-    return model_with(run, run.model, run.info.effects)
+    return model_with(run, run.model, run.info.effects, with_hits=with_hits)
 
 
 def fitted_modes(run: Run, fit: FitResult) -> FittedModes:

@@ -7,10 +7,10 @@ import json
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
-from ema_pipeline.hysteresis.types import IsolatorResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.levels.linear import structure
 from ema_pipeline.levels.words import flagged
+from ema_pipeline.loops.types import IsolatorResult
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report.results import ConfigurationResults, RunResults

@@ -24,15 +24,15 @@ NOTICED = 0.03
 """Movement in half-power half-widths from which hits are aligned: a smaller one widens a peak by less than a
 thousandth."""
 
+MOVES = 0.05
+"""Movement of one peak beyond that of all, in half-power half-widths, from which a fit makes twins of it."""
+
 ONE_MODE = 0.02
 """Second over first singular value of the residues of a peak over hits, above which more than one mode shows in
 it: hits on other points then excite another mixture, which looks like movement."""
 
 REACH = 2.0
 """Decay rates within which no second mode is looked for at a peak that one mode makes."""
-
-NORMAL_MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 PLATEAU = 0.4
 """Share of the way to the next peak that moves with a peak: its flanks too must stay where it is."""
@@ -103,8 +103,11 @@ class Alignment:
     aligned: bool
 
     def known_peaks(self) -> KnownPeaks:
-        """Peaks of which hits on several points show that one mode is there."""
-        proven = [p for p in self.peaks if p.proven]
+        """Peaks that move, and of which hits on several points show that one mode is there.
+
+        Peaks that stay where they are need no such help, and may hide a second mode.
+        """
+        proven = [p for p in self.peaks if p.proven and p.own_spread > MOVES * p.damping_ratio]
         poles = np.array([p.pole for p in proven], dtype=np.complex128)
         spread = np.array([p.own_spread for p in proven])
         std = np.array([p.spread for p in proven]).reshape(-1, 2)
@@ -186,10 +189,14 @@ def _movements(peaks: list[PeakPoles], keys: tuple[HitKey, ...]) -> tuple[Moveme
 
 
 def _spread(peak: PeakPoles, own_spread: float) -> Real:
-    """Standard deviations of decay and frequency over hits, rad/s, (2,): the middle of hits that show the peak."""
-    shown = np.isfinite(peak.std)
-    decay = np.median(np.abs(peak.poles.real[shown] - peak.pole.real))
-    return np.array([NORMAL_MAD * float(decay), own_spread * peak.pole.imag])
+    """Standard deviations of decay and frequency over hits, rad/s, (2,).
+
+    Decays are weighted as the shared pole weighs them, by the power with which a hit shows the peak.
+    """
+    power = np.where(np.isfinite(peak.std), np.sum(np.abs(peak.residues) ** 2, axis=1), 0.0)
+    off = peak.poles.real - peak.pole.real
+    decay = np.sqrt(np.sum(power * off**2) / max(float(power.sum()), 1e-300))
+    return np.array([float(decay), own_spread * peak.pole.imag])
 
 
 def _is_single(peak: PeakPoles, *, one_point: bool) -> bool:

@@ -32,6 +32,9 @@ FARTHEST = 3.0
 RINGS_ON = 0.7
 """Share of a peak left at the end of the record above which it is a tone, not a decay."""
 
+EXPLAINED = 0.9
+"""Share of what a straight background leaves of the lines around a peak that one pole must explain."""
+
 MAX_DAMPING = 0.2
 """A pole with more is no peak."""
 
@@ -93,6 +96,34 @@ def peak_poles(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> 
     for h in range(n_hits):
         poles[h], std[h], residues[h] = _own_pole(window, data[h], weight[h], pole, omega, rest_s)
     return PeakPoles(pole, poles, std, residues)
+
+
+def plain_pole(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> complex | None:
+    """Pole that all FRFs share at a peak; None where one pole does not explain the peak.
+
+    Parameters
+    ----------
+    window : PeakWindow
+    frf : complex ndarray, (n_inputs, n_outputs, n_lines)
+        Accelerance on the lines of the window; NaN where not measured.
+    omega : ndarray, (n_lines,)
+    rest_s : float
+        Time from hit to end of the record.
+    """
+    known = np.asarray(np.isfinite(frf).all(axis=-1))
+    data = np.where(known[..., None], frf, 0.0)
+    shared = _shared_pole(window, data, known, omega, rest_s)
+    if shared is None:
+        return None
+    flat = data.reshape(-1, len(omega))
+    fit = _linear_fit(shared[0], window.neighbours, flat, omega, rest_s)
+    if fit is None:
+        return None
+    line = np.linspace(-1, 1, len(omega))
+    basis = np.linalg.qr(np.stack([np.ones(len(omega)), line]).T)[0]
+    without = flat - (flat @ basis) @ basis.T
+    left = float(np.sum(np.abs(fit.left) ** 2))
+    return shared[0] if left < (1 - EXPLAINED) * float(np.sum(np.abs(without) ** 2)) else None
 
 
 def _shared_pole(

@@ -1,0 +1,111 @@
+"""Backward steps of the selection: what was added early may be needless, or elsewhere, once the rest is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ema_pipeline.diagnose.claims import Judged, judge
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.ranking import Ranked, Ranking
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import Fit, Model, learned, refined, transferred
+
+
+def reconsidered(
+    observations: Observations,
+    start: Fit,
+    claimed: Sequence[Judged],
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+) -> list[Judged]:
+    """Claims without those that are needless by now, and with those moved that explain more elsewhere.
+
+    Parameters
+    ----------
+    observations : Observations
+    start : Fit
+        The model before any claim.
+    claimed : sequence of Judged
+        In the order in which they were added.
+    hypotheses : sequence of Hypothesis
+        All that was asked.
+    settings : DiagnoseSettings
+
+    Returns
+    -------
+    list of Judged
+        The same where nothing changes; else judged anew, one on top of the other.
+    """
+    now = [j.hypothesis for j in claimed]
+    fit = learned(observations, claimed[-1].ranked.fit)
+    changed = False
+    while len(now) > 1:
+        better = _best_change(observations, start.model, now, fit, hypotheses, settings)
+        if better is None:
+            break
+        now, fit, changed = *better, True
+    return _judged_anew(observations, start, now, fit, settings) if changed else list(claimed)
+
+
+def _best_change(
+    observations: Observations,
+    known: Model,
+    now: Sequence[Hypothesis],
+    fit: Fit,
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+) -> tuple[list[Hypothesis], Fit] | None:
+    """The change that raises the evidence most, a needless effect counting as much as a claim needs."""
+    options = []
+    for i, one in enumerate(now[:-1]):  # the last was judged with all others known
+        rest = [h for h in now if h is not one]
+        without = _fitted(observations, known, rest, fit)
+        options.append((without.log_evidence + settings.claim, rest, without))
+        for other in hypotheses:
+            if other.placed.effect.id == one.placed.effect.id and other not in now:
+                moved = [*now[:i], other, *now[i + 1 :]]
+                found = _fitted(observations, known, moved, fit, (one, other))
+                options.append((found.log_evidence - settings.alike, moved, found))
+    score, change, found = max(options, key=lambda option: option[0])
+    return (change, found) if score > fit.log_evidence else None
+
+
+def _fitted(
+    observations: Observations,
+    known: Model,
+    effects: Sequence[Hypothesis],
+    near: Fit,
+    moved: tuple[Hypothesis, Hypothesis] | None = None,
+) -> Fit:
+    """A model begun at a fit nearby, one effect having moved; scatters learned."""
+    model = known
+    for h in effects:
+        model = model.plus(h.placed, h.scales)
+    problem = model.problem(observations)
+    x = transferred(near.posterior, problem.unknowns, problem.start())
+    if moved is not None:
+        before, after = (h.placed for h in moved)
+        for p in after.effect.parameters:
+            x[problem.unknowns.index[after.parameter_name(p.name)]] = near.posterior.value(
+                before.parameter_name(p.name)
+            )
+    return learned(observations, refined(observations, model, x, near.posterior.scatters, steps=20))
+
+
+def _judged_anew(
+    observations: Observations,
+    start: Fit,
+    effects: Sequence[Hypothesis],
+    fit: Fit,
+    settings: DiagnoseSettings,
+) -> list[Judged]:
+    """Every effect judged on top of those before it."""
+    base, found = learned(observations, start), []
+    for k in range(1, len(effects) + 1):
+        last = k == len(effects)
+        here = fit if last else _fitted(observations, start.model, effects[:k], fit)
+        ranked = Ranked(effects[k - 1], here, here.log_evidence - base.log_evidence, True)
+        found.append(judge(observations, Ranking(base, (ranked,)), ranked, settings))
+        base = here
+    return found

@@ -1,0 +1,91 @@
+"""When an effect is claimed: evidence, size, error and held-out data must all support it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from ema_pipeline.diagnose.heldout import HeldOut, held_out
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.naming import Named, named, sizes_of
+from ema_pipeline.diagnose.ranking import Ranked, Ranking
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.inference import widened
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import Fit, at_scatters
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One hypothesis and what supports it.
+
+    Attributes
+    ----------
+    ranked : Ranked
+    named : Named
+    gain : float
+        Log evidence gained, under the name that is said.
+    base : Fit
+        The model without it, at the same scatters.
+    held_before, held_after : HeldOut
+        Of data held out, without and with it.
+    doubt : str
+        Why it is not claimed; empty where it is.
+    """
+
+    ranked: Ranked
+    named: Named
+    gain: float
+    base: Fit
+    held_before: HeldOut
+    held_after: HeldOut
+    doubt: str
+
+    @property
+    def hypothesis(self) -> Hypothesis:
+        """What was fitted."""
+        return self.ranked.hypothesis
+
+    @property
+    def claimed(self) -> bool:
+        """True where everything supports it."""
+        return not self.doubt
+
+
+def judge(observations: Observations, ranking: Ranking, ranked: Ranked, settings: DiagnoseSettings) -> Judged:
+    """Hold one finalist against all conditions of a claim."""
+    name = named(ranked.hypothesis, ranked.fit)
+    gain = ranked.gain + name.advantage
+    base = at_scatters(observations, ranking.base, ranked.fit.posterior.scatters)
+    nothing = HeldOut(float("nan"), float("nan"))
+    before = after = nothing
+    doubt = _weak(ranked, gain, settings)
+    if not doubt:
+        before, after = held_out(observations, base), held_out(observations, ranked.fit)
+        doubt = _contradicted(ranked, base, before, after)
+        name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, _widened(observations, ranked.fit)))
+    return Judged(ranked, name, gain, base, before, after, doubt)
+
+
+def _widened(observations: Observations, fit: Fit) -> Fit:
+    """The fit at scatters that hold how well they are known, for intervals that are true."""
+    return at_scatters(observations, fit, widened(fit.posterior, observations.scatters))
+
+
+def _weak(ranked: Ranked, gain: float, settings: DiagnoseSettings) -> str:
+    if gain < settings.claim:
+        return f"the log evidence that it gains, {gain:.1f}, is below {settings.claim:g}"
+    if not ranked.hypothesis.extends:
+        p = ranked.hypothesis.placed.effect.parameters[0]
+        i = ranked.fit.posterior.unknowns.index[ranked.hypothesis.placed.parameter_name(p.name)]
+        x, std = ranked.fit.posterior.x[i], ranked.fit.posterior.std[i]
+        if abs(x) < settings.sigmas * std:
+            return f"its size is within {settings.sigmas:g} standard deviations of nothing"
+    return ""
+
+
+def _contradicted(ranked: Ranked, base: Fit, before: HeldOut, after: HeldOut) -> str:
+    if ranked.fit.posterior.error >= base.posterior.error:
+        return "the error does not fall with it"
+    if after.log_density <= before.log_density:
+        return "data held out are not predicted better with it"
+    return ""

@@ -1,0 +1,46 @@
+"""What these data would have shown: the least size of every effect that would be claimed in nine tests of ten."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ema_pipeline.diagnose.score import Score
+from ema_pipeline.diagnose.types import DetectionLimit
+from ema_pipeline.observations.rig_model import SizeMap
+
+_NINE_OF_TEN = 1.2816
+"""Quantile of the normal distribution: in nine tests of ten the estimate is no further than this below the truth."""
+
+
+def detection_limits(found: Iterable[Score], claim: float, sigmas: float) -> tuple[DetectionLimit, ...]:
+    """Limit of every effect, from the information that the data hold of its size beside everything uncertain.
+
+    An effect of size z·σ gains z²/2 in log evidence, less what its freedom costs, ½ ln(1 + (prior σ/σ)²).
+    """
+    limits = []
+    for score in found:
+        parameter = score.hypothesis.placed.effect.parameters[0]
+        name = score.hypothesis.placed.parameter_name(parameter.name)
+        size = SizeMap.of(parameter, score.hypothesis.scales.get(name, parameter.scale))
+        needed = max(sigmas, float(np.sqrt(2 * claim + np.log1p(score.std**-2.0))))
+        unknown = score.std * (needed + _NINE_OF_TEN)
+        least = abs(size.slope(0.0)) * unknown
+        if least > parameter.maximum - parameter.null:
+            least = float("inf")
+        for name_of in score.hypothesis.names:
+            own = name_of.placed.effect.parameters[0]
+            own_size = SizeMap.of(own, name_of.scales.get(own.name, own.scale))
+            ratio = score.hypothesis.representative.relative / name_of.relative
+            limits.append(
+                DetectionLimit(
+                    name_of.label,
+                    own.name,
+                    least
+                    if name_of.label == score.hypothesis.label
+                    else abs(own_size.slope(0.0)) * unknown * ratio,
+                    own.unit,
+                )
+            )
+    return tuple(limits)

@@ -1,0 +1,240 @@
+"""Diagnosis of an isolator by its force-displacement loops: hypotheses, the next loop, and what else they show."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.diagnose.diagnosis import diagnose
+from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
+from ema_pipeline.diagnose.selection import Progress
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import Diagnosis, Ladder, Localisation
+from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.loops.compare import loop_fits
+from ema_pipeline.loops.sentences import failures
+from ema_pipeline.loops.types import LoopModel
+from ema_pipeline.observations.fitting import Model
+from ema_pipeline.observations.loop_data import SAME_FREQUENCY
+from ema_pipeline.observations.loop_forces import effects_of_loops
+from ema_pipeline.observations.loop_regions import regions
+from ema_pipeline.observations.loops import LoopObservations, LoopProblem
+from ema_pipeline.observations.rig_model import SizeMap
+
+MOST_EFFECTS = 6
+"""Most effects that are added in turn: effects of an isolator act together more often than those of a structure."""
+_LISTED = 3
+"""Thirds of the cycle that are reported."""
+_FREE = 0.4
+"""Prior 1 σ of the logarithm of a family from which the loops determine it."""
+_SAME = 1 - 1e-9
+"""Correlation of two changes of the force from which they are the same physics."""
+_LOG_STARTS = (-1.0, 0.4, 1.5)
+"""Unknowns of yields, times and the like from which fits begin: a factor of about four apart."""
+_SIZE_STARTS = (0.1, 0.6)
+"""The same of sizes that have a sign, in units of their prior 1 σ."""
+
+
+def diagnose_loops(
+    observations: LoopObservations,
+    library: Mapping[str, Effect],
+    known: Model | None = None,
+    settings: DiagnoseSettings | None = None,
+    progress: Progress = lambda share, text: None,
+) -> Diagnosis:
+    """Which physics is the isolator's model missing?
+
+    Parameters
+    ----------
+    observations : LoopObservations
+    library : dict of str to Effect
+    known : Model, optional
+        Effects that the model has already.
+    settings : DiagnoseSettings, optional
+    progress : callable, optional
+
+    Returns
+    -------
+    Diagnosis
+    """
+    settings, known = settings or DiagnoseSettings(), known or Model()
+    settings = settings.model_copy(update={"most_effects": MOST_EFFECTS})
+    hypotheses = loop_hypotheses(observations, library, known.labels)
+    found = diagnose(
+        observations, observations.rig, library, known, settings, progress, hypotheses=hypotheses
+    )
+    last = found.ladder.rungs[-1]
+    values = {name: size.value for name, size in last.parameters.items()}
+    placed = placed_effects(observations, library, last.effects)
+    problem, x = observations.fitted_near(placed, values)
+    notes = [*_setting_words(observations, problem, x), *found.notes]
+    if found.verdict == "unknown_effect":
+        places = regions(problem, x)
+        return dataclasses.replace(
+            found,
+            notes=(*notes, *_missing_words(problem, x, last.error)),
+            localisation=tuple(
+                Localisation(r.place, r.acts_like, r.size, r.squares) for r in places[:_LISTED]
+            ),
+            summary=f"{found.summary} Most of what is left sits on the {places[0].place}, and acts there like "
+            f"{places[0].acts_like}.",
+            next_measurement=_next_loop(observations),
+        )
+    return dataclasses.replace(found, notes=tuple(notes))
+
+
+def loop_hypotheses(
+    observations: LoopObservations, library: Mapping[str, Effect], known: Iterable[str] = ()
+) -> tuple[Hypothesis, ...]:
+    """Every effect that changes the loops' force, those of the same force as one hypothesis of several names.
+
+    What acts like a parameter of the rig that is free already is left out.
+    """
+    skip = set(known)
+    problem = observations.problem((), {})
+    free = _free_columns(problem)
+    groups: Groups = [(column, []) for column in free]
+    for placed in _placed(observations, library):
+        if placed.label not in skip and observations.isolator.shows(observations.rig, placed):
+            _grouped(groups, Name(placed, {}), _change(observations, placed))
+    return tuple(
+        Hypothesis(tuple(names), begun=_begun(names[0].placed))
+        for k, (_, names) in enumerate(groups)
+        if names and k >= len(free)
+    )
+
+
+def _placed(observations: LoopObservations, library: Mapping[str, Effect]) -> list[PlacedEffect]:
+    """Effects at all their places, the rig's own before generic ones."""
+    assembly = observations.rig.assembly(observations.isolator.configuration)
+    own = sorted(library.values(), key=lambda e: e.generic)
+    return [observations.scaled(PlacedEffect(e, place)) for e in own for place in e.find_places(assembly)]
+
+
+Groups = list[tuple[NDArray[np.float64] | None, list[Name]]]
+"""Changes of the force, and the effects that bring them."""
+
+
+def _grouped(groups: Groups, name: Name, change: NDArray[np.float64] | None) -> None:
+    size = 0.0 if change is None else float(np.linalg.norm(change))
+    for known, names in groups:
+        if known is None or change is None:
+            continue
+        reference = float(np.linalg.norm(known))
+        if float(known @ change) > _SAME * reference * size:
+            names.append(dataclasses.replace(name, relative=size / reference))
+            return
+    groups.append((change, [name]))
+
+
+def _change(observations: LoopObservations, placed: PlacedEffect) -> NDArray[np.float64] | None:
+    """Change of the force by one prior 1 σ of the size; None where it is not in proportion to one size."""
+    if len(placed.effect.parameters) != 1:
+        return None
+    p = placed.effect.parameters[0]
+    assembly = observations.rig.assembly(observations.isolator.configuration)
+    before = observations.cycles.force([e for e, _ in observations.isolator.elements(assembly)])
+    found = []
+    for share in (0.5, 1.0):
+        edited = placed.effect.edit(assembly, placed.place, {p.name: p.null + share * p.scale})
+        after = observations.cycles.force([e for e, _ in observations.isolator.elements(edited)])
+        found.append((after - before) / share)
+    linear = float(np.linalg.norm(found[1] - found[0])) <= 1e-6 * float(np.linalg.norm(found[1]))
+    return found[1] if linear else None
+
+
+def _free_columns(problem: LoopProblem) -> list[NDArray[np.float64]]:
+    """Change of the force by every family of the rig that the loops determine."""
+    here = problem.force_law.at(np.zeros(problem.offset), 0.0).slopes()
+    return [
+        here[:, i]
+        for i, s in enumerate(problem.model.dependence.unknowns.std)
+        if s >= _FREE and np.any(here[:, i])
+    ]
+
+
+def _begun(placed: PlacedEffect) -> tuple[Mapping[str, float], ...]:
+    """Unknowns from which fits begin: the first size, and the shape that follows it."""
+    options = []
+    for k, p in enumerate(placed.effect.parameters):
+        size = SizeMap.of(p, p.scale)
+        low, high = size.bounds
+        starts: tuple[float, ...] = (0.0,)
+        if size.logarithmic and k < 2:
+            starts = _LOG_STARTS
+        elif not size.logarithmic and len(placed.effect.parameters) == 1:
+            starts = _SIZE_STARTS if low == 0.0 else (0.3, -0.3)
+        elif k == 0:
+            starts = (0.3,)
+        name = placed.parameter_name(p.name)
+        options.append([(name, float(np.clip(s, low, high))) for s in starts])
+    return tuple(dict(combination) for combination in product(*options))
+
+
+def loop_models(
+    observations: LoopObservations, library: Mapping[str, Effect], ladder: Ladder
+) -> tuple[LoopModel, ...]:
+    """The models of a ladder beside the measured loops."""
+    found = []
+    for rung in ladder.rungs:
+        values = {name: size.value for name, size in rung.parameters.items()}
+        problem, x = observations.fitted_near(placed_effects(observations, library, rung.effects), values)
+        fits = loop_fits(observations.loops, problem.forces(x))
+        found.append(LoopModel(rung.effects, fits, problem.force_scales(x)))
+    return tuple(found)
+
+
+def placed_effects(
+    observations: LoopObservations, library: Mapping[str, Effect], labels: Sequence[str]
+) -> tuple[PlacedEffect, ...]:
+    """Effects by their labels, scaled to the loops; EmaError for those that a force loop does not show."""
+    found = effects_of_loops(observations.rig, labels, library)
+    return tuple(observations.scaled(placed) for placed in found)
+
+
+def loop_model(observations: LoopObservations, library: Mapping[str, Effect], labels: Sequence[str]) -> Model:
+    """The rig with effects ``id@place``; EmaError as in `placed_effects`."""
+    return Model(placed_effects(observations, library, labels))
+
+
+def _setting_words(
+    observations: LoopObservations, problem: LoopProblem, x: NDArray[np.float64]
+) -> tuple[str, ...]:
+    """Which loops stand for other settings of the device."""
+    scales = problem.force_scales(x)
+    if not scales:
+        return ()
+    text = ", ".join(f"{name} {scale:.2f}" for name, scale in scales.items())
+    ratio = max(scales.values()) / min(scales.values())
+    return (
+        "loops of one frequency and amplitude differ in force, so they are tests of one device at several "
+        f"settings (e.g. tensions): each has a force scale of its own, over a range of 1 : {ratio:.2g} ({text})",
+    )
+
+
+def _missing_words(problem: LoopProblem, x: NDArray[np.float64], error: float) -> list[str]:
+    """What the best model does not show."""
+    o = problem.observations
+    fits = loop_fits(o.loops, problem.forces(x))
+    play = any(e.effect.id == "backlash" for e in problem.model.effects)
+    words = failures(o.loops, fits, fits, error, has_play=play, own_scales=o.own_scales)
+    return [f"still missing: {text}" for text in words]
+
+
+def _next_loop(observations: LoopObservations) -> str:
+    """What to record where no model explains the loops."""
+    frequencies = [loop.frequency_hz for loop in observations.loops]
+    if max(frequencies) < (1 + SAME_FREQUENCY) * min(frequencies):
+        return (
+            f"Repeat the loops at {0.5 * min(frequencies):.3g} and at {2 * max(frequencies):.3g} Hz: what stays "
+            "is friction or play, what changes depends on the rate. Ten cycles or more of each loop would tell "
+            "scatter from what repeats."
+        )
+    return (
+        "Repeat one loop about another mean position, and record ten cycles or more of each: what moves with "
+        "the position is geometry, what stays is the material."
+    )

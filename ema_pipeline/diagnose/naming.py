@@ -1,0 +1,100 @@
+"""Which of several names of the same physics is said, and how large the effect is under that name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
+from ema_pipeline.diagnose.types import EffectSize
+from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
+from ema_pipeline.observations.fitting import Fit
+from ema_pipeline.observations.rig_model import SizeMap
+
+_ALIKE = 3.0
+"""Log evidence by which a name's prior may be behind the best one's and still be said."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """What a hypothesis is called.
+
+    Attributes
+    ----------
+    name : Name
+    equivalents : tuple of str
+        Other labels of the same physics, with sizes that they can have.
+    sizes : dict of str to EffectSize
+        By the short name of each size.
+    advantage : float
+        Log prior density of this name's size against that of the effect that was fitted.
+    """
+
+    name: Name
+    equivalents: tuple[str, ...]
+    sizes: dict[str, EffectSize]
+    advantage: float
+
+    @property
+    def label(self) -> str:
+        """``id@place``."""
+        return self.name.label
+
+
+def named(hypothesis: Hypothesis, fit: Fit) -> Named:
+    """The name that is said: a rig's own effect first, then what is added, then a part out of tolerance."""
+    options = [(n, _advantage(hypothesis, n, fit)) for n in hypothesis.names]
+    possible = [(n, a) for n, a in options if np.isfinite(a)] or [(hypothesis.representative, 0.0)]
+    best = max(a for _, a in possible)
+    near = [(n, a) for n, a in possible if best - a < _ALIKE]
+    positive = _unknown(hypothesis, fit) >= 0
+    name, advantage = min(near, key=lambda pair: _rank(pair[0], positive))
+    others = tuple(n.label for n, a in possible if n.label != name.label and best - a < 2 * _ALIKE)
+    return Named(name, others, sizes_of(hypothesis, name, fit), advantage)
+
+
+def sizes_of(hypothesis: Hypothesis, name: Name, fit: Fit) -> dict[str, EffectSize]:
+    """Sizes of the effect under a name, with 1 σ."""
+    placed = hypothesis.placed
+    ratio = hypothesis.representative.relative / name.relative
+    found = {}
+    for p, own in zip(placed.effect.parameters, name.placed.effect.parameters, strict=True):
+        full = placed.parameter_name(p.name)
+        i = fit.posterior.unknowns.index[full]
+        x, std = float(fit.posterior.x[i]), float(fit.posterior.std[i])
+        if name.label == placed.label:
+            size = SizeMap.of(p, hypothesis.scales.get(full, p.scale))
+            value, slope = size.value(x), size.slope(x)
+        else:
+            size = SizeMap.of(own, name.scales.get(own.name, own.scale))
+            value, slope = size.value(x * ratio), size.slope(x * ratio) * ratio
+        found[own.name] = EffectSize(value, std * abs(slope), own.unit)
+    return found
+
+
+def _unknown(hypothesis: Hypothesis, fit: Fit) -> float:
+    p = hypothesis.placed.effect.parameters[0]
+    return fit.posterior.value(hypothesis.placed.parameter_name(p.name))
+
+
+def _rank(name: Name, positive: bool) -> tuple[int, str]:
+    effect = name.placed.effect
+    if effect.id == OUT_OF_TOLERANCE:
+        return 2, ""
+    if effect.generic:
+        return (1 if positive else 3), ""
+    return 0, ""
+
+
+def _advantage(hypothesis: Hypothesis, name: Name, fit: Fit) -> float:
+    """Log prior density at the size found, against the fitted effect's; -inf where the name cannot have that size."""
+    if name.label == hypothesis.label:
+        return 0.0
+    ratio = name.relative / hypothesis.representative.relative
+    x = _unknown(hypothesis, fit)
+    own = name.placed.effect.parameters[0]
+    low, high = SizeMap.of(own, name.scales.get(own.name, own.scale)).bounds
+    if not low <= x / ratio <= high:
+        return float("-inf")
+    return 0.5 * x**2 - 0.5 * (x / ratio) ** 2 - float(np.log(ratio))

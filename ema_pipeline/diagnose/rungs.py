@@ -1,0 +1,106 @@
+"""Models from the base upwards, with their errors on data fitted and on data held out, all at the same scatters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ema_pipeline.diagnose.heldout import HeldOut, held_out
+from ema_pipeline.diagnose.types import EffectSize, Ladder, LearnedScatter, Rung
+from ema_pipeline.inference import Posterior
+from ema_pipeline.inference.maximise import ANNEALING, anneal
+from ema_pipeline.observations.base import EffectProblem, Observations
+from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned, refined, transferred
+from ema_pipeline.observations.modes import UNEXPLAINED
+
+
+def rungs_of(observations: Observations, fits: Sequence[Fit]) -> tuple[Rung, ...]:
+    """Every fit as a rung, at the scatters of the last one."""
+    scatters = fits[-1].posterior.scatters
+    alike = tuple(at_scatters(observations, f, scatters) for f in fits)
+    base = alike[0].log_evidence
+    return tuple(rung(observations, f, base, held_out(observations, f)) for f in alike)
+
+
+def rung(observations: Observations, fit: Fit, base_evidence: float, held: HeldOut) -> Rung:
+    """One model of the ladder."""
+    problem = fit.model.problem(observations)
+    return Rung(
+        effects=fit.model.labels,
+        error=fit.posterior.error,
+        heldout_error=held.error,
+        chi2=float(fit.posterior.residuals.values @ fit.posterior.residuals.values),
+        objective=2 * fit.posterior.cost,
+        parameters=parameter_sizes(problem, fit.posterior),
+        log_evidence=fit.log_evidence - base_evidence,
+        unexplained=int(fit.posterior.residuals.penalty // UNEXPLAINED),
+    )
+
+
+def parameter_sizes(problem: EffectProblem, posterior: Posterior) -> dict[str, EffectSize]:
+    """Values of all parameters and effects' sizes with 1 σ."""
+    values = problem.parameter_values(posterior.x)
+    found = {}
+    for name, value in values.items():
+        i = posterior.unknowns.index.get(name)
+        if i is None:
+            continue
+        size = problem.sizes.get(name)
+        slope = abs(size.slope(float(posterior.x[i]))) if size is not None else abs(value)
+        found[name] = EffectSize(
+            value, float(posterior.std[i]) * slope, "" if size is None else size.parameter.unit
+        )
+    return found
+
+
+def make_ladder(observations: Observations, models: Sequence[Model]) -> Ladder:
+    """The ladder of given models, each on top of the one before.
+
+    Parameters
+    ----------
+    observations : Observations
+    models : sequence of Model
+        The base model first.
+    """
+    fits: list[Fit] = [fit_base(observations, models[0])]
+    for model in models[1:]:
+        fits.append(_best_of(observations, model, fits[-1]))
+    fits[-1] = learned(observations, fits[-1])
+    rungs = rungs_of(observations, fits)
+    return Ladder(rungs, *noise(fits[-1]), note="", scatters=learned_scatters(observations, fits[-1]))
+
+
+def _best_of(observations: Observations, model: Model, before: Fit) -> Fit:
+    """A model with one effect more, begun at several sizes of it."""
+    problem = model.problem(observations)
+    new = [n for n in problem.sizes if n not in before.posterior.unknowns.index]
+    scatters = before.posterior.scatters
+    begun = problem.begun(transferred(before.posterior, problem.unknowns, problem.start()), scatters)
+    if begun is not None:
+        return refined(observations, model, begun, scatters)
+    fits = []
+    for factor in (1.0, 0.3, -0.5):
+        x = transferred(before.posterior, problem.unknowns, problem.start())
+        for name in new:
+            i = problem.unknowns.index[name]
+            x[i] = factor * x[i] if x[i] else 0.3 * factor
+        found = anneal(problem, before.posterior.scatters, problem.unknowns.clipped(x), ANNEALING)
+        fits.append(Fit(model, found))
+    return max(fits, key=lambda f: f.log_evidence)
+
+
+def noise(fit: Fit) -> tuple[float, float, float]:
+    """Scatter of frequency, damping and shapes beside the test's own; 0 where the data have none."""
+    known = fit.posterior.scatters
+    return (
+        known.get("frequency_scatter", 0.0),
+        known.get("damping_scatter", 0.0),
+        known.get("shape_scatter", 0.0),
+    )
+
+
+def learned_scatters(observations: Observations, fit: Fit) -> tuple[LearnedScatter, ...]:
+    """Every hyper-parameter as stated and as learned."""
+    return tuple(
+        LearnedScatter(s.name, s.title, s.default, fit.posterior.scatters[s.name])
+        for s in observations.scatters.values()
+    )

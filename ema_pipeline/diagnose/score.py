@@ -1,0 +1,88 @@
+"""What an effect promises to first order: the gain of one step from the model as it stands."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import Fit, transferred
+
+
+@dataclass(frozen=True)
+class Score:
+    """Linearised posterior of one effect's size about its null.
+
+    Attributes
+    ----------
+    hypothesis : Hypothesis
+    size : ndarray, (k,)
+        Estimate of its unknowns, in units of their prior σ.
+    std : float
+        1 σ of the first unknown from the data alone, everything else uncertain; infinite where they say nothing.
+    gain : float
+        Expected log evidence gained.
+    """
+
+    hypothesis: Hypothesis
+    size: NDArray[np.float64]
+    std: float
+    gain: float
+
+
+def scores(observations: Observations, base: Fit, hypotheses: Sequence[Hypothesis]) -> list[Score]:
+    """Scores of hypotheses on top of a fitted model; those whose size cannot be zero are left out."""
+    found = []
+    factor = _Marginal(base)
+    for hypothesis in hypotheses:
+        if hypothesis.extends:
+            continue
+        model = base.model.plus(hypothesis.placed, hypothesis.scales)
+        problem = model.problem(observations)
+        names = [n for n in problem.unknowns.names if n.startswith(hypothesis.label + ".")]
+        start = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+        at = [problem.unknowns.index[n] for n in names]
+        residuals = problem.residuals(
+            start, base.posterior.scatters, matching=base.posterior.residuals.matching
+        )
+        if residuals.jacobian.shape[0] != factor.count:
+            continue
+        found.append(factor.score(hypothesis, residuals.jacobian[:, at], problem.unknowns.lower[at]))
+    return found
+
+
+class _Marginal:
+    """Residual and information of new directions once everything that is uncertain already is allowed for."""
+
+    def __init__(self, base: Fit) -> None:
+        p = base.posterior
+        self.residual = p.residuals.values
+        self.count = len(self.residual)
+        self.whitened = p.residuals.jacobian * p.prior_std
+        information = np.eye(self.whitened.shape[1]) + self.whitened.T @ self.whitened
+        self.factor = scipy.linalg.cho_factor(information, check_finite=False)
+
+    def information(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Fisher information of directions, the rest marginalised, (k, k)."""
+        shared = self.whitened.T @ columns
+        solved = scipy.linalg.cho_solve(self.factor, shared, check_finite=False)
+        return np.asarray(columns.T @ columns - shared.T @ solved)
+
+    def score(
+        self, hypothesis: Hypothesis, columns: NDArray[np.float64], lower: NDArray[np.float64]
+    ) -> Score:
+        """At the maximum the residual is orthogonal to what was fitted, so that it needs no correction."""
+        information = self.information(columns)
+        precision = information + np.eye(len(information))
+        slope = -columns.T @ self.residual
+        size = np.linalg.solve(precision, slope)
+        if size[0] < lower[0]:
+            size = np.zeros_like(size)
+        gain = 0.5 * float(slope @ size) - 0.5 * float(np.linalg.slogdet(precision)[1])
+        std = float(1 / np.sqrt(max(information[0, 0], 1e-300)))
+        return Score(hypothesis, np.asarray(size, float), std, gain)

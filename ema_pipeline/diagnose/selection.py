@@ -1,0 +1,147 @@
+"""Forward selection: the best supported effect is added, and the rest is asked again on top of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ema_pipeline.diagnose.backward import reconsidered
+from ema_pipeline.diagnose.claims import Judged, judge
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.naming import named
+from ema_pipeline.diagnose.ranking import Ranked, Ranking, rank
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import Fit, Model, fit_base
+
+Progress = Callable[[float, str], None]
+
+NOTHING = "nothing"
+_SAME = 0.3
+"""Distance of two predictions, in standard deviations of all data together, that shows in no test."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """One question: what is missing on top of the model as it stands.
+
+    Attributes
+    ----------
+    ranking : Ranking
+    judged : tuple of Judged
+        Finalists, best first.
+    probabilities : dict of str to float
+        Of every hypothesis by the name that is said, and of `NOTHING`; adds up to 1.
+    """
+
+    ranking: Ranking
+    judged: tuple[Judged, ...]
+    probabilities: Mapping[str, float]
+
+    @property
+    def best(self) -> Judged | None:
+        """The best supported hypothesis that is claimed."""
+        return next((j for j in self.judged if j.claimed), None)
+
+    def alike(self, settings: DiagnoseSettings) -> tuple[Judged, ...]:
+        """Claimed hypotheses that explain the data as well as the best; the rig's own before generic ones."""
+        best = self.best
+        if best is None:
+            return ()
+        near = [j for j in self.judged if j.claimed and best.gain - j.gain < settings.alike]
+        different: list[Judged] = []
+        for j in sorted(near, key=lambda j: (j.hypothesis.generic, -j.gain)):
+            if not any(_same_prediction(j, other) for other in different):
+                different.append(j)
+        return tuple(different)
+
+
+def _same_prediction(one: Judged, other: Judged) -> bool:
+    """True for fits that no data of this kind could tell apart: two names of the same physics."""
+    a, b = one.ranked.fit.posterior.residuals, other.ranked.fit.posterior.residuals
+    if len(a.values) != len(b.values):
+        return False
+    return float(np.linalg.norm(a.stated - b.stated)) < _SAME
+
+
+@dataclass(frozen=True)
+class Selection:
+    """All rounds, the last of which found nothing more.
+
+    Attributes
+    ----------
+    rounds : tuple of Round
+    claimed : tuple of Judged
+        In the order in which they were added.
+    final : Fit
+        The model with all that is claimed.
+    """
+
+    rounds: tuple[Round, ...]
+    claimed: tuple[Judged, ...]
+    final: Fit
+
+
+def select(
+    observations: Observations,
+    known: Model,
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+    progress: Progress = lambda share, text: None,
+) -> Selection:
+    """Add effects one by one while the data support them.
+
+    Parameters
+    ----------
+    observations : Observations
+    known : Model
+        Effects that the model has already.
+    hypotheses : sequence of Hypothesis
+    settings : DiagnoseSettings
+    progress : callable
+    """
+    base = start = fit_base(observations, known)
+    rounds: list[Round] = []
+    claimed: list[Judged] = []
+    left: Sequence[Hypothesis] = hypotheses
+    while True:
+        low = len(rounds) / (settings.most_effects + 1)
+        ranking = rank(
+            observations,
+            base,
+            left,
+            settings.processes,
+            lambda share, text, low=low: progress(low + share / (settings.most_effects + 1), text),  # type: ignore[misc]
+        )
+        rounds.append(_round(observations, ranking, settings))
+        near = rounds[-1].alike(settings)
+        if not near or len(claimed) == settings.most_effects:
+            return Selection(tuple(rounds), tuple(claimed), ranking.base)
+        claimed.append(near[0])
+        if len(claimed) > 1:
+            claimed = reconsidered(observations, start, claimed, hypotheses, settings)
+        taken = {j.hypothesis.label for j in claimed}
+        left = [h for h in hypotheses if h.label not in taken]
+        base = fit_base(observations, claimed[-1].ranked.fit.model, claimed[-1].ranked.fit)
+
+
+def _round(observations: Observations, ranking: Ranking, settings: DiagnoseSettings) -> Round:
+    finals = [r for r in ranking.ranked if r.final]
+    judged = sorted((judge(observations, ranking, r, settings) for r in finals), key=lambda j: -j.gain)
+    return Round(ranking, tuple(judged), _probabilities(ranking.ranked, settings))
+
+
+def _probabilities(ranked: Sequence[Ranked], settings: DiagnoseSettings) -> dict[str, float]:
+    """Probability of every hypothesis on top of the model, and of nothing."""
+    names = [named(r.hypothesis, r.fit) for r in ranked]
+    weights = np.array([settings.generic_prior if r.hypothesis.generic else 1.0 for r in ranked])
+    logs = np.array([r.gain + n.advantage for r, n in zip(ranked, names, strict=True)])
+    if len(weights):
+        logs = logs + np.log((1 - settings.null_prior) * weights / np.sum(weights))
+    everything = np.append(logs, np.log(settings.null_prior))
+    shares = np.exp(everything - np.max(everything))
+    shares /= np.sum(shares)
+    found = {n.label: float(p) for n, p in zip(names, shares, strict=False)}
+    return found | {NOTHING: float(shares[-1])}

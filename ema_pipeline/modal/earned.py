@@ -1,0 +1,113 @@
+"""Heavily damped poles without a peak: whether they are modes, or mend what a fit leaves over.
+
+A structure that is not quite linear leaves a misfit that poles with much damping follow well. A mode shows a peak, or
+else one shape wherever it is excited; what only mends a misfit shows neither.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.ndimage
+import scipy.signal
+from numpy.typing import NDArray
+
+from ema_pipeline.modal.assurance import mpc
+from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.fit import Estimate, LinearSolution, solve_linear
+
+Real = NDArray[np.float64]
+
+HEAVY = 0.02
+"""Damping ratio below which a pole that is needed makes a peak, if only a small one."""
+
+RISE_DB = 1.0
+"""A peak rises by so much out of the response of all FRFs."""
+
+SMOOTHING = 0.35
+"""Smoothing of the response for the peak of a pole, in its decay rate: noise makes narrower peaks."""
+
+UNSEEN = 0.1
+"""Share of model orders below which no order can be said to show a pole."""
+
+COLLINEAR = 0.9
+"""Modal phase collinearity of a shape that is a mode's without further question."""
+
+ONE_SHAPE = 0.9
+"""Share of the largest singular value in the power of free residues that is a mode's without further question."""
+
+
+def unearned(
+    data: FitData,
+    weight: Real,
+    estimate: Estimate,
+    solution: LinearSolution,
+    share: Real,
+    explained: NDArray[np.bool_],
+) -> NDArray[np.bool_]:
+    """Heavily damped poles that have no peak and nothing else that speaks for a mode, (n_modes,).
+
+    Parameters
+    ----------
+    data : FitData
+    weight : ndarray, (n_rows, n_references, n_lines)
+    estimate, solution
+        The fit.
+    share : ndarray, (n_modes,)
+        Share of model orders that show each mode.
+    explained : ndarray of bool, (n_modes,)
+        True where the scatter over hits explains all that is left over around a mode.
+    """
+    zeta = -estimate.poles.real / np.abs(estimate.poles)
+    out = np.zeros(len(zeta), dtype=bool)
+    suspects = np.flatnonzero(zeta > HEAVY)
+    if not len(suspects):
+        return out
+    # one weight per FRF: weights over lines take the peaks away where a fit leaves a share of them
+    weight = np.broadcast_to(np.median(weight, axis=-1, keepdims=True), weight.shape)
+    power = np.sum(weight * np.abs(data.frf) ** 2, axis=(0, 1))
+    suspects = np.array(
+        [r for r in suspects if not has_peak(data.omega, power, estimate.poles[r])], dtype=int
+    )
+    out[suspects] = share[suspects] < UNSEEN
+    doubtful = [
+        r
+        for r in suspects
+        if not out[r]
+        and not explained[r]
+        and mpc(solution.shapes[:, r]) < COLLINEAR
+        and len(solution.shapes) > 2
+    ]
+    if doubtful and data.measured.shape[1] > 1:
+        ranks = one_shape(data, weight, estimate)
+        out[doubtful] = ranks[doubtful] < ONE_SHAPE
+    return out
+
+
+def has_peak(omega: Real, power: Real, pole: complex) -> bool:
+    """True where the response rises to a peak within a half-power half-width of a pole."""
+    step = float(omega[1] - omega[0])
+    smooth = scipy.ndimage.gaussian_filter1d(power, max(-SMOOTHING * pole.real / step, 1.0), mode="nearest")
+    curve = 10 * np.log10(np.maximum(smooth, 1e-300))
+    peaks = scipy.signal.find_peaks(curve, prominence=RISE_DB)[0]
+    return bool(np.any(np.abs(omega[peaks] - pole.imag) < max(-pole.real, 2 * step)))
+
+
+def one_shape(data: FitData, weight: Real, estimate: Estimate) -> Real:
+    """Share of the first singular value in the power of each mode's residues, fitted freely, (n_modes,)."""
+    n_modes, n_ref = len(estimate.poles), data.measured.shape[1]
+    free = Estimate(estimate.poles, np.ones((n_modes, 1), dtype=np.complex128))
+    residues = np.empty((n_modes, len(data.measured), n_ref), dtype=np.complex128)
+    for i in range(n_ref):
+        column = FitData(
+            data.omega,
+            data.frf[:, [i]],
+            data.variance[:, [i]],
+            data.measured[:, [i]],
+            data.rest_s,
+            data.transposed,
+            data.window_rad_s,
+        )
+        residues[:, :, i] = solve_linear(column, weight[:, [i]], free).shapes.T
+    scale = np.sqrt(np.mean(weight, axis=-1))
+    values = np.linalg.svd(residues * scale, compute_uv=False) ** 2
+    return np.asarray(values[:, 0] / np.maximum(values.sum(axis=1), 1e-300))

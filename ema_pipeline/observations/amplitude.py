@@ -1,0 +1,367 @@
+"""Hits at several force levels as observations: the modes of a linear rig, and how they move from hit to hit.
+
+The measured modes of the level that is nearest to the linear structure are compared as `observations.modes` does. On
+top of them every mode's frequency and damping in every single hit is compared with what the nonlinear elements of a
+hypothesis make of them at the amplitudes that were measured (`observations.hit_modes`). Only differences between hits
+on one point count: whatever a linear model has wrong is alike in all of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.effects.base import PlacedEffect
+from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
+from ema_pipeline.mechanics.laws import Nonlinear, Spring
+from ema_pipeline.mechanics.nonlinear import element_rows
+from ema_pipeline.observations.hit_modes import HitData, Linear, comparable, shifted_poles
+from ema_pipeline.observations.modes import ModeObservations, ModeProblem, Paired, stacked
+from ema_pipeline.observations.parts import part_key
+from ema_pipeline.observations.rig_model import LOG_STD, RigModel, SizeMap
+
+DRIFT = "drift"
+HIT_FREQUENCY = "hit_frequency_scatter"
+HIT_DAMPING = "hit_damping_scatter"
+LINEARISATION = "linearisation"
+AMPLITUDE_STD = 0.02
+"""1 σ of the logarithm of all amplitudes: the sensors' calibration, less what their number averages out."""
+
+_STEP = 1e-3
+"""Step of the differences by sizes, in units of their prior σ."""
+_DECADES = 6.0
+_ALONG, _ACROSS = 19, 3
+"""Sizes that are tried to begin with: their range, and their number for an effect's first size and the others."""
+_QUASI_STATIC = 0.5
+"""Modes below the lowest measured frequency times this take no part in static flexibility: they are slower than the
+decay of the motion that pushes the mean aside."""
+
+
+def hit_scatters() -> dict[str, Scatter]:
+    """The hyper-parameters that single hits add to those of measured modes."""
+    known = (
+        Scatter(DRIFT, "ln f of all modes from hit to hit", 1e-4, 1.0, 1e-4),
+        Scatter(HIT_FREQUENCY, "ln f of one mode from hit to hit", 3e-5, 1.0, 3e-5),
+        Scatter(HIT_DAMPING, "ln ζ of one mode from hit to hit", 5e-3, 1.0, 5e-3),
+        Scatter(LINEARISATION, "equivalent linearisation", 0.15, 0.3, 0.15),
+    )
+    return {s.name: s for s in known}
+
+
+class AmplitudeObservations:
+    """Modes of a rig, and of single hits at several force levels.
+
+    Parameters
+    ----------
+    modes : ModeObservations
+        Of the level nearest to the linear structure, of every configuration.
+    hits : sequence of HitData
+        Of the configurations that were struck at several levels.
+    """
+
+    def __init__(self, modes: ModeObservations, hits: Sequence[HitData]) -> None:
+        self.modes, self.hits = modes, tuple(hits)
+        self.scatters = {**modes.scatters, **hit_scatters()}
+
+    def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> AmplitudeProblem:
+        """See `Observations`."""
+        return AmplitudeProblem(self, effects, scales)
+
+    def folds(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
+        """Every force level held out in turn, with the nearest other level beside it that it is compared with."""
+        levels = sorted({int(k) for h in self.hits for k in h.level})
+        pairs = []
+        for k in levels if len(levels) > 2 else []:
+            beside = levels[1] if k == levels[0] else levels[0]
+            kept = [h.only(h.level != k) for h in self.hits]
+            out = [h.only((h.level == k) | (h.level == beside)) for h in self.hits]
+            without_modes = self.modes.with_data(())
+            pairs.append(
+                (
+                    AmplitudeObservations(self.modes, [h for h in kept if comparable(h)]),
+                    AmplitudeObservations(without_modes, [h for h in out if comparable(h)]),
+                )
+            )
+        return pairs
+
+
+class AmplitudeProblem:
+    """Hits at several levels, and the rig with a list of effects."""
+
+    def __init__(
+        self,
+        observations: AmplitudeObservations,
+        effects: Sequence[PlacedEffect],
+        scales: Mapping[str, float],
+    ) -> None:
+        self.observations = observations
+        self.modes: ModeProblem = observations.modes.problem(effects, scales)
+        self._nonlinear = tuple(e.label for e in effects if not e.effect.linear)
+
+    @property
+    def model(self) -> RigModel:
+        """The rig with the effects."""
+        return self.modes.model
+
+    @property
+    def sizes(self) -> Mapping[str, SizeMap]:
+        """See `EffectProblem`."""
+        return self.modes.sizes
+
+    def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
+        """See `EffectProblem`."""
+        x = self.modes.start(sizes)
+        return np.concatenate([x, np.zeros(len(self.unknowns) - len(x))])
+
+    def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
+        """See `EffectProblem`."""
+        return self.modes.parameter_values(x)
+
+    @cached_property
+    def unknowns(self) -> Unknowns:
+        """Those of the modes, the scale of all amplitudes, every hit's drift and what linearisation leaves out."""
+        hits = self.observations.hits
+        drift = [f"drift of {h.configuration} {n}" for h in hits for n in h.names]
+        left = [_left_name(h, s, r) for h in hits for s in np.unique(h.sheet) for r in range(len(h.modes))]
+        return joined(
+            self.modes.unknowns,
+            Unknowns.plain(("amplitude of all modes",), AMPLITUDE_STD),
+            Unknowns.plain(drift, 1.0, DRIFT),
+            Unknowns.plain(left, 1.0, LINEARISATION, lower=-1.0, upper=1.0),
+        )
+
+    @cached_property
+    def nonlinear_sizes(self) -> tuple[int, ...]:
+        """Positions of the sizes of effects that depend on the amplitude."""
+        names = [n for n in self.sizes if n.rpartition(".")[0] in self._nonlinear]
+        return tuple(self.unknowns.index[n] for n in names)
+
+    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
+        """`x` with the sizes of the effect added last at the best of a grid, where it depends on the amplitude.
+
+        From far off there is often no slope that leads to the right size: teeth that never part, friction that locks,
+        and a quadratic spring of no size change nothing.
+        """
+        names = [n for n in self.sizes if self._nonlinear and n.rpartition(".")[0] == self._nonlinear[-1]]
+        if not names or not self.observations.hits:
+            return None
+        at = [self.unknowns.index[n] for n in names]
+        grids = [_grid(self.sizes[n], _ALONG if i == 0 else _ACROSS) for i, n in enumerate(names)]
+        matching = self.residuals(x, scatters, derivatives=False).matching
+        best, least = x, np.inf
+        for values in itertools.product(*grids):
+            trial = x.copy()
+            trial[at] = values
+            found = self.residuals(trial, scatters, matching=matching, derivatives=False)
+            cost = found.cost + 0.5 * float(np.sum(np.square(values)))
+            if cost < least:
+                best, least = trial, cost
+        return best
+
+    def residuals(
+        self,
+        x: NDArray[np.float64],
+        scatters: Mapping[str, float],
+        *,
+        heat: float = 1.0,
+        matching: object = None,
+        derivatives: bool = True,
+    ) -> Residuals:
+        """See `Problem`."""
+        given = matching if isinstance(matching, tuple) and len(matching) == 2 else (None, None)
+        count = len(self.modes.unknowns)
+        modes = self.modes.residuals(
+            x[:count], scatters, heat=heat, matching=given[0], derivatives=derivatives
+        )
+        pairs = given[1] if isinstance(given[1], tuple) else (None,) * len(self.observations.hits)
+        wide = np.pad(modes.jacobian, ((0, 0), (0, len(x) - count)))
+        parts = [dataclasses.replace(modes, jacobian=wide)]
+        for data, pair in zip(self.observations.hits, pairs, strict=True):
+            parts.append(self._of_hits(data, x, scatters, heat, pair, derivatives))
+        return dataclasses.replace(
+            stacked(parts, len(x)), matching=(modes.matching, tuple(p.matching for p in parts[1:]))
+        )
+
+    def _of_hits(
+        self,
+        data: HitData,
+        x: NDArray[np.float64],
+        scatters: Mapping[str, float],
+        heat: float,
+        pair: object,
+        derivatives: bool,
+    ) -> Residuals:
+        given = pair if isinstance(pair, np.ndarray) else None
+        paired = self.modes.paired(data.reference, x[: len(self.modes.unknowns)], given)
+        if paired is None:
+            return Residuals(np.full(1, np.inf), np.zeros((1, len(x))))
+        return _Hits(self, data, paired, x, scatters, heat).residuals(derivatives)
+
+
+def _grid(size: SizeMap, points: int) -> NDArray[np.float64]:
+    """Unknowns of a size to try: evenly over `_DECADES` decades of it, of both signs where it has two."""
+    low, high = size.bounds
+    if size.logarithmic:
+        reach = 0.5 * _DECADES * np.log(10) / LOG_STD
+        grid = np.linspace(-reach, reach, points) if points > 1 else np.zeros(1)
+    else:
+        one = np.logspace(1 - _DECADES, 1, points)
+        grid = np.concatenate([one, -one])
+    return np.asarray(grid[(grid >= low) & (grid <= high)])
+
+
+def _left_name(data: HitData, sheet: int, mode: int) -> str:
+    return f"linearisation of {data.configuration} mode {data.modes[mode] + 1} at point {sheet + 1}"
+
+
+class _Hits:
+    """Residuals of one configuration's hits at one point of the unknowns."""
+
+    def __init__(
+        self,
+        problem: AmplitudeProblem,
+        data: HitData,
+        paired: Paired,
+        x: NDArray[np.float64],
+        scatters: Mapping[str, float],
+        heat: float,
+    ) -> None:
+        self.problem, self.data, self.paired, self.x = problem, data, paired, x
+        self.scatters, self.heat = scatters, heat
+        index = problem.unknowns.index
+        self.scale = index["amplitude of all modes"]
+        self.drift = np.array([index[f"drift of {data.configuration} {n}"] for n in data.names])
+        self.left = np.array(
+            [[index[_left_name(data, s, r)] for r in range(len(data.modes))] for s in data.sheet]
+        )
+
+    def residuals(self, derivatives: bool) -> Residuals:
+        """Frequencies, then damping ratios, each without its mean over a sheet's hits."""
+        data, x = self.data, self.x
+        match = self.paired.match[data.modes]
+        used = data.used & (match >= 0)
+        hit, mode = np.nonzero(used)
+        omega = np.median(data.poles.imag, axis=0)
+        moved = self._moved(x)
+        left = np.exp(x[self.left])
+        jacobian = np.zeros((2 * len(hit) if derivatives else 0, len(x)))
+        if derivatives:
+            for i in (*self.problem.nonlinear_sizes, self.scale):
+                ahead = x.copy()
+                ahead[i] += _STEP if ahead[i] + _STEP <= self.problem.unknowns.upper[i] else -_STEP
+                change = (
+                    (self._moved(ahead) - moved) / (ahead[i] - x[i])
+                    if np.any(moved) or i != self.scale
+                    else 0
+                )
+                jacobian[:, i] = -_read(left * change + np.zeros_like(moved), omega, data)[
+                    :, hit, mode
+                ].ravel()
+            rows = np.arange(2 * len(hit))
+            jacobian[rows[: len(hit)], self.drift[hit]] = -1.0
+            predicted = _read(left * moved, omega, data)[:, hit, mode].ravel()
+            jacobian[rows, np.tile(self.left[hit, mode], 2)] = -predicted
+        difference = np.stack([data.log_frequency, np.log(np.where(used, data.damping, 1.0))])
+        difference = difference - _read(left * moved, omega, data)
+        difference[0] -= x[self.drift][:, None]
+        values = difference[:, hit, mode]
+        own = np.stack([data.log_frequency_std, data.damping_std / np.where(used, data.damping, 1.0)])
+        return self._whitened(values, own[:, hit, mode], jacobian, data.sheet[hit], mode)
+
+    def _moved(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Change of every mode's pole in every hit, 1/s, (h, m)."""
+        data, model = self.data, self.problem.model
+        own = x[: self.problem.modes.offset]
+        assembly = model.assembly(data.configuration, own[model.shape_start :])
+        elements = assembly.nonlinear
+        total = np.zeros(data.log_frequency.shape, complex)
+        match = self.paired.match[data.modes]
+        on = np.flatnonzero(match >= 0)
+        if not elements or not len(on):
+            return total
+        rows = element_rows(assembly, elements)
+        shapes = self.paired.solution.shapes[: rows.shape[1]]
+        stretch = rows @ shapes
+        frequency = self.paired.solution.frequency_hz
+        slow = frequency < _QUASI_STATIC * float(np.exp(data.log_frequency[:, on].min()))
+        flexible = np.where(slow, 0.0, 1 / self.paired.solution.eigenvalues)
+        along = np.zeros((len(elements), len(match)))
+        along[:, on] = stretch[:, match[on]]
+        linear = Linear(along, (stretch * flexible) @ stretch.T, self._displacement(x, match, on))
+        return shifted_poles(data, [self._scaled(e, x) for e in elements], linear)
+
+    def _displacement(
+        self, x: NDArray[np.float64], match: NDArray[np.int64], on: NDArray[np.int64]
+    ) -> NDArray[np.complex128]:
+        """Amplitude of each modal coordinate just after each blow, as the sensors saw it, (h, m)."""
+        data = self.data
+        reading = self.problem.model.sensor_rows(data.configuration, data.dofs)
+        seen = reading @ self.paired.solution.shapes[: reading.shape[1], match[on]]
+        factor = np.einsum("om,mo->m", seen, data.shapes[on]) / np.maximum(np.sum(seen**2, axis=0), 1e-300)
+        result = np.zeros(data.motion.shape, complex)
+        result[:, on] = np.nan_to_num(data.motion[:, on]) * factor * np.exp(x[self.scale])
+        return result
+
+    def _scaled(self, element: Nonlinear, x: NDArray[np.float64]) -> Nonlinear:
+        """An element that replaces a spring, with the stiffness that the spring has at these unknowns."""
+        model = self.problem.model
+        row = model.dependence.elements[self.data.configuration].get(part_key(element))
+        if row is None or not isinstance(element, Spring):
+            return element
+        factor = float(np.exp(row @ x[: len(row)]))
+        return dataclasses.replace(element, stiffness=element.stiffness * factor)
+
+    def _whitened(
+        self,
+        values: NDArray[np.float64],
+        own: NDArray[np.float64],
+        jacobian: NDArray[np.float64],
+        sheet: NDArray[np.int64],
+        mode: NDArray[np.int64],
+    ) -> Residuals:
+        """Rows at unit σ, without what all hits of a sheet share: its mean has no prior."""
+        count = values.shape[1]
+        defaults = self.problem.observations.scatters
+        added = np.repeat([self.scatters[HIT_FREQUENCY], self.scatters[HIT_DAMPING]], count) ** 2
+        usual = np.repeat([defaults[HIT_FREQUENCY].default, defaults[HIT_DAMPING].default], count) ** 2
+        noise = own.ravel() ** 2
+        variance, default = noise + added, noise + usual
+        group = sheet * (int(mode.max(initial=0)) + 1) + mode
+        group = np.unique(np.concatenate([group, group + group.max(initial=0) + 1]), return_inverse=True)[1]
+        sigma = np.sqrt(variance) * self.heat
+        r = _without_mean(values.ravel() / sigma, 1 / sigma, group)
+        j = jacobian
+        if len(jacobian):
+            j = _without_mean(jacobian / sigma[:, None], 1 / sigma, group)
+        scale = 0.5 * float(np.sum(np.log(variance / default)))
+        scale += 0.5 * float(
+            np.sum(np.log(np.bincount(group, 1 / variance) / np.bincount(group, 1 / default)))
+        )
+        first = np.arange(2 * count) < count
+        share = {HIT_FREQUENCY: np.where(first, added / variance, 0.0)}
+        share[HIT_DAMPING] = np.where(first, 0.0, added / variance)
+        groups = int(group.max(initial=-1)) + 1
+        return Residuals(r, j, share, scale, matching=self.paired.match, projected=groups)
+
+
+def _read(moved: NDArray[np.complex128], omega: NDArray[np.float64], data: HitData) -> NDArray[np.float64]:
+    """Changes of ln f and of ln ζ that changes of poles (h, m) make, (2, h, m)."""
+    frequency = moved.imag / omega
+    damping = -moved.real / omega - data.usual_damping * frequency
+    return np.stack([frequency, damping / data.usual_damping])
+
+
+def _without_mean(
+    rows: NDArray[np.float64], weight: NDArray[np.float64], group: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Whitened rows less their weighted mean in every group."""
+    norm = np.bincount(group, weight**2)
+    flat = rows.reshape(len(rows), -1)
+    total = np.zeros((len(norm), flat.shape[1]))
+    np.add.at(total, group, flat * weight[:, None])
+    return np.asarray((flat - weight[:, None] * (total / norm[:, None])[group]).reshape(rows.shape))

@@ -1,0 +1,273 @@
+"""Modes of single hits at several force levels, and how far nonlinear elements move them.
+
+A blow excites all modes at once, and their amplitudes fall while they are observed. A fit of one pole to the spectrum
+of a whole decay finds a mean of the momentary pole over time. Fitted to all lines its weight were (2σ)²t·exp(-2σt),
+which leaves a quarter of the shift that a cubic spring makes at the blow; the band and the smooth terms of the fit
+leave less, so the weight is taken from that fit itself. Modes so near to each other that their beat is slower than
+their decay move in step, so their motions add before an element's force is found; far ones meet in all phases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.correlate.measured import from_modal_model
+from ema_pipeline.dof import Dof
+from ema_pipeline.levels.differences import smooth_terms
+from ema_pipeline.levels.types import HitModes
+from ema_pipeline.mechanics.equivalent import Motions, settled_offsets
+from ema_pipeline.mechanics.laws import Nonlinear
+from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.observations.modes import ModeData, prepare
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Integers = NDArray[np.int64]
+
+IN_STEP = 4.0
+"""Distance of poles, in decay rates, within which modes move in step while they are observed: at this distance the
+weight of one mode's force in the other's pole, 1/|1 - jΔω/2σ|², is 0.2."""
+
+_FIRST, _LAST = 0.03, 8.0
+"""First and last instant, in units of 1/2σ of the fastest and the slowest mode; 99.7 % of the weight is between."""
+_PER_EFOLD = 1.1
+_STILL = 1e-300
+_HEARD = 0.1
+"""Motion of a mode over that of the largest that moves in step with it, below which a hit does not tell its pole."""
+_FINE = 400
+"""Instants at which the weight of a mode's fit is found before it is put together to few."""
+
+
+@dataclass(frozen=True)
+class HitData:
+    """One configuration's modes in every single hit.
+
+    Attributes
+    ----------
+    reference : ModeData
+        Modes of the level that is nearest to the linear structure; the hits' modes are among them.
+    modes : ndarray of int, (m,)
+        Their indices.
+    dofs : tuple of Dof
+    shapes : complex ndarray, (m, s)
+        Shapes of unit `motion`.
+    names : tuple of str
+    level, sheet : ndarray of int, (h,)
+        Force level; only differences between hits of one sheet count.
+    force_n : ndarray, (n_levels,)
+    log_frequency, log_frequency_std, damping, damping_std : ndarray, (h, m)
+        Infinite standard deviations where a hit tells nothing.
+    motion : complex ndarray, (h, m)
+        Displacement amplitude just after the hit, m.
+    window_decay : float
+        Of the exponential window, 1/s.
+    band_hz : ndarray, (m, 2)
+        Lines from which each mode was read.
+    line_hz : float
+        Their distance.
+    """
+
+    reference: ModeData
+    modes: Integers
+    dofs: tuple[Dof, ...]
+    shapes: Complex
+    names: tuple[str, ...]
+    level: Integers
+    sheet: Integers
+    force_n: Real
+    log_frequency: Real
+    log_frequency_std: Real
+    damping: Real
+    damping_std: Real
+    motion: Complex
+    window_decay: float
+    band_hz: Real
+    line_hz: float
+
+    @property
+    def configuration(self) -> str:
+        """Name of the configuration."""
+        return self.reference.configuration
+
+    @cached_property
+    def used(self) -> NDArray[np.bool_]:
+        """Mask of hits and modes that can be compared, (h, m)."""
+        known = self._known.copy()
+        size = np.nan_to_num(np.abs(self.motion)) * np.max(np.abs(self.shapes), axis=1, initial=0.0)
+        for group in self.groups:
+            known[:, group] &= size[:, group] >= _HEARD * size[:, group].max(axis=1, keepdims=True)
+        return known
+
+    @cached_property
+    def _known(self) -> NDArray[np.bool_]:
+        known = np.isfinite(self.log_frequency_std) & np.isfinite(self.damping_std)
+        known &= np.isfinite(self.log_frequency) & (self.damping > 0)
+        return np.asarray(known & np.isfinite(self.motion))
+
+    def only(self, keep: NDArray[np.bool_]) -> HitData:
+        """Some of the hits."""
+        of_hits = (
+            "level", "sheet", "log_frequency", "log_frequency_std", "damping", "damping_std", "motion",
+        )  # fmt: skip
+        names = tuple(n for n, k in zip(self.names, keep, strict=True) if k)
+        return replace(self, names=names, **{n: getattr(self, n)[keep] for n in of_hits})
+
+    @cached_property
+    def poles(self) -> Complex:
+        """Of every mode in every hit, 1/s, (h, m); the reference's where a hit tells none."""
+        own = self.reference
+        omega = np.where(self._known, self.log_frequency, own.log_frequency[self.modes])
+        decay = np.where(self._known, self.damping, np.exp(own.log_damping[self.modes]))
+        return np.asarray(2 * np.pi * np.exp(omega) * (1j - np.nan_to_num(decay, nan=1e-3)))
+
+    @cached_property
+    def usual_damping(self) -> Real:
+        """Median damping ratio of every mode over the hits, (m,)."""
+        return np.asarray(np.median(-self.poles.real / self.poles.imag, axis=0))
+
+    @cached_property
+    def groups(self) -> tuple[Integers, ...]:
+        """Modes that move in step, by their place among `modes`, from the lowest up."""
+        pole = np.median(self.poles.real, axis=0) + 1j * np.median(self.poles.imag, axis=0)
+        groups: list[list[int]] = []
+        for r in np.argsort(pole.imag):
+            last = groups[-1][-1] if groups else None
+            near = last is not None and pole[r].imag - pole[last].imag < -IN_STEP * min(
+                pole[r].real, pole[last].real
+            )
+            if near:
+                groups[-1].append(int(r))
+            else:
+                groups.append([int(r)])
+        return tuple(np.array(g) for g in groups)
+
+    @cached_property
+    def weights(self) -> tuple[Real, Complex]:
+        """Instants after the blow, (t,), and the weight of each in the pole that is read of every mode, (t, m)."""
+        decay = np.median(-self.poles.real, axis=0) + self.window_decay
+        first, last = np.log(0.5 * _FIRST / decay.max()), np.log(0.5 * _LAST / decay.min())
+        instants = np.exp(np.linspace(first, last, int(_PER_EFOLD * (last - first)) + 2))
+        omega = np.median(self.poles.imag, axis=0)
+        columns = [
+            _fit_weights(instants, complex(-s, w), np.arange(low, high, self.line_hz))
+            for s, w, (low, high) in zip(decay, omega, self.band_hz.tolist(), strict=True)
+        ]
+        return instants, np.stack(columns, axis=1)
+
+
+def _fit_weights(instants: Real, pole: complex, lines_hz: Real) -> Complex:
+    """Weight of the momentary change of a pole at each instant in what a fit of differences of spectra reads.
+
+    The fit is that of `levels.differences`: derivatives of the mode's line by its pole and by its size, and smooth
+    terms. A change at the instant τ alone adds exp(λt) from then on.
+    """
+    s = 2j * np.pi * lines_hz - pole
+    columns = np.stack([s**-2, 1 / s, *smooth_terms(len(s))], axis=1)
+    size = np.linalg.norm(columns, axis=0)
+    reads = np.linalg.pinv(columns / size)[0] / size[0]
+    fine = np.linspace(0.0, 0.5 * _LAST / -pole.real, _FINE)
+    weight = (np.exp(-np.outer(fine, s)) / s) @ reads * (fine[1] - fine[0])
+    place = np.interp(fine, instants, np.arange(len(instants), dtype=float))
+    low = np.minimum(place.astype(int), len(instants) - 2)
+    share = place - low
+    total = np.zeros(len(instants), complex)
+    np.add.at(total, low, (1 - share) * weight)
+    np.add.at(total, low + 1, share * weight)
+    return total
+
+
+def prepare_hits(
+    configuration: str, hits: HitModes, modal: ModalModel, force_n: Sequence[float]
+) -> HitData | None:
+    """What single hits tell, prepared; None where no sheet was struck at several levels.
+
+    Parameters
+    ----------
+    configuration : str
+    hits : HitModes
+    modal : ModalModel
+        Of the level that is nearest to the linear structure.
+    force_n : sequence of float
+        Of each level.
+    """
+    data = HitData(
+        prepare(from_modal_model(modal, configuration)),
+        hits.modes,
+        hits.outputs,
+        np.nan_to_num(hits.shapes),
+        hits.names,
+        hits.level,
+        hits.sheet,
+        np.asarray(force_n, float),
+        hits.log_frequency,
+        hits.log_frequency_std,
+        hits.damping_ratio,
+        hits.damping_std,
+        hits.motion_m,
+        hits.window_decay_rad_s,
+        hits.band_hz,
+        hits.line_hz,
+    )
+    return data if comparable(data) else None
+
+
+def comparable(data: HitData) -> bool:
+    """True where hits of several levels share a sheet and tell of a mode."""
+    return any(
+        len(set(data.level[data.used[:, r] & (data.sheet == s)].tolist())) > 1
+        for r in range(len(data.modes))
+        for s in np.unique(data.sheet)
+    )
+
+
+@dataclass(frozen=True)
+class Linear:
+    """What of the linear model the elements' forces act on.
+
+    Attributes
+    ----------
+    along : ndarray, (n_elements, m)
+        Stretch of every element in each hit mode's mass-normalised shape.
+    flexibility : ndarray, (n_elements, n_elements)
+        Static stretch per force, m/N.
+    displacement : complex ndarray, (h, m)
+        Amplitude of each modal coordinate just after the blow.
+    """
+
+    along: Real
+    flexibility: Real
+    displacement: Complex
+
+
+def shifted_poles(data: HitData, elements: Sequence[Nonlinear], linear: Linear) -> Complex:
+    """Change of every mode's pole in every hit that nonlinear elements make, 1/s, (h, m).
+
+    Notes
+    -----
+    Of first order in the elements' forces: a force G·e^{jωt} along v changes the envelope of the mass-normalised
+    coordinate z by (j/2ω)(v·φ)G per second.
+    """
+    instants, weight = data.weights
+    omega = np.median(data.poles.imag, axis=0)
+    centre = np.array([np.mean(omega[g]) for g in data.groups])
+    group_of = np.zeros(len(omega), np.int64)
+    for k, g in enumerate(data.groups):
+        group_of[g] = k
+    turning = data.poles - 1j * centre[group_of]
+    z = linear.displacement[:, None] * np.exp(turning[:, None] * instants[:, None])  # (h, t, m)
+    paths = [np.stack([z[..., g] @ v[g] for g in data.groups], axis=-1) for v in linear.along]
+    motions = [Motions(np.abs(p).reshape(-1, len(centre)), centre) for p in paths]
+    offsets = settled_offsets(elements, motions, linear.flexibility)
+    still = np.abs(z) < _STILL
+    total = np.zeros(linear.displacement.shape, complex)
+    for element, v, path, motion, offset in zip(elements, linear.along, paths, motions, offsets, strict=True):
+        stiffness = motion.stiffness(element, offset).reshape(path.shape)
+        force = (stiffness * path)[..., group_of]
+        ratio = np.where(still, 0.0, force / np.where(still, 1.0, z))
+        total += 0.5j * v / omega * np.einsum("htm,tm->hm", ratio, weight)
+    return total
