@@ -120,6 +120,12 @@ class AmplitudeProblem:
         x = self.modes.start(sizes)
         return np.concatenate([x, np.zeros(len(self.unknowns) - len(x))])
 
+    def escapes(
+        self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
+    ) -> list[NDArray[np.float64]]:
+        """See `EffectProblem`: none."""
+        return []
+
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""
         return self.modes.parameter_values(x)

@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import scipy.optimize
@@ -53,6 +54,11 @@ _FREQUENCY_REACH = 0.1
 _FREQUENCY_REACH_ALONE = 0.3
 _LEAVE = 0.3
 """Cost above the best at which an assignment leaves a measured mode without a partner."""
+
+_CLOSE_PAIR = 0.2
+"""Difference of ln f within which two modes may have changed places."""
+_WRONG = 4.0
+"""σ from which a shape is another one."""
 
 _ACROSS = {"x": "y", "y": "x", "zeta": "eta", "eta": "zeta"}
 
@@ -255,6 +261,11 @@ class ModeRows:
     damping: float
     shape: NDArray[np.float64]
 
+    @property
+    def shape_off(self) -> float:
+        """Largest difference of the shape, in σ; 0 where none was measured."""
+        return float(np.max(np.abs(np.nan_to_num(self.shape)), initial=0.0))
+
 
 class ModeProblem:
     """Measured modes and the rig with a list of effects."""
@@ -355,6 +366,34 @@ class ModeProblem:
                 f"{configuration}: the model has no modes at the fitted values; check the rig's masses"
             )
         return solution
+
+    def escapes(
+        self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
+    ) -> list[NDArray[np.float64]]:
+        """See `EffectProblem`: close pairs of modes whose order is the wrong way round, split the other way.
+
+        No descent leads through the point where two modes coincide. The least probable part of the way is saved by
+        moving all unknowns as little as their priors allow.
+        """
+        assert isinstance(found.matching, tuple)
+        variance = self.unknowns.prior_std(scatters) ** 2
+        rows, starts, at = self.rows(found), [], 0
+        for data, match in zip(self.observations.data, found.matching, strict=True):
+            own = [r for r in rows if r.configuration == data.configuration]
+            modes = self.solution(data.configuration, x)
+            std = np.hypot(data.log_frequency_std, scatters[FREQUENCY])
+            for (i, a), (j, b) in pairwise(enumerate(own)):
+                split = float(np.log(modes.frequency_hz[b.model] / max(modes.frequency_hz[a.model], 1e-6)))
+                if abs(split) < _CLOSE_PAIR and a.shape_off > _WRONG and b.shape_off > _WRONG:
+                    slope = (
+                        found.jacobian[at + i] * std[a.measured] - found.jacobian[at + j] * std[b.measured]
+                    )
+                    reach = float(slope @ (variance * slope))
+                    if reach > 0:
+                        starts.append(self.unknowns.clipped(x - 2 * split * variance * slope / reach))
+            at += len(own) + int(np.sum(np.isfinite(data.log_damping[match >= 0])))
+            at += int(np.sum(np.isfinite(data.shapes[match >= 0])))
+        return starts
 
     def rows(self, found: Residuals) -> list[ModeRows]:
         """Residuals sorted by the mode that they belong to, every measured mode that has a model mode."""
