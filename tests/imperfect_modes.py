@@ -108,11 +108,11 @@ def measure(
         found[configuration] = MeasuredModes(
             configuration=configuration,
             frequency_hz=f * np.exp(lab.frequency * rng.normal(size=len(f))),
-            frequency_std_hz=0.3 * lab.frequency * f,
+            frequency_std_hz=0.5 * lab.frequency * f,
             damping_ratio=zeta * np.exp(0.02 * rng.normal(size=len(f))),
             damping_std=0.02 * zeta,
             shapes=shapes + lab.shapes * noise,
-            shape_std=np.full(shapes.shape, 0.5 * lab.shapes),
+            shape_std=np.full(shapes.shape, lab.shapes),
             dofs=tuple(Dof.parse(n) for n in names),
             band_hz=band,
         )

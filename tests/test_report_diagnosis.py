@@ -21,8 +21,8 @@ from ema_pipeline.diagnose.types import (
     DetectionLimit,
     Diagnosis,
     EffectSize,
-    HeldOutMode,
     Ladder,
+    LearnedScatter,
     Localisation,
     Rung,
     VerdictWord,
@@ -460,19 +460,22 @@ def test_summary_json_before_a_diagnosis_has_neither(base: RunResults, tmp_path:
     assert not {"diagnosis", "ladder"} & set(content)
 
 
-# second witness, detection limits, left-out modes
+# detection limits, scatter, other names
 
 
-def test_what_the_frfs_say_is_one_sentence_and_nothing_without_frfs() -> None:
-    plain = candidate(CRACK, 0.97, 1.02, 1.05)
-    assert diagnosis.frf_words(plain) == ""
-    seen = replace(plain, frf_error_before=10.75, frf_error_after=1.572, frf_impacts_better=9, frf_impacts=9)
-    assert diagnosis.frf_words(seen) == (
-        "FRFs around the modes, which were not fitted: 10.8 σ off without it, 1.57 σ with it; nearer at 9 of 9 "
-        "impact points."
-    )
-    told = replace(found("effect"), candidates=(replace(seen, claimed=True),))
-    assert diagnosis.frf_words(seen) in diagnosis.reasons(told)[0]
+def test_other_names_of_the_same_change_are_told() -> None:
+    named = replace(candidate(CRACK, 0.97, 1.02, 1.05), claimed=True, equivalents=("spring@sun.u",))
+    told = replace(found("effect"), candidates=(named,))
+    assert "Also called: spring at sun.u." in diagnosis.reasons(told)[0]
+
+
+def test_scatter_stands_as_stated_and_as_learned() -> None:
+    scatter = (LearnedScatter("part_scatter", "stiffness of parts", 0.02, 0.0314),)
+    ladder = replace(found("adequate").ladder, scatters=scatter)
+    (row,) = diagnosis_tables.scatter_table(ladder).rows
+    assert row.cells == ("stiffness of parts", "2.0 %", "3.1 %")
+    shown = flowing(printed(terminal.diagnosis_screen(replace(found("adequate"), ladder=ladder))))
+    assert "stiffness of parts" in shown
 
 
 LIMITS = (
@@ -496,43 +499,15 @@ def test_detection_limits_are_told_by_effect_with_best_and_worst_place() -> None
     assert diagnosis.detection_words(found("adequate")) == ""
 
 
-def test_modes_predicted_from_the_others_stand_beside_the_measured_ones() -> None:
-    modes = (
-        HeldOutMode("default", 5.529, 0.055, 5.518, 0.069),
-        HeldOutMode("default", 9.0, 0.09, math.nan, math.nan),
-        HeldOutMode("default", 2.748, 0.027, 3.1, 0.04),
-    )
-    d = replace(found("effect"), heldout_modes=modes)
-    rows = diagnosis_tables.heldout_table(d).rows
-    assert rows[0].cells == ("", "5.529 ± 0.055", "5.518 ± 0.069", "+0.1")
-    assert rows[1].cells[2] == "no such mode"
-    # (2.748 - 3.1)/√(0.027² + 0.04²) = -7.3
-    assert rows[2].cells[3] == "−7.3"
-    assert [r.alert for r in rows] == [False, True, True]
-    assert diagnosis.heldout_words(d).startswith("1 of 3 frequencies are predicted within 3σ")
-    assert "predicted, Hz" in printed(terminal.diagnosis_screen(d))
-
-
-def test_summary_holds_what_the_data_would_show_and_what_the_frfs_say(
-    run: RunResults, tmp_path: Path
-) -> None:
+def test_summary_holds_what_the_data_would_show(run: RunResults, tmp_path: Path) -> None:
     assert run.diagnosis is not None
     d = replace(run.diagnosis, detection_limits=LIMITS)
     write_summary(replace(run, diagnosis=d), tmp_path / "summary.json")
     content = json.loads((tmp_path / "summary.json").read_text())["diagnosis"]
-    assert content["detection_limits"][0]["size"] == 0.021
+    assert content["detection_limits"][0] == {
+        "effect": "mesh_stiffness_loss@sun-planet1", "parameter": "fraction", "size": 0.021, "unit": "1"
+    }  # fmt: skip
     assert content["detection_limits"][1]["size"] is None  # JSON has no infinity
-    assert content["candidates"][0]["frf_error_after"] is None
-    assert content["thresholds_from"] == "shipped with the program"
-
-
-def test_ladder_shows_frfs_where_there_are_any_and_evidence_where_not() -> None:
-    ladder = found("effect").ladder
-    assert "evidence" in printed(terminal.ladder_screen(ladder))
-    with_frfs = replace(ladder, rungs=tuple(replace(r, frf_error=1.6) for r in ladder.rungs))
-    shown = printed(terminal.ladder_screen(with_frfs))
-    assert "FRFs" in shown
-    assert "1.60" in shown
 
 
 def test_values_of_a_model_that_fails_are_not_called_identified(run: RunResults) -> None:

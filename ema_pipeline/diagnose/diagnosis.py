@@ -75,7 +75,8 @@ def diagnose(
     if found.claimed:
         fits[-1] = found.final
     rungs = rungs_of(observations, fits)
-    left = scores(observations, found.final, hypotheses)
+    in_model = set(found.final.model.labels)
+    left = scores(observations, found.final, [h for h in hypotheses if h.label not in in_model])
     group = alike(found, settings)
     candidates = _candidates(found, settings, group)
     fails = not explains(found.final, settings)
@@ -86,7 +87,7 @@ def diagnose(
     nothing = found.rounds[0].probabilities[NOTHING]
     scatter = learned_scatters(observations, found.final)
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found), scatters=scatter)
-    remarks = [*notes, sentences.scatter_text(scatter)]
+    remarks = list(notes)
     outlying = outlying_parts(found.final, settings)
     remarks.insert(0, sentences.standing_out(outlying, found.final.posterior.scatters.get(PART_SCATTER, 0.0)))
     return Diagnosis(

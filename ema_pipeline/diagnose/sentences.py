@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from ema_pipeline.diagnose.types import NOT_TOLD, EffectSize, LearnedScatter, VerdictWord
+from ema_pipeline.diagnose.types import NOT_TOLD, EffectSize, VerdictWord
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
 
 _SHOWN = 3
@@ -58,12 +58,6 @@ def summary(
         best = f" The best that the library has is {named}." if named else ""
         return f"The model does not explain the data (error {after:.2f}), and no effect in the library mends it.{best}"
     return "These data do not suffice to tell what is missing."
-
-
-def scatter_text(scatters: Sequence[LearnedScatter]) -> str:
-    """What was stated of everything that scatters, and what was learned."""
-    told = ", ".join(f"{s.title} {100 * s.learned:.2g} % (stated {100 * s.stated:.2g} %)" for s in scatters)
-    return f"Scatter (1 σ) learned from the data: {told}." if told else ""
 
 
 def standing_out(parts: Mapping[str, float], scatter: float) -> str:

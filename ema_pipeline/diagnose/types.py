@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -66,11 +65,6 @@ class Candidate:
         True where probability, gain and held-out data all support it.
     why : str
         Two plain sentences.
-    frf_error_before, frf_error_after : float
-        Root-mean-square of (measurement - model)/standard uncertainty of the FRFs around the modes, which were
-        not fitted, without and with it; NaN where there are none.
-    frf_impacts_better, frf_impacts : int
-        Impact points whose FRFs come nearer with it, and how many there are.
     equivalents : tuple of str
         Other names of the same physics.
     """
@@ -89,10 +83,6 @@ class Candidate:
     log_evidence: float
     claimed: bool
     why: str
-    frf_error_before: float = float("nan")
-    frf_error_after: float = float("nan")
-    frf_impacts_better: int = 0
-    frf_impacts: int = 0
     equivalents: tuple[str, ...] = ()
 
     @property
@@ -120,8 +110,6 @@ class Rung:
         Against the base model.
     unexplained : int
         Measured modes that the model does not explain.
-    frf_error : float
-        Of the FRFs around the modes, see `Candidate`.
     misfit, heldout_misfit : tuple of float
         Normalised time-domain misfit at each force level of the ladder, of hits that were fitted and of a level left
         out of the fit; empty where hits at one level only were compared.
@@ -135,7 +123,6 @@ class Rung:
     parameters: dict[str, EffectSize]
     log_evidence: float
     unexplained: int
-    frf_error: float = float("nan")
     misfit: tuple[float, ...] = ()
     heldout_misfit: tuple[float, ...] = ()
 
@@ -273,37 +260,6 @@ class DetectionLimit:
 
 
 @dataclass(frozen=True)
-class HeldOutMode:
-    """One measured frequency, predicted by the model fitted to the other modes.
-
-    Attributes
-    ----------
-    configuration : str
-    measured_hz, measured_std_hz : float
-    predicted_hz, predicted_std_hz : float
-        NaN where the model has no such mode.
-    """
-
-    configuration: str
-    measured_hz: float
-    measured_std_hz: float
-    predicted_hz: float
-    predicted_std_hz: float
-
-    @property
-    def predicted(self) -> bool:
-        """False where the model has no such mode."""
-        return math.isfinite(self.predicted_hz)
-
-    @property
-    def z(self) -> float:
-        """Difference over the uncertainty of both."""
-        return (self.measured_hz - self.predicted_hz) / math.hypot(
-            self.measured_std_hz, self.predicted_std_hz
-        )
-
-
-@dataclass(frozen=True)
 class Diagnosis:
     """The answer to: which physics is the model missing?
 
@@ -333,10 +289,6 @@ class Diagnosis:
         What the data's screening found.
     detection_limits : tuple of DetectionLimit
         What these data would show; empty where even the best model fails.
-    heldout_modes : tuple of HeldOutMode
-        Every frequency as the best model predicts it from the other modes.
-    thresholds_from : str
-        Where the thresholds come from, in a few words.
     """
 
     verdict: VerdictWord
@@ -352,5 +304,3 @@ class Diagnosis:
     ladder: Ladder
     notes: tuple[str, ...] = ()
     detection_limits: tuple[DetectionLimit, ...] = ()
-    heldout_modes: tuple[HeldOutMode, ...] = ()
-    thresholds_from: str = ""

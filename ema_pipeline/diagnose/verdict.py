@@ -9,7 +9,7 @@ from ema_pipeline.diagnose.selection import Selection
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import VerdictWord
 from ema_pipeline.observations.fitting import Fit
-from ema_pipeline.observations.parts import MASS_SCATTER, PART_SCATTER
+from ema_pipeline.observations.parts import FREE_STD, MASS_SCATTER, PART_SCATTER
 
 
 def explains(fit: Fit, settings: DiagnoseSettings) -> bool:
@@ -28,8 +28,21 @@ def outlying_parts(fit: Fit, settings: DiagnoseSettings) -> dict[str, float]:
     return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
 
 
+def too_few(fit: Fit) -> bool:
+    """True where there is no datum left for an effect once every free parameter has taken one."""
+    unknowns, residuals = fit.posterior.unknowns, fit.posterior.residuals
+    loose = [
+        name
+        for name, std, scatter in zip(unknowns.names, unknowns.std, unknowns.scatter, strict=True)
+        if not scatter and "@" not in name and std >= FREE_STD[0]
+    ]
+    return len(residuals.values) - residuals.projected <= len(loose) + 1
+
+
 def verdict_of(found: Selection, settings: DiagnoseSettings) -> VerdictWord:
     """What the data support."""
+    if not found.claimed and too_few(found.final):
+        return "not_enough_data"
     if not explains(found.final, settings):
         return "unknown_effect"
     if not found.claimed:

@@ -145,12 +145,7 @@ def _estimate(fitted: FittedModes, p: Parameter, value: float, settings: FitSett
     i = posterior.unknowns.index.get(p.name)
     prior = float("nan") if p.free else abs(p.tolerance * p.value)
     if i is None or (p.free and posterior.narrowing(p.name) > _UNTOUCHED):
-        std = float("nan") if p.free else abs(p.tolerance * p.value)
-        return ParameterEstimate(
-            p.name, value, std, p.minimum if p.free else value - std, p.maximum if p.free else value + std,
-            p.unit, p.free, p.value, prior, False, float("nan") if p.free else 0.0,
-            "not measured: nothing that was measured depends on it",
-        )  # fmt: skip
+        return _not_measured(p, value, prior)
     size = fitted.problem.sizes.get(p.name)
     slope = abs(value) if size is None else abs(size.slope(float(posterior.x[i])))
     std = float(posterior.std[i]) * slope
@@ -176,6 +171,16 @@ def _estimate(fitted: FittedModes, p: Parameter, value: float, settings: FitSett
         )
     return ParameterEstimate(
         p.name, value, std, low, high, p.unit, p.free, p.value, prior, identified, shift, "; ".join(notes),
+    )  # fmt: skip
+
+
+def _not_measured(p: Parameter, value: float, prior: float) -> ParameterEstimate:
+    """A parameter that nothing measured depends on: its prior, or where it is free, nothing but its bounds."""
+    std, shift = (float("nan"), float("nan")) if p.free else (abs(p.tolerance * p.value), 0.0)
+    low, high = (p.minimum, p.maximum) if p.free else (value - std, value + std)
+    return ParameterEstimate(
+        p.name, value, std, low, high, p.unit, p.free, p.value, prior, False, shift,
+        "not measured: nothing that was measured depends on it",
     )  # fmt: skip
 
 

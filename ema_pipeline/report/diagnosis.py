@@ -16,7 +16,6 @@ from ema_pipeline.diagnose.types import (
     EffectSize,
     Ladder,
 )
-from ema_pipeline.report.limits import FAR_SIGMA
 from ema_pipeline.report.numbers import format_value, plain, prefixed, words
 
 NOTHING = "nothing"
@@ -118,20 +117,13 @@ def reasons(found: Diagnosis) -> tuple[str, ...]:
     if found.verdict in ("adequate", "not_enough_data"):
         return ()
     return tuple(
-        f"{_capital(label_words(c.label))}: {c.title}. {c.why} {frf_words(c)}".rstrip()
-        for c in leading(found)
+        f"{_capital(label_words(c.label))}: {c.title}. {c.why}{_also_called(c)}" for c in leading(found)
     )
 
 
-def frf_words(c: Candidate) -> str:
-    """What the FRFs, which were not fitted, say of a candidate; empty where there are none."""
-    if not (math.isfinite(c.frf_error_before) and math.isfinite(c.frf_error_after)):
-        return ""
-    return (
-        f"FRFs around the modes, which were not fitted: {plain(c.frf_error_before, 3)} σ off without it, "
-        f"{plain(c.frf_error_after, 3)} σ with it; nearer at {c.frf_impacts_better} of {c.frf_impacts} "
-        f"impact point{'' if c.frf_impacts == 1 else 's'}."
-    )
+def _also_called(c: Candidate) -> str:
+    """Other names of the same change of the model; empty where there are none."""
+    return f" Also called: {', '.join(label_words(x) for x in c.equivalents)}." if c.equivalents else ""
 
 
 def detection_words(found: Diagnosis) -> str:
@@ -163,23 +155,6 @@ def limit_words(limit: DetectionLimit) -> str:
         return f"{plain(100 * limit.size, 2)} %"
     scale, unit = prefixed(limit.size, limit.unit)
     return f"{plain(scale * limit.size, 2)} {unit}"
-
-
-def heldout_words(found: Diagnosis) -> str:
-    """How well frequencies are predicted from the others, in a sentence; empty where none was left out."""
-    modes = found.heldout_modes
-    if not modes:
-        return ""
-    near = sum(abs(m.z) <= FAR_SIGMA for m in modes)
-    text = f"{near} of {len(modes)} frequencies are predicted within {FAR_SIGMA:g}σ by a fit to the others"
-    told = [m for m in modes if m.predicted]
-    if not told:
-        return f"{text}."
-    worst = max(told, key=lambda m: abs(m.z))
-    return (
-        f"{text}; furthest off: {format_value(worst.predicted_hz, worst.predicted_std_hz, 'Hz')} for the measured "
-        f"{format_value(worst.measured_hz, worst.measured_std_hz, 'Hz')} ({worst.configuration})."
-    )
 
 
 def of_modes(ladder: Ladder) -> bool:

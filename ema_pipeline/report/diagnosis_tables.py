@@ -26,8 +26,7 @@ from ema_pipeline.report.diagnosis import (
     size_words,
     standing,
 )
-from ema_pipeline.report.limits import FAR_SIGMA
-from ema_pipeline.report.numbers import format_value, plain, signed, words
+from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.tables import Row, Table
 
 
@@ -72,10 +71,8 @@ def candidates_table(found: Diagnosis) -> Table:
 
 
 def _why_words(c: Candidate, told: bool) -> str:
-    """Why a candidate is suspected; nothing where chance explains it."""
-    if told:
-        return "see above"
-    return c.why if c.gain >= c.threshold else ""
+    """Why a candidate is suspected or not claimed."""
+    return "see above" if told else c.why
 
 
 def short_candidates_table(found: Diagnosis) -> Table:
@@ -112,10 +109,7 @@ def short_candidates_table(found: Diagnosis) -> Table:
 
 
 def ladder_table(ladder: Ladder) -> Table:
-    """One row per model from the base model upwards, each with what it adds to the one before.
-
-    The column of FRFs is empty where there are none.
-    """
+    """One row per model from the base model upwards, each with what it adds to the one before."""
     rows: list[Row] = []
     before: tuple[str, ...] = ()
     for rung in ladder.rungs:
@@ -126,15 +120,14 @@ def ladder_table(ladder: Ladder) -> Table:
                     size_words(_own_sizes(before, rung.effects, rung.parameters), ";\n"),
                     plain(rung.error, 3),
                     plain(rung.heldout_error, 3),
-                    plain(rung.frf_error, 3) if math.isfinite(rung.frf_error) else "",
                     str(rung.unexplained) if of_modes(ladder) else "",
                     plain(rung.log_evidence, 3),
                 )
             )
         )
         before = rung.effects
-    head = ("model", "size (±1σ)", "error, σ", "held out, σ", "FRFs, σ", "modes left", "ln evidence")
-    return Table(head, tuple(rows), frozenset({2, 3, 4, 5, 6}))
+    head = ("model", "size (±1σ)", "error, σ", "held out, σ", "modes left", "ln evidence")
+    return Table(head, tuple(rows), frozenset({2, 3, 4, 5}))
 
 
 def detection_table(found: Diagnosis) -> Table:
@@ -161,23 +154,13 @@ def _place(limit: DetectionLimit) -> str:
     return words(limit.label.rpartition("@")[2])
 
 
-def heldout_table(found: Diagnosis) -> Table:
-    """Every measured frequency beside its prediction by a fit that has not seen it."""
-    several = len({m.configuration for m in found.heldout_modes}) > 1
+def scatter_table(ladder: Ladder) -> Table:
+    """What was stated of everything that scatters, and what was learned from the data."""
     rows = tuple(
-        Row(
-            (
-                m.configuration if several else "",
-                format_value(m.measured_hz, m.measured_std_hz),
-                format_value(m.predicted_hz, m.predicted_std_hz) if m.predicted else "no such mode",
-                signed(m.z),
-            ),
-            not abs(m.z) <= FAR_SIGMA,
-        )
-        for m in found.heldout_modes
+        Row((s.title, f"{plain(100 * s.stated, 2)} %", f"{plain(100 * s.learned, 2)} %"))
+        for s in ladder.scatters
     )
-    head = ("configuration" if several else "", "measured, Hz (±1σ)", "predicted, Hz (±1σ)", "differ, σ")
-    return Table(head, rows, frozenset({3}))
+    return Table(("of", "stated", "learned"), rows, frozenset({1, 2}))
 
 
 def localisation_table(found: Diagnosis) -> Table:
@@ -200,7 +183,7 @@ def localisation_table(found: Diagnosis) -> Table:
         )
         for place in found.localisation
     )
-    return Table(("where", "acts like", "size", "χ² it takes away"), rows, frozenset({2, 3}))
+    return Table(("where", "acts like", "size", "ln evidence it promises"), rows, frozenset({2, 3}))
 
 
 def _stands_out(found: Diagnosis, c: Candidate) -> bool:

@@ -128,7 +128,7 @@ def _diagnosis(results: RunResults) -> dict[str, Any] | None:
         "alike": diagnosis.group_words(found),
         "next": found.next_measurement,
         "localisation": diagnosis_tables.localisation_table(found) if found.localisation else None,
-        "heldout": diagnosis.heldout_words(found),
+        "scatter": diagnosis_tables.scatter_table(found.ladder) if found.ladder.scatters else None,
         "detection": diagnosis_tables.detection_table(found) if found.detection_limits else None,
         "notes": found.notes,
     }

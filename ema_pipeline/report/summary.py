@@ -34,7 +34,7 @@ def findings(results: RunResults) -> tuple[str, ...]:
     compared, fit = results.comparison, results.fit
     if fit is not None:
         lines.append(
-            f"The fit uses {fit.data_count} data; χ² per degree of freedom is {plain(fit.chi2_per_dof, 3)}, "
+            f"The fit uses {fit.data_count} data; its error is {plain(fit.error, 3)}, "
             f"the error function ε is {plain(fit.frequency_error, 3)}."
         )
         lines += _narrowed(fit)
@@ -85,7 +85,7 @@ def fails(fit: FitResult) -> bool:
 def identified_words(p: ParameterEstimate, fit: FitResult) -> str:
     """``"identified by the data"`` or why not."""
     if p.identified and fails(fit):
-        return "what a model that fails makes of the data: no result yet"
+        return "provisional: the model does not explain the data"
     if p.identified:
         return "identified by the data"
     if p.free:
@@ -100,8 +100,8 @@ def cautions(results: RunResults) -> tuple[str, ...]:
     if fit is not None:
         if fails(fit):
             lines.append(
-                f"The model does not fit (χ² per degree of freedom {plain(fit.chi2_per_dof, 3)}): "
-                "the fitted values and their uncertainties hold only for a model that lacks nothing"
+                f"The model does not explain the data (error {plain(fit.error, 3)}): "
+                "fitted values and their uncertainties are provisional"
             )
         for p in fit.parameters.values():
             value = format_value(p.value, p.std, p.unit)

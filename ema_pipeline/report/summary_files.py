@@ -102,9 +102,14 @@ def _diagnosis(found: Diagnosis) -> dict[str, Any]:
         "heldout_error": found.heldout_error,
         "localisation": [asdict(place) for place in found.localisation],
         "notes": list(found.notes),
-        "detection_limits": [asdict(limit) for limit in found.detection_limits],
-        "heldout_modes": [asdict(m) for m in found.heldout_modes],
-        "thresholds_from": found.thresholds_from or "shipped with the program",
+        "detection_limits": [
+            {"effect": x.label, "parameter": x.parameter, "size": x.size, "unit": x.unit}
+            for x in found.detection_limits
+        ],
+        "scatter": {
+            s.name: {"title": s.title, "stated": s.stated, "learned": s.learned}
+            for s in found.ladder.scatters
+        },
     }
 
 
@@ -119,13 +124,10 @@ def _candidate(c: Candidate) -> dict[str, Any]:
         "error_after": c.error_after,
         "heldout_error_before": c.heldout_before,
         "heldout_error_after": c.heldout_error_after,
-        "gain": c.gain,
-        "threshold": c.threshold,
         "log_evidence": c.log_evidence,
         "claimed": c.claimed,
+        "also_called": list(c.equivalents),
         "why": c.why,
-        "frf_error_before": c.frf_error_before,
-        "frf_error_after": c.frf_error_after,
     }
 
 
@@ -138,7 +140,6 @@ def _ladder(ladder: Ladder) -> list[dict[str, Any]]:
             "chi2": r.chi2,
             "log_evidence": r.log_evidence + 0.0,  # never -0.0
             "unexplained_modes": r.unexplained,
-            "frf_error": r.frf_error,
             "parameters": _sizes(r.parameters),
         }
         | _misfits(ladder, r)

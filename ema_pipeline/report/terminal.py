@@ -6,7 +6,6 @@ deserve a look start with ``!``.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 
@@ -27,7 +26,6 @@ from ema_pipeline.report.results import RunResults
 
 Clean = Callable[[str], str]
 _SHORT = 15
-_HELD_OUT_SHOWN = 8
 _VALUE = 32
 _ERROR_WORDS = (
     "error: root mean square of (measurement - model)/σ, about 1 where the model explains the data; "
@@ -186,42 +184,29 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
         parts += [_line(""), _rich(diagnosis_tables.localisation_table(found), "Where the misfit sits")]
     if found.next_measurement:
         parts += [_line(""), _line(f"Measure next: {found.next_measurement}")]
-    if 0 < len(found.heldout_modes) <= _HELD_OUT_SHOWN:
-        parts += [
-            _line(""),
-            _rich(diagnosis_tables.heldout_table(found), "Each mode predicted from the others"),
-        ]
-    elif told := diagnosis.heldout_words(found):
-        parts += [_line(""), _line(told)]
     if shown := diagnosis.detection_words(found):
         parts += [_line(""), _line(shown)]
-    if found.thresholds_from:
-        parts += [_line(""), _line(f"Thresholds of claims: {found.thresholds_from}.")]
+    if found.ladder.scatters:
+        parts += [_line(""), _rich(diagnosis_tables.scatter_table(found.ladder), "Scatter, 1 σ")]
     if found.notes:
-        parts += [_line(""), _line("From the data's screening:"), *(_line(f"! {n}") for n in found.notes)]
+        parts += [_line(""), _line("Remarks on the data:"), *(_line(f"! {n}") for n in found.notes)]
     parts += _commands(diagnosis.next_commands(found, out))
     return Group(*parts)
 
 
 def ladder_screen(ladder: Ladder) -> RenderableType:
     """Every model with its error on the data fitted and on data held out."""
-    heads = ("model", "size (±1σ)", "error", "held out", "FRFs", "left", "evidence")
-    with_frfs = any(math.isfinite(r.frf_error) for r in ladder.rungs)
-    # both do not fit 80 columns; the report has both
-    shown = (0, 1, 2, 3, 4, 5) if with_frfs else (0, 1, 2, 3, 5, 6)
-    words_of = {
-        "FRFs": "FRFs: those around the modes, which were not fitted",
-        "left": "left: measured modes that the model does not explain" if diagnosis.of_modes(ladder) else "",
-        "evidence": "evidence: logarithm, against the base model",
-    }
-    told = [words_of[heads[k]] for k in shown if words_of.get(heads[k])]
+    heads = ("model", "size (±1σ)", "error", "held out", "left", "evidence")
+    told = ["evidence: logarithm, against the base model"]
+    if diagnosis.of_modes(ladder):
+        told.insert(0, "left: measured modes that the model does not explain")
     parts: list[RenderableType] = [
-        _rich(_pick(_renamed(diagnosis_tables.ladder_table(ladder), heads), shown), "Ladder of models"),
+        _rich(_renamed(diagnosis_tables.ladder_table(ladder), heads), "Ladder of models"),
         _line("; ".join([_ERROR_WORDS, *told])),
         _line(diagnosis.noise_words(ladder)),
     ]
     if ladder.note:
-        parts.append(_line(f"Where climbing ended: {ladder.note}."))
+        parts.append(_line(f"No further effect is added: {ladder.note}."))
     return Group(*parts)
 
 

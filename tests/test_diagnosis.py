@@ -1,0 +1,326 @@
+"""The diagnosis by modes: what is named on imperfect rigs, what stays silent, and every verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from imperfect_modes import GOOD, NORMAL, Hidden, Lab, chain, chain_modes, planetary_modes
+
+from ema_pipeline import codec
+from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
+from ema_pipeline.diagnose.claims import judge
+from ema_pipeline.diagnose.diagnosis import diagnose
+from ema_pipeline.diagnose.heldout import held_out
+from ema_pipeline.diagnose.hypotheses import list_hypotheses
+from ema_pipeline.diagnose.ranking import rank
+from ema_pipeline.diagnose.rungs import make_ladder
+from ema_pipeline.diagnose.selection import NOTHING
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import Diagnosis
+from ema_pipeline.effects.base import Effect
+from ema_pipeline.effects.library import parse_effect, shipped_effects
+from ema_pipeline.mechanics.assembly import Damper, Element, Mass, Spring
+from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned
+from ema_pipeline.observations.modes import ModeObservations, prepare
+from ema_pipeline.rigs.planetary import planetary
+from ema_pipeline.rigs.types import Rig
+
+SETTINGS = DiagnoseSettings(processes=1)
+GENERIC = {k: v for k, v in shipped_effects().items() if k in ("spring", "mass", "damper")}
+MESHES = {k: shipped_effects()[k] for k in ("mesh_stiffness_loss", "planet_bearing_mistune", "shaft_torsion")}
+
+
+def observed(rig: Rig, measured: Mapping[str, MeasuredModes]) -> ModeObservations:
+    return ModeObservations(rig, [prepare(m) for m in measured.values()])
+
+
+def of_chain(
+    seed: int,
+    hidden: Hidden | None = None,
+    lab: Lab = NORMAL,
+    library: Mapping[str, Effect] | None = None,
+    settings: DiagnoseSettings = SETTINGS,
+) -> Diagnosis:
+    rig = chain()
+    return diagnose(observed(rig, chain_modes(seed, lab, hidden)), rig, library or GENERIC, None, settings)
+
+
+def added(element: type, size: float, row: dict[str, float]) -> Hidden:
+    made: Element = element("hidden", row, size)
+    return Hidden(added=(made,))
+
+
+def names_of(found: Diagnosis) -> set[str]:
+    """What is said to be missing, under all its names."""
+    claimed = [c for c in found.candidates if c.claimed]
+    return {label for c in claimed for label in (c.label, *c.equivalents)}
+
+
+# --- a chain as laboratories have it ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [11, 12])
+def test_a_healthy_chain_whose_parts_and_sensors_scatter_is_adequate(seed: int) -> None:
+    found = of_chain(seed)
+    assert found.verdict == "adequate"
+    assert not names_of(found)
+    assert 0.6 < found.error < 1.4
+    assert found.probabilities[NOTHING] == max(found.probabilities.values())
+    assert found.ladder.rungs[0].effects == ()
+    assert len(found.ladder.rungs) == 1
+
+
+@pytest.mark.parametrize(
+    ("hidden", "label", "truth", "seed"),
+    [
+        (added(Spring, 2e5, {"m2.z": 1.0}), "spring@m2", 2e5, 1),
+        (added(Spring, 2.5e5, {"m1.z": -1.0, "m3.z": 1.0}), "spring@m1-m3", 2.5e5, 2),
+        (added(Mass, 0.8, {"m4.z": 1.0}), "mass@m4", 0.8, 3),
+        (added(Damper, 120.0, {"m3.z": 1.0}), "damper@m3", 120.0, 4),
+    ],
+)
+def test_what_is_hidden_in_a_chain_is_named_with_its_size(
+    hidden: Hidden, label: str, truth: float, seed: int
+) -> None:
+    found = of_chain(seed, hidden)
+    assert found.verdict in ("effect", "ambiguous")
+    first = found.candidates[0]
+    assert label in (first.label, *first.equivalents)
+    assert first.claimed
+    (size,) = first.parameters.values()
+    assert abs(size.value - truth) < 3 * size.std
+    assert size.std < 0.5 * truth
+    assert found.ladder.rungs[-1].error < 1.5
+    assert not {d.label for d in found.detection_limits} & {first.label}
+    assert first.gain > SETTINGS.claim
+    assert first.heldout_error_after < first.heldout_before
+
+
+def test_two_hidden_effects_are_found_one_after_the_other() -> None:
+    hidden = Hidden(added=(Spring("a", {"m2.z": 1.0}, 4e5), Mass("b", {"m5.z": 1.0}, 1.0)))
+    found = of_chain(5, hidden, GOOD)
+    assert {"spring@m2", "mass@m5"} <= names_of(found)
+    assert found.verdict in ("effect", "ambiguous")
+    assert [len(r.effects) for r in found.ladder.rungs] == [0, 1, 2]
+    errors = [r.error for r in found.ladder.rungs]
+    assert errors == sorted(errors, reverse=True)
+
+
+def test_an_effect_far_below_its_limit_is_not_claimed() -> None:
+    found = of_chain(6, added(Spring, 2e3, {"m2.z": 1.0}))
+    assert found.verdict == "adequate"
+    limits = {d.label: d.size for d in found.detection_limits}
+    assert limits["spring@m2"] > 4e3
+
+
+def test_an_effect_that_the_library_lacks_is_unknown_and_its_place_is_told() -> None:
+    only = {k: v for k, v in GENERIC.items() if k == "damper"}
+    found = of_chain(7, added(Spring, 1.6e6, {"m3.z": 1.0}), GOOD, only)
+    assert found.verdict == "unknown_effect"
+    assert found.detection_limits == ()
+    assert "force levels" in found.next_measurement
+
+
+# --- the planetary rig ------------------------------------------------------------------------------------------
+
+
+@cache
+def cracked() -> Diagnosis:
+    rig = planetary()
+    measured = planetary_modes(rig, 1, GOOD, Hidden({"sun-planet1 mesh": 0.65}), ("no_ring",))
+    return diagnose(observed(rig, measured), rig, MESHES, None, SETTINGS)
+
+
+def test_a_cracked_mesh_is_named_with_its_size() -> None:
+    found = cracked()
+    assert found.verdict == "effect"
+    first = found.candidates[0]
+    assert first.label == "mesh_stiffness_loss@sun-planet1"
+    size = first.parameters["fraction"]
+    assert abs(size.value - 0.35) < 3 * size.std
+    assert 0.002 < size.std < 0.1
+
+
+def test_the_error_of_one_model_is_one_number() -> None:
+    found = cracked()
+    first = found.candidates[0]
+    bottom, top = found.ladder.rungs
+    assert found.error == bottom.error
+    assert found.heldout_error == bottom.heldout_error
+    assert first.error_before == pytest.approx(bottom.error, rel=0.02)
+    assert first.error_after == pytest.approx(top.error, rel=0.02)
+
+
+def test_probabilities_of_all_hypotheses_and_of_nothing_add_up_to_one() -> None:
+    found = cracked()
+    assert sum(found.probabilities.values()) == pytest.approx(1)
+    assert found.probabilities[NOTHING] == found.null_probability < 1e-3
+
+
+def test_a_diagnosis_survives_the_store(tmp_path: Path) -> None:
+    found = cracked()
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        codec.write(file, "d", found)
+        back = codec.read(file, "d", Diagnosis)
+    assert repr(back.candidates) == repr(found.candidates)
+    assert [r.error for r in back.ladder.rungs] == [r.error for r in found.ladder.rungs]
+    assert back.ladder.scatters == found.ladder.scatters
+    assert back.probabilities == found.probabilities
+    assert back.detection_limits == found.detection_limits
+
+
+def test_a_healthy_planetary_rig_with_parts_that_differ_is_adequate() -> None:
+    rig = planetary()
+    measured = planetary_modes(rig, 3, NORMAL, configurations=("no_ring",))
+    found = diagnose(observed(rig, measured), rig, MESHES, None, SETTINGS)
+    assert found.verdict == "adequate"
+    assert 0.6 < found.error < 1.4
+
+
+def test_a_support_far_out_of_its_tolerance_is_named_by_its_parameter() -> None:
+    rig = planetary()
+    hidden = Hidden({"sun bearing x": 1.8, "sun bearing y": 1.8})
+    measured = planetary_modes(rig, 3, GOOD, hidden, ("no_ring",))
+    found = diagnose(observed(rig, measured), rig, MESHES, None, SETTINGS)
+    first = found.candidates[0]
+    assert first.label == "out_of_tolerance@sun_bearing_stiffness"
+    size = first.parameters["relative_change"]
+    assert size.value == pytest.approx(0.8, abs=max(0.1, 3 * size.std))
+
+
+def test_what_is_known_already_is_not_looked_for_again() -> None:
+    rig = planetary()
+    measured = planetary_modes(rig, 1, GOOD, Hidden({"sun-planet1 mesh": 0.65}), ("no_ring",))
+    label = "mesh_stiffness_loss@sun-planet1"
+    known = Model().plus(parse_effect(label, rig), {})
+    found = diagnose(observed(rig, measured), rig, MESHES, known, SETTINGS)
+    assert found.verdict == "adequate"
+    assert label not in found.probabilities
+    assert found.ladder.rungs[0].effects == (label,)
+
+
+# --- verdicts, groups and held-out data ----------------------------------------------------------------------------
+
+
+def test_effects_that_explain_the_data_alike_are_a_group_with_a_measurement_that_parts_them() -> None:
+    # no shapes: a symmetric chain tells nothing of left or right
+    measured = chain_modes(8, GOOD, added(Spring, 4e5, {"m2.z": 1.0}))["all"]
+    plain = from_frequencies("all", measured.frequency_hz)
+    rig = chain()
+    found = diagnose(observed(rig, {"all": plain}), rig, {"spring": GENERIC["spring"]}, None, SETTINGS)
+    assert found.verdict == "ambiguous"
+    group = set(found.indistinguishable[0])
+    assert {"spring@m2", "spring@m4"} <= group
+    listed = {c.label for c in found.candidates}
+    assert group <= listed
+    assert found.next_measurement
+
+
+def test_three_frequencies_do_not_name_an_effect() -> None:
+    rig = planetary()
+    one = {"with_ring": from_frequencies("with_ring", [47.0, 98.0, 519.0])}
+    found = diagnose(observed(rig, one), rig, MESHES, None, SETTINGS)
+    assert found.verdict == "not_enough_data"
+    assert not names_of(found)
+
+
+def test_the_right_effect_predicts_what_was_held_out_and_a_wrong_one_does_not() -> None:
+    rig = chain()
+    observations = observed(rig, chain_modes(9, GOOD, added(Mass, 1.0, {"m4.z": 1.0})))
+    right = learned(observations, _with(observations, "mass@m4"))
+    scatters = right.posterior.scatters
+    fits = {"nothing": fit_base(observations, Model()), "damper@m1": _with(observations, "damper@m1")}
+    density = {k: held_out(observations, at_scatters(observations, f, scatters)) for k, f in fits.items()}
+    best = held_out(observations, right)
+    assert best.log_density > max(d.log_density for d in density.values()) + 3
+    assert best.error < 1.5 < density["nothing"].error
+
+
+def _with(observations: ModeObservations, label: str) -> Fit:
+    return fit_base(observations, Model().plus(parse_effect(label, observations.rig), {}))
+
+
+def test_an_effect_is_claimed_only_where_everything_supports_it() -> None:
+    rig = chain()
+    observations = observed(rig, chain_modes(10, NORMAL))
+    base = fit_base(observations, Model())
+    ranking = rank(observations, base, list_hypotheses(rig, GENERIC), 1)
+    judged = [judge(observations, ranking, r, SETTINGS) for r in ranking.ranked if r.final]
+    assert judged
+    assert not any(j.claimed for j in judged)
+    assert all(j.doubt for j in judged)
+
+
+def test_learned_scatters_are_those_of_the_laboratory() -> None:
+    found = of_chain(15, lab=NORMAL)
+    told = {s.name: s for s in found.ladder.scatters}
+    assert {"part_scatter", "calibration", "damping_scatter", "frequency_scatter", "shape_scatter"} <= set(
+        told
+    )
+    assert told["part_scatter"].stated == 0.02
+    assert 0.008 < told["part_scatter"].learned < 0.06
+    assert 0.01 < told["calibration"].learned < 0.1
+
+
+def test_the_number_of_processes_does_not_change_a_digit() -> None:
+    hidden, library = added(Spring, 2e5, {"m2.z": 1.0}), {"mass": GENERIC["mass"]}
+    one = of_chain(1, hidden, library=library)
+    two = of_chain(1, hidden, library=library, settings=SETTINGS.model_copy(update={"processes": 2}))
+    assert one.probabilities == two.probabilities
+    assert repr(one.ladder) == repr(two.ladder)
+
+
+def test_effects_that_cannot_be_pickled_are_fitted_in_other_processes_too() -> None:
+    own = replace(GENERIC["spring"], id="my_spring", find_places=lambda a: a.bodies, generic=False)
+    found = of_chain(
+        1,
+        added(Spring, 2e5, {"m2.z": 1.0}),
+        library={"my_spring": own},
+        settings=SETTINGS.model_copy(update={"processes": 2}),
+    )
+    assert found.candidates[0].label == "my_spring@m2"
+
+
+def test_a_ladder_of_given_effects_is_measured_at_one_yardstick() -> None:
+    rig = planetary()
+    measured = planetary_modes(rig, 1, GOOD, Hidden({"sun-planet1 mesh": 0.65}), ("no_ring",))
+    model = Model().plus(parse_effect("mesh_stiffness_loss@sun-planet1", rig), {})
+    up = make_ladder(observed(rig, measured), [Model(), model])
+    assert [r.effects for r in up.rungs] == [(), ("mesh_stiffness_loss@sun-planet1",)]
+    assert up.rungs[1].error < 1.3 < up.rungs[0].error
+    assert up.rungs[1].heldout_error < up.rungs[0].heldout_error
+    assert up.rungs[1].error == pytest.approx(cracked().ladder.rungs[1].error, rel=0.05)
+
+
+# --- data that are hard to work with ----------------------------------------------------------------------------
+
+
+def test_hopeless_data_give_a_verdict_and_no_error() -> None:
+    rig = chain()
+    measured = chain_modes(16)["all"]
+    assert measured.shapes is not None
+    cases = {
+        "one mode": from_frequencies("all", [18.0]),
+        "all alike": from_frequencies("all", [40.0, 40.0, 40.0]),
+        "far off": replace(measured, frequency_hz=measured.frequency_hz * [4.0, 0.3, 1.0, 3.0, 0.5]),
+        "no shapes": replace(measured, shapes=np.full(measured.shapes.shape, np.nan)),
+        "no damping": replace(measured, damping_ratio=np.full(5, np.nan), damping_std=np.full(5, np.nan)),
+    }
+    for name, modes in cases.items():
+        found = diagnose(observed(rig, {"all": modes}), rig, {"mass": GENERIC["mass"]}, None, SETTINGS)
+        assert found.verdict in ("adequate", "effect", "ambiguous", "unknown_effect", "not_enough_data"), name
+        assert sum(found.probabilities.values()) == pytest.approx(1), name
+        assert np.isfinite(found.error), name
+
+
+def test_no_modes_at_all_are_refused_or_called_too_few() -> None:
+    rig = chain()
+    found = diagnose(observed(rig, {"all": from_frequencies("all", [])}), rig, GENERIC, None, SETTINGS)
+    assert found.verdict == "not_enough_data"
+    assert not names_of(found)
