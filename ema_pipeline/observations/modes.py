@@ -42,6 +42,9 @@ DAMPING_SCATTER = "damping_scatter"
 FREQUENCY = "frequency_scatter"
 SHAPE = "shape_scatter"
 
+DRIFT_STD = 3e-4
+"""1 σ of what all frequencies of one configuration are off together: 2 K in steel."""
+
 UNEXPLAINED = 12.0
 """Cost, in the log posterior, of a measured mode without a model mode."""
 UNSEEN = 3.0
@@ -227,6 +230,11 @@ def _calibration(sensor: str, channel: ChannelQuality) -> str:
     return f"calibration of {channel.name or sensor}"
 
 
+def _drift(configuration: str) -> str:
+    """Name of the unknown: temperature and time move all frequencies of one configuration alike."""
+    return f"drift of {configuration}"
+
+
 def _transverse(sensor: str) -> str:
     return f"transverse sensitivity at {sensor}"
 
@@ -299,8 +307,10 @@ class ModeProblem:
         gains = {_calibration(s, c): c.calibration_std / CALIBRATION_STD for s, c in sensors.items()}
         gains = {name: std for name, std in gains.items() if std > 0}
         across = {s: c.transverse for s, c in sensors.items() if c.transverse > 0 and self._has_across(s)}
+        drifts = [_drift(d.configuration) for d in self.observations.data]
         return joined(
             self.model.unknowns,
+            Unknowns.plain(drifts, DRIFT_STD),
             Unknowns.plain(tuple(gains), list(gains.values()), CALIBRATION),
             Unknowns.plain([_transverse(s) for s in across], list(across.values())),
         )
@@ -587,13 +597,18 @@ class _Configuration:
         slopes: ModeDerivatives | None,
     ) -> _Rows:
         d = self.data
+        drift = self.problem.unknowns.index[_drift(d.configuration)]
+        slope = self._none
+        if slopes is not None:
+            slope = self._padded(slopes.log_frequency)
+            slope[:, drift] = 1.0
         return _Rows(
-            d.log_frequency[on] - np.log(np.maximum(solution.frequency_hz[match], 1e-6)),
+            d.log_frequency[on] - np.log(np.maximum(solution.frequency_hz[match], 1e-6)) - self.x[drift],
             d.log_frequency_std[on],
             np.ones(len(on)),
             FREQUENCY,
             self.heat,
-            self._none if slopes is None else self._padded(slopes.log_frequency),
+            slope,
         )
 
     def _damping(
