@@ -5,6 +5,7 @@
     python benchmarks/identification_study.py coverage --cases 500
     python benchmarks/identification_study.py noise --cases 30
     python benchmarks/identification_study.py window --cases 60
+    python benchmarks/identification_study.py moving --cases 20
 
 Records are simulated by the simulator of the tests (blow, response, noise on all channels) and go through the
 program's own hit finding, checks and FRFs. A true mode counts as found when an identified mode lies within
@@ -44,7 +45,10 @@ from ema_pipeline.ingest.description import read_description
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import Record, cut_hit
+from ema_pipeline.modal.circle import attach_circles
 from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.moving import identify_hits
+from ema_pipeline.modal.pooling import pooled
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel
 
@@ -317,6 +321,82 @@ def coverage_study(cases: int, first: int, settings: ModalSettings) -> None:
         )
 
 
+def moving_case(seed: int) -> tuple[TrueSystem, Hits, list[int], list[int]]:
+    """A system whose frequencies move: drift 0.1 %, half of its modes soften by 0.1 %, calibration 4 %."""
+    rng = np.random.default_rng(90_000 + seed)
+    n_out, n_ref = int(rng.integers(4, 17)), int(rng.integers(1, 4))
+    system = random_system(
+        rng, n_modes=int(rng.integers(4, 11)), n_dofs=n_out, low_hz=50, high_hz=760, min_spacing=0.03,
+        damping=(0.002, 0.02),
+    )  # fmt: skip
+    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
+    dofs_out, dofs_in = list(range(n_out)), list(range(n_ref))
+    hits = simulate_hits(
+        system, dofs_out, dofs_in, f_max=800.0, record_s=float(np.clip(6.0 / slowest, 1.28, 10.0)),
+        n_hits=int(rng.integers(1, 6)),
+        force_noise=rng.uniform(0.01, 0.05), response_noise=rng.uniform(0.01, 0.05), rng=rng,
+        drift=1e-3, softening=1e-3, calibration=0.04,
+    )  # fmt: skip
+    return system, hits, dofs_out, dofs_in
+
+
+def moving_study(cases: int, first: int, settings: ModalSettings, verbose: bool) -> None:
+    """Modes of hits that differ in frequency, as the stage finds them: aligned, with circles, pooled.
+
+    One hit in all, or hits on one point only once each, cannot tell drift; coverage is given for both.
+    """
+    truth = found = spurious = 0
+    z: dict[str, list[float]] = {"frequency": [], "frequency, several hits": [], "damping": []}
+    clock = 0.0
+    for seed in range(first, first + cases):
+        system, made, dofs_out, dofs_in = moving_case(seed)
+        records = records_of(made, dofs_out, dofs_in)
+        by_file, judged = {r.file: r for r in records}, [h for h in hits_of_test(records) if h.accepted]
+
+        def hits(by_file=by_file, judged=judged):
+            return (cut_hit(by_file[h.file], h) for h in judged)
+
+        frfs = estimate_frfs(hits())
+        bound = crlb_decay(system, made, frfs, dofs_out, dofs_in)
+        clock -= time.perf_counter()
+        one = identify_hits(hits, frfs, FrfSettings(), settings)
+        model = pooled(attach_circles(one.frfs, one.modal), one.alignment, frfs.record_s)
+        clock += time.perf_counter()
+        pairs, extra = match(system, model)
+        seen = bound < INVISIBLE_STD
+        missed = [t for t in np.flatnonzero(seen) if t not in pairs]
+        truth, found, spurious = (
+            truth + int(seen.sum()),
+            found + int(seen.sum()) - len(missed),
+            spurious + len(extra),
+        )
+        for t, j in pairs.items():
+            mode = model.modes[j]
+            off = (mode.frequency_hz - system.frequency_hz[t]) / mode.frequency_std_hz
+            z["frequency"].append(off)
+            if len(judged) > 1:
+                z["frequency, several hits"].append(off)
+            z["damping"].append((mode.damping_ratio - system.damping_ratio[t]) / mode.damping_std)
+        if verbose and (missed or extra):
+            print(
+                f"  seed {seed}: points {len(dofs_in)} hits {len(judged)} missed",
+                [round(float(system.frequency_hz[t]), 2) for t in missed],
+                "extra",
+                [
+                    (round(model.modes[j].frequency_hz, 2), round(model.modes[j].damping_ratio, 4))
+                    for j in extra
+                ],
+                flush=True,
+            )
+    print(f"modes {truth}  time per case {clock / cases:.2f} s")
+    print(
+        f"recall {found / truth:.4f}  precision {found / max(found + spurious, 1):.4f} ({spurious} spurious)"
+    )
+    for name, values in z.items():
+        inside = np.abs(np.array(values)) < 1.645
+        print(f"90 % interval of {name} covers {inside.mean():.3f} of {len(values)}")
+
+
 END_VALUES = (0.5, 0.2, 0.05, 0.01, 0.001)
 """What the exponential windows of the study have come down to at the end of the record."""
 
@@ -390,7 +470,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("study", choices=["random", "pairs", "noise", "coverage", "window"])
+    parser.add_argument("study", choices=["random", "pairs", "noise", "coverage", "window", "moving"])
     parser.add_argument("--cases", type=int, default=50)
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
     parser.add_argument("--engine", default="plscf", choices=["plscf", "lscf", "sdypy"])
@@ -407,6 +487,8 @@ def main() -> None:
         noise_study(args.cases, args.first, settings)
     elif args.study == "window":
         window_study(args.cases, args.first, settings, args.verbose)
+    elif args.study == "moving":
+        moving_study(args.cases, args.first, settings, args.verbose)
     else:
         coverage_study(args.cases, args.first, settings)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from ema_pipeline.diagnose.explain import size_text
 
+from ema_pipeline.diagnose.sentences import size_text
 from ema_pipeline.diagnose.types import EffectSize, Ladder, Rung, TimeTrace
 from ema_pipeline.dof import Dof
 from ema_pipeline.report.diagnosis import hits_words, noise_words, size_words

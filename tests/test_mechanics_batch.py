@@ -69,7 +69,7 @@ def plain(
         PolynomialSpring("cubic", {"hub.x": 1.0}, cubic=3e11),
         PolynomialSpring("quadratic", {"hub.x": 1.0}, quadratic=-1e8),
         DryFriction("friction", {"hub.x": 1.0}, 4.0),
-        PartingSpring("contact", {"hub.x": 1.0, "rim.x": -1.0}, 2e5, 0.0, 1e-5, 1e-3),
+        PartingSpring("contact", {"hub.x": 1.0, "rim.x": -1.0}, 2e5, preload=1e-5, gap=1e-3),
     ],
     ids=lambda e: e.name,
 )
@@ -110,7 +110,7 @@ def test_lines_in_closed_form_are_those_of_the_simulated_signals(substeps: int) 
         base.add(
             PolynomialSpring("cubic", {"hub.x": 1.0}, cubic=2e11), DryFriction("f", {"rim.x": 1.0}, 0.4)
         ),
-        base.add(PartingSpring("contact", {"hub.x": 1.0, "rim.x": -1.0}, 2e5, 0.0, 2e-6, 1e-5)),
+        base.add(PartingSpring("contact", {"hub.x": 1.0, "rim.x": -1.0}, 2e5, preload=2e-6, gap=1e-5)),
     ]
     force = np.stack([pulse(601, p) for p in (30.0, 200.0)])
     rows = np.array([[1.0, 0.5, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0]])
@@ -131,7 +131,7 @@ def test_lines_in_closed_form_are_those_of_the_simulated_signals(substeps: int) 
 def test_strikes_shorter_than_a_sample_are_read_as_an_analyser_reads_them() -> None:
     """Against the general integrator at 16 times the rate behind another filter, a plain FIR low-pass."""
     model = RIG.assembly("test", TRUE).add(
-        PartingSpring("contact", {"hub.x": 1.0, "rim.x": -1.0}, 2e7, 0.0, 2e-7, 1e-3)
+        PartingSpring("contact", {"hub.x": 1.0, "rim.x": -1.0}, 2e7, preload=2e-7, gap=1e-3)
     )
     force = pulse(600, 100.0)
     rows = np.eye(4)[[0, 2]]

@@ -14,7 +14,12 @@ from ema_pipeline.frf.warp import WarpedTransform
 from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import HitSamples, cut_hit
 from ema_pipeline.modal.drift.shifts import movement
+from ema_pipeline.modal.earned import has_peak
+from ema_pipeline.modal.fit import Estimate
+from ema_pipeline.modal.left_out import left_out, sentences
 from ema_pipeline.modal.moving import HitModes, identify_hits
+from ema_pipeline.modal.peaks import KnownPeaks
+from ema_pipeline.modal.pooling import Witness, pool
 from ema_pipeline.modal.settings import ModalSettings
 
 SYSTEM = random_system(
@@ -106,3 +111,34 @@ def test_hits_that_do_not_move_are_left_as_they_are() -> None:
     found = identified(SYSTEM, 3, [0, 3])
     assert not found.alignment.aligned
     assert not any("moves" in flag for mode in found.modal.modes for flag in mode.flags)
+
+
+def test_estimates_that_disagree_widen_the_interval_and_two_of_them_move_the_value() -> None:
+    pole = Witness("all FRFs", 40.06, 0.01)
+    circle, hit = Witness("circles", 40.16, 0.01), Witness("single hits", 40.17, 0.01)
+    assert pool([pole, Witness("circles", 40.07, 0.01)], 0.0, "Hz", 1.0) == (40.06, 0.01, "")
+    value, std, said = pool([pole, circle], 0.0, "Hz", 1.0)
+    assert value == pole.value
+    assert std == pytest.approx(np.hypot(0.01, 0.05))
+    assert "circles 40.16 Hz" in said
+    value, std, _ = pool([pole, circle, hit], 0.0, "Hz", 1.0)
+    assert value == pytest.approx(40.13, abs=0.01)
+    assert all(abs(w.value - value) < 2 * std for w in (pole, circle, hit))
+
+
+def test_a_heavy_pole_without_a_peak_is_told_from_one_that_makes_a_peak() -> None:
+    omega = 2 * np.pi * np.linspace(10, 100, 600)
+    pole = complex(-0.04, 1.0) * 2 * np.pi * 50
+    power = np.abs(1 / (1j * omega - pole)) ** 2
+    assert has_peak(omega, power, pole)
+    slope = 1 / (1 + (omega / omega[0]) ** 2)
+    noise = np.random.default_rng(2).exponential(size=len(omega))
+    assert not has_peak(omega, slope * (1 + 0.1 * noise), pole)
+
+
+def test_a_plain_peak_without_a_mode_is_named() -> None:
+    peak = KnownPeaks(np.array([-3 + 300j, -4 + 500j]), np.array([6.0, 8.0]), np.zeros((2, 2)))
+    modes = Estimate(np.array([-3.1 + 300.2j]), np.ones((1, 1), complex))
+    (named,) = left_out([], peak, modes, 0.0)
+    assert named.frequency_hz == pytest.approx(500 / (2 * np.pi), rel=1e-3)
+    assert "has no mode" in sentences((named,))[0]

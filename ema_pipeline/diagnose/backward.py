@@ -1,8 +1,10 @@
-"""Backward steps of the selection: what was added early may be needless, or elsewhere, once the rest is known."""
+"""Backward steps of the selection: what was added early may be needless, or something else, once the rest is known."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+
+import numpy as np
 
 from ema_pipeline.diagnose.claims import Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
@@ -16,10 +18,10 @@ def reconsidered(
     observations: Observations,
     start: Fit,
     claimed: Sequence[Judged],
-    hypotheses: Sequence[Hypothesis],
+    rivals: dict[str, tuple[Judged, ...]],
     settings: DiagnoseSettings,
 ) -> list[Judged]:
-    """Claims without those that are needless by now, and with those moved that explain more elsewhere.
+    """Claims without those that are needless by now, and with those replaced that a rival explains better.
 
     Parameters
     ----------
@@ -28,8 +30,8 @@ def reconsidered(
         The model before any claim.
     claimed : sequence of Judged
         In the order in which they were added.
-    hypotheses : sequence of Hypothesis
-        All that was asked.
+    rivals : dict of str to tuple of Judged
+        By the label of a claim: the finalists of its round. A replacement inherits them.
     settings : DiagnoseSettings
 
     Returns
@@ -41,7 +43,7 @@ def reconsidered(
     fit = learned(observations, claimed[-1].ranked.fit)
     changed = False
     while len(now) > 1:
-        better = _best_change(observations, start.model, now, fit, hypotheses, settings)
+        better = _best_change(observations, start.model, now, fit, rivals, settings)
         if better is None:
             break
         now, fit, changed = *better, True
@@ -53,22 +55,26 @@ def _best_change(
     known: Model,
     now: Sequence[Hypothesis],
     fit: Fit,
-    hypotheses: Sequence[Hypothesis],
+    rivals: dict[str, tuple[Judged, ...]],
     settings: DiagnoseSettings,
 ) -> tuple[list[Hypothesis], Fit] | None:
     """The change that raises the evidence most, a needless effect counting as much as a claim needs."""
+    labels = {h.label for h in now}
     options = []
     for i, one in enumerate(now[:-1]):  # the last was judged with all others known
         rest = [h for h in now if h is not one]
         without = _fitted(observations, known, rest, fit)
-        options.append((without.log_evidence + settings.claim, rest, without))
-        for other in hypotheses:
-            if other.placed.effect.id == one.placed.effect.id and other not in now:
-                moved = [*now[:i], other, *now[i + 1 :]]
-                found = _fitted(observations, known, moved, fit, (one, other))
-                options.append((found.log_evidence - settings.alike, moved, found))
-    score, change, found = max(options, key=lambda option: option[0])
-    return (change, found) if score > fit.log_evidence else None
+        options.append((without.log_evidence + settings.claim, rest, without, one, one))
+        for rival in rivals.get(one.label, ()):
+            if rival.hypothesis.label not in labels:
+                moved = [*now[:i], rival.hypothesis, *now[i + 1 :]]
+                found = _fitted(observations, known, moved, fit, rival)
+                options.append((found.log_evidence - settings.alike, moved, found, one, rival.hypothesis))
+    score, change, found, before, after = max(options, key=lambda option: option[0])
+    if score <= fit.log_evidence:
+        return None
+    rivals.setdefault(after.label, rivals.get(before.label, ()))
+    return change, found
 
 
 def _fitted(
@@ -76,20 +82,19 @@ def _fitted(
     known: Model,
     effects: Sequence[Hypothesis],
     near: Fit,
-    moved: tuple[Hypothesis, Hypothesis] | None = None,
+    rival: Judged | None = None,
 ) -> Fit:
-    """A model begun at a fit nearby, one effect having moved; scatters learned."""
+    """A model begun at a fit nearby, a rival at its own sizes; scatters learned."""
     model = known
     for h in effects:
         model = model.plus(h.placed, h.scales)
     problem = model.problem(observations)
-    x = transferred(near.posterior, problem.unknowns, problem.start())
-    if moved is not None:
-        before, after = (h.placed for h in moved)
-        for p in after.effect.parameters:
-            x[problem.unknowns.index[after.parameter_name(p.name)]] = near.posterior.value(
-                before.parameter_name(p.name)
-            )
+    x = transferred(near.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+    if rival is not None:
+        sizes = rival.ranked.fit.posterior
+        for p in rival.hypothesis.placed.effect.parameters:
+            name = rival.hypothesis.placed.parameter_name(p.name)
+            x[problem.unknowns.index[name]] = sizes.value(name)
     return learned(observations, refined(observations, model, x, near.posterior.scatters, steps=20))
 
 

@@ -12,15 +12,18 @@ from numpy.typing import NDArray
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
 from ema_pipeline.diagnose.selection import Progress
+from ema_pipeline.diagnose.sentences import label_text, size_text, summary
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Diagnosis, Ladder, Localisation
 from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.inference import Posterior, descend, learn
 from ema_pipeline.loops.compare import loop_fits
 from ema_pipeline.loops.sentences import failures
 from ema_pipeline.loops.types import LoopModel
+from ema_pipeline.mechanics.cycles import Cycles
 from ema_pipeline.observations.fitting import Model
 from ema_pipeline.observations.loop_data import SAME_FREQUENCY
-from ema_pipeline.observations.loop_forces import effects_of_loops
+from ema_pipeline.observations.loop_forces import IsolatorForce, effects_of_loops
 from ema_pipeline.observations.loop_regions import regions
 from ema_pipeline.observations.loops import LoopObservations, LoopProblem
 from ema_pipeline.observations.rig_model import SizeMap
@@ -29,6 +32,12 @@ MOST_EFFECTS = 6
 """Most effects that are added in turn: effects of an isolator act together more often than those of a structure."""
 _LISTED = 3
 """Thirds of the cycle that are reported."""
+_TRIED = ((0.5, 1.0), (2.0, 1.0), (4.0, 1.0), (1.0, 0.5), (1.0, 1.5))
+"""Factors on frequency and amplitude of the further loops that are thought of."""
+_POINTS = 128
+"""Points of a further loop."""
+_TOLD = 2.0
+"""Standard deviations by which a further loop would have to tell two models apart."""
 _FREE = 0.4
 """Prior 1 σ of the logarithm of a family from which the loops determine it."""
 _SAME = 1 - 1e-9
@@ -67,6 +76,8 @@ def diagnose_loops(
     found = diagnose(
         observations, observations.rig, library, known, settings, progress, hypotheses=hypotheses
     )
+    if found.verdict == "ambiguous":
+        found = _told_apart(observations, library, found, settings)
     last = found.ladder.rungs[-1]
     values = {name: size.value for name, size in last.parameters.items()}
     placed = placed_effects(observations, library, last.effects)
@@ -173,6 +184,101 @@ def _begun(placed: PlacedEffect) -> tuple[Mapping[str, float], ...]:
         name = placed.parameter_name(p.name)
         options.append([(name, float(np.clip(s, low, high))) for s in starts])
     return tuple(dict(combination) for combination in product(*options))
+
+
+def _told_apart(
+    observations: LoopObservations,
+    library: Mapping[str, Effect],
+    found: Diagnosis,
+    settings: DiagnoseSettings,
+) -> Diagnosis:
+    """The diagnosis without rivals that the rest of the model has ruled out or made the same, and the loop that would
+    tell the others apart."""
+    top = found.ladder.rungs[-1]
+    values = {name: size.value for name, size in top.parameters.items()}
+    group = found.indistinguishable[0] if found.indistinguishable else ()
+    mine = next((label for label in group if label in top.effects), "")
+    named = _learned_near(observations, placed_effects(observations, library, top.effects), values)
+    left, best = [], Further("", 0.0)
+    for rival in (label for label in group if mine and label != mine):
+        effects = [rival if label == mine else label for label in top.effects]
+        sizes = {c.label: c.parameters for c in found.candidates}.get(rival, {})
+        begin = values | {f"{rival}.{n}": s.value for n, s in sizes.items()}
+        other = _learned_near(observations, placed_effects(observations, library, effects), begin)
+        further = furthest(observations, named, other)
+        behind = named.posterior.log_evidence - other.posterior.log_evidence
+        if behind < settings.alike and further.separation > _TOLD:
+            left.append(rival)
+            best = max(best, further, key=lambda f: f.separation)
+    if left:
+        text = (
+            f"A loop {best.text} would tell {label_text(mine)} from {label_text(left[0])}: a difference of "
+            f"{best.separation:.2g} standard deviations is expected."
+        )
+        return dataclasses.replace(
+            found, next_measurement=text, indistinguishable=((mine, *left), *found.indistinguishable[1:])
+        )
+    claimed = [(c.label, size_text(c.parameters)) for c in found.candidates if c.label in top.effects]
+    errors = (found.ladder.rungs[0].error, top.error)
+    return dataclasses.replace(
+        found,
+        verdict="effect",
+        summary=summary("effect", claimed, errors, found.null_probability),
+        indistinguishable=found.indistinguishable[1:],
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Fitted:
+    """A model and its posterior."""
+
+    problem: LoopProblem
+    posterior: Posterior
+
+
+def _learned_near(
+    observations: LoopObservations, effects: Sequence[PlacedEffect], values: Mapping[str, float]
+) -> Fitted:
+    """A model fitted from known values, with learned scatters."""
+    problem, x = observations.fitted_near(effects, values)
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    return Fitted(problem, learn(problem, descend(problem, scatters, x), observations.scatters))
+
+
+@dataclasses.dataclass(frozen=True)
+class Further:
+    """A further loop, and by how many standard deviations two models differ in it."""
+
+    text: str
+    separation: float
+
+
+def furthest(observations: LoopObservations, one: Fitted, other: Fitted) -> Further:
+    """The further loop in which two models differ most; both keep their parameters."""
+    frequencies = [loop.frequency_hz for loop in observations.loops]
+    amplitudes = [loop.amplitude_m for loop in observations.loops]
+    share = float(np.median([loop.force_std_n / np.ptp(loop.force) for loop in observations.loops]))
+    phase = (np.arange(_POINTS) + 0.5) / _POINTS
+    found = []
+    for f, a in _TRIED:
+        frequency, amplitude = _extreme(frequencies, f), _extreme(amplitudes, a)
+        cycles = Cycles.of([frequency], [np.array([0.0, 0.0, amplitude])], [phase])
+        forces = []
+        for fit in (one, other):
+            law = IsolatorForce(observations.isolator, fit.problem.model, cycles)
+            force = law.at(fit.posterior.x[: fit.problem.offset], 0.0).total
+            forces.append(force - np.mean(force))
+        std = share * float(np.ptp(forces[0]))
+        text = f"at {frequency:.3g} Hz and {1e3 * amplitude:.3g} mm"
+        found.append(Further(text, float(np.linalg.norm(forces[0] - forces[1])) / max(std, 1e-300)))
+    return max(found, key=lambda one: one.separation)
+
+
+def _extreme(values: Sequence[float], factor: float) -> float:
+    """A factor times the largest or the smallest value, or the middle one where the factor is 1."""
+    if factor == 1.0:
+        return float(np.median(values))
+    return factor * (max(values) if factor > 1.0 else min(values))
 
 
 def loop_models(

@@ -19,8 +19,8 @@ from ema_pipeline.observations.fitting import Fit, Model, fit_base
 Progress = Callable[[float, str], None]
 
 NOTHING = "nothing"
-_SAME = 0.3
-"""Distance of two predictions, in standard deviations of all data together, that shows in no test."""
+_TIE = 0.1
+"""Difference of log evidence within which the order of two effects is that of their names."""
 
 
 @dataclass(frozen=True)
@@ -51,19 +51,12 @@ class Round:
         if best is None:
             return ()
         near = [j for j in self.judged if j.claimed and best.gain - j.gain < settings.alike]
-        different: list[Judged] = []
-        for j in sorted(near, key=lambda j: (j.hypothesis.generic, -j.gain)):
-            if not any(_same_prediction(j, other) for other in different):
-                different.append(j)
-        return tuple(different)
 
+        def order(j: Judged) -> tuple[bool, float, str]:
+            behind = best.gain - j.gain
+            return j.hypothesis.generic, behind if behind > _TIE else 0.0, j.hypothesis.label
 
-def _same_prediction(one: Judged, other: Judged) -> bool:
-    """True for fits that no data of this kind could tell apart: two names of the same physics."""
-    a, b = one.ranked.fit.posterior.residuals, other.ranked.fit.posterior.residuals
-    if len(a.values) != len(b.values):
-        return False
-    return float(np.linalg.norm(a.stated - b.stated)) < _SAME
+        return tuple(sorted(near, key=order))
 
 
 @dataclass(frozen=True)
@@ -105,6 +98,7 @@ def select(
     base = start = fit_base(observations, known)
     rounds: list[Round] = []
     claimed: list[Judged] = []
+    rivals: dict[str, tuple[Judged, ...]] = {}
     left: Sequence[Hypothesis] = hypotheses
     while True:
         low = len(rounds) / (settings.most_effects + 1)
@@ -120,8 +114,9 @@ def select(
         if not near or len(claimed) == settings.most_effects:
             return Selection(tuple(rounds), tuple(claimed), ranking.base)
         claimed.append(near[0])
+        rivals[near[0].hypothesis.label] = rounds[-1].judged
         if len(claimed) > 1:
-            claimed = reconsidered(observations, start, claimed, hypotheses, settings)
+            claimed = reconsidered(observations, start, claimed, rivals, settings)
         taken = {j.hypothesis.label for j in claimed}
         left = [h for h in hypotheses if h.label not in taken]
         base = fit_base(observations, claimed[-1].ranked.fit.model, claimed[-1].ranked.fit)

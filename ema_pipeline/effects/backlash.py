@@ -9,20 +9,20 @@ from ema_pipeline.effects.isolators import isolator_spring, isolators
 from ema_pipeline.mechanics.assembly import Assembly, Element, Spring
 from ema_pipeline.mechanics.laws import LooseSpring, PartingSpring
 
-_ALONE = ".spring"
-"""Ending of the places where the spring alone has the play, and the elements beside it go on in it."""
+_MOUNT = ".mount"
+"""Ending of the places where the isolator is loose as a whole: in the play none of its elements acts."""
 
 
 def _places(assembly: Assembly) -> tuple[str, ...]:
-    whole = isolators(assembly)
-    return (*whole, *(place + _ALONE for place in whole))
+    springs = isolators(assembly)
+    return (*springs, *(place + _MOUNT for place in springs))
 
 
 def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
     gap = values["gap"]
     if gap == 0.0:
         return assembly
-    kind = PartingSpring if place.endswith(_ALONE) else LooseSpring
+    kind = LooseSpring if place.endswith(_MOUNT) else PartingSpring
 
     def let_play(element: Element) -> Element:
         assert isinstance(element, Spring)
@@ -31,7 +31,7 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
             element.name, element.row, element.stiffness, element.loss_factor, preload=-0.5 * gap, gap=gap
         )
 
-    return assembly.edit([isolator_spring(place.removesuffix(_ALONE))], let_play)
+    return assembly.edit([isolator_spring(place.removesuffix(_MOUNT))], let_play)
 
 
 EFFECT = Effect(

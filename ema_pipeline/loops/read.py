@@ -27,7 +27,7 @@ def analyse_loops(
     """
     tell = progress or (lambda share, text: None)
     loops = load_loops(test, settings)
-    tell(0.3, "least squares on all loops")
+    tell(0.3, "the published model on all loops")
     return identify_isolator(loops, settings)
 
 

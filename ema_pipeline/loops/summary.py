@@ -10,7 +10,7 @@ from ema_pipeline.loops.types import Estimate, IsolatorResult
 
 def terminal_lines(result: IsolatorResult) -> list[str]:
     """Parameters, dampers, loss factors, what cannot be, and where the published model fails."""
-    lines = [f"{len(result.loops)} loops; parameters of the published model by least squares on all of them:"]
+    lines = [f"{len(result.loops)} loops; parameters of the published model fitted to all of them:"]
     lines += [f"  {_line(name, e)}" for name, e in result.parameters.items()]
     if result.relaxation:
         lines.append("with a relaxation (Maxwell branch) instead of a negative damper:")

@@ -157,7 +157,7 @@ class IsolatorResult:
     loops : tuple of Loop
         The measurement.
     parameters : dict of str to Estimate
-        From least squares on all loops: ``stiffness`` K1, ``quadratic_stiffness`` K2, ``cubic_stiffness`` K3,
+        From the posterior of all loops: ``stiffness`` K1, ``quadratic_stiffness`` K2, ``cubic_stiffness`` K3,
         ``viscous_damping`` c, ``hysteresis_force`` k_w, ``hysteresis_rho`` ρ, ``hysteresis_sigma`` σ, and
         ``hysteresis_stiffness`` k_w·ρ.
     names : tuple of str
@@ -175,8 +175,8 @@ class IsolatorResult:
     alone : tuple of LoopFit
         Every loop with parameters of its own.
     misfit_scale : float
-        Factor by which the standard deviations were widened because the model does not reach the data's own
-        accuracy; 1 where it does.
+        Root mean square of (measurement - model)/noise, 1 where the model reaches the data's own accuracy; what it
+        does not reach is in the standard deviations.
     relaxation : dict of str to Estimate
         Parameters of a fit with a Maxwell branch, made where the damper came out negative; empty otherwise.
     flags : tuple of str

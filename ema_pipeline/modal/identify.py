@@ -19,6 +19,7 @@ from ema_pipeline.modal.fit import (
     residual_fit,
     synthesis,
 )
+from ema_pipeline.modal.left_out import left_out, sentences
 from ema_pipeline.modal.noise import Noise, fit_law, flat_law, second_difference_power
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, seeded
 from ema_pipeline.modal.poles import PoleSet
@@ -177,6 +178,7 @@ def _model(
         )
         for k, j in enumerate(order)
     )
+    lost = left_out(charts, plain, estimate, frfs.response_decay_rad_s)
     return ModalModel(
         dofs=scaled.dofs,
         modes=result,
@@ -189,7 +191,8 @@ def _model(
         outputs=frfs.outputs,
         inputs=frfs.inputs,
         chart=chart,
-        notes=(*_notes(data, note), *_peaks_without_mode(plain.absent(estimate), frfs.response_decay_rad_s)),
+        notes=(*_notes(data, note), *sentences(lost)),
+        left_out=lost,
     )
 
 
@@ -285,15 +288,6 @@ def _synthesis(window: Window, modes: FittedModes) -> Complex:
         fitted += residual_fit(some, noise.weight(some.measured), fitted)
         total[rows] = np.where(some.measured[..., None], fitted, np.nan)
     return np.asarray(total.swapaxes(0, 1) if data.transposed else total)
-
-
-def _peaks_without_mode(absent: KnownPeaks, decay: float) -> list[str]:
-    """A sentence on each plain peak that no mode makes."""
-    return [
-        f"a plain peak at {abs(p + decay) / (2 * np.pi):.5g} Hz has no mode: with the other modes in the fit, the FRFs "
-        "do not need it; look at it in the FRFs"
-        for p in absent.poles
-    ]
 
 
 def _chart_of(window: Window, part: SubBand, settings: ModalSettings) -> PoleSet:

@@ -140,8 +140,12 @@ def _with_force(peak: PeakMovement) -> float:
 
 
 def _of_few(n_hits: int) -> float:
-    """How much wider than a normal one the interval of a mean of few values is."""
-    return float(scipy.stats.t.ppf(COVERED, max(n_hits - 1, 1)) / scipy.stats.norm.ppf(COVERED))
+    """How much wider than a normal one the interval of a mean of few values is.
+
+    The spread is one of maximum likelihood, which leaves out that the mean was estimated too.
+    """
+    unbiased = np.sqrt(n_hits / max(n_hits - 1, 1))
+    return float(unbiased * scipy.stats.t.ppf(COVERED, max(n_hits - 1, 1)) / scipy.stats.norm.ppf(COVERED))
 
 
 def _words(spread: float, trend: float) -> str:

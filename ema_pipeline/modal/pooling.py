@@ -92,8 +92,8 @@ def _weighed(mode: Mode, peak: PeakMovement | None, record_s: float, decay_rad_s
         )
         dampings.append(Witness("single hits", -pole.real / abs(pole), peak.spread[0] / (abs(pole) * few)))
     half_width = mode.damping_ratio * mode.frequency_hz
-    f, f_std, f_text = _pool(frequencies, FREQUENCY_TOLERANCE * half_width, "Hz", 1.0)
-    z, z_std, z_text = _pool(dampings, DAMPING_TOLERANCE * mode.damping_ratio, "%", 100.0)
+    f, f_std, f_text = pool(frequencies, FREQUENCY_TOLERANCE * half_width, "Hz", 1.0)
+    z, z_std, z_text = pool(dampings, DAMPING_TOLERANCE * mode.damping_ratio, "%", 100.0)
     if not f_text and not z_text:
         return mode
     texts = "; ".join(t for t in (f_text, z_text) if t)
@@ -109,7 +109,7 @@ def _weighed(mode: Mode, peak: PeakMovement | None, record_s: float, decay_rad_s
     )
 
 
-def _pool(found: list[Witness], tolerance: float, unit: str, scale: float) -> tuple[float, float, str]:
+def pool(found: list[Witness], tolerance: float, unit: str, scale: float) -> tuple[float, float, str]:
     """Value, standard deviation and a word on the disagreement; the first estimate where there is none.
 
     One witness alone only widens the interval; two that both contradict the first one move the value too.

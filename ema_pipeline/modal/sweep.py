@@ -29,7 +29,13 @@ from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, at_peak
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.segment import SegmentFit, fit_segment, measured_noise
 from ema_pipeline.modal.selection import link, votes
-from ema_pipeline.modal.uncertainty import left_to_go, parameter_covariance, shape_covariance
+from ema_pipeline.modal.uncertainty import (
+    left_to_go,
+    parameter_covariance,
+    row_scores,
+    scatter_over_rows,
+    shape_covariance,
+)
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -296,11 +302,17 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand) -> Fitt
     weight = fit.noise.weight(few.measured)
     parameters = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
     if compressible(window.data):
-        made = [
-            _shapes_and_stds(*_linear_fit(window.rows(rows), estimate), parameters)
-            for rows in window.data.row_blocks()
-        ]
+        made, scores = [], []
+        information = np.zeros_like(parameters)
+        for rows in window.data.row_blocks():
+            linear = _linear_fit(window.rows(rows), estimate)
+            made.append(_shapes_and_stds(*linear, parameters))
+            score, more = row_scores(estimate, linear[1].solution)
+            scores.append(score)
+            information += more
         shapes, stds = np.concatenate([s for s, _ in made]), np.concatenate([s for _, s in made])
+        if window.data.transposed:  # rows are struck points: other hits
+            parameters = _widened(parameters, scatter_over_rows(np.concatenate(scores), information))
     else:
         shapes, stds = _shapes_and_stds(few, fit, parameters)
     core = np.flatnonzero(between(estimate.poles, part.low, part.high))
@@ -317,6 +329,13 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand) -> Fitt
         held=fit.held[core],
         restless=far > AT_REST,
     )
+
+
+def _widened(covariance: Real, scatter: Real) -> Real:
+    """A covariance with each variance raised to that of the scatter where that is larger."""
+    own = np.diag(covariance)
+    factor = np.sqrt(np.maximum(np.diag(scatter) / np.where(own > 0, own, np.inf), 1.0))
+    return np.asarray(covariance * factor[:, None] * factor)
 
 
 def _linear_fit(window: Window, estimate: Estimate) -> tuple[FitData, SegmentFit]:

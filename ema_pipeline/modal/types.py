@@ -119,6 +119,25 @@ class StabilisationChart:
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """What looks like a mode and is none of the list.
+
+    Attributes
+    ----------
+    frequency_hz, damping_ratio : float
+    evidence : str
+        What speaks for it, e.g. ``"peak"``.
+    reason : str
+        Why it is left out.
+    """
+
+    frequency_hz: float
+    damping_ratio: float
+    evidence: str
+    reason: str
+
+
+@dataclass(frozen=True)
 class ModalModel:
     """Everything identified from one configuration's FRFs.
 
@@ -145,6 +164,8 @@ class ModalModel:
     chart : StabilisationChart
     notes : tuple of str
         Plain sentences, e.g. that a single reference cannot show a multiplicity.
+    left_out : tuple of LeftOut
+        Peaks and columns of stable poles without a mode.
     """
 
     dofs: tuple[Dof, ...]
@@ -159,3 +180,4 @@ class ModalModel:
     inputs: tuple[Dof, ...]
     chart: StabilisationChart
     notes: tuple[str, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()

@@ -77,6 +77,55 @@ def parameter_covariance(
     return np.asarray(0.5 * (parameters + parameters.T))
 
 
+FEWEST_GROUPS = 12
+"""Rows without which their scatter does not tell an interval."""
+
+
+def row_scores(estimate: Estimate, solution: LinearSolution) -> tuple[Real, Real]:
+    """What each row asks of the parameters, and the information of all rows together.
+
+    Returns
+    -------
+    scores : ndarray, (n_rows, n_parameters)
+        Gradient of each row at its own best shapes.
+    information : ndarray, (n_parameters, n_parameters)
+    """
+    z = parameter_columns(estimate, solution.shapes)
+    psi = np.stack([solution.shapes.real, solution.shapes.imag], axis=-1).reshape(len(solution.shapes), -1)
+    coefficients = np.einsum("iab,ob->oia", mixing(estimate.participation), psi)
+    n = coefficients.shape[-1]
+    misfit = solution.moment - np.einsum("oiab,oib->oia", solution.gram[..., :n], coefficients)
+    return np.einsum("oiap,oia->op", z, misfit, optimize=True), newton_step(estimate, solution).information
+
+
+def scatter_over_rows(scores: Real, information: Real) -> Real:
+    """Covariance of the parameters from the scatter of what single rows ask for.
+
+    Where rows are hits on different points, this is the jackknife over hits, to first order: it holds whatever differs
+    from hit to hit, be it noise or a structure that is not quite linear.
+
+    Parameters
+    ----------
+    scores : ndarray, (n_rows, n_parameters)
+    information : ndarray, (n_parameters, n_parameters)
+
+    Returns
+    -------
+    ndarray, (n_parameters, n_parameters)
+        0 for few rows.
+
+    References
+    ----------
+    Efron, B., "The Jackknife, the Bootstrap and Other Resampling Plans", SIAM 1982 (infinitesimal jackknife).
+    """
+    n = len(scores)
+    if n < FEWEST_GROUPS:
+        return np.zeros_like(information)
+    off = scores - scores.mean(axis=0)
+    inverse = _inverse(information)
+    return np.asarray(inverse @ (off.T @ off) @ inverse * n / (n - 1))
+
+
 def left_to_go(estimate: Estimate, solution: LinearSolution) -> Real:
     """Step (Re s, Im s) that each pole would still take to the best fit, (n_modes, 2).
 

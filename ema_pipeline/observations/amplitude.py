@@ -32,23 +32,22 @@ LINEARISATION = "linearisation"
 AMPLITUDE_STD = 0.02
 """1 σ of the logarithm of all amplitudes: the sensors' calibration, less what their number averages out."""
 
+_BEYOND = 3.0
+"""Growth of what linearisation leaves out per decay rate by which a pole moves: it is of first order in that."""
 _STEP = 1e-3
 """Step of the differences by sizes, in units of their prior σ."""
 _DECADES = 6.0
 _ALONG, _ACROSS = 19, 3
 """Sizes that are tried to begin with: their range, and their number for an effect's first size and the others."""
-_QUASI_STATIC = 0.5
-"""Modes below the lowest measured frequency times this take no part in static flexibility: they are slower than the
-decay of the motion that pushes the mean aside."""
 
 
 def hit_scatters() -> dict[str, Scatter]:
     """The hyper-parameters that single hits add to those of measured modes."""
     known = (
-        Scatter(DRIFT, "ln f of all modes from hit to hit", 1e-4, 1.0, 1e-4),
-        Scatter(HIT_FREQUENCY, "ln f of one mode from hit to hit", 3e-5, 1.0, 3e-5),
-        Scatter(HIT_DAMPING, "ln ζ of one mode from hit to hit", 5e-3, 1.0, 5e-3),
-        Scatter(LINEARISATION, "equivalent linearisation", 0.15, 0.3, 0.15),
+        Scatter(DRIFT, "ln f of all modes from hit to hit", 1e-4, 1.0, 1e-4, 20.0),
+        Scatter(HIT_FREQUENCY, "ln f of one mode from hit to hit", 3e-5, 1.0, 3e-5, 5.0),
+        Scatter(HIT_DAMPING, "ln ζ of one mode from hit to hit", 5e-3, 1.0, 5e-3, 15.0),
+        Scatter(LINEARISATION, "equivalent linearisation", 0.15, 0.3, 0.15, 2.0),
     )
     return {s.name: s for s in known}
 
@@ -127,12 +126,16 @@ class AmplitudeProblem:
         """Those of the modes, the scale of all amplitudes, every hit's drift and what linearisation leaves out."""
         hits = self.observations.hits
         drift = [f"drift of {h.configuration} {n}" for h in hits for n in h.names]
-        left = [_left_name(h, s, r) for h in hits for s in np.unique(h.sheet) for r in range(len(h.modes))]
+        sheets = [(h, s) for h in hits for s in np.unique(h.sheet)]
+        left = [_left_name(h, s, r) for h, s in sheets for r in range(len(h.modes))]
+        beyond = [1 + _BEYOND * h.reach(s) for h, s in sheets]
         return joined(
             self.modes.unknowns,
             Unknowns.plain(("amplitude of all modes",), AMPLITUDE_STD),
             Unknowns.plain(drift, 1.0, DRIFT),
-            Unknowns.plain(left, 1.0, LINEARISATION, lower=-1.0, upper=1.0),
+            Unknowns.plain(
+                left, np.concatenate([*beyond, np.zeros(0)]), LINEARISATION, lower=-1.5, upper=1.5
+            ),
         )
 
     @cached_property
@@ -142,14 +145,15 @@ class AmplitudeProblem:
         return tuple(self.unknowns.index[n] for n in names)
 
     def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
-        """`x` with the sizes of the effect added last at the best of a grid, where it depends on the amplitude.
+        """`x` with the sizes of the effect added last at the best of a grid; None where it is linear.
 
         From far off there is often no slope that leads to the right size: teeth that never part, friction that locks,
         and a quadratic spring of no size change nothing.
         """
-        names = [n for n in self.sizes if self._nonlinear and n.rpartition(".")[0] == self._nonlinear[-1]]
-        if not names or not self.observations.hits:
+        last = self.model.effects[-1] if self.model.effects else None
+        if last is None or last.effect.linear or not self.observations.hits:
             return None
+        names = [last.parameter_name(p.name) for p in last.effect.parameters]
         at = [self.unknowns.index[n] for n in names]
         grids = [_grid(self.sizes[n], _ALONG if i == 0 else _ACROSS) for i, n in enumerate(names)]
         matching = self.residuals(x, scatters, derivatives=False).matching
@@ -285,14 +289,9 @@ class _Hits:
         if not elements or not len(on):
             return total
         rows = element_rows(assembly, elements)
-        shapes = self.paired.solution.shapes[: rows.shape[1]]
-        stretch = rows @ shapes
-        frequency = self.paired.solution.frequency_hz
-        slow = frequency < _QUASI_STATIC * float(np.exp(data.log_frequency[:, on].min()))
-        flexible = np.where(slow, 0.0, 1 / self.paired.solution.eigenvalues)
-        along = np.zeros((len(elements), len(match)))
-        along[:, on] = stretch[:, match[on]]
-        linear = Linear(along, (stretch * flexible) @ stretch.T, self._displacement(x, match, on))
+        solution = self.paired.solution
+        stretch = rows @ solution.shapes[: rows.shape[1]]
+        linear = Linear.of(data, stretch, match, solution.eigenvalues, self._displacement(x, match, on))
         return shifted_poles(data, [self._scaled(e, x) for e in elements], linear)
 
     def _displacement(

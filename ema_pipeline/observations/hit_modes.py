@@ -37,6 +37,15 @@ _FIRST, _LAST = 0.03, 8.0
 """First and last instant, in units of 1/2σ of the fastest and the slowest mode; 99.7 % of the weight is between."""
 _PER_EFOLD = 1.1
 _STILL = 1e-300
+_QUASI_STATIC = 0.5
+"""Modes below the lowest measured frequency times this take no part in static flexibility: they are slower than the
+decay of the motion that pushes the mean aside."""
+_NEAR = 0.05
+"""Relative distance of squared frequencies within which a mode that is not in step gives no stretch at once."""
+_RIGID = 0.02
+_SETTLING_STEPS = 3
+_MOST_GIVEN = 5.0
+"""Change of a stretch by its own force that is not worth a further step, most steps, and largest change allowed."""
 _HEARD = 0.1
 """Motion of a mode over that of the largest that moves in step with it, below which a hit does not tell its pole."""
 _FINE = 400
@@ -146,6 +155,16 @@ class HitData:
                 groups.append([int(r)])
         return tuple(np.array(g) for g in groups)
 
+    def reach(self, sheet: int) -> Real:
+        """Largest measured change of each mode's pole between hits of a sheet, in its decay rates, (m,)."""
+        poles = np.where(self.used, self.poles, np.nan)[self.sheet == sheet]
+        known = np.isfinite(poles).any(axis=0)
+        middle = np.nanmedian(np.where(known, poles.real, 0.0), axis=0)
+        centre = middle + 1j * np.nanmedian(np.where(known, poles.imag, 0.0), axis=0)
+        apart = np.nan_to_num(np.abs(poles - centre))
+        usual = np.median(-self.poles.real, axis=0)
+        return np.where(known, apart.max(axis=0, initial=0.0) / usual, 0.0)
+
     @cached_property
     def weights(self) -> tuple[Real, Complex]:
         """Instants after the blow, (t,), and the weight of each in the pole that is read of every mode, (t, m)."""
@@ -232,16 +251,47 @@ class Linear:
     Attributes
     ----------
     along : ndarray, (n_elements, m)
-        Stretch of every element in each hit mode's mass-normalised shape.
+        Stretch of every element in each hit mode's mass-normalised shape; 0 for a mode that the model has not.
     flexibility : ndarray, (n_elements, n_elements)
         Static stretch per force, m/N.
+    elsewhere : ndarray, (n_elements, n_groups)
+        Stretch per force at the frequency of each group of modes that all other modes give, m/N.
     displacement : complex ndarray, (h, m)
         Amplitude of each modal coordinate just after the blow.
     """
 
     along: Real
     flexibility: Real
+    elsewhere: Real
     displacement: Complex
+
+    @classmethod
+    def of(
+        cls, data: HitData, stretch: Real, match: Integers, eigenvalues: Real, displacement: Complex
+    ) -> Linear:
+        """From the stretch of every element in every mode of the model, (n_elements, n).
+
+        Parameters
+        ----------
+        data : HitData
+        stretch : ndarray, (n_elements, n)
+        match : ndarray of int, (m,)
+            Mode of the model that each hit mode is; -1 for none.
+        eigenvalues : ndarray, (n,)
+            (rad/s)².
+        displacement : complex ndarray, (h, m)
+        """
+        along = np.where(match >= 0, stretch[:, match], 0.0)
+        lowest = float(np.median(data.poles.imag, axis=0).min())
+        flexible = np.where(eigenvalues < (_QUASI_STATIC * lowest) ** 2, 0.0, 1 / eigenvalues)
+        elsewhere = np.zeros((len(stretch), len(data.groups)))
+        for c, group in enumerate(data.groups):
+            square = float(np.mean(data.poles.imag[:, group])) ** 2
+            apart = eigenvalues - square
+            dynamic = apart / (apart**2 + (_NEAR * square) ** 2)
+            dynamic[match[group][match[group] >= 0]] = 0.0
+            elsewhere[:, c] = stretch**2 @ dynamic
+        return cls(along, (stretch * flexible) @ stretch.T, elsewhere, displacement)
 
 
 def shifted_poles(data: HitData, elements: Sequence[Nonlinear], linear: Linear) -> Complex:
@@ -249,9 +299,13 @@ def shifted_poles(data: HitData, elements: Sequence[Nonlinear], linear: Linear) 
 
     Notes
     -----
-    Of first order in the elements' forces: a force G·e^{jωt} along v changes the envelope of the mass-normalised
-    coordinate z by (j/2ω)(v·φ)G per second.
+    A force G·e^{jωt} along v changes the envelope of the mass-normalised coordinate z by (j/2ω)(v·φ)G per second. What
+    the force moves of all other modes changes the stretch at once: a spring of stiffness N in a place that gives
+    way by S per force stretches by 1/(1 + NS) of what it did.
     """
+    total = np.zeros(linear.displacement.shape, complex)
+    if not elements:
+        return total
     instants, weight = data.weights
     omega = np.median(data.poles.imag, axis=0)
     centre = np.array([np.mean(omega[g]) for g in data.groups])
@@ -264,10 +318,29 @@ def shifted_poles(data: HitData, elements: Sequence[Nonlinear], linear: Linear) 
     motions = [Motions(np.abs(p).reshape(-1, len(centre)), centre) for p in paths]
     offsets = settled_offsets(elements, motions, linear.flexibility)
     still = np.abs(z) < _STILL
-    total = np.zeros(linear.displacement.shape, complex)
-    for element, v, path, motion, offset in zip(elements, linear.along, paths, motions, offsets, strict=True):
-        stiffness = motion.stiffness(element, offset).reshape(path.shape)
-        force = (stiffness * path)[..., group_of]
+    for i, (element, motion) in enumerate(zip(elements, motions, strict=True)):
+        stiffness = _settled_stiffness(element, motion, offsets[i], linear.elsewhere[i])
+        force = (stiffness.reshape(paths[i].shape) * paths[i])[..., group_of]
         ratio = np.where(still, 0.0, force / np.where(still, 1.0, z))
-        total += 0.5j * v / omega * np.einsum("htm,tm->hm", ratio, weight)
+        total += 0.5j * linear.along[i] / omega * np.einsum("htm,tm->hm", ratio, weight)
     return total
+
+
+def _settled_stiffness(element: Nonlinear, motion: Motions, offset: Real, elsewhere: Real) -> Complex:
+    """Force over the stretch that the linear model has, once the stretch has settled, (n_states, n_groups)."""
+    stiffness = motion.stiffness(element, offset)
+    given = _given_way(stiffness, elsewhere)
+    for _ in range(_SETTLING_STEPS):
+        if np.max(np.abs(given - 1), initial=0.0) < _RIGID:
+            break
+        settled = Motions(motion.amplitude * np.abs(given), motion.omega)
+        stiffness = settled.stiffness(element, offset)
+        given = _given_way(stiffness, elsewhere)
+    return stiffness * given
+
+
+def _given_way(stiffness: Complex, elsewhere: Real) -> Complex:
+    """Stretch over that of the linear model, within `_MOST_GIVEN`."""
+    inverse = 1 + stiffness * elsewhere
+    size = np.abs(inverse)
+    return np.asarray(1 / (inverse / np.maximum(size, 1e-12) * np.clip(size, 1 / _MOST_GIVEN, _MOST_GIVEN)))

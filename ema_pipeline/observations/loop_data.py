@@ -18,6 +18,8 @@ SAME_FREQUENCY = 0.02
 """Loops whose frequencies agree to this share are taken as tests at one frequency."""
 _FEWEST_GROUPS = 3
 """Amplitudes or frequencies from which one can be left out and still be enclosed or extrapolated by two."""
+_ROUGH = 10
+"""Harmonic up to which what a model lacks may be as large as at the first: play, stick and slip reach that far."""
 FRICTION_RATE = 0.02
 """Rate, as a share of the largest, at which dry friction has reached most of its force: a regularisation."""
 _CLEARLY = 0.1
@@ -64,7 +66,13 @@ class LoopData:
         by_displacement = np.where(
             order <= len(loop.series) // 2, stiffness * loop.displacement_std_m * per_point, 0.0
         )
-        return cls(loop, basis, measured, np.hypot(loop.force_std_n, by_displacement), force / order)
+        return cls(
+            loop,
+            basis,
+            measured,
+            np.hypot(loop.force_std_n, by_displacement),
+            force / np.hypot(1.0, order / _ROUGH),
+        )
 
     @property
     def stiffness(self) -> float:

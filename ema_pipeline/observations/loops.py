@@ -58,7 +58,7 @@ _NEAR_STEPS = 10
 
 @dataclass(frozen=True)
 class Spread:
-    """Variance of the measured coefficients, N², each scatter's share in it, and its ratio to the stated one."""
+    """Variance of the measured coefficients, N², each scatter's share in it, and its ratio to the noise's."""
 
     variance: NDArray[np.float64]
     share: Mapping[str, NDArray[np.float64]]
@@ -137,9 +137,8 @@ class LoopObservations:
             FORCE_SCATTER: scatters[FORCE_SCATTER] ** 2 * unit,
             NOISE_SCATTER: scatters[NOISE_SCATTER] ** 2 * own,
         }
-        stated = own * (1 + UNSEEN_NOISE**2) + DISCREPANCY**2 * unit
         variance = own + sum(added.values())
-        return Spread(variance, {n: a / variance for n, a in added.items()}, variance / stated)
+        return Spread(variance, {n: a / variance for n, a in added.items()}, variance / own)
 
     @cached_property
     def cycles(self) -> Cycles:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import dataclasses
 import json
 import shlex
 from collections.abc import Mapping, Sequence
@@ -33,7 +32,7 @@ SECTIONS = (
 _CAPTIONS = {
     "models": "Measured loops, the linear spring, and the last model of the ladder",
     "misfit": "What each model leaves of the force along the cycle, one line per loop",
-    "candidates": "Probability that an effect is part of the model, over all sets of effects",
+    "candidates": "Probability of every effect as the first that the linear spring is missing",
     "ladder": "Error rung by rung, on all loops and on loops held out",
     "energy": "Energy per cycle over frequency, and the damper that its slope means; bars are two standard deviations",
     "loss_factor": "Loss factor over amplitude and frequency; bars are two standard deviations",
@@ -295,9 +294,7 @@ def _images(
         drawn["models"] = partial(models_figure, loops, models)
         drawn["misfit"] = partial(misfit_figure, loops, models)
     if found is not None:
-        # Sets are listed one by one in summary.json; the picture shows effects.
-        alone = dataclasses.replace(found, probabilities={})
-        drawn["candidates"] = partial(candidate_probabilities, alone)
+        drawn["candidates"] = partial(candidate_probabilities, found)
     if ladder is not None and ladder.rungs:
         drawn["ladder"] = partial(ladder_errors, ladder)
     figures = {name: draw() for name, draw in drawn.items()}

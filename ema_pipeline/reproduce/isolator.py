@@ -142,7 +142,7 @@ def _parameter_table(result: IsolatorResult) -> Table:
             "holds the "
             f"hysteresis too: they give K1 = {closed[STIFFNESS]:.3g} N/m, too large by about k_w·ρ, and "
             "leave no zero "
-            "crossing for the hysteresis steps. Least squares on whole loops starts from them and parts "
+            "crossing for the hysteresis steps. The posterior of whole loops parts "
             "the two.",
         ),
     )

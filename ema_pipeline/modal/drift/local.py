@@ -33,7 +33,10 @@ RINGS_ON = 0.7
 """Share of a peak left at the end of the record above which it is a tone, not a decay."""
 
 EXPLAINED = 0.9
-"""Share of what a straight background leaves of the lines around a peak that one pole must explain."""
+"""Share of what a straight background leaves of the lines around a peak that one pole explains of a plain one."""
+
+FOLLOWED = 0.7
+"""The same for a peak that is followed from hit to hit: noise makes peaks that a pole explains worse."""
 
 MAX_DAMPING = 0.2
 """A pole with more is no peak."""
@@ -86,7 +89,7 @@ def peak_poles(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> 
     known = np.asarray(np.isfinite(frf).all(axis=-1))
     data = np.where(known[..., None], frf, 0.0)
     shared = _shared_pole(window, data, known, omega, rest_s)
-    if shared is None:
+    if shared is None or _explained(shared[0], window, data, omega, rest_s) < FOLLOWED:
         return None
     pole, noise = shared
     n_hits, n_outputs = known.shape
@@ -115,15 +118,19 @@ def plain_pole(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> 
     shared = _shared_pole(window, data, known, omega, rest_s)
     if shared is None:
         return None
+    explained = _explained(shared[0], window, data, omega, rest_s)
+    return shared[0] if explained > EXPLAINED else None
+
+
+def _explained(pole: complex, window: PeakWindow, data: Complex, omega: Real, rest_s: float) -> float:
+    """Share of what a straight background leaves of the FRFs that a pole explains."""
     flat = data.reshape(-1, len(omega))
-    fit = _linear_fit(shared[0], window.neighbours, flat, omega, rest_s)
+    fit = _linear_fit(pole, window.neighbours, flat, omega, rest_s)
     if fit is None:
-        return None
-    line = np.linspace(-1, 1, len(omega))
-    basis = np.linalg.qr(np.stack([np.ones(len(omega)), line]).T)[0]
-    without = flat - (flat @ basis) @ basis.T
-    left = float(np.sum(np.abs(fit.left) ** 2))
-    return shared[0] if left < (1 - EXPLAINED) * float(np.sum(np.abs(without) ** 2)) else None
+        return 0.0
+    basis = np.linalg.qr(np.stack([np.ones(len(omega)), np.linspace(-1, 1, len(omega))]).T)[0]
+    without = float(np.sum(np.abs(flat - (flat @ basis) @ basis.T) ** 2))
+    return 1.0 - float(np.sum(np.abs(fit.left) ** 2)) / max(without, 1e-300)
 
 
 def _shared_pole(

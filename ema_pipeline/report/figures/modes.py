@@ -76,6 +76,16 @@ def stabilisation_chart(modal: ModalModel, frfs: FrfSet | None) -> Figure:
             label=f"{label} ({int(keep.sum())})",
             **draw,
         )
+    for entry in modal.left_out:
+        if low <= entry.frequency_hz <= high:
+            first = entry is modal.left_out[0]
+            ax.axvline(
+                entry.frequency_hz,
+                color=GREY,
+                lw=0.8,
+                ls="--",
+                label="left out, see the remarks" if first else None,
+            )
     if not chart.order.size:
         note(ax, "no poles")
     handles, labels = ax.get_legend_handles_labels()

@@ -1,0 +1,76 @@
+"""What the charts and the FRFs show and the list of modes lacks: named, each with its reason."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.modal.credibility import PLAIN_DAMPING
+from ema_pipeline.modal.fit import Estimate
+from ema_pipeline.modal.peaks import KnownPeaks
+from ema_pipeline.modal.poles import PoleSet
+from ema_pipeline.modal.selection import link
+from ema_pipeline.modal.types import LeftOut
+
+STABLE = 0.8
+"""Share of model orders from which a column of poles is named where it has no mode."""
+
+NEAR = 2.0
+"""Distance from a mode, in the larger of the decay rates, within which a column follows that mode."""
+
+MOST = 8
+"""Named at most, peaks first."""
+
+NO_PEAK_MODE = "a plain peak of the FRFs, but with the other modes in the fit the FRFs do not need it"
+NO_COLUMN_MODE = "the fit of all FRFs drops it: noise, or what other modes leave over, explains it as well"
+
+
+def left_out(
+    charts: Sequence[PoleSet], plain: KnownPeaks, estimate: Estimate, decay_rad_s: float
+) -> tuple[LeftOut, ...]:
+    """Peaks and stable columns without a mode.
+
+    Parameters
+    ----------
+    charts : sequence of PoleSet
+        Poles of all orders of each sub-band, of its core only.
+    plain : KnownPeaks
+    estimate : Estimate
+        The modes.
+    decay_rad_s : float
+        Decay of the exponential window, which all poles still hold.
+    """
+    found = [_entry(complex(p), decay_rad_s, "peak", NO_PEAK_MODE) for p in plain.absent(estimate).poles]
+    columns = []
+    for chart in charts:
+        tracks = link(chart)
+        for index, share in zip(tracks.representative, tracks.votes, strict=True):
+            pole = complex(chart.pole[index])
+            if (
+                share >= STABLE
+                and chart.damping_ratio[index] < PLAIN_DAMPING
+                and _alone(pole, estimate.poles)
+            ):
+                columns.append((share, pole))
+    for share, pole in sorted(columns, key=lambda c: -c[0]):
+        evidence = f"stable in {100 * min(share, 1.0):.0f} % of the model orders"
+        found.append(_entry(pole, decay_rad_s, evidence, NO_COLUMN_MODE))
+    return tuple(sorted(found[:MOST], key=lambda entry: entry.frequency_hz))
+
+
+def sentences(entries: tuple[LeftOut, ...]) -> list[str]:
+    """One sentence on each."""
+    return [f"{e.frequency_hz:.5g} Hz ({e.evidence}) has no mode: {e.reason}" for e in entries]
+
+
+def _alone(pole: complex, modes: NDArray[np.complex128]) -> bool:
+    reach = NEAR * np.maximum(-modes.real, -pole.real)
+    return bool(np.all(np.abs(modes - pole) > reach))
+
+
+def _entry(pole: complex, decay: float, evidence: str, reason: str) -> LeftOut:
+    physical = pole + decay
+    size = abs(physical)
+    return LeftOut(size / (2 * np.pi), -physical.real / size, evidence, reason)

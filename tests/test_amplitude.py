@@ -1,0 +1,175 @@
+"""Hits at several force levels against describing functions, on top of the modes of the linear level."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulate_amplitude import COORDINATES, LEVELS, RIG, STRUCK, observed, simulated_hits, true_assembly
+
+from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.dof import Dof
+from ema_pipeline.effects.library import parse_effect
+from ema_pipeline.inference import Posterior
+from ema_pipeline.mechanics.laws import DryFriction, Nonlinear, PartingSpring, PolynomialSpring
+from ema_pipeline.mechanics.modes import eigen_solution
+from ema_pipeline.mechanics.nonlinear import element_rows
+from ema_pipeline.observations.amplitude import AmplitudeObservations, AmplitudeProblem
+from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, refined, transferred
+from ema_pipeline.observations.hit_modes import HitData, Linear, comparable, shifted_poles
+from ema_pipeline.observations.modes import ModeObservations, prepare
+
+RATIO, LINE_HZ, HITS = 0.01, 0.5, 2
+IMPULSE_S = 1e-3
+"""Impulse of a blow over its peak force."""
+
+
+def synthetic(
+    elements: Sequence[Nonlinear] = (), seed: int = 0, drift: float = 1e-4
+) -> AmplitudeObservations:
+    """Modes of the true rig, and of hits whose poles move as describing functions say, with noise and drift."""
+    random = np.random.default_rng(seed)
+    assembly = true_assembly()
+    values, shapes = eigen_solution(assembly.system())
+    omega, dofs = np.sqrt(values), tuple(Dof.parse(c) for c in COORDINATES)
+    m = len(omega)
+    measured = MeasuredModes(
+        "test", omega / (2 * np.pi), 1e-5 * omega, np.full(m, RATIO), np.full(m, 1e-4),
+        shapes.T.astype(complex), np.full((m, m), 1e-3), dofs, band_hz=(50.0, 200.0),
+    )  # fmt: skip
+    sheet, level, motion = [], [], []
+    for i, struck in enumerate(STRUCK):
+        for k, force in enumerate(LEVELS):
+            for _ in range(HITS):
+                peak = force * np.exp(0.05 * random.standard_normal())
+                sheet.append(i)
+                level.append(k)
+                motion.append(shapes[COORDINATES.index(struck)] * peak * IMPULSE_S / omega)
+    count = len(sheet)
+    std = np.full((count, m), 1e-5)
+    clean = HitData(
+        prepare(measured), np.arange(m), dofs, shapes.T.astype(complex), tuple(f"h{i}" for i in range(count)),
+        np.array(level), np.array(sheet), np.array(LEVELS), np.tile(np.log(omega / (2 * np.pi)), (count, 1)), std,
+        np.full((count, m), RATIO), 1e-5 * np.ones((count, m)), np.array(motion, complex), 0.0,
+        np.stack([omega / (2 * np.pi) - 8.0, omega / (2 * np.pi) + 8.0], axis=1), LINE_HZ,
+    )  # fmt: skip
+    stretch = element_rows(assembly, list(elements)) @ shapes
+    linear = Linear.of(clean, stretch, np.arange(m), values, clean.motion)
+    moved = shifted_poles(clean, elements, linear)
+    frequency = clean.log_frequency + moved.imag / omega + 1e-5 * random.standard_normal((count, m))
+    frequency += drift * random.standard_normal((count, 1))
+    damping = RATIO - moved.real / omega + 1e-5 * random.standard_normal((count, m))
+    hits = replace(clean, log_frequency=frequency, damping=damping)
+    return AmplitudeObservations(ModeObservations(RIG, [hits.reference]), [hits])
+
+
+def base_fit(observations: AmplitudeObservations) -> Fit:
+    modes = fit_base(observations.modes, Model())
+    unknowns = observations.problem((), {}).unknowns
+    start = transferred(modes.posterior, unknowns, np.zeros(len(unknowns)))
+    return learned(observations, refined(observations, Model(), start))
+
+
+def fitted(observations: AmplitudeObservations, base: Fit, label: str) -> tuple[AmplitudeProblem, Posterior]:
+    model = base.model.plus(parse_effect(label, RIG), {})
+    problem = observations.problem(model.effects, model.scales)
+    x = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+    fit = refined(observations, model, problem.begun(x, base.posterior.scatters), base.posterior.scatters)
+    return problem, learned(observations, fit).posterior
+
+
+CASES = {
+    "bearing_cubic@hub": ([PolynomialSpring(f"c{a}", {f"hub.{a}": 1.0}, cubic=8e9) for a in "xy"], "stiffness", 8e9),
+    "bearing_quadratic@rim": (
+        [PolynomialSpring(f"q{a}", {f"rim.{a}": 1.0}, quadratic=-1.2e7) for a in "xy"], "stiffness", 1.2e7,
+    ),
+    "dry_friction@hub": ([DryFriction(f"f{a}", {f"hub.{a}": 1.0}, 0.02) for a in "xy"], "force", 0.02),
+    "mesh_backlash@hub-rim": (
+        [PartingSpring("hub-rim mesh", {"hub.x": 1.0, "rim.x": -1.0}, 2.1e5, preload=3e-4, gap=1e-2)], "preload", 3e-4,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("label", list(CASES))
+def test_each_effect_is_told_at_its_place_with_its_size(label: str) -> None:
+    elements, parameter, size = CASES[label]
+    observations = synthetic(elements)
+    base = base_fit(observations)
+    gains, values = {}, {}
+    for other in CASES:
+        problem, found = fitted(observations, base, other)
+        gains[other] = found.log_evidence - base.log_evidence
+        values[other] = problem.parameter_values(found.x)
+    assert max(gains, key=lambda k: gains[k]) == label, gains
+    assert gains[label] > 5
+    assert abs(values[label][f"{label}.{parameter}"]) == pytest.approx(size, rel=0.5)
+
+
+def test_nothing_is_claimed_where_only_drift_moves_the_modes() -> None:
+    observations = synthetic(drift=5e-4)
+    base = base_fit(observations)
+    assert base.posterior.scatters["drift"] == pytest.approx(5e-4, rel=0.5)
+    for label in CASES:
+        _, found = fitted(observations, base, label)
+        assert found.log_evidence - base.log_evidence < 5
+
+
+def test_derivatives_by_sizes_are_those_of_small_differences() -> None:
+    elements, _, size = CASES["bearing_cubic@hub"]
+    observations = synthetic(elements)
+    problem = observations.problem((parse_effect("bearing_cubic@hub", RIG),), {})
+    scatters = {n: s.start for n, s in observations.scatters.items()}
+    x = problem.start({"bearing_cubic@hub.stiffness": size})
+    here = problem.residuals(x, scatters)
+    drift = next(i for i, n in enumerate(problem.unknowns.names) if n.startswith("drift"))
+    for i in (*problem.nonlinear_sizes, problem.unknowns.index["amplitude of all modes"], drift):
+        ahead, behind = x.copy(), x.copy()
+        ahead[i], behind[i] = x[i] + 1e-5, x[i] - 1e-5
+        values = [
+            problem.residuals(p, scatters, matching=here.matching, derivatives=False).values
+            for p in (ahead, behind)
+        ]
+        slope = (values[0] - values[1]) / 2e-5
+        np.testing.assert_allclose(here.jacobian[:, i], slope, atol=0.01 * np.abs(slope).max())
+
+
+def test_every_level_is_held_out_once_beside_another() -> None:
+    observations = synthetic()
+    folds = observations.folds()
+    assert len(folds) == len(LEVELS)
+    for k, (kept, out) in enumerate(folds):
+        assert k not in kept.hits[0].level
+        assert set(out.hits[0].level) == {k, 1 if k == 0 else 0}
+        assert not out.modes.data
+
+
+def test_hits_of_one_level_cannot_be_compared() -> None:
+    (hits,) = synthetic().hits
+    assert comparable(hits)
+    assert not comparable(hits.only(hits.level == 1))
+
+
+def test_hits_without_any_motion_or_with_gaps_are_left_out() -> None:
+    (hits,) = synthetic().hits
+    motion = hits.motion.copy()
+    motion[0] = np.nan
+    std = hits.log_frequency_std.copy()
+    std[1] = np.inf
+    holed = replace(hits, motion=motion, log_frequency_std=std)
+    observations = AmplitudeObservations(ModeObservations(RIG, [holed.reference]), [holed])
+    _, found = fitted(observations, base_fit(observations), "bearing_cubic@hub")
+    assert np.isfinite(found.log_evidence)
+
+
+def test_a_cubic_bearing_is_told_from_simulated_hits() -> None:
+    """Direct integration, FRFs, modes and the study of the levels: nothing here knows describing functions."""
+    elements = [PolynomialSpring(f"c{a}", {f"hub.{a}": 1.0}, cubic=1e11) for a in "xy"]
+    observations = observed(simulated_hits(elements, seed=3, drift=1e-4))
+    base = base_fit(observations)
+    problem, found = fitted(observations, base, "bearing_cubic@hub")
+    gain = found.log_evidence - base.log_evidence
+    _, rival = fitted(observations, base, "bearing_cubic@rim")
+    assert gain > max(5.0, 5.0 + rival.log_evidence - base.log_evidence)
+    assert problem.parameter_values(found.x)["bearing_cubic@hub.stiffness"] == pytest.approx(1e11, rel=0.3)
