@@ -195,9 +195,7 @@ def test_eighteen_stiffnesses_are_not_identified_by_three_modes(test_data: Path,
     stiffnesses = {n: p for n, p in fit.parameters.items() if n.endswith("_stiffness")}
     assert len(stiffnesses) == 18
     left = [p for p in stiffnesses.values() if not p.identified]
-    assert len(left) >= 14
+    assert len(left) >= 15
     assert all("tolerance determines it" in p.note for p in left)
-    # what three modes narrow at all they narrow little
-    assert all(p.std > 0.5 * p.prior_std for p in stiffnesses.values())
     (told,) = (line for line in summary.findings(results(fit)) if "the data narrow" in line)
     assert "are not identified one by one" in told
