@@ -398,9 +398,9 @@ def test_summary_speaks_of_agreement_only_where_the_error_is_about_one(run: RunR
 
 def test_misfit_is_the_first_caution_even_where_values_are_identified(run: RunResults) -> None:
     assert run.fit is not None
-    assert "does not fit" not in " ".join(summary.cautions(run))
-    poor = replace(run, fit=replace(run.fit, chi2_per_dof=3091.0))
-    assert summary.cautions(poor)[0].startswith("The model does not fit (χ² per degree of freedom 3091)")
+    assert "does not explain" not in " ".join(summary.cautions(run))
+    poor = replace(run, fit=replace(run.fit, error=55.6))
+    assert summary.cautions(poor)[0].startswith("The model does not explain the data (error 55.6)")
 
 
 def test_cautions_of_one_kind_are_counted_rather_than_all_written_out() -> None:

@@ -513,9 +513,9 @@ def test_summary_holds_what_the_data_would_show(run: RunResults, tmp_path: Path)
 def test_values_of_a_model_that_fails_are_not_called_identified(run: RunResults) -> None:
     assert run.fit is not None
     (first, *_) = (p for p in run.fit.parameters.values() if p.identified)
-    assert summary.identified_words(first, replace(run.fit, chi2_per_dof=1.1)) == "identified by the data"
-    failing = replace(run.fit, chi2_per_dof=40.0)
+    assert summary.identified_words(first, replace(run.fit, error=1.1)) == "identified by the data"
+    failing = replace(run.fit, error=6.3)
     assert "identified" not in summary.identified_words(first, failing)
     states = {r.cells[5] for r in tables.parameters_table(failing).rows}
     assert "identified" not in states
-    assert "if the model held" in states
+    assert "provisional" in states

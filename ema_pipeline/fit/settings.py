@@ -83,7 +83,7 @@ class FitSettings(UncertaintySettings):
         "beyond 50 % not even its factor of two is known.",
     )
     narrowed: float = Field(
-        default=0.8,
+        default=0.5,
         gt=0,
         lt=1,
         description="A parameter with a tolerance counts as identified where its posterior is narrower than"

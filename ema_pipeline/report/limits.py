@@ -6,5 +6,5 @@ LOW_MAC = 0.8
 FAR_SIGMA = 3.0
 """A difference beyond this many standard uncertainties is named."""
 
-POOR_CHI2 = 4.0
-"""χ² per degree of freedom beyond which fitted values are doubtful (misfit twice the uncertainty)."""
+POOR_ERROR = 1.5
+"""Error beyond which a model does not explain the data and its fitted values are provisional, as in the diagnosis."""

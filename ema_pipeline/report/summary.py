@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.levels import has_to_say
-from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_CHI2
+from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_ERROR
 from ema_pipeline.report.numbers import below, format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 
@@ -40,7 +40,7 @@ def findings(results: RunResults) -> tuple[str, ...]:
         lines += _narrowed(fit)
     if compared is not None and math.isfinite(compared.error):
         size = plain(compared.error, 3)
-        if compared.error <= 1.5:
+        if compared.error <= POOR_ERROR:
             lines.append(
                 f"Model and measurement differ by {size} standard uncertainties (root mean square): "
                 "the model explains the data about as well as the data can tell."
@@ -79,7 +79,7 @@ def _narrowed(fit: FitResult) -> list[str]:
 
 def fails(fit: FitResult) -> bool:
     """True where the model does not fit, so that its values hold only for a model that lacks nothing."""
-    return fit.chi2_per_dof > POOR_CHI2
+    return fit.error > POOR_ERROR
 
 
 def identified_words(p: ParameterEstimate, fit: FitResult) -> str:
