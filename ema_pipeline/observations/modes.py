@@ -146,8 +146,9 @@ def prepare(measured: MeasuredModes, settings: UncertaintySettings | None = None
         damping_std = np.nan_to_num(measured.damping_std) / damping
     band = measured.band_hz or (0.9 * float(np.min(f, initial=1.0)), 1.1 * float(np.max(f, initial=1.0)))
     return ModeData(
-        measured.configuration, np.log(f), relative, np.log(damping), damping_std, shapes, std, dofs, band
-    )
+        measured.configuration, np.log(f), relative, np.log(damping), damping_std, shapes, std, dofs, band,
+        complete=measured.band_hz is not None,  # a list of frequencies does not say that there are no others
+    )  # fmt: skip
 
 
 class ModeObservations:
