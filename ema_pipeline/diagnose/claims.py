@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from ema_pipeline.diagnose.heldout import HeldOut, held_out
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import Named, named, sizes_of
@@ -77,10 +79,18 @@ def _weak(ranked: Ranked, gain: float, settings: DiagnoseSettings) -> str:
     if not ranked.hypothesis.extends:
         p = ranked.hypothesis.placed.effect.parameters[0]
         i = ranked.fit.posterior.unknowns.index[ranked.hypothesis.placed.parameter_name(p.name)]
-        x, std = ranked.fit.posterior.x[i], ranked.fit.posterior.std[i]
+        x, std = ranked.fit.posterior.x[i], _std_of_first(ranked)
         if abs(x) < settings.sigmas * std:
             return f"its size is within {settings.sigmas:g} standard deviations of nothing"
     return ""
+
+
+def _std_of_first(ranked: Ranked) -> float:
+    """1 σ of the first size, the effect's other sizes held: a size and a shape that only show together are no doubt."""
+    posterior, placed = ranked.fit.posterior, ranked.hypothesis.placed
+    at = [posterior.unknowns.index[placed.parameter_name(p.name)] for p in placed.effect.parameters]
+    own = posterior.covariance[np.ix_(at, at)]
+    return float(1 / np.sqrt(max(np.linalg.pinv(own)[0, 0], 1e-300)))
 
 
 def _contradicted(ranked: Ranked, base: Fit, before: HeldOut, after: HeldOut) -> str:

@@ -9,17 +9,20 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.pool import spread
 from ema_pipeline.diagnose.score import Score, scores
 from ema_pipeline.inference import Posterior
-from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import QUICK, Fit, Model, annealed, learned, refined, transferred
+from ema_pipeline.observations.base import EffectProblem, Observations
+from ema_pipeline.observations.fitting import QUICK, Fit, Model, annealed, learned, refined, transferred, wide
 
 Progress = Callable[[float, str], None]
+Schedule = tuple[tuple[float, int], ...]
 
 FINALISTS = 5
 """Hypotheses for which the scatters are learned."""
@@ -27,6 +30,10 @@ _SCREENED = 14
 """Generic hypotheses, best first by their score, that are fitted in full."""
 _UNSEEN = 1e6
 """1 σ of a size, in units of its prior, from which the data hold nothing of it: it cannot be told from nothing."""
+_GRID = tuple(np.linspace(-2.0, 2.0, 9))
+"""Unknowns of sizes, in units of their prior σ, at which an effect that adds modes is tried."""
+_GRID_STARTS = 4
+_FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
 _EXPLAINED = 1.3
@@ -131,13 +138,34 @@ def _first_fit(
         fit = refined(observations, model, unknowns.clipped(begin))
         if fit.posterior.cost <= base.posterior.cost:
             return fit.posterior
+    starts = hypothesis.starts()
+    schedule: Schedule = QUICK
+    if hypothesis.extends:
+        starts, schedule = _best_of_grid(observations, problem, begin, hypothesis), _FROM_GRID
     fits = []
-    for start in hypothesis.starts():
+    for start in starts:
         x = begin.copy()
         for name, value in start.items():
             x[unknowns.index[name]] = value
-        fits.append(annealed(observations, model, unknowns.clipped(x), QUICK))
+        fits.append(annealed(observations, model, unknowns.clipped(x), schedule))
     return max(fits, key=lambda f: f.log_evidence).posterior
+
+
+def _best_of_grid(
+    observations: Observations, problem: EffectProblem, begin: NDArray[np.float64], hypothesis: Hypothesis
+) -> list[dict[str, float]]:
+    """Sizes, by their unknowns, at which the modes that the effect adds lie nearest to measured ones."""
+    names = [hypothesis.placed.parameter_name(p.name) for p in hypothesis.placed.effect.parameters]
+    scatters = wide(observations)
+    tried = []
+    for values in product(_GRID, repeat=len(names)):
+        x = begin.copy()
+        x[[problem.unknowns.index[n] for n in names]] = values
+        found = problem.residuals(
+            problem.unknowns.clipped(x), scatters, heat=_FROM_GRID[0][0], derivatives=False
+        )
+        tried.append((found.cost, dict(zip(names, values, strict=True))))
+    return [start for _, start in sorted(tried, key=lambda pair: pair[0])[:_GRID_STARTS]]
 
 
 Found = dict[str, tuple[Hypothesis, Fit]]

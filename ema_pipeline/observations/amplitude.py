@@ -34,6 +34,8 @@ AMPLITUDE_STD = 0.02
 
 _BEYOND = 3.0
 """Growth of what linearisation leaves out per decay rate by which a pole moves: it is of first order in that."""
+_REMEMBERED = 16
+"""Last points at which the shifts are kept: a step is tried without derivatives, then taken with them."""
 _STEP = 1e-3
 """Step of the differences by sizes, in units of their prior σ."""
 _DECADES = 6.0
@@ -101,6 +103,7 @@ class AmplitudeProblem:
         self.observations = observations
         self.modes: ModeProblem = observations.modes.problem(effects, scales)
         self._nonlinear = tuple(e.label for e in effects if not e.effect.linear)
+        self.moved: dict[tuple[object, ...], NDArray[np.complex128]] = {}
 
     @property
     def model(self) -> RigModel:
@@ -116,6 +119,12 @@ class AmplitudeProblem:
         """See `EffectProblem`."""
         x = self.modes.start(sizes)
         return np.concatenate([x, np.zeros(len(self.unknowns) - len(x))])
+
+    def escapes(
+        self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
+    ) -> list[NDArray[np.float64]]:
+        """See `EffectProblem`: none."""
+        return []
 
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""
@@ -279,6 +288,16 @@ class _Hits:
 
     def _moved(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Change of every mode's pole in every hit, 1/s, (h, m)."""
+        own = x[: self.problem.modes.offset]
+        key = (self.data.configuration, own.tobytes(), float(x[self.scale]), self.paired.match.tobytes())
+        known = self.problem.moved
+        if key not in known:
+            if len(known) >= _REMEMBERED:
+                known.clear()
+            known[key] = self._found_moved(x)
+        return known[key]
+
+    def _found_moved(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
         data, model = self.data, self.problem.model
         own = x[: self.problem.modes.offset]
         assembly = model.assembly(data.configuration, own[model.shape_start :])

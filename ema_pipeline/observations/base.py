@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect
-from ema_pipeline.inference import Problem, Scatter
+from ema_pipeline.inference import Problem, Residuals, Scatter
 from ema_pipeline.observations.rig_model import SizeMap
 
 
@@ -27,6 +27,12 @@ class EffectProblem(Problem, Protocol):
 
     def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
         """`x` with the sizes of the effect added last where a descent finds its way; None where it does anyway."""
+        ...
+
+    def escapes(
+        self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
+    ) -> list[NDArray[np.float64]]:
+        """Points beyond a barrier that no descent passes, where the fit at `x` looks stuck before one."""
         ...
 
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:

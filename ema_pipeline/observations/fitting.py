@@ -14,6 +14,9 @@ from ema_pipeline.inference import Posterior, Unknowns, anneal, descend, learn
 from ema_pipeline.inference.maximise import ANNEALING
 from ema_pipeline.observations.base import EffectProblem, Observations
 
+_MOST_ESCAPES = 4
+"""Barriers that a fit is led past, one after the other."""
+
 QUICK = ((30.0, 5), (5.0, 5), (1.0, 8))
 """Annealing of a hypothesis that begins at the base model's fit."""
 
@@ -83,7 +86,8 @@ def annealed(
     schedule: Sequence[tuple[float, int]],
 ) -> Fit:
     """A fit from far off, at wide scatters."""
-    return Fit(model, anneal(model.problem(observations), wide(observations), start, schedule))
+    found = Fit(model, anneal(model.problem(observations), wide(observations), start, schedule))
+    return freed(observations, found)
 
 
 def refined(
@@ -96,6 +100,22 @@ def refined(
     """A fit from a good start."""
     problem = model.problem(observations)
     return Fit(model, descend(problem, scatters or wide(observations), start, steps=steps))
+
+
+def freed(observations: Observations, fit: Fit) -> Fit:
+    """The fit led past barriers before which it is stuck, as long as that makes it better."""
+    problem = fit.model.problem(observations)
+    for _ in range(_MOST_ESCAPES):
+        p = fit.posterior
+        better = None
+        for start in problem.escapes(p.x, p.scatters, p.residuals):
+            found = descend(problem, p.scatters, start)
+            if found.cost < p.cost - 1.0 and (better is None or found.cost < better.cost):
+                better = found
+        if better is None:
+            break
+        fit = replace(fit, posterior=better)
+    return fit
 
 
 def learned(observations: Observations, fit: Fit) -> Fit:

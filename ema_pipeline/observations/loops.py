@@ -247,6 +247,12 @@ class LoopProblem:
         """See `EffectProblem`: forces change with every size."""
         return None
 
+    def escapes(
+        self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
+    ) -> list[NDArray[np.float64]]:
+        """See `EffectProblem`: none."""
+        return []
+
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""
         return self.model.parameter_values(x[: self.offset])

@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import scipy.optimize
@@ -41,6 +42,9 @@ DAMPING_SCATTER = "damping_scatter"
 FREQUENCY = "frequency_scatter"
 SHAPE = "shape_scatter"
 
+DRIFT_STD = 3e-4
+"""1 σ of what all frequencies of one configuration are off together: 2 K in steel."""
+
 UNEXPLAINED = 12.0
 """Cost, in the log posterior, of a measured mode without a model mode."""
 UNSEEN = 3.0
@@ -53,6 +57,11 @@ _FREQUENCY_REACH = 0.1
 _FREQUENCY_REACH_ALONE = 0.3
 _LEAVE = 0.3
 """Cost above the best at which an assignment leaves a measured mode without a partner."""
+
+_CLOSE_PAIR = 0.2
+"""Difference of ln f within which two modes may have changed places."""
+_WRONG = 4.0
+"""σ from which a shape is another one."""
 
 _ACROSS = {"x": "y", "y": "x", "zeta": "eta", "eta": "zeta"}
 
@@ -222,6 +231,11 @@ def _calibration(sensor: str, channel: ChannelQuality) -> str:
     return f"calibration of {channel.name or sensor}"
 
 
+def _drift(configuration: str) -> str:
+    """Name of the unknown: temperature and time move all frequencies of one configuration alike."""
+    return f"drift of {configuration}"
+
+
 def _transverse(sensor: str) -> str:
     return f"transverse sensitivity at {sensor}"
 
@@ -256,6 +270,11 @@ class ModeRows:
     damping: float
     shape: NDArray[np.float64]
 
+    @property
+    def shape_off(self) -> float:
+        """Largest difference of the shape, in σ; 0 where none was measured."""
+        return float(np.max(np.abs(np.nan_to_num(self.shape)), initial=0.0))
+
 
 class ModeProblem:
     """Measured modes and the rig with a list of effects."""
@@ -289,8 +308,10 @@ class ModeProblem:
         gains = {_calibration(s, c): c.calibration_std / CALIBRATION_STD for s, c in sensors.items()}
         gains = {name: std for name, std in gains.items() if std > 0}
         across = {s: c.transverse for s, c in sensors.items() if c.transverse > 0 and self._has_across(s)}
+        drifts = [_drift(d.configuration) for d in self.observations.data]
         return joined(
             self.model.unknowns,
+            Unknowns.plain(drifts, DRIFT_STD),
             Unknowns.plain(tuple(gains), list(gains.values()), CALIBRATION),
             Unknowns.plain([_transverse(s) for s in across], list(across.values())),
         )
@@ -356,6 +377,34 @@ class ModeProblem:
                 f"{configuration}: the model has no modes at the fitted values; check the rig's masses"
             )
         return solution
+
+    def escapes(
+        self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
+    ) -> list[NDArray[np.float64]]:
+        """See `EffectProblem`: close pairs of modes whose order is the wrong way round, split the other way.
+
+        No descent leads through the point where two modes coincide. The least probable part of the way is saved by
+        moving all unknowns as little as their priors allow.
+        """
+        assert isinstance(found.matching, tuple)
+        variance = self.unknowns.prior_std(scatters) ** 2
+        rows, starts, at = self.rows(found), [], 0
+        for data, match in zip(self.observations.data, found.matching, strict=True):
+            own = [r for r in rows if r.configuration == data.configuration]
+            modes = self.solution(data.configuration, x)
+            std = np.hypot(data.log_frequency_std, scatters[FREQUENCY])
+            for (i, a), (j, b) in pairwise(enumerate(own)):
+                split = float(np.log(modes.frequency_hz[b.model] / max(modes.frequency_hz[a.model], 1e-6)))
+                if abs(split) < _CLOSE_PAIR and a.shape_off > _WRONG and b.shape_off > _WRONG:
+                    slope = (
+                        found.jacobian[at + i] * std[a.measured] - found.jacobian[at + j] * std[b.measured]
+                    )
+                    reach = float(slope @ (variance * slope))
+                    if reach > 0:
+                        starts.append(self.unknowns.clipped(x - 2 * split * variance * slope / reach))
+            at += len(own) + int(np.sum(np.isfinite(data.log_damping[match >= 0])))
+            at += int(np.sum(np.isfinite(data.shapes[match >= 0])))
+        return starts
 
     def rows(self, found: Residuals) -> list[ModeRows]:
         """Residuals sorted by the mode that they belong to, every measured mode that has a model mode."""
@@ -549,13 +598,18 @@ class _Configuration:
         slopes: ModeDerivatives | None,
     ) -> _Rows:
         d = self.data
+        drift = self.problem.unknowns.index[_drift(d.configuration)]
+        slope = self._none
+        if slopes is not None:
+            slope = self._padded(slopes.log_frequency)
+            slope[:, drift] = 1.0
         return _Rows(
-            d.log_frequency[on] - np.log(np.maximum(solution.frequency_hz[match], 1e-6)),
+            d.log_frequency[on] - np.log(np.maximum(solution.frequency_hz[match], 1e-6)) - self.x[drift],
             d.log_frequency_std[on],
             np.ones(len(on)),
             FREQUENCY,
             self.heat,
-            self._none if slopes is None else self._padded(slopes.log_frequency),
+            slope,
         )
 
     def _damping(

@@ -94,7 +94,8 @@ def peak_windows(frfs: FrfSet, band_hz: tuple[float, float]) -> tuple[PeakWindow
     frfs : FrfSet
     band_hz : tuple of float
     """
-    curve = response_curve(frfs)
+    level = np.array([[np.median(np.abs(frf[1:]) ** 2) for frf in row] for row in frfs.frf])
+    curve = _response_curve(frfs, level)
     low, high = (int(k) for k in np.searchsorted(frfs.frequency_hz, band_hz))
     smooth = scipy.ndimage.gaussian_filter1d(curve, 1.0)
     found, known = scipy.signal.find_peaks(smooth[: high + 1], prominence=PROMINENCE_DB)
@@ -104,17 +105,14 @@ def peak_windows(frfs: FrfSet, band_hz: tuple[float, float]) -> tuple[PeakWindow
     step = 2 * np.pi * float(frfs.frequency_hz[1])
     decay = np.array([max(_half_width(curve, k), 0.3) for k in kept]) * step
     poles = np.asarray(-decay + 1j * step * kept, dtype=np.complex128)
-    return tuple(_window(frfs, poles, r, step) for r in range(len(poles)))
+    return tuple(_window(frfs, level, poles, r, step) for r in range(len(poles)))
 
 
-def response_curve(frfs: FrfSet) -> Real:
-    """Power of all FRFs, each over its own median, in dB over the lines."""
+def _response_curve(frfs: FrfSet, level: Real) -> Real:
+    """Power of all FRFs, each over its own median (n_outputs, n_inputs), in dB over the lines."""
     power = np.zeros(len(frfs.frequency_hz))
-    for row in frfs.frf.reshape(-1, len(power)):
-        square = np.abs(row) ** 2
-        middle = float(np.median(square[1:]))
-        if np.isfinite(middle) and middle > 0:
-            power += square / middle
+    for o, i in np.argwhere(np.isfinite(level) & (level > 0)):
+        power += np.abs(frfs.frf[o, i]) ** 2 / level[o, i]
     return np.asarray(10 * np.log10(np.maximum(power, 1e-30)))
 
 
@@ -133,7 +131,7 @@ def _half_width(curve: Real, peak: int) -> float:
     return 0.5 * (high - low)
 
 
-def _window(frfs: FrfSet, poles: Complex, index: int, step: float) -> PeakWindow:
+def _window(frfs: FrfSet, level: Real, poles: Complex, index: int, step: float) -> PeakWindow:
     pole = complex(poles[index])
     half = int(np.clip(REACH * -pole.real / step, FEWEST_LINES, MOST_LINES))
     centre = round(pole.imag / step)
@@ -141,8 +139,8 @@ def _window(frfs: FrfSet, poles: Complex, index: int, step: float) -> PeakWindow
     distance = np.abs(poles.imag - pole.imag) / step
     near = (distance < 2 * half) & (np.arange(len(poles)) != index)
     power = np.nan_to_num(np.abs(frfs.frf[..., lines]) ** 2).sum(axis=-1)
-    level = np.nan_to_num(np.median(np.abs(frfs.frf) ** 2, axis=-1))
-    shown = np.where(level > 0, power / np.where(level > 0, level, 1.0), 0.0).sum(axis=1)
+    known = np.isfinite(level) & (level > 0)
+    shown = np.where(known, power / np.where(known, level, 1.0), 0.0).sum(axis=1)
     outputs = np.sort(np.argsort(-shown, kind="stable")[:MAX_OUTPUTS])
     return PeakWindow(lines, pole, poles[near], outputs.astype(np.int64))
 
