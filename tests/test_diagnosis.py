@@ -208,7 +208,6 @@ def test_what_is_known_already_is_not_looked_for_again() -> None:
 # --- verdicts, groups and held-out data ----------------------------------------------------------------------------
 
 
-@pytest.mark.xfail(reason="equal predictions at different places are taken for one name", strict=True)
 def test_effects_that_explain_the_data_alike_are_a_group_with_a_measurement_that_parts_them() -> None:
     # no shapes: a symmetric chain tells nothing of left or right
     measured = chain_modes(8, GOOD, added(Spring, 4e5, {"m2.z": 1.0}))["all"]

@@ -197,5 +197,4 @@ def test_eighteen_stiffnesses_are_not_identified_by_three_modes(test_data: Path,
     left = [p for p in stiffnesses.values() if not p.identified]
     assert len(left) >= 15
     assert all("tolerance determines it" in p.note for p in left)
-    (told,) = (line for line in summary.findings(results(fit)) if "the data narrow" in line)
-    assert "are not identified one by one" in told
+    assert "are not identified one by one" in " ".join(summary.findings(results(fit)))

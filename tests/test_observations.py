@@ -18,8 +18,9 @@ from ema_pipeline.observations.fitting import Model, fit_base, learned
 from ema_pipeline.observations.modes import UNEXPLAINED, UNSEEN, ModeObservations, prepare
 from ema_pipeline.observations.parts import (
     MASS_SCATTER,
+    MASS_STD,
     PART_SCATTER,
-    STIFFNESS_SCATTER,
+    STIFFNESS_STD,
     dependence,
     part_key,
     value_of,
@@ -63,7 +64,7 @@ def test_every_element_follows_its_families_as_the_rig_builds_it(name: str) -> N
 def test_every_part_of_a_rig_has_a_deviation_of_its_own(name: str) -> None:
     rig = load_rig(name)
     known = dependence(rig)
-    governed = known.unknowns.governed(PART_SCATTER)
+    governed = known.unknowns.governed(PART_SCATTER) | known.unknowns.governed(MASS_SCATTER)
     for configuration in rig.configurations:
         for element in rig.assembly(configuration).elements:
             if isinstance(element, Mass | Spring | Damper) and value_of(element) > 0:
@@ -91,10 +92,16 @@ def test_parts_scatter_by_the_default_and_by_what_is_stated() -> None:
     stated = {"carrier_mass": Parameter("carrier_mass", 1.0, "kg", 0.01, scatter=0.1),
               "sun_bearing_stiffness": Parameter("sun_bearing_stiffness", 1e6, "N/m", 0.1, scatter=0.0)}  # fmt: skip
     known = dependence(planetary(2, stated))
-    std = dict(zip(known.unknowns.names, known.unknowns.prior_std({PART_SCATTER: 0.02}), strict=True))
+    std = dict(
+        zip(
+            known.unknowns.names,
+            known.unknowns.prior_std({PART_SCATTER: 0.02, MASS_SCATTER: 0.005}),
+            strict=True,
+        )
+    )
     assert std["carrier mass (mass)"] == pytest.approx(0.1)
-    assert std["sun mass (mass)"] == pytest.approx(MASS_SCATTER)
-    assert std["sun-planet1 mesh (spring)"] == pytest.approx(STIFFNESS_SCATTER)
+    assert std["sun mass (mass)"] == pytest.approx(MASS_STD)
+    assert std["sun-planet1 mesh (spring)"] == pytest.approx(STIFFNESS_STD)
     assert not any(n.startswith("sun bearing") for n in known.unknowns.names)
 
 

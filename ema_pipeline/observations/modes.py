@@ -145,18 +145,17 @@ def prepare(measured: MeasuredModes, settings: UncertaintySettings | None = None
             real = np.real(y * np.exp(-0.5j * np.angle(np.nansum(y**2))))
             size = float(np.nanmax(np.abs(real), initial=0.0)) or 1.0
             shapes[r] = real / size
-            given = (
-                np.zeros(len(dofs)) if measured.shape_std is None else np.nan_to_num(measured.shape_std[r])
-            )
-            std[r] = given / size
+            given = np.full(len(dofs), np.nan) if measured.shape_std is None else measured.shape_std[r]
+            std[r] = _known_or(given / size, settings.shape_std_assumed)
     with np.errstate(invalid="ignore", divide="ignore"):
-        relative = np.nan_to_num(measured.frequency_std_hz) / f
+        relative = _known_or(measured.frequency_std_hz / f, settings.frequency_std_assumed)
         damping = np.where(measured.damping_ratio > 0, measured.damping_ratio, np.nan)
-        damping_std = np.nan_to_num(measured.damping_std) / damping
+        damping_std = _known_or(measured.damping_std / damping, settings.damping_std_assumed)
     band = measured.band_hz or (0.9 * float(np.min(f, initial=1.0)), 1.1 * float(np.max(f, initial=1.0)))
     return ModeData(
-        measured.configuration, np.log(f), relative, np.log(damping), damping_std, shapes, std, dofs, band
-    )
+        measured.configuration, np.log(f), relative, np.log(damping), damping_std, shapes, std, dofs, band,
+        complete=measured.band_hz is not None,  # a list of frequencies does not say that there are no others
+    )  # fmt: skip
 
 
 class ModeObservations:
