@@ -46,11 +46,14 @@ class Round:
         return next((j for j in self.judged if j.claimed), None)
 
     def alike(self, settings: DiagnoseSettings) -> tuple[Judged, ...]:
-        """Claimed hypotheses that explain the data as well as the best; the rig's own before generic ones."""
+        """The best claimed hypothesis and all that explain the data as well; the rig's own before generic ones.
+
+        Rivals need not pass the threshold of a claim themselves: what the best one has, they nearly have.
+        """
         best = self.best
         if best is None:
             return ()
-        near = [j for j in self.judged if j.claimed and best.gain - j.gain < settings.alike]
+        near = [j for j in self.judged if j is best or (0 < j.gain and best.gain - j.gain < settings.alike)]
 
         def order(j: Judged) -> tuple[bool, float, str]:
             behind = best.gain - j.gain
