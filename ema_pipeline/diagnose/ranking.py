@@ -32,7 +32,7 @@ _UNSEEN = 1e6
 """1 σ of a size, in units of its prior, from which the data hold nothing of it: it cannot be told from nothing."""
 _GRID = tuple(np.linspace(-2.0, 2.0, 9))
 """Unknowns of sizes, in units of their prior σ, at which an effect that adds modes is tried."""
-_GRID_STARTS = 4
+_GRID_STARTS = 2
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
@@ -138,17 +138,41 @@ def _first_fit(
         fit = refined(observations, model, unknowns.clipped(begin))
         if fit.posterior.cost <= base.posterior.cost:
             return fit.posterior
-    starts = hypothesis.starts()
-    schedule: Schedule = QUICK
-    if hypothesis.extends:
-        starts, schedule = _best_of_grid(observations, problem, begin, hypothesis), _FROM_GRID
-    fits = []
-    for start in starts:
-        x = begin.copy()
-        for name, value in start.items():
-            x[unknowns.index[name]] = value
-        fits.append(annealed(observations, model, unknowns.clipped(x), schedule))
+    fits = [
+        annealed(observations, model, x, schedule)
+        for x, schedule in _starts(observations, problem, hypothesis, begin)
+    ]
     return max(fits, key=lambda f: f.log_evidence).posterior
+
+
+def _starts(
+    observations: Observations,
+    problem: EffectProblem,
+    hypothesis: Hypothesis,
+    begin: NDArray[np.float64],
+) -> list[tuple[NDArray[np.float64], Schedule]]:
+    """Points from which a hypothesis is fitted, each with its annealing.
+
+    A base model that fails has bent parts and channels to the data: a true effect is found from unbent ones.
+    """
+    unbent = begin.copy()
+    scattered = [bool(s) for s in problem.unknowns.scatter]
+    unbent[scattered] = 0.0
+    plans: list[tuple[NDArray[np.float64], dict[str, float], Schedule]] = []
+    if hypothesis.extends:
+        for x in (begin, unbent):
+            best = _best_of_grid(observations, problem, x, hypothesis)
+            plans += [(x, start, _FROM_GRID) for start in best]
+    else:
+        plans = [(begin, start, QUICK) for start in hypothesis.starts()]
+        plans += [(unbent, start, QUICK) for start in hypothesis.starts()[:1]]
+    found = []
+    for x, sizes, schedule in plans:
+        moved = x.copy()
+        for name, value in sizes.items():
+            moved[problem.unknowns.index[name]] = value
+        found.append((problem.unknowns.clipped(moved), schedule))
+    return found
 
 
 def _best_of_grid(

@@ -53,7 +53,7 @@ class Round:
         best = self.best
         if best is None:
             return ()
-        near = [j for j in self.judged if j is best or (0 < j.gain and best.gain - j.gain < settings.alike)]
+        near = [j for j in self.judged if j is best or (j.gain > 0 and best.gain - j.gain < settings.alike)]
 
         def order(j: Judged) -> tuple[bool, float, str]:
             behind = best.gain - j.gain
