@@ -40,7 +40,13 @@ def findings(results: RunResults) -> tuple[str, ...]:
         lines += _narrowed(fit)
     if compared is not None and math.isfinite(compared.error):
         size = plain(compared.error, 3)
-        if compared.error <= POOR_ERROR:
+        verdict = None if results.diagnosis is None else results.diagnosis.verdict
+        if compared.error <= POOR_ERROR and verdict in ("effect", "ambiguous"):
+            lines.append(
+                f"Model and measurement differ by {size} standard uncertainties (root mean square); "
+                "what would bring them nearer stands above."
+            )
+        elif compared.error <= POOR_ERROR:
             lines.append(
                 f"Model and measurement differ by {size} standard uncertainties (root mean square): "
                 "the model explains the data about as well as the data can tell."
