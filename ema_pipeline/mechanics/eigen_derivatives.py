@@ -19,6 +19,8 @@ from ema_pipeline.mechanics.terms import DAMPING_MATRIX, MASS, STIFFNESS, STRUCT
 _CLOSE = 1e-4
 """Relative distance of eigenvalues below which the rotation of their shapes into each other is no longer linear."""
 _LEAST_DAMPING_RATIO = 1e-6
+_ROUNDING = 1e-12
+"""Share of the largest eigenvalue below which a negative one is a rigid body's zero."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class EigenSolution:
     def of(
         cls, dense: NDArray[np.float64], skew: NDArray[np.float64], damping_ratio: float
     ) -> EigenSolution | None:
-        """Modes of M, C, K and structural matrix, (4, n, n); None where a trial mass is not positive."""
+        """Modes of M, C, K and structural matrix, (4, n, n); None where a mass or a stiffness is not admissible."""
         mass, damping, stiffness, structural = dense
         if not np.all(np.isfinite(dense)):
             return None
@@ -51,7 +53,9 @@ class EigenSolution:
         if solved is None:
             return None
         values, shapes = solved
-        values = np.maximum(values, 1.0)  # rigid bodies, and trial stiffnesses below zero: far under any band
+        if values[0] < -_ROUNDING * float(np.max(np.abs(values))):
+            return None
+        values = np.maximum(values, 1.0)  # rigid bodies: far under any band
         omega = np.sqrt(values)
         ratio = np.full(len(values), damping_ratio)
         if np.any(damping):
