@@ -107,6 +107,8 @@ def freed(observations: Observations, fit: Fit) -> Fit:
     problem = fit.model.problem(observations)
     for _ in range(_MOST_ESCAPES):
         p = fit.posterior
+        if not np.isfinite(p.cost):  # no admissible model at the start: nothing to lead anywhere
+            break
         better = None
         for start in problem.escapes(p.x, p.scatters, p.residuals):
             found = descend(problem, p.scatters, start)
