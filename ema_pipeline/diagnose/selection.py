@@ -116,8 +116,9 @@ def select(
         near = rounds[-1].alike(settings)
         if not near or len(claimed) == settings.most_effects:
             return Selection(tuple(rounds), tuple(claimed), ranking.base)
-        claimed.append(near[0])
-        rivals[near[0].hypothesis.label] = rounds[-1].judged
+        added = next(j for j in near if j.claimed)  # a rival alone does not pass the conditions of a claim
+        claimed.append(added)
+        rivals[added.hypothesis.label] = rounds[-1].judged
         if len(claimed) > 1:
             claimed = reconsidered(observations, start, claimed, rivals, settings)
         taken = {j.hypothesis.label for j in claimed}
