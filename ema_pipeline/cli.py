@@ -12,6 +12,8 @@ import typer
 
 from ema_pipeline import __version__
 from ema_pipeline.commands import diagnosis, listings, raw, runs
+from ema_pipeline.commands.interrupts import INTERRUPTED, answer_ctrl_c
+from ema_pipeline.commands.screen import program
 from ema_pipeline.crash import write_crash_report
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import reason
@@ -30,9 +32,7 @@ STAGE_HELP = {
     "hits": "Find and judge the hits of OUT.",
     "frf": "Estimate the FRFs of OUT.",
     "modal": "Identify the modes of OUT.",
-    "fit": "Fit the model's parameters to the modes of OUT.",
     "correlate": "Pair and compare the modes and FRFs of OUT with the fitted model.",
-    "report": "Write the tables, plots and report of OUT.",
 }
 """Stages that can be run alone, and what each does."""
 
@@ -44,11 +44,16 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a character gets its escape
             stream.reconfigure(errors="backslashreplace")
     try:
+        answer_ctrl_c(program())
         app()
     except EmaError as error:
         _stop(f"ema: {error}", 1)
     except KeyboardInterrupt:
-        _stop("ema: interrupted; what was finished is kept, the same command goes on from there", 130)
+        _end_interrupted()
+    except SystemExit as stop:
+        if stop.code == INTERRUPTED:
+            _end_interrupted()
+        raise
     except BrokenPipeError:
         os._exit(1)
     except MemoryError:
@@ -60,6 +65,12 @@ def main() -> None:
         _stop(f"ema: {where}{reason(error)}; check the disk's free space and the folder's rights", 1)
     except Exception as error:
         _stop_for_crash(error)
+
+
+def _end_interrupted() -> NoReturn:
+    """End with the exit code of an interrupt: Python itself kills its process if the interrupt passed an exec()."""
+    sys.stdout.flush()
+    os._exit(INTERRUPTED)
 
 
 def _stop_for_crash(error: Exception) -> NoReturn:
@@ -95,6 +106,8 @@ app.command()(runs.run)
 for _name, _help in STAGE_HELP.items():
     app.command(_name, help=_help)(runs.stage_command(_name))
 for _verb in (
+    runs.fit,
+    runs.report,
     raw.check,
     raw.init,
     diagnosis.compare,
@@ -108,6 +121,7 @@ for _verb in (
     listings.rigs,
     listings.effects,
     listings.model,
+    listings.settings,
     listings.reproduce,
     raw.simulate,
 ):

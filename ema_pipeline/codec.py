@@ -3,7 +3,7 @@
 The layout is meant to be read with any HDF5 viewer: scalars are attributes, arrays are datasets, nested
 dataclasses and dictionaries are groups, a tuple of plain records is a table (compound dataset), a tuple of
 anything else is a group with members ``0``, ``1``, … An iterator is written like a tuple, one item at a
-time, and `Rows` like an array, one row at a time, so that they need not fit into memory. DOFs are written as
+time, and `LazySamples` like an array, one row at a time, so that they need not fit into memory. DOFs are written as
 text (``"sun.x"``).
 
 Damage is seen when it is read: every array carries a Fletcher-32 checksum, and text is stored with its length
@@ -28,7 +28,7 @@ import numpy as np
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import reason
-from ema_pipeline.rows import Rows
+from ema_pipeline.lazy_samples import LazySamples
 
 T = TypeVar("T")
 
@@ -63,7 +63,7 @@ def write(parent: h5py.Group, name: str, value: Any) -> None:
         parent.attrs[name] = value
     elif isinstance(value, np.ndarray):
         _write_array(parent, name, value)
-    elif isinstance(value, Rows):
+    elif isinstance(value, LazySamples):
         # Not compressed: measured samples gain a twentieth and would take ten times as long to read.
         chunk = (1, min(_ROW_CHUNK, value.shape[1]))
         dataset = parent.create_dataset(

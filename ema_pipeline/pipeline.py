@@ -29,7 +29,8 @@ from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.names import check_name
 from ema_pipeline.report.settings import ReportSettings
-from ema_pipeline.settings import Settings, parse
+from ema_pipeline.rigs.types import Rig
+from ema_pipeline.settings import Settings, parse, setting_names
 from ema_pipeline.stages.base import (
     Progress,
     Run,
@@ -151,6 +152,11 @@ def _settings(data: dict[str, Any], overrides: Iterable[str], where: str) -> Pip
         if not sign or not key.strip():
             raise EmaError(f"--set {change}: is not of the form stage.key=value")
         *parents, last = key.strip().split(".")
+        known = setting_names(PipelineSettings)
+        if key.strip() not in known and (alike := [k for k in known if k.split(".")[-1] == last]):
+            raise EmaError(
+                f"--set {change}: there is no setting '{key.strip()}' (did you mean {' or '.join(alike)}?)"
+            )
         table = data
         for parent in parents:
             table = table.setdefault(parent, {})
@@ -173,7 +179,7 @@ def toml_value(text: str) -> Any:
         return text
 
 
-def new_run(store: Store, info: RunInfo, effect_files: Iterable[str] = ()) -> Run:
+def new_run(store: Store, info: RunInfo, effect_files: Iterable[str] = (), rig: Rig | None = None) -> Run:
     """A run with the settings that its description holds.
 
     Parameters
@@ -182,10 +188,12 @@ def new_run(store: Store, info: RunInfo, effect_files: Iterable[str] = ()) -> Ru
     info : RunInfo
     effect_files : iterable of str
         Files with the user's own effects that are named in this call: only their code may run.
+    rig : Rig, optional
+        Built in Python, in place of that of `info`.
     """
     settings = stored_settings(store, info)
     stages = {name: settings.of(name) for name in STAGES}
-    return Run(store, info, stages, settings.effect_files, frozenset(map(_absolute, effect_files)))
+    return Run(store, info, stages, settings.effect_files, frozenset(map(_absolute, effect_files)), rig)
 
 
 def with_effect_files(store: Store, info: RunInfo, effect_files: Iterable[str]) -> RunInfo:

@@ -54,6 +54,17 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
         raise EmaError(f"{where}: {path or 'file'} = {shown}: {message}") from None
 
 
+def setting_names(model: type[BaseModel], prefix: str = "") -> tuple[str, ...]:
+    """Every setting with its tables in front, e.g. ``"modal.identify.low_hz"``."""
+    names: list[str] = []
+    for name, field in model.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            names += setting_names(inner, f"{prefix}{name}.")
+        names.append(f"{prefix}{name}")
+    return tuple(names)
+
+
 def _fields_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
     """Names of the fields of the (nested) model that `loc` leads to; keys of dictionaries are passed over."""
     current: Any = model

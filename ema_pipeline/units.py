@@ -113,7 +113,7 @@ _ALIASES = {
     "hertz": "Hz",
 }
 _PLAIN = str.maketrans("²µμ·⋅*", "2uu  ^")
-# Symbols whose meaning hangs on letter case (mN and MN, nm and Nm): these are never folded.
+# Symbols whose meaning depends on letter case (mN and MN, nm and Nm): these are never folded.
 _CASE_MATTERS = {"mn", "mv", "mg", "nm"}
 
 

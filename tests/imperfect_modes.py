@@ -103,7 +103,8 @@ def measure(
                 gain[name], cross[name] = np.exp(lab.gains * rng.normal()), lab.transverse * rng.normal()
             rows.append(gain[name] * (_row(assembly, name) + cross[name] * _across(assembly, name)))
         shapes = (np.array(rows) @ phi).T
-        shapes = shapes / np.max(np.abs(shapes), axis=1, keepdims=True)
+        # The sign of an eigenvector is the library's choice: noise is to fall on the same shape on every machine.
+        shapes = shapes / np.take_along_axis(shapes, np.argmax(np.abs(shapes), axis=1)[:, None], axis=1)
         noise = rng.normal(size=shapes.shape) + 1j * rng.normal(size=shapes.shape)
         found[configuration] = MeasuredModes(
             configuration=configuration,

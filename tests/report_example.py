@@ -18,7 +18,7 @@ from ema_pipeline.correlate.types import (
     Unpaired,
 )
 from ema_pipeline.dof import Dof
-from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate, Profile, TwoStep
+from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate, Profile, StepwiseEstimate
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.mechanics.system import LinearSystem
@@ -433,7 +433,11 @@ def fit_result() -> FitResult:
         96,
         "the step fell below the tolerance after 9 iterations",
         tuple(sweeps),
-        TwoStep(9.7e6, 1.6e7, 1.285e7, "Three modes leave the sun-planet value open."),
+        StepwiseEstimate(
+            {"sun_planet_mesh_stiffness": 9.7e6, "ring_planet_mesh_stiffness": 1.6e7},
+            1.285e7,
+            "Three modes leave the sun-planet value open.",
+        ),
         ("The posterior is well approximated by a normal distribution.",),
     )
 
@@ -493,7 +497,6 @@ def planetary_run(lines: int = 4097) -> RunResults:
         configurations,
         fit_result(),
         comparison(configurations),
-        ("with_ring: planet3.y was not measured.",),
         {"ema": "0.1.0", "python": "3.11", "raw folder": "campaign <a & b>", "input hash": "3f2a…"},
         {"frf": {"estimator": "H1", "window": "force + exponential"}, "modal": {"max_order": "60"}},
     )

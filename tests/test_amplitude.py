@@ -14,12 +14,13 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.inference import Posterior
 from ema_pipeline.mechanics.laws import DryFriction, Nonlinear, PartingSpring, PolynomialSpring
+from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import eigen_solution
-from ema_pipeline.mechanics.nonlinear import element_rows
 from ema_pipeline.observations.amplitude import AmplitudeObservations, AmplitudeProblem
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, refined, transferred
 from ema_pipeline.observations.hit_modes import HitData, Linear, comparable, shifted_poles
-from ema_pipeline.observations.modes import ModeObservations, prepare
+from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.modes import ModeObservations
 
 RATIO, LINE_HZ, HITS = 0.01, 0.5, 2
 IMPULSE_S = 1e-3
@@ -173,3 +174,13 @@ def test_a_cubic_bearing_is_told_from_simulated_hits() -> None:
     _, rival = fitted(observations, base, "bearing_cubic@rim")
     assert gain > max(5.0, 5.0 + rival.log_evidence - base.log_evidence)
     assert problem.parameter_values(found.x)["bearing_cubic@hub.stiffness"] == pytest.approx(1e11, rel=0.3)
+
+
+def test_levels_held_out_are_predicted_without_the_modes_they_were_paired_by() -> None:
+    """A held-out level has no modes of its own among the data, and still needs to know which mode moves."""
+    observations = synthetic()
+    for _, out in observations.folds():
+        problem = out.problem((), {})
+        found = problem.residuals(problem.start(), {n: s.default for n, s in out.scatters.items()})
+        assert np.isfinite(found.cost)
+        assert len(found.values)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -15,8 +18,8 @@ import h5py
 import numpy as np
 import pytest
 import pyuff
+from bench import ema, write_bench
 
-from ema_pipeline import cli
 from ema_pipeline.loops.simulate import PRINTED, write_sine_tests
 from ema_pipeline.pipeline import existing_run
 from ema_pipeline.simulate import simulate_campaign
@@ -26,21 +29,6 @@ STAGES = 'stages=["ingest", "hits", "frf", "modal", "ladder", "fit", "correlate"
 
 RIG = ("--rig", "planetary", "--set", STAGES)
 RUN = [sys.executable, "-m", "ema_pipeline.cli", "run"]
-
-
-def ema(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    """Run the command in this process; returns exit code, stdout and stderr."""
-    before = sys.argv
-    sys.argv = ["ema", *map(str, arguments)]
-    try:
-        cli.main()
-        code = 0
-    except SystemExit as stop:
-        code = int(stop.code or 0)
-    finally:
-        sys.argv = before
-    out, err = capsys.readouterr()
-    return code, out, err
 
 
 @pytest.fixture(scope="module")
@@ -74,9 +62,8 @@ def results(small_raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_run_writes_every_file_of_the_results_folder(results: Path) -> None:
     names = {p.name for p in results.iterdir()}
-    assert {"ema.h5", "report.html", "plots", "modes.csv", "summary.json"} <= names
-    plots = {p.suffix for p in (results / "plots").iterdir()}
-    assert {".png", ".svg"} <= plots
+    assert {"ema.h5", "report.html", "modes.csv", "summary.json"} <= names
+    assert "plots" not in names  # drawn on demand
 
 
 def test_the_summary_holds_modes_near_those_of_the_model_that_made_the_data(
@@ -125,10 +112,28 @@ def test_a_changed_setting_recomputes_only_what_depends_on_it(
         out,
         "--verbose",
         "--set",
-        "report.plots=false",
+        "report.plots=true",
     )
     assert code == 0
     assert "Computed: report\n" in text
+    assert {".png", ".svg"} <= {p.suffix for p in (out / "plots").iterdir()}
+
+
+def test_report_for_print_has_eight_pages_at_most_and_the_test_sheet(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(results, out)
+    code, text, err = ema(capsys, "report", out, "--pdf")
+    assert code == 0, err
+    assert "report.pdf" in text
+    pages = (out / "report.pdf").read_bytes()
+    assert pages.startswith(b"%PDF")
+    assert 3 <= len(re.findall(rb"/Type /Page\b(?!s)", pages)) <= 8
+    html = (out / "report.html").read_text(encoding="utf-8")
+    sheet = html[html.index("Set-up and processing") :]
+    for item in ("impact points", "sample rate", "exponential window", "mV/", "ISO 7626-5"):
+        assert item in sheet
 
 
 def test_stages_run_alone_on_a_results_folder_without_the_raw_data(
@@ -225,6 +230,7 @@ def test_hysteresis_tests_run_through_the_same_command(
     assert "viscous damping" in text
     found = json.loads((out / "summary.json").read_text(encoding="utf-8"))["configurations"]["default"]
     assert found["parameters"]["stiffness"]["value"] == pytest.approx(PRINTED["stiffness"], rel=0.03)
+    assert ema(capsys, "report", out, "--plots")[0] == 0
     assert list((out / "plots").glob("*.png"))
 
 
@@ -536,3 +542,107 @@ def test_bad_settings_are_one_clear_line(
     arguments = list(cases.values())[number]
     assert_one_clear_line(*ema(capsys, *arguments))
     assert not (tmp_path / "out").exists()
+
+
+def test_every_setting_is_listed_with_its_default_its_values_and_why(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    code, out, _ = ema(capsys, "settings", "--json")
+    listed = {s["name"]: s for s in json.loads(out)["settings"]}
+    assert code == 0
+    assert listed["frf.estimator"] | {"description": ""} == {
+        "name": "frf.estimator",
+        "default": "H1",
+        "values": "H1 | H2 | Hv",
+        "description": "",
+    }
+    assert listed["frf.reciprocity"]["values"] == "number > 0"
+    assert [name for name, s in listed.items() if not s["description"]] == []
+    code, out, _ = ema(capsys, "settings", "correlate.pairing")
+    assert code == 0
+    assert "correlate.pairing.least_mac = 0.4" in out
+    assert "frf." not in out
+    code, out, err = ema(capsys, "settings", "correlat")
+    assert (code, out) == (0, ema(capsys, "settings", "correlate")[1])
+    code, out, err = ema(capsys, "settings", "modla")
+    assert code == 1
+    assert "did you mean 'modal'" in err
+
+
+def test_check_fits_80_columns_with_units_and_clauses_and_fails_where_a_point_has_no_good_hit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    test = {"hits": 2, "double_hits": ("m3.x#1", "m3.x#2", "m1.x#1")}
+    raw = write_bench(tmp_path, **test)
+    code, out, err = ema(capsys, "check", raw)
+    assert max(map(len, out.splitlines())) <= 80
+    assert len([line for line in out.splitlines() if ".h5" in line and "FAIL" in line]) == 3
+    assert re.search(r"m1\.x +\d+ N +\d+\.?\d* % +\d+ Hz", out)
+    assert "2.5 %" in out
+    assert "ISO 7626-5" in out
+    assert code == 1
+    assert err.count("\n") == 1
+    assert "no good hit on m3.x" in err
+    listed = ema(capsys, "check", raw, "--json")
+    assert listed[0] == 1
+    assert {hit["force_unit"] for hit in json.loads(listed[1])["default"]} == {"N"}
+
+
+def test_init_takes_the_struck_node_and_direction_from_universal_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    time = np.arange(1024) / 1024.0
+    for number, (node, direction) in enumerate(((7, 3), (9, -1))):
+        file = pyuff.UFF(str(tmp_path / f"run{number}.uff"))
+        for name, own, way in (("hammer", node, direction), ("a", 7, 3), ("b", 8, 1)):
+            data = (
+                np.sin(40 * own * time) if name != "hammer" else np.where(abs(time - 0.1) < 0.002, 1.0, 0.0)
+            )
+            places = {"rsp_node": own, "rsp_dir": way, "ref_node": node, "ref_dir": direction}
+            file.write_sets(
+                {
+                    "type": 58,
+                    "func_type": 1,
+                    **places,
+                    "data": data,
+                    "x": time,
+                    "id1": name,
+                    "binary": 0,
+                    "abscissa_spacing": 1,
+                    "rsp_ent_name": "NONE",
+                    "ref_ent_name": "NONE",
+                    "abscissa_spec_data_type": 17,
+                    "ordinate_spec_data_type": 0,
+                    "orddenom_spec_data_type": 0,
+                },
+                mode="add",
+            )
+    code, _, err = ema(capsys, "init", tmp_path)
+    assert code == 0, err
+    text = (tmp_path / "test.toml").read_text(encoding="utf-8")
+    assert re.findall(r'impact = "(.*?)"(.*)', text) == [("7.z", ""), ("-9.x", "")]
+    assert 'dof = "7.z"' in text
+
+
+@pytest.mark.parametrize("stage", ["ingest", "modal"])
+def test_ctrl_c_ends_within_a_second_with_one_line_that_says_how_to_go_on(
+    small_raw: Path, tmp_path: Path, stage: str
+) -> None:
+    out = tmp_path / "out"
+    command = [*RUN, str(small_raw), *RIG, "--out", str(out)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True) as run:
+        assert run.stderr is not None
+        line = run.stderr.readline()
+        while stage not in line:  # the line of a stage is written once it is done
+            line = run.stderr.readline()
+            assert line, "the run ended before it was interrupted"
+        os.killpg(run.pid, signal.SIGINT)
+        before = time.monotonic()
+        rest = run.stderr.read()
+        code = run.wait(10)
+        assert time.monotonic() - before < 1.5  # one second, and room for a busy machine
+    assert code == 130
+    (told,) = [text for text in rest.splitlines() if text.startswith("ema:")]
+    assert told.startswith("ema: interrupted; finished stages are kept, go on with: ema run")
+    done = subprocess.run([*command, "--verbose"], capture_output=True, text=True, check=True)
+    assert stage not in done.stdout.partition("Computed: ")[2].split(", ")[0]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ema_pipeline.correlate.compare import band_differences, compare
-from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies, with_floors
-from ema_pipeline.correlate.pairing import close_groups, pair, pair_rig
-from ema_pipeline.correlate.settings import CompareSettings, PairingSettings, UncertaintySettings
+from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
+from ema_pipeline.correlate.pairing import assign, close_groups, pair, pair_rig
+from ema_pipeline.correlate.settings import CompareSettings, PairingSettings
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
+from ema_pipeline.fit.comparison import band_differences, compare
 from ema_pipeline.fit.parameters import FittedModes
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.inference import Posterior
@@ -21,7 +21,8 @@ from ema_pipeline.mechanics.frf import accelerance
 from ema_pipeline.mechanics.modes import normal_modes
 from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
 from ema_pipeline.observations.fitting import Fit, Model
-from ema_pipeline.observations.modes import ModeObservations, prepare
+from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs import load_rig
 from ema_pipeline.rigs.types import ModelMode
 
@@ -177,12 +178,9 @@ def test_groups_chain_neighbours_and_part_distant_modes() -> None:
     assert len({int(groups[0]), int(groups[1]), int(groups[4])}) == 3
 
 
-def test_missing_standard_deviations_are_replaced_and_tiny_ones_raised_to_the_floor() -> None:
-    table = with_floors(from_frequencies("no_ring", [100.0, 50.0]), UncertaintySettings())
+def test_a_table_of_frequencies_is_sorted_and_none_may_be_zero() -> None:
+    table = from_frequencies("no_ring", [100.0, 50.0])
     assert table.frequency_hz.tolist() == [50.0, 100.0]
-    assert table.frequency_std_hz / table.frequency_hz == pytest.approx([0.01, 0.01], rel=1e-3)
-    exact = with_floors(from_frequencies("no_ring", [100.0], [1e-7]), UncertaintySettings())
-    assert exact.frequency_std_hz[0] == pytest.approx(0.01)
     with pytest.raises(EmaError, match="must be positive"):
         from_frequencies("no_ring", [0.0, 10.0])
 
@@ -277,3 +275,42 @@ def test_an_exponential_window_on_the_frfs_is_given_to_the_model_too() -> None:
     with_window = replace(frfs, frf=windowed, response_decay_rad_s=sigma)
     bands = band_differences("no_ring", system, with_window, CompareSettings())
     assert max(b.z for b in bands) < 1e-6
+
+
+def test_the_price_of_a_pair_is_one_at_the_frequency_tolerance_and_one_at_the_least_mac() -> None:
+    settings = PairingSettings(frequency_tolerance=0.3, least_mac=0.4, refusal=1.2)
+
+    def paired(distance: float, mac: float) -> bool:
+        one = np.array([[mac]])
+        return assign(np.array([[distance]]), one, one, settings) == {0: 0}
+
+    assert paired(0.29, 0.99)  # 0.93 + 0.02
+    assert not paired(0.29, 0.80)  # 0.93 + 0.33
+    assert paired(0.0, 0.41)  # 0 + 0.98
+    assert not paired(0.0, 0.39)  # below the least MAC
+    assert not paired(0.31, 1.0)  # beyond the tolerance
+    assert paired(0.15, 0.50)  # 0.25 + 0.83
+    assert not paired(0.20, 0.50)  # 0.44 + 0.83
+
+
+def test_of_two_members_of_a_group_the_one_with_the_better_plain_mac_is_taken() -> None:
+    distance, grouped = np.zeros((1, 2)), np.ones((1, 2))
+    for better in (0, 1):
+        single = np.full((1, 2), 0.4)
+        single[0, better] = 0.6
+        assert assign(distance, grouped, single, PairingSettings()) == {0: better}
+
+
+def test_why_a_mode_stays_unpaired_is_said_with_its_numbers() -> None:
+    rig = load_rig("frame")
+    model_hz, _ = normal_modes(rig.system("default"))
+    settings = PairingSettings(frequency_tolerance=0.1)
+    table = from_frequencies("default", [0.8 * model_hz[0], model_hz[1]])
+    pairing = pair_rig(rig, "default", {}, table, settings)
+    assert [(p.measured, p.model) for p in pairing.pairs] == [(1, 1)]
+    assert [u.reason for u in pairing.unpaired_measured] == ["no model mode within 10 %"]
+    # Without a stated band modes are looked for from 0.7 times the lowest to 1.3 times the highest measured one.
+    assert [u.reason for u in pairing.unpaired_model] == ["no measured mode within 10 %", "above band"]
+    narrow = from_frequencies("default", [1.2 * model_hz[1], 1.01 * model_hz[2]])
+    pairing = pair_rig(rig, "default", {}, narrow, PairingSettings())
+    assert [u.reason for u in pairing.unpaired_model] == ["below band"]

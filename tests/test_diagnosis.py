@@ -18,16 +18,17 @@ from ema_pipeline.diagnose.claims import judge
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.heldout import held_out
 from ema_pipeline.diagnose.hypotheses import list_hypotheses
+from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.ranking import rank
 from ema_pipeline.diagnose.rungs import make_ladder
-from ema_pipeline.diagnose.selection import NOTHING
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.mechanics.assembly import Damper, Element, Mass, Spring
 from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned
-from ema_pipeline.observations.modes import ModeObservations, prepare
+from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs.planetary import planetary
 from ema_pipeline.rigs.types import Rig
 

@@ -14,21 +14,17 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.errors import EmaError
-from ema_pipeline.fit.error_function import (
-    RING_PLANET,
-    SUN_PLANET,
-    error_sweep,
-    frequency_error,
-    two_step,
-)
+from ema_pipeline.fit.error_function import error_sweep, frequency_error, stepwise
 from ema_pipeline.fit.parameters import fit_modes, fit_result, restored
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.mechanics.modes import normal_modes
 from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.observations.fitting import Model
-from ema_pipeline.observations.modes import ModeObservations, prepare
+from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs import load_rig
+from ema_pipeline.rigs.planetary import RING_PLANET, SUN_PLANET
 from ema_pipeline.rigs.types import Rig
 
 RIG = load_rig("planetary")
@@ -110,18 +106,16 @@ def test_three_modes_of_case_1_leave_the_error_function_flat_within_one_percent(
 
 
 def test_the_ring_mesh_of_case_2_has_its_minimum_between_1_6_and_1_8_MN_per_m() -> None:
-    result = two_step(RIG, {"no_ring": from_frequencies("no_ring", CASE_1),
+    result = stepwise(RIG, {"no_ring": from_frequencies("no_ring", CASE_1),
                             "with_ring": from_frequencies("with_ring", CASE_2)}, FitSettings())  # fmt: skip
-    assert result.sun_planet_mesh_stiffness == pytest.approx(5.5e6, rel=0.02)
-    assert 1.6e6 < result.ring_planet_mesh_stiffness < 1.8e6
-    assert result.average == pytest.approx(
-        (result.sun_planet_mesh_stiffness + result.ring_planet_mesh_stiffness) / 2
-    )
+    assert result.values[SUN_PLANET] == pytest.approx(5.5e6, rel=0.02)
+    assert 1.6e6 < result.values[RING_PLANET] < 1.8e6
+    assert result.average == pytest.approx((result.values[SUN_PLANET] + result.values[RING_PLANET]) / 2)
 
 
 def test_the_second_step_is_left_out_when_the_ring_was_not_measured() -> None:
-    result = two_step(RIG, {"no_ring": from_frequencies("no_ring", CASE_1)}, FAST)
-    assert np.isnan(result.ring_planet_mesh_stiffness)
+    result = stepwise(RIG, {"no_ring": from_frequencies("no_ring", CASE_1)}, FAST)
+    assert np.isnan(result.values[RING_PLANET])
     assert np.isnan(result.average)
     assert "with_ring was not measured" in result.note
 

@@ -370,8 +370,16 @@ def test_driving_points_and_reciprocity_pass_on_a_passive_reciprocal_structure()
 def test_reversed_sensor_shows_at_its_driving_point_and_in_reciprocity() -> None:
     frfs = estimate_frfs(two_way_hits(-1.0, 1.0))
     assert checks(frfs, "driving point") == [True, False]
-    assert checks(frfs, "reciprocity") == [False]
+    assert checks(frfs, "sensitivity") == [False]
     assert any("reversed" in v.message for v in frfs.verdicts)
+    assert any("contradict each other" in v.message and "signs" in v.message for v in frfs.verdicts)
+
+
+def test_sensitivity_wrong_by_a_factor_shows_as_that_factor_in_reciprocity() -> None:
+    frfs = estimate_frfs(two_way_hits(1.0, 9.81))
+    (found,) = (v for v in frfs.verdicts if v.check == "sensitivity")
+    assert max(found.value, 1 / found.value) == pytest.approx(9.81, rel=0.05)
+    assert "mV/g" in found.message
 
 
 def test_miscalibrated_sensor_shows_in_reciprocity_only() -> None:
@@ -399,3 +407,119 @@ def test_record_helper_gives_whole_records() -> None:
     record = record_of(h.force, h.responses, RATE)
     (hit,) = hits_of_test([record])
     assert np.array_equal(cut_hit(record, hit).force, h.force)
+
+
+def gauss_pulse(cut_hz: float, n: int = 8192) -> NDArray[np.float64]:
+    """A pulse whose autospectrum falls as exp(-a·f²), by 40 dB at `cut_hz`."""
+    tau = np.sqrt(8 * np.log(10)) / (2 * np.pi * cut_hz)
+    return 100 * np.exp(-(((np.arange(n) / RATE - 0.05) / tau) ** 2))
+
+
+@pytest.mark.parametrize(("drop_db", "end_hz"), [(40.0, 300.0), (30.0, 259.8), (20.0, 212.1)])
+def test_the_band_of_a_clean_pulse_ends_at_the_drop_that_the_settings_say(
+    drop_db: float, end_hz: float
+) -> None:
+    force = gauss_pulse(300.0)
+    frfs = estimate_frfs([hit_of(force, force[None])], FrfSettings(band_drop_db=drop_db))
+    assert frfs.band_hz[1] == pytest.approx(end_hz, abs=5)  # blocks of lines are 4 Hz wide
+
+
+def test_the_band_ends_10_db_above_the_flat_part_of_the_force_spectrum() -> None:
+    force = gauss_pulse(300.0)
+    flat = np.zeros(force.size)
+    flat[4000] = np.abs(np.fft.rfft(force)).max() * 10 ** (
+        -35 / 20
+    )  # a click far from the pulse: 35 dB lower
+    end_hz = estimate_frfs([hit_of(force + flat, force[None])]).band_hz[1]
+    assert -40 * (end_hz / 300) ** 2 == pytest.approx(-35 + 10, abs=1.5)
+
+
+def test_repeatability_is_the_scatter_of_single_hits_beyond_the_noise() -> None:
+    factors = np.array([0.8, 0.9, 1.0, 1.1, 1.2])
+    rng = np.random.default_rng(3)
+    hits = [
+        replace(h, responses=f * h.responses + 0.02 * rng.standard_normal(h.responses.shape))
+        for h, f in zip(clean_hits(5, 8192, outputs=1), factors, strict=True)
+    ]
+    verdicts = estimate_frfs(hits).verdicts
+    repeatability = next(v for v in verdicts if v.check == "repeatability")
+    coherence = next(v for v in verdicts if v.check == "coherence")
+    assert repeatability.value == pytest.approx(np.std(factors, ddof=1), rel=0.15)
+    assert coherence.value == pytest.approx(1 / (1 + np.var(factors)), abs=0.01)
+    assert (repeatability.passes, coherence.passes) == (False, True)
+    steady = [replace(h, responses=h.responses + 0.02 * rng.standard_normal(h.responses.shape))
+              for h in clean_hits(5, 8192, outputs=1)]  # fmt: skip
+    assert next(v for v in estimate_frfs(steady).verdicts if v.check == "repeatability").value < 0.02
+
+
+def test_two_channels_at_one_dof_are_named() -> None:
+    hit = hit_of(half_sine(256, 10, 4, 1.0), np.ones((3, 256)), outputs=("p0.z", "p1.z", "p1.z"))
+    with pytest.raises(EmaError, match=r"channels 'a1' and 'a2' both measure p1\.z"):
+        estimate_frfs([hit])
+
+
+def test_the_force_window_leaves_out_what_the_hammer_reads_long_after_the_pulse() -> None:
+    (clean,) = clean_hits(1, 4096, outputs=1)
+    late = clean.force.copy()
+    late[3000:3020] += 0.2 * clean.force.max()
+    disturbed = replace(clean, force=late)
+    lines = slice(10, 800)
+    true = estimate_frfs([clean]).frf[0, 0, lines]
+
+    def off(settings: FrfSettings) -> float:
+        found = estimate_frfs([disturbed], settings).frf[0, 0, lines]
+        return float(np.abs(found - true).max() / np.abs(true).max())
+
+    assert off(FrfSettings(force_window="auto")) < 1e-3 < 0.1 < off(FrfSettings())
+
+
+def test_windows_find_the_pulse_of_a_hit_that_was_cut_from_a_long_recording() -> None:
+    (clean,) = clean_hits(1, 4096, outputs=1)
+    later = replace(clean, hit=replace(clean.hit, start=20000, stop=24096, peak=clean.hit.peak + 20000))
+    settings = FrfSettings(force_window="auto", exponential_window=12.0)
+    np.testing.assert_array_equal(estimate_frfs([later], settings).frf, estimate_frfs([clean], settings).frf)
+
+
+def value(frfs: FrfSet, check: str) -> float:
+    """Value of the last verdict of a check."""
+    return [v.value for v in frfs.verdicts if v.check == check][-1]
+
+
+@pytest.mark.parametrize("gain", [0.8, 1.0, 1.3])
+def test_reciprocity_is_the_difference_of_two_frfs_over_their_mean_size(gain: float) -> None:
+    frfs = estimate_frfs(two_way_hits(1.0, gain))
+    assert value(frfs, "reciprocity") == pytest.approx(abs(gain - 1) / (0.5 * (gain + 1)), abs=0.01)
+
+
+def test_the_noise_of_two_frfs_is_not_taken_for_a_lack_of_reciprocity() -> None:
+    rng = np.random.default_rng(0)
+    noisy = [
+        replace(h, responses=h.responses + 0.1 * np.std(h.responses) * rng.standard_normal(h.responses.shape))
+        for h in two_way_hits(1.0, 1.0)
+    ]
+    assert value(estimate_frfs(noisy), "reciprocity") < 0.05
+
+
+def test_a_reversed_driving_point_has_nearly_all_of_its_imaginary_part_negative() -> None:
+    right, wrong = estimate_frfs(two_way_hits(1.0, 1.0)), estimate_frfs(two_way_hits(1.0, -1.0))
+    assert value(right, "driving point") < 0.02
+    assert value(wrong, "driving point") > 0.98
+    assert "reversed" in [v.message for v in wrong.verdicts if v.check == "driving point"][-1]
+
+
+def test_one_hit_each_way_is_enough_for_reciprocity() -> None:
+    single = [two_way_hits(1.0, 1.3)[k] for k in (0, 3)]
+    assert value(estimate_frfs(single), "reciprocity") == pytest.approx(0.3 / 1.15, abs=0.01)
+
+
+def test_coherence_is_judged_from_three_hits_on() -> None:
+    rng = np.random.default_rng(5)
+    poor = [
+        replace(h, responses=h.responses + 2 * np.std(h.responses) * rng.standard_normal(h.responses.shape))
+        for h in clean_hits(3, 8192, outputs=1)
+    ]
+    two, three = estimate_frfs(poor[:2]), estimate_frfs(poor)
+    assert value(three, "coherence") < 0.9
+    assert checks(three, "coherence") == [False]
+    assert checks(two, "coherence") == [True]
+    assert "two hits are too few" in next(v.message for v in two.verdicts if v.check == "coherence")

@@ -20,11 +20,11 @@ from hypothesis import HealthCheck, given, seed, settings
 from hypothesis import strategies as st
 from ingest_example import hammer_test, write_csv
 
+from ema_pipeline.describe import checked_rig, describe_modes
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest import read_description
 from ema_pipeline.ingest.load import load_record
 from ema_pipeline.ingest.readers import read_raw
-from ema_pipeline.job import checked_rig, describe_modes
 from ema_pipeline.pipeline import load_pipeline
 from ema_pipeline.plain_text import printable
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from bench import ema
 from ingest_example import DESCRIPTION, hammer_test, make_test, write_csv
 
-from ema_pipeline import cli
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest import load_record, read_description
 from ema_pipeline.names import check_name
@@ -22,21 +22,6 @@ from ema_pipeline.plain_text import printable
 from ema_pipeline.toml_text import LARGEST_BYTES, parse_toml, read_toml
 
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202e"
-
-
-def ema(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    """Run the command in this process; returns exit code, stdout and stderr."""
-    before = sys.argv
-    sys.argv = ["ema", *map(str, arguments)]
-    try:
-        cli.main()
-        code = 0
-    except SystemExit as stop:
-        code = int(stop.code or 0)
-    finally:
-        sys.argv = before
-    out, err = capsys.readouterr()
-    return code, out, err
 
 
 def one_line(err: str) -> str:
@@ -268,7 +253,7 @@ def test_a_fault_of_the_program_writes_a_report_and_says_where(
 
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
-    monkeypatch.setattr("ema_pipeline.job.check_raw", fail)
+    monkeypatch.setattr("ema_pipeline.raw_folder.check_raw", fail)
     code, out, err = ema(capsys, "check", tmp_path)
     assert code == 1
     assert out == ""
@@ -288,7 +273,7 @@ def test_a_full_disk_is_one_line_wherever_it_is_met(
     def fail(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "truth.json"))
 
-    monkeypatch.setattr("ema_pipeline.job.check_raw", fail)
+    monkeypatch.setattr("ema_pipeline.raw_folder.check_raw", fail)
     code, _, err = ema(capsys, "check", tmp_path)
     assert code == 1
     assert "truth.json: No space left on device" in one_line(err)

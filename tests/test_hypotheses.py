@@ -14,12 +14,15 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnose.limits import detection_limits
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import named, sizes_of
+from ema_pipeline.diagnose.probability import needed
 from ema_pipeline.diagnose.score import Score, scores
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.mechanics.assembly import Damper, Mass, Spring
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, refined
-from ema_pipeline.observations.modes import ModeObservations, prepare
+from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs import load_rig
 from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.planetary import planetary
@@ -219,11 +222,14 @@ def test_the_best_score_is_that_of_the_spring_that_was_made_stiffer() -> None:
 
 @pytest.mark.parametrize("label", ["spring@m2-m3", "mass@m3"])
 def test_an_effect_of_twice_its_limit_is_seen_and_one_far_below_it_is_not(label: str) -> None:
-    claim, sigmas = 5.0, 2.0
+    settings = DiagnoseSettings(claim=5.0)
     healthy = chain_data(3, lab=NORMAL)
     base = learned(healthy, fit_base(healthy, Model()))
-    found = scores(healthy, base, list_hypotheses(chain(), shipped_effects()))
-    limit = {d.label: d for d in detection_limits(found, claim, sigmas)}[label]
+    hypotheses = list_hypotheses(chain(), shipped_effects())
+    h = of_chain()[label]
+    limit = {d.label: d for d in detection_limits(scores(healthy, base, hypotheses), hypotheses, settings)}[
+        label
+    ]
     assert 0 < limit.size < np.inf
     effect, _, place = label.partition("@")
     rows = {"m2-m3": {"m2.z": -1.0, "m3.z": 1.0}, "m3": {"m3.z": 1.0}, "m2": {"m2.z": 1.0}}
@@ -234,9 +240,8 @@ def test_an_effect_of_twice_its_limit_is_seen_and_one_far_below_it_is_not(label:
         observations = chain_data(seed, hidden, NORMAL)
         start = learned(observations, fit_base(observations, Model()))
         with_it = learned(observations, fit_base(observations, Model().plus(h.placed, h.scales)))
-        return with_it.log_evidence - start.log_evidence >= claim
+        return with_it.log_evidence - start.log_evidence >= needed(h, hypotheses, settings, 0)
 
-    h = of_chain()[label]
     at = np.mean([seen(2.0 * limit.size, 20 + i) for i in range(4)])
     below = np.mean([seen(0.2 * limit.size, 40 + i) for i in range(3)])
     assert at >= 0.75
@@ -246,7 +251,12 @@ def test_an_effect_of_twice_its_limit_is_seen_and_one_far_below_it_is_not(label:
 def test_limits_of_several_names_are_the_same_change() -> None:
     _, _, found = scored()
     limits = {
-        d.label: d.size for d in detection_limits({id(s): s for s in found.values()}.values(), 5.0, 2.0)
+        d.label: d.size
+        for d in detection_limits(
+            {id(s): s for s in found.values()}.values(),
+            list_hypotheses(chain(), shipped_effects()),
+            DiagnoseSettings(),
+        )
     }
     assert limits["spring@m2"] == pytest.approx(limits["spring@m2.z"])
     assert all(v > 0 for v in limits.values())
@@ -267,7 +277,7 @@ def test_a_sensor_less_lets_less_be_seen() -> None:
         observations = ModeObservations(chain(), [prepare(fewer)])
         base = fit_base(observations, Model())
         found = scores(observations, base, [of_chain()["spring@m4"]])
-        limits.append(detection_limits(found, 5.0, 2.0)[0].size)
+        limits.append(detection_limits(found, [of_chain()["spring@m4"]], DiagnoseSettings())[0].size)
     assert limits[1] > limits[0]
 
 

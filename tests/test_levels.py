@@ -17,10 +17,10 @@ from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import HitSamples, cut_hit
 from ema_pipeline.levels import LevelSettings, LevelStudy, study_levels
+from ema_pipeline.levels.sentences import flagged
 from ema_pipeline.levels.single import single_hits
 from ema_pipeline.levels.sizes import relative_sizes, sizes_at_levels
 from ema_pipeline.levels.trend import Samples, clearest, combined, holm, samples, shifts, trends
-from ema_pipeline.levels.words import flagged
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel

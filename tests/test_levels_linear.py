@@ -88,8 +88,8 @@ def test_fit_and_comparison_take_the_modes_and_frfs_of_that_level(
     def held_result(stage: str, configuration: str, name: str, cls: type) -> object:
         return held[name]
 
-    store = SimpleNamespace(find=held_result, load=held_result)
-    run = cast(Run, SimpleNamespace(store=store, info=SimpleNamespace(configurations=("rig",))))
+    store = SimpleNamespace(find=held_result, load=held_result, key=lambda stage, configuration: "")
+    run = cast(Run, SimpleNamespace(store=store, info=SimpleNamespace(configurations=("rig",)), memory={}))
     assert measured_modes(run)["rig"].frequency_hz[1] == pytest.approx(130.0, rel=4e-4)
     assert measured_frfs(run)["rig"] is study.levels[0].frfs
     assert held["study"].levels[0].modal.modes[1].circles

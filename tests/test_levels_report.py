@@ -11,12 +11,12 @@ from rich.console import Console
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.levels.sentences import flagged
 from ema_pipeline.levels.types import DecayCurve, ForceLevel, LevelStudy, ModeLevels
-from ema_pipeline.levels.words import flagged
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
 from ema_pipeline.report import summary, terminal
 from ema_pipeline.report.html import report_html
-from ema_pipeline.report.plots import figure_specs, render
+from ema_pipeline.report.plots import figure_specs
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.summary_files import summary as summary_json
 
@@ -97,7 +97,7 @@ def test_the_report_has_a_section_where_there_is_something_to_say(results: RunRe
     names = [s.name for s in figure_specs(results)]
     assert "c_levels" in names
     assert "c_levels_mode_01" in names
-    page = report_html(results, render(results))
+    page = report_html(results)
     assert "Does it depend on how hard you hit?" in page
     assert "101.200 ± 0.020" in page
     assert any("not linear" in line for line in summary.findings(results))
@@ -111,7 +111,7 @@ def test_the_report_keeps_quiet_about_one_level_that_shows_nothing(results: RunR
     )
     silent = replace(results, configurations=(replace(results.configurations[0], levels=quiet),))
     assert not any("levels" in s.name for s in figure_specs(silent))
-    assert "how hard you hit" not in report_html(silent, ())
+    assert "how hard you hit" not in report_html(silent)
     assert not any("cannot be known" in line for line in summary.findings(silent))
 
 

@@ -10,14 +10,13 @@ import pytest
 
 from ema_pipeline import codec
 from ema_pipeline.errors import EmaError
+from ema_pipeline.fit.isolator import analyse_loops, identify_isolator
 from ema_pipeline.ingest.description import read_campaign
 from ema_pipeline.loops.closed_form import bouc_wen_steps, damping_from_energies, hysteresis_force
 from ema_pipeline.loops.extract import measure_loop
-from ema_pipeline.loops.figures import isolator_figures
-from ema_pipeline.loops.identify import identify_isolator
-from ema_pipeline.loops.read import analyse_loops
 from ema_pipeline.loops.simulate import PRINTED, simulate_sine_test, write_sine_tests
 from ema_pipeline.loops.types import IsolatorResult, Loop
+from ema_pipeline.report.figures.loops import isolator_figures
 
 TRUE = {**PRINTED, "hysteresis_stiffness": PRINTED["hysteresis_force"] * PRINTED["hysteresis_rho"]}
 

@@ -18,7 +18,8 @@ from ema_pipeline.fit.parameters import fit_modes, fit_result
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.observations.fitting import Model
-from ema_pipeline.observations.modes import ModeObservations, prepare
+from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.report import summary
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.rigs import Rig, load_rig, model_modes

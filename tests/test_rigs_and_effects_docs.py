@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from ema_pipeline import cli
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.effects.rig import rig_with_effects
+from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics import laws
 from ema_pipeline.mechanics.assembly import Damper, Gyroscopic, Mass, Nonlinear, Spring
 from ema_pipeline.mechanics.modes import complex_modes
@@ -108,6 +109,66 @@ def test_a_test_is_simulated_with_the_effect_of_a_file(
     assert truth["filmed"]["values"]["oil_film@sun.stiffness"] == 3e7
     f = {n: [m["frequency_hz"] for m in t["configurations"]["no_ring"]["modes"]] for n, t in truth.items()}
     assert max(b / a for a, b in zip(f["plain"], f["filmed"], strict=True) if a > 1) > 1.001
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "words"),
+    [
+        ("EFFECT = Effect(", "effect = Effect(", 19, "the effect is called effect; call it EFFECT"),
+        (
+            'values["coefficient"]',
+            'values["damping"]',
+            15,
+            "asks for 'damping', its parameters are 'stiffness'",
+        ),
+        (
+            '"N/m", 0.0, 1e5',
+            '"N/m", 7.0, 1e5',
+            10,
+            "changes the stiffness although all is null (stiffness = 7",
+        ),
+        ("return assembly.add(", "return assembly.ad(", 13, "does not work: AttributeError"),
+        ("1e5, 3e5, 0.0, 1e9", "1e5, 0.0, 0.0, 1e9", 24, "'stiffness': scale 0 must be above 0"),
+        ("1e5, 3e5, 0.0, 1e9", "1e5, 3e5, 2e5, 1e9", 24, "start 100000 lies outside"),
+        (
+            "def edit(assembly, place, values):",
+            "def edit(assembly, place, values",
+            10,
+            "does not run: SyntaxError",
+        ),
+    ],
+)
+def test_mistakes_in_an_effect_file_are_told_with_line_and_remedy_before_anything_is_computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: str, line: int, words: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = blocks("adding_an_effect.md", "python")[0]
+    assert old in text
+    Path("oil_film.py").write_text(text.replace(old, new), encoding="utf-8")
+    Path("rig.toml").write_text('base = "frame"\n', encoding="utf-8")
+    Path("modes.toml").write_text(_table(load_rig("rig.toml"), seed=0), encoding="utf-8")
+    file = ("--effect-file", "oil_film.py")
+    for command in (
+        ("effects", "--rig", "rig.toml", *file),
+        ("run", "--modes", "modes.toml", "--rig", "rig.toml", "--out", "out", *file),
+    ):
+        done = CliRunner().invoke(cli.app, list(command))
+        assert isinstance(done.exception, EmaError)
+        assert f"oil_film.py, line {line}: " in str(done.exception).replace(str(tmp_path) + "/", "")
+        assert words in str(done.exception)
+    assert not Path("out").exists()
+
+
+def test_effects_of_a_file_are_listed_with_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("oil_film.py").write_text(blocks("adding_an_effect.md", "python")[0], encoding="utf-8")
+    done = CliRunner().invoke(cli.app, ["effects", "--effect-file", "oil_film.py", "--json"])
+    assert done.exit_code == 0
+    listed = {e["id"]: e for e in json.loads(done.output)["effects"]}
+    assert "sun" in listed["oil_film"]["places"]
+    assert "mesh_stiffness_loss" in listed
 
 
 def _table(rig: Rig, seed: int) -> str:

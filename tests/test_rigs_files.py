@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from bench import ema
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
@@ -232,7 +234,8 @@ MISTAKES = [
     ('"planetary"', "planetary", 1, "not valid TOML: Invalid value in 'base = planetary'"),
     ('base = "planetary"\n', "", 1, "key 'base'"),
     ("carrier_mass", "carier_mass", 6, "'parameters.carier_mass' (did you mean 'carrier_mass'?)"),
-    ('"kg"', '"g"', 6, "'carrier_mass' has unit 'g', the rig works in 'kg'; convert the value to kg"),
+    ('"kg"', '"N"', 6, "'carrier_mass' has unit 'N', which is not one of 'kg' or its multiples"),
+    ('"kg"', '"kgg"', 6, "'carrier_mass' has unit 'kgg', which is not one of 'kg'"),
     ("tolerance = 0.02", "tolerence = 0.02", 6, "did you mean 'tolerance'?"),
     ("tolerance = 0.02", "tolerance = -0.02", 6, "carrier_mass.tolerance = -0.02"),
     ("tolerance = 0.02", 'tolerance = "2 %"', 6, "carrier_mass.tolerance = '2 %'"),
@@ -345,3 +348,77 @@ def test_lines_of_keys_are_found_in_every_form_of_toml() -> None:
     assert lines["masses", 1, "row", "t.x"] == 15
     assert line_of(lines, ("masses", 0, "at")) == lines["masses", 0] == 12
     assert line_of(lines, ("nowhere",)) is None
+
+
+UNITS = """
+name = "bench"
+[parameters]
+m = { value = 2600, unit = "g" }
+k = { value = 110, unit = "N/mm", tolerance = 0.05, min = 10, max = 1000 }
+[[masses]]
+at = "m1.x"
+value = "m"
+[[masses]]
+at = "m2.x"
+value = 1200
+unit = "g"
+[[springs]]
+at = "m1.x"
+value = "k"
+[[springs]]
+between = ["m1.x", "m2.x"]
+value = 0.4
+unit = "kN/mm"
+[[dampers]]
+at = "m2.x"
+value = 5e-3
+unit = "N·s/mm"
+"""
+
+
+def test_any_unit_of_the_right_dimension_is_converted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    in_si = UNITS
+    for old, new in (
+        ('value = 2600, unit = "g"', "value = 2.6"),
+        ('value = 110, unit = "N/mm"', 'value = 1.1e5, unit = "N/m"'),
+        ("min = 10, max = 1000", "min = 1e4, max = 1e6"),
+        ('value = 1200\nunit = "g"', "value = 1.2"),
+        ('value = 0.4\nunit = "kN/mm"', "value = 4e5"),
+        ('value = 5e-3\nunit = "N·s/mm"', "value = 5.0"),
+    ):
+        assert old in in_si
+        in_si = in_si.replace(old, new)
+    shown = []
+    for number, text in enumerate((UNITS, in_si)):
+        file = tmp_path / f"rig{number}.toml"
+        file.write_text(text, encoding="utf-8")
+        code, out, err = ema(capsys, "model", "--rig", file, "--json")
+        assert code == 0, err
+        shown.append(json.loads(out))
+    assert shown[0] == shown[1]
+    rig = load_rig(str(tmp_path / "rig0.toml"))
+    k = rig.parameters["k"]
+    assert (k.value, k.unit, k.minimum, k.maximum) == (1.1e5, "N/m", 1e4, 1e6)
+    assert rig.parameters["m"].unit == "kg"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "words"),
+    [
+        ('unit = "N/mm"', 'unit = "N*mm"', 5, "'k' has unit 'N*mm', but [[springs]] takes N/m"),
+        ('unit = "g" }', 'unit = "N/mm" }', 4, "'m' has unit 'N/mm', but [[masses]] takes kg"),
+        ('unit = "kN/mm"', 'unit = "mm"', 19, "unit 'mm' is not one of N/m"),
+        ('value = "k"', 'value = "k"\nunit = "N/m"', 16, "whose own unit counts"),
+    ],
+)
+def test_a_unit_of_another_dimension_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, line: int, words: str
+) -> None:
+    file = tmp_path / "rig.toml"
+    file.write_text(UNITS.replace(old, new), encoding="utf-8")
+    code, _, err = ema(capsys, "model", "--rig", file)
+    assert code == 1
+    assert f"line {line}: " in err
+    assert words in err

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.units import find_unit, parse_unit
+from ema_pipeline.units import UNITS, Unit, find_unit, parse_unit
 
 
 @pytest.mark.parametrize(
@@ -44,6 +44,27 @@ def test_a_unit_has_the_size_that_the_standards_give_it(text: str, quantity: str
     unit = parse_unit(text)
     assert unit.quantity == quantity
     assert unit.scale == pytest.approx(scale, rel=1e-12)
+
+
+ALL_SCALES = {
+    "m": 1.0, "mm": 1e-3, "cm": 1e-2, "um": 1e-6, "nm": 1e-9, "in": 0.0254, "ft": 0.3048, "mil": 2.54e-5,
+    "m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "um/s": 1e-6, "nm/s": 1e-9, "in/s": 0.0254, "ft/s": 0.3048,
+    "m/s^2": 1.0, "mm/s^2": 1e-3, "cm/s^2": 1e-2, "um/s^2": 1e-6, "nm/s^2": 1e-9, "in/s^2": 0.0254, "ft/s^2": 0.3048,
+    "g": 9.80665, "mg": 9.80665e-3, "gal": 1e-2,
+    "N": 1.0, "mN": 1e-3, "kN": 1e3, "MN": 1e6, "lbf": 4.4482216152605, "kgf": 9.80665,
+    "V": 1.0, "mV": 1e-3, "uV": 1e-6, "s": 1.0, "ms": 1e-3, "us": 1e-6, "Hz": 1.0, "kHz": 1e3,
+}  # fmt: skip
+"""Every unit that is known, in SI; written apart from the program's own table."""
+
+
+def test_every_known_unit_has_the_scale_of_a_table_written_apart() -> None:
+    assert {symbol: unit.scale for symbol, unit in UNITS.items()} == pytest.approx(ALL_SCALES, rel=1e-12)
+
+
+def test_one_unit_spelt_two_ways_is_the_same_but_a_near_one_is_not() -> None:
+    assert parse_unit("gal").same_as(parse_unit("cm/s^2"))
+    assert not parse_unit("m/s").same_as(parse_unit("m"))
+    assert not parse_unit("g").same_as(Unit("g almost", "acceleration", 9.80665 * (1 + 2e-6)))
 
 
 def test_velocity_is_not_taken_for_acceleration() -> None:

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ema_pipeline.commands.options import EffectFiles, Out, Overrides, Quiet
-from ema_pipeline.commands.screen import progress, show
+from ema_pipeline.commands.interrupts import go_on_with
+from ema_pipeline.commands.options import EffectFiles, Json, Out, Overrides, Quiet
+from ema_pipeline.commands.screen import program, progress, show, show_json
 
 if TYPE_CHECKING:
+    from ema_pipeline.report.results import RunResults
     from ema_pipeline.stages.base import Run
 
 
-def compare(out: Out, effect_file: EffectFiles = None) -> None:
-    """Show where model and measurement part, in units of the measurement's uncertainty."""
+def compare(out: Out, effect_file: EffectFiles = None, json: Json = False) -> None:
+    """Show where model and measurement differ, in units of the measurement's uncertainty."""
     from ema_pipeline.job import run_on
     from ema_pipeline.report import terminal
     from ema_pipeline.stages.results import load_results
@@ -25,14 +29,21 @@ def compare(out: Out, effect_file: EffectFiles = None) -> None:
         run, _ = run_on(out, stages, show=show_stage, effect_files=effect_file or [])
     run.require_model("compare")
     if run.info.kind == "hysteresis":
-        from ema_pipeline.report.loops import comparison_screen
+        from ema_pipeline.report.loops import comparison_rows, comparison_screen
         from ema_pipeline.stages.loop_ladder import loops_of, own_models
 
-        show(comparison_screen(loops_of(run), own_models(run)))
+        loops, models = loops_of(run), own_models(run)
+        if json:
+            show_json({"loops": comparison_rows(loops, models)})
+        else:
+            show(comparison_screen(loops, models))
         return
-    comparison = load_results(run).comparison
-    assert comparison is not None  # the stage has just run
-    show(terminal.comparison_tables(comparison))
+    results = load_results(run)
+    assert results.comparison is not None  # the stage has just run
+    if json:
+        _show_json(results, "comparison")
+    else:
+        show(terminal.comparison_tables(results.comparison))
 
 
 def diagnose(
@@ -43,23 +54,29 @@ def diagnose(
     effect_file: EffectFiles = None,
     set_: Overrides = None,
     quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Say which physical effect the model is missing, how sure that is, and what to measure next."""
     from ema_pipeline.job import adding, change_effects, run_on
     from ema_pipeline.report import terminal
+    from ema_pipeline.report.cautions import suspicions
     from ema_pipeline.stages.results import load_results
 
     with progress(quiet) as show_stage:
         run, _ = run_on(out, ["diagnose", "report"], set_ or [], show_stage, effect_file or [])
         run.require_model("diagnose")
-        found = load_results(run).diagnosis
+        results = load_results(run)
+        found = results.diagnosis
         assert found is not None  # the stage has just run
-        supported = found.ladder.rungs[-1].effects
+        supported = [x for x in found.ladder.rungs[-1].effects if x not in run.info.effects]
         if auto and supported:
             run = change_effects(out, adding(supported), (), show_stage, effect_file or [])
     if quiet:
         return
-    show(terminal.diagnosis_screen(found, str(out)))
+    if json:
+        _show_json(load_results(run), "diagnosis", "ladder")
+        return
+    show(terminal.diagnosis_screen(found, str(out), program(), suspicions(results)))
     if auto and supported:
         _show_ladder(run)
 
@@ -70,14 +87,12 @@ def add(
     effect_file: EffectFiles = None,
     set_: Overrides = None,
     quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Add a physical effect to the model, refit, and show the error before and after."""
-    from ema_pipeline.job import adding, change_effects
+    from ema_pipeline.job import adding
 
-    with progress(quiet) as show_stage:
-        run = change_effects(out, adding(effect), set_ or [], show_stage, effect_file or [])
-    if not quiet:
-        _show_ladder(run)
+    _change(out, adding(effect), effect_file or [], set_ or [], quiet, json)
 
 
 def remove(
@@ -85,21 +100,43 @@ def remove(
     effect: Annotated[str, typer.Argument(metavar="EFFECT@PLACE", help="An effect that was added.")],
     effect_file: EffectFiles = None,
     quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Take an added effect out of the model again."""
-    from ema_pipeline.job import change_effects, removing
+    from ema_pipeline.job import removing
+
+    _change(out, removing(effect), effect_file or [], [], quiet, json)
+
+
+def _change(
+    out: Path,
+    change: Callable[[tuple[str, ...]], tuple[str, ...]],
+    effect_files: list[str],
+    overrides: list[str],
+    quiet: bool,
+    json: bool,
+) -> None:
+    """Change the effects of the model; the ladder is the answer, fit and report follow."""
+    from ema_pipeline.job import AFTER_EFFECTS, run_on, set_effects
 
     with progress(quiet) as show_stage:
-        run = change_effects(out, removing(effect), (), show_stage, effect_file or [])
+        run = set_effects(out, change, overrides, show_stage, effect_files)
     if not quiet:
-        _show_ladder(run)
+        _show_ladder(run, json)
+    files = [word for file in effect_files for word in ("--effect-file", file)]
+    stages = (shlex.join([stage, str(out), *files]) for stage in AFTER_EFFECTS)
+    go_on_with(f" && {program()} ".join(stages))
+    with progress(quiet) as show_stage:
+        run_on(out, AFTER_EFFECTS, [], show_stage, effect_files)
+    if not quiet and not json:
+        show(f"Fit, comparison and report hold this model now: {run.store.folder / 'report.html'}")
 
 
-def ladder(out: Out, effect_file: EffectFiles = None) -> None:
+def ladder(out: Out, effect_file: EffectFiles = None, json: Json = False) -> None:
     """Show the models so far, each with its error on the data fitted and on data held out."""
     from ema_pipeline.pipeline import existing_run
 
-    _show_ladder(existing_run(out, effect_file or []))
+    _show_ladder(existing_run(out, effect_file or []), json)
 
 
 def _of_loops(out: Path) -> bool:
@@ -108,15 +145,27 @@ def _of_loops(out: Path) -> bool:
     return existing_run(out).info.kind == "hysteresis"
 
 
-def _show_ladder(run: Run) -> None:
+def _show_json(results: RunResults, *parts: str) -> None:
+    """Parts of what summary.json holds."""
+    from ema_pipeline.report.summary_files import finite, summary
+
+    content = finite(summary(results))
+    show_json({part: content[part] for part in parts if part in content})
+
+
+def _show_ladder(run: Run, json: bool = False) -> None:
     from ema_pipeline.report import terminal
     from ema_pipeline.stages.results import load_results
 
-    results = load_results(run)
-    rungs = results.ladder or (None if results.diagnosis is None else results.diagnosis.ladder)
-    if rungs is None:
-        show(
-            f"The model has no added effects. 'ema diagnose {run.store.folder}' says what it may be missing."
-        )
+    results, folder = load_results(run), run.store.folder
+    if json:
+        _show_json(results, "effects", "ladder")
+    elif run.info.effects and results.ladder is not None:
+        show(terminal.ladder_screen(results.ladder))
+    elif (
+        results.diagnosis is not None and len(results.diagnosis.ladder.rungs) > 1 and not results.diagnosed_on
+    ):
+        show("The model has no added effects. What the diagnosis proposes:")
+        show(terminal.ladder_screen(results.diagnosis.ladder))
     else:
-        show(terminal.ladder_screen(rungs))
+        show(f"The model has no added effects. '{program()} diagnose {folder}' says what it may be missing.")

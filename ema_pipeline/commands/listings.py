@@ -2,33 +2,59 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ema_pipeline.commands.options import Json, RigOption
+from ema_pipeline.commands.options import EffectFiles, Json, RigOption
 from ema_pipeline.commands.screen import show, show_json
 
 
-def rigs() -> None:
+def rigs(json: Json = False) -> None:
     """List the rigs that ship with the program."""
     from ema_pipeline.rigs import rig_kinds
 
+    if json:
+        show_json({"rigs": [{"name": name, "title": kind.title} for name, kind in rig_kinds().items()]})
+        return
     for name, kind in rig_kinds().items():
         show(f"{name:12s} {kind.title}")
 
 
-def effects(rig: RigOption = None, json: Json = False) -> None:
+def effects(rig: RigOption = None, effect_file: EffectFiles = None, json: Json = False) -> None:
     """List the physical effects that a model may be missing, with places, parameters and signs."""
-    from ema_pipeline.job import list_effects
+    from ema_pipeline.catalogue import list_effects
     from ema_pipeline.report.listings import effects_list
 
-    listed = list_effects(rig or "planetary")
+    listed = list_effects(rig or "planetary", effect_file or [])
     if json:
         show_json({"effects": listed})
     else:
         show(effects_list(listed))
+
+
+def settings(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Only settings whose name starts so, e.g. 'frf'.")
+    ] = "",
+    json: Json = False,
+) -> None:
+    """List every setting of a pipeline: name, default, what it may be, and why."""
+    from ema_pipeline.catalogue import list_settings
+    from ema_pipeline.errors import EmaError, did_you_mean
+
+    listed = list_settings(name)
+    if not listed:
+        known = {s["name"].partition(".")[0] for s in list_settings()}
+        raise EmaError(f"no setting starts with '{name}'{did_you_mean(name, known)}")
+    if json:
+        show_json({"settings": listed})
+        return
+    from ema_pipeline.report.listings import settings_list
+
+    show(settings_list(listed))
 
 
 def model(
@@ -39,7 +65,7 @@ def model(
     json: Json = False,
 ) -> None:
     """Show the modes of the model itself."""
-    from ema_pipeline.job import list_model_modes
+    from ema_pipeline.catalogue import list_model_modes
     from ema_pipeline.report.listings import model_table
 
     listed = list_model_modes(rig, configuration)
@@ -58,10 +84,15 @@ def reproduce(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for the figures; none are drawn if left out.")
     ] = None,
+    json: Json = False,
 ) -> None:
     """Compute the tables and figures of the source papers anew, beside what they print."""
     from ema_pipeline.reproduce import NAMES, terminal_text
     from ema_pipeline.reproduce import reproduce as compute
 
-    for name in (which,) if which else NAMES:
-        show(terminal_text(compute(name, out)))
+    found = [compute(name, out) for name in ((which,) if which else NAMES)]
+    if json:
+        show_json({r.name: [asdict(table) for table in r.tables] for r in found})
+        return
+    for reproduced in found:
+        show(terminal_text(reproduced))

@@ -2,31 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ema_pipeline.commands.options import EffectFiles, Overrides, Quiet, Raw
-from ema_pipeline.commands.screen import show
+from ema_pipeline.commands.options import EffectFiles, Json, Overrides, Quiet, Raw
+from ema_pipeline.commands.screen import program, show, show_json
 
 
-def check(raw: Raw, set_: Overrides = None) -> None:
-    """Judge every hit of a raw folder: value, limit and clause of each check."""
-    from ema_pipeline.job import check_raw
-    from ema_pipeline.report import terminal
+def check(raw: Raw, set_: Overrides = None, json: Json = False) -> None:
+    """Judge every hit of a raw folder: value, limit and clause of each check.
 
-    for name, hits in check_raw(raw, set_ or []).items():
-        show(terminal.verdict_table(hits, name))
-        show(terminal.hits_table(hits, name))
+    The exit code is 1 where a point has no good hit left.
+    """
+    from ema_pipeline.raw_folder import check_raw
+    from ema_pipeline.report import summary_files, terminal
+    from ema_pipeline.stages.hits import require_good_hits
+
+    judged = check_raw(raw, set_ or [])
+    if json:
+        show_json(summary_files.finite({name: [asdict(h) for h in hits] for name, hits in judged.items()}))
+    else:
+        for name, hits in judged.items():
+            show(terminal.verdict_table(hits, name))
+            show(terminal.hits_table(hits, name))
+    for name, hits in judged.items():
+        require_good_hits(hits, name)
 
 
 def init(raw: Raw, set_: Overrides = None) -> None:
     """Draft test.toml from what the record files say."""
-    from ema_pipeline.job import draft_raw
+    from ema_pipeline.raw_folder import draft_raw
 
     for path in draft_raw(raw, set_ or []):
-        show(f"Wrote {path}; look for the lines marked CHECK, then: ema check {raw}")
+        show(f"Wrote {path}; look for the lines marked CHECK, then: {program()} check {raw}")
 
 
 def simulate(
@@ -54,7 +65,7 @@ def simulate(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a hammer test of a rig and write it as a raw folder."""
-    from ema_pipeline.job import simulate_raw
+    from ema_pipeline.raw_folder import simulate_raw
 
     made = simulate_raw(
         out,

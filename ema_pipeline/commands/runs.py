@@ -6,12 +6,12 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ema_pipeline.commands.options import EffectFiles, Out, Overrides, Quiet, RigOption, Verbose
-from ema_pipeline.commands.screen import progress, show
+from ema_pipeline.commands.options import EffectFiles, Json, Out, Overrides, Quiet, RigOption, Verbose
+from ema_pipeline.commands.screen import program, progress, show, show_json
 
 if TYPE_CHECKING:
     from ema_pipeline.stages.base import Run
@@ -35,9 +35,11 @@ def run(
     set_: Overrides = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
+    json: Json = False,
 ) -> None:
     """Go from raw hits to modes and, with a rig, to a fitted model. Unchanged stages are skipped."""
-    from ema_pipeline.job import describe_modes, run_raw
+    from ema_pipeline.describe import describe_modes
+    from ema_pipeline.job import run_raw
 
     source = modes or raw
     if source is None or (modes is not None and raw is not None):
@@ -54,26 +56,42 @@ def run(
             describe_modes if modes else None,
             effect_file or [],
         )
-    if not quiet:
+    if json:
+        show_json(_content(result))
+    elif not quiet:
         _show_summary(result)
         if not computed:
             show("Nothing had changed: all results are those of the earlier run.")
         elif verbose:
             show(f"Computed: {', '.join(computed)}")
-        show(f"Report: {result.store.folder / 'report.html'}")
 
 
 def _show_summary(done: Run) -> None:
-    from ema_pipeline.report import terminal
     from ema_pipeline.stages.results import load_results
 
+    results, folder = load_results(done), done.store.folder
+    report = f"Report: {folder / 'report.html'}"
     if done.info.kind == "hysteresis":
         from ema_pipeline.report.loops import run_screen
         from ema_pipeline.stages.results import isolators
 
-        show(run_screen(isolators(done), load_results(done), str(done.store.folder)))
-        return
-    show(terminal.run_summary(load_results(done), str(done.store.folder)))
+        show(run_screen(isolators(done), results, str(folder)))
+        show(report)
+    else:
+        from ema_pipeline.report.run_screen import RunScreen, next_lines
+
+        below = [*(f"Next: {line}" for line in next_lines(results, str(folder), program())), report]
+        show(RunScreen(results, str(folder), len(below)))
+        for line in below:  # never cropped: they are there to be copied
+            show(line)
+
+
+def _content(done: Run) -> Any:
+    """What summary.json holds, or would hold."""
+    from ema_pipeline.report.summary_files import finite, summary
+    from ema_pipeline.stages.results import load_results
+
+    return finite(summary(load_results(done)))
 
 
 def stage_command(name: str) -> Callable[..., None]:
@@ -85,18 +103,80 @@ def stage_command(name: str) -> Callable[..., None]:
         set_: Overrides = None,
         quiet: Quiet = False,
         verbose: Verbose = False,
+        json: Json = False,
     ) -> None:
         from ema_pipeline.job import run_on
 
         with progress(quiet) as show_stage:
-            _, computed = run_on(out, [name], set_ or [], show_stage, effect_file or [])
-        if not quiet:
+            run, computed = run_on(out, [name], set_ or [], show_stage, effect_file or [])
+        if json:
+            show_json(_content(run))
+        elif not quiet:
             show(f"Computed: {', '.join(computed)}" if computed else "Nothing had changed.")
 
     return command
 
 
-def levels(out: Out, effect_file: EffectFiles = None, set_: Overrides = None) -> None:
+def fit(
+    out: Out,
+    save: Annotated[
+        Path | None, typer.Option("--save", metavar="RIG.toml", help="Write the fitted model as a rig file.")
+    ] = None,
+    effect_file: EffectFiles = None,
+    set_: Overrides = None,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    json: Json = False,
+) -> None:
+    """Fit the model's parameters to the modes of OUT, and show them."""
+    from ema_pipeline.export import save_rig
+    from ema_pipeline.job import run_on
+    from ema_pipeline.report import terminal
+    from ema_pipeline.stages.results import load_results
+
+    with progress(quiet) as show_stage:
+        run, _ = run_on(out, ["fit"], set_ or [], show_stage, effect_file or [])
+    run.require_model("fit")
+    if save is not None:
+        save_rig(run, save)
+    found = load_results(run).fit
+    if json:
+        show_json(_content(run))
+    elif not quiet and found is not None:
+        show(terminal.fit_table(found))
+        if save is not None:
+            show(f"Wrote {save}; use it with --rig {save}")
+
+
+def report(
+    out: Out,
+    plots: Annotated[
+        bool, typer.Option("--plots", help="Also draw every figure for print into OUT/plots (PNG, SVG).")
+    ] = False,
+    pdf: Annotated[
+        bool, typer.Option("--pdf", help="Also write OUT/report.pdf for print, eight pages at most.")
+    ] = False,
+    effect_file: EffectFiles = None,
+    set_: Overrides = None,
+    quiet: Quiet = False,
+) -> None:
+    """Write the tables and the report of OUT; on demand also figures and pages for print."""
+    from ema_pipeline.export import draw_plots, write_pages
+    from ema_pipeline.job import run_on
+
+    with progress(quiet) as show_stage:
+        run, _ = run_on(out, ["report"], set_ or [], show_stage, effect_file or [])
+        drawn = draw_plots(run, show_stage) if plots else None
+        pages = write_pages(run, show_stage) if pdf else None
+    if not quiet:
+        show(f"Report: {run.store.folder / 'report.html'}")
+        if drawn is not None:
+            show(f"Plots: {drawn}")
+        if pages is not None:
+            show(f"Pages: {pages}")
+
+
+def levels(out: Out, effect_file: EffectFiles = None, set_: Overrides = None, json: Json = False) -> None:
     """Show what moves with the force of the hits: frequency and damping of every mode by force level."""
     from ema_pipeline.job import run_on
     from ema_pipeline.report import terminal
@@ -104,6 +184,9 @@ def levels(out: Out, effect_file: EffectFiles = None, set_: Overrides = None) ->
 
     with progress(False) as show_stage:
         run, _ = run_on(out, ["levels", "report"], set_ or [], show_stage, effect_file or [])
+    if json:
+        show_json({name: c.get("levels") for name, c in _content(run)["configurations"].items()})
+        return
     for found in load_results(run).configurations:
         if found.levels is not None and found.modal is not None:
             show(terminal.levels_tables(found.levels, found.modal, found.name))
@@ -111,10 +194,28 @@ def levels(out: Out, effect_file: EffectFiles = None, set_: Overrides = None) ->
 
 def view(
     out: Out,
-    browser: Annotated[bool, typer.Option(help="Open the report in the web browser.")] = True,
+    browser: Annotated[bool, typer.Option(help="Open the page in the web browser.")] = True,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0: a free one.")] = 0,
+    effect_file: EffectFiles = None,
 ) -> None:
-    """Open the report of OUT, or print its path where there is no screen."""
-    from ema_pipeline.job import report_path
+    """Open the live page of OUT: add and remove effects and watch the error. It stops with Ctrl-C."""
+    from ema_pipeline.pipeline import existing_run
+
+    if existing_run(out, effect_file or []).info.kind == "hysteresis":
+        _open_report(out, browser)  # loops have a report, but no live page
+        return
+    from ema_pipeline.view.server import serve
+
+    def ready(address: str) -> None:
+        show(f"The page of {out} is at {address}\nIt is for one browser on this machine; stop with Ctrl-C.")
+        if browser and _has_screen():
+            typer.launch(address)
+
+    serve(out, effect_file or [], port, ready)
+
+
+def _open_report(out: Path, browser: bool) -> None:
+    from ema_pipeline.export import report_path
 
     path = report_path(out)
     if not (browser and _has_screen() and typer.launch(path.as_uri()) == 0):
@@ -129,7 +230,7 @@ def export(
     effect_file: EffectFiles = None,
 ) -> None:
     """Write FRFs, modes and shapes as universal file (58, 55) and CSV for other programs."""
-    from ema_pipeline.job import export_results
+    from ema_pipeline.export import export_results
 
     for path in export_results(out, to or out / "export", effect_file or []):
         show(str(path))

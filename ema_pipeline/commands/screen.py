@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -30,6 +33,15 @@ def show(what: Any) -> None:
     # Cleaned only once it is rendered: before, nobody can tell names from the colours that rich puts around them.
     rendered = [Segment(printable(s.text), s.style, s.control) for s in console.render(what)]
     console.print(Segments(rendered), end="")
+
+
+def program() -> str:
+    """The command ``ema`` as the user can type it: its bare name where the shell finds it, else its path."""
+    called = Path(sys.argv[0])
+    found = shutil.which("ema")
+    if called.name != "ema" or not called.is_file() or (found and Path(found).samefile(called)):
+        return "ema"
+    return os.path.relpath(called) if called.is_relative_to(Path.cwd()) else str(called)
 
 
 def show_json(content: Any) -> None:

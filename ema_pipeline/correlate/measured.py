@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.correlate.settings import UncertaintySettings
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.modal.assurance import mpc
@@ -37,6 +36,8 @@ class MeasuredModes:
         Band in which modes were looked for; None where unknown.
     references : tuple of Dof
         Points at which the rig was struck; empty where unknown.
+    notes : tuple of str
+        What a reader should know of these numbers, one plain sentence each.
     """
 
     configuration: str
@@ -50,6 +51,7 @@ class MeasuredModes:
     scaled: bool = False
     band_hz: tuple[float, float] | None = None
     references: tuple[Dof, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return int(self.frequency_hz.size)
@@ -93,6 +95,7 @@ def to_modal_model(measured: MeasuredModes) -> ModalModel:
         outputs=(),
         inputs=(),
         chart=nothing,
+        notes=measured.notes,
     )
 
 
@@ -140,31 +143,3 @@ def from_frequencies(
     order = np.argsort(frequency, kind="stable")
     unknown = np.full(frequency.shape, np.nan)
     return MeasuredModes(configuration, frequency[order], std[order], unknown, unknown.copy())
-
-
-def with_floors(measured: MeasuredModes, settings: UncertaintySettings) -> MeasuredModes:
-    """Standard uncertainties for comparison with a model: root sum of squares of scatter and floors.
-
-    Standard deviations that are missing (NaN, zero or negative) are replaced by the assumed ones.
-    """
-    frequency, damping = measured.frequency_hz, measured.damping_ratio
-    frequency_std = _or_assumed(measured.frequency_std_hz, settings.frequency_std_assumed * frequency)
-    damping_std = _or_assumed(measured.damping_std, settings.damping_std_assumed * np.abs(damping))
-    shape_std = None
-    if measured.shapes is not None:
-        size = np.max(np.nan_to_num(np.abs(measured.shapes)), axis=1, keepdims=True, initial=0.0)
-        size = np.broadcast_to(size, measured.shapes.shape)
-        given = np.full(measured.shapes.shape, np.nan) if measured.shape_std is None else measured.shape_std
-        std = _or_assumed(given, settings.shape_std_assumed * size)
-        shape_std = np.hypot(std, settings.shape_floor * size)
-    return replace(
-        measured,
-        frequency_std_hz=np.hypot(frequency_std, settings.frequency_floor * frequency),
-        damping_std=np.hypot(damping_std, settings.damping_floor * np.abs(damping)),
-        shape_std=shape_std,
-    )
-
-
-def _or_assumed(std: NDArray[np.float64], assumed: NDArray[np.float64]) -> NDArray[np.float64]:
-    known = np.isfinite(std) & (std > 0)
-    return np.where(known, np.where(known, std, 1.0), assumed)

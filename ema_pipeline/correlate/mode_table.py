@@ -28,6 +28,7 @@ import csv
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +44,11 @@ from ema_pipeline.settings import Settings, parse
 
 _NUMBERS = ("frequency_hz", "frequency_std_hz", "damping_ratio", "damping_std")
 _PASSED_OVER = (
-    "mode", "index", "mpc", "stability", "method", "flags", "model_mode", "model_frequency_hz", "mac",
-    "family",
+    "mode", "index", "mpc", "stability", "method", "flags", "model_mode", "model_frequency_hz", "difference_percent",
+    "mac", "family",
 )  # fmt: skip
+FEWEST_ROUNDED = 3
+"""Fewer numbers may all end on 0 by chance, and look more rounded than they are."""
 _SHAPE = re.compile(r"^(?P<dof>-?[\w-]+\.\w+)(?: (?P<part>re|im))?$")
 
 
@@ -212,19 +215,42 @@ def _measured(name: str, table: ConfigurationModes, path: Path, rig: Rig | None)
         if table.shape_std is not None:
             largest = np.max(np.abs(shapes), axis=1, keepdims=True)
             shape_std = table.shape_std * np.broadcast_to(largest, shapes.shape)
+    notes = []
+    spreads = {}
+    for key, values, stated, unit in (
+        ("frequency_std_hz", table.frequency_hz, table.frequency_std_hz, " Hz"),
+        ("damping_std", table.damping_ratio or (), table.damping_std, ""),
+    ):
+        spread, rounding = _spread(stated, count, key, where), _rounding(values)
+        if np.any(spread < rounding):
+            notes.append(
+                f"{key} = {np.nanmin(spread):.2g}{unit} is finer than the rounding of the table's numbers: "
+                f"{rounding:.2g}{unit} is taken"
+            )
+        spreads[key] = np.maximum(spread, rounding)  # unknown ones, NaN, stay unknown
     return MeasuredModes(
         configuration=name,
         frequency_hz=frequency[order],
-        frequency_std_hz=_spread(table.frequency_std_hz, count, "frequency_std_hz", where)[order],
+        frequency_std_hz=spreads["frequency_std_hz"][order],
         damping_ratio=damping[order],
-        damping_std=_spread(table.damping_std, count, "damping_std", where)[order],
+        damping_std=spreads["damping_std"][order],
         shapes=shapes,
         shape_std=shape_std,
         dofs=dofs,
         scaled=table.scaled,
         band_hz=table.band_hz,
         references=references,
+        notes=tuple(notes),
     )
+
+
+def _rounding(values: Sequence[float]) -> float:
+    """Standard deviation that rounding to the decimals of these numbers brings; 0 for too few to tell by."""
+    if len(values) < FEWEST_ROUNDED:
+        return 0.0
+    exponents = [Decimal(repr(v)).normalize().as_tuple().exponent for v in values]
+    last = min(e for e in exponents if isinstance(e, int))
+    return float(10.0 ** min(last, 0) / np.sqrt(12))
 
 
 def _places(texts: Sequence[str], configuration: str, where: str, rig: Rig | None) -> tuple[Dof, ...]:

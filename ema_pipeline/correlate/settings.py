@@ -7,40 +7,9 @@ from pydantic import Field
 from ema_pipeline.settings import Settings
 
 
-class UncertaintySettings(Settings):
-    """Least standard uncertainty that a comparison with a model takes for granted.
+class AssumedSettings(Settings):
+    """Standard deviations of what comes without one, as a printed table does."""
 
-    The scatter of a test says how well the test repeats. It does not say how well the rig stays the
-    same from hour to hour, how true the sensors are, or how far a lumped model can be trusted. The
-    floors stand for these; they are added to the test's own scatter as root sum of squares.
-    """
-
-    frequency_floor: float = Field(
-        default=1e-4,
-        ge=0,
-        lt=1,
-        description="Relative standard uncertainty of a frequency that no averaging removes: "
-        "steel at ±0.5 K moves by 1e-4 (Young's modulus about -3e-4 per K, half of it in frequency).",
-    )
-    damping_floor: float = Field(
-        default=0.03,
-        ge=0,
-        description="Relative standard uncertainty of a damping ratio that no averaging removes; "
-        "damping of an assembled machine does not repeat better than a few per cent.",
-    )
-    shape_floor: float = Field(
-        default=0.01,
-        ge=0,
-        description="Standard uncertainty of a shape entry, in units of the shape's largest entry: "
-        "accelerometer "
-        "sensitivity is known to 1-2 % (ISO 16063-21), and a mounting angle off by 1 degree gives 1.7 %.",
-    )
-    scale_floor: float = Field(
-        default=0.05,
-        ge=0,
-        description="Relative standard uncertainty of a mass-normalised shape's size that no averaging removes: "
-        "sensitivities of hammer and accelerometer, 3 % together (ISO 16063-21), and the angle of the blow.",
-    )
     frequency_std_assumed: float = Field(
         default=0.01,
         gt=0,
@@ -54,20 +23,12 @@ class UncertaintySettings(Settings):
     shape_std_assumed: float = Field(
         default=0.05,
         gt=0,
-        description="Standard deviation of a shape entry that comes without one, in units of the largest "
-        "entry.",
-    )
-    mode_mixing: float = Field(
-        default=1e-3,
-        gt=0,
-        description="Relative scatter of eigenvalues from small asymmetries that no model holds (planets "
-        "that "
-        "differ in the last gram). Modes closer than this exchange their shapes freely.",
+        description="Standard deviation of a shape entry that comes without one, in units of the largest entry.",
     )
 
 
 class PairingSettings(Settings):
-    """When a measured mode and a model mode may be one and the same."""
+    """When a measured mode and a model mode may be the same."""
 
     frequency_tolerance: float = Field(
         default=0.3,
@@ -85,19 +46,18 @@ class PairingSettings(Settings):
     refusal: float = Field(
         default=1.2,
         gt=0,
-        description="Cost above which a mode rather stays alone; the cost is 1 at the frequency tolerance "
+        description="Cost above which a mode stays unpaired; the cost is 1 at the frequency tolerance "
         "with a MAC of 1, and 1 at the least MAC with equal frequencies.",
     )
     node_level: float = Field(
         default=0.02,
         ge=0,
         description="A model mode whose share of motion at the sensors (or at the points struck) is below "
-        "this, "
-        "relative to the best seen mode, counts as not seen (not excited).",
+        "this, relative to the mode that is seen best, counts as not seen (not excited).",
     )
 
 
-class CompareSettings(UncertaintySettings):
+class CompareSettings(Settings):
     """How differences of FRFs are counted."""
 
     bands: int = Field(default=12, ge=1, description="Number of bands, equally wide on a logarithmic axis.")

@@ -1,13 +1,23 @@
-"""Which measured mode is which model mode, and where the two part."""
+"""Which measured mode is which model mode, and where the two differ."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.rigs.types import ModelMode
+
+
+def percent_off(measured: float, model: float) -> float:
+    """How far a measured frequency lies above the model's, %; NaN for a model mode at 0 Hz.
+
+    >>> round(percent_off(101.0, 100.0), 6)
+    1.0
+    """
+    return 100 * (measured / model - 1) if model > 0 else math.nan
 
 
 @dataclass(frozen=True)
@@ -109,7 +119,7 @@ class BandDifference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Where model and measurement part.
+    """Where model and measurement differ.
 
     Attributes
     ----------

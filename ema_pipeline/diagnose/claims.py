@@ -53,14 +53,29 @@ class Judged:
         return not self.doubt
 
 
-def judge(observations: Observations, ranking: Ranking, ranked: Ranked, settings: DiagnoseSettings) -> Judged:
-    """Hold one finalist against all conditions of a claim."""
+def judge(
+    observations: Observations,
+    ranking: Ranking,
+    ranked: Ranked,
+    settings: DiagnoseSettings,
+    nothing: float = 0.0,
+) -> Judged:
+    """Hold one finalist against all conditions of a claim.
+
+    Parameters
+    ----------
+    observations : Observations
+    ranking : Ranking
+    ranked : Ranked
+    settings : DiagnoseSettings
+    nothing : float
+        Probability that nothing is missing.
+    """
     name = named(ranked.hypothesis, ranked.fit)
     gain = ranked.gain + name.advantage
     base = at_scatters(observations, ranking.base, ranked.fit.posterior.scatters)
-    nothing = HeldOut(float("nan"), float("nan"))
-    before = after = nothing
-    doubt = _weak(ranked, gain, settings)
+    before = after = HeldOut(float("nan"), float("nan"))
+    doubt = _weak(ranked, gain, settings, nothing)
     if not doubt:
         before, after = held_out(observations, base), held_out(observations, ranked.fit)
         doubt = _contradicted(ranked, base, before, after)
@@ -73,9 +88,11 @@ def _widened(observations: Observations, fit: Fit) -> Fit:
     return at_scatters(observations, fit, widened(fit.posterior, observations.scatters))
 
 
-def _weak(ranked: Ranked, gain: float, settings: DiagnoseSettings) -> str:
+def _weak(ranked: Ranked, gain: float, settings: DiagnoseSettings, nothing: float) -> str:
     if gain < settings.claim:
         return f"the log evidence that it gains, {gain:.1f}, is below {settings.claim:g}"
+    if nothing > settings.doubt:
+        return f"that nothing is missing has a probability of {100 * nothing:.0f} %"
     if not ranked.hypothesis.extends:
         p = ranked.hypothesis.placed.effect.parameters[0]
         i = ranked.fit.posterior.unknowns.index[ranked.hypothesis.placed.parameter_name(p.name)]

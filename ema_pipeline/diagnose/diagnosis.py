@@ -10,9 +10,10 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnose.limits import detection_limits
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.next_test import next_measurement
+from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
 from ema_pipeline.diagnose.score import scores
-from ema_pipeline.diagnose.selection import NOTHING, Progress, Selection, select
+from ema_pipeline.diagnose.selection import Progress, Selection, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder
 from ema_pipeline.diagnose.verdict import alike, explains, outlying_parts, verdict_of
@@ -103,7 +104,7 @@ def diagnose(
         heldout_error=rungs[0].heldout_error,
         ladder=ladder,
         notes=tuple(r for r in remarks if r),
-        detection_limits=() if fails else detection_limits(left, settings.claim, settings.sigmas),
+        detection_limits=() if fails else detection_limits(left, hypotheses, settings),
     )
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.claims import Judged
-from ema_pipeline.diagnose.selection import NOTHING, Selection
+from ema_pipeline.diagnose.probability import NOTHING
+from ema_pipeline.diagnose.selection import Selection
 from ema_pipeline.diagnose.sentences import label_text
 from ema_pipeline.diagnose.types import VerdictWord
 from ema_pipeline.dof import Dof
@@ -17,7 +18,8 @@ from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
 from ema_pipeline.mechanics.system import LinearSystem, sensor_row
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit
-from ema_pipeline.observations.modes import FREQUENCY, SHAPE, ModeObservations
+from ema_pipeline.observations.mode_residuals import FREQUENCY, SHAPE
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.rig_model import RigModel
 
 _ADDED_SHARE = 0.1

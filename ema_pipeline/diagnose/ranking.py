@@ -19,7 +19,17 @@ from ema_pipeline.diagnose.pool import spread
 from ema_pipeline.diagnose.score import Score, scores
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import EffectProblem, Observations
-from ema_pipeline.observations.fitting import QUICK, Fit, Model, annealed, learned, refined, transferred, wide
+from ema_pipeline.observations.fitting import (
+    QUICK,
+    Fit,
+    Model,
+    annealed,
+    freed,
+    learned,
+    refined,
+    transferred,
+    wide,
+)
 
 Progress = Callable[[float, str], None]
 Schedule = tuple[tuple[float, int], ...]
@@ -36,6 +46,8 @@ _GRID_STARTS = 2
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
+_BETTER = 0.05
+"""Log evidence by which a start must lead a fit to be followed."""
 _EXPLAINED = 1.3
 """Error up to which the base model is near enough for hypotheses to begin at its fit."""
 
@@ -95,18 +107,19 @@ def rank(
         Processes that share the fits; the result does not depend on their number.
     progress : callable
     """
-    promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses)}
+    models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
+    promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models)}
     hypotheses = [h for h in hypotheses if h.label not in promise or promise[h.label].std < _UNSEEN]
     chosen = _screened(hypotheses, promise)
     stuck = base.posterior.error > _EXPLAINED or base.posterior.residuals.penalty > 0
-    job = partial(_first_fit, observations, base, {} if stuck else promise)
+    job = partial(_first_fit, observations, base, models, {} if stuck else promise)
     found: dict[str, tuple[Hypothesis, Fit]] = {}
     for i, (hypothesis, posterior) in enumerate(zip(chosen, spread(job, chosen, processes), strict=True)):
-        model = base.model.plus(hypothesis.placed, hypothesis.scales)
-        found[hypothesis.label] = (hypothesis, Fit(model, posterior))
+        found[hypothesis.label] = (hypothesis, Fit(models[hypothesis.label], posterior))
         progress(0.6 * (i + 1) / len(chosen), hypothesis.label)
-    for contenders, steps in ((len(found), 5), (_CONTENDERS, 12)):
-        base, found = _begun_again(observations, base, found, processes, contenders, steps)
+    base, found = _begun_again(observations, base, found, processes, len(found), steps=5)
+    found = _bettered(found, _CONTENDERS, partial(_free, observations), processes)
+    base, found = _begun_again(observations, base, found, processes, _CONTENDERS, steps=12)
     progress(0.8, "scatter of parts and channels")
     return _finals(observations, base, found, processes)
 
@@ -121,10 +134,14 @@ def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) ->
 
 
 def _first_fit(
-    observations: Observations, base: Fit, promise: Mapping[str, Score], hypothesis: Hypothesis
+    observations: Observations,
+    base: Fit,
+    models: Mapping[str, Model],
+    promise: Mapping[str, Score],
+    hypothesis: Hypothesis,
 ) -> Posterior:
     """The fit begun at the size that its score tells; annealed from several sizes where the base model fails."""
-    model = base.model.plus(hypothesis.placed, hypothesis.scales)
+    model = models[hypothesis.label]
     problem = model.problem(observations)
     unknowns = problem.unknowns
     begin = transferred(base.posterior, unknowns, np.zeros(len(unknowns)))
@@ -138,11 +155,10 @@ def _first_fit(
         fit = refined(observations, model, unknowns.clipped(begin))
         if fit.posterior.cost <= base.posterior.cost:
             return fit.posterior
-    fits = [
-        annealed(observations, model, x, schedule)
-        for x, schedule in _starts(observations, problem, hypothesis, begin)
-    ]
-    return max(fits, key=lambda f: f.log_evidence).posterior
+    schedule = _FROM_GRID if hypothesis.extends else QUICK
+    return annealed(
+        observations, model, _starts(observations, problem, hypothesis, begin), schedule
+    ).posterior
 
 
 def _starts(
@@ -150,28 +166,28 @@ def _starts(
     problem: EffectProblem,
     hypothesis: Hypothesis,
     begin: NDArray[np.float64],
-) -> list[tuple[NDArray[np.float64], Schedule]]:
-    """Points from which a hypothesis is fitted, each with its annealing.
+) -> list[NDArray[np.float64]]:
+    """Points from which a hypothesis is fitted.
 
     A base model that fails has bent parts and channels to the data: a true effect is found from unbent ones.
     """
     unbent = begin.copy()
-    scattered = [bool(s) for s in problem.unknowns.scatter]
-    unbent[scattered] = 0.0
-    plans: list[tuple[NDArray[np.float64], dict[str, float], Schedule]] = []
+    unbent[[bool(s) for s in problem.unknowns.scatter]] = 0.0
     if hypothesis.extends:
-        for x in (begin, unbent):
-            best = _best_of_grid(observations, problem, x, hypothesis)
-            plans += [(x, start, _FROM_GRID) for start in best]
+        plans = [
+            (x, start)
+            for x in (begin, unbent)
+            for start in _best_of_grid(observations, problem, x, hypothesis)
+        ]
     else:
-        plans = [(begin, start, QUICK) for start in hypothesis.starts()]
-        plans += [(unbent, start, QUICK) for start in hypothesis.starts()[:1]]
+        plans = [(begin, start) for start in hypothesis.starts()]
+        plans += [(unbent, start) for start in hypothesis.starts()[:1]]
     found = []
-    for x, sizes, schedule in plans:
+    for x, sizes in plans:
         moved = x.copy()
         for name, value in sizes.items():
             moved[problem.unknowns.index[name]] = value
-        found.append((problem.unknowns.clipped(moved), schedule))
+        found.append(problem.unknowns.clipped(moved))
     return found
 
 
@@ -204,9 +220,19 @@ def _begun_again(
     if again.log_evidence > base.log_evidence:
         base = again
     job = partial(_better, observations, (base, top), steps)
-    items = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)[:contenders]
+    return base, _bettered(found, contenders, job, processes)
+
+
+def _bettered(found: Found, count: int, job: Callable[[Fit], Posterior], processes: int) -> Found:
+    """The hypotheses, the best `count` of them with what `job` makes of their fits."""
+    items = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)[:count]
     better = _spread_fits(job, [fit for _, fit in items], processes)
-    return base, found | {h.label: (h, fit) for (h, _), fit in zip(items, better, strict=True)}
+    return found | {h.label: (h, fit) for (h, _), fit in zip(items, better, strict=True)}
+
+
+def _free(observations: Observations, fit: Fit) -> Posterior:
+    """The fit led past barriers before which it is stuck."""
+    return freed(observations, fit).posterior
 
 
 def _on(observations: Observations, model: Model, source: Fit, sizes: Fit) -> np.ndarray:
@@ -263,11 +289,15 @@ def _finals(observations: Observations, base: Fit, found: Found, processes: int)
 
 
 def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:
-    candidates = [learned(observations, fit)]
+    """Scatters learned, begun at the fit and at what other fits know, where that is better than the fit itself."""
+    best = learned(observations, fit)
     for source in sources:
-        x = _on(observations, fit.model, source, fit)
-        if not np.allclose(x, fit.posterior.x):
-            scatters: Mapping[str, float] = source.posterior.scatters
-            start = refined(observations, fit.model, x, scatters, steps=10)
-            candidates.append(learned(observations, start))
-    return max(candidates, key=lambda f: f.log_evidence).posterior
+        scatters = source.posterior.scatters
+        start = refined(
+            observations, fit.model, _on(observations, fit.model, source, fit), scatters, steps=10
+        )
+        here = refined(observations, fit.model, best.posterior.x, scatters, steps=4)
+        if start.log_evidence > here.log_evidence + _BETTER:
+            again = learned(observations, start)
+            best = max(best, again, key=lambda f: f.log_evidence)
+    return best.posterior

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from ema_pipeline.diagnose.heldout import HeldOut, held_out
 from ema_pipeline.diagnose.types import EffectSize, Ladder, LearnedScatter, Rung
@@ -10,7 +10,7 @@ from ema_pipeline.inference import Posterior
 from ema_pipeline.inference.maximise import ANNEALING, anneal
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned, refined, transferred
-from ema_pipeline.observations.modes import UNEXPLAINED
+from ema_pipeline.observations.mode_residuals import UNEXPLAINED
 
 
 def rungs_of(observations: Observations, fits: Sequence[Fit]) -> tuple[Rung, ...]:
@@ -33,6 +33,7 @@ def rung(observations: Observations, fit: Fit, base_evidence: float, held: HeldO
         parameters=parameter_sizes(problem, fit.posterior),
         log_evidence=fit.log_evidence - base_evidence,
         unexplained=int(fit.posterior.residuals.penalty // UNEXPLAINED),
+        unknowns=fit.unknowns,
     )
 
 
@@ -61,10 +62,28 @@ def make_ladder(observations: Observations, models: Sequence[Model]) -> Ladder:
     models : sequence of Model
         The base model first.
     """
-    fits: list[Fit] = [fit_base(observations, models[0])]
+    return ladder_of(observations, fits_of(observations, models))
+
+
+def fits_of(observations: Observations, models: Sequence[Model], start: Fit | None = None) -> list[Fit]:
+    """Fits of models, each begun at the one before; the first at `start`, a fit to the same data, if there is one."""
+    fits = [fit_base(observations, models[0], start)]
     for model in models[1:]:
         fits.append(_best_of(observations, model, fits[-1]))
     fits[-1] = learned(observations, fits[-1])
+    return fits
+
+
+def ladder_of(
+    observations: Observations, fits: Sequence[Fit], scatters: Mapping[str, float] | None = None
+) -> Ladder:
+    """The ladder of fits, all at given scatters, or at those of the last one."""
+    if scatters:
+        known = fits[-1].posterior.scatters
+        fits = [
+            *fits[:-1],
+            at_scatters(observations, fits[-1], {n: scatters.get(n, s) for n, s in known.items()}),
+        ]
     rungs = rungs_of(observations, fits)
     return Ladder(rungs, *noise(fits[-1]), note="", scatters=learned_scatters(observations, fits[-1]))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, transferred
+from ema_pipeline.observations.fitting import Fit, Model, transferred
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,28 @@ class Score:
     gain: float
 
 
-def scores(observations: Observations, base: Fit, hypotheses: Sequence[Hypothesis]) -> list[Score]:
-    """Scores of hypotheses on top of a fitted model; those whose size cannot be zero are left out."""
+def scores(
+    observations: Observations,
+    base: Fit,
+    hypotheses: Sequence[Hypothesis],
+    models: Mapping[str, Model] | None = None,
+) -> list[Score]:
+    """Scores of hypotheses on top of a fitted model; those whose size cannot be zero are left out.
+
+    Parameters
+    ----------
+    observations : Observations
+    base : Fit
+    hypotheses : sequence of Hypothesis
+    models : dict of str to Model, optional
+        The base model with each hypothesis, by its label, where they are at hand.
+    """
     found = []
     factor = _Marginal(base)
     for hypothesis in hypotheses:
         if hypothesis.extends:
             continue
-        model = base.model.plus(hypothesis.placed, hypothesis.scales)
+        model = models[hypothesis.label] if models else base.model.plus(hypothesis.placed, hypothesis.scales)
         problem = model.problem(observations)
         names = [n for n in problem.unknowns.names if n.startswith(hypothesis.label + ".")]
         start = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))

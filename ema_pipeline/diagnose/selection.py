@@ -5,20 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from ema_pipeline.diagnose.backward import reconsidered
 from ema_pipeline.diagnose.claims import Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.naming import named
-from ema_pipeline.diagnose.ranking import Ranked, Ranking, rank
+from ema_pipeline.diagnose.probability import NOTHING, probabilities
+from ema_pipeline.diagnose.ranking import Ranking, rank
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, fit_base
 
 Progress = Callable[[float, str], None]
 
-NOTHING = "nothing"
 _TIE = 0.1
 """Difference of log evidence within which the order of two effects is that of their names."""
 
@@ -112,7 +109,7 @@ def select(
             settings.processes,
             lambda share, text, low=low: progress(low + share / (settings.most_effects + 1), text),  # type: ignore[misc]
         )
-        rounds.append(_round(observations, ranking, settings))
+        rounds.append(_round(observations, ranking, left, settings, len(claimed)))
         near = rounds[-1].alike(settings)
         if not near or len(claimed) == settings.most_effects:
             return Selection(tuple(rounds), tuple(claimed), ranking.base)
@@ -126,21 +123,14 @@ def select(
         base = fit_base(observations, claimed[-1].ranked.fit.model, claimed[-1].ranked.fit)
 
 
-def _round(observations: Observations, ranking: Ranking, settings: DiagnoseSettings) -> Round:
+def _round(
+    observations: Observations,
+    ranking: Ranking,
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+    found: int,
+) -> Round:
+    told = probabilities(ranking, hypotheses, settings, found)
     finals = [r for r in ranking.ranked if r.final]
-    judged = sorted((judge(observations, ranking, r, settings) for r in finals), key=lambda j: -j.gain)
-    return Round(ranking, tuple(judged), _probabilities(ranking.ranked, settings))
-
-
-def _probabilities(ranked: Sequence[Ranked], settings: DiagnoseSettings) -> dict[str, float]:
-    """Probability of every hypothesis on top of the model, and of nothing."""
-    names = [named(r.hypothesis, r.fit) for r in ranked]
-    weights = np.array([settings.generic_prior if r.hypothesis.generic else 1.0 for r in ranked])
-    logs = np.array([r.gain + n.advantage for r, n in zip(ranked, names, strict=True)])
-    if len(weights):
-        logs = logs + np.log((1 - settings.null_prior) * weights / np.sum(weights))
-    everything = np.append(logs, np.log(settings.null_prior))
-    shares = np.exp(everything - np.max(everything))
-    shares /= np.sum(shares)
-    found = {n.label: float(p) for n, p in zip(names, shares, strict=False)}
-    return found | {NOTHING: float(shares[-1])}
+    judged = [judge(observations, ranking, r, settings, told[NOTHING]) for r in finals]
+    return Round(ranking, tuple(sorted(judged, key=lambda j: -j.gain)), told)

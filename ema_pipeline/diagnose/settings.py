@@ -13,6 +13,19 @@ class DiagnoseSettings(Settings):
     null_prior: float = Field(
         default=0.3, gt=0, lt=1, description="Prior probability that nothing is missing."
     )
+    further_null_prior: float = Field(
+        default=0.6,
+        gt=0,
+        lt=1,
+        description="The same once an effect was found: a rig seldom misses two.",
+    )
+    doubt: float = Field(
+        default=0.2,
+        gt=0,
+        lt=1,
+        description="Probability of nothing up to which an effect is claimed; the more hypotheses there are, the more "
+        "evidence one of them needs.",
+    )
     generic_prior: float = Field(
         default=0.3,
         gt=0,

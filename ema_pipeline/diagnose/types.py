@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -113,6 +113,8 @@ class Rung:
     misfit, heldout_misfit : tuple of float
         Normalised time-domain misfit at each force level of the ladder, of hits that were fitted and of a level left
         out of the fit; empty where hits at one level only were compared.
+    unknowns : dict of str to float
+        Everything uncertain as this model was fitted, by name: where a later fit of it begins.
     """
 
     effects: tuple[str, ...]
@@ -125,6 +127,7 @@ class Rung:
     unexplained: int
     misfit: tuple[float, ...] = ()
     heldout_misfit: tuple[float, ...] = ()
+    unknowns: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

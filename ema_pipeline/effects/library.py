@@ -13,6 +13,7 @@ from pathlib import Path
 import ema_pipeline.effects as package
 from ema_pipeline.effects import out_of_tolerance
 from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.effects.checks import check_definition, check_on_rig, line_of_error, named_otherwise
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.rigs.types import Rig
 
@@ -49,20 +50,43 @@ def load_effect_file(path: str | Path) -> Effect:
     try:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:  # whatever a user's file raises is shown as one line
-        raise EmaError(f"{path}: does not run: {type(error).__name__}: {error}") from None
+        line = line_of_error(error, path)
+        where = f"{path}, line {line}" if line else f"{path}"
+        said = error.msg if isinstance(error, SyntaxError) else str(error)
+        raise EmaError(f"{where}: does not run: {type(error).__name__}: {said}") from None
     effect = getattr(module, "EFFECT", None)
-    if not isinstance(effect, Effect):
-        raise EmaError(f"{path}: defines no EFFECT = Effect(...)")
-    return effect
+    if isinstance(effect, Effect):
+        check_definition(effect, path)
+        return effect
+    other = named_otherwise(path)
+    if other is not None:
+        raise EmaError(f"{path}, line {other[0]}: the effect is called {other[1]}; call it EFFECT")
+    raise EmaError(
+        f"{path}: defines no EFFECT; add EFFECT = Effect(...), see 'Adding an effect' in the documentation"
+    )
 
 
-def effect_library(files: Iterable[str | Path] = ()) -> dict[str, Effect]:
-    """Shipped effects and those of the user's files; an id may not be taken twice."""
+def effect_library(files: Iterable[str | Path] = (), rig: Rig | None = None) -> dict[str, Effect]:
+    """Shipped effects and those of the user's files; an id may not be taken twice.
+
+    Parameters
+    ----------
+    files : iterable of str or Path
+    rig : Rig, optional
+        What the user's effects are tried on.
+
+    Raises
+    ------
+    EmaError
+        For a file that is not right, with line and remedy.
+    """
     library = dict(shipped_effects())
     for file in files:
         effect = load_effect_file(file)
         if effect.id in library:
             raise EmaError(f"{file}: effect id '{effect.id}' is already taken; choose another id")
+        if rig is not None:
+            check_on_rig(effect, rig, Path(file))
         library[effect.id] = effect
     return library
 

@@ -55,6 +55,7 @@ def rig_with_effects(
             uses=partial(_uses, rig, tuple(placed)),
             classifier=rig.classify,
             modal_damping_scatter=rig.modal_damping_scatter,
+            stiffness_steps=rig.stiffness_steps,
         )
     if isinstance(current, ParametricRig):
         return current
@@ -66,6 +67,7 @@ def rig_with_effects(
         partial(_uses, rig, ()),
         rig.classify,
         rig.modal_damping_scatter,
+        rig.stiffness_steps,
     )
 
 

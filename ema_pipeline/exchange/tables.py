@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ema_pipeline.correlate.types import Pairing
+from ema_pipeline.correlate.types import Pairing, percent_off
 from ema_pipeline.files import replace_file, replacing
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.types import ModalModel
@@ -28,6 +28,7 @@ MODES_COLUMNS = (
     "method",
     "model_mode",
     "model_frequency_hz",
+    "difference_percent",
     "mac",
     "family",
     "flags",
@@ -38,8 +39,7 @@ MODES_COLUMNS = (
 def modes_table(modal: ModalModel, configuration: str = "", pairing: Pairing | None = None) -> list[Row]:
     """One row per mode, with the columns of `MODES_COLUMNS`; flags are joined by ``"; "``.
 
-    Modes are numbered from 1, those of the model from 0; what is said of the model is None where `pairing` has
-    no partner.
+    Modes are numbered from 1; what is said of the model is None where `pairing` has no partner.
     """
     pairs = {} if pairing is None else {p.measured: p for p in pairing.pairs}
     return [
@@ -53,8 +53,11 @@ def modes_table(modal: ModalModel, configuration: str = "", pairing: Pairing | N
             "mpc": mode.mpc,
             "stability": mode.stability,
             "method": mode.method,
-            "model_mode": pairs[index].model if index in pairs else None,
+            "model_mode": pairs[index].model + 1 if index in pairs else None,
             "model_frequency_hz": pairs[index].model_frequency_hz if index in pairs else None,
+            "difference_percent": (
+                percent_off(mode.frequency_hz, pairs[index].model_frequency_hz) if index in pairs else None
+            ),
             "mac": pairs[index].mac if index in pairs else None,
             "family": pairs[index].family if index in pairs else None,
             "flags": "; ".join(mode.flags),

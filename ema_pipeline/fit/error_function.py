@@ -1,17 +1,17 @@
-"""The error function of natural frequencies over one stiffness, and the two-step route built on it.
+"""The error function of natural frequencies over one stiffness, and the stepwise route built on it.
 
 ε = Σ ((ω_measured - ω_model)/ω_model)², each measured frequency held against the nearest model frequency.
 
 References
 ----------
 K. A. Olanipekun, "Estimation of a planetary gear mesh stiffness: an approach based on minimising error
-function",
-Eq. 10 and Figs. 5 and 6.
+function", Eq. 10 and Figs. 5 and 6.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,11 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.pairing import RIGID_HZ
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.settings import FitSettings
-from ema_pipeline.fit.types import ErrorSweep, TwoStep
+from ema_pipeline.fit.types import ErrorSweep, StepwiseEstimate
 from ema_pipeline.mechanics.modes import normal_modes
+from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.rigs.types import Rig
 
-SUN_PLANET, RING_PLANET = "sun_planet_mesh_stiffness", "ring_planet_mesh_stiffness"
 LOW, HIGH = 1e6, 1e9
 
 
@@ -83,12 +83,7 @@ def error_sweep(
     used = np.sort(np.asarray(measured_hz, dtype=float))[:mode_count]
     stiffness = np.geomspace(low, high, settings.sweep_points)
     error = np.array(
-        [
-            frequency_error(
-                used, normal_modes(rig.system(configuration, {**(values or {}), parameter: float(k)}))[0]
-            )
-            for k in stiffness
-        ]
+        [frequency_error(used, f) for f in _swept(rig, configuration, parameter, stiffness, values or {})]
     )
     at = int(np.argmin(error))
     least = max(float(error[at]), 1e-300)
@@ -108,6 +103,27 @@ def error_sweep(
         identified=identified,
         note=note,
     )
+
+
+def _swept(
+    rig: Rig, configuration: str, parameter: str, stiffness: NDArray[np.float64], values: Mapping[str, float]
+) -> Iterator[NDArray[np.float64]]:
+    """The model's frequencies, Hz, at every stiffness; matrices that are linear in it are interpolated."""
+
+    def system(k: float) -> LinearSystem:
+        return rig.system(configuration, {**values, parameter: float(k)})
+
+    low, high = stiffness[0], stiffness[-1]
+    first, last, middle = system(low), system(high), system(stiffness[stiffness.size // 2])
+    slope = (last.stiffness - first.stiffness) / (high - low)
+    expected = first.stiffness + slope * (stiffness[stiffness.size // 2] - low)
+    alike = np.array_equal(first.mass, middle.mass) and np.array_equal(first.mass, last.mass)
+    linear = alike and np.allclose(
+        expected, middle.stiffness, rtol=1e-9, atol=1e-12 * np.abs(last.stiffness).max()
+    )
+    for k in stiffness:
+        at = replace(first, stiffness=first.stiffness + slope * (k - low)) if linear else system(float(k))
+        yield normal_modes(at)[0]
 
 
 def _judge(
@@ -130,37 +146,31 @@ def mode_counts(available: int) -> tuple[int, ...]:
     return tuple(sorted({n for n in (3, 4) if n <= available} | ({available} if available else set())))
 
 
-def two_step(
+def stepwise(
     rig: Rig,
     measured: Mapping[str, MeasuredModes],
     settings: FitSettings,
     mode_count: int | None = None,
-) -> TwoStep:
-    """Sun-planet stiffness from ``no_ring``, with it ring-planet from ``with_ring``, then their average.
+) -> StepwiseEstimate:
+    """The stiffnesses of the rig's steps, each with those of the earlier steps known, and their average.
 
-    All measured modes are used, or the lowest `mode_count`. Values are NaN where the configuration was not
-    measured; the average is NaN unless both steps determine their stiffness, and the note says why they do
-    not.
+    All measured modes are used, or the lowest `mode_count`.
     """
-    sun = ring = float("nan")
     sound = True
     notes = []
     values: dict[str, float] = {}
-    steps = (("no_ring", SUN_PLANET, "sun-planet"), ("with_ring", RING_PLANET, "ring-planet"))
-    for configuration, parameter, label in steps:
-        modes = measured.get(configuration)
+    known: dict[str, float] = {}
+    for configuration, parameter in rig.stiffness_steps:
+        modes, label = measured.get(configuration), parameter.replace("_", " ")
+        values[parameter] = float("nan")
         if modes is None or not len(modes):
             notes.append(f"{label}: {configuration} was not measured")
             continue
         count = len(modes) if mode_count is None else mode_count
-        sweep = error_sweep(rig, configuration, parameter, modes.frequency_hz, count, settings, values)
-        values[parameter] = sweep.minimum
+        sweep = error_sweep(rig, configuration, parameter, modes.frequency_hz, count, settings, known)
+        values[parameter] = known[parameter] = sweep.minimum
         sound &= sweep.identified
         if not sweep.identified:
             notes.append(f"{label}: {sweep.note}")
-        if parameter == SUN_PLANET:
-            sun = sweep.minimum
-        else:
-            ring = sweep.minimum
-    both = sound and np.isfinite(sun) and np.isfinite(ring)
-    return TwoStep(sun, ring, 0.5 * (sun + ring) if both else float("nan"), "; ".join(notes))
+    average = sum(values.values()) / len(values) if sound else float("nan")
+    return StepwiseEstimate(values, average, "; ".join(notes))

@@ -9,13 +9,15 @@ import numpy as np
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.errors import EmaError
-from ema_pipeline.fit.error_function import RING_PLANET, SUN_PLANET, error_sweep, mode_counts, two_step
+from ema_pipeline.fit.error_function import error_sweep, mode_counts, stepwise
 from ema_pipeline.fit.settings import FitSettings
-from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate, TwoStep
+from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate, StepwiseEstimate
 from ema_pipeline.inference import Posterior
 from ema_pipeline.mechanics.system import LinearSystem
-from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned
-from ema_pipeline.observations.modes import UNEXPLAINED, ModeObservations, ModeProblem
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned, wide
+from ema_pipeline.observations.mode_residuals import UNEXPLAINED
+from ema_pipeline.observations.modes import ModeObservations, ModeProblem
 from ema_pipeline.rigs.types import Parameter, Rig
 
 _OUT_OF_TOLERANCE = 3.0
@@ -51,9 +53,19 @@ class FittedModes:
         model = self.problem.model
         return model.system(configuration, self.posterior.x[: len(model.unknowns)])
 
+    def system_of_like_parts(self, configuration: str) -> LinearSystem:
+        """The fitted model's system, like parts being alike: what the single parts deviate is left out."""
+        model = self.problem.model
+        single = np.array([bool(name) for name in model.unknowns.scatter])
+        x = np.where(single, 0.0, self.posterior.x[: len(model.unknowns)])
+        return model.system(configuration, x)
+
 
 def fit_modes(
-    observations: ModeObservations, model: Model, scatters: Mapping[str, float] | None = None
+    observations: ModeObservations,
+    model: Model,
+    scatters: Mapping[str, float] | None = None,
+    start: Mapping[str, float] | None = None,
 ) -> FittedModes:
     """Fit a model to measured modes.
 
@@ -63,6 +75,8 @@ def fit_modes(
     model : Model
     scatters : dict of str to float, optional
         What parts, channels, damping and the model scatter; learned where left out.
+    start : dict of str to float, optional
+        Unknowns of an earlier fit of this model to these data, which is then only refined.
 
     Raises
     ------
@@ -77,19 +91,38 @@ def fit_modes(
             f"rig '{observations.rig.name}' has no parameter with a tolerance or marked free: nothing to fit; "
             "add 'tolerance' or 'free = true' in the rig file"
         )
-    fit = fit_base(observations, model)
+    fit = fit_base(observations, model) if start is None else begun_at(observations, model, start)
     done = learned(observations, fit) if scatters is None else at_scatters(observations, fit, scatters)
     return FittedModes(observations, problem, done)
+
+
+def begun_at(
+    observations: Observations,
+    model: Model,
+    unknowns: Mapping[str, float],
+    scatters: Mapping[str, float] | None = None,
+) -> Fit:
+    """A model at given unknowns, those left out at their means; at the scatters where fits begin, if none are given."""
+    problem = model.problem(observations)
+    x = np.array([unknowns.get(n, 0.0) for n in problem.unknowns.names])
+    scatters = wide(observations) if scatters is None else scatters
+    return Fit(model, Posterior(problem.unknowns, x, scatters, problem.residuals(x, scatters)))
+
+
+def deviations_of(fit: Fit) -> dict[str, float]:
+    """How far everything uncertain but the effects' sizes had to move from what is stated, in prior 1 σ, by name."""
+    posterior, sizes = fit.posterior, {f"{label}." for label in fit.model.labels}
+    return {
+        name: float(x / std)
+        for name, x, std in zip(posterior.unknowns.names, posterior.x, posterior.prior_std, strict=True)
+        if not any(name.startswith(size) for size in sizes)
+    }
 
 
 def restored(observations: ModeObservations, model: Model, found: FitResult) -> FittedModes:
     """The fitted model of stored results."""
     problem = observations.problem(model.effects, model.scales)
-    x = np.array([found.unknowns.get(n, 0.0) for n in problem.unknowns.names])
-    residuals = problem.residuals(x, found.scatters)
-    return FittedModes(
-        observations, problem, Fit(model, Posterior(problem.unknowns, x, found.scatters, residuals))
-    )
+    return FittedModes(observations, problem, begun_at(observations, model, found.unknowns, found.scatters))
 
 
 def fit_result(
@@ -123,9 +156,9 @@ def fit_result(
         data_count=count,
         stop_reason="converged",
         sweeps=sweeps,
-        two_step=steps,
+        stepwise=steps,
         notes=_notes(fitted),
-        unknowns={n: float(v) for n, v in zip(posterior.unknowns.names, posterior.x, strict=True)},
+        unknowns=fitted.fit.unknowns,
         scatters={k: float(v) for k, v in posterior.scatters.items()},
     )
 
@@ -222,7 +255,7 @@ def _frequency_error(fitted: FittedModes) -> float:
 
 def seed_route(
     rig: Rig, measured: Mapping[str, MeasuredModes], settings: FitSettings
-) -> tuple[tuple[ErrorSweep, ...], TwoStep | None]:
+) -> tuple[tuple[ErrorSweep, ...], StepwiseEstimate | None]:
     """The seed's error function over every free stiffness, each in the first configuration that depends on it."""
     sweeps: list[ErrorSweep] = []
     held: dict[str, float] = {}
@@ -237,5 +270,4 @@ def seed_route(
             sweeps.append(error_sweep(rig, configuration, p.name, frequency, count, settings, held))
         if sweeps:
             held[p.name] = sweeps[-1].minimum
-    known = SUN_PLANET in rig.parameters and RING_PLANET in rig.parameters
-    return tuple(sweeps), two_step(rig, measured, settings) if known else None
+    return tuple(sweeps), stepwise(rig, measured, settings) if rig.stiffness_steps else None

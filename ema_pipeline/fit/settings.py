@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from ema_pipeline.correlate.settings import UncertaintySettings
+from ema_pipeline.correlate.settings import AssumedSettings
 
 
-class FitSettings(UncertaintySettings):
+class FitSettings(AssumedSettings):
     """How the model's parameters are fitted to measured modes."""
 
     relative_std_limit: float = Field(

@@ -1,4 +1,4 @@
-"""What fitting the model's parameters hands on."""
+"""Results of fitting the model's parameters."""
 
 from __future__ import annotations
 
@@ -43,14 +43,20 @@ class ErrorSweep:
 
 
 @dataclass(frozen=True)
-class TwoStep:
-    """The seed's route: sun-planet from ``no_ring``, ring-planet from ``with_ring``, then the average.
+class StepwiseEstimate:
+    """Stiffnesses by their error functions, one configuration after the other, and their average.
 
-    Values are NaN where the step could not be taken (its configuration was not measured).
+    Attributes
+    ----------
+    values : dict of str to float
+        N/m; NaN where the step could not be taken (its configuration was not measured).
+    average : float
+        NaN unless every step determines its stiffness.
+    note : str
+        Why not.
     """
 
-    sun_planet_mesh_stiffness: float
-    ring_planet_mesh_stiffness: float
+    values: dict[str, float]
     average: float
     note: str
 
@@ -128,20 +134,12 @@ class FitResult:
     stop_reason : str
         Why the optimiser stopped, in words.
     sweeps : tuple of ErrorSweep
-    two_step : TwoStep or None
+    stepwise : StepwiseEstimate or None
     notes : tuple of str
     unknowns : dict of str to float
         Every unknown at the maximum of the posterior: logarithms of families and parts, calibrations, effects' sizes.
     scatters : dict of str to float
         What parts, channels, damping and the model scatter, as learned.
-    objective : float
-        -2 log posterior at the data's own uncertainties, up to a constant that is the same for all models of
-        the same data: the smaller, the better.
-    outlier_share : float
-        Share of the measured modes that the model does not explain.
-    misfit_scale : float
-        Factor by which all uncertainties were multiplied because the model does not reach them; 1 where it
-        does.
     """
 
     parameters: dict[str, ParameterEstimate]
@@ -153,13 +151,10 @@ class FitResult:
     data_count: int
     stop_reason: str
     sweeps: tuple[ErrorSweep, ...] = ()
-    two_step: TwoStep | None = None
+    stepwise: StepwiseEstimate | None = None
     notes: tuple[str, ...] = ()
     unknowns: dict[str, float] = field(default_factory=dict)
     scatters: dict[str, float] = field(default_factory=dict)
-    objective: float = float("nan")
-    outlier_share: float = 0.0
-    misfit_scale: float = 1.0
 
     def values(self) -> dict[str, float]:
         """Parameter values at the optimum, as `Rig.system` takes them."""

@@ -7,6 +7,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.frf.sensitivities import (
+    RECIPROCAL_FACTOR,
+    SENSITIVITY,
+    channels_words,
+    factor_words,
+    likely_cause,
+    reciprocal_factor,
+)
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.verdict import Verdict, judged
@@ -25,6 +33,13 @@ PEAK_SHARE = 0.01
 NODE_LEVEL = 0.1
 """An FRF below this share of the strongest at its sensor is near a node: its noise tells little."""
 
+STRONG_LEVEL = 0.4
+"""Cross FRFs above this share of their driving points are ruled by the structure; oblique blows and transverse
+sensitivity make a tenth to a fifth, which may well differ by a factor or in sign with the direction."""
+
+WEAK_LEVEL, OBVIOUS_FACTOR = 0.15, 7.0
+"""From this share on such a test makes factors of up to five by itself: only larger ones speak of a sensitivity."""
+
 NOISE_MARGIN = 2.0
 """Reciprocal FRFs may differ by their noise: this many times its power is taken off their difference."""
 
@@ -42,7 +57,8 @@ def check_frfs(frfs: FrfSet, settings: FrfSettings | None = None) -> tuple[Verdi
     tuple of Verdict
         All with consequence "warn". Coherence and repeatability per pair of output and input with at least
         two hits (one verdict for the whole set where no pair has two); the sign of each driving point;
-        reciprocity of each pair of points measured both ways. `channel` reads "output over input".
+        reciprocity of each pair of points measured both ways, or "sensitivity" where a constant factor or a sign
+        explains their difference. `channel` reads "output over input".
     """
     settings = settings or FrfSettings()
     low, high = np.searchsorted(frfs.frequency_hz, frfs.band_hz)
@@ -180,21 +196,45 @@ def _reciprocity(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Ver
             power = np.maximum(np.abs(one), np.abs(other)) ** 2
             seen = power >= PEAK_SHARE * power.max()
             one, other = one[seen], other[seen]
+            level = (peak[o1, i2] * peak[o2, i1] / (peak[o1, i1] * peak[o2, i2])) ** 0.25
+            apart = _sensor(frfs, o1) != _sensor(frfs, o2)
+            factor = reciprocal_factor(one, other) if apart and level > WEAK_LEVEL else 1.0
+            if level <= STRONG_LEVEL and factor < OBVIOUS_FACTOR and 1 / factor < OBVIOUS_FACTOR:
+                factor = 1.0
+            if factor != 1.0:
+                verdicts.append(_contradiction(frfs, o1, o2, factor))
+                continue
             size = 0.5 * (np.linalg.norm(one) + np.linalg.norm(other))
             noise = np.nan_to_num(_noise(frfs, o1, i2, inside) + _noise(frfs, o2, i1, inside))[seen]
             beyond = max(float(np.sum(np.abs(one - other) ** 2) - NOISE_MARGIN * np.sum(noise)), 0.0)
             difference = float(np.sqrt(beyond) / size) if size > 0 else 0.0
             passes = difference <= settings.reciprocity
             name = f"{frfs.outputs[o1]} and {frfs.outputs[o2]}"
-            fault = (
-                f"FRFs between {name} differ by {difference:.0%} with the direction: sign, calibration, "
-                "position or a nonlinearity"
-            )
+            fault = f"FRFs between {name} differ by {difference:.0%} with the direction: position, or a nonlinearity"
             limit = settings.reciprocity
             verdicts.append(
                 judged("reciprocity", difference, limit, passes, RECIPROCITY, "warn", fault, channel=name)
             )
     return verdicts
+
+
+def _contradiction(frfs: FrfSet, one: int, other: int, factor: float) -> Verdict:
+    """Two channels whose reciprocal FRFs differ by one constant: a sensitivity or a sign is wrong."""
+    sensors = channels_words([_sensor(frfs, one), _sensor(frfs, other)])
+    what = ["their signs"] if factor < 0 else []
+    size = abs(factor)
+    if size != 1.0:
+        sides = f"the first reads {factor_words(size)}, or the second {factor_words(1 / size)}"
+        what.append(f"sensitivity_mv and unit: {sides}{likely_cause(size, frfs.quantities[one])}")
+    fault = f"{sensors} contradict each other (reciprocity of their FRFs): look up {', and '.join(what)}"
+    channel = f"{frfs.outputs[one]} and {frfs.outputs[other]}"
+    return Verdict(SENSITIVITY, factor, RECIPROCAL_FACTOR, "1", False, RECIPROCITY, "warn", channel, fault)
+
+
+def _sensor(frfs: FrfSet, output: int) -> str:
+    """Name of the channel at an output; its DOF where no channel is known."""
+    name = frfs.channels[output].name if output < len(frfs.channels) else ""
+    return name or str(frfs.outputs[output])
 
 
 def _accelerance(frfs: FrfSet, output: int, source: int, inside: slice) -> NDArray[np.complex128]:

@@ -20,28 +20,36 @@ class FrfSettings(Settings):
     )
     exponential_window: Literal["none", "auto"] | Annotated[float, Field(ge=0)] = Field(
         default="none",
-        description="Decay rate of a window to put on force and responses, rad/s; auto: down to 1 % at the end",
+        description="Decay rate of a window on force and responses, rad/s; auto: falls to 1 % at the end of the record",
     )
     variance_dof: int = Field(
         default=16,
         ge=1,
-        description="Degrees of freedom that the variance is smoothed to, (hits - 1) × neighbouring lines",
+        description="Degrees of freedom of the variance, (hits - 1) × neighbouring lines that it is averaged over",
     )
     band_drop_db: float = Field(
         default=40.0,
         ge=20.0,
-        description="Drop of the force autospectrum that ends the band, dB, unless noise ends it before",
+        description="Drop of the force autospectrum at which the band ends, dB, unless noise ends it earlier",
     )
-    threads: int = Field(default=2, ge=1, description="Threads over blocks of channels")
+    threads: int = Field(default=2, ge=1, description="Number of threads, each with a block of channels")
     minimum_coherence: float = Field(
-        default=0.9, gt=0, lt=1, description="Coherence, weighted with the FRF's power, from 3 hits on"
+        default=0.9,
+        gt=0,
+        lt=1,
+        description="Least coherence, weighted by the FRF's power; judged from 3 hits on",
     )
     negative_driving_point: float = Field(
-        default=0.1, gt=0, lt=1, description="Share of a driving point's imaginary part with the wrong sign"
+        default=0.1,
+        gt=0,
+        lt=1,
+        description="Largest share of a driving point's imaginary part that may have the wrong sign",
     )
     reciprocity: float = Field(
-        default=0.15, gt=0, description="Difference of two reciprocal FRFs over their size"
+        default=0.15, gt=0, description="Largest difference of two reciprocal FRFs, relative to their size"
     )
     repeatability: float = Field(
-        default=0.1, gt=0, description="Scatter of single hits' FRFs over their size, from 2 hits on"
+        default=0.1,
+        gt=0,
+        description="Largest scatter of the FRFs of single hits, relative to their size; judged from 2 hits on",
     )

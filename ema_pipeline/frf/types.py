@@ -1,4 +1,4 @@
-"""What the FRF stage hands on."""
+"""Results of the FRF stage."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import replace_file
+from ema_pipeline.ingest.derived import derived_channels
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE
 from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers import read_raw, reader_of
@@ -108,7 +109,10 @@ def draft_description(raw: Path, limits: ReadLimits | None = None) -> str:
         reason = f"; {problems[0]}" if problems else ""
         raise EmaError(f"{raw}: no record file that can be read{reason}")
     channels = _common_channels(found)
-    hammer = _find_hammer(channels, found)
+    left_out = derived_channels(channels)
+    hammer = _find_hammer(_without(channels, left_out), found)
+    left_out = derived_channels(channels, hammer)
+    channels = _without(channels, left_out)
     lines = [
         "# Drafted by 'ema init'. Go through every line marked CHECK, then run 'ema check' on this folder.",
         *(f"# CHECK: not drafted: {problem}" for problem in problems),
@@ -117,6 +121,7 @@ def draft_description(raw: Path, limits: ReadLimits | None = None) -> str:
         '# rig = "planetary"            # CHECK: name of the rig, or leave it to --rig or a rig.toml',
         '# configuration = "no_ring"    # CHECK: one of the rig\'s configurations',
         *_rate_lines(found),
+        *(f"# left out: {_quoted(name)} is {what}" for name, what in left_out.items()),
     ]
     dofs = _channel_dofs(channels, hammer)
     calibrated = any(_unit_of(c) in _ENGINEERING for n, c in channels.items() if n != hammer)
@@ -127,7 +132,8 @@ def draft_description(raw: Path, limits: ReadLimits | None = None) -> str:
         else:
             lines += _response_lines(channel, dofs[name])
         lines += _presence_comment(name, found)
-    lines += ["", *_record_lines(found, [dof for dof, _ in dofs.values()])]
+    nodes = {Dof.parse(c.dof).body: dofs[n][0].body for n, c in channels.items() if n in dofs and c.dof}
+    lines += ["", *_record_lines(found, [dof for dof, _ in dofs.values()], hammer, nodes)]
     return "\n".join(lines) + "\n"
 
 
@@ -156,6 +162,10 @@ def _common_channels(found: list[_Found]) -> dict[str, RawChannel]:
     channels = next(f.raw.channels for f in found if tuple(f.raw.channels) == usual)
     length = Counter(c.samples.size for c in channels.values()).most_common(1)[0][0]
     return {name: c for name, c in channels.items() if c.samples.size == length}
+
+
+def _without(channels: Mapping[str, RawChannel], names: Mapping[str, str]) -> dict[str, RawChannel]:
+    return {name: channel for name, channel in channels.items() if name not in names}
 
 
 def _find_hammer(channels: Mapping[str, RawChannel], found: list[_Found]) -> str | None:
@@ -191,7 +201,7 @@ def _known_unit(channel: RawChannel) -> Unit | None:
 def _rate_lines(found: list[_Found]) -> list[str]:
     rates = sorted({f.raw.sample_rate_hz for f in found if f.raw.sample_rate_hz is not None})
     if not rates:
-        return ["# sample_rate_hz = 25600    # CHECK: the files do not state it; fill it in"]
+        return ["# sample_rate_hz =    # CHECK: the files do not state it; fill it in and remove the '#'"]
     if rates[-1] / rates[0] - 1 > 1e-4:
         return [
             f"# CHECK: the files differ in sample rate ({rates[0]:.10g} to {rates[-1]:.10g} Hz); split them"
@@ -290,13 +300,15 @@ def _presence_comment(name: str, found: list[_Found]) -> list[str]:
     )
 
 
-def _record_lines(found: list[_Found], dofs: list[Dof]) -> list[str]:
+def _record_lines(
+    found: list[_Found], dofs: list[Dof], hammer: str | None, nodes: Mapping[str, str]
+) -> list[str]:
     bodies = {dof.body.casefold(): dof.body for dof in dofs}
     impacts: list[tuple[str, bool]] = []
     placeholders: dict[str, str] = {}
     for record in found:
         stem = record.file.split(".", 1)[0]
-        known = _impact_in(stem, bodies)
+        known = _impact_in(stem, bodies) or _impact_stated(record.raw, hammer, nodes)
         key = _blow_key(stem)
         if known is None and key not in placeholders:
             placeholders[key] = f"hit{len(placeholders) + 1}.{_PLACEHOLDER_DIRECTION}"
@@ -325,6 +337,19 @@ def _impact_in(stem: str, bodies: Mapping[str, str]) -> str | None:
                 if joined in bodies:
                     return f"{bodies[joined]}.{direction.lower()}"
     return None
+
+
+def _impact_stated(raw: RawRecord, hammer: str | None, nodes: Mapping[str, str]) -> str | None:
+    """The struck node and direction where the file states them: the reference of its responses, or the hammer's place.
+
+    A node that bears a sensor is called as that sensor's channel calls it.
+    """
+    references = {c.reference for n, c in raw.channels.items() if n != hammer and c.reference}
+    stated = references or {c.dof for n, c in raw.channels.items() if n == hammer and c.dof}
+    if len(stated) != 1:
+        return None
+    dof = Dof.parse(stated.pop())
+    return str(Dof(nodes.get(dof.body, dof.body), dof.direction, dof.sign))
 
 
 def _blow_key(stem: str) -> str:

@@ -88,6 +88,7 @@ def find_hits(record: Record, settings: HitSettings | None = None) -> tuple[Hit,
             stop=stop,
             peak=peak,
             peak_force=float(deviation[peak]),
+            force_unit="N" if record.force_calibrated else "V",
         )
         for number, (peak, (start, stop)) in enumerate(zip(peaks, bounds, strict=True))
     )

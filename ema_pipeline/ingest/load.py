@@ -15,7 +15,7 @@ from ema_pipeline.ingest.readers import read_raw
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord, Samples, split_unit
 from ema_pipeline.ingest.records import Record, ResponseChannel
 from ema_pipeline.ingest.swap import find_swap
-from ema_pipeline.rows import Rows
+from ema_pipeline.lazy_samples import LazySamples
 from ema_pipeline.units import Unit, find_unit
 
 MINIMUM_SAMPLES = 64
@@ -64,7 +64,7 @@ class _Source:
         return np.asarray(self.samples[start:stop] * self.factor, dtype=np.float64)
 
 
-class _ScaledRows(Rows):
+class _ScaledSamples(LazySamples):
     """Responses of one record in SI; each is scaled, and read where its format allows it, when asked for."""
 
     def __init__(self, sources: list[_Source]) -> None:
@@ -160,7 +160,7 @@ def load_record(test: TestDescription, entry: RecordDescription, limits: ReadLim
         sample_rate_hz=rate,
         force_name=test.force.name,
         force=force,
-        responses=_ScaledRows(list(responses.values())),
+        responses=_ScaledSamples(list(responses.values())),
         channels=tuple(channels),
         force_full_scale=hammer.full_scale,
         force_calibrated=not test.force.uncalibrated,

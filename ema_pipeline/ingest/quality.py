@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -24,6 +25,15 @@ DECAY = "ISO 7626-5, record length and decay of the response"
 
 FLAT_TOP_LIMIT = 0.7
 """Smooth peaks have 0.5: the time within ε of the top grows with √ε."""
+
+SURE_FLAT_TOP = 0.85
+"""Flatter tops are clipped whatever else is known; 1 in 1600 channels of weak signals lies between the two limits."""
+
+FAR_BELOW_SCALE = 0.25
+"""No input clips below this share of its full scale: a sensor's own supply ends at half the usual input range."""
+
+EXCEEDED = 2.0
+"""A level that the same channel exceeds this many times in another hit is not where it clips."""
 
 BAND_OVER_RATE = 1 / 2.56
 """Converters' anti-alias filters are flat up to the sample rate over 2.56."""
@@ -49,7 +59,12 @@ def hits_of_test(records: Sequence[Record], settings: HitSettings | None = None)
     found: list[Hit] = []
     owner: list[int] = []
     silent: dict[int, Hit] = {}
+    copies: dict[int, str] = {}
+    seen: dict[bytes, str] = {}
     for index, record in enumerate(records):
+        original = seen.setdefault(hashlib.sha256(record.force.tobytes()).digest(), record.file)
+        if original != record.file:
+            copies[index] = original
         try:
             hits = find_hits(record, settings)
         except EmaError as error:
@@ -63,16 +78,62 @@ def hits_of_test(records: Sequence[Record], settings: HitSettings | None = None)
     checked: list[Hit] = []
     for index, record in enumerate(records):
         mine = [hit for hit, i in zip(aligned, owner, strict=True) if i == index]
-        checked += [check_hit(record, hit, settings) for hit in mine]
-    trimmed = trim_hits(checked, records, settings)
+        checked += [_copy_told(check_hit(record, hit, settings), copies.get(index, "")) for hit in mine]
+    trimmed = trim_hits(_without_false_clipping(checked, owner, records), records, settings)
     placed = [*zip(owner, trimmed, strict=True), *silent.items()]
     return tuple(hit for _, hit in sorted(placed, key=lambda item: item[0]))
+
+
+def _copy_told(hit: Hit, original: str) -> Hit:
+    """The hit with a warning where its record is one that came before: no two blows are the same to the last bit."""
+    if not original:
+        return hit
+    fault = f"{hit.file} holds the same force record as {original}, bit for bit: one is a copy; take it out"
+    verdict = judged("copy", 1.0, 0.0, False, "", "warn", fault, unit="copies")
+    return replace(hit, verdicts=(*hit.verdicts, verdict))
+
+
+def _without_false_clipping(
+    hits: Sequence[Hit], owner: Sequence[int], records: Sequence[Record]
+) -> list[Hit]:
+    """Channels whose tops are somewhat flat at a level that they exceed by far in another record are not clipped."""
+    highest: dict[str, float] = {}
+
+    def exceeded(verdict: Verdict, hit: Hit, record: Record) -> bool:
+        if verdict.check != "clipping" or verdict.passes or verdict.value >= SURE_FLAT_TOP:
+            return False
+        name = verdict.channel
+        if name not in highest:
+            highest[name] = max((_largest(r, name) for r in records), default=0.0)
+        return highest[name] > EXCEEDED * _largest(record, name, hit.start, hit.stop)
+
+    kept = []
+    for hit, index in zip(hits, owner, strict=True):
+        if any(v.check == "clipping" and not v.passes for v in hit.verdicts):
+            record = records[index]
+            verdicts = tuple(
+                replace(v, passes=True, message="") if exceeded(v, hit, record) else v for v in hit.verdicts
+            )
+            kept.append(replace(hit, verdicts=verdicts))
+        else:
+            kept.append(hit)
+    return kept
+
+
+def _largest(record: Record, name: str, start: int = 0, stop: int | None = None) -> float:
+    """Largest excursion of a response channel from its middle; 0 where the record has no such channel."""
+    rows = [k for k, channel in enumerate(record.channels) if channel.name == name]
+    if not rows:
+        return 0.0
+    samples = np.asarray(record.responses[rows[0], start:stop])
+    return float(np.max(np.abs(samples - np.median(samples))))
 
 
 def _silent_hit(record: Record, reason: str, settings: HitSettings) -> Hit:
     """A record without a blow, as a hit that is left out."""
     fault, name = reason.removeprefix(f"{record.file}: "), record.force_name
-    verdict = judged("force level", 0.0, settings.trigger_noise, False, "", "reject_hit", fault, channel=name)
+    limit = settings.trigger_noise
+    verdict = judged("force level", 0.0, limit, False, "", "reject_hit", fault, channel=name, unit="×")
     return Hit(record.file, 0, record.impact, 0, record.force.size, 0, 0.0, (verdict,))
 
 
@@ -99,10 +160,12 @@ def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> 
         *hit.verdicts,
         _double_hit(force, pulse, rate, settings),
         _overload(force, record.force_full_scale, name, "reject_hit", pulse.peak, rate, settings),
-        _flat_top(force, name, "reject_hit"),
+        _flat_top(force, record.force_full_scale, name, "reject_hit"),
         _force_level(force, pulse, name, settings),
         _force_spectrum(force, pulse, rate, name, settings),
     ]
+    if record.force_calibrated:
+        verdicts.append(_force_peak(hit.peak_force, name))
     # Before the first hit of a record the structure is at rest: what is there is noise and hum.
     rest = pulse.start if hit.start == 0 and hit.number == 0 else 0
     for row, channel in enumerate(record.channels):
@@ -162,9 +225,12 @@ def _overload(
     return judged("overload", share, settings.overload, passes, OVERLOAD, consequence, fault, channel=name)
 
 
-def _flat_top(samples: NDArray[np.float64], name: str, consequence: Consequence) -> Verdict:
+def _flat_top(
+    samples: NDArray[np.float64], full_scale: float, name: str, consequence: Consequence
+) -> Verdict:
     share = flat_top_share(samples)
-    passes = share < FLAT_TOP_LIMIT
+    far_below = float(max(samples.max(), -samples.min())) < FAR_BELOW_SCALE * full_scale
+    passes = share < FLAT_TOP_LIMIT or (np.isfinite(full_scale) and far_below)
     fault = f"{name} is clipped: its tops are flat; use a lower gain or hit softer"
     return judged("clipping", share, FLAT_TOP_LIMIT, passes, OVERLOAD, consequence, fault, channel=name)
 
@@ -174,7 +240,20 @@ def _force_level(force: NDArray[np.float64], pulse: Pulse, name: str, settings: 
     ratio = min(pulse.height / noise, 1e12) if noise > 0 else 1e12
     passes = ratio >= settings.trigger_noise
     fault = f"{name} does not stand out of its noise: {ratio:.1f} times"
-    return judged("force level", ratio, settings.trigger_noise, passes, "", "reject_hit", fault, channel=name)
+    limit = settings.trigger_noise
+    return judged("force level", ratio, limit, passes, "", "reject_hit", fault, channel=name, unit="×")
+
+
+def _force_peak(peak: float, name: str) -> Verdict:
+    """Whether an impact hammer can have made this peak; its unit or sensitivity is wrong if not."""
+    size, (low, high) = abs(peak), HAMMER_PEAKS_N
+    limit = low if size < low else high
+    fault = (
+        f"channel '{name}' peaks at {size:.3g} N, which no impact hammer makes ({low:g} to {high:g} N): look up "
+        "sensitivity_mv and unit; leave sensitivity_mv out where the file holds newtons"
+    )
+    passes = low <= size <= high
+    return judged("force peak", size, limit, passes, "", "warn", fault, channel=name, unit="N")
 
 
 def _force_spectrum(
@@ -202,7 +281,7 @@ def _check_response(
     return [
         dead,
         _overload(samples, channel.full_scale, channel.name, "reject_channel", pulse.peak, rate, settings),
-        _flat_top(samples, channel.name, "reject_channel"),
+        _flat_top(samples, channel.full_scale, channel.name, "reject_channel"),
         _decay(channel.name, samples, pulse, rest, settings),
     ]
 
@@ -229,8 +308,11 @@ def _dead_channel(name: str, samples: NDArray[np.float64], pulse: Pulse, rest: i
     else:
         fault = f"{name} flickers by one converter step only: sensor or cable dead"
     value = 0.0 if only_hum else min(spans, 1e12)
-    return judged("dead channel", value, 1.5, passes, "", "reject_channel", fault, channel=name)
+    return judged("dead channel", value, 1.5, passes, "", "reject_channel", fault, channel=name, unit="steps")
 
+
+HAMMER_PEAKS_N = (0.2, 40e3)
+"""Peaks that impact hammers make: the smallest (1 g, for turbine blades) tap with about 1 N, sledges end at 22 kN."""
 
 HUM_ONLY = 0.98
 """Share of a channel's power in mains lines from which on it carries nothing else."""

@@ -1,4 +1,4 @@
-"""What ingest hands on: records in SI units, the hits found in them, and each hit's verdicts."""
+"""Records in SI units, the hits found in them, and each hit's verdicts."""
 
 from __future__ import annotations
 
@@ -8,15 +8,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.rows import CutRows, Rows
+from ema_pipeline.lazy_samples import CutSamples, LazySamples
 from ema_pipeline.verdict import Verdict
 
 CALIBRATION_STD = 0.02
-"""Relative 1 σ of a sensitivity that nobody has stated: what calibration certificates of accelerometers and
+"""Relative 1 σ of a sensitivity that is not stated: what calibration certificates of accelerometers and
 modal hammers usually claim, 3 to 5 % at two sigma."""
 
 TRANSVERSE = 0.03
-"""Transverse sensitivity that nobody has stated, 1 σ: data sheets promise less than 3 to 5 %."""
+"""Transverse sensitivity where none is stated, 1 σ: data sheets promise less than 3 to 5 %."""
+
+
+@dataclass(frozen=True)
+class Transducer:
+    """A sensor as the test's description states it, for the test sheet.
+
+    Attributes
+    ----------
+    name, quantity, unit : str
+    dof : str
+        Where it sits; empty for the hammer and for a roving sensor.
+    sensitivity_mv : float
+        mV per `unit`; NaN where the files hold `unit` already.
+    mass_kg : float
+    calibration_std, transverse : float
+        As in `ResponseChannel`.
+    """
+
+    name: str
+    quantity: str
+    unit: str
+    dof: str
+    sensitivity_mv: float
+    mass_kg: float
+    calibration_std: float
+    transverse: float
 
 
 @dataclass(frozen=True)
@@ -65,8 +91,8 @@ class Record:
         Name of the hammer channel.
     force : ndarray, (n_samples,)
         Force, N (V where `force_calibrated` is false).
-    responses : Rows or ndarray, (n_channels, n_samples)
-        Responses in SI; `Rows` are read where they are sliced.
+    responses : LazySamples or ndarray, (n_channels, n_samples)
+        Responses in SI; `LazySamples` are read where they are sliced.
     channels : tuple of ResponseChannel
         One per row of `responses`.
     force_full_scale : float
@@ -84,7 +110,7 @@ class Record:
     sample_rate_hz: float
     force_name: str
     force: NDArray[np.float64]
-    responses: Rows | NDArray[np.float64]
+    responses: LazySamples | NDArray[np.float64]
     channels: tuple[ResponseChannel, ...]
     force_full_scale: float = float("inf")
     force_calibrated: bool = True
@@ -110,9 +136,11 @@ class Hit:
     peak : int
         Sample of the force peak within the record.
     peak_force : float
-        Force at the peak, N, with its sign.
+        Force at the peak, in `force_unit`, with its sign.
     verdicts : tuple of Verdict
         Outcome of every check that could be made.
+    force_unit : str
+        ``"N"``, ``"V"`` for an uncalibrated hammer.
     """
 
     file: str
@@ -123,6 +151,7 @@ class Hit:
     peak: int
     peak_force: float
     verdicts: tuple[Verdict, ...] = ()
+    force_unit: str = "N"
 
     @property
     def accepted(self) -> bool:
@@ -153,8 +182,8 @@ class HitSamples:
     sample_rate_hz : float
     force : ndarray, (n_samples,)
         N, or V for an uncalibrated hammer.
-    responses : Rows or ndarray, (n_channels, n_samples)
-        SI; `Rows` are read where they are sliced.
+    responses : LazySamples or ndarray, (n_channels, n_samples)
+        SI; `LazySamples` are read where they are sliced.
     channels : tuple of ResponseChannel
         One per row of `responses`; channels rejected in this hit are already left out.
     force_calibrated : bool
@@ -169,7 +198,7 @@ class HitSamples:
     hit: Hit
     sample_rate_hz: float
     force: NDArray[np.float64]
-    responses: Rows | NDArray[np.float64]
+    responses: LazySamples | NDArray[np.float64]
     channels: tuple[ResponseChannel, ...]
     force_calibrated: bool = True
     window_decay_rad_s: float = 0.0
@@ -185,7 +214,7 @@ def cut_hit(record: Record, hit: Hit) -> HitSamples:
         hit=hit,
         sample_rate_hz=record.sample_rate_hz,
         force=record.force[hit.start : hit.stop],
-        responses=CutRows(record.responses, keep, hit.start, hit.stop),
+        responses=CutSamples(record.responses, keep, hit.start, hit.stop),
         channels=tuple(record.channels[i] for i in keep),
         force_calibrated=record.force_calibrated,
         window_decay_rad_s=record.window_decay_rad_s,

@@ -69,7 +69,7 @@ def signs(levels: Sequence[ForceLevel], frfs: FrfSet, modal: ModalModel) -> tupl
             correlation, size = distortion(hard_circles)
             limit = max(ROUND, 3 * distortion(soft_circles)[1])
             bad = size > limit and correlation > SMOOTH
-            message = f"leaves its circle by {100 * size:.2g} % of the radius at {levels[-1].force_n:.3g} N"
+            message = f"leaves its circle by {100 * size:.2g} % of the radius at {levels[-1].label}"
             found.append(_verdict("Nyquist circle", size, limit, not bad, mode, message))
     return tuple(found)
 

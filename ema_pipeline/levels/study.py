@@ -74,17 +74,19 @@ def study_levels(
     """
     from ema_pipeline.levels.harmonics import without_products
     from ema_pipeline.levels.linear import linear_level
+    from ema_pipeline.levels.sentences import one_level, several_levels
     from ema_pipeline.levels.signs import signs
     from ema_pipeline.levels.sort import sort_levels
-    from ema_pipeline.levels.words import one_level, several_levels
 
-    found = [(h.hit.impact.point, abs(h.hit.peak_force), f"{h.hit.file}#{h.hit.number}") for h in hits()]
+    kept = [h.hit for h in hits()]
+    found = [(h.impact.point, abs(h.peak_force), f"{h.file}#{h.number}") for h in kept]
+    unit = kept[0].force_unit
     force = np.array([f for _, f, _ in found])
     names = tuple(name for _, _, name in found)
     place = sort_levels([p for p, _, _ in found], force.tolist(), settings.level_ratio)
     n_levels = int(place.max()) + 1
     if n_levels == 1:
-        level = ForceLevel(float(np.median(force)), names)
+        level = ForceLevel(float(np.median(force)), names, unit=unit)
         progress(0.2, "decays of single hits")
         modes, curves, p_value = _from_decays(modal, hits, frfs, settings)
         depends = bool(p_value < settings.false_alarm)
@@ -94,9 +96,9 @@ def study_levels(
     levels: tuple[ForceLevel, ...] = ()
     for k in range(n_levels):
         level_force = float(np.median(force[place == k]))
-        progress(0.7 * k / n_levels, f"modes at {level_force:.3g} N")
+        progress(0.7 * k / n_levels, f"modes at {level_force:.3g} {unit}")
         chosen = tuple(n for n, p in zip(names, place, strict=True) if p == k)
-        levels += (_level(hits, chosen, level_force, frf_settings, modal_settings),)
+        levels += (_level(hits, chosen, level_force, unit, frf_settings, modal_settings),)
     progress(0.7, "modes of single hits")
     level_of = dict(zip(names, place.tolist(), strict=True))
 
@@ -133,6 +135,7 @@ def _level(
     hits: Hits,
     chosen: tuple[str, ...],
     force_n: float,
+    unit: str,
     frf_settings: FrfSettings,
     modal_settings: ModalSettings,
 ) -> ForceLevel:
@@ -143,7 +146,7 @@ def _level(
     wanted = set(chosen)
     some = (h for h in hits() if f"{h.hit.file}#{h.hit.number}" in wanted)
     frfs = estimate_frfs(some, frf_settings)
-    return ForceLevel(force_n, chosen, frfs, identify(frfs, modal_settings))
+    return ForceLevel(force_n, chosen, frfs, identify(frfs, modal_settings), unit)
 
 
 def _modes(modal: ModalModel, levels: Sequence[ForceLevel], n_inputs: int) -> tuple[ModeLevels, ...]:
@@ -193,10 +196,10 @@ def _tested(
 ) -> tuple[tuple[ModeLevels, ...], float, HitModes | None]:
     """The modes of a model with their tests, those that move if any does, the p value of all tests, and every hit's."""
     from ema_pipeline.levels.hit_trends import hit_trends
+    from ema_pipeline.levels.sentences import trend_words
     from ema_pipeline.levels.single import single_hits
     from ema_pipeline.levels.sizes import NO_TREND
     from ema_pipeline.levels.trend import clearest, shifts
-    from ema_pipeline.levels.words import trend_words
 
     modes = _modes(modal, levels, len(frfs.inputs))
     base = _trusted(modal, modes)
@@ -311,9 +314,9 @@ def _from_decays(
 ) -> tuple[tuple[ModeLevels, ...], tuple[DecayCurve, ...], float]:
     """What the decays after hits of one level tell: the modes with their tests, the curves, and the p value."""
     from ema_pipeline.levels.decay import decay_trends
+    from ema_pipeline.levels.sentences import trend_words
     from ema_pipeline.levels.tracks import doubles, separated
     from ema_pipeline.levels.trend import clearest, combined
-    from ema_pipeline.levels.words import trend_words
 
     n = len(modal.modes)
     votes = np.array([m.stability for m in modal.modes])

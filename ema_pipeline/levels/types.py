@@ -1,4 +1,4 @@
-"""What the level stage hands on."""
+"""Results of the study of force levels."""
 
 from __future__ import annotations
 
@@ -28,12 +28,20 @@ class ForceLevel:
     modal : ModalModel or None
         Identified from `frfs` alone, without circle fits; None where all hits are of one level. The softest
         level's is the closest to the linear structure.
+    unit : str
+        Of the force: V where the hammer is not calibrated.
     """
 
     force_n: float
     hits: tuple[str, ...]
     own_frfs: FrfSet | None = None
     modal: ModalModel | None = None
+    unit: str = "N"
+
+    @property
+    def label(self) -> str:
+        """The force with its unit."""
+        return f"{self.force_n:.3g} {self.unit}"
 
     @property
     def frfs(self) -> FrfSet:

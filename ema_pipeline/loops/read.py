@@ -1,34 +1,13 @@
-"""From a test description with ``kind = "hysteresis"`` to an identified isolator."""
+"""From a test description with ``kind = "hysteresis"`` to averaged loops."""
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.description import TestDescription
 from ema_pipeline.ingest.load import load_channels
 from ema_pipeline.loops.extract import measure_loop, share_noise
-from ema_pipeline.loops.identify import identify_isolator
 from ema_pipeline.loops.settings import LoopSettings
-from ema_pipeline.loops.types import IsolatorResult, Loop
-
-
-def analyse_loops(
-    test: TestDescription,
-    settings: LoopSettings | None = None,
-    progress: Callable[[float, str], None] | None = None,
-) -> IsolatorResult:
-    """Read all records of a hysteresis test and identify the isolator.
-
-    Raises
-    ------
-    EmaError
-        Names file, channel or record and what is wrong with it.
-    """
-    tell = progress or (lambda share, text: None)
-    loops = load_loops(test, settings)
-    tell(0.3, "the published model on all loops")
-    return identify_isolator(loops, settings)
+from ema_pipeline.loops.types import Loop
 
 
 def load_loops(test: TestDescription, settings: LoopSettings | None = None) -> tuple[Loop, ...]:

@@ -1,4 +1,4 @@
-"""What the isolator identification works on and hands on."""
+"""Measured loops, and the results of identifying an isolator from them."""
 
 from __future__ import annotations
 

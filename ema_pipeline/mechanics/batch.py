@@ -4,7 +4,7 @@ The linear part, tangents of the nonlinear elements included, is advanced exactl
 every state is a number of its own; the nonlinear elements only need their stretches. A compiled loop takes all
 pairs of assembly and blow through time: this is what a fit needs, which asks for the same blows at a dozen
 neighbouring sets of parameters. Elements with a memory take the slower way of
-`mechanics.nonlinear.nonlinear_response`.
+`mechanics.marching.marched_response`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.laws import check_element
+from ema_pipeline.mechanics.marching import element_rows, interpolated, marched_response
 from ema_pipeline.mechanics.modes import eigen_solution
-from ema_pipeline.mechanics.nonlinear import element_rows, nonlinear_response
 from ema_pipeline.mechanics.sampling import band_limited
 from ema_pipeline.mechanics.system import LinearSystem
+from ema_pipeline.mechanics.time_response import TimeResponse
 
 if TYPE_CHECKING:
     from ema_pipeline.mechanics.kernel import Marched
@@ -157,6 +158,24 @@ def compiled_response(
     return found.motion.swapaxes(2, 3), batch.direct[:, :, : len(force)].swapaxes(1, 2)
 
 
+def response_from_rest(
+    assembly: Assembly,
+    sample_rate_hz: float,
+    forces: NDArray[np.float64],
+    out_rows: NDArray[np.float64],
+    in_rows: NDArray[np.float64],
+    substeps: int,
+) -> TimeResponse:
+    """Response of one assembly, whose elements have no memory, to one force, (1, n_samples), from rest."""
+    orders = np.repeat(np.arange(3), len(out_rows))
+    motion, direct = compiled_response(
+        [assembly], sample_rate_hz, interpolated(forces, substeps), np.tile(out_rows, (3, 1)), orders, in_rows,
+        substeps,
+    )  # fmt: skip
+    both = motion[0, 0] + direct[0, 0][:, None] * forces
+    return TimeResponse(*both.reshape(3, len(out_rows), -1))
+
+
 @dataclass(frozen=True)
 class Batch:
     """Modes of many assemblies, filled up with nothing to one size.
@@ -254,10 +273,10 @@ def one_by_one(assemblies: Sequence[Assembly], blows: Blows, substeps: int) -> N
     order = [ORDERS[q] for q in blows.quantities]
     result = []
     for assembly in assemblies:
+        forgets = all(e.law is not None for e in assembly.nonlinear)
+        respond = response_from_rest if forgets else marched_response
         for force, row in zip(blows.force, blows.in_rows, strict=True):
-            r = nonlinear_response(
-                assembly, blows.sample_rate_hz, force[None], blows.out_rows, row[None], substeps=substeps
-            )
+            r = respond(assembly, blows.sample_rate_hz, force[None], blows.out_rows, row[None], substeps)
             read = (r.displacement, r.velocity, r.acceleration)
             result.append([read[k][i] for i, k in enumerate(order)])
     return np.array(result).reshape(len(assemblies), len(blows.force), len(order), -1)

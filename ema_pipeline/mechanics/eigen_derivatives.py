@@ -14,6 +14,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from ema_pipeline.mechanics.damped_modes import DampedModes
 from ema_pipeline.mechanics.terms import DAMPING_MATRIX, MASS, STIFFNESS, STRUCTURAL, Matrices
 
 _CLOSE = 1e-4
@@ -25,7 +26,9 @@ _ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class EigenSolution:
-    """Undamped modes with damping ratios from the diagonal of the modal damping matrix.
+    """Undamped modes, with the frequencies and ratios of the damped ones.
+
+    Damping ratios come from the diagonal of the modal damping matrix where its coupling changes nothing.
 
     Attributes
     ----------
@@ -34,12 +37,15 @@ class EigenSolution:
     shapes : ndarray, (n, n)
         Mass-normalised columns.
     frequency_hz, damping_ratio : ndarray, (n,)
+    damped : DampedModes, optional
+        Where damping couples the modes; frequencies and damping ratios are then theirs.
     """
 
     eigenvalues: NDArray[np.float64]
     shapes: NDArray[np.float64]
     frequency_hz: NDArray[np.float64]
     damping_ratio: NDArray[np.float64]
+    damped: DampedModes | None = None
 
     @classmethod
     def of(
@@ -58,10 +64,16 @@ class EigenSolution:
         values = np.maximum(values, 1.0)  # rigid bodies: far under any band
         omega = np.sqrt(values)
         ratio = np.full(len(values), damping_ratio)
-        if np.any(damping):
-            ratio += np.sum(shapes * (damping @ shapes), axis=0) / (2 * omega)
-        if np.any(structural):
-            ratio += np.sum(shapes * (structural @ shapes), axis=0) / (2 * values)
+        coupling, lag = np.any(damping), np.any(structural)
+        modal = shapes.T @ damping @ shapes if coupling else np.zeros_like(shapes)
+        modal_lag = shapes.T @ structural @ shapes if lag else np.zeros_like(shapes)
+        if coupling or lag:
+            modal[np.diag_indices_from(modal)] += 2 * damping_ratio * omega
+            found = DampedModes.of(values, shapes, modal, modal_lag)
+            if found is not None:
+                least = np.maximum(found.damping_ratio, _LEAST_DAMPING_RATIO)
+                return cls(values, shapes, found.frequency_hz, least, found)
+            ratio = np.diag(modal) / (2 * omega) + np.diag(modal_lag) / (2 * values)
         return cls(values, shapes, omega / (2 * np.pi), np.maximum(ratio, _LEAST_DAMPING_RATIO))
 
 
@@ -127,14 +139,22 @@ class ModeDerivatives:
         own = stiffness[:, modes, here] - values * mass[:, modes, here]
         weight[:, modes, here] = -0.5 * mass[:, modes, here]
         log_frequency = own / (2 * values)
-        shapes = (solution.shapes @ weight).transpose(1, 2, 0)
-        ratio = _damping(matrices, solution, modes, log_frequency, weight)
+        if solution.damped is None:
+            ratio = _damping(matrices, solution, modes, log_frequency, weight)
+        else:
+            omega = np.sqrt(solution.eigenvalues)
+            log_frequency, ratio = solution.damped.derivatives(matrices, modes, log_frequency, weight, omega)
         if has_ratio:
             at = matrices.terms.log.shape[1]
-            log_frequency = np.insert(log_frequency, at, 0.0, axis=0)
-            ratio = np.insert(ratio, at, matrices.damping_ratio, axis=0)
-            shapes = np.insert(shapes, at, 0.0, axis=2)
-        return cls(log_frequency.T, ratio.T, shapes)
+            log_frequency = _inserted(log_frequency, at, 0.0)
+            ratio = _inserted(ratio, at, matrices.damping_ratio)
+            weight = _inserted(weight, at, 0.0)
+        return cls(log_frequency.T, ratio.T, (solution.shapes @ weight).transpose(1, 2, 0))
+
+
+def _inserted(array: NDArray[np.float64], at: int, value: float) -> NDArray[np.float64]:
+    """`numpy.insert` of one row, which is many times slower."""
+    return np.concatenate([array[:at], np.full((1, *array.shape[1:]), value), array[at:]])
 
 
 def _forms(

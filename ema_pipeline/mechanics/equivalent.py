@@ -1,7 +1,7 @@
 """Nonlinear elements in motion of several frequencies, each replaced by a complex stiffness per frequency.
 
 The motion after a blow holds all modes at once. An element's force at one of their frequencies is its complex stiffness
-times the motion at that frequency; what the stiffness is hangs on the motion at all of them (multiple-input describing
+times the motion at that frequency; the stiffness depends on the motion at all of them (multiple-input describing
 functions [1]_).
 
 References
@@ -23,6 +23,8 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.harmonic import describing_function
 from ema_pipeline.mechanics.laws import BoucWen, Nonlinear
 
+POLYNOMIAL = 0
+"""Kind of law, see `mechanics.laws.LAWS`, whose averages are known in closed form."""
 OWN_PHASES = 8
 """Phases of the frequency itself; the describing function of a sign alone is then 3 % off."""
 _PRIMES = (11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61)
@@ -68,6 +70,10 @@ class Motions:
         """Mean force beside the tangent's about an offset (n_states,), N; 0 for an element with memory."""
         if element.law is None:
             return np.zeros(len(offset))
+        kind, quadratic, cubic, _ = element.law
+        if kind == POLYNOMIAL:
+            square = 0.5 * np.sum(self.amplitude**2, axis=1)
+            return np.asarray(quadratic * (offset**2 + square) + cubic * offset * (offset**2 + 3 * square))
         stretch, rate = (each.sum(axis=1) for each in self._each)
         both = [offset[:, None] + stretch, offset[:, None] - stretch]
         force = _vectorised(element.law)
@@ -82,6 +88,12 @@ class Motions:
         law = element.law
         if law is None:
             return _from_table(element, np.sqrt(np.sum(self.amplitude**2, axis=1)), self.omega)
+        kind, quadratic, cubic, _ = law
+        if kind == POLYNOMIAL:  # E[f cos φ]/E[a cos² φ] with independent phases, exactly
+            each = self.amplitude**2
+            others = 0.5 * np.sum(each, axis=1, keepdims=True) - 0.5 * each
+            about = offset[:, None]
+            return (2 * quadratic * about + cubic * (3 * (about**2 + others) + 0.75 * each)).astype(complex)
         own = 2 * np.pi * (np.arange(OWN_PHASES) + 0.5) / OWN_PHASES
         stretch, rate = self._each
         rest = stretch.sum(axis=1, keepdims=True) - stretch + offset[:, None, None]
@@ -138,10 +150,8 @@ def _phases(count: int) -> Real:
 
 
 def _vectorised(law: tuple[int, float, float, float]) -> Force:
-    """One of `mechanics.laws.LAWS` for arrays of stretches and rates."""
+    """Friction or parting, see `mechanics.laws.LAWS`, for arrays of stretches and rates."""
     kind, a, b, c = law
-    if kind == 0:
-        return lambda x, v: (a + b * x) * x * x
     if kind == 1:
         return lambda x, v: a * np.tanh(v / b)
     if b == np.inf:

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.laws import Nonlinear, check_element
+from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import eigen_solution, total_damping
-from ema_pipeline.mechanics.nonlinear import element_rows, steady_deviation
+from ema_pipeline.mechanics.nonlinear import steady_deviation
 from ema_pipeline.mechanics.system import LinearSystem
 
 

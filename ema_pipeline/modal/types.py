@@ -1,4 +1,4 @@
-"""What the modal stage hands on: modes with uncertainties, and the chart they were picked from."""
+"""Results of the modal stage: modes with uncertainties, and the chart that they were selected from."""
 
 from __future__ import annotations
 

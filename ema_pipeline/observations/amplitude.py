@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
 from ema_pipeline.mechanics.laws import Nonlinear, Spring
-from ema_pipeline.mechanics.nonlinear import element_rows
+from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.observations.hit_modes import HitData, Linear, comparable, shifted_poles
-from ema_pipeline.observations.modes import ModeObservations, ModeProblem, Paired, stacked
+from ema_pipeline.observations.mode_residuals import stacked
+from ema_pipeline.observations.modes import ModeObservations, ModeProblem, Paired
 from ema_pipeline.observations.parts import part_key
 from ema_pipeline.observations.rig_model import LOG_STD, RigModel, SizeMap
 
@@ -103,6 +104,7 @@ class AmplitudeProblem:
         self.observations = observations
         self.modes: ModeProblem = observations.modes.problem(effects, scales)
         self._nonlinear = tuple(e.label for e in effects if not e.effect.linear)
+        self._positions: dict[str, tuple[HitData, NDArray[np.int64], NDArray[np.int64]]] = {}
         self.moved: dict[tuple[object, ...], NDArray[np.complex128]] = {}
 
     @property
@@ -146,6 +148,17 @@ class AmplitudeProblem:
                 left, np.concatenate([*beyond, np.zeros(0)]), LINEARISATION, lower=-1.5, upper=1.5
             ),
         )
+
+    def positions(self, data: HitData) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Positions of the hits' drift, (h,), and of what linearisation leaves out, (h, m)."""
+        known = self._positions.get(data.configuration)
+        if known is None or known[0] is not data:
+            index, name = self.unknowns.index, data.configuration
+            drift = np.array([index[f"drift of {name} {n}"] for n in data.names])
+            modes = range(len(data.modes))
+            left = np.array([[index[_left_name(data, s, r)] for r in modes] for s in data.sheet])
+            known = self._positions[name] = data, drift, left
+        return known[1], known[2]
 
     @cached_property
     def nonlinear_sizes(self) -> tuple[int, ...]:
@@ -246,12 +259,8 @@ class _Hits:
     ) -> None:
         self.problem, self.data, self.paired, self.x = problem, data, paired, x
         self.scatters, self.heat = scatters, heat
-        index = problem.unknowns.index
-        self.scale = index["amplitude of all modes"]
-        self.drift = np.array([index[f"drift of {data.configuration} {n}"] for n in data.names])
-        self.left = np.array(
-            [[index[_left_name(data, s, r)] for r in range(len(data.modes))] for s in data.sheet]
-        )
+        self.scale = problem.unknowns.index["amplitude of all modes"]
+        self.drift, self.left = problem.positions(data)
 
     def residuals(self, derivatives: bool) -> Residuals:
         """Frequencies, then damping ratios, each without its mean over a sheet's hits."""

@@ -20,6 +20,10 @@ _MOST_ESCAPES = 4
 QUICK = ((30.0, 5), (5.0, 5), (1.0, 8))
 """Annealing of a hypothesis that begins at the base model's fit."""
 
+_RACED = 2
+"""Starts that are annealed to the end."""
+_MET = 0.05
+"""Distance, in units of the prior 1 σ, below which two fits have met while they are still hot."""
 
 _FREE_STARTS = (0.0, 1.2, -1.2)
 """Start values of the logarithm of a free parameter: a decade to either side of its nominal value is reached."""
@@ -34,6 +38,7 @@ class Model:
 
     effects: tuple[PlacedEffect, ...] = ()
     scales: Mapping[str, float] = field(default_factory=dict)
+    _known: list[tuple[Observations, EffectProblem]] = field(default_factory=list, compare=False, repr=False)
 
     def plus(self, placed: PlacedEffect, scales: Mapping[str, float]) -> Model:
         """With one effect more."""
@@ -45,8 +50,10 @@ class Model:
         return tuple(e.label for e in self.effects)
 
     def problem(self, observations: Observations) -> EffectProblem:
-        """The problem of fitting it to data."""
-        return observations.problem(self.effects, self.scales)
+        """The problem of fitting it to data; that of the last data is remembered, it takes as long as some steps."""
+        if not self._known or self._known[0][0] is not observations:
+            self._known[:] = [(observations, observations.problem(self.effects, self.scales))]
+        return self._known[0][1]
 
 
 @dataclass(frozen=True)
@@ -60,6 +67,11 @@ class Fit:
     def log_evidence(self) -> float:
         """Of the model, up to a constant of the data."""
         return self.posterior.log_evidence
+
+    @property
+    def unknowns(self) -> dict[str, float]:
+        """Everything uncertain as it was fitted, by name."""
+        return {n: float(v) for n, v in zip(self.posterior.unknowns.names, self.posterior.x, strict=True)}
 
 
 def transferred(
@@ -82,12 +94,22 @@ def wide(observations: Observations) -> dict[str, float]:
 def annealed(
     observations: Observations,
     model: Model,
-    start: NDArray[np.float64],
+    starts: Sequence[NDArray[np.float64]],
     schedule: Sequence[tuple[float, int]],
 ) -> Fit:
-    """A fit from far off, at wide scatters."""
-    found = Fit(model, anneal(model.problem(observations), wide(observations), start, schedule))
-    return freed(observations, found)
+    """A fit from far off, at wide scatters: the best of those begun at `starts`.
+
+    After the first steps of annealing only the most promising starts that did not meet go on.
+    """
+    problem, scatters = model.problem(observations), wide(observations)
+    std = problem.unknowns.prior_std(scatters)
+    hot = [anneal(problem, scatters, x, schedule[:1]) for x in starts]
+    kept: list[Posterior] = []
+    for found in sorted(hot, key=lambda p: p.cost):
+        if len(kept) < _RACED and all(np.max(np.abs(found.x - k.x) / std) > _MET for k in kept):
+            kept.append(found)
+    cooled = [Fit(model, anneal(problem, scatters, p.x, schedule[1:])) for p in kept]
+    return max(cooled, key=lambda f: f.log_evidence)
 
 
 def refined(
@@ -142,12 +164,9 @@ def fit_base(observations: Observations, model: Model, start: Fit | None = None)
         begin = transferred(start.posterior, problem.unknowns, begin)
     free = [i for i, s in enumerate(problem.unknowns.std) if not problem.unknowns.scatter[i] and s >= _ALONE]
     free = [i for i in free if problem.unknowns.names[i] not in problem.sizes][:_MOST_FREE]
-    best = None
+    starts = []
     for values in product(_FREE_STARTS, repeat=0 if start is not None else len(free)):
         x = begin.copy()
         x[free[: len(values)]] += values
-        fit = annealed(observations, model, x, ANNEALING)
-        if best is None or fit.log_evidence > best.log_evidence:
-            best = fit
-    assert best is not None
-    return best
+        starts.append(x)
+    return freed(observations, annealed(observations, model, starts, ANNEALING))

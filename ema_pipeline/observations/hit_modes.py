@@ -23,7 +23,7 @@ from ema_pipeline.levels.types import HitModes
 from ema_pipeline.mechanics.equivalent import Motions, settled_offsets
 from ema_pipeline.mechanics.laws import Nonlinear
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.observations.modes import ModeData, prepare
+from ema_pipeline.observations.mode_data import ModeData, prepare
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]

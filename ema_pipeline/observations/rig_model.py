@@ -7,7 +7,7 @@ is one product. Only what an effect edits is differentiated by small differences
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import EffectParameter, PlacedEffect
 from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Assembly, Row
+from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.mechanics.terms import Matrices, Terms, assemble_terms
 from ema_pipeline.observations.parts import DAMPING, Dependence, dependence, part_key
@@ -45,19 +46,31 @@ class SizeMap:
     def value(self, x: float) -> float:
         """Size at the unknown `x`, within its range."""
         p = self.parameter
-        value = p.start * np.exp(LOG_STD * x) if self.logarithmic else p.null + self.scale * x
+        value = p.start * self.coordinate(x) if self.logarithmic else p.null + self.scale * x
         return float(np.clip(value, p.minimum, p.maximum))
 
     def unknown(self, value: float) -> float:
         """The unknown at which the size is `value`."""
         p = self.parameter
         if self.logarithmic:
-            return float(np.log(max(value, 1e-300) / p.start) / LOG_STD)
+            return self.of_coordinate(max(value, 1e-300) / p.start)
         return (value - p.null) / self.scale
 
     def slope(self, x: float) -> float:
         """Derivative of the size by the unknown."""
         return self.value(x) * LOG_STD if self.logarithmic else self.scale
+
+    def coordinate(self, x: float) -> float:
+        """What a size is linear in: the unknown itself, or the size over its start."""
+        return float(np.exp(LOG_STD * x)) if self.logarithmic else x
+
+    def of_coordinate(self, z: float) -> float:
+        """The unknown at a coordinate."""
+        return float(np.log(z)) / LOG_STD if self.logarithmic else z
+
+    def coordinate_slope(self, x: float) -> float:
+        """Derivative of the coordinate by the unknown."""
+        return LOG_STD * self.coordinate(x) if self.logarithmic else 1.0
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -69,7 +82,7 @@ class SizeMap:
 
 @dataclass(frozen=True)
 class LinearTerms:
-    """Terms whose coefficients are linear functions of the effects' unknowns.
+    """Terms whose coefficients are linear functions of the effects' coordinates (`SizeMap.coordinate`).
 
     Attributes
     ----------
@@ -86,17 +99,17 @@ class LinearTerms:
     slopes: NDArray[np.float64]
     skew_slopes: NDArray[np.float64]
 
-    def at(self, shape: NDArray[np.float64]) -> Terms:
-        """Terms at other unknowns."""
+    def at(self, coordinates: NDArray[np.float64]) -> Terms:
+        """Terms at other coordinates."""
         if not len(self.begin):
             return self.start
-        moved = shape - self.begin
-        found = replace(
-            self.start,
-            coefficient=self.start.coefficient + moved @ self.slopes,
-            skew=self.start.skew + np.tensordot(moved, self.skew_slopes, axes=1),
-        )
-        found.__dict__["by_kind"] = self.start.by_kind  # the rows are the same ones
+        moved = coordinates - self.begin
+        s = self.start
+        skew = s.skew
+        if np.any(self.skew_slopes):
+            skew = skew + np.tensordot(moved, self.skew_slopes, axes=1)
+        found = Terms(s.dofs, s.rows, s.coefficient + moved @ self.slopes, s.matrix, s.log, skew)
+        found.__dict__["by_kind"] = s.by_kind  # the rows are the same ones
         return found
 
 
@@ -145,6 +158,7 @@ class RigModel:
         self._terms: dict[tuple[object, ...], Terms] = {}
         self._linear: dict[str, LinearTerms | None] = {}
         self._nominal: dict[tuple[object, ...], Assembly] = {}
+        self._modes: dict[str, tuple[bytes, bool, Matrices, EigenSolution | None]] = {}
 
     @cached_property
     def unknowns(self) -> Unknowns:
@@ -202,6 +216,24 @@ class RigModel:
                 values[name] *= float(np.exp(x[self.unknowns.index[name]]))
         return values | self.size_values(x)
 
+    def modes(
+        self, configuration: str, x: NDArray[np.float64], derivatives: bool = True
+    ) -> tuple[Matrices, EigenSolution | None]:
+        """Matrices and modes of a configuration at `x`; no modes where a mass or a stiffness is not admissible.
+
+        Derivatives are mostly wanted where a trial step was found to lead, so the last modes are remembered.
+        """
+        key, known = x.tobytes(), self._modes.get(configuration)
+        if known is None or known[0] != key or (derivatives and not known[1]):
+            matrices = self.matrices(configuration, x, derivatives)
+            solution = (
+                known[3]
+                if known is not None and known[0] == key
+                else EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio)
+            )
+            known = self._modes[configuration] = key, derivatives, matrices, solution
+        return known[2], known[3]
+
     def matrices(self, configuration: str, x: NDArray[np.float64], derivatives: bool = True) -> Matrices:
         """Matrices of a configuration at `x`, and their derivatives by effects and geometry."""
         logs, ratio = x[: self._logs], self._damping_ratio(x)
@@ -226,12 +258,16 @@ class RigModel:
         """Derivatives of the matrices by effects' unknowns and geometry: exact where they are linear in the sizes."""
         n = len(terms.dofs)
         by_shape, skew = np.zeros((len(shape), 4, n, n)), np.zeros((len(shape), n, n))
+        if not len(shape):
+            return by_shape, skew
         linear = self._linear_terms(configuration)
+        if linear is not None:
+            for i, (size, x) in enumerate(zip(self.sizes.values(), shape, strict=True)):
+                slope = size.coordinate_slope(float(x))
+                by_shape[i] = slope * terms.dense(linear.slopes[i] * factor)
+                skew[i] = slope * linear.skew_slopes[i]
+            return by_shape, skew
         for i in range(len(shape)):
-            if linear is not None:
-                by_shape[i] = terms.dense(linear.slopes[i] * factor)
-                skew[i] = linear.skew_slopes[i]
-                continue
             ends = []
             for h in (-_DIFFERENCE, _DIFFERENCE):
                 moved = shape.copy()
@@ -253,7 +289,13 @@ class RigModel:
     def terms(self, configuration: str, shape: NDArray[np.float64]) -> Terms:
         """Elements of a configuration with geometry and effects' unknowns at `shape`."""
         linear = self._linear_terms(configuration)
-        return self._assembled(configuration, shape) if linear is None else linear.at(shape)
+        return (
+            self._assembled(configuration, shape) if linear is None else linear.at(self._coordinates(shape))
+        )
+
+    def _coordinates(self, shape: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coordinates of the sizes in which terms may be linear, (k,)."""
+        return np.array([s.coordinate(float(x)) for s, x in zip(self.sizes.values(), shape, strict=True)])
 
     def _assembled(self, configuration: str, shape: NDArray[np.float64]) -> Terms:
         key = (configuration, shape.tobytes())
@@ -266,21 +308,25 @@ class RigModel:
         return self._terms[key]
 
     def _linear_terms(self, configuration: str) -> LinearTerms | None:
-        """The terms as linear functions of the effects' unknowns; None where they are not."""
+        """The terms as linear functions of the effects' coordinates; None where they are not."""
         if configuration not in self._linear:
-            possible = not self.dependence.geometric and not any(s.logarithmic for s in self.sizes.values())
-            self._linear[configuration] = self._tried(configuration) if possible else None
+            self._linear[configuration] = None if self.dependence.geometric else self._tried(configuration)
         return self._linear[configuration]
 
     def _tried(self, configuration: str) -> LinearTerms | None:
-        """Find the linear function from a few points, and try it at another."""
-        unknowns = self.unknowns
+        """Find the linear function from a few points, and try it at others."""
+        sizes, unknowns = tuple(self.sizes.values()), self.unknowns
         low, high = unknowns.lower[self.shape_start :], unknowns.upper[self.shape_start :]
-        begin = np.clip(np.full(len(low), 0.2), 0.5 * low, 0.5 * high)
-        start = self._assembled(configuration, begin)
+        begin = np.where([s.logarithmic for s in sizes], 1.0, np.clip(0.2, 0.5 * low, 0.5 * high))
+
+        def at(coordinates: NDArray[np.float64]) -> Terms:
+            x = [s.of_coordinate(float(z)) for s, z in zip(sizes, coordinates, strict=True)]
+            return self._assembled(configuration, np.array(x))
+
+        start = at(begin)
         slopes, skews = [], []
         for i in range(len(begin)):
-            other = self._assembled(configuration, begin * np.where(np.arange(len(begin)) == i, 1.5, 1.0))
+            other = at(begin * np.where(np.arange(len(begin)) == i, 1.5, 1.0))
             if not _same_rows(start, other):
                 return None
             slopes.append((other.coefficient - start.coefficient) / (0.5 * begin[i]))
@@ -292,9 +338,8 @@ class RigModel:
             np.array(slopes).reshape(len(begin), len(start.coefficient)),
             np.array(skews).reshape(len(begin), n, n),
         )
-        if len(begin):
-            trial = self._assembled(configuration, 0.6 * begin)
-            told = linear.at(0.6 * begin)
+        for share in (0.6, 1.3) if len(begin) else ():
+            trial, told = at(share * begin), linear.at(share * begin)
             if not _same_rows(start, trial) or not np.allclose(
                 told.coefficient, trial.coefficient, rtol=1e-9
             ):

@@ -1,46 +1,30 @@
-"""The self-contained HTML report: one file, no network, prints on A4."""
+"""The self-contained HTML report: one file, no network; its figures are those of the live page."""
 
 from __future__ import annotations
 
-import base64
+import json
+import math
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from ema_pipeline.correlate.types import ModeDifference
 from ema_pipeline.files import replace_file
 from ema_pipeline.report import diagnosis, diagnosis_tables, levels, summary, tables
+from ema_pipeline.report.band import band_of
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.moving_gear import fill_of, moving_gears
-from ema_pipeline.report.numbers import format_value, slug, words
+from ema_pipeline.report.numbers import format_percent, format_value, plain, signed, slug, words
 from ema_pipeline.report.pages import page_templates
-from ema_pipeline.report.plots import Plot, Progress, render
 from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.report.summary_files import finite
+from ema_pipeline.report.test_sheet import set_up_table, transducers_table
 
 HITS_LISTED = 300
-SECTIONS = (
-    ("summary", "Summary"),
-    ("diagnosis", "Diagnosis"),
-    ("frf", "FRFs and coherence"),
-    ("nyquist", "Nyquist circles"),
-    ("levels", "Does it depend on how hard you hit?"),
-    ("stabilisation", "Stabilisation charts"),
-    ("modes", "Modes"),
-    ("pairing", "Pairing and MAC"),
-    ("shapes", "Mode shapes"),
-    ("error_function", "Error function"),
-    ("fit", "Fitted parameters"),
-    ("comparison", "Where model and measurement part"),
-    ("hits", "Hits"),
-    ("provenance", "Settings and provenance"),
-)
 
 
-def write_report(
-    results: RunResults,
-    path: str | Path,
-    plots: Sequence[Plot] | None = None,
-    progress: Progress | None = None,
-) -> None:
+def write_report(results: RunResults, path: str | Path) -> None:
     """Write the report.
 
     Parameters
@@ -48,49 +32,114 @@ def write_report(
     results : RunResults
     path : str or Path
         HTML file to write; its folder is made if need be.
-    plots : sequence of Plot or None
-        What `write_plots` returned; None draws the figures now.
-    progress : callable or None
-        Told of each figure drawn.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    drawn = render(results, None, progress) if plots is None else plots
-    replace_file(target, report_html(results, drawn))
+    replace_file(target, report_html(results))
 
 
-def report_html(results: RunResults, plots: Sequence[Plot]) -> str:
-    """The report's text, with `plots` embedded."""
+def report_html(results: RunResults) -> str:
+    """The report's text."""
+    from ema_pipeline.report.interactive.data import measured_data, model_data
+
+    context = page_context(results)
+    data = {
+        "measured": measured_data(results),
+        "model": model_data(results),
+        "items": figures_of(context, results),
+    }
+    return (
+        _templates()
+        .get_template("report.html.j2")
+        .render(context | {"data": script_json(data), "bokeh": bokeh_script()})
+    )
+
+
+def script_json(data: Any) -> str:
+    """JSON that no browser takes for markup, whatever names it holds."""
+    text = json.dumps(finite(data), allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def page_parts(context: dict[str, Any], names: Sequence[str]) -> dict[str, str]:
+    """Parts of the live page by the names of their templates."""
+    return {name: _templates().get_template(f"{name}.html.j2").render(context) for name in names}
+
+
+def live_page(results: RunResults) -> str:
+    """The live page's text; its data are fetched apart."""
+    return str(_templates().get_template("live.html.j2").render(page_context(results, live=True)))
+
+
+def live_data(results: RunResults) -> str:
+    """What the live page needs once, as JSON: the figures without data, and what was measured."""
+    from ema_pipeline.report.interactive.data import measured_data
+
+    items = figures_of(page_context(results, live=True), results)
+    return script_json({"items": items, "measured": measured_data(results, None)})
+
+
+def figures_of(context: dict[str, Any], results: RunResults) -> dict[str, Any]:
+    """Documents of the figures for which there is something to show."""
+    from ema_pipeline.report.interactive.figures import figure_items
+
+    return figure_items(list(context["figures"]), _log_frequency(results))
+
+
+def bokeh_script() -> str:
+    """The drawing library's own script, from its package."""
+    from bokeh.resources import Resources
+
+    return str("\n".join(Resources(mode="inline", components=["bokeh"], log_level="warn").js_raw))
+
+
+@cache
+def _templates() -> Any:
     environment = page_templates()
     environment.filters["slug"] = slug
     environment.filters["words"] = words
-    return environment.get_template("report.html.j2").render(_context(results, plots))
+    return environment
 
 
-def _context(results: RunResults, plots: Sequence[Plot]) -> dict[str, Any]:
-    shown = [p for p in plots if p.spec.in_report]
-    fit, compared = results.fit, results.comparison
-    images = [
-        {
-            "section": p.spec.section,
-            "configuration": p.spec.configuration,
-            "caption": p.spec.caption,
-            "uri": _data_uri(p),
-            "share": min(100, round(100 * p.width_in / 7.2)),
-        }
-        for p in shown
-    ]
-    absent = set() if results.shown_ladder is not None else {"diagnosis"}
-    if not any(has_to_say(c.levels) for c in results.configurations):
-        absent.add("levels")
-    sections = tuple((i, t) for i, t in SECTIONS if i not in absent)
+def _log_frequency(results: RunResults) -> bool:
+    """True where the modes lie over about a decade or more."""
+    all_hz = [m.frequency_hz for c in results.configurations if c.modal for m in c.modal.modes]
+    return bool(all_hz) and max(all_hz) > 8 * min(all_hz) > 0
+
+
+def page_context(results: RunResults, live: bool = False) -> dict[str, Any]:
+    """Everything that the templates show, as text and tables; what is not there is None or empty."""
+    fit, compared, found = results.fit, results.comparison, results.diagnosis
+    configurations = [_configuration(results, c) for c in results.configurations]
+    ladder = _ladder(results)
+    shown = {
+        "frf": any(c["frfs"] for c in configurations),
+        "errors": bool(compared and compared.modes),
+        "moved": bool(results.deviations[0]) and bool(found),
+        "ladder": bool(ladder and (ladder["several"] or live)),
+        "nyquist": any(m.circles for c in results.configurations if c.modal for m in c.modal.modes),
+        "stab": any(c.modal and c.modal.chart.order.size for c in results.configurations),
+        "shape": any(c.modal and c.modal.dofs and c.modal.modes for c in results.configurations),
+        "mac": any(
+            (c.modal and c.modal.modes and c.modal.dofs) or (c.pairing and c.pairing.mac.size)
+            for c in results.configurations
+        ),
+        "levels": any(
+            c.levels and has_to_say(c.levels) and len(c.levels.levels) > 1 for c in results.configurations
+        ),
+        "traces": bool(results.shown_ladder and results.shown_ladder.traces),
+        "sweeps": bool(fit and fit.sweeps),
+    }
+    figures = tuple(name for name, there in shown.items() if there)
     return {
         "results": results,
-        "sections": sections,
-        "number": {name: k for k, (name, _) in enumerate(sections, start=1)},
-        "diagnosis": _diagnosis(results),
-        "ladder": _ladder(results),
-        "images": images,
+        "live": live,
+        "addable": _addable(results) if live else (),
+        "band": band_of(results),
+        "sections": _sections(results, figures),
+        "figures": figures,
+        "diagnosis": None if found is None else _diagnosis(results),
+        "ladder": ladder,
         "findings": summary.findings(results),
         "cautions": summary.cautions(results),
         "stiffnesses": [
@@ -104,10 +153,10 @@ def _context(results: RunResults, plots: Sequence[Plot]) -> dict[str, Any]:
         ]
         if fit
         else [],
-        "configurations": [_configuration(c) for c in results.configurations],
+        "configurations": configurations,
         "parameters": tables.parameters_table(fit) if fit else None,
         "sweeps": tables.sweeps_table(fit) if fit and fit.sweeps else None,
-        "two_step": _two_step(results),
+        "stepwise": _stepwise(results),
         "differences": tables.differences_table(compared) if compared else None,
         "worst_dofs": tables.worst_dofs_table(compared) if compared and compared.dofs else None,
         "worst_bands": tables.worst_bands_table(compared) if compared and compared.bands else None,
@@ -115,22 +164,75 @@ def _context(results: RunResults, plots: Sequence[Plot]) -> dict[str, Any]:
     }
 
 
-def _diagnosis(results: RunResults) -> dict[str, Any] | None:
+def _addable(results: RunResults) -> tuple[str, ...]:
+    """Effects that the diagnosis weighed, the more probable first."""
     found = results.diagnosis
     if found is None:
-        return None
+        return ()
+    single = [label for label in found.probabilities if "@" in label and " + " not in label]
+    return tuple(sorted((x for x in single if x not in results.added), key=lambda x: -found.probabilities[x]))
+
+
+def _sections(results: RunResults, figures: tuple[str, ...]) -> tuple[tuple[str, str], ...]:
+    there = {
+        "summary": True,
+        "frf": "frf" in figures,
+        "model": results.diagnosis is not None or results.shown_ladder is not None or "errors" in figures,
+        "modes": any(c.modal and c.modal.modes for c in results.configurations),
+        "pairing": "mac" in figures or any(c.pairing for c in results.configurations),
+        "levels": any(c.levels and has_to_say(c.levels) for c in results.configurations),
+        "fit": results.fit is not None,
+        "hits": any(c.hits for c in results.configurations),
+        "provenance": bool(results.provenance or results.settings),
+    }
+    titles = {
+        "summary": "Summary",
+        "frf": "FRFs",
+        "model": "Model and missing physics",
+        "modes": "Modes",
+        "pairing": "Pairing and MAC",
+        "levels": "Does it depend on how hard you hit?",
+        "fit": "Fitted parameters",
+        "hits": "Hits",
+        "provenance": "Settings and provenance",
+    }
+    return tuple((name, title) for name, title in titles.items() if there[name])
+
+
+def _diagnosis(results: RunResults) -> dict[str, Any]:
+    found = results.diagnosis
+    assert found is not None
     return {
-        "heading": diagnosis.heading(found),
-        "summary": found.summary,
-        "candidates": diagnosis_tables.candidates_table(found),
-        "reasons": diagnosis.reasons(found),
-        "unexplained": diagnosis.unexplained_words(found.ladder),
-        "alike": diagnosis.group_words(found),
-        "next": found.next_measurement,
+        "candidates": [_candidate(results, c) for c in found.candidates],
+        "null": {
+            "probability": diagnosis.probability_words(found.null_probability),
+            "share": found.null_probability,
+            "error": plain(found.error, 3),
+            "held": plain(found.heldout_error, 3),
+        },
         "localisation": diagnosis_tables.localisation_table(found) if found.localisation else None,
         "scatter": diagnosis_tables.scatter_table(found.ladder) if found.ladder.scatters else None,
         "detection": diagnosis_tables.detection_table(found) if found.detection_limits else None,
-        "notes": found.notes,
+    }
+
+
+def _candidate(results: RunResults, c: Any) -> dict[str, Any]:
+    """A candidate as a row, with what the page needs to add it."""
+    found = results.diagnosis
+    assert found is not None
+    return {
+        "label": c.label,
+        "name": diagnosis.label_words(c.label),
+        "size": diagnosis.size_words(c.parameters),
+        "probability": diagnosis.probability_words(c.probability),
+        "share": c.probability,
+        "standing": diagnosis.standing(found, c),
+        "before": plain(c.error_before, 3),
+        "error": plain(c.error_after, 3),
+        "held": f"{plain(c.heldout_before, 3)} → {plain(c.heldout_error_after, 3)}",
+        "claimed": c.claimed,
+        "why": c.why,
+        "in_model": c.label in results.added,
     }
 
 
@@ -143,10 +245,11 @@ def _ladder(results: RunResults) -> dict[str, Any] | None:
         "noise": diagnosis.noise_words(ladder),
         "note": ladder.note,
         "users": results.ladder is not None,
+        "several": len(ladder.rungs) > 1,
     }
 
 
-def _configuration(c: ConfigurationResults) -> dict[str, Any]:
+def _configuration(results: RunResults, c: ConfigurationResults) -> dict[str, Any]:
     hits = c.hits
     listed = hits
     if len(hits) > HITS_LISTED:
@@ -154,10 +257,11 @@ def _configuration(c: ConfigurationResults) -> dict[str, Any]:
     return {
         "name": c.name,
         "modal": c.modal,
-        "frfs": c.frfs,
+        "frfs": c.frfs if c.frfs is not None and (c.frfs.hits > 0).any() else None,
         "averages": _averages(c),
         "pairing": c.pairing,
         "levels": _levels(c),
+        "rows": _mode_rows(results, c),
         "modes": tables.modes_table(c.modal) if c.modal else None,
         "pairs": tables.pairs_table(c.pairing, c.modal) if c.pairing and c.modal else None,
         "unpaired": tables.unpaired_table(c.pairing) if c.pairing else None,
@@ -167,8 +271,42 @@ def _configuration(c: ConfigurationResults) -> dict[str, Any]:
         "rejected": tables.rejected_hits_table(hits),
         "verdicts": tables.verdicts_table(listed),
         "listed": len(listed),
+        "set_up": set_up_table(results, c),
+        "transducers": transducers_table(c),
+        "check_limits": tables.checks_table(hits) if hits else None,
         "checks": tables.failed_checks_table(c.frfs.verdicts) if c.frfs else None,
     }
+
+
+def _mode_rows(results: RunResults, c: ConfigurationResults) -> list[dict[str, Any]]:
+    """One row per mode: frequency and damping with σ, MAC, and the model's difference in % and σ."""
+    if c.modal is None:
+        return []
+    by_mode: dict[int, ModeDifference] = {}
+    if results.comparison is not None:
+        by_mode = {m.measured: m for m in results.comparison.modes if m.configuration == c.name}
+    rows = []
+    for k, mode in enumerate(c.modal.modes):
+        m = by_mode.get(k)
+        percent = (
+            100 * (m.measured_frequency_hz / m.model_frequency_hz - 1)
+            if m and m.model_frequency_hz > 0
+            else None
+        )
+        rows.append(
+            {
+                "number": k + 1,
+                "frequency": format_value(mode.frequency_hz, mode.frequency_std_hz),
+                "damping": format_percent(mode.damping_ratio, mode.damping_std).removesuffix(" %"),
+                "mac": "–" if m is None else f"{m.mac:.2f}",
+                "percent": "–" if percent is None else signed(percent, 2),
+                "z": "–" if m is None else signed(m.frequency_z),
+                "damping_z": "–" if m is None else signed(m.damping_z),
+                "shape_z": "–" if m is None else signed(m.shape_z),
+                "remarks": "; ".join(mode.flags),
+            }
+        )
+    return rows
 
 
 def _levels(c: ConfigurationResults) -> dict[str, Any] | None:
@@ -193,21 +331,11 @@ def _averages(c: ConfigurationResults) -> str:
     return f"{low} to {high} hits"
 
 
-def _two_step(results: RunResults) -> dict[str, str] | None:
-    if results.fit is None or results.fit.two_step is None:
-        return None
-    two = results.fit.two_step
-    nan = float("nan")
-    return {
-        "sun planet mesh stiffness": format_value(two.sun_planet_mesh_stiffness, nan, "N/m"),
-        "ring planet mesh stiffness": format_value(two.ring_planet_mesh_stiffness, nan, "N/m"),
-        "average": format_value(two.average, nan, "N/m"),
-        "note": two.note,
-    }
-
-
-def _data_uri(plot: Plot) -> str:
-    wanted = plot.spec.report_format
-    kind = wanted if wanted in plot.files else next(iter(plot.files))
-    mime = {"png": "image/png", "svg": "image/svg+xml"}[kind]
-    return f"data:{mime};base64,{base64.b64encode(plot.files[kind]).decode('ascii')}"
+def _stepwise(results: RunResults) -> str:
+    """The stiffnesses found one configuration after the other, in words; empty without such a route."""
+    found = None if results.fit is None else results.fit.stepwise
+    if found is None:
+        return ""
+    values = [f"{words(name)} {format_value(value, math.nan, 'N/m')}" for name, value in found.values.items()]
+    average = f"average {format_value(found.average, math.nan, 'N/m')}"
+    return f"One configuration after the other: {', '.join([*values, average])}. {found.note}".rstrip()

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ema_pipeline.levels.sentences import move_text
 from ema_pipeline.levels.types import LevelStudy, ModeLevels
-from ema_pipeline.levels.words import move_text
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report.numbers import format_percent, format_value, plain
 from ema_pipeline.report.tables import Row, Table
@@ -33,7 +33,7 @@ def frequency_table(study: LevelStudy, modal: ModalModel) -> Table:
         )
         for m in study.modes
     )
-    heads = tuple(f"f at {level.force_n:.3g} N, Hz" for level in study.levels)
+    heads = tuple(f"f at {level.label}, Hz" for level in study.levels)
     return Table(("mode", *heads, "p", "moves"), rows, frozenset(range(len(heads) + 2)))
 
 
@@ -46,7 +46,7 @@ def damping_table(study: LevelStudy) -> Table:
         )
         for m in study.modes
     )
-    heads = tuple(f"ζ at {level.force_n:.3g} N, %" for level in study.levels)
+    heads = tuple(f"ζ at {level.label}, %" for level in study.levels)
     return Table(("mode", *heads, "p"), rows, frozenset(range(len(heads) + 2)))
 
 
@@ -62,7 +62,7 @@ def size_table(study: LevelStudy) -> Table | None:
         )
         for m in known
     )
-    heads = tuple(f"size at {level.force_n:.3g} N" for level in study.levels)
+    heads = tuple(f"size at {level.label}" for level in study.levels)
     return Table(("mode", *heads, "p"), rows, frozenset(range(len(heads) + 2)))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import Any
@@ -34,6 +35,22 @@ def effects_list(effects: Sequence[dict[str, Any]]) -> RenderableType:
         table.add_row("  signs", Text(effect["signs"]))
         parts += [Text(effect["id"], style="bold"), table]
     return Group(*parts)
+
+
+def settings_list(settings: Sequence[dict[str, Any]]) -> RenderableType:
+    """Every setting with its default, what it may be, and why."""
+    parts: list[RenderableType] = []
+    for s in settings:
+        table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 1))
+        table.add_column(overflow="fold")
+        table.add_row(Text(f"  {s['description']} ({s['values']})"))
+        parts += [Text(f"{s['name']} = {setting_text(s['default'])}", style="bold"), table]
+    return Group(*parts)
+
+
+def setting_text(default: Any) -> str:
+    """A default as TOML would write it; ``"not set"`` where there is none."""
+    return "not set" if default is None else json.dumps(default, ensure_ascii=False)
 
 
 def model_table(configuration: str, modes: Sequence[dict[str, Any]]) -> RenderableType:

@@ -1,4 +1,4 @@
-"""summary.json, plots, report.html and screens of hysteresis tests: the story of the loops."""
+"""summary.json, report.html, plots and screens of hysteresis tests: the story of the loops."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import base64
 import json
 import shlex
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ema_pipeline.files import replace_file
 from ema_pipeline.loops.summary import summary, terminal_lines
@@ -48,7 +48,7 @@ def write_loops_report(
     models: Sequence[LoopModel],
     folder: Path,
 ) -> None:
-    """Write ``summary.json``, ``plots/`` and ``report.html`` into `folder`.
+    """Write ``summary.json`` and ``report.html`` into `folder`.
 
     Parameters
     ----------
@@ -65,7 +65,7 @@ def write_loops_report(
     content["configurations"] = {name: summary(one) for name, one in isolators.items()}
     text = json.dumps(summary_files.finite(content), indent=2, ensure_ascii=False)
     replace_file(folder / "summary.json", text + "\n")
-    images = _images(isolators, results, loops, models, folder / "plots")
+    images = _images(_figures(isolators, results, loops, models))
     page = (
         page_templates()
         .get_template("loops.html.j2")
@@ -86,6 +86,23 @@ def run_screen(isolators: Mapping[str, IsolatorResult], results: RunResults, out
         lines += ["", "Next:", *(f"  {c}" for c in commands)] if commands else []
         lines += [] if commands else ["", f"Next:\n  ema compare {shlex.quote(out)}"]
     return "\n".join(lines)
+
+
+def comparison_rows(
+    loops: Sequence[Loop], models: Sequence[LoopModel]
+) -> list[dict[str, float | str | None]]:
+    """What `comparison_screen` shows, as numbers: shares of the force's range, energies of a cycle in J."""
+    first, last = models[0], models[-1]
+    return [
+        {
+            "loop": loop.name,
+            "misfit_linear": a.misfit,
+            "misfit": b.misfit,
+            "energy_measured_j": loop.energy_j,
+            "energy_model_j": b.energy_j,
+        }
+        for loop, a, b in zip(loops, first.fits, last.fits, strict=True)
+    ]
 
 
 def comparison_screen(loops: Sequence[Loop], models: Sequence[LoopModel]) -> str:
@@ -277,36 +294,49 @@ def _unit(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
-def _images(
+def write_loops_plots(
     isolators: Mapping[str, IsolatorResult],
     results: RunResults,
     loops: Sequence[Loop],
     models: Sequence[LoopModel],
-    plots: Path,
-) -> dict[str, dict[str, str]]:
-    """Figures by name, drawn into `plots` and embedded in the page."""
-    from ema_pipeline.loops.figures import isolator_figures, misfit_figure, models_figure
-    from ema_pipeline.report.figures.diagnosis import candidate_probabilities, ladder_errors
+    folder: Path,
+) -> None:
+    """Write every figure as PNG and SVG into `folder`; parameters as in `write_loops_report`."""
+    folder.mkdir(exist_ok=True)
+    for name, figure in _figures(isolators, results, loops, models).items():
+        replace_file(folder / f"{name}.png", style.png(figure))
+        replace_file(folder / f"{name}.svg", style.svg(figure))
 
-    drawn = {}
+
+def _figures(
+    isolators: Mapping[str, IsolatorResult],
+    results: RunResults,
+    loops: Sequence[Loop],
+    models: Sequence[LoopModel],
+) -> dict[str, Figure]:
+    """Figures by name."""
+    from ema_pipeline.report.figures.diagnosis import candidate_probabilities, ladder_errors
+    from ema_pipeline.report.figures.loops import isolator_figures, misfit_figure, models_figure
+
+    figures: dict[str, Figure] = {}
     found, ladder = results.diagnosis, results.shown_ladder
     if models:
-        drawn["models"] = partial(models_figure, loops, models)
-        drawn["misfit"] = partial(misfit_figure, loops, models)
+        figures["models"] = models_figure(loops, models)
+        figures["misfit"] = misfit_figure(loops, models)
     if found is not None:
-        drawn["candidates"] = partial(candidate_probabilities, found)
+        figures["candidates"] = candidate_probabilities(found)
     if ladder is not None and ladder.rungs:
-        drawn["ladder"] = partial(ladder_errors, ladder)
-    figures = {name: draw() for name, draw in drawn.items()}
+        figures["ladder"] = ladder_errors(ladder)
     for name, one in isolators.items():
         figures |= {f"{name}_{kind}": figure for kind, figure in isolator_figures(one).items()}
-    plots.mkdir(exist_ok=True)
+    return figures
+
+
+def _images(figures: Mapping[str, Figure]) -> dict[str, dict[str, str]]:
+    """Figures by name, to be embedded in the page."""
     images = {}
     for name, figure in figures.items():
-        picture = style.png(figure)
-        replace_file(plots / f"{name}.png", picture)
-        replace_file(plots / f"{name}.svg", style.svg(figure))
-        uri = f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
+        uri = f"data:image/png;base64,{base64.b64encode(style.png(figure)).decode('ascii')}"
         caption = _CAPTIONS.get(name) or _CAPTIONS[next(k for k in _CAPTIONS if name.endswith(f"_{k}"))]
         images[name] = {
             "uri": uri,

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ema_pipeline.report.figures.shapes import FILLS
 from ema_pipeline.report.numbers import format_percent, format_value, slug
 from ema_pipeline.report.planetary import (
+    FILLS,
     GearBody,
     GearLayout,
     Motion,
@@ -23,7 +23,9 @@ from ema_pipeline.report.planetary import (
 )
 from ema_pipeline.report.results import ConfigurationResults
 
-_UNITS = 100.0  # drawing units per sun radius
+UNITS = 100.0
+"""Drawing units per radius of the sun."""
+
 _SCALE_SHARE = 0.14
 
 
@@ -77,7 +79,7 @@ def moving_gears(configuration: ConfigurationResults) -> MovingGears | None:
     if layout is None or modal is None or not modal.modes:
         return None
     stem = slug(configuration.name)
-    outlines = {f"{stem}-{kind}": _path(body) for kind, body in _kinds(layout).items()}
+    outlines = {f"{stem}-{kind}": outline_path(body) for kind, body in _kinds(layout).items()}
     modes, lacks = [], ""
     for index, mode in enumerate(modal.modes):
         pair = shape_pair(configuration, index)
@@ -100,7 +102,7 @@ def moving_gears(configuration: ConfigurationResults) -> MovingGears | None:
                 remark,
             )
         )
-    reach = 1.12 * layout.reach * _UNITS
+    reach = 1.12 * layout.reach * UNITS
     ring = next((b.radius for b in layout.bodies if b.name == "ring"), 0.0)
     planets = tuple((_n(b.x), _n(b.y)) for b in layout.bodies if b.name.startswith("planet"))
     box = " ".join(f"{v:.0f}" for v in (-reach, -reach, 2 * reach, 2 * reach))
@@ -137,16 +139,17 @@ def _drawing(stem: str, layout: GearLayout, moved: dict[str, Motion], scale: flo
             )
         )
         u = complex(motion.u) * scale / body.radius * 180 / np.pi
-        mx, my = complex(motion.x) * scale * _UNITS, complex(motion.y) * scale * _UNITS
-        row = (body.x * _UNITS, body.y * _UNITS, mx.real, mx.imag, my.real, my.imag, u.real, u.imag)
+        mx, my = complex(motion.x) * scale * UNITS, complex(motion.y) * scale * UNITS
+        row = (body.x * UNITS, body.y * UNITS, mx.real, mx.imag, my.real, my.imag, u.real, u.imag)
         numbers.append([round(float(v), 2) for v in row])
     return MovingGear(label, tuple(bodies), json.dumps(numbers, separators=(",", ":")))
 
 
-def _path(body: GearBody) -> str:
-    points = outline(body, samples=4 if body.teeth else 1) * _UNITS
+def outline_path(body: GearBody) -> str:
+    """Outline of a body about its own centre, as an SVG path."""
+    points = outline(body, samples=4 if body.teeth else 1) * UNITS
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points[:-1]) + "Z"
 
 
 def _n(value: float) -> float:
-    return round(float(value) * _UNITS, 2)
+    return round(float(value) * UNITS, 2)

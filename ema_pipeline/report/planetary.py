@@ -21,6 +21,9 @@ from ema_pipeline.report.results import ConfigurationResults
 _PLANET = re.compile(r"planet(\d+)$")
 _CENTRAL = ("carrier", "ring", "sun")
 
+FILLS = {"carrier": "#f2d8c0", "ring": "#dcdcdc", "sun": "#f6ecb0", "planet": "#cfe3f1"}
+"""Colours of the bodies in every drawing."""
+
 
 @dataclass(frozen=True)
 class GearBody:

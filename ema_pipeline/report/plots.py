@@ -1,4 +1,4 @@
-"""Which figures a run has, drawn once and kept as PNG and SVG."""
+"""Figures for print: which a run has, drawn on demand as PNG and SVG."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.files import replace_file
+from ema_pipeline.frf.overview import representative_frfs
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report import style
 from ema_pipeline.report.figures import (
@@ -55,10 +56,6 @@ class FigureSpec:
         What it shows, in words; the text for readers who cannot see it.
     draw : callable
         Returns the figure.
-    report_format : {"png", "svg"}
-        The smaller of the two for this kind of figure.
-    in_report : bool
-        False for figures that the report replaces by a moving drawing.
     """
 
     name: str
@@ -66,17 +63,14 @@ class FigureSpec:
     configuration: str
     caption: str
     draw: Callable[[], Figure]
-    report_format: Format = "svg"
-    in_report: bool = True
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A drawn figure: the bytes of its files by format, and its size in inches."""
+    """A drawn figure: the bytes of its files by format."""
 
     spec: FigureSpec
     files: dict[Format, bytes]
-    width_in: float
 
 
 def figure_specs(results: RunResults) -> tuple[FigureSpec, ...]:
@@ -89,21 +83,20 @@ def figure_specs(results: RunResults) -> tuple[FigureSpec, ...]:
 
 
 def render(
-    results: RunResults, formats: Collection[Format] | None = None, progress: Progress | None = None
+    results: RunResults, formats: Collection[Format] = ("png", "svg"), progress: Progress | None = None
 ) -> tuple[Plot, ...]:
     """Draw all figures.
 
     Parameters
     ----------
     results : RunResults
-    formats : collection of {"png", "svg"} or None
-        None keeps for each figure the one format that the report embeds.
+    formats : collection of {"png", "svg"}
     progress : callable or None
     """
-    specs = tuple(s for s in figure_specs(results) if formats is not None or s.in_report)
+    specs = figure_specs(results)
     plots = []
     for number, spec in enumerate(specs, start=1):
-        plots.append(_render(spec, formats or (spec.report_format,)))
+        plots.append(_render(spec, formats))
         if progress is not None:
             progress(number, len(specs), spec.name)
     return tuple(plots)
@@ -116,16 +109,12 @@ def write_plots(
 
     Figures of an earlier run that this one no longer has are removed (those that ``figures.txt`` names).
 
-    Returns
-    -------
-    tuple of Plot
-        Hand it to `write_report`, which then need not draw again.
     """
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
     index = target / "figures.txt"
     before = set(index.read_text(encoding="utf-8").split()) if index.is_file() else set()
-    plots = render(results, ("png", "svg"), progress)
+    plots = render(results, progress=progress)
     names = []
     for plot in plots:
         for suffix, content in plot.files.items():
@@ -146,7 +135,7 @@ def _render(spec: FigureSpec, formats: Collection[Format]) -> Plot:
         files["png"] = style.png(figure)
     if "svg" in formats:
         files["svg"] = style.svg(figure)
-    return Plot(spec, files, float(figure.get_size_inches()[0]))
+    return Plot(spec, files)
 
 
 def _chunks(count: int, size: int) -> Iterator[list[int]]:
@@ -215,7 +204,7 @@ def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:
     name = configuration.name
     stem = slug(name)
     if frfs is not None:
-        picks = frf.representative_frfs(frfs)
+        picks = representative_frfs(frfs)
         for n, chunk in enumerate(_chunks(len(picks), frf.FRFS_PER_SHEET), start=1):
             chosen = [picks[k] for k in chunk]
             which = " and ".join(f"{frfs.outputs[o].point} ← {frfs.inputs[i].point}" for o, i in chosen)
@@ -225,7 +214,6 @@ def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:
                 name,
                 f"FRFs {which}: magnitude, phase and coherence, with the modal model",
                 partial(frf.frf_sheet, frfs, modal, chosen),
-                "png",
             )
         yield FigureSpec(
             f"{stem}_frf_all",
@@ -233,7 +221,6 @@ def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:
             name,
             "All FRFs over one another, and the complex mode indicator function",
             partial(frf.frf_overview, frfs, modal),
-            "png",
         )
     if modal is None:
         return
@@ -251,7 +238,6 @@ def _measured(configuration: ConfigurationResults) -> Iterator[FigureSpec]:
             name,
             "Stabilisation chart: poles of all model orders over the CMIF",
             partial(modes.stabilisation_chart, modal, frfs),
-            "png",
         )
     if modal.modes:
         yield FigureSpec(
@@ -324,8 +310,6 @@ def _shapes(configuration: ConfigurationResults, stem: str) -> Iterator[FigureSp
                 configuration.name,
                 caption + " as a moved gear set",
                 partial(shapes.gear_shapes, configuration, layout, chunk),
-                "png",
-                in_report=False,
             )
         else:
             yield FigureSpec(

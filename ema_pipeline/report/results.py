@@ -9,10 +9,11 @@ from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.ingest.records import Hit
+from ema_pipeline.ingest.records import Hit, Transducer
 from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,14 @@ class ConfigurationResults:
     system : LinearSystem or None
         The model that `pairing` was made with; its `dofs` and `sensors` turn the model's shapes into
         what the sensors read. Without it only the measured shapes are drawn.
+    transducers : tuple of Transducer
+        As the test's description states them.
+    base_system : LinearSystem or None
+        The fitted model without any added effect.
+    system_after : LinearSystem or None
+        The fitted model with the effects that the diagnosis found.
+    like_parts : tuple of LinearSystem or None
+        The base model, the model as it stands and the one that the diagnosis proposes, all like parts being alike.
     levels : LevelStudy or None
         What moves with the force of the hits.
     """
@@ -40,6 +49,10 @@ class ConfigurationResults:
     pairing: Pairing | None = None
     system: LinearSystem | None = None
     levels: LevelStudy | None = None
+    transducers: tuple[Transducer, ...] = ()
+    base_system: LinearSystem | None = None
+    system_after: LinearSystem | None = None
+    like_parts: tuple[LinearSystem | None, ...] = (None, None, None)
 
 
 @dataclass(frozen=True)
@@ -54,17 +67,32 @@ class RunResults:
     fit : FitResult or None
     comparison : Comparison or None
         Of the model as it stands.
+    comparison_base : Comparison or None
+        Of the modes with the base model, where effects were added.
     comparison_after : Comparison or None
         Of the model with the effects that the diagnosis found, where it was made.
     diagnosis : Diagnosis or None
+    deviations : tuple of dict of str to float
+        How far everything uncertain had to move from what is stated, in σ: of the base model, the model as it stands,
+        and the one that the diagnosis proposes.
+    added : tuple of str
+        Effects that the user added, ``id@place``.
+    diagnosed_on : tuple of str
+        Effects of the model that the diagnosis was made of.
+    folder : str
+        Results folder, as a user would type it.
     ladder : Ladder or None
         Of the effects that the user added; without it that of the diagnosis is shown.
-    warnings : tuple of str
-        One plain sentence each.
     provenance : mapping of str to str
         Versions, files, hashes, dates: what a reader needs to do the run again.
     settings : mapping of str to mapping
         Stage to its settings, as text.
+    added : tuple of str
+        Effects that the user added, ``id@place``.
+    diagnosed_on : tuple of str
+        Effects of the model that the diagnosis was made of.
+    sensitivities : tuple of Verdict
+        Channels whose scale or sign the model contradicts, see `fit.sensitivities`.
     """
 
     title: str
@@ -72,12 +100,22 @@ class RunResults:
     configurations: tuple[ConfigurationResults, ...] = ()
     fit: FitResult | None = None
     comparison: Comparison | None = None
-    warnings: tuple[str, ...] = ()
     provenance: Mapping[str, str] = field(default_factory=dict)
     settings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     diagnosis: Diagnosis | None = None
     ladder: Ladder | None = None
     comparison_after: Comparison | None = None
+    sensitivities: tuple[Verdict, ...] = ()
+    comparison_base: Comparison | None = None
+    deviations: tuple[dict[str, float], ...] = ({}, {}, {})
+    added: tuple[str, ...] = ()
+    diagnosed_on: tuple[str, ...] = ()
+    folder: str = ""
+
+    @property
+    def diagnosis_is_old(self) -> bool:
+        """True where effects were added or removed since the diagnosis was made."""
+        return self.diagnosis is not None and self.added != self.diagnosed_on
 
     @property
     def shown_ladder(self) -> Ladder | None:

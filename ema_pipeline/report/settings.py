@@ -10,4 +10,4 @@ from ema_pipeline.settings import Settings
 class ReportSettings(Settings):
     """What is written beside the tables and the report."""
 
-    plots: bool = Field(True, description="also write every figure as PNG and SVG into plots/")
+    plots: bool = Field(False, description="also draw every figure for print, as PNG and SVG, into plots/")

@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Sequence
 
-from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
+from ema_pipeline.correlate.types import Pairing
+from ema_pipeline.fit.types import FitResult, ParameterEstimate
 from ema_pipeline.report import diagnosis
+from ema_pipeline.report.cautions import cautions, fails, identified_words, suspicions
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_ERROR
-from ema_pipeline.report.numbers import below, format_value, plain, words
+from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 
-SAME_KIND = 2
-"""Cautions of one kind that are written out; the rest is counted."""
+__all__ = ["cautions", "fails", "findings", "identified_words", "stiffnesses"]
 
 TOLD = 6
 """Narrowed parameters that are named."""
 
-_DOF_OR_NUMBER = re.compile(r"-?\b[A-Za-z]\w*\.[a-z]\w*|[\d.]*\d")
-
 
 def findings(results: RunResults) -> tuple[str, ...]:
     """What was measured and how well the model follows it, one sentence each."""
-    lines = [] if results.diagnosis is None else [diagnosis.compact(results.diagnosis)]
+    lines: list[str] = []
+    if suspicions(results):
+        lines.append(
+            "A sensor is suspected, see the cautions: all that follows holds only if it reads right."
+        )
+    if results.diagnosis is not None:
+        lines += [] if not results.diagnosis_is_old else [changed_words(results)]
+        lines.append(diagnosis.compact(results.diagnosis))
     lines += [_measured(c) for c in results.configurations]
     lines += [
         f"{c.name}: {c.levels.summary}" for c in results.configurations if c.levels and has_to_say(c.levels)
@@ -60,6 +64,16 @@ def findings(results: RunResults) -> tuple[str, ...]:
     return tuple(lines)
 
 
+def changed_words(results: RunResults) -> str:
+    """What was added or taken out since the diagnosis, and what that brought."""
+    named = " and ".join(diagnosis.label_words(x) for x in results.added)
+    error = "" if results.fit is None else f" (error {plain(results.fit.error, 3)})"
+    holds = f"The model holds {named} now{error}" if named else f"The model has no added effects now{error}"
+    before = " and ".join(diagnosis.label_words(x) for x in results.diagnosed_on)
+    of = f"the model with {before}" if before else "the base model"
+    return f"{holds}; the diagnosis is of {of}: 'ema diagnose' renews it."
+
+
 def stiffnesses(fit: FitResult) -> tuple[ParameterEstimate, ...]:
     """The parameters that a reader wants first: the free ones, or else the mesh stiffnesses."""
     free = tuple(p for p in fit.parameters.values() if p.free)
@@ -83,50 +97,6 @@ def _narrowed(fit: FitResult) -> list[str]:
     return [f"Of {len(known)} parameters with tolerances the data narrow {named}{more}{rest}."]
 
 
-def fails(fit: FitResult) -> bool:
-    """True where the model does not fit, so that its values hold only for a model that lacks nothing."""
-    return fit.error > POOR_ERROR
-
-
-def identified_words(p: ParameterEstimate, fit: FitResult) -> str:
-    """``"identified by the data"`` or why not."""
-    if p.identified and fails(fit):
-        return "provisional: the model does not explain the data"
-    if p.identified:
-        return "identified by the data"
-    if p.free:
-        return "not identified by the data" + (f": {p.note}" if p.note else "")
-    return "not narrowed by the data: its tolerance decides"
-
-
-def cautions(results: RunResults) -> tuple[str, ...]:
-    """What to be careful about, one sentence each, the gravest first."""
-    lines: list[str] = []
-    fit = results.fit
-    if fit is not None:
-        if fails(fit):
-            lines.append(
-                f"The model does not explain the data (error {plain(fit.error, 3)}): "
-                "fitted values and their uncertainties are provisional"
-            )
-        for p in fit.parameters.values():
-            value = format_value(p.value, p.std, p.unit)
-            if p.free and not p.identified:
-                lines.append(
-                    f"{words(p.name)} ({value}) is {identified_words(p, fit)}. Do not quote it as a result."
-                )
-            elif math.isfinite(p.shift_z) and abs(p.shift_z) > FAR_SIGMA:
-                lines.append(
-                    f"{words(p.name)} was fitted to {value}, {abs(p.shift_z):.1f} tolerances from "
-                    f"its nominal {format_value(p.nominal, p.prior_std, p.unit)}: check the nominal value."
-                )
-        lines += _flat_sweeps(fit.sweeps)
-    for c in results.configurations:
-        lines += [f"{c.name}: {text}" for text in _cautions_of(c)]
-    lines += results.warnings
-    return _without_repeats([_sentence(line) for line in lines])
-
-
 def _measured(c: ConfigurationResults) -> str:
     used = sum(h.accepted for h in c.hits)
     text = f"{c.name}: {used} of {len(c.hits)} hits used" if c.hits else f"{c.name}:"
@@ -141,67 +111,15 @@ def _measured(c: ConfigurationResults) -> str:
     text += _count(len(c.modal.modes), "mode")
     text += f" between {low:.4g} and {high:.5g} Hz" if math.isfinite(high) else " from a table"
     if c.pairing is not None:
-        text += f", {len(c.pairing.pairs)} of them paired with the model"
+        text += f", {paired_words(c.pairing)}"
     return text + "."
 
 
-def _cautions_of(c: ConfigurationResults) -> list[str]:
-    lines = []
-    rejected = sum(not h.accepted for h in c.hits)
-    if rejected:
-        lines.append(f"{rejected} of {len(c.hits)} hits were left out")
-    if c.frfs is not None:
-        singles = int((c.frfs.hits == 1).sum())
-        if singles:
-            lines.append(
-                f"{_count(singles, 'FRF')} rest on one hit: no coherence and no scatter to judge them by"
-            )
-        if not c.frfs.force_calibrated:
-            lines.append("the hammer is not calibrated: FRFs and shapes have no absolute scale")
-        lines += [v.message or f"{v.check} fails" for v in c.frfs.verdicts if not v.passes][:5]
-    if c.modal is not None:
-        if not c.modal.scaled and c.modal.dofs:
-            lines.append(f"shapes are not mass-normalised: {c.modal.scaling_note or 'no driving point'}")
-        lines += c.modal.notes
-    if c.pairing is not None:
-        lines += [
-            f"measured mode {u.index + 1} at {u.frequency_hz:.5g} Hz has no model partner: {u.reason}"
-            for u in c.pairing.unpaired_measured
-        ]
-        weak = [p for p in c.pairing.pairs if p.mac < LOW_MAC]
-        if weak:
-            named = ", ".join(f"{p.measured_frequency_hz:.5g} Hz ({below(p.mac, LOW_MAC)})" for p in weak[:6])
-            more = f" and {len(weak) - 6} more" if len(weak) > 6 else ""
-            lines.append(f"doubtful pairs with MAC under {LOW_MAC}: {named}{more}")
-    return lines
-
-
-def _flat_sweeps(sweeps: Sequence[ErrorSweep]) -> list[str]:
-    """One sentence per stiffness whose error function determines nothing, over all its sweeps."""
-    groups: dict[tuple[str, str], list[ErrorSweep]] = {}
-    for s in sweeps:
-        if not s.identified:
-            groups.setdefault((s.parameter, s.configuration), []).append(s)
-    lines = []
-    for (parameter, configuration), mine in groups.items():
-        counts = " or ".join(str(n) for n in sorted({s.mode_count for s in mine}))
-        lines.append(
-            f"ε of {words(parameter)} ({configuration}) determines nothing with {counts} modes: "
-            f"{_flat_words(mine)}"
-        )
-    return lines
-
-
-def _flat_words(sweeps: Sequence[ErrorSweep]) -> str:
-    """How much ε changes over the sweeps, or why its minimum means nothing."""
-    flat = [s for s in sweeps if s.note.startswith("flat")]
-    if len(flat) == len(sweeps):
-        changes = [
-            100 * float((s.error.max() - s.error.min()) / max(float(s.error.min()), 1e-300)) for s in sweeps
-        ]
-        low, high = plain(min(changes), 2), plain(max(changes), 2)
-        return f"it changes by {low if low == high else f'{low}–{high}'} % over the sweep"
-    return "; ".join(dict.fromkeys(s.note for s in sweeps))
+def paired_words(pairing: Pairing) -> str:
+    """How many modes have a model partner, and how many of these pairs are doubtful."""
+    weak = sum(p.mac < LOW_MAC for p in pairing.pairs)
+    doubtful = f", {weak} of these doubtfully" if weak else ""
+    return f"{len(pairing.pairs)} of them paired with the model{doubtful}"
 
 
 def _worst(results: RunResults) -> list[str]:
@@ -227,24 +145,5 @@ def _worst(results: RunResults) -> list[str]:
     return lines
 
 
-def _without_repeats(lines: list[str]) -> tuple[str, ...]:
-    """Lines that differ only in DOFs and numbers are a kind: its first `SAME_KIND` lines stand for all."""
-    kinds: dict[str, list[str]] = {}
-    for line in dict.fromkeys(lines):
-        kinds.setdefault(_DOF_OR_NUMBER.sub("#", line), []).append(line)
-    shown = []
-    for mine in kinds.values():
-        rest = len(mine) - SAME_KIND
-        shown += mine[:SAME_KIND] if rest > 1 else mine
-        if rest > 1:
-            shown[-1] += f" ({rest} more of this kind.)"
-    return tuple(shown)
-
-
 def _count(n: int, noun: str) -> str:
     return f"{n} {noun}{'' if n == 1 else 's'}"
-
-
-def _sentence(text: str) -> str:
-    text = text.strip()
-    return text if text.endswith((".", "!", "?")) else text + "."

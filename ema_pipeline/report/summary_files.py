@@ -9,11 +9,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ema_pipeline.correlate.types import Comparison, percent_off
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Rung
 from ema_pipeline.exchange.tables import csv_text, modes_table
 from ema_pipeline.files import replace_file
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.report import levels
+from ema_pipeline.report.cautions import cautions
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 
 SCHEMA = 1
@@ -41,17 +43,15 @@ def summary(results: RunResults) -> dict[str, Any]:
         "schema": SCHEMA,
         "title": results.title,
         "rig": results.rig,
+        "effects": list(results.added),
         "configurations": {c.name: _configuration(c) for c in results.configurations},
     }
     if results.fit is not None:
         content["fit"] = _fit(results.fit)
     if results.comparison is not None:
-        content["comparison"] = {
-            "error": results.comparison.error,
-            "frequency_error": results.comparison.frequency_error,
-        }
+        content["comparison"] = _comparison(results.comparison)
     if results.diagnosis is not None:
-        content["diagnosis"] = _diagnosis(results.diagnosis)
+        content["diagnosis"] = _diagnosis(results.diagnosis) | {"on_top_of": list(results.diagnosed_on)}
     if results.shown_ladder is not None:
         content["ladder"] = _ladder(results.shown_ladder)
         content["ladder_note"] = results.shown_ladder.note
@@ -59,8 +59,34 @@ def summary(results: RunResults) -> dict[str, Any]:
             content["ladder_compared_s"] = results.shown_ladder.compared_s
         if results.shown_ladder.left_out:
             content["ladder_left_out"] = list(results.shown_ladder.left_out)
-    content["warnings"] = list(results.warnings)
+    content["warnings"] = list(cautions(results))
     return content
+
+
+def _comparison(compared: Comparison) -> dict[str, Any]:
+    """Differences by mode and by DOF; modes count from 1, `_z` are in standard uncertainties."""
+    modes = [
+        {
+            "configuration": m.configuration,
+            "mode": m.measured + 1,
+            "frequency_hz": m.measured_frequency_hz,
+            "model_frequency_hz": m.model_frequency_hz,
+            "frequency_difference_percent": percent_off(m.measured_frequency_hz, m.model_frequency_hz),
+            "frequency_z": m.frequency_z,
+            "damping_ratio": m.measured_damping_ratio,
+            "model_damping_ratio": m.model_damping_ratio,
+            "damping_z": m.damping_z,
+            "mac": m.mac,
+            "shape_z": m.shape_z,
+        }
+        for m in compared.modes
+    ]
+    return {
+        "error": compared.error,
+        "frequency_error": compared.frequency_error,
+        "modes": modes,
+        "dofs": [asdict(d) for d in compared.dofs],
+    }
 
 
 def _fit(fit: FitResult) -> dict[str, Any]:
@@ -83,7 +109,7 @@ def _fit(fit: FitResult) -> dict[str, Any]:
         "data_count": fit.data_count,
         "stop_reason": fit.stop_reason,
         "sweeps": [{k: v for k, v in vars(s).items() if k not in ("values", "error")} for s in fit.sweeps],
-        "two_step": None if fit.two_step is None else asdict(fit.two_step),
+        "stepwise": None if fit.stepwise is None else asdict(fit.stepwise),
         "notes": list(fit.notes),
     }
 
@@ -179,12 +205,16 @@ def _configuration(c: ConfigurationResults) -> dict[str, Any]:
 
 
 def _modes(c: ConfigurationResults) -> list[dict[str, Any]]:
-    """Rows of the table of modes, with the flags one by one."""
+    """Rows of the table of modes, with the flags one by one; `model_mode` is an index, as in `unpaired_model_modes`."""
     if c.modal is None:
         return []
     rows = modes_table(c.modal, c.name, c.pairing)
     return [
-        {k: v for k, v in row.items() if k not in ("configuration", "mode")} | {"flags": list(mode.flags)}
+        {k: v for k, v in row.items() if k != "configuration"}
+        | {
+            "flags": list(mode.flags),
+            "model_mode": None if row["model_mode"] is None else int(row["model_mode"]) - 1,
+        }
         for row, mode in zip(rows, c.modal.modes, strict=True)
     ]
 

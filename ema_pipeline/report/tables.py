@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ema_pipeline.correlate.types import Comparison, Pairing
+from ema_pipeline.correlate.types import Comparison, Pairing, percent_off
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
+from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.modal.types import ModalModel, Mode
 from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_ERROR
 from ema_pipeline.report.numbers import (
@@ -41,7 +42,7 @@ class Table:
 
 
 def modes_table(modal: ModalModel) -> Table:
-    """One row per mode: frequency and damping of the pole and the best circle, MPC, votes, remarks."""
+    """One row per mode: frequency and damping of the pole and of all circles together, MPC, votes, remarks."""
     rows = tuple(_mode_row(i, m) for i, m in enumerate(modal.modes))
     head = (
         "mode",
@@ -62,11 +63,7 @@ def pairs_table(pairing: Pairing, modal: ModalModel) -> Table:
     rows = []
     for p in pairing.pairs:
         std = modal.modes[p.measured].frequency_std_hz
-        percent = (
-            100 * (p.measured_frequency_hz / p.model_frequency_hz - 1)
-            if p.model_frequency_hz > 0
-            else math.nan
-        )
+        percent = percent_off(p.measured_frequency_hz, p.model_frequency_hz)
         remark = f"group {p.group + 1}" if p.group >= 0 else ""
         weak = p.mac < LOW_MAC
         remark = "; ".join(t for t in (remark, "low MAC" if weak else "") if t)
@@ -171,6 +168,7 @@ def differences_table(compared: Comparison) -> Table:
                     str(m.measured + 1),
                     _bare(m.measured_frequency_hz, m.frequency_std_hz),
                     plain(m.model_frequency_hz, 5),
+                    signed(percent_off(m.measured_frequency_hz, m.model_frequency_hz), 2),
                     signed(m.frequency_z),
                     _bare(100 * m.measured_damping_ratio, 100 * m.damping_std),
                     plain(100 * m.model_damping_ratio, 3),
@@ -186,6 +184,7 @@ def differences_table(compared: Comparison) -> Table:
         "mode",
         "measured, Hz",
         "model, Hz",
+        "difference, %",
         "f: z, σ",
         "measured ζ, %",
         "model ζ, %",
@@ -193,7 +192,7 @@ def differences_table(compared: Comparison) -> Table:
         "MAC",
         "shape: z, σ",
     )
-    return Table(head, tuple(rows), frozenset(range(1, 10)))
+    return Table(head, tuple(rows), frozenset(range(1, 11)))
 
 
 def worst_dofs_table(compared: Comparison, count: int = 8) -> Table:
@@ -253,12 +252,12 @@ def verdicts_table(hits: Sequence[Hit]) -> Table:
     for h in hits:
         for v in h.verdicts:
             checks.setdefault(v.check, v)
-    head = ["file", "hit", "impact", "peak, N"]
+    head = ["file", "hit", "impact", "peak"]
     for v in checks.values():
-        head.append(f"{words(v.check)} (limit {plain(v.limit, 3)}{_unit(v)})")
+        head.append(f"{words(v.check)} (limit {with_unit(v.limit, v.unit)})")
     rows = []
     for h in hits:
-        cells = [h.file, str(h.number + 1), str(h.impact), plain(h.peak_force, 3)]
+        cells = [h.file, str(h.number + 1), str(h.impact), with_unit(h.peak_force, h.force_unit)]
         for check in checks:
             mine = [v for v in h.verdicts if v.check == check]
             cells.append(_verdict_cell(mine))
@@ -266,15 +265,30 @@ def verdicts_table(hits: Sequence[Hit]) -> Table:
     return Table(tuple(head), tuple(rows), frozenset({1, 3}))
 
 
-_CONSEQUENCES = {
-    "reject_hit": "hit left out",
-    "reject_channel": "channel left out",
-    "warn": "warning",
-}
+SHOWN_CHECKS = {"double hit": "bounce", "force spectrum": "up to", "response decay": "left"}
+"""Checks whose value is shown for every hit, and the heads of their columns."""
+
+
+def hits_table(hits: Sequence[Hit]) -> Table:
+    """One row per hit: peak force, what the checks of `SHOWN_CHECKS` measured, and PASS or FAIL."""
+    rows = []
+    for h in hits:
+        values = []
+        for check in SHOWN_CHECKS:
+            mine = [v for v in h.verdicts if v.check == check]
+            worst = _worst(mine) if mine else None
+            values.append("–" if worst is None else with_unit(worst.value, worst.unit))
+        warned = any(not v.passes for v in h.verdicts)
+        result = "FAIL" if not h.accepted else "PASS" if not warned else "warn"
+        peak = with_unit(h.peak_force, h.force_unit)
+        name = h.file + (f" ({h.number + 1})" if h.number else "")
+        rows.append(Row((name, str(h.impact), peak, *values, result), not h.accepted))
+    head = ("file", "impact", "peak", *SHOWN_CHECKS.values(), "result")
+    return Table(head, tuple(rows), frozenset({2, 3, 4, 5}))
 
 
 def checks_table(hits: Sequence[Hit]) -> Table:
-    """One row per check: its limit, where the limit comes from, and how many hits fail it."""
+    """One row per check: limit, worst value, how many hits fail it (FAIL where that rejects something), and clause."""
     found: dict[str, list[Verdict]] = {}
     failing: dict[str, set[tuple[str, int]]] = {}
     for h in hits:
@@ -282,20 +296,21 @@ def checks_table(hits: Sequence[Hit]) -> Table:
             found.setdefault(v.check, []).append(v)
             if not v.passes:
                 failing.setdefault(v.check, set()).add((h.file, h.number))
-    rows = tuple(
-        Row(
-            (
-                words(check),
-                f"{plain(verdicts[0].limit, 3)}{_unit(verdicts[0])}",
-                _CONSEQUENCES[verdicts[0].consequence],
-                verdicts[0].clause or "own limit",
-                f"{len(failing.get(check, ()))} of {len(hits)}",
-            ),
-            check in failing,
+    rows = []
+    for check, verdicts in found.items():
+        failed = len(failing.get(check, ()))
+        rejects = any(not v.passes and v.consequence != "warn" for v in verdicts)
+        result = "PASS" if not failed else f"{'FAIL' if rejects else 'warn'} {failed} of {len(hits)}"
+        result += " (channels)" if failed and verdicts[0].consequence == "reject_channel" else ""
+        cells = (
+            words(check),
+            with_unit(verdicts[0].limit, verdicts[0].unit),
+            with_unit(_worst(verdicts).value, verdicts[0].unit),
+            result,
+            verdicts[0].clause or "own limit",
         )
-        for check, verdicts in found.items()
-    )
-    return Table(("check", "limit", "if it fails", "clause", "hits failing"), rows)
+        rows.append(Row(cells, rejects))
+    return Table(("check", "limit", "worst", "result", "clause"), tuple(rows))
 
 
 def failed_checks_table(verdicts: Sequence[Verdict]) -> Table:
@@ -305,7 +320,7 @@ def failed_checks_table(verdicts: Sequence[Verdict]) -> Table:
             (
                 words(v.check),
                 v.channel,
-                f"{plain(v.value, 3)} (limit {plain(v.limit, 3)}{_unit(v)})",
+                f"{with_unit(v.value, v.unit)} (limit {with_unit(v.limit, v.unit)})",
                 v.clause,
                 v.message,
             ),
@@ -317,29 +332,53 @@ def failed_checks_table(verdicts: Sequence[Verdict]) -> Table:
     return Table(("check", "where", "value", "clause", "finding"), rows)
 
 
-def _unit(v: Verdict) -> str:
-    return "" if v.unit in ("", "1") else f" {v.unit}"
+def with_unit(value: float, unit: str) -> str:
+    """A checked value with its unit; ratios in per cent.
+
+    >>> with_unit(0.0251, "1"), with_unit(2291.4, "Hz")
+    ('2.51 %', '2290 Hz')
+    """
+    if unit in ("", "1"):
+        return f"{_short(100 * value)} %" if math.isfinite(value) else "–"
+    return f"{_short(value)} {unit}" if math.isfinite(value) else "–"
+
+
+def _short(value: float) -> str:
+    """Three significant figures, without noughts that say nothing."""
+    text = plain(float(f"{value:.3g}"), 3)
+    return text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
+
+
+def _worst(verdicts: Sequence[Verdict]) -> Verdict:
+    """The verdict nearest to its limit, or furthest beyond it."""
+    pool = [v for v in verdicts if not v.passes] or list(verdicts)
+
+    def beyond(v: Verdict) -> float:
+        distance = abs(v.value - v.limit) if math.isfinite(v.value) else 0.0
+        return distance if not v.passes else -distance
+
+    return max(pool, key=beyond)
 
 
 def _verdict_cell(verdicts: Sequence[Verdict]) -> str:
     if not verdicts:
         return "–"
     failed = [v for v in verdicts if not v.passes]
-    pool = failed or list(verdicts)
-    worst = max(pool, key=lambda v: abs(v.value) if math.isfinite(v.value) else 0.0)
+    worst = _worst(verdicts)
+    rejects = any(v.consequence != "warn" for v in failed)
     where = f" {worst.channel}" if failed and worst.channel else ""
     more = f" +{len(failed) - 1}" if len(failed) > 1 else ""
-    return f"{'FAIL' if failed else 'ok'} {plain(worst.value, 3)}{where}{more}"
+    return f"{'FAIL' if rejects else 'warn' if failed else 'ok'} {with_unit(worst.value, worst.unit)}{where}{more}"
 
 
 def _mode_row(index: int, mode: Mode) -> Row:
-    best = mode.circles[0] if mode.circles else None
+    circle = average(mode.circles) if mode.circles else None  # what the remark about circles compares with
     cells = (
         str(index + 1),
         _bare(mode.frequency_hz, mode.frequency_std_hz),
         format_percent(mode.damping_ratio, mode.damping_std).removesuffix(" %"),
-        _bare(best.natural_frequency_hz, best.natural_frequency_std_hz) if best else "–",
-        _bare(100 * best.damping_ratio, 100 * best.damping_std) if best else "–",
+        _bare(circle.frequency_hz, circle.frequency_std_hz) if circle else "–",
+        _bare(100 * circle.damping_ratio, 100 * circle.damping_std) if circle else "–",
         f"{mode.mpc:.2f}",
         f"{100 * mode.stability:.0f} %",
         mode.method,

@@ -7,6 +7,7 @@ deserve a look start with ``!``.
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Iterator, Sequence
 
 from rich import box
@@ -17,12 +18,12 @@ from rich.text import Text
 
 from ema_pipeline.correlate.types import Comparison
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.report import diagnosis, diagnosis_tables, levels, summary, tables
-from ema_pipeline.report.numbers import format_value, plain, words
-from ema_pipeline.report.results import RunResults
+from ema_pipeline.report import diagnosis, diagnosis_tables, levels, tables
+from ema_pipeline.report.numbers import plain
 
 Clean = Callable[[str], str]
 _SHORT = 15
@@ -77,7 +78,7 @@ def modes_table(modal: ModalModel, title: str = "Modes") -> RenderableType:
     remarks = [
         _line(f"mode {i}: {'; '.join(m.flags)}") for i, m in enumerate(modal.modes, start=1) if m.flags
     ]
-    return Group(_rich(source, title), *remarks)
+    return Group(text_table(source, title), *remarks)
 
 
 def levels_tables(study: LevelStudy, modal: ModalModel, title: str = "") -> RenderableType:
@@ -87,19 +88,19 @@ def levels_tables(study: LevelStudy, modal: ModalModel, title: str = "") -> Rend
     if study.modes:
         table = levels.frequency_table(study, modal)
         last = len(table.head) - 1
-        parts += [_line(""), _rich(_pick(table, range(last)), "Natural frequency by force level")]
+        parts += [_line(""), text_table(_pick(table, range(last)), "Natural frequency by force level")]
         remarks: dict[str, list[str]] = {}
         for row in table.rows:
             remarks.setdefault(row.cells[last], []).append(row.cells[0])
         for remark, alike in remarks.items():
             if remark:
                 parts.append(_line(f"{'mode' if len(alike) == 1 else 'modes'} {', '.join(alike)}: {remark}"))
-        parts += [_line(""), _rich(levels.damping_table(study), "Damping ratio by force level")]
+        parts += [_line(""), text_table(levels.damping_table(study), "Damping ratio by force level")]
         sizes = levels.size_table(study)
         if sizes is not None:
             parts += [
                 _line(""),
-                _rich(sizes, "Size in the FRFs by force level, 1 where it is alike in all hits"),
+                text_table(sizes, "Size in the FRFs by force level, 1 where it is alike in all hits"),
             ]
         parts.append(_line("p: probability of a trend as clear as this where nothing depends on the force;"))
         parts.append(_line("–: not tested, or a size that changes by less than a tenth."))
@@ -116,29 +117,31 @@ def hits_table(hits: Sequence[Hit], title: str = "Hits") -> RenderableType:
     source = tables.rejected_hits_table(hits)
     if not source.rows:
         return head
-    return Group(head, _rich(source, ""))
+    return Group(head, text_table(source, ""))
 
 
-def verdict_table(hits: Sequence[Hit], title: str = "Verdicts") -> RenderableType:
-    """The checks with limit and clause, then every hit's values, worst over its channels."""
-    source = tables.verdicts_table(hits)
-    checks = list(range(4, len(source.head)))
-    short = _renamed(source, tuple(h.partition(" (limit")[0] for h in source.head))
-    blocks = [_pick(short, (0, 1, *checks[k : k + 4])) for k in range(0, len(checks), 4)]
+def verdict_table(hits: Sequence[Hit], title: str = "Hits") -> RenderableType:
+    """Every hit with what was measured of it and PASS or FAIL, then every check with limit, worst value and clause."""
+    legend = (
+        "bounce: second blow over the first; up to: where the force's spectrum has fallen; "
+        "left: response at the end over its largest"
+    )
     return Group(
-        _rich(tables.checks_table(hits), f"{title}: checks"),
-        *(_rich(b, f"{title}: hits") for b in blocks),
+        text_table(tables.hits_table(hits), f"{title}: hits"),
+        _line(legend),
+        text_table(tables.checks_table(hits), f"{title}: checks"),
     )
 
 
 def comparison_tables(compared: Comparison) -> RenderableType:
     """Differences per mode in units of σ, and the worst DOFs and FRF bands."""
     several = len({m.configuration for m in compared.modes}) > 1
-    columns = ((0,) if several else ()) + (1, 2, 3, 4, 7, 8, 9)
+    columns = ((0,) if several else ()) + (1, 2, 3, 4, 5, 8, 9, 10)
     heads = (("config",) if several else ()) + (
         "mode",
         "measured, Hz",
         "model, Hz",
+        "diff. %",
         "freq.",
         "damping",
         "MAC",
@@ -149,19 +152,31 @@ def comparison_tables(compared: Comparison) -> RenderableType:
             f"Model against measurement: {plain(compared.error, 3)} σ root mean square, "
             f"ε {plain(compared.frequency_error, 3)}"
         ),
-        _rich(
+        text_table(
             _renamed(_pick(tables.differences_table(compared), columns), heads),
             "Per mode, (measured − model)/σ",
         ),
     ]
     if compared.dofs:
-        parts += [_line(""), _rich(tables.worst_dofs_table(compared), "DOFs that differ most")]
+        parts += [_line(""), text_table(tables.worst_dofs_table(compared), "DOFs that differ most")]
     if compared.bands:
-        parts += [_line(""), _rich(tables.worst_bands_table(compared), "FRF bands that differ most")]
+        parts += [_line(""), text_table(tables.worst_bands_table(compared), "FRF bands that differ most")]
     return Group(*parts)
 
 
-def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
+def fit_table(fit: FitResult) -> RenderableType:
+    """Fitted parameters with their uncertainty, nominal values, and what the data say of each."""
+    source = _pick(tables.parameters_table(fit), (0, 1, 3, 4, 5))
+    source = _renamed(source, ("parameter", "fitted (±1σ)", "nominal (±1σ)", "shift", "data say"))
+    return Group(
+        text_table(source, "Parameters; shift: in tolerances"),
+        _line(f"error {plain(fit.error, 3)} over {fit.data_count} data, ε {plain(fit.frequency_error, 3)}"),
+    )
+
+
+def diagnosis_screen(
+    found: Diagnosis, out: str = "OUT", program: str = "ema", suspicions: Sequence[str] = ()
+) -> RenderableType:
     """Verdict, candidates, what cannot be told apart, what to measure and what to type next.
 
     Parameters
@@ -169,10 +184,18 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
     found : Diagnosis
     out : str
         Results folder as the user would type it.
+    program : str
+        The command ``ema`` as the user would type it.
+    suspicions : sequence of str
+        Sensors that cannot be right; they come first.
     """
-    parts: list[RenderableType] = [_heading(diagnosis.heading(found)), _line(found.summary)]
+    parts: list[RenderableType] = [_line(f"! {text}") for text in suspicions]
+    parts += [_heading(diagnosis.heading(found)), _line(found.summary)]
     if found.candidates:
-        parts += [_line(""), _rich(diagnosis_tables.short_candidates_table(found), "What may be missing")]
+        parts += [
+            _line(""),
+            text_table(diagnosis_tables.short_candidates_table(found), "What may be missing"),
+        ]
         parts.append(_line(_ERROR_WORDS))
     for text in diagnosis.reasons(found):
         parts += [_line(""), _line(text)]
@@ -181,16 +204,18 @@ def diagnosis_screen(found: Diagnosis, out: str = "OUT") -> RenderableType:
     if found.indistinguishable:
         parts += [_line(""), *(_line(f"! {text}") for text in diagnosis.group_words(found))]
     if found.localisation:
-        parts += [_line(""), _rich(diagnosis_tables.localisation_table(found), "Where the misfit sits")]
+        parts += [_line(""), text_table(diagnosis_tables.localisation_table(found), "Where the misfit sits")]
     if found.next_measurement:
         parts += [_line(""), _line(f"Measure next: {found.next_measurement}")]
     if shown := diagnosis.detection_words(found):
         parts += [_line(""), _line(shown)]
     if found.ladder.scatters:
-        parts += [_line(""), _rich(diagnosis_tables.scatter_table(found.ladder), "Scatter, 1 σ")]
+        parts += [_line(""), text_table(diagnosis_tables.scatter_table(found.ladder), "Scatter, 1 σ")]
     if found.notes:
         parts += [_line(""), _line("Remarks on the data:"), *(_line(f"! {n}") for n in found.notes)]
-    parts += _commands(diagnosis.next_commands(found, out))
+    if not suspicions:
+        commands = diagnosis.next_commands(found, out)
+        parts += _commands([c.replace("ema ", f"{shlex.quote(program)} ", 1) for c in commands])
     return Group(*parts)
 
 
@@ -201,41 +226,12 @@ def ladder_screen(ladder: Ladder) -> RenderableType:
     if diagnosis.of_modes(ladder):
         told.insert(0, "left: measured modes that the model does not explain")
     parts: list[RenderableType] = [
-        _rich(_renamed(diagnosis_tables.ladder_table(ladder), heads), "Ladder of models"),
+        text_table(_renamed(diagnosis_tables.ladder_table(ladder), heads), "Ladder of models"),
         _line("; ".join([_ERROR_WORDS, *told])),
         _line(diagnosis.noise_words(ladder)),
     ]
     if ladder.note:
         parts.append(_line(f"No further effect is added: {ladder.note}."))
-    return Group(*parts)
-
-
-def run_summary(results: RunResults, out: str = "OUT") -> RenderableType:
-    """The run in a few sentences: findings, stiffnesses, what to be careful about, and what to type next.
-
-    Parameters
-    ----------
-    results : RunResults
-    out : str
-        Results folder as the user would type it.
-    """
-    parts: list[RenderableType] = [_line(line) for line in summary.findings(results)]
-    if results.fit is not None:
-        parts += [
-            _line(
-                f"{words(p.name)} = {format_value(p.value, p.std, p.unit)}, "
-                f"{summary.identified_words(p, results.fit)}"
-            )
-            for p in summary.stiffnesses(results.fit)
-        ]
-    cautions = summary.cautions(results)
-    if cautions:
-        parts += [_line(""), _line("Be careful about:"), *(_line(f"! {c}") for c in cautions)]
-    if results.diagnosis is not None:
-        added = (
-            results.ladder.rungs[-1].effects if results.ladder is not None and results.ladder.rungs else ()
-        )
-        parts += _commands(diagnosis.next_commands(results.diagnosis, out, added))
     return Group(*parts)
 
 
@@ -250,11 +246,15 @@ class Safe:
         self._build = build
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
-        unicode_console = (console.encoding or "").lower().replace("-", "").startswith("utf")
-        clean = str if unicode_console else _to_ascii
+        clean = console_text(console)
         rigid = self._build(clean, True)
         needed = Measurement.get(console, options.update(max_width=10_000), rigid).minimum
         yield rigid if needed <= options.max_width else self._build(clean, False)
+
+
+def console_text(console: Console) -> Clean:
+    """The function that makes text fit for a console: it replaces what an ASCII one cannot show."""
+    return str if (console.encoding or "").lower().replace("-", "").startswith("utf") else _to_ascii
 
 
 def _to_ascii(text: str) -> str:
@@ -289,17 +289,21 @@ def _renamed(source: tables.Table, head: tuple[str, ...]) -> tables.Table:
     return tables.Table(head, source.rows, source.numeric)
 
 
-def _rich(source: tables.Table, title: str) -> Safe:
-    return Safe(lambda clean, rigid: _build(source, title, clean, rigid))
+def text_table(source: tables.Table, title: str) -> Safe:
+    """A table for the terminal, or for any other place with letters of one width."""
+    return Safe(lambda clean, rigid: build_table(source, title, clean, rigid))
 
 
-def _build(source: tables.Table, title: str, clean: Clean, rigid: bool) -> RichTable:
+def build_table(
+    source: tables.Table, title: str, clean: Clean, rigid: bool, *, ruled: bool = True
+) -> RichTable:
+    """A table for rich; `rigid` keeps numbers whole, `ruled` draws a line under the head."""
     # a column of remarks that nobody made is only noise
     kept = [k for k in range(len(source.head)) if not source.rows or any(r.cells[k] for r in source.rows)]
     table = RichTable(
         title=Text(clean(title), style="bold") if title else None,
         title_justify="left",
-        box=box.SIMPLE_HEAD,
+        box=box.SIMPLE_HEAD if ruled else None,
         safe_box=True,
         show_edge=False,
         pad_edge=False,

@@ -26,7 +26,8 @@ from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.observations.fitting import Model
-from ema_pipeline.observations.modes import ModeObservations, prepare
+from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.report.style import GREY, LINES, SERIES, log_y, margins, new_figure, styled
 from ema_pipeline.reproduce.backlash import (
     PRELOAD_M,

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
+from ema_pipeline.fit.isolator import HYSTERESIS_STIFFNESS, identify_isolator
 from ema_pipeline.loops.closed_form import damping_from_energies
 from ema_pipeline.loops.extract import measure_loop
-from ema_pipeline.loops.figures import isolator_figures
-from ema_pipeline.loops.identify import HYSTERESIS_STIFFNESS, identify_isolator
 from ema_pipeline.loops.model import FORCE, RHO, STIFFNESS, UNITS, loop_force
 from ema_pipeline.loops.simulate import PRINTED, simulate_sine_test
 from ema_pipeline.loops.types import IsolatorResult
+from ema_pipeline.report.figures.loops import isolator_figures
 from ema_pipeline.report.style import (
     LINES,
     MARKERS,

@@ -55,6 +55,8 @@ class ParametricRig:
         See `Rig.classify`.
     modal_damping_scatter : float
         Standard deviation (1 σ) of ln ζ from mode to mode.
+    stiffness_steps : tuple of (str, str)
+        Configuration and stiffness of every step of a fit by frequencies alone, one after the other; empty without one.
     """
 
     name: str
@@ -64,6 +66,7 @@ class ParametricRig:
     uses: Callable[[str, str], bool] = uses_everything
     classifier: Classify = classify_plain
     modal_damping_scatter: float = MODAL_DAMPING_SCATTER
+    stiffness_steps: tuple[tuple[str, str], ...] = ()
 
     def used(self, configuration: str) -> tuple[str, ...]:
         """Names of the parameters that this configuration depends on."""

@@ -33,7 +33,8 @@ class ElementEntry(Settings):
     at: str | None = Field(None, description="DOF, to ground: 'plate.x'")
     between: tuple[str, str] | None = Field(None, description="two DOFs: ['plate.x', 'base.x']")
     row: dict[str, float] | None = Field(None, description="coefficients of the stretch over DOFs")
-    value: float | str = Field(description="number in SI, or the name of a parameter")
+    value: float | str = Field(description="number, or the name of a parameter")
+    unit: str | None = Field(None, description="unit of a number in `value`; SI where left out")
     configurations: tuple[str, ...] = Field((), description="only in these configurations; all if empty")
 
     _flat_row = field_validator("row", mode="before")(_flat)

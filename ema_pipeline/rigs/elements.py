@@ -32,6 +32,7 @@ from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.element_entries import ElementEntry, ElementRigFile, NonlinearEntry
 from ema_pipeline.rigs.entries import Mistake, merged
 from ema_pipeline.rigs.types import Parameter, Rig
+from ema_pipeline.rigs.units import UNITS_OF, factor_to
 from ema_pipeline.toml_lines import Location
 
 
@@ -43,11 +44,12 @@ def rig_from_elements(file: ElementRigFile) -> Rig:
     Mistake
         For whatever makes no sense.
     """
-    parameters: dict[str, Parameter] = {}
+    file, parameters = _in_si(file), {}
     for name, entry in file.parameters.items():
         if entry.value is None:
             raise Mistake(("parameters", name), f"parameter '{name}' has no value; add value = …")
-        parameters[name] = merged(Parameter(name, entry.value, entry.unit or "1"), entry)
+        unit = _unit_of(file, name, entry.unit)
+        parameters[name] = merged(Parameter(name, entry.value, unit), entry)
     if "modal_damping_ratio" not in parameters:
         parameters["modal_damping_ratio"] = Parameter(
             "modal_damping_ratio", file.modal_damping_ratio, "1", 0.3, 0.0, 0.5
@@ -73,6 +75,61 @@ def rig_from_elements(file: ElementRigFile) -> Rig:
         except EmaError as error:
             raise Mistake(_suspect(file, parameters, str(error)), str(error)) from None
     return rig
+
+
+def _in_si(file: ElementRigFile) -> ElementRigFile:
+    """The file with the numbers of elements that state a unit in SI."""
+    sections: dict[str, list[ElementEntry]] = {}
+    for (section, *index), entry in file.entries():
+        if entry.unit is not None:
+            if isinstance(entry.value, str):
+                said = f"value is the parameter '{entry.value}', whose own unit counts; drop unit"
+                raise Mistake((section, *index, "unit"), said)
+            units = _units_of(str(section), "value", entry)
+            factor = next((f for u in units if (f := factor_to(entry.unit, u))), None)
+            if factor is None:
+                said = f"unit '{entry.unit}' is not one of {' or '.join(units)} or their multiples"
+                raise Mistake((section, *index, "unit"), said)
+            entry = entry.model_copy(update={"value": factor * entry.value, "unit": None})
+        sections.setdefault(str(section), []).append(entry)
+    return file.model_copy(update={name: tuple(entries) for name, entries in sections.items()})
+
+
+def _unit_of(file: ElementRigFile, name: str, given: str | None) -> str:
+    """The SI unit of a parameter, from the elements that use it; as stated where none does.
+
+    Raises
+    ------
+    Mistake
+        Where the stated unit has another dimension than what an element takes.
+    """
+    uses = [
+        (str(where[0]), units)
+        for where, entry in file.entries()
+        for key, number in entry.numbers.items()
+        if number == name and (units := _units_of(str(where[0]), key, entry))
+    ]
+    if given is None or not uses:
+        return given or "1"
+    kept = uses[0][1]
+    for section, units in uses:
+        kept = tuple(u for u in kept if u in units and factor_to(given, u))
+        if not kept:
+            said = f"parameter '{name}' has unit '{given}', but [[{section}]] takes {' or '.join(units)}"
+            raise Mistake(("parameters", name, "unit"), f"{said}, or multiples of these")
+    return given if factor_to(given, kept[0]) == 1.0 else kept[0]
+
+
+def _units_of(section: str, key: str, entry: ElementEntry) -> tuple[str, ...]:
+    """SI units of one number of an element; none for a number without a dimension."""
+    law = entry.law if isinstance(entry, NonlinearEntry) else section
+    units = UNITS_OF.get(law if key == "value" else key, ())
+    dofs = [d for d in (entry.at, *(entry.between or ()), *(entry.row or ())) if d]
+    return units[:1] if all(d.rpartition(".")[2] in ALONG for d in dofs) else units
+
+
+ALONG = ("x", "y", "z")
+"""Directions that are no angles; any other may be one."""
 
 
 def _check_names(file: ElementRigFile) -> None:

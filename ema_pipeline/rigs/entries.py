@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.rigs.types import Parameter
+from ema_pipeline.rigs.units import factor_to
 from ema_pipeline.settings import Settings, parse
 from ema_pipeline.toml_lines import Location
 
@@ -30,7 +30,7 @@ class ParameterEntry(Settings):
     model_config = ConfigDict(strict=True)
 
     value: float | None = Field(None, description="nominal value in `unit`")
-    unit: str | None = Field(None, description="unit, checked against the one that the rig works in")
+    unit: str | None = Field(None, description="unit of value, min and max; converted to the rig's")
     tolerance: float | None = Field(
         None, ge=0, description="relative standard deviation of the nominal value"
     )
@@ -78,12 +78,14 @@ def merged(default: Parameter, given: ParameterEntry) -> Parameter:
     name = default.name
     here: Location = ("parameters", name)
     unit = "" if default.unit == "1" else f" {default.unit}"
-    if given.unit is not None and _plain_unit(given.unit) != _plain_unit(default.unit):
-        raise Mistake(
-            (*here, "unit"),
-            f"parameter '{name}' has unit '{given.unit}', the rig works in '{default.unit}'; "
-            f"convert the value to {default.unit}",
-        )
+    factor = 1.0
+    if given.unit is not None:
+        factor = factor_to(given.unit, default.unit) or 0.0
+        if not factor:
+            raise Mistake(
+                (*here, "unit"),
+                f"parameter '{name}' has unit '{given.unit}', which is not one of '{default.unit}' or its multiples",
+            )
     if given.tolerance is not None and given.tolerance > LARGEST_TOLERANCE:
         raise Mistake(
             (*here, "tolerance"),
@@ -93,11 +95,11 @@ def merged(default: Parameter, given: ParameterEntry) -> Parameter:
     free = given.free if given.free is not None else default.free and given.tolerance is None
     result = Parameter(
         name=name,
-        value=default.value if given.value is None else given.value,
+        value=default.value if given.value is None else factor * given.value,
         unit=default.unit,
         tolerance=default.tolerance if given.tolerance is None else given.tolerance,
-        minimum=default.minimum if given.min is None else given.min,
-        maximum=default.maximum if given.max is None else given.max,
+        minimum=default.minimum if given.min is None else factor * given.min,
+        maximum=default.maximum if given.max is None else factor * given.max,
         free=free,
         scatter=default.scatter if given.scatter is None else given.scatter,
     )
@@ -116,9 +118,3 @@ def merged(default: Parameter, given: ParameterEntry) -> Parameter:
     if default.unit == "kg" and result.value <= 0:
         raise Mistake((*here, "value"), f"parameter '{name}' = {result.value:g}{unit}: give a mass above 0")
     return result
-
-
-def _plain_unit(unit: str) -> str:
-    """Units as people type them: N·s/m = N*s/m = Ns/m, deg = °, 1 = '' = '-'."""
-    plain = re.sub(r"[\s·*.]", "", unit)
-    return {"°": "deg", "degree": "deg", "degrees": "deg", "": "1", "-": "1"}.get(plain, plain)

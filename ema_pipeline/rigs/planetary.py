@@ -24,6 +24,7 @@ from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.rigs.base import Families, ParametricRig, RigKind, check_count
 from ema_pipeline.rigs.types import Parameter
 
+SUN_PLANET, RING_PLANET = "sun_planet_mesh_stiffness", "ring_planet_mesh_stiffness"
 CONFIGURATIONS = ("no_ring", "with_ring")
 CENTRAL = ("carrier", "ring", "sun")
 
@@ -105,6 +106,7 @@ def planetary(planets: int = 2, parameters: Mapping[str, Parameter] | None = Non
         build=partial(_build, planets),
         uses=_uses,
         classifier=partial(classify, planets),
+        stiffness_steps=(("no_ring", SUN_PLANET), ("with_ring", RING_PLANET)),
     )
 
 

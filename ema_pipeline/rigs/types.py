@@ -93,6 +93,11 @@ class Rig(Protocol):
         """Standard deviation (1 σ) of ln ζ from mode to mode."""
         ...
 
+    @property
+    def stiffness_steps(self) -> tuple[tuple[str, str], ...]:
+        """Configuration and stiffness of every step of a fit by frequencies alone; empty without such a route."""
+        ...
+
     def used(self, configuration: str) -> tuple[str, ...]:
         """Names of the parameters that this configuration depends on."""
         ...

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from ema_pipeline import __version__, codec
 from ema_pipeline.effects.base import Effect
@@ -83,6 +83,8 @@ class Run:
     named_files : frozenset of str
         Those of them that the user has named in this call: only their code may run, as the results folder may
         come from somebody else.
+    built_rig : Rig or None
+        A rig built in Python, which takes the place of that of `info`.
     """
 
     store: Store
@@ -90,6 +92,7 @@ class Run:
     settings: Mapping[str, Settings]
     effect_files: tuple[str, ...] = ()
     named_files: frozenset[str] = frozenset()
+    built_rig: Rig | None = None
 
     @cached_property
     def library(self) -> dict[str, Effect]:
@@ -107,7 +110,7 @@ class Run:
                     f"{self.info.effect_hashes.get(path, 'unknown')[:12]}; code runs only if you name it: "
                     f"look at it, then add --effect-file {path}"
                 )
-        return effect_library(self.effect_files)
+        return effect_library(self.effect_files, self.rig)
 
     def effect_hashes(self) -> str:
         """Fingerprint of the files with the user's own effects."""
@@ -115,6 +118,11 @@ class Run:
             file_hash(Path(path)) if path in self.named_files else self.info.effect_hashes.get(path, "")
             for path in self.effect_files
         )
+
+    @cached_property
+    def memory(self) -> dict[tuple[str, str], Any]:
+        """Small results that several stages ask for, by name and key of what they were made of."""
+        return {}
 
     @cached_property
     def model(self) -> Rig | None:
@@ -126,6 +134,8 @@ class Run:
     @cached_property
     def rig(self) -> Rig | None:
         """The rig without added effects, None for a modal analysis without a model."""
+        if self.built_rig is not None:
+            return self.built_rig
         if not self.info.rig:
             return None
         if "\n" in self.info.rig:
@@ -196,11 +206,12 @@ def file_hash(path: Path) -> str:
 
 @cache
 def code_fingerprint() -> str:
-    """Hash of the package's source, so that a changed program does not trust old results."""
+    """Hash of the package's source and its pages' templates, so that a changed program does not trust old results."""
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
-    for path in sorted(root.rglob("*.py")):
-        digest.update(path.read_bytes())
+    for path in sorted(root.rglob("*")):
+        if path.suffix in (".py", ".j2", ".js"):
+            digest.update(path.read_bytes())
     return digest.hexdigest()
 
 

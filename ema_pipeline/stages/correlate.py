@@ -1,7 +1,8 @@
-"""Modes and fitted model → pairs, and where the two part."""
+"""Modes and fitted model → pairs, and where the two differ."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.correlate.types import Comparison, Pairing
@@ -10,6 +11,7 @@ from ema_pipeline.rigs.types import Rig
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.modes import measured_frfs, measured_modes
 from ema_pipeline.store import ALL
+from ema_pipeline.verdict import Verdict
 
 if TYPE_CHECKING:
     from ema_pipeline.fit.parameters import FittedModes
@@ -28,18 +30,36 @@ def inputs(run: Run, configuration: str) -> str:
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
-    """Pair the modes at the fitted parameters, then compare modes, shapes and FRFs."""
-    from ema_pipeline.stages.models import fitted_modes
+    """Pair the modes at the fitted parameters, then compare modes, shapes and FRFs; so for the base model's modes."""
+    from ema_pipeline.fit.parameters import restored
+    from ema_pipeline.observations.fitting import Model
+    from ema_pipeline.stages.models import base_unknowns, known_model, mode_observations
 
-    fitted = fitted_modes(run, run.store.load("fit", ALL, "fit", FitResult))
+    fit, observations = run.store.load("fit", ALL, "fit", FitResult), mode_observations(run)
+    fitted = restored(observations, known_model(run), fit)
     pairings, comparison = correlate(run, run.require_model(NAME), fitted)
-    return {f"pairing {name}": p for name, p in pairings.items()} | {"comparison": comparison}
+    results: dict[str, object] = {f"pairing {name}": p for name, p in pairings.items()}
+    if fitted.fit.model.effects and run.rig is not None:
+        base = restored(observations, Model(), replace(fit, unknowns=base_unknowns(run)))
+        results["comparison_base"] = correlate(run, run.rig, base, with_frfs=False)[1]
+    return results | {"comparison": comparison, "sensitivities": _suspected(run, fitted)}
 
 
-def correlate(run: Run, rig: Rig, fitted: FittedModes) -> tuple[dict[str, Pairing], Comparison]:
+def _suspected(run: Run, fitted: FittedModes) -> tuple[Verdict, ...]:
+    """Sensitivities that neither the nominal nor the fitted model can explain."""
+    from ema_pipeline.fit.sensitivities import suspected_sensitivities
+
+    model, frfs = run.require_model(NAME), measured_frfs(run)
+    systems = {name: (model.system(name), fitted.system(name)) for name in frfs}
+    return suspected_sensitivities(frfs, systems)
+
+
+def correlate(
+    run: Run, rig: Rig, fitted: FittedModes, with_frfs: bool = True
+) -> tuple[dict[str, Pairing], Comparison]:
     """Pair the measured modes with those of a fitted model, and compare the two."""
-    from ema_pipeline.correlate.compare import compare
     from ema_pipeline.correlate.pairing import pair_system
+    from ema_pipeline.fit.comparison import compare
 
     settings = cast("CorrelateSettings", run.settings[NAME])
     measured = measured_modes(run)
@@ -47,4 +67,6 @@ def correlate(run: Run, rig: Rig, fitted: FittedModes) -> tuple[dict[str, Pairin
         name: pair_system(rig, fitted.system(name), modes, settings.pairing)
         for name, modes in measured.items()
     }
-    return pairings, compare(fitted, measured, measured_frfs(run), pairings, settings.compare)
+    return pairings, compare(
+        fitted, measured, measured_frfs(run) if with_frfs else None, pairings, settings.compare
+    )

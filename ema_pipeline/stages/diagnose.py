@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, cast
 
-from ema_pipeline.correlate.types import Comparison
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.effects.rig import rig_with_effects
@@ -14,6 +13,7 @@ from ema_pipeline.stages import loop_ladder
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.correlate import correlate
 from ema_pipeline.stages.levels import level_studies
+from ema_pipeline.stages.modes import modes_key
 
 if TYPE_CHECKING:
     from ema_pipeline.diagnose.types import Diagnosis
@@ -35,10 +35,14 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     if run.info.kind == "hysteresis":
         return loop_ladder.diagnose_run(run, progress)
     found = _diagnosed(run, progress)
-    results: dict[str, object] = {"diagnosis": found, "on_top_of": run.info.effects}
+    results: dict[str, object] = {
+        "diagnosis": found,
+        "on_top_of": run.info.effects,
+        "modes_key": modes_key(run),
+    }
     top = found.ladder.rungs[-1]
     if top.effects and not any(depends_on_level(x, run.library) for x in top.effects):
-        results["comparison_after"] = _compared_with(run, top.effects)
+        results |= _compared_with(run, top.effects, top.unknowns)
     return results
 
 
@@ -69,15 +73,18 @@ def _level_summaries(run: Run) -> tuple[str, ...]:
     return tuple(s.summary for s in level_studies(run).values() if s.level_dependent)
 
 
-def _compared_with(run: Run, labels: Sequence[str]) -> Comparison:
-    """Where model and measurement part once these effects are in the model."""
-    from ema_pipeline.fit.parameters import fit_modes
+def _compared_with(run: Run, labels: Sequence[str], unknowns: Mapping[str, float]) -> dict[str, object]:
+    """Where model and measurement differ once these effects are in the model, and that model."""
+    from ema_pipeline.fit.parameters import deviations_of, fit_modes
     from ema_pipeline.stages.models import mode_observations, model_with
 
     assert run.rig is not None
     mended = rig_with_effects(run.rig, labels, run.library)
-    fitted = fit_modes(mode_observations(run), model_with(run, mended, labels))
-    return correlate(run, mended, fitted)[1]
+    fitted = fit_modes(mode_observations(run), model_with(run, mended, labels), start=unknowns or None)
+    systems = {f"system after {name}": fitted.system(name) for name in run.info.configurations}
+    systems |= {f"like parts {name}": fitted.system_of_like_parts(name) for name in run.info.configurations}
+    moved = deviations_of(fitted.fit)
+    return {"comparison_after": correlate(run, mended, fitted)[1], "deviations after": moved, **systems}
 
 
 def failed_checks(run: Run) -> tuple[str, ...]:

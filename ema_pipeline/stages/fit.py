@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
 
-from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.types import FitResult, ParameterEstimate
 from ema_pipeline.stages.base import Progress, Run
-from ema_pipeline.stages.modes import measured_modes
+from ema_pipeline.stages.modes import measured_modes, modes_key
 from ema_pipeline.store import ALL
 
 NAME = "fit"
@@ -25,30 +26,44 @@ def inputs(run: Run, configuration: str) -> str:
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
-    """Fit all parameters to all configurations at once."""
-    from ema_pipeline.fit.parameters import fit_modes, fit_result
-    from ema_pipeline.stages.models import known_model, mode_observations
+    """Fit all parameters to all configurations at once, and the base model beside the one with added effects."""
+    from ema_pipeline.fit.parameters import deviations_of, fit_modes, fit_result
+    from ema_pipeline.observations.fitting import Model
+    from ema_pipeline.stages.models import (
+        diagnosed_scatters,
+        earlier_unknowns,
+        known_model,
+        mode_observations,
+        rung_unknowns,
+    )
     from ema_pipeline.threads import single_blas_thread
 
     settings = cast(FitSettings, run.settings[NAME])
     rig = run.require_model(NAME)
     with single_blas_thread():
-        fitted = fit_modes(mode_observations(run), known_model(run), _scatters(run))
+        observations, model, told = mode_observations(run), known_model(run), diagnosed_scatters(run)
+        scatters = {name: told[name] for name in observations.scatters if name in told} or None
+        ladder = run.store.find("ladder", ALL, "ladder", Ladder)
+
+        def begun(effects: Sequence[str]) -> dict[str, float] | None:
+            return rung_unknowns(ladder, effects) or earlier_unknowns(run, effects) or None
+
+        base = fitted = fit_modes(observations, model, scatters, begun(run.info.effects))
+        if model.effects:
+            base = fit_modes(observations, Model(), fitted.posterior.scatters, begun(()))
         progress(0.6, "error function")
         found = fit_result(fitted, rig, measured_modes(run), settings)
-    ladder = run.store.find("ladder", ALL, "ladder", Ladder)
-    return {"fit": found if ladder is None else _with_sizes(found, ladder)}
-
-
-def _scatters(run: Run) -> dict[str, float] | None:
-    """The scatters at which the diagnosis compares models, so that an error is the same wherever it stands."""
-    from ema_pipeline.stages.models import mode_observations
-
-    found = run.store.find("diagnose", ALL, "diagnosis", Diagnosis)
-    if found is None or not found.ladder.scatters:
-        return None
-    own = mode_observations(run).scatters
-    return {s.name: s.learned for s in found.ladder.scatters if s.name in own}
+    return {
+        "fit": found if ladder is None else _with_sizes(found, ladder),
+        "base_unknowns": base.fit.unknowns,
+        "deviations": deviations_of(fitted.fit),
+        "base deviations": deviations_of(base.fit),
+        "modes_key": modes_key(run),
+        **{f"like parts {name}": fitted.system_of_like_parts(name) for name in run.info.configurations},
+        **{f"base like parts {name}": base.system_of_like_parts(name) for name in run.info.configurations},
+        **{f"system {name}": fitted.system(name) for name in run.info.configurations},
+        **{f"base system {name}": base.system(name) for name in run.info.configurations},
+    }
 
 
 def _with_sizes(found: FitResult, ladder: Ladder) -> FitResult:

@@ -13,7 +13,7 @@ from ema_pipeline import codec
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.records import Hit, HitSamples, Record, cut_hit
-from ema_pipeline.rows import StoredRows
+from ema_pipeline.lazy_samples import StoredSamples
 from ema_pipeline.stages.base import Progress, Run, silent
 from ema_pipeline.store import Store
 
@@ -70,7 +70,7 @@ class StoredRecords(Sequence[Record]):
         small = {
             f.name: codec.read(group, f.name, hints[f.name]) for f in fields(Record) if f.name != "responses"
         }
-        return Record(responses=StoredRows(codec.member(group, "responses")), **small)
+        return Record(responses=StoredSamples(codec.member(group, "responses")), **small)
 
 
 @contextlib.contextmanager

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import cast
 
-from ema_pipeline.ingest.description import TestDescription, read_campaign
+from ema_pipeline.ingest.description import ChannelDescription, TestDescription, read_campaign
 from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.load import load_records
-from ema_pipeline.ingest.records import Record
+from ema_pipeline.ingest.records import Record, Transducer
 from ema_pipeline.stages.base import Progress, Run, file_hash
 
 NAME = "ingest"
@@ -31,8 +31,22 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     return {
         "sources": file_hashes(test),
         "title": test.title,
+        "transducers": tuple(_transducer(c) for c in test.channels),
         "records": _with_progress(load_records(test, limits), len(test.records), progress),
     }
+
+
+def _transducer(channel: ChannelDescription) -> Transducer:
+    return Transducer(
+        channel.name,
+        channel.quantity,
+        channel.unit,
+        "" if channel.dof is None else str(channel.dof),
+        float("nan") if channel.sensitivity_mv is None else channel.sensitivity_mv,
+        channel.sensor_mass_kg,
+        channel.calibration_std,
+        channel.transverse,
+    )
 
 
 def _with_progress(records: Iterator[Record], count: int, progress: Progress) -> Iterator[Record]:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
 from ema_pipeline.stages import loop_ladder
 from ema_pipeline.stages.base import Progress, Run
-
-if TYPE_CHECKING:
-    from ema_pipeline.diagnose.types import Ladder
+from ema_pipeline.stages.models import diagnosed_scatters, earlier_unknowns
 
 NAME = "ladder"
 NEEDS = ("modal",)
@@ -43,7 +40,8 @@ def _measured(run: Run) -> Ladder:
     EmaError
         For an effect that shows in hits at several levels only, where there are none.
     """
-    from ema_pipeline.diagnose.rungs import make_ladder
+    from ema_pipeline.diagnose.rungs import fits_of, ladder_of
+    from ema_pipeline.fit.parameters import begun_at
     from ema_pipeline.observations.fitting import Model
     from ema_pipeline.stages.amplitude import amplitude_observations
     from ema_pipeline.stages.models import mode_observations, model_with
@@ -59,5 +57,8 @@ def _measured(run: Run) -> Ladder:
     models = [Model()]
     for label in run.info.effects:
         models.append(model_with(run, run.require_model(NAME), [label], models[-1], hits is not None))
+    observations = hits or mode_observations(run)
     with single_blas_thread():
-        return make_ladder(hits or mode_observations(run), models)
+        known = earlier_unknowns(run, ())
+        fits = fits_of(observations, models, begun_at(observations, models[0], known) if known else None)
+        return ladder_of(observations, fits, diagnosed_scatters(run))

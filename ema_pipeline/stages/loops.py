@@ -22,7 +22,7 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Measure the loops and identify the isolator that makes them."""
-    from ema_pipeline.loops import analyse_loops
+    from ema_pipeline.fit.isolator import analyse_loops
 
     test = test_of(run, configuration)
     result = analyse_loops(test, cast(LoopSettings, run.settings[NAME]), progress)

@@ -21,7 +21,18 @@ def modes_of_structure(run: Run, configuration: str) -> ModalModel:
 
 def measured_modes(run: Run) -> dict[str, MeasuredModes]:
     """Measured modes of every configuration, as a linear structure."""
-    return {name: from_modal_model(modes_of_structure(run, name), name) for name in run.info.configurations}
+    at = ("measured modes", modes_key(run))
+    if at not in run.memory:
+        run.memory[at] = {
+            name: from_modal_model(modes_of_structure(run, name), name) for name in run.info.configurations
+        }
+    return dict(run.memory[at])
+
+
+def modes_key(run: Run) -> str:
+    """Key of the measured modes: an equal key means the same data."""
+    keys = [run.store.key(stage, c) for stage in ("modal", "levels") for c in run.info.configurations]
+    return " ".join(keys)
 
 
 def measured_frfs(run: Run) -> dict[str, FrfSet]:

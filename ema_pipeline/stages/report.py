@@ -1,12 +1,13 @@
-"""Everything found → summary.json, modes.csv, plots and report.html."""
+"""Everything found → summary.json, modes.csv, report.html and, on demand, plots."""
 
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import cast
 
 from ema_pipeline.report.settings import ReportSettings
-from ema_pipeline.stages.base import Progress, Run
+from ema_pipeline.stages.base import Progress, Run, silent
 from ema_pipeline.stages.loop_ladder import loops_of, models_of
 from ema_pipeline.stages.results import isolators, load_results
 
@@ -27,22 +28,40 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Write every file of the results folder but the store."""
     from ema_pipeline.report.html import write_report
     from ema_pipeline.report.loops import write_loops_report
-    from ema_pipeline.report.plots import write_plots
     from ema_pipeline.report.summary_files import write_modes_csv, write_summary
 
     settings = cast(ReportSettings, run.settings[NAME])
     folder = run.store.folder
-    if run.info.kind == "hysteresis":
-        found = isolators(run)
-        write_loops_report(found, load_results(run), loops_of(run), models_of(run), folder)
-        return {"files": OUTPUTS}
     results = load_results(run)
-    write_summary(results, folder / "summary.json")
-    write_modes_csv(results, folder / "modes.csv")
-
-    def drawn(number: int, count: int, name: str) -> None:
-        progress(0.95 * number / count, name)
-
-    plots = write_plots(results, folder / "plots", drawn) if settings.plots else None
-    write_report(results, folder / "report.html", plots, drawn)
+    if run.info.kind == "hysteresis":
+        write_loops_report(isolators(run), results, loops_of(run), models_of(run), folder)
+    else:
+        write_summary(results, folder / "summary.json")
+        write_modes_csv(results, folder / "modes.csv")
+        write_report(results, folder / "report.html")
+    if settings.plots:
+        draw(run, progress)
     return {"files": OUTPUTS}
+
+
+def draw(run: Run, progress: Progress = silent) -> Path:
+    """Draw every figure for print, as PNG and SVG, into the folder ``plots`` beside the store."""
+    folder = run.store.folder / "plots"
+    if run.info.kind == "hysteresis":
+        from ema_pipeline.report.loops import write_loops_plots
+
+        write_loops_plots(isolators(run), load_results(run), loops_of(run), models_of(run), folder)
+    else:
+        from ema_pipeline.report.plots import write_plots
+
+        write_plots(load_results(run), folder, lambda k, count, name: progress(0.95 * k / count, name))
+    return folder
+
+
+def paper(run: Run, progress: Progress = silent) -> Path:
+    """Write the report for print, ``report.pdf`` beside the store."""
+    from ema_pipeline.report.pdf import write_pdf
+
+    path = run.store.folder / "report.pdf"
+    write_pdf(load_results(run), path, lambda k, count, name: progress(0.95 * k / count, name))
+    return path

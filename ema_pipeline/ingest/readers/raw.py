@@ -64,11 +64,14 @@ class RawChannel:
         As the file spells it, None where it is silent, `FULL_SCALE` for integer WAV.
     dof : str or None
         Hint such as ``"12.z"``, for drafting a description only.
+    reference : str or None
+        The same of what drives the structure: where the hammer strikes.
     """
 
     samples: Samples
     unit: str | None = None
     dof: str | None = None
+    reference: str | None = None
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
         if rate is not None:
             rates.append(rate)
         channels[name] = RawChannel(
-            samples, clean_unit(header["ordinate_axis_units_lab"]), _dof(header, taken=name)
+            samples, clean_unit(header["ordinate_axis_units_lab"]), _dof(header, "rsp"), _dof(header, "ref")
         )
     if not channels:
         raise EmaError("holds no time histories (data set 58 with function type 1); export the time data")
@@ -198,12 +198,13 @@ def _name(header: dict[str, Any]) -> str:
     return entity + _node(header)
 
 
-def _node(header: dict[str, Any]) -> str:
-    direction = int(header["rsp_dir"])
+def _node(header: dict[str, Any], end: str = "rsp") -> str:
+    direction = int(header[f"{end}_dir"])
     letter = _DIRECTIONS.get(abs(direction), "s")
-    return ("-" if direction < 0 else "") + f"{int(header['rsp_node'])}.{letter}"
+    return ("-" if direction < 0 else "") + f"{int(header[f'{end}_node'])}.{letter}"
 
 
-def _dof(header: dict[str, Any], taken: str) -> str | None:
-    """Node and direction as a hint; None where the file does not use them."""
-    return _node(header) if int(header["rsp_node"]) > 0 and int(header["rsp_dir"]) != 0 else None
+def _dof(header: dict[str, Any], end: str) -> str | None:
+    """Node and direction of the response (``rsp``) or the reference (``ref``); None where the file has none."""
+    used = int(header[f"{end}_node"]) > 0 and int(header[f"{end}_dir"]) != 0
+    return _node(header, end) if used else None

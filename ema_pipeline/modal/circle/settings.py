@@ -22,13 +22,15 @@ class CircleSettings(Settings):
         le=10,
         description="lines used on either side of a mode, in half-power bandwidths",
     )
-    minimum_points: int = Field(default=7, ge=5, description="lines used at least, however narrow the mode")
+    minimum_points: int = Field(
+        default=7, ge=5, description="least number of lines used, however narrow the mode"
+    )
     remove_neighbours: bool = Field(
         default=True,
-        description="take the circles of the neighbouring modes in the same FRF off before the final fit",
+        description="subtract the circles of the neighbouring modes in the same FRF before the final fit",
     )
     flag_sigma: float = Field(
-        default=3.0, gt=0, description="combined standard deviations past which circle and mode disagree"
+        default=3.0, gt=0, description="combined standard deviations beyond which circle and mode disagree"
     )
     frequency_tolerance: float = Field(
         default=0.04,
@@ -39,13 +41,13 @@ class CircleSettings(Settings):
         default=0.04, ge=0, description="relative disagreement in damping always allowed"
     )
     peak_prominence_db: float = Field(
-        default=2.0, gt=0, description="engine 'circle': a peak of the mode indicator rises by so much, dB"
+        default=2.0, gt=0, description="method 'circle': least prominence of a peak of the mode indicator, dB"
     )
     maximum_damping_ratio: float = Field(
-        default=0.2, gt=0, lt=1, description="engine 'circle': modes damped more than this are left out"
+        default=0.2, gt=0, lt=1, description="method 'circle': modes with a larger damping ratio are left out"
     )
     maximum_residual: float = Field(
         default=0.2,
         gt=0,
-        description="engine 'circle': rms distance of points from the fitted circle over its radius, at most",
+        description="method 'circle': largest rms distance of points from the fitted circle over its radius",
     )

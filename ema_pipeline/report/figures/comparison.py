@@ -1,4 +1,4 @@
-"""Where model and measurement part: per mode, per DOF and per FRF band, in units of the uncertainty."""
+"""Where model and measurement differ: per mode, per DOF and per FRF band, in units of the uncertainty."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def all_modes(study: LevelStudy, modal: ModalModel) -> Figure:
                 colour, marker, _ = level_style(k)
                 ax.errorbar(
                     shift, row + 0.16 * (k - len(study.levels) / 2), xerr=std, fmt=marker, color=colour, ms=4,
-                    lw=1, capsize=2, label=f"{study.levels[k].force_n:.3g} N" if row == 0 else None,
+                    lw=1, capsize=2, label=f"{study.levels[k].label}" if row == 0 else None,
                 )  # fmt: skip
         ax.margins(x=0.08)
         ax.xaxis.set_major_locator(MaxNLocator(6))
@@ -86,7 +86,7 @@ def all_modes(study: LevelStudy, modal: ModalModel) -> Figure:
     axes[0].set_xlabel("change of frequency, half-widths ζf")
     axes[1].set_xlabel("change of damping ratio, %")
     figure.suptitle(
-        f"Change from {study.levels[0].force_n:.3g} N (±1σ; ! moves beyond chance)",
+        f"Change from {study.levels[0].label} (±1σ; ! moves beyond chance)",
         y=1 - 0.1 / height, fontsize=9, fontweight="bold",
     )  # fmt: skip
     handles, labels = axes[0].get_legend_handles_labels()
@@ -202,7 +202,7 @@ def _frfs(left: Axes, right: Axes, study: LevelStudy, modal: ModalModel, mode: M
         acceleration = f.accelerance(lines)[o, i]
         mobility = acceleration / (2j * np.pi * f.frequency_hz[lines])
         colour, marker, line = level_style(k)
-        label = f"{level.force_n:.3g} N"
+        label = f"{level.label}"
         left.plot(
             f.frequency_hz[lines],
             np.abs(acceleration),

@@ -8,9 +8,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ema_pipeline.frf.overview import cmif
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.report.figures.frf import accelerance_unit, cmif
+from ema_pipeline.report.figures.frf import accelerance_unit
 from ema_pipeline.report.style import (
     BLUE,
     GREY,

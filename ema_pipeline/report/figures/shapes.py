@@ -12,6 +12,7 @@ from matplotlib.patches import Polygon
 from matplotlib.transforms import Affine2D
 
 from ema_pipeline.report.planetary import (
+    FILLS,
     GearLayout,
     Motion,
     displaced,
@@ -26,7 +27,6 @@ from ema_pipeline.report.style import GREY, MEASURED, MODEL, margins, new_figure
 
 GEAR_MODES_PER_SHEET = 4
 STEM_MODES_PER_SHEET = 4
-FILLS = {"carrier": "#f2d8c0", "ring": "#dcdcdc", "sun": "#f6ecb0", "planet": "#cfe3f1"}
 _DOF_LABELS_UP_TO = 34
 
 

@@ -43,7 +43,7 @@ def one_level(study: LevelStudy, modal: ModalModel) -> str:
         "To know more, strike every point at two or three forces, each at least twice the last, and two or more "
         "times at each."
     )
-    about = f"All hits are about as hard ({study.levels[0].force_n:.3g} N)"
+    about = f"All hits are about as hard ({study.levels[0].label})"
     moving = [m for m in study.modes if m.depends]
     tested = [m for m in study.modes if np.isfinite(m.frequency_p)]
     if moving:
@@ -91,8 +91,8 @@ def several_levels(study: LevelStudy, modal: ModalModel, settings: LevelSettings
 
 def forces_text(study: LevelStudy) -> str:
     """``"30, 100 and 300 N"``."""
-    forces = [f"{level.force_n:.3g}" for level in study.levels]
-    return f"{', '.join(forces[:-1])} and {forces[-1]} N" if len(forces) > 1 else f"{forces[0]} N"
+    forces, unit = [f"{level.force_n:.3g}" for level in study.levels], study.levels[0].unit
+    return f"{', '.join(forces[:-1])} and {forces[-1]} {unit}" if len(forces) > 1 else f"{forces[0]} {unit}"
 
 
 def move_text(study: LevelStudy, mode: ModeLevels) -> str:
@@ -118,7 +118,7 @@ def move_text(study: LevelStudy, mode: ModeLevels) -> str:
         parts.append(f"size in the FRFs {word} with {_cause(study)}{_arrow(ends, 1)}")
     if not parts:
         return ""
-    span = f" from {study.levels[0].force_n:.3g} to {study.levels[-1].force_n:.3g} N"
+    span = f" from {study.levels[0].force_n:.3g} to {study.levels[-1].label}"
     return ", ".join(parts) + (span if len(study.levels) > 1 else "")
 
 
@@ -192,4 +192,4 @@ def _only_hard(study: LevelStudy, mode: ModeLevels) -> str:
         return ""
     if not len(seen):
         return "not found at any force level alone: likely made by mixing levels"
-    return f"not found in hits softer than {study.levels[seen[0]].force_n:.3g} N: weak, or made by the nonlinearity"
+    return f"not found in hits softer than {study.levels[seen[0]].label}: weak, or made by the nonlinearity"

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Real = NDArray[np.float64]
 
 
-class Rows(ABC):
+class LazySamples(ABC):
     """Samples of several channels, (n_rows, n_samples), that are read where they are sliced.
 
     ``rows[k]``, ``rows[k, a:b]``, ``rows[2:4]`` and ``numpy.asarray(rows)`` give arrays, as those of an array
@@ -55,17 +55,17 @@ class Rows(ABC):
         return np.asarray(self[:], dtype=dtype)
 
 
-class CutRows(Rows):
+class CutSamples(LazySamples):
     """Some rows of a table, from one sample to another.
 
     Parameters
     ----------
-    whole : Rows or ndarray, (n_rows, n_samples)
+    whole : LazySamples or ndarray, (n_rows, n_samples)
     keep : list of int
     start, stop : int
     """
 
-    def __init__(self, whole: Rows | Real, keep: list[int], start: int, stop: int) -> None:
+    def __init__(self, whole: LazySamples | Real, keep: list[int], start: int, stop: int) -> None:
         self._whole, self._keep, self._start = whole, keep, start
         self.shape = (len(keep), min(stop, whole.shape[1]) - start)
 
@@ -74,7 +74,7 @@ class CutRows(Rows):
         return np.asarray(self._whole[self._keep[row], self._start + start : self._start + stop])
 
 
-class StoredRows(Rows):
+class StoredSamples(LazySamples):
     """A two-dimensional dataset of an HDF5 file; once the file is closed, each read opens it again.
 
     Parameters

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Posterior, anneal, descend, learn
+from ema_pipeline.ingest.description import TestDescription
 from ema_pipeline.loops.closed_form import bouc_wen_steps, closed_form, energy_lines, hysteresis_force
 from ema_pipeline.loops.compare import loop_fits
 from ema_pipeline.loops.model import (
@@ -25,6 +26,7 @@ from ema_pipeline.loops.model import (
     STIFFNESS,
     UNITS,
 )
+from ema_pipeline.loops.read import load_loops
 from ema_pipeline.loops.sentences import failures
 from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.loops.types import Estimate, IsolatorResult, Loop, LoopFit, LossFactor
@@ -42,6 +44,24 @@ _REASONS = {
     DAMPING: "a negative damper cannot be: the loss falls with frequency (relaxation), or friction with rate",
     RELAXATION: "a negative relaxation cannot be: the loss does not fall as a Maxwell branch's does",
 }
+
+
+def analyse_loops(
+    test: TestDescription,
+    settings: LoopSettings | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> IsolatorResult:
+    """Read all records of a hysteresis test and identify the isolator.
+
+    Raises
+    ------
+    EmaError
+        Names file, channel or record and what is wrong with it.
+    """
+    tell = progress or (lambda share, text: None)
+    loops = load_loops(test, settings)
+    tell(0.3, "the published model on all loops")
+    return identify_isolator(loops, settings)
 
 
 def identify_isolator(loops: Sequence[Loop], settings: LoopSettings | None = None) -> IsolatorResult:

@@ -1,4 +1,4 @@
-"""Where model and measurement part: by mode, DOF and band, in units of the uncertainty."""
+"""Where model and measurement differ: by mode, DOF and band, in units of the uncertainty."""
 
 from __future__ import annotations
 

@@ -1,0 +1,66 @@
+"""How probable every hypothesis is, and how much evidence one of them needs among so many."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.naming import named
+from ema_pipeline.diagnose.ranking import Ranking
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+
+NOTHING = "nothing"
+
+
+def weight(hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
+    """Prior weight of a hypothesis among the others."""
+    return settings.generic_prior if hypothesis.generic else 1.0
+
+
+def null_prior(settings: DiagnoseSettings, found: int) -> float:
+    """Prior probability that nothing is missing beside `found` effects."""
+    return settings.further_null_prior if found else settings.null_prior
+
+
+def prior(
+    hypothesis: Hypothesis, hypotheses: Sequence[Hypothesis], settings: DiagnoseSettings, found: int
+) -> float:
+    """Prior probability of one among all hypotheses, beside `found` effects."""
+    total = sum(weight(h, settings) for h in hypotheses)
+    return (1 - null_prior(settings, found)) * weight(hypothesis, settings) / total
+
+
+def probabilities(
+    ranking: Ranking, hypotheses: Sequence[Hypothesis], settings: DiagnoseSettings, found: int
+) -> dict[str, float]:
+    """Probability of every ranked hypothesis by the name that is said, and of `NOTHING`; adds up to 1.
+
+    Parameters
+    ----------
+    ranking : Ranking
+    hypotheses : sequence of Hypothesis
+        All that were asked about, among which those that were not ranked have their share of the prior.
+    settings : DiagnoseSettings
+    found : int
+        Effects that were found before.
+    """
+    names = [named(r.hypothesis, r.fit) for r in ranking.ranked]
+    logs = [
+        r.gain + n.advantage + np.log(prior(r.hypothesis, hypotheses, settings, found))
+        for r, n in zip(ranking.ranked, names, strict=True)
+    ]
+    everything = np.array([*logs, np.log(null_prior(settings, found))])
+    shares = np.exp(everything - np.max(everything))
+    shares /= np.sum(shares)
+    told = {n.label: float(p) for n, p in zip(names, shares, strict=False)}
+    return told | {NOTHING: float(shares[-1])}
+
+
+def needed(
+    hypothesis: Hypothesis, hypotheses: Sequence[Hypothesis], settings: DiagnoseSettings, found: int
+) -> float:
+    """Log evidence that one hypothesis has to gain to be claimed where all others gain nothing."""
+    odds = null_prior(settings, found) / prior(hypothesis, hypotheses, settings, found)
+    return max(settings.claim, float(np.log((1 - settings.doubt) / settings.doubt * odds)))

@@ -1,0 +1,110 @@
+"""What is taken from a results folder: report, fitted rig, and FRFs, modes and shapes for other programs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.files import replace_file
+from ema_pipeline.fit.types import FitResult
+from ema_pipeline.pipeline import ShowStage, existing_run
+from ema_pipeline.report.limits import POOR_ERROR
+from ema_pipeline.stages.base import Run
+from ema_pipeline.store import ALL, Store
+
+
+def report_path(out: Path) -> Path:
+    """The report of a results folder.
+
+    Raises
+    ------
+    EmaError
+        If there is none.
+    """
+    path = Store.existing(out).folder / "report.html"
+    if not path.is_file():
+        raise EmaError(f"{path}: there is no report yet; write it with 'ema report {out}'")
+    return path.resolve()
+
+
+def save_rig(run: Run, file: Path) -> None:
+    """Write the fitted model of a run as a rig file.
+
+    Raises
+    ------
+    EmaError
+        If nothing has been fitted yet, the file exists already, or it cannot be written.
+    """
+    from ema_pipeline.fit.saved_rig import saved_rig
+
+    fit = run.store.load("fit", ALL, "fit", FitResult)
+    if file.exists():
+        raise EmaError(f"{file}: exists already and is kept; name another file")
+    heads = [f"Fitted by ema to {run.info.raw}; tolerances are the values' own uncertainties, 1 sigma."]
+    if fit.error > POOR_ERROR:
+        heads.append(f"Provisional: the model does not explain the data (error {fit.error:.3g}).")
+    try:
+        replace_file(file, saved_rig(run.info.rig, fit, heads))
+    except OSError as error:
+        raise EmaError(f"{file}: cannot be written ({error.strerror}); name another file") from None
+
+
+def draw_plots(run: Run, show: ShowStage | None = None) -> Path:
+    """Draw every figure of a run for print, as PNG and SVG; returns their folder."""
+    from ema_pipeline.stages.report import draw
+
+    if show is None:
+        return draw(run)
+    with show("plots") as progress:
+        return draw(run, progress)
+
+
+def write_pages(run: Run, show: ShowStage | None = None) -> Path:
+    """Write the report of a run for print, ``report.pdf``; returns its path.
+
+    Raises
+    ------
+    EmaError
+        For force-displacement loops, which have no such pages.
+    """
+    from ema_pipeline.stages.report import paper
+
+    if run.info.kind == "hysteresis":
+        raise EmaError(
+            f"{run.store.folder}: reports of loops have no PDF; print report.html from the browser"
+        )
+    if show is None:
+        return paper(run)
+    with show("pdf") as progress:
+        return paper(run, progress)
+
+
+def export_results(out: Path, folder: Path, effect_files: Iterable[str] = ()) -> list[Path]:
+    """Write FRFs, modes and shapes of every configuration as universal file and as CSV.
+
+    Raises
+    ------
+    EmaError
+        If nothing has been identified yet, or the folder cannot be written.
+    """
+    from ema_pipeline.exchange.tables import shapes_table, write_frf_csv, write_table
+    from ema_pipeline.exchange.uff import write_uff
+    from ema_pipeline.stages.modes import measured_frfs, modes_of_structure
+
+    run = existing_run(out, effect_files)
+    measured = measured_frfs(run)
+    written = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise EmaError(f"{folder}: cannot be written ({error.strerror}); name another folder") from None
+    for name in run.info.configurations:
+        modal, frfs = modes_of_structure(run, name), measured.get(name)
+        files = [folder / f"{name}.uff", folder / f"{name}_shapes.csv", folder / f"{name}_frfs.csv"]
+        write_uff(files[0], frfs, modal)
+        write_table(files[1], shapes_table(modal, name))
+        if frfs is not None:
+            write_frf_csv(files[2], frfs)
+        written += [f for f in files if f.exists()]
+    return written

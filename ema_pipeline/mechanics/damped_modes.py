@@ -1,0 +1,198 @@
+"""Modes that damping couples: frequencies, damping ratios and shapes beyond the diagonal of the modal damping matrix.
+
+A strong damper at one place shifts frequencies by the square of what it couples: a model that leaves this out explains
+it by a spring that is not there.
+
+References
+----------
+T. K. Caughey, M. E. J. O'Kelly, Classical normal modes in damped linear dynamic systems, J. Appl. Mech. 32 (1965)
+583-588. S. Adhikari, Rates of change of eigenvalues and eigenvectors in damped dynamic system, AIAA Journal 37 (1999)
+1452-1458.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+from numpy.typing import NDArray
+
+from ema_pipeline.mechanics.terms import DAMPING_MATRIX, MASS, STIFFNESS, STRUCTURAL, Matrices
+
+_NEGLIGIBLE = 1e-6
+"""Relative shift of a frequency below which coupling by damping is left out."""
+_WEAK = 0.15
+"""Share of another mode in a shape up to which eliminating the others one by one is exact enough."""
+_ROUNDING = 1e-9
+"""Coupling, over ω², that is no more than rounding: modes of one frequency are not mixed by it."""
+_ITERATIONS = 4
+_OSCILLATES = 0.1
+"""Share of a pole that is imaginary, below which a mode counts as one that does not oscillate."""
+_LARGEST_RATIO = 0.99
+
+
+@dataclass(frozen=True)
+class DampedModes:
+    """Modes of a coupled damping matrix.
+
+    Attributes
+    ----------
+    poles : ndarray of complex, (n,)
+        rad/s, with positive imaginary part, in the order of the undamped modes that they come from.
+    shapes : ndarray of complex, (n, n)
+        Columns; the share of the undamped mode of the same index is its own.
+    shares : ndarray of complex, (n, n)
+        Of the undamped modes in every shape; 1 on the diagonal.
+    """
+
+    poles: NDArray[np.complex128]
+    shapes: NDArray[np.complex128]
+    shares: NDArray[np.complex128]
+
+    @property
+    def frequency_hz(self) -> NDArray[np.float64]:
+        """Natural frequencies \\|λ\\|/2π, (n,)."""
+        return np.asarray(np.abs(self.poles) / (2 * np.pi))
+
+    @property
+    def damping_ratio(self) -> NDArray[np.float64]:
+        """-Re λ/\\|λ\\|, (n,)."""
+        return np.asarray(-np.real(self.poles) / np.abs(self.poles))
+
+    @classmethod
+    def of(
+        cls,
+        values: NDArray[np.float64],
+        shapes: NDArray[np.float64],
+        damping: NDArray[np.float64],
+        structural: NDArray[np.float64],
+    ) -> DampedModes | None:
+        """Modes; None where coupling changes nothing.
+
+        Parameters
+        ----------
+        values : ndarray, (n,)
+            ω² of the undamped modes.
+        shapes : ndarray, (n, n)
+            Mass-normalised.
+        damping, structural : ndarray, (n, n)
+            In modal coordinates, the damping ratio that all modes share included.
+        """
+        omega = np.sqrt(values)
+        coupled = np.hypot(omega[None, :] * damping, structural)
+        np.fill_diagonal(coupled, 0.0)
+        own = omega * np.diag(damping) + np.diag(structural)
+        apart = np.hypot(values[:, None] - values[None, :], own[:, None] - own[None, :])
+        np.fill_diagonal(apart, 1.0)
+        apart = np.maximum(apart, 1e-12 * values[None, :])
+        if np.max(coupled**2 / apart / values[None, :]) < _NEGLIGIBLE:
+            return None
+        if np.max(coupled / apart) < _WEAK:
+            poles, weights = _eliminated(values, damping, structural)
+        else:
+            poles, weights = _exact(values, damping, structural) or _eliminated(values, damping, structural)
+        if not np.all(np.isfinite(poles)):
+            return None
+        # What does not oscillate, a damped rigid body say, keeps the frequency and the shape that it has undamped.
+        still = np.flatnonzero(np.imag(poles) < _OSCILLATES * np.abs(poles))
+        ratio = np.minimum(own[still] / (2 * values[still]), _LARGEST_RATIO)
+        poles[still] = omega[still] * (-ratio + 1j * np.sqrt(1 - ratio**2))
+        weights[:, still] = np.eye(len(values))[:, still]
+        return cls(poles, shapes @ weights, weights)
+
+    def derivatives(
+        self,
+        matrices: Matrices,
+        modes: NDArray[np.int64],
+        log_frequency: NDArray[np.float64],
+        turning: NDArray[np.float64],
+        omega: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Derivatives of ln f and of the damping ratio by all unknowns but the common ratio, two of (n_unknowns, m).
+
+        Parameters
+        ----------
+        matrices : Matrices
+        modes : ndarray of int, (m,)
+        log_frequency : ndarray, (n_unknowns, m)
+            Derivatives of the undamped modes, with which the common damping goes.
+        turning : ndarray, (n_unknowns, n, m)
+            Shares of all undamped shapes in the derivatives of these.
+        omega : ndarray, (n,)
+            Of the undamped modes, rad/s.
+        """
+        terms, pole, shape = matrices.terms, self.poles[modes], self.shapes[:, modes]
+        common = (
+            2 * matrices.damping_ratio * omega[modes]
+        )  # what all modes share goes with ω and the modal mass
+        power = {
+            MASS: pole**2 + pole * common,
+            DAMPING_MATRIX: pole,
+            STIFFNESS: np.ones_like(pole),
+            STRUCTURAL: 1j + 0 * pole,
+        }
+        change = np.zeros((terms.log.shape[1] + len(matrices.by_shape), len(modes)), complex)
+        for kind, (on, rows) in terms.by_kind.items():
+            square = matrices.coefficient[on, None] * (rows @ shape) ** 2
+            change[: terms.log.shape[1]] += power[kind] * (terms.log[on].T @ square)
+        for k, kinds in enumerate(matrices.by_shape):
+            for kind, factor in power.items():
+                change[terms.log.shape[1] + k] += factor * np.sum(shape * (kinds[kind] @ shape), axis=0)
+        change += pole * common * log_frequency
+        apart = 2 * matrices.damping_ratio * (omega[:, None] - omega[modes][None, :])
+        change -= 2 * pole * np.einsum("jsr,sr->jr", turning, self.shares[:, modes] * apart)
+        mass, damping = matrices.dense[MASS], matrices.dense[DAMPING_MATRIX]
+        slope = np.sum(shape * ((2 * mass) @ shape), axis=0) * pole
+        slope += np.sum(shape * (damping @ shape), axis=0) + common
+        moved = -change / slope / pole
+        ratio = -np.real(pole) / np.abs(pole)
+        # λ = |λ|(-ζ + i√(1 - ζ²)): the real part of d ln λ is d ln|λ|, the imaginary one turns the pole by dζ
+        return np.real(moved), np.imag(moved) * np.sqrt(np.maximum(1 - ratio**2, 0.0))
+
+
+def _eliminated(
+    values: NDArray[np.float64], damping: NDArray[np.float64], structural: NDArray[np.float64]
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Poles and shares of the undamped modes, each mode with all others eliminated."""
+    own, lag = np.diag(damping), np.diag(structural)
+    mixed = np.hypot(np.sqrt(values)[None, :] * damping, structural) > _ROUNDING * values[None, :]
+    np.fill_diagonal(mixed, False)
+    stiff = values + 1j * lag
+    pole = -0.5 * own + 1j * np.sqrt(np.maximum(stiff - 0.25 * own**2, 1e-12) + 0j)
+    for _ in range(_ITERATIONS):
+        across = damping * pole[None, :] + 1j * structural
+        others = pole[None, :] ** 2 + pole[None, :] * own[:, None] + stiff[:, None]
+        share = np.where(mixed, -across / np.where(mixed, others, 1.0), 0.0)
+        pull = np.sum(across * share, axis=0)  # nothing from the mode itself, whose share is 0 here
+        pole = -0.5 * own + 1j * np.sqrt(stiff + pull - 0.25 * own**2 + 0j)
+    np.fill_diagonal(share, 1.0)
+    return pole, share
+
+
+def _exact(
+    values: NDArray[np.float64], damping: NDArray[np.float64], structural: NDArray[np.float64]
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]] | None:
+    """The same from the eigenvalues of the first-order system; None where a mode does not oscillate."""
+    n = len(values)
+    scale = float(np.sqrt(np.max(values)))
+    first = np.zeros((2 * n, 2 * n), complex)
+    first[:n, n:] = np.eye(n)
+    first[n:, :n] = -(np.diag(values) + 1j * structural) / scale**2
+    first[n:, n:] = -damping / scale
+    try:
+        found, vectors = scipy.linalg.eig(first, check_finite=False)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    up = np.flatnonzero(np.imag(found) > 1e-9)
+    if len(up) != n:
+        return None
+    weights = vectors[:n, up]
+    weights = weights / np.max(np.abs(weights), axis=0)
+    own = scipy.optimize.linear_sum_assignment(-(np.abs(weights) ** 2))[1]
+    weights = weights[:, own]
+    diagonal = np.diag(weights)
+    if np.any(np.abs(diagonal) < 1e-3):
+        return None
+    return found[up][own] * scale, weights / diagonal

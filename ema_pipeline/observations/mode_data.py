@@ -1,0 +1,107 @@
+"""Measured modes in the form that residuals need: real shapes, logarithms of frequencies and damping ratios."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.correlate.settings import AssumedSettings
+from ema_pipeline.dof import Dof
+
+
+@dataclass(frozen=True)
+class ModeData:
+    """One configuration's measured modes, prepared: real shapes with their largest entry 1.
+
+    Attributes
+    ----------
+    configuration : str
+    log_frequency, log_frequency_std : ndarray, (m,)
+    log_damping, log_damping_std : ndarray, (m,)
+        NaN where not measured.
+    shapes, shape_std : ndarray, (m, s)
+        NaN where not measured; s may be 0.
+    dofs : tuple of Dof
+    band_hz : tuple of float
+    complete : bool
+        False where modes of the band were taken out on purpose: what the model has besides is then no contradiction.
+    """
+
+    configuration: str
+    log_frequency: NDArray[np.float64]
+    log_frequency_std: NDArray[np.float64]
+    log_damping: NDArray[np.float64]
+    log_damping_std: NDArray[np.float64]
+    shapes: NDArray[np.float64]
+    shape_std: NDArray[np.float64]
+    dofs: tuple[Dof, ...]
+    band_hz: tuple[float, float]
+    complete: bool = True
+
+    def __len__(self) -> int:
+        return len(self.log_frequency)
+
+    @cached_property
+    def known_shapes(self) -> NDArray[np.float64]:
+        """Shapes with 0 where not measured, (m, s)."""
+        return np.nan_to_num(self.shapes)
+
+    @cached_property
+    def seen(self) -> NDArray[np.float64]:
+        """1 where a shape was measured, 0 elsewhere, (m, s)."""
+        return np.isfinite(self.shapes).astype(float)
+
+    @cached_property
+    def squares(self) -> NDArray[np.float64]:
+        """Sum of squares of every shape, (m,)."""
+        return np.asarray(np.sum(self.known_shapes**2, axis=1))
+
+    def only(self, keep: NDArray[np.bool_]) -> ModeData:
+        """The modes of a mask, (m,)."""
+        names = (
+            "log_frequency",
+            "log_frequency_std",
+            "log_damping",
+            "log_damping_std",
+            "shapes",
+            "shape_std",
+        )
+        return dataclasses.replace(self, complete=False, **{n: getattr(self, n)[keep] for n in names})
+
+
+def _known_or(std: NDArray[np.float64], assumed: float) -> NDArray[np.float64]:
+    """Standard deviations, the assumed one where none is known."""
+    return np.where(np.isfinite(std) & (std > 0), std, assumed)
+
+
+def prepare(measured: MeasuredModes, settings: AssumedSettings | None = None) -> ModeData:
+    """Measured modes in the form that residuals need; where no scatter is known, `settings` say what is assumed."""
+    settings = settings or AssumedSettings()
+    m, f = len(measured), measured.frequency_hz
+    shapes = np.zeros((m, 0))
+    std = np.zeros((m, 0))
+    dofs: tuple[Dof, ...] = ()
+    if measured.shapes is not None and measured.dofs:
+        dofs = measured.dofs
+        shapes, std = np.zeros((m, len(dofs))), np.zeros((m, len(dofs)))
+        for r in range(m):
+            y = measured.shapes[r]
+            real = np.real(y * np.exp(-0.5j * np.angle(np.nansum(y**2))))
+            size = float(np.nanmax(np.abs(real), initial=0.0)) or 1.0
+            shapes[r] = real / size
+            given = np.full(len(dofs), np.nan) if measured.shape_std is None else measured.shape_std[r]
+            std[r] = _known_or(given / size, settings.shape_std_assumed)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        relative = _known_or(measured.frequency_std_hz / f, settings.frequency_std_assumed)
+        damping = np.where(measured.damping_ratio > 0, measured.damping_ratio, np.nan)
+        damping_std = _known_or(measured.damping_std / damping, settings.damping_std_assumed)
+    band = measured.band_hz or (0.9 * float(np.min(f, initial=1.0)), 1.1 * float(np.max(f, initial=1.0)))
+    return ModeData(
+        measured.configuration, np.log(f), relative, np.log(damping), damping_std, shapes, std, dofs, band,
+        complete=measured.band_hz is not None,  # a list of frequencies does not say that there are no others
+    )  # fmt: skip

@@ -1,0 +1,285 @@
+"""One configuration's measured modes against the model's at one point: pairing, residuals and their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+from numpy.typing import NDArray
+
+from ema_pipeline.inference import Residuals
+from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
+from ema_pipeline.mechanics.terms import Matrices
+from ema_pipeline.observations.mode_data import ModeData
+from ema_pipeline.observations.rig_model import RigModel
+
+DAMPING_SCATTER = "damping_scatter"
+FREQUENCY = "frequency_scatter"
+SHAPE = "shape_scatter"
+
+UNEXPLAINED = 12.0
+"""Cost, in the log posterior, of a measured mode without a model mode."""
+UNSEEN = 3.0
+"""Cost of a model mode in the band that was not measured: it may lie on a node of every sensor or hit point."""
+
+_SHAPE_REACH = 0.3
+"""Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
+_FREQUENCY_REACH = 0.1
+"""Difference of ln f that costs a pair as much as shapes that have nothing in common; wider while a fit is annealed."""
+_FREQUENCY_REACH_ALONE = 0.3
+_LEAVE = 0.3
+"""Cost above the best at which an assignment leaves a measured mode without a partner."""
+
+
+@dataclass(frozen=True)
+class Sensing:
+    """What the sensors of one configuration read: rows of the motion along and across each, and their unknowns.
+
+    Attributes
+    ----------
+    along, across : ndarray, (s, n)
+    gain, transverse : ndarray of int, (s,)
+        Positions of their unknowns, -1 for none.
+    drift : int
+        Position of the unknown by which all frequencies are off together; -1 where no frequencies are compared.
+    """
+
+    along: NDArray[np.float64]
+    across: NDArray[np.float64]
+    gain: NDArray[np.int64]
+    transverse: NDArray[np.int64]
+    drift: int
+
+
+def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
+    """Residuals of several parts of the data as one."""
+    names = dict.fromkeys(k for p in parts for k in p.share)
+    return Residuals(
+        values=np.concatenate([p.values for p in parts] or [np.zeros(0)]),
+        jacobian=np.concatenate([p.jacobian for p in parts] or [np.zeros((0, n))]),
+        share={k: np.concatenate([p.share.get(k, np.zeros(len(p.values))) for p in parts]) for k in names},
+        log_scale=sum(p.log_scale for p in parts),
+        penalty=sum(p.penalty for p in parts),
+        matching=tuple(p.matching for p in parts),
+        projected=sum(p.projected for p in parts),
+    )
+
+
+class Comparison:
+    """Residuals of one configuration at one point.
+
+    Parameters
+    ----------
+    model : RigModel
+    data : ModeData
+    sensing : Sensing
+    x : ndarray, (n,)
+        The model's unknowns, then the sensors'.
+    scatters, defaults : dict of str to float
+        As they are tried, and those to which the price of wider ones refers.
+    heat : float
+    """
+
+    def __init__(
+        self,
+        model: RigModel,
+        data: ModeData,
+        sensing: Sensing,
+        x: NDArray[np.float64],
+        scatters: Mapping[str, float],
+        defaults: Mapping[str, float],
+        heat: float = 1.0,
+    ) -> None:
+        self.model, self.data, self.sensing, self.x, self.heat = model, data, sensing, x, heat
+        self.scatters, self.defaults = scatters, defaults
+        self.gain = np.where(sensing.gain >= 0, np.exp(x[np.maximum(sensing.gain, 0)]), 1.0)
+        cross = np.where(sensing.transverse >= 0, x[np.maximum(sensing.transverse, 0)], 0.0)
+        self.reading = self.gain[:, None] * (sensing.along + cross[:, None] * sensing.across)
+
+    def residuals(self, matching: object, derivatives: bool) -> Residuals:
+        """Residuals with the pairs of `matching`, or with new ones where it is no array."""
+        own = self.x[: len(self.model.unknowns)]
+        matrices, solution = self.model.modes(self.data.configuration, own, derivatives)
+        if solution is None:
+            return Residuals(np.full(1, np.inf), np.zeros((1, len(self.x))), matching=matching)
+        predicted = self.seen(solution)
+        match = matching if isinstance(matching, np.ndarray) else self.matched(solution, predicted)
+        return self._compared(matrices, solution, predicted, match, derivatives)
+
+    def seen(self, solution: EigenSolution) -> NDArray[np.float64]:
+        """What the sensors read of every shape, (s, n); complex shapes turned as measured ones are, and made real."""
+        width = self.reading.shape[1]
+        if solution.damped is None:
+            return np.asarray(self.reading @ solution.shapes[:width])
+        read = self.reading @ solution.damped.shapes[:width]
+        return np.asarray(np.real(read * np.exp(-0.5j * np.angle(np.sum(read**2, axis=0)))))
+
+    def matched(self, solution: EigenSolution, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Index of the model mode of every measured one, -1 for none, (m,)."""
+        d = self.data
+        log = np.log(np.maximum(solution.frequency_hz, 1e-6))
+        apart = np.abs(log[None] - d.log_frequency[:, None])
+        if d.shapes.shape[1]:
+            cross = (d.known_shapes @ predicted) ** 2
+            norm = d.squares[:, None] * (d.seen @ predicted**2)
+            reach = _FREQUENCY_REACH * (1 + 0.1 * (self.heat - 1))
+            cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / reach, 3.0)
+        else:
+            # convex, so that close modes keep their order: two crossed pairs would cost as much as two straight ones
+            cost = np.minimum(apart * (1 + apart) / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
+        m = len(d)
+        padded = np.hstack([cost, np.full((m, m), _LEAVE)])
+        column = scipy.optimize.linear_sum_assignment(padded)[1]
+        return np.where(column < cost.shape[1], column, -1)
+
+    def _compared(
+        self,
+        matrices: Matrices,
+        solution: EigenSolution,
+        predicted: NDArray[np.float64],
+        match: NDArray[np.int64],
+        derivatives: bool,
+    ) -> Residuals:
+        paired = match >= 0
+        on, alone = np.flatnonzero(paired), np.flatnonzero(~paired)
+        to = match[on]
+        slopes = None
+        if derivatives:
+            slopes = ModeDerivatives.of(matrices, solution, to, self.model.has_ratio)
+        damped = np.isfinite(self.data.log_damping[on])
+        rows = (
+            self._frequencies(solution, on, to),
+            self._damping(solution, on[damped], to[damped]),
+            self._shapes(solution, predicted, on, to, slopes),
+        )
+        total = sum(len(r.difference) for r in rows)
+        values, share = np.empty(total), {}
+        jacobian = np.zeros((total if derivatives else 0, len(self.x)))
+        log_scale, at = 0.0, 0
+        for r in rows:
+            here = slice(at, at + len(r.difference))
+            at = here.stop
+            added = (self.scatters[r.scatter] * r.unit) ** 2
+            squared = r.own**2
+            variance = squared + added
+            log_scale += 0.5 * float(
+                np.sum(np.log(variance / (squared + (self.defaults[r.scatter] * r.unit) ** 2)))
+            )
+            sigma = np.sqrt(variance) * r.heat
+            values[here] = r.difference / sigma
+            if slopes is not None:
+                share[r.scatter] = np.zeros(total)
+                share[r.scatter][here] = added / variance
+                if r.scatter == FREQUENCY:
+                    jacobian[here, : slopes.log_frequency.shape[1]] = slopes.log_frequency
+                    jacobian[here, self.sensing.drift] = 1.0
+                elif r.scatter == DAMPING_SCATTER:
+                    ratio = solution.damping_ratio[to[damped], None]
+                    jacobian[here, : slopes.damping_ratio.shape[1]] = slopes.damping_ratio[damped] / ratio
+                else:
+                    jacobian[here] = r.slope
+                jacobian[here] /= -sigma[:, None]
+        return Residuals(
+            values=values,
+            jacobian=jacobian,
+            share=share,
+            log_scale=log_scale + (self._usual(alone) if len(alone) else 0.0),
+            penalty=UNEXPLAINED * len(alone) + UNSEEN * self._unseen(solution, to),
+            matching=match,
+            projected=len(on) if self.data.shapes.shape[1] else 0,
+        )
+
+    def _usual(self, alone: NDArray[np.int64]) -> float:
+        """What modes without a partner would cost on average if they were explained.
+
+        Without it, leaving a mode out would gain what its rows cost, and no effect would ever bring it back.
+        """
+        d = self.data
+        seen = np.isfinite(d.shapes[alone])
+        reach = np.maximum(_SHAPE_REACH, np.abs(d.shapes[alone]))[seen]
+        damped = alone[np.isfinite(d.log_damping[alone])]
+        total = -0.5 * int(np.sum(np.any(seen, axis=1)))
+        for own, unit, name in (
+            (d.log_frequency_std[alone], 1.0, FREQUENCY),
+            (d.log_damping_std[damped], 1.0, DAMPING_SCATTER),
+            (d.shape_std[alone][seen], reach, SHAPE),
+        ):
+            now, usual = (own**2 + (at[name] * unit) ** 2 for at in (self.scatters, self.defaults))
+            total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
+        return total
+
+    def _frequencies(self, solution: EigenSolution, on: NDArray[np.int64], to: NDArray[np.int64]) -> _Rows:
+        d = self.data
+        model = np.log(np.maximum(solution.frequency_hz[to], 1e-6)) + self.x[self.sensing.drift]
+        return _Rows(
+            d.log_frequency[on] - model, d.log_frequency_std[on], np.ones(len(on)), FREQUENCY, self.heat
+        )
+
+    def _damping(self, solution: EigenSolution, on: NDArray[np.int64], to: NDArray[np.int64]) -> _Rows:
+        d = self.data
+        difference = d.log_damping[on] - np.log(solution.damping_ratio[to])
+        return _Rows(difference, d.log_damping_std[on], np.ones(len(on)), DAMPING_SCATTER, 1.0)
+
+    def _shapes(
+        self,
+        solution: EigenSolution,
+        predicted: NDArray[np.float64],
+        on: NDArray[np.int64],
+        to: NDArray[np.int64],
+        slopes: ModeDerivatives | None,
+    ) -> _Rows:
+        """Shapes with the factor projected out that fits them best."""
+        d, p = self.data, predicted[:, to].T
+        seen = d.seen[on] > 0
+        y, own = d.known_shapes[on], d.shape_std[on]
+        unit = np.maximum(_SHAPE_REACH, np.abs(y))
+        weight = seen / (own**2 + (self.scatters[SHAPE] * unit) ** 2)
+        weighted = weight * p
+        squared = np.maximum(np.sum(weighted * p, axis=1), 1e-300)
+        scale = np.sum(weighted * y, axis=1) / squared
+        slope = None
+        if slopes is not None:
+            dp = self._shape_slopes(slopes.shapes, solution.shapes[:, to], p)
+            towards = weight * (y - 2 * scale[:, None] * p) / squared[:, None]
+            factor = towards[:, None, :] @ dp
+            slope = (scale[:, None, None] * dp + p[:, :, None] * factor)[seen]
+        difference = (y - scale[:, None] * p)[seen]
+        return _Rows(difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), slope)
+
+    def _unseen(self, solution: EigenSolution, to: NDArray[np.int64]) -> int:
+        """Model modes well inside the band that no measured mode is paired with."""
+        if not self.data.complete:
+            return 0
+        low, high = self.data.band_hz
+        inside = (solution.frequency_hz > 1.05 * low) & (solution.frequency_hz < 0.95 * high)
+        inside[to] = False
+        return int(np.count_nonzero(inside))
+
+    def _shape_slopes(
+        self, by_model: NDArray[np.float64], shapes: NDArray[np.float64], predicted: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Derivatives of what the sensors read of some shapes by all unknowns, (k, s, n)."""
+        width, s = self.reading.shape[1], self.sensing
+        k, count = predicted.shape
+        slope = np.zeros((k, count, len(self.x)))
+        read = self.reading @ by_model[:width].reshape(width, k * by_model.shape[2])
+        slope[:, :, : by_model.shape[2]] = read.reshape(count, k, by_model.shape[2]).transpose(1, 0, 2)
+        has = np.flatnonzero(s.gain >= 0)
+        slope[:, has, s.gain[has]] += predicted[:, has]
+        has = np.flatnonzero(s.transverse >= 0)
+        slope[:, has, s.transverse[has]] += (self.gain[:, None] * (s.across @ shapes[:width])).T[:, has]
+        return slope
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Differences of one kind: own 1 σ, the unit of the scatter that adds to it, heat, and derivatives of shapes."""
+
+    difference: NDArray[np.float64]
+    own: NDArray[np.float64]
+    unit: NDArray[np.float64]
+    scatter: str
+    heat: float
+    slope: NDArray[np.float64] | None = None

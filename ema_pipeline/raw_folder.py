@@ -1,0 +1,76 @@
+"""Raw folders: their hits judged, their description drafted, a test simulated."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ema_pipeline.describe import DEFAULT_PIPELINE, checked_rig
+from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.description import read_campaign
+from ema_pipeline.ingest.load import load_records
+from ema_pipeline.ingest.records import Hit
+from ema_pipeline.pipeline import load_pipeline, toml_value
+
+if TYPE_CHECKING:
+    from ema_pipeline.simulate.campaign import SimulatedCampaign
+
+
+def check_raw(raw: Path, overrides: Iterable[str] = ()) -> dict[str, tuple[Hit, ...]]:
+    """Hits of every configuration of a raw folder with their verdicts; nothing is written."""
+    from ema_pipeline.ingest.quality import hits_of_test
+
+    settings = load_pipeline(DEFAULT_PIPELINE, overrides)
+    judged = {}
+    for test in read_campaign(raw).tests:
+        judged[test.configuration or "default"] = hits_of_test(
+            list(load_records(test, settings.ingest)), settings.hits
+        )
+    return judged
+
+
+def draft_raw(raw: Path, overrides: Iterable[str] = ()) -> list[Path]:
+    """Draft test.toml from what the record files of a folder say; returns the files written."""
+    from ema_pipeline.ingest.draft import write_drafts
+
+    return write_drafts(raw, load_pipeline(DEFAULT_PIPELINE, overrides).ingest)
+
+
+def simulate_raw(
+    out: Path,
+    rig: str,
+    *,
+    configurations: list[str],
+    effects: list[str],
+    effect_files: list[str],
+    values: list[str],
+    sensors: list[str],
+    impacts: list[str],
+    settings: list[str],
+) -> SimulatedCampaign:
+    """Simulate a campaign; values and settings are given as ``"name=value"``."""
+    from ema_pipeline.effects.library import effect_library
+    from ema_pipeline.simulate.campaign import simulate_campaign
+
+    return simulate_campaign(
+        out,
+        rig,
+        configurations=configurations,
+        effects=effects,
+        values=_named_values(values, "--value"),
+        sensors=sensors,
+        impacts=impacts,
+        library=effect_library(effect_files, checked_rig(rig)),
+        **_named_values(settings, "--set"),
+    )
+
+
+def _named_values(texts: list[str], option: str) -> dict[str, Any]:
+    named = {}
+    for text in texts:
+        name, sign, value = text.partition("=")
+        if not sign or not name.strip():
+            raise EmaError(f"{option} {text}: is not of the form name=value")
+        named[name.strip()] = toml_value(value.strip())
+    return named

@@ -1,0 +1,164 @@
+"""The top of the page: the verdict in a sentence, what it rests on, three numbers before and after, what to type."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from ema_pipeline.diagnose.types import Diagnosis, Rung
+from ema_pipeline.report import diagnosis
+from ema_pipeline.report.culprit import CulpritDrawing, culprit_drawing
+from ema_pipeline.report.numbers import plain
+from ema_pipeline.report.planetary import layout_of
+from ema_pipeline.report.results import RunResults
+
+_OTHERS = 3
+"""Less likely explanations that are named."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A number of the base model and of the model with effects; `after` is empty where there is none."""
+
+    name: str
+    before: str
+    after: str
+    words: str
+
+
+@dataclass(frozen=True)
+class Band:
+    """What a reader sees first.
+
+    Attributes
+    ----------
+    heading, summary : str
+        The verdict and one or two sentences on it; of the modes alone where there is no model.
+    tiles : tuple of Tile
+    reasons : tuple of str
+        Why the named effects are suspected.
+    against : tuple of str
+        What stands against the verdict, or limits it.
+    next : str
+        What to measure next; may be empty.
+    commands : tuple of str
+        What a user would type next.
+    drawing : CulpritDrawing or None
+    """
+
+    heading: str
+    summary: str
+    tiles: tuple[Tile, ...] = ()
+    reasons: tuple[str, ...] = ()
+    against: tuple[str, ...] = ()
+    next: str = ""
+    commands: tuple[str, ...] = ()
+    drawing: CulpritDrawing | None = None
+
+
+def band_of(results: RunResults) -> Band:
+    """The top of the page for these results."""
+    found = results.diagnosis
+    if found is None:
+        return Band(_heading_without_diagnosis(results), "", _tiles(results))
+    commands = list(diagnosis.next_commands(found, results.folder, results.added))
+    if results.added:
+        folder = shlex.quote(results.folder) if results.folder else "OUT"
+        commands = [*commands, f"ema diagnose {folder}", f"ema remove {folder} {results.added[-1]}"]
+    known = Band("", "", _tiles(results), commands=tuple(commands), drawing=_drawing(results))
+    if results.diagnosed_on != results.added:
+        names = " + ".join(map(diagnosis.label_words, results.added)) or "no effects"
+        told = "The diagnosis below was made before; make it anew to see what is still missing."
+        return replace(known, heading=f"In the model: {names}", summary=told)
+    return replace(
+        known,
+        heading=diagnosis.heading(found),
+        summary=found.summary,
+        reasons=diagnosis.reasons(found),
+        against=_against(found),
+        next=found.next_measurement,
+    )
+
+
+def _heading_without_diagnosis(results: RunResults) -> str:
+    count = sum(len(c.modal.modes) for c in results.configurations if c.modal)
+    if not count:
+        return "No modes have been identified yet"
+    return f"{count} modes identified" + ("" if results.rig else "; there is no model to compare them with")
+
+
+def _rungs(results: RunResults) -> tuple[Rung, Rung] | None:
+    ladder = results.shown_ladder
+    return None if ladder is None or not ladder.rungs else (ladder.rungs[0], ladder.rungs[-1])
+
+
+def _tiles(results: RunResults) -> tuple[Tile, ...]:
+    ends = _rungs(results)
+    if ends is None:
+        error = math.nan if results.comparison is None else results.comparison.error
+        if not math.isfinite(error):
+            return ()
+        return (Tile("error", plain(error, 3), "", "about 1 where the model explains the data"),)
+    first, last = ends
+    changed = first is not last
+    tiles = [
+        Tile(
+            "error", plain(first.error, 3), plain(last.error, 3) if changed else "",
+            "root mean square of (measured − model)/σ: about 1 where the model explains the data",
+        ),
+        Tile(
+            "error held out", plain(first.heldout_error, 3), plain(last.heldout_error, 3) if changed else "",
+            "the same on data that the fit has not seen",
+        ),
+    ]  # fmt: skip
+    total = sum(len(c.modal.modes) for c in results.configurations if c.modal)
+    ladder = results.shown_ladder
+    if total and ladder is not None and diagnosis.of_modes(ladder):
+        more = last.unexplained != first.unexplained
+        tiles.append(
+            Tile(
+                "modes explained", f"{total - first.unexplained} of {total}",
+                f"{total - last.unexplained} of {total}" if more else "",
+                "measured modes with a counterpart in the model",
+            )
+        )  # fmt: skip
+    return tuple(tiles)
+
+
+def _against(found: Diagnosis) -> tuple[str, ...]:
+    """What a careful reader would hold against the verdict."""
+    lines = list(diagnosis.group_words(found))
+    named = {c.label for c in diagnosis.leading(found)}
+    if found.verdict in ("effect", "ambiguous", "unknown_effect"):
+        nothing = diagnosis.probability_words(found.null_probability)
+        others = [
+            f"{diagnosis.label_words(c.label)} ({diagnosis.probability_words(c.probability)})"
+            for c in found.candidates
+            if c.label not in named
+        ][:_OTHERS]
+        lines.append(
+            f"Nothing missing has probability {nothing}"
+            + (f"; less likely: {', '.join(others)}." if others else ".")
+        )
+    if found.verdict == "adequate":
+        lines += [text for text in (diagnosis.detection_words(found),) if text]
+    return (*lines, *found.notes)
+
+
+def _drawing(results: RunResults) -> CulpritDrawing | None:
+    """The rig with the places of what is named or added; of the configuration with most bodies."""
+    places = _places(results)
+    drawings = [culprit_drawing(layout_of(c), places) for c in results.configurations]
+    known = [d for d in drawings if d is not None]
+    return max(known, key=lambda d: len(d.bodies), default=None)
+
+
+def _places(results: RunResults) -> Sequence[str]:
+    if results.added:
+        return [label.partition("@")[2] for label in results.added]
+    found = results.diagnosis
+    if found is None or found.verdict not in ("effect", "ambiguous"):
+        return []
+    return [c.at for c in diagnosis.leading(found)]

@@ -1,0 +1,225 @@
+"""What to be careful about in a run, one sentence each, the gravest first."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from enum import IntEnum
+
+from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
+from ema_pipeline.frf.sensitivities import SENSITIVITY
+from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_ERROR
+from ema_pipeline.report.numbers import below, format_value, plain, words
+from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.verdict import Verdict
+
+SAME_KIND = 2
+"""Cautions of one kind that are written out; the rest is counted."""
+
+_DOF_OR_NUMBER = re.compile(r"-?\b[A-Za-z]\w*\.[a-z]\w*|[\d.]*\d")
+
+
+class Weight(IntEnum):
+    """What a caution puts in doubt, from everything to a detail."""
+
+    SENSOR = 0
+    MISFIT = 1
+    LEFT_OUT = 2
+    VALUE = 3
+    PAIR = 4
+    SCALE = 5
+    MODE = 6
+    SCATTER = 7
+    SWEEP = 8
+
+
+def cautions(results: RunResults, lightest: Weight = Weight.SWEEP) -> tuple[str, ...]:
+    """What to be careful about, one sentence each, the gravest first.
+
+    Parameters
+    ----------
+    results : RunResults
+    lightest : Weight
+        Lighter ones are not told.
+    """
+    found = sorted((pair for pair in _all(results) if pair[0] <= lightest), key=lambda pair: pair[0])
+    return _without_repeats([_sentence(text) for _, text in found])
+
+
+def suspicions(results: RunResults) -> tuple[str, ...]:
+    """Channels that cannot be right: their sensitivity, unit or sign contradicts the rest of the test.
+
+    What the model says of single channels goes before what two channels say of each other.
+    """
+    found = [v.message for v in results.sensitivities]
+    if not found:
+        for c in results.configurations:
+            verdicts = () if c.frfs is None else c.frfs.verdicts
+            found += [_where(results, c) + v.message for v in verdicts if not v.passes and _of_sensor(v)]
+    for c in results.configurations:
+        peaks = [v for h in c.hits for v in h.verdicts if v.check == "force peak" and not v.passes]
+        found += [_where(results, c) + v.message for v in peaks[:1]]
+    return tuple(_sentence(text) for text in found)
+
+
+def identified_words(p: ParameterEstimate, fit: FitResult) -> str:
+    """``"identified by the data"`` or why not."""
+    if p.identified and fails(fit):
+        return "provisional: the model does not explain the data"
+    if p.identified:
+        return "identified by the data"
+    if p.free:
+        return "not identified by the data" + (f": {p.note}" if p.note else "")
+    return "not narrowed by the data: its tolerance decides"
+
+
+def fails(fit: FitResult) -> bool:
+    """True where the model does not fit, so that its values hold only for a model that lacks nothing."""
+    return fit.error > POOR_ERROR
+
+
+def _where(results: RunResults, c: ConfigurationResults) -> str:
+    """The configuration, where there are several."""
+    return f"{c.name}: " if len(results.configurations) > 1 else ""
+
+
+def _of_sensor(v: Verdict) -> bool:
+    """True for a check that a wrong sign or sensitivity fails."""
+    return v.check == SENSITIVITY or (v.check == "driving point" and v.value > 0.5)
+
+
+def _all(results: RunResults) -> Iterator[tuple[Weight, str]]:
+    for text in suspicions(results):
+        yield Weight.SENSOR, text
+    if results.fit is not None:
+        found = None if results.diagnosis_is_old else results.diagnosis
+        yield from _of_fit(results.fit, results.fit.error if found is None else found.error)
+    for c in results.configurations:
+        for weight, text in _of_configuration(c):
+            yield weight, _where(results, c) + text
+
+
+def _of_fit(fit: FitResult, error: float) -> Iterator[tuple[Weight, str]]:
+    """Of the fitted values; `error` is that of the model as the verdict states it."""
+    if fails(fit):
+        yield (
+            Weight.MISFIT,
+            f"The model does not explain the data (error {plain(error, 3)}): "
+            "fitted values and their uncertainties are provisional",
+        )
+    for p in fit.parameters.values():
+        value = format_value(p.value, p.std, p.unit)
+        if p.free and not p.identified:
+            told = f"{words(p.name)} ({value}) is {identified_words(p, fit)}. Do not quote it as a result."
+            yield Weight.VALUE, told
+        elif not fails(fit) and math.isfinite(p.shift_z) and abs(p.shift_z) > FAR_SIGMA:
+            yield (
+                Weight.VALUE,
+                f"{words(p.name)} was fitted to {value}, {abs(p.shift_z):.1f} tolerances from "
+                f"its nominal {format_value(p.nominal, p.prior_std, p.unit)}: check the nominal value.",
+            )
+    for text in _flat_sweeps(fit.sweeps):
+        yield Weight.SWEEP, text
+
+
+def _of_configuration(c: ConfigurationResults) -> Iterator[tuple[Weight, str]]:
+    yield from ((Weight.LEFT_OUT, text) for text in left_out(c))
+    if c.frfs is not None:
+        if not c.frfs.force_calibrated:
+            yield Weight.SCALE, "the hammer is not calibrated: FRFs and shapes have no absolute scale"
+        for v in c.frfs.verdicts:
+            if not v.passes and not _of_sensor(v):
+                yield Weight.SCATTER, v.message or f"{v.check} fails"
+        singles = int((c.frfs.hits == 1).sum())
+        if singles:
+            rests = "FRF rests" if singles == 1 else "FRFs rest"
+            yield Weight.SCATTER, f"{singles} {rests} on one hit: no coherence and no scatter to judge by"
+    if c.modal is not None:
+        if not c.modal.scaled and c.modal.dofs:
+            yield Weight.SCALE, c.modal.scaling_note or "shapes are unscaled: no driving point"
+        yield from ((Weight.MODE, note) for note in c.modal.notes if note != c.modal.scaling_note)
+    if c.pairing is not None:
+        for u in c.pairing.unpaired_measured:
+            where = f"measured mode {u.index + 1} at {u.frequency_hz:.5g} Hz"
+            yield Weight.PAIR, f"{where} has no model partner: {u.reason}"
+        weak = [p for p in c.pairing.pairs if p.mac < LOW_MAC]
+        if weak:
+            named = ", ".join(f"{p.measured_frequency_hz:.5g} Hz ({below(p.mac, LOW_MAC)})" for p in weak[:6])
+            more = f" and {len(weak) - 6} more" if len(weak) > 6 else ""
+            yield Weight.PAIR, f"doubtful pairs with MAC under {LOW_MAC}: {named}{more}"
+
+
+def left_out(c: ConfigurationResults) -> list[str]:
+    """What was dropped, or should be: hits with the first reason, copies, channels with the hits that lack them."""
+    rejected = [h for h in c.hits if not h.accepted]
+    lines = []
+    if rejected:
+        lines.append(
+            f"{len(rejected)} of {len(c.hits)} hits were left out, first {rejected[0].file}: {rejected[0].reason}"
+        )
+    copies = [v for h in c.hits for v in h.verdicts if v.check == "copy" and not v.passes]
+    lines += list(dict.fromkeys(v.message for v in copies))
+    dropped: dict[str, list[Verdict]] = {}
+    used = [h for h in c.hits if h.accepted]
+    for h in used:
+        for name in sorted(h.rejected_channels):
+            dropped.setdefault(name, []).append(
+                next(
+                    v
+                    for v in h.verdicts
+                    if v.channel == name and v.consequence == "reject_channel" and not v.passes
+                )
+            )
+    for name, verdicts in dropped.items():
+        lines.append(
+            f"channel '{name}' was left out of {len(verdicts)} of {len(used)} hits: {verdicts[0].message}"
+        )
+    return lines
+
+
+def _flat_sweeps(sweeps: Sequence[ErrorSweep]) -> list[str]:
+    """One sentence per stiffness whose error function determines nothing, over all its sweeps."""
+    groups: dict[tuple[str, str], list[ErrorSweep]] = {}
+    for s in sweeps:
+        if not s.identified:
+            groups.setdefault((s.parameter, s.configuration), []).append(s)
+    lines = []
+    for (parameter, configuration), mine in groups.items():
+        counts = " or ".join(str(n) for n in sorted({s.mode_count for s in mine}))
+        lines.append(
+            f"ε of {words(parameter)} ({configuration}) determines nothing with {counts} modes: "
+            f"{_flat_words(mine)}"
+        )
+    return lines
+
+
+def _flat_words(sweeps: Sequence[ErrorSweep]) -> str:
+    """How much ε changes over the sweeps, or why its minimum means nothing."""
+    flat = [s for s in sweeps if s.note.startswith("flat")]
+    if len(flat) == len(sweeps):
+        changes = [
+            100 * float((s.error.max() - s.error.min()) / max(float(s.error.min()), 1e-300)) for s in sweeps
+        ]
+        low, high = plain(min(changes), 2), plain(max(changes), 2)
+        return f"it changes by {low if low == high else f'{low}–{high}'} % over the sweep"
+    return "; ".join(dict.fromkeys(s.note for s in sweeps))
+
+
+def _without_repeats(lines: Iterable[str]) -> tuple[str, ...]:
+    """Lines that differ only in DOFs and numbers are a kind: its first `SAME_KIND` lines stand for all."""
+    kinds: dict[str, list[str]] = {}
+    for line in dict.fromkeys(lines):
+        kinds.setdefault(_DOF_OR_NUMBER.sub("#", line), []).append(line)
+    shown = []
+    for mine in kinds.values():
+        rest = len(mine) - SAME_KIND
+        shown += mine[:SAME_KIND] if rest > 1 else mine
+        if rest > 1:
+            shown[-1] += f" ({rest} more of this kind.)"
+    return tuple(shown)
+
+
+def _sentence(text: str) -> str:
+    text = text.strip()
+    return text if text.endswith((".", "!", "?")) else text + "."

@@ -1,0 +1,210 @@
+"""A run on one screen: verdict and culprit, modes, the gravest cautions, and what to type next."""
+
+from __future__ import annotations
+
+import math
+import shlex
+import textwrap
+from collections.abc import Iterator, Sequence
+
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.text import Text
+
+from ema_pipeline.correlate.types import percent_off
+from ema_pipeline.diagnose.types import Diagnosis
+from ema_pipeline.report import diagnosis
+from ema_pipeline.report.cautions import Weight, cautions, left_out, suspicions
+from ema_pipeline.report.levels import has_to_say
+from ema_pipeline.report.limits import LOW_MAC
+from ema_pipeline.report.numbers import below, format_percent, format_value, plain, signed
+from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.report.summary import changed_words
+from ema_pipeline.report.tables import Row, Table
+from ema_pipeline.report.terminal import build_table, console_text
+
+SCREEN_LINES = 15
+"""Lines of the summary: what a reader takes in at a glance, and what a terminal of 24 lines holds with its prompt."""
+
+MOST_CAUTIONS = 3
+LEAST_MODES = 3
+"""Rows of modes that later cautions do not push out."""
+
+
+class RunScreen:
+    """The summary of a run in at most `SCREEN_LINES` lines of 80 characters; for ``rich.console.Console.print``.
+
+    Parameters
+    ----------
+    results : RunResults
+    out : str
+        Results folder as the user would type it.
+    below : int
+        Lines that the caller prints below; they are counted.
+    """
+
+    def __init__(self, results: RunResults, out: str, below: int = 0) -> None:
+        self._results, self._out, self._below = results, out, below
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
+        clean = console_text(console)
+        width = options.max_width
+
+        def wrapped(text: str, indent: str = "") -> list[str]:
+            return textwrap.wrap(clean(text), width, subsequent_indent=indent, break_long_words=False) or [""]
+
+        head = wrapped(verdict_line(self._results)) + wrapped(data_line(self._results))
+        table = modes_table(self._results)
+        total = len(table.rows)
+        # the head of the table is a line of its own, and so is the count of modes that are not shown
+        room = SCREEN_LINES - len(head) - self._below - (1 if total else 0)
+        told = _fitting(
+            [wrapped(f"! {c}", "  ") for c in cautions(self._results, Weight.SCALE)],
+            room - min(total, LEAST_MODES + 1),
+        )
+        shown = room - sum(map(len, told))
+        rows = table.rows if total <= shown else table.rows[: max(shown - 1, 0)]
+        yield from (Text(line) for line in head)
+        if rows:
+            yield build_table(Table(table.head, rows, table.numeric), "", clean, True, ruled=False)
+        if len(rows) < total:
+            yield Text(clean(f"  … {total - len(rows)} more modes in {self._out}/modes.csv"))
+        yield from (Text(line) for lines in told for line in lines)
+
+
+def _fitting(blocks: Sequence[list[str]], room: int) -> list[list[str]]:
+    """The first caution, and as many more as fit."""
+    told: list[list[str]] = []
+    for block in blocks[:MOST_CAUTIONS]:
+        if told and sum(map(len, told)) + len(block) > room:
+            break
+        told.append(block)
+    return told
+
+
+def verdict_line(results: RunResults) -> str:
+    """What is missing and how sure that is; without a model how many modes there are."""
+    words = _verdict(results)
+    if suspicions(results) and results.fit is not None:
+        return f"A sensor is suspected, see below. If it reads right: {words[:1].lower()}{words[1:]}"
+    return words
+
+
+def _verdict(results: RunResults) -> str:
+    found = results.diagnosis
+    fit = results.fit
+    if results.diagnosis_is_old:
+        return changed_words(results)
+    if found is not None:
+        told = _diagnosed(found)
+        named = " and ".join(diagnosis.label_words(x) for x in results.added)
+        return f"With {named} in the model: {told[:1].lower()}{told[1:]}" if named else told
+    if fit is not None:
+        return f"The model was fitted: error {plain(fit.error, 3)} (about 1 where it explains the data)."
+    modes = [m for c in results.configurations if c.modal is not None for m in c.modal.modes]
+    if not modes:
+        return "No modes were found." if results.configurations else "Nothing has been analysed yet."
+    low, high = min(m.frequency_hz for m in modes), max(m.frequency_hz for m in modes)
+    return f"{_count(len(modes), 'mode')} from {plain(low)} to {plain(high)} Hz; no model was named (--rig)."
+
+
+def _diagnosed(found: Diagnosis) -> str:
+    """The verdict in a sentence, with the errors that the ladder states."""
+    error = found.error
+    heading = diagnosis.heading(found)
+    if found.verdict == "adequate":
+        odds = diagnosis.probability_words(found.null_probability)
+        return f"{heading} (probability {odds}, error {plain(error, 3)})."
+    if found.verdict == "not_enough_data":
+        return f"{heading}. {found.summary}"
+    top = found.ladder.rungs[-1].parameters if found.ladder.rungs else {}
+    named = []
+    for c in diagnosis.leading(found):
+        sizes = {
+            n: top.get(f"{c.label}.{n}", s) for n, s in c.parameters.items()
+        }  # as the ladder states them
+        shown = diagnosis.size_words(sizes, ", ")
+        named.append(diagnosis.label_words(c.label) + (f", {shown}" if shown else ""))
+    if found.verdict == "effect":
+        mine = diagnosis.claimed(found)
+        odds = diagnosis.probability_words(min((c.probability for c in mine), default=math.nan))
+        rungs = found.ladder.rungs
+        fall = f", error {plain(error, 3)} → {plain(rungs[-1].error, 3)}" if rungs else ""
+        return f"Missing: {'; '.join(named)} (probability {odds}{fall})."
+    if found.verdict == "ambiguous":
+        return f"{heading}: {'; '.join(named)}."
+    return f"{heading} (error {plain(error, 3)})."
+
+
+def data_line(results: RunResults) -> str:
+    """Hits, modes and pairs of every configuration, and what was left out."""
+    return "; ".join(_data_words(c, len(results.configurations) > 1) for c in results.configurations) + "."
+
+
+def _data_words(c: ConfigurationResults, several: bool) -> str:
+    parts = []
+    if c.hits:
+        dropped = " (channels left out of some)" if any(t.startswith("channel") for t in left_out(c)) else ""
+        parts.append(f"{sum(h.accepted for h in c.hits)} of {len(c.hits)} hits used{dropped}")
+    if c.modal is not None:
+        parts.append(_count(len(c.modal.modes), "mode"))
+    if c.pairing is not None:
+        weak = sum(p.mac < LOW_MAC for p in c.pairing.pairs)
+        parts.append(f"{len(c.pairing.pairs)} paired" + (f", {weak} of these doubtfully" if weak else ""))
+    if c.levels is not None and has_to_say(c.levels) and c.levels.level_dependent:
+        parts.append("some move with the force")
+    return (f"{c.name}: " if several else "") + (", ".join(parts) or "nothing analysed yet")
+
+
+def next_lines(results: RunResults, out: str, program: str) -> tuple[str, ...]:
+    """The command to type next, as it can be pasted; none where there is nothing left to do."""
+    if suspicions(results):
+        raw, rig = results.provenance.get("raw folder", "RAW"), results.provenance.get("rig", "none")
+        model = "" if rig == "none" else f" --rig {shlex.quote(rig)}"
+        again = f"run {shlex.quote(raw)}{model} --out {shlex.quote(out)}"
+        return (f"correct test.toml, then {shlex.quote(program)} {again}",)
+    if results.diagnosis is None:
+        return ()
+    commands = diagnosis.next_commands(results.diagnosis, out, results.added)
+    if results.diagnosis_is_old:
+        commands = (f"ema diagnose {shlex.quote(out)}",)
+    return tuple(c.replace("ema ", f"{shlex.quote(program)} ", 1) for c in commands[:1])
+
+
+def modes_table(results: RunResults) -> Table:
+    """Frequency and damping of every mode and, with a model, its frequency, the difference and the MAC."""
+    several = len(results.configurations) > 1
+    paired = any(c.pairing is not None for c in results.configurations)
+    head = (("",) if several else ()) + ("mode", "frequency, Hz", "damping, %")
+    head += ("model, Hz", "difference, %", "MAC") if paired else ("MPC",)
+    rows = tuple(
+        Row(((c.name,) if several else ()) + cells, alert)
+        for c in results.configurations
+        for cells, alert in _mode_rows(c, paired)
+    )
+    first = 1 if several else 0
+    return Table(head, rows, frozenset(range(first, len(head))))
+
+
+def _mode_rows(c: ConfigurationResults, paired: bool) -> Iterator[tuple[tuple[str, ...], bool]]:
+    pairs = {} if c.pairing is None else {p.measured: p for p in c.pairing.pairs}
+    for k, mode in enumerate(() if c.modal is None else c.modal.modes):
+        cells: tuple[str, ...] = (
+            str(k + 1),
+            format_value(mode.frequency_hz, mode.frequency_std_hz),
+            format_percent(mode.damping_ratio, mode.damping_std).removesuffix(" %"),
+        )
+        if not paired:
+            yield (*cells, f"{mode.mpc:.2f}"), bool(mode.flags)
+            continue
+        pair = pairs.get(k)
+        if pair is None:
+            yield (*cells, "none", "–", "–"), True
+            continue
+        weak = pair.mac < LOW_MAC
+        mac = "–" if math.isnan(pair.mac) else below(pair.mac, LOW_MAC) if weak else f"{pair.mac:.2f}"
+        off = percent_off(mode.frequency_hz, pair.model_frequency_hz)
+        yield (*cells, plain(pair.model_frequency_hz, 5), signed(off, 2), mac), weak
+
+
+def _count(n: int, noun: str) -> str:
+    return f"{n} {noun}{'' if n == 1 else 's'}"

@@ -1,0 +1,300 @@
+"""What the live page shows and what is under way: one state for all tabs."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.pipeline import existing_run
+from ema_pipeline.report.numbers import plain
+from ema_pipeline.report.results import RunResults
+from ema_pipeline.stages.results import load_results
+from ema_pipeline.view.snapshots import Snapshots
+
+PARTS = ("band", "candidates", "model_details", "mode_rows", "gears")
+"""Parts of the page that change with the model, by the names of their templates."""
+
+_LOOK_S = 1.0
+"""How often the folder is looked at for changes that somebody else made."""
+_SHARES = {"ladder": 0.25, "fit": 0.4, "correlate": 0.2, "report": 0.15, "diagnose": 0.85}
+"""Shares of the time that stages take, roughly."""
+
+
+@dataclass
+class Job:
+    """An action under way: its verb, the stage that runs, and how much of all is done (0 to 1)."""
+
+    verb: str
+    label: str
+    stage: str = "starting"
+    text: str = ""
+    done: float = 0.0
+    before: float = 0.0
+    began: float = field(default_factory=time.monotonic)
+
+    def shown(self) -> dict[str, Any]:
+        """For the page."""
+        seconds = time.monotonic() - self.began
+        return {
+            "verb": self.verb, "label": self.label, "stage": self.stage, "text": self.text, "done": self.done,
+            "seconds": seconds,
+        }  # fmt: skip
+
+
+class Session:
+    """A results folder with its page.
+
+    Parameters
+    ----------
+    folder : Path
+    effect_files : sequence of str
+        Files with the user's own effects.
+    """
+
+    def __init__(self, folder: Path, effect_files: Sequence[str] = ()) -> None:
+        self.folder = folder
+        self._effect_files = tuple(effect_files)
+        self.version = 0
+        self.job: Job | None = None
+        self.message = ""
+        self.commands: list[str] = []
+        self.preview: list[dict[str, Any]] | None = None
+        self._snapshots = Snapshots(folder)
+        self._listeners: set[asyncio.Queue[None]] = set()
+        self._worker: asyncio.subprocess.Process | None = None
+        self._running: asyncio.Task[None] | None = None
+        self._seen: tuple[int, int] = (0, 0)
+        self._cancelled = False
+        self._changing = asyncio.Lock()
+        self.load()
+
+    # what is shown
+
+    def load(self) -> None:
+        """Read the folder anew."""
+        seen = self._stamp()
+        self.results: RunResults = load_results(existing_run(self.folder, self._effect_files))
+        self._seen = seen
+        self.version += 1
+
+    def state(self) -> dict[str, Any]:
+        """Everything small that the page follows."""
+        return {
+            "version": self.version,
+            "job": None if self.job is None else self.job.shown(),
+            "message": self.message,
+            "commands": self.commands,
+            "undo": len(self._snapshots) > 0 and self.job is None,
+            "preview": self.preview,
+        }
+
+    def model(self) -> dict[str, Any]:
+        """What changes with the model: data of the figures, and parts of the page."""
+        from ema_pipeline.report.html import page_context, page_parts
+        from ema_pipeline.report.interactive.data import model_data
+
+        context = page_context(self.results, live=True)
+        return {
+            "version": self.version,
+            "figures": list(context["figures"]),
+            "parts": page_parts(context, PARTS),
+            "data": model_data(self.results),
+        }
+
+    def listen(self) -> asyncio.Queue[None]:
+        """A queue that gets an item whenever the state changes."""
+        queue: asyncio.Queue[None] = asyncio.Queue(maxsize=1)
+        self._listeners.add(queue)
+        return queue
+
+    def leave(self, queue: asyncio.Queue[None]) -> None:
+        """Stop listening."""
+        self._listeners.discard(queue)
+
+    def _tell(self) -> None:
+        for queue in self._listeners:
+            with contextlib.suppress(asyncio.QueueFull):
+                queue.put_nowait(None)
+
+    # what is done
+
+    async def act(self, verb: str, label: str) -> None:
+        """Begin an action; what comes of it is told to all tabs.
+
+        Raises
+        ------
+        EmaError
+            If another one is under way.
+        """
+        if self.job is not None:
+            raise EmaError(f"'{self.job.verb}' is under way; wait for it or cancel it")
+        self.job = Job(verb, label)
+        self.message, self.preview, self._cancelled = "", None, False
+        self._tell()
+        self._running = asyncio.create_task(self._run_alone(self.job))
+
+    async def cancel(self) -> None:
+        """Stop what is under way; the folder is as it was before."""
+        if self.job is not None and self._worker is not None:
+            self._cancelled = True
+            self._worker.kill()
+
+    async def undo(self) -> None:
+        """Bring back the state before the last action.
+
+        Raises
+        ------
+        EmaError
+            If there is none, or an action is under way.
+        """
+        if self.job is not None or not len(self._snapshots):
+            raise EmaError("there is nothing to undo")
+        async with self._changing:
+            before = self.results.added
+            await asyncio.to_thread(self._snapshots.restore)
+            await asyncio.to_thread(self.load)
+            self._log(before, self.results.added)
+        self.message = "Undone."
+        self._tell()
+
+    async def watch(self) -> None:
+        """Keep a worker ready, and follow changes that are made on the command line."""
+        await self._start_worker()
+        while True:
+            await asyncio.sleep(_LOOK_S)
+            if not self._changing.locked() and self._stamp() != self._seen:
+                with contextlib.suppress(EmaError):
+                    await asyncio.to_thread(self.load)
+                    self._snapshots.clear()
+                    self.message = "The results were changed outside this page."
+                    self._tell()
+
+    async def close(self) -> None:
+        """Stop what is under way, as `cancel` does, and remove the snapshots."""
+        if self._running is not None and not self._running.done():
+            self._running.cancel()
+            await asyncio.wait([self._running])
+        if self._worker is not None and self._worker.returncode is None:
+            self._worker.kill()
+            await self._worker.wait()
+        if self.job is not None and len(self._snapshots):
+            self._snapshots.restore()
+        self._snapshots.clear()
+
+    async def _run_alone(self, job: Job) -> None:
+        async with self._changing:
+            await self._run(job)
+
+    async def _run(self, job: Job) -> None:
+        before, stamp = self.results.added, self._stamp()
+        try:
+            self._snapshots.take()
+            outcome = await self._work(job)
+            if outcome.get("outcome") == "done":
+                await asyncio.to_thread(self._load_once)
+                self._log(before, self.results.added, job)
+                self.message = self._outcome()
+            else:
+                if self._stamp() == stamp:
+                    self._snapshots.drop()
+                else:
+                    self._snapshots.restore()
+                await asyncio.to_thread(self._load_once)
+                self.message = (
+                    "Cancelled; nothing was changed." if self._cancelled else outcome.get("why", "")
+                )
+        except (EmaError, OSError) as error:
+            self.message = str(error)
+        self.job, self.preview = None, None
+        self._tell()
+
+    async def _work(self, job: Job) -> dict[str, Any]:
+        """Have the worker do it; its last message."""
+        worker = self._worker
+        if worker is None or worker.returncode is not None:
+            worker = await self._start_worker()
+        assert worker.stdin is not None
+        assert worker.stdout is not None
+        worker.stdin.write((json.dumps({"verb": job.verb, "label": job.label}) + "\n").encode())
+        await worker.stdin.drain()
+        while line := await worker.stdout.readline():
+            told = json.loads(line)
+            if "outcome" in told:
+                return dict(told)
+            await self._follow(job, told)
+        await worker.wait()
+        await self._start_worker()
+        return {"outcome": "failed", "why": "the refit has ended before its time; nothing was changed"}
+
+    async def _follow(self, job: Job, told: dict[str, Any]) -> None:
+        if "finished" in told:
+            stage = str(told["finished"])
+            job.before = min(job.before + _SHARES.get(stage, 0.1), 1.0)
+            job.done = job.before
+            if stage == "ladder":
+                self.preview = await asyncio.to_thread(self._rungs)
+            if stage == "correlate":  # all is there but the report on disk
+                await asyncio.to_thread(self._load_once)
+        else:
+            job.stage, job.text = str(told["stage"]), str(told.get("text", ""))
+            job.done = min(job.before + _SHARES.get(job.stage, 0.1) * float(told["done"]), 1.0)
+        self._tell()
+
+    def _outcome(self) -> str:
+        """What an action has brought, in one line."""
+        ladder = self.results.shown_ladder
+        if ladder is None or len(ladder.rungs) < 2:
+            return "Done."
+        first, last = ladder.rungs[0], ladder.rungs[-1]
+        held = f"held out {plain(first.heldout_error, 3)} → {plain(last.heldout_error, 3)}"
+        return f"Error {plain(first.error, 3)} → {plain(last.error, 3)}, {held}."
+
+    def _load_once(self) -> None:
+        """Load unless the model on screen is that in the folder already."""
+        if self._stamp() != self._seen:
+            self.load()
+
+    def _rungs(self) -> list[dict[str, Any]]:
+        from ema_pipeline.diagnose.types import Ladder
+        from ema_pipeline.report.interactive.data import ladder_data
+        from ema_pipeline.store import ALL, Store
+
+        return ladder_data(Store(self.folder).find("ladder", ALL, "ladder", Ladder))
+
+    async def _start_worker(self) -> asyncio.subprocess.Process:
+        self._worker = await asyncio.create_subprocess_exec(
+            sys.executable, "-P", "-m", "ema_pipeline.view.worker", str(self.folder), *self._effect_files,
+            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=1 << 20,
+            start_new_session=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        )  # fmt: skip
+        return self._worker
+
+    def _log(self, before: tuple[str, ...], after: tuple[str, ...], job: Job | None = None) -> None:
+        """The commands that lead from one list of effects to the other."""
+        folder = shlex.quote(str(self.folder))
+        if job is not None and job.verb == "diagnose":
+            self.commands.append(f"ema diagnose {folder}")
+            return
+        if job is not None and job.verb == "remove":
+            self.commands.append(f"ema remove {folder} {shlex.quote(job.label)}")
+            return
+        common = 0
+        while common < min(len(before), len(after)) and before[common] == after[common]:
+            common += 1
+        self.commands += [f"ema remove {folder} {shlex.quote(x)}" for x in reversed(before[common:])]
+        if after[common:]:
+            self.commands.append(f"ema add {folder} {' '.join(shlex.quote(x) for x in after[common:])}")
+
+    def _stamp(self) -> tuple[int, int]:
+        found = (self.folder / "ema.h5").stat()
+        return found.st_ino, found.st_mtime_ns

@@ -1,0 +1,125 @@
+"""What the interactive figures are given: models as sums over poles, FRFs in few bytes, names as text."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import zlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import report_example as example
+
+from ema_pipeline.dof import Dof
+from ema_pipeline.mechanics.frf import receptance
+from ema_pipeline.mechanics.partial_fractions import partial_fractions
+from ema_pipeline.mechanics.system import LinearSystem
+from ema_pipeline.report.html import report_html, script_json
+from ema_pipeline.report.interactive.data import measured_data, model_data
+from ema_pipeline.report.interactive.packing import DECADES, packed_frfs
+from ema_pipeline.report.results import RunResults
+
+HOSTILE = "<script>alert(1)</script>"
+
+
+@pytest.fixture(scope="module")
+def run() -> RunResults:
+    return example.planetary_run(lines=513)
+
+
+def damped(kind: str) -> LinearSystem:
+    """Three masses in a row, the first one free to drift where nothing holds it."""
+    rng = np.random.default_rng(3)
+    k = 1e6 * np.array([[1.0, -1, 0], [-1, 3, -2], [0, -2, 2]])
+    zero = np.zeros((3, 3))
+    viscous = 20 * np.array([[1.0, -1, 0], [-1, 2, -1], [0, -1, 1]])
+    skew = rng.normal(size=(3, 3))
+    system = LinearSystem(("a.x", "b.x", "c.x"), np.diag([1.0, 2, 0.5]), k, zero, zero, 0.01)
+    return {
+        "modal": system,
+        "viscous": replace(system, damping=viscous),
+        "hysteretic": replace(system, structural=0.03 * k, modal_damping_ratio=0.0),
+        "gyroscopic": replace(system, damping=viscous + 30 * (skew - skew.T)),
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", ["modal", "viscous", "hysteretic", "gyroscopic"])
+def test_sum_over_poles_is_the_receptance_with_any_damping(kind: str) -> None:
+    system, f = damped(kind), np.linspace(2.0, 600.0, 300)
+    out, inp = np.eye(3), np.array([[1.0, 0, 0], [0, 1, -1]])
+    expected = receptance(system, f, out, inp)
+    found = partial_fractions(system, out, inp).receptance(f)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+
+
+def unpacked(text: str, lines: int) -> np.ndarray:
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8).astype(np.uint32)
+    low, high = planes.reshape(2, -1)
+    return np.cumsum((low + 256 * high).reshape(-1, lines), axis=1) % 65536
+
+
+def test_packed_frfs_are_the_measured_ones_to_a_tenth_of_a_per_cent(run: RunResults) -> None:
+    frfs = run.configurations[0].frfs
+    assert frfs is not None
+    packed = packed_frfs(frfs, 1500.0, None)
+    lines = packed["lines"]
+    size = 10 ** (DECADES[0] + (DECADES[1] - DECADES[0]) * unpacked(packed["magnitude"], lines) / 65534)
+    turn = np.exp(1j * (2 * np.pi * unpacked(packed["phase"], lines) / 65535 - np.pi))
+    expected = np.stack([frfs.accelerance()[o, i, 1 : lines + 1] for o, i, _ in packed["pairs"]])
+    assert np.max(np.abs(size * turn / expected - 1)) < 1e-3
+    assert len(packed["pairs"]) == packed["total"] == int((frfs.hits > 0).sum())
+
+
+def test_of_more_frfs_than_fit_the_driving_points_are_kept(run: RunResults) -> None:
+    frfs = run.configurations[0].frfs
+    assert frfs is not None
+    packed = packed_frfs(frfs, 1500.0, 4 * int(frfs.frequency_hz.size))
+    assert len(packed["pairs"]) < packed["total"]
+    kept = {(packed["outputs"][o], packed["inputs"][i]) for o, i, _ in packed["pairs"]}
+    driving = {(d.point, d.point) for d in frfs.inputs if d.point in packed["outputs"]}
+    assert len(kept & driving) == min(len(driving), len(kept))
+
+
+def test_every_model_has_its_frfs_differences_and_name(run: RunResults) -> None:
+    assert run.comparison is not None
+    systems = {c.name: c.system for c in run.configurations}
+    both = replace(
+        run,
+        added=("spring@sun",),
+        comparison_base=run.comparison,
+        configurations=tuple(replace(c, base_system=systems[c.name]) for c in run.configurations),
+    )
+    model = model_data(both)
+    assert model["models"] == ["base model", "with spring at sun"]
+    assert len(model["errors"]["models"]) == 2
+    assert all(len(per) == 2 for per in model["frfs"].values())
+    name, c = run.configurations[0].name, run.configurations[0]
+    assert c.frfs is not None
+    assert len(model["frfs"][name][0]["own"]["outputs"]) == len(c.frfs.outputs)
+
+
+def test_names_from_files_are_text_in_page_and_data(run: RunResults) -> None:
+    c = run.configurations[0]
+    assert c.frfs is not None
+    named = replace(c, name=HOSTILE, hits=tuple(replace(h, file=HOSTILE) for h in c.hits))
+    html = report_html(replace(run, title=HOSTILE, configurations=(named,)))
+    assert HOSTILE not in html
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in html
+    data = re.search(r'id="ema-data">(.*?)</script>', html, flags=re.DOTALL)
+    assert data is not None
+    assert "<" not in data[1]
+    assert json.loads(data[1])["measured"]["configurations"][0]["name"] == HOSTILE
+
+
+def test_data_are_json_whatever_is_missing(run: RunResults) -> None:
+    assert script_json({"a": float("nan"), "b": "</script>"}) == '{"a":null,"b":"\\u003c/script\\u003e"}'
+    for results in (RunResults("empty"), replace(run, comparison=None, fit=None)):
+        for found in (measured_data(results), model_data(results)):
+            json.loads(script_json(found))
+    c = run.configurations[0]
+    assert c.frfs is not None
+    unknown = replace(c.frfs, outputs=(Dof("moon", "x"), *c.frfs.outputs[1:]))
+    model = model_data(replace(run, configurations=(replace(c, frfs=unknown),)))
+    assert model["frfs"][c.name][0]["own"]["outputs"][0] is None

@@ -1,0 +1,352 @@
+"""The live page and the report in a real browser, and who is let in."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ema_pipeline.job import change_effects, removing, run_raw
+from ema_pipeline.pipeline import existing_run
+from ema_pipeline.simulate.campaign import simulate_campaign
+from ema_pipeline.store import Store
+from ema_pipeline.view.snapshots import FOLDER, Snapshots
+
+HOSTILE = "<img src=x onerror=document.title=1>"
+CULPRIT = "mass@b"
+RIG = """
+name = "chain"
+modal_damping_ratio = 0.01
+[parameters]
+link = { value = 1e6, unit = "N/m", tolerance = 0.05 }
+[[masses]]
+at = "a.x"
+value = 1.0
+[[masses]]
+at = "b.x"
+value = 1.0
+[[masses]]
+at = "c.x"
+value = 1.0
+[[springs]]
+name = "foot"
+at = "a.x"
+value = "link"
+[[springs]]
+name = "middle"
+between = ["a.x", "b.x"]
+value = "link"
+[[springs]]
+name = "top"
+between = ["b.x", "c.x"]
+value = "link"
+"""
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Results of three masses in a row, the middle one heavier than its model; the test has a hostile title."""
+    folder = tmp_path_factory.mktemp("view")
+    raw, rig = folder / "raw", folder / "rig.toml"
+    rig.write_text(RIG, encoding="utf-8")
+    simulate_campaign(raw, str(rig), effects=["mass@b.x:mass=0.3"], hits=1, duration_s=1.0, seed=5)
+    description = next(raw.rglob("test.toml"))
+    text = re.sub(
+        r"^title = .*$", f"title = '{HOSTILE}'", description.read_text(encoding="utf-8"), flags=re.M
+    )
+    first = next(p for p in sorted(description.parent.iterdir()) if p.suffix == ".uff")
+    first.rename(first.with_name(f"{HOSTILE}.uff"))
+    description.write_text(text.replace(f'"{first.name}"', f"'{HOSTILE}.uff'"), encoding="utf-8")
+    run_raw(raw, str(rig), folder / "out")
+    return folder / "out"
+
+
+@pytest.fixture
+def out(results: Path, tmp_path: Path) -> Path:
+    """A copy of the results that a test may change."""
+    return Path(shutil.copytree(results, tmp_path / "out"))
+
+
+class Page:
+    """A running ``ema view``: its process, port and address with the token."""
+
+    def __init__(self, folder: Path) -> None:
+        command = [
+            sys.executable,
+            "-c",
+            "from ema_pipeline.cli import main; main()",
+            "view",
+            str(folder),
+            "--no-browser",
+        ]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        assert self.process.stdout is not None
+        found = re.search(r"http://127\.0\.0\.1:(\d+)/\?token=\S+", self.process.stdout.readline())
+        assert found is not None
+        self.address, self.port = found[0], int(found[1])
+
+    @property
+    def origin(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def ask(
+        self, method: str, path: str, body: str | None = None, **headers: str
+    ) -> http.client.HTTPResponse:
+        """One request with these headers, an underscore in a name standing for a dash."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+        connection.request(method, path, body, {k.replace("_", "-"): v for k, v in headers.items()})
+        return connection.getresponse()
+
+    def enter(self) -> str:
+        """The cookie for the token."""
+        answer = self.ask("GET", self.address.removeprefix(self.origin))
+        assert answer.status == 303
+        return str(answer.headers["set-cookie"])
+
+    def stop(self) -> int:
+        """Ctrl-C."""
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(timeout=15)
+
+
+@pytest.fixture
+def page(out: Path) -> Iterator[Page]:
+    """The live page of a copy of the results."""
+    served = Page(out)
+    yield served
+    if served.process.poll() is None:
+        assert served.stop() == 0
+
+
+# who is let in
+
+
+def test_token_opens_once_and_the_cookie_is_for_this_page_alone(page: Page) -> None:
+    cookie = page.enter()
+    assert "httponly" in cookie.lower()
+    assert "samesite=strict" in cookie.lower()
+    assert page.ask("GET", page.address.removeprefix(page.origin)).status == 403
+    answer = page.ask("GET", "/", Cookie=cookie.partition(";")[0])
+    assert answer.status == 200
+    policy = answer.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe-eval" not in policy
+    assert "script-src 'self';" in policy
+
+
+ROUTES = (
+    "/",
+    "/measured",
+    "/model",
+    "/events",
+    "/commands",
+    "/numbers.js",
+    "/page.js",
+    "/bokeh.js",
+    "/live.js",
+    "/nowhere",
+)
+
+
+def test_nobody_else_is_let_in(page: Page) -> None:
+    cookie = page.enter().partition(";")[0]
+    name = cookie.partition("=")[0]
+    for path in ROUTES:
+        assert page.ask("GET", path).status == 403
+        assert page.ask("GET", path, Cookie=f"{name}=guess").status == 403
+        for host in ("localhost", f"localhost:{page.port}", "127.0.0.1", f"evil.example:{page.port}"):
+            assert page.ask("GET", path, Cookie=cookie, Host=host).status == 403
+        assert page.ask("GET", path, Cookie=cookie, Origin="http://evil.example").status == 403
+        assert page.ask("GET", path, Cookie=cookie, Sec_Fetch_Site="cross-site").status == 403
+    assert page.ask("GET", "/?token=guess").status == 403
+    upgrade = page.ask(
+        "GET", "/events", Upgrade="websocket", Connection="Upgrade", Origin="http://evil.example"
+    )
+    assert upgrade.status == 403
+
+
+def test_nothing_changes_without_the_pages_own_origin_or_by_get(page: Page, out: Path) -> None:
+    cookie = page.enter().partition(";")[0]
+    before = (out / "ema.h5").stat().st_mtime_ns
+    wanted = json.dumps({"verb": "add", "label": CULPRIT})
+    kind = "application/json"
+    assert page.ask("POST", "/action", wanted, Cookie=cookie, Content_Type=kind).status == 403
+    for origin in ("null", "http://evil.example", f"http://localhost:{page.port}", "http://127.0.0.1"):
+        assert (
+            page.ask("POST", "/action", wanted, Cookie=cookie, Content_Type=kind, Origin=origin).status == 403
+        )
+    assert page.ask("GET", "/action", Cookie=cookie).status == 405
+    own = {"Cookie": cookie, "Origin": page.origin}
+    assert page.ask("POST", "/action", wanted, Content_Type="text/plain", **own).status == 409
+    for body in ("", "[]", "{}", '{"verb": "run"}', '{"verb": "add", "label": 3}', "x" * 5000):
+        assert page.ask("POST", "/action", body, Content_Type=kind, **own).status == 409
+    time.sleep(0.5)
+    assert (out / "ema.h5").stat().st_mtime_ns == before
+
+
+def test_undone_state_is_the_file_that_was_there_before(out: Path) -> None:
+    before = (out / "ema.h5").read_bytes()
+    kept = Snapshots(out)
+    kept.take()
+    with Store(out).changing() as file:
+        file.attrs["x"] = 1
+    assert (out / "ema.h5").read_bytes() != before
+    kept.restore()
+    assert (out / "ema.h5").read_bytes() == before
+    assert not len(kept)
+
+
+# in a browser
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Debian's Chromium, driven by Playwright."""
+    sync_api = pytest.importorskip(
+        "playwright.sync_api", reason="Playwright is not installed: pip install playwright"
+    )
+    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if path is None:
+        pytest.skip("no Chromium on this machine: apt-get install chromium")
+    sandbox = [] if os.geteuid() else ["--no-sandbox"]  # Chromium refuses its sandbox to root
+    with sync_api.sync_playwright() as driver:
+        started = driver.chromium.launch(executable_path=path, args=sandbox)
+        yield started
+        started.close()
+
+
+def opened(context, address: str):
+    """A tab whose page has started; what its script complains of is kept in ``faults``."""
+    tab = context.new_page()
+    tab.faults = []
+    tab.on("pageerror", lambda error: tab.faults.append(str(error)))
+    tab.goto(address)
+    tab.wait_for_selector("html[data-ready]", timeout=30_000)
+    return tab
+
+
+def errors_shown(tab) -> tuple[float, float]:
+    """Error before and after, as the first tile has them."""
+    tile = tab.locator(".tile").first
+    return float(tile.locator(".was").inner_text()), float(tile.locator("strong").inner_text())
+
+
+def test_click_on_the_culprit_and_the_error_falls_in_every_tab(browser, page: Page, out: Path) -> None:
+    from playwright.sync_api import expect
+
+    context = browser.new_context()
+    tab = opened(context, page.address)
+    second = opened(context, page.origin)
+    tab.wait_for_selector("[data-figure=frf][data-state=shown]", timeout=30_000)
+    tab.locator(f'button.act.add[data-label="{CULPRIT}"]').click()
+    expect(tab.locator("#band h2")).to_contain_text("In the model: mass at b", timeout=60_000)
+    before, after = errors_shown(tab)
+    assert before > 5
+    assert after < 1.5
+    expect(second.locator("#band h2")).to_contain_text("In the model: mass at b", timeout=20_000)
+    expect(tab.locator("#cancel")).to_be_hidden(timeout=60_000)
+    expect(second.locator("#commands")).to_have_text(f"ema add {out} {CULPRIT}")
+    assert existing_run(out).info.effects == (CULPRIT,)
+
+    second.locator("#undo").click()
+    expect(tab.locator("#band h2")).to_contain_text("Missing: mass at b", timeout=20_000)
+    assert existing_run(out).info.effects == ()
+    expect(tab.locator("#undo")).to_be_disabled()
+
+    tab.locator("#add-label").fill("no_such@thing")
+    tab.locator("#add-form button").click()
+    expect(tab.locator("#status")).to_contain_text("no_such", timeout=20_000)
+    assert existing_run(out).info.effects == ()
+    assert tab.faults == second.faults == []
+    context.close()
+
+
+def test_refit_that_is_cancelled_leaves_the_folder_as_it_was(browser, page: Page, out: Path) -> None:
+    from playwright.sync_api import expect
+
+    before = (out / "ema.h5").read_bytes()
+    context = browser.new_context()
+    tab = opened(context, page.address)
+    tab.locator(f'button.act.add[data-label="{CULPRIT}"]').click()
+    tab.locator("#cancel").click(timeout=20_000)
+    expect(tab.locator("#status")).to_contain_text("Cancelled", timeout=20_000)
+    assert (out / "ema.h5").read_bytes() == before
+    expect(tab.locator("#band h2")).to_contain_text("Missing: mass at b")
+    tab.locator(f'button.act.add[data-label="{CULPRIT}"]').click()  # a new worker does it
+    expect(tab.locator("#band h2")).to_contain_text("In the model", timeout=60_000)
+    context.close()
+
+
+def test_server_stopped_amid_a_refit_leaves_the_folder_as_it_was(page: Page, out: Path) -> None:
+    before = (out / "ema.h5").read_bytes()
+    own = {
+        "Cookie": page.enter().partition(";")[0],
+        "Origin": page.origin,
+        "Content_Type": "application/json",
+    }
+    assert page.ask("POST", "/action", json.dumps({"verb": "diagnose"}), **own).status == 202
+    time.sleep(1.5)
+    assert page.stop() == 0
+    assert (out / "ema.h5").read_bytes() == before
+    assert not list(out.glob(f"{FOLDER}*"))
+
+
+def test_server_that_is_killed_leaves_whole_results_and_nothing_behind(page: Page, out: Path) -> None:
+    own = {
+        "Cookie": page.enter().partition(";")[0],
+        "Origin": page.origin,
+        "Content_Type": "application/json",
+    }
+    assert page.ask("POST", "/action", json.dumps({"verb": "add", "label": CULPRIT}), **own).status == 202
+    deadline = time.monotonic() + 30
+    while not existing_run(out).info.effects and time.monotonic() < deadline:
+        time.sleep(0.02)
+    page.process.kill()
+    page.process.wait()
+    time.sleep(0.5)
+    with Store(out).lock():  # the worker is gone
+        assert existing_run(out).info.effects == (CULPRIT,)
+    change_effects(out, removing(CULPRIT))
+    assert existing_run(out).info.effects == ()
+    Snapshots(out)
+    assert not list(out.glob(f"{FOLDER}*"))
+
+
+def test_hostile_names_are_text_on_the_live_page(browser, page: Page) -> None:
+    context = browser.new_context()
+    tab = opened(context, page.address)
+    assert tab.locator("h1").inner_text() == HOSTILE
+    assert tab.title().startswith(HOSTILE)
+    assert tab.locator("img").count() == 0
+    assert HOSTILE in tab.locator("#provenance").inner_html().replace("&lt;", "<").replace("&gt;", ">")
+    context.close()
+
+
+def test_report_opens_from_disk_without_network_and_shows_its_figures(browser, results: Path) -> None:
+    context = browser.new_context(offline=True)
+    asked: list[str] = []
+    context.on("request", lambda request: asked.append(request.url))
+    tab = opened(context, (results / "report.html").as_uri())
+    for figure in ("frf", "moved", "errors", "ladder", "nyquist", "stab", "shape", "mac"):
+        place = tab.locator(f"[data-figure={figure}]")
+        place.scroll_into_view_if_needed()
+        tab.wait_for_selector(
+            f"[data-figure={figure}][data-state=shown] canvas", state="attached", timeout=20_000
+        )
+    tab.locator("button.pick").nth(1).click()
+    assert "mode 2" in tab.locator("#mode-title").inner_text()
+    assert tab.faults == []
+    assert len([url for url in asked if not url.startswith(("data:", "blob:"))]) == 1
+    assert tab.title().startswith(HOSTILE)
+    assert (results / "report.html").stat().st_size < 6e6
+    context.close()
