@@ -13,7 +13,7 @@ from imperfect_modes import GOOD, NORMAL, Hidden, chain, chain_modes
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnose.limits import detection_limits
 from ema_pipeline.diagnose.localise import localise
-from ema_pipeline.diagnose.naming import named, sizes_of
+from ema_pipeline.diagnose.naming import in_said_names, named, sizes_of
 from ema_pipeline.diagnose.probability import needed
 from ema_pipeline.diagnose.score import Score, scores
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -171,6 +171,25 @@ def test_sizes_under_several_names_are_the_same_change_of_the_model() -> None:
     assert len(assemblies) >= 2
     for other in assemblies[1:]:
         np.testing.assert_allclose(other, assemblies[0], rtol=1e-9, atol=1e-3)
+
+
+@pytest.mark.parametrize("said", range(2))
+def test_a_fit_under_another_name_is_the_same_fit(said: int) -> None:
+    one = of_chain()["spring@m1"]
+    rig = chain()
+    observations = ModeObservations(rig, [prepare(m) for m in chain_modes(0, GOOD).values()])
+    fit = fitted_on_top(one, 0.3, rig, observations)
+    fit = refined(observations, fit.model, fit.posterior.x, fit.posterior.scatters)
+    name = sorted(one.names, key=lambda n: n.label)[said]
+    again = in_said_names(observations, fit, [(one, name)])
+    assert again.model.labels == (name.label,)
+    before, after = (f.model.problem(observations) for f in (fit, again))
+    modes = [p.solution("all", f.posterior.x) for p, f in ((before, fit), (after, again))]
+    np.testing.assert_allclose(modes[1].frequency_hz, modes[0].frequency_hz, rtol=1e-3)
+    size = next(iter(sizes_of(one, name, fit).values()))
+    found = after.parameter_values(again.posterior.x)[f"{name.label}.{name.placed.effect.parameters[0].name}"]
+    assert found == pytest.approx(size.value, rel=0.2)
+    assert abs(again.posterior.error - fit.posterior.error) < 0.05
 
 
 # --- scores and limits against a refit in full ------------------------------------------------------------

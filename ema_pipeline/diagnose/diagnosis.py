@@ -9,6 +9,7 @@ from ema_pipeline.diagnose.claims import Judged
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnose.limits import detection_limits
 from ema_pipeline.diagnose.localise import localise
+from ema_pipeline.diagnose.naming import in_said_names
 from ema_pipeline.diagnose.next_test import next_measurement
 from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
@@ -75,7 +76,8 @@ def diagnose(
     fits = [start, *(j.ranked.fit for j in found.claimed)]
     if found.claimed:
         fits[-1] = found.final
-    rungs = rungs_of(observations, fits)
+    said = [(j.hypothesis, j.named.name) for j in found.claimed]
+    rungs = rungs_of(observations, [in_said_names(observations, f, said) for f in fits])
     in_model = set(found.final.model.labels)
     left = scores(observations, found.final, [h for h in hypotheses if h.label not in in_model])
     group = alike(found, settings)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
 from ema_pipeline.diagnose.types import EffectSize
+from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
-from ema_pipeline.observations.fitting import Fit
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import Fit, Model, refined
 from ema_pipeline.observations.rig_model import SizeMap
 
 _ALIKE = 3.0
@@ -52,6 +55,30 @@ def named(hypothesis: Hypothesis, fit: Fit) -> Named:
     name, advantage = min(near, key=lambda pair: _rank(pair[0], positive))
     others = tuple(n.label for n, a in possible if n.label != name.label and best - a < 2 * _ALIKE)
     return Named(name, others, sizes_of(hypothesis, name, fit), advantage)
+
+
+def in_said_names(observations: Observations, fit: Fit, said: Sequence[tuple[Hypothesis, Name]]) -> Fit:
+    """The same model with its effects under the names that are said, so that every table tells one story."""
+    swapped = {h.label: (h, n) for h, n in said if n.label != h.label}
+    if not swapped.keys() & set(fit.model.labels):
+        return fit
+    model, values = Model(), dict(fit.unknowns)
+    for placed in fit.model.effects:
+        known = {n: fit.model.scales[n] for n in _full_names(placed) if n in fit.model.scales}
+        if placed.label in swapped:
+            hypothesis, name = swapped[placed.label]
+            ratio = hypothesis.representative.relative / name.relative
+            for old, new in zip(_full_names(placed), _full_names(name.placed), strict=True):
+                values[new] = values.pop(old) * ratio
+            placed, known = name.placed, {name.placed.parameter_name(k): v for k, v in name.scales.items()}
+        model = model.plus(placed, known)
+    unknowns = model.problem(observations).unknowns
+    begin = unknowns.clipped(np.array([values[n] for n in unknowns.names]))
+    return refined(observations, model, begin, fit.posterior.scatters)
+
+
+def _full_names(placed: PlacedEffect) -> list[str]:
+    return [placed.parameter_name(p.name) for p in placed.effect.parameters]
 
 
 def sizes_of(hypothesis: Hypothesis, name: Name, fit: Fit) -> dict[str, EffectSize]:
