@@ -39,8 +39,11 @@ class Sensing:
 
     Attributes
     ----------
-    along, across : ndarray, (s, n)
-    gain, transverse : ndarray of int, (s,)
+    along : ndarray, (s, n)
+    across : ndarray, (k, s, n)
+        In up to k directions.
+    gain : ndarray of int, (s,)
+    transverse : ndarray of int, (k, s)
         Positions of their unknowns, -1 for none.
     drift : int
         Position of the unknown by which all frequencies are off together; -1 where no frequencies are compared.
@@ -96,7 +99,7 @@ class Comparison:
         self.scatters, self.defaults = scatters, defaults
         self.gain = np.where(sensing.gain >= 0, np.exp(x[np.maximum(sensing.gain, 0)]), 1.0)
         cross = np.where(sensing.transverse >= 0, x[np.maximum(sensing.transverse, 0)], 0.0)
-        self.reading = self.gain[:, None] * (sensing.along + cross[:, None] * sensing.across)
+        self.reading = self.gain[:, None] * (sensing.along + np.sum(cross[..., None] * sensing.across, axis=0))
 
     def residuals(self, matching: object, derivatives: bool) -> Residuals:
         """Residuals with the pairs of `matching`, or with new ones where it is no array."""
@@ -268,8 +271,9 @@ class Comparison:
         slope[:, :, : by_model.shape[2]] = read.reshape(count, k, by_model.shape[2]).transpose(1, 0, 2)
         has = np.flatnonzero(s.gain >= 0)
         slope[:, has, s.gain[has]] += predicted[:, has]
-        has = np.flatnonzero(s.transverse >= 0)
-        slope[:, has, s.transverse[has]] += (self.gain[:, None] * (s.across @ shapes[:width])).T[:, has]
+        for across, unknown in zip(s.across, s.transverse, strict=True):
+            has = np.flatnonzero(unknown >= 0)
+            slope[:, has, unknown[has]] += (self.gain[:, None] * (across @ shapes[:width])).T[:, has]
         return slope
 
 

@@ -51,7 +51,8 @@ _CLOSE_PAIR = 0.2
 _WRONG = 4.0
 """σ from which a shape is another one."""
 
-_ACROSS = {"x": "y", "y": "x", "zeta": "eta", "eta": "zeta"}
+_FRAMES = (("x", "y", "z"), ("zeta", "eta"))
+_TURNING = "u"
 
 
 def scatters_of(rig: Rig) -> dict[str, Scatter]:
@@ -144,8 +145,8 @@ def _drift(configuration: str) -> str:
     return f"drift of {configuration}"
 
 
-def _transverse(sensor: str) -> str:
-    return f"transverse sensitivity at {sensor}"
+def _transverse(sensor: str, direction: str) -> str:
+    return f"transverse sensitivity at {sensor} along {direction}"
 
 
 @dataclass(frozen=True)
@@ -221,21 +222,31 @@ class ModeProblem:
         sensors = {s: self.observations.channel(s) for s in self.observations.sensors}
         gains = {_calibration(s, c): c.calibration_std / CALIBRATION_STD for s, c in sensors.items()}
         gains = {name: std for name, std in gains.items() if std > 0}
-        across = {s: c.transverse for s, c in sensors.items() if c.transverse > 0 and self._has_across(s)}
+        across: dict[str, float] = {}
+        for s, c in sensors.items():
+            others = self._directions_across(s)
+            if c.transverse > 0:
+                across |= {_transverse(s, d): c.transverse / np.sqrt(len(others)) for d in others}
         drifts = [_drift(d.configuration) for d in self.observations.data]
         return joined(
             self.model.unknowns,
             Unknowns.plain(drifts, DRIFT_STD),
             Unknowns.plain(tuple(gains), list(gains.values()), CALIBRATION),
-            Unknowns.plain([_transverse(s) for s in across], list(across.values())),
+            Unknowns.plain(tuple(across), list(across.values())),
         )
 
-    def _has_across(self, sensor: str) -> bool:
+    def _directions_across(self, sensor: str) -> tuple[str, ...]:
+        """Directions whose motion a sensor also reads; for one on the rim the radius, wherever it is."""
         body, _, direction = sensor.rpartition(".")
-        other = _ACROSS.get(direction)
-        if other is None:
-            return False
-        return any(self.observations.has(d.configuration, Dof(body, other)) for d in self.observations.data)
+        for frame in _FRAMES:
+            if direction in frame or direction == _TURNING:
+                others = tuple(d for d in frame if d != direction and self._anywhere(Dof(body, d)))
+                if others:
+                    return others
+        return ()
+
+    def _anywhere(self, dof: Dof) -> bool:
+        return any(self.observations.has(d.configuration, dof) for d in self.observations.data)
 
     def sensing(self, data: ModeData) -> Sensing:
         """What the sensors of one configuration's modes read."""
@@ -249,18 +260,19 @@ class ModeProblem:
 
     def _found_sensing(self, d: ModeData) -> Sensing:
         along = self.model.sensor_rows(d.configuration, d.dofs)
-        across = np.zeros_like(along)
+        most = max(map(len, _FRAMES))
+        across = np.zeros((most, *along.shape))
         gain = np.full(len(d.dofs), -1)
-        transverse = np.full(len(d.dofs), -1)
+        transverse = np.full((most, len(d.dofs)), -1)
         for i, dof in enumerate(d.dofs):
             gain[i] = self.unknowns.index.get(
                 _calibration(dof.point, self.observations.channel(dof.point)), -1
             )
-            transverse[i] = self.unknowns.index.get(_transverse(dof.point), -1)
-            if transverse[i] >= 0:
-                other = Dof(dof.body, _ACROSS[dof.direction])
-                if self.observations.has(d.configuration, other):
-                    across[i] = self.model.sensor_rows(d.configuration, (other,))[0]
+            for k, direction in enumerate(self._directions_across(dof.point)):
+                other = Dof(dof.body, direction)
+                transverse[k, i] = self.unknowns.index.get(_transverse(dof.point, direction), -1)
+                if transverse[k, i] >= 0 and self.observations.has(d.configuration, other):
+                    across[k, i] = self.model.sensor_rows(d.configuration, (other,))[0]
         drift = self.unknowns.index.get(_drift(d.configuration), -1)
         return Sensing(along, across, gain, transverse, drift)
 
