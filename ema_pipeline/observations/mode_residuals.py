@@ -99,7 +99,9 @@ class Comparison:
         self.scatters, self.defaults = scatters, defaults
         self.gain = np.where(sensing.gain >= 0, np.exp(x[np.maximum(sensing.gain, 0)]), 1.0)
         cross = np.where(sensing.transverse >= 0, x[np.maximum(sensing.transverse, 0)], 0.0)
-        self.reading = self.gain[:, None] * (sensing.along + np.sum(cross[..., None] * sensing.across, axis=0))
+        self.reading = self.gain[:, None] * (
+            sensing.along + np.sum(cross[..., None] * sensing.across, axis=0)
+        )
 
     def residuals(self, matching: object, derivatives: bool) -> Residuals:
         """Residuals with the pairs of `matching`, or with new ones where it is no array."""
