@@ -32,8 +32,8 @@ from ema_pipeline.modal.selection import link, votes
 from ema_pipeline.modal.uncertainty import (
     left_to_go,
     parameter_covariance,
-    row_scores,
-    scatter_over_rows,
+    scatter_over_points,
+    scores_of_points,
     shape_covariance,
 )
 
@@ -301,19 +301,22 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand) -> Fitt
     estimate = fit.estimate
     weight = fit.noise.weight(few.measured)
     parameters = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
+    transposed = window.data.transposed
     if compressible(window.data):
         made, scores = [], []
         information = np.zeros_like(parameters)
         for rows in window.data.row_blocks():
             linear = _linear_fit(window.rows(rows), estimate)
             made.append(_shapes_and_stds(*linear, parameters))
-            score, more = row_scores(estimate, linear[1].solution)
+            score, more = scores_of_points(transposed, estimate, linear[1].solution)
             scores.append(score)
             information += more
         shapes, stds = np.concatenate([s for s, _ in made]), np.concatenate([s for _, s in made])
-        if window.data.transposed:  # rows are struck points: other hits
-            parameters = _widened(parameters, scatter_over_rows(np.concatenate(scores), information))
+        points = np.concatenate(scores) if transposed else np.sum(scores, axis=0)
+        parameters = _widened(parameters, scatter_over_points(points, information))
     else:
+        scatter = scatter_over_points(*scores_of_points(transposed, estimate, fit.solution))
+        parameters = _widened(parameters, scatter)
         shapes, stds = _shapes_and_stds(few, fit, parameters)
     core = np.flatnonzero(between(estimate.poles, part.low, part.high))
     pole_cov = np.array([parameters[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] for r in core]).reshape(-1, 2, 2)

@@ -77,42 +77,52 @@ def parameter_covariance(
     return np.asarray(0.5 * (parameters + parameters.T))
 
 
-FEWEST_GROUPS = 12
-"""Rows without which their scatter does not tell an interval."""
+FEWEST_GROUPS = 5
+"""Struck points without which their scatter does not tell an interval."""
 
 
-def row_scores(estimate: Estimate, solution: LinearSolution) -> tuple[Real, Real]:
-    """What each row asks of the parameters, and the information of all rows together.
-
-    Returns
-    -------
-    scores : ndarray, (n_rows, n_parameters)
-        Gradient of each row at its own best shapes.
-    information : ndarray, (n_parameters, n_parameters)
-    """
-    z = parameter_columns(estimate, solution.shapes)
-    psi = np.stack([solution.shapes.real, solution.shapes.imag], axis=-1).reshape(len(solution.shapes), -1)
-    coefficients = np.einsum("iab,ob->oia", mixing(estimate.participation), psi)
-    n = coefficients.shape[-1]
-    misfit = solution.moment - np.einsum("oiab,oib->oia", solution.gram[..., :n], coefficients)
-    return np.einsum("oiap,oia->op", z, misfit, optimize=True), newton_step(estimate, solution).information
-
-
-def scatter_over_rows(scores: Real, information: Real) -> Real:
-    """Covariance of the parameters from the scatter of what single rows ask for.
-
-    Where rows are hits on different points, this is the jackknife over hits, to first order: it holds whatever differs
-    from hit to hit, be it noise or a structure that is not quite linear.
+def scores_of_points(transposed: bool, estimate: Estimate, solution: LinearSolution) -> tuple[Real, Real]:
+    """What the hits on each point ask of the parameters, and the information of all of them.
 
     Parameters
     ----------
-    scores : ndarray, (n_rows, n_parameters)
+    transposed : bool
+        True where rows are struck points, False where references are.
+    estimate, solution
+        Result of a fit.
+
+    Returns
+    -------
+    scores : ndarray, (n_points, n_parameters)
+        Gradient of each point's FRFs, shapes eliminated.
+    information : ndarray, (n_parameters, n_parameters)
+    """
+    m = len(estimate.poles)
+    mix = mixing(estimate.participation)
+    z = parameter_columns(estimate, solution.shapes)
+    z[:, :, : 2 * m] -= np.einsum("iab,obp->oiap", mix, _eliminated(estimate, solution), optimize=True)
+    psi = np.stack([solution.shapes.real, solution.shapes.imag], axis=-1).reshape(len(solution.shapes), -1)
+    coefficients = np.einsum("iab,ob->oia", mix, psi)
+    misfit = solution.moment - np.einsum("oiab,oib->oia", solution.gram[..., : 2 * m], coefficients)
+    scores = np.einsum("oiap,oia->op" if transposed else "oiap,oia->ip", z, misfit, optimize=True)
+    return scores, newton_step(estimate, solution).information
+
+
+def scatter_over_points(scores: Real, information: Real) -> Real:
+    """Covariance of the parameters from the scatter of what single struck points ask for.
+
+    This is the jackknife over points, to first order: it holds whatever differs from hit to hit, be it noise, drift or
+    a structure that is not quite linear. Drift moves a peak as a whole, which noise from line to line does not know.
+
+    Parameters
+    ----------
+    scores : ndarray, (n_points, n_parameters)
     information : ndarray, (n_parameters, n_parameters)
 
     Returns
     -------
     ndarray, (n_parameters, n_parameters)
-        0 for few rows.
+        0 for few points.
 
     References
     ----------

@@ -110,8 +110,9 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
             )
     hits = slice(n_peaks, n_peaks + n_hits)
     single = np.zeros(shift.shape)
-    spread = own[peak] * weak
-    single[hit, peak] = (value - found.fitted) * spread / (spread + noise)
+    # What a weak peak seems to move beyond what a strong one does is the flank of another: no movement to undo.
+    spread = own[peak] * np.minimum(weak, 1.0)
+    single[hit, peak] = (value - found.fitted) * spread / (own[peak] * weak + noise)
     return Movement(
         common=found.mean[hits],
         common_std=np.sqrt(found.variance[hits]),
