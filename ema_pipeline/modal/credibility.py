@@ -64,6 +64,12 @@ SAME_RESPONSE = 0.9
 """MAC at three or more sensors that measured together, above which two coinciding poles are one mode where a
 misfit is left over: its frequency drifts between hits, which splits it in two that look alike."""
 
+ONE_SHAPE = 0.97
+"""The same at six or more sensors for poles within a decay rate of each other, whatever the scatter between hits
+explains: hits on one point that differ in direction and frequency leave it room for twins."""
+
+MIN_SENSORS_FOR_SHAPE = 6
+
 RANDOM_PHASE = 0.25
 """Modal phase collinearity below which the phases of a shape are random."""
 
@@ -215,6 +221,8 @@ def _doubles(
     double = close & (_second_singular(estimate, solution, close) < least)
     if n_sensors > 2:
         double |= close & (sensors > SAME_RESPONSE) & ~explained[:, None]
+    if n_sensors >= MIN_SENSORS_FOR_SHAPE:
+        double |= (distance < np.maximum(decay[:, None], decay)) & (sensors > ONE_SHAPE)
     if min(data.measured.shape) > 2:
         double |= (distance < ECHO_REACH * decay) & (rows * references > ECHO_MAC) & ~explained[:, None]
     size = _size(estimate, solution)
