@@ -171,11 +171,15 @@ def test_derivatives_of_the_residuals_are_those_of_differences(labels: tuple[str
     for i, name in enumerate(problem.unknowns.names):
         h = np.zeros(len(x))
         h[i] = 1e-6
-        low, high = (problem.residuals(x + s * h, scatters, matching=here.matching).values for s in (-1, 1))
-        change = (high - low) / 2e-6
+        low, high = (problem.residuals(x + s * h, scatters, matching=here.matching) for s in (-1, 1))
+        change = (high.stated - low.stated) / 2e-6
         # Where damping couples modes, that it turns their shapes is left out of the derivatives.
         close = max(0.5, 1e-2 * np.max(np.abs(change))) if any("damper" in x for x in labels) else 2e-3
-        np.testing.assert_allclose(here.jacobian[:, i], change, atol=max(close, 2e-3), err_msg=name)
+        slope = here.jacobian[:, i] * here.relative
+        np.testing.assert_allclose(slope, change, atol=max(close, 2e-3), err_msg=name)
+        gradient = float(here.jacobian[:, i] @ here.values)
+        fall = (high.cost - low.cost) / 2e-6
+        assert gradient == pytest.approx(fall, rel=1e-3, abs=20 * max(close, 2e-3)), name
 
 
 def test_derivatives_of_the_residuals_hold_for_two_configurations_with_transverse_sensors() -> None:
@@ -185,12 +189,13 @@ def test_derivatives_of_the_residuals_hold_for_two_configurations_with_transvers
     scatters = {n: s.default for n, s in observations.scatters.items()}
     x = problem.start() + 0.02 * np.random.default_rng(2).normal(size=len(problem.unknowns))
     here = problem.residuals(x, scatters)
-    scale = np.abs(here.jacobian).max()
+    slopes = here.jacobian * here.relative[:, None]
+    scale = np.abs(slopes).max()
     for i, name in enumerate(problem.unknowns.names):
         h = np.zeros(len(x))
         h[i] = 1e-6
-        low, high = (problem.residuals(x + s * h, scatters, matching=here.matching).values for s in (-1, 1))
-        np.testing.assert_allclose(here.jacobian[:, i], (high - low) / 2e-6, atol=1e-4 * scale, err_msg=name)
+        low, high = (problem.residuals(x + s * h, scatters, matching=here.matching).stated for s in (-1, 1))
+        np.testing.assert_allclose(slopes[:, i], (high - low) / 2e-6, atol=1e-4 * scale, err_msg=name)
 
 
 def test_a_rig_that_is_as_drawn_has_residuals_of_nothing_but_noise() -> None:

@@ -43,6 +43,8 @@ _UNSEEN = 1e6
 _GRID = tuple(np.linspace(-2.0, 2.0, 9))
 """Unknowns of sizes, in units of their prior σ, at which an effect that adds modes is tried."""
 _GRID_STARTS = 2
+_GRID_HEAT = 30.0
+"""Factor on the uncertainties there: two neighbours of the grid differ by a third in the frequency of an added mode."""
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
@@ -201,9 +203,7 @@ def _best_of_grid(
     for values in product(_GRID, repeat=len(names)):
         x = begin.copy()
         x[[problem.unknowns.index[n] for n in names]] = values
-        found = problem.residuals(
-            problem.unknowns.clipped(x), scatters, heat=_FROM_GRID[0][0], derivatives=False
-        )
+        found = problem.residuals(problem.unknowns.clipped(x), scatters, heat=_GRID_HEAT, derivatives=False)
         tried.append((found.cost, dict(zip(names, values, strict=True))))
     return [start for _, start in sorted(tried, key=lambda pair: pair[0])[:_GRID_STARTS]]
 

@@ -10,7 +10,6 @@ from ema_pipeline.inference import Posterior
 from ema_pipeline.inference.maximise import ANNEALING, anneal
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned, refined, transferred
-from ema_pipeline.observations.mode_residuals import UNEXPLAINED
 
 
 def rungs_of(observations: Observations, fits: Sequence[Fit]) -> tuple[Rung, ...]:
@@ -32,7 +31,7 @@ def rung(observations: Observations, fit: Fit, base_evidence: float, held: HeldO
         objective=2 * fit.posterior.cost,
         parameters=parameter_sizes(problem, fit.posterior),
         log_evidence=fit.log_evidence - base_evidence,
-        unexplained=int(fit.posterior.residuals.penalty // UNEXPLAINED),
+        unexplained=fit.posterior.residuals.unexplained,
         unknowns=fit.unknowns,
     )
 

@@ -11,10 +11,15 @@ from ema_pipeline.diagnose.types import VerdictWord
 from ema_pipeline.observations.fitting import Fit
 from ema_pipeline.observations.parts import FREE_STD, MASS_SCATTER, PART_SCATTER
 
+MOST_UNEXPLAINED = 1
+"""Measured modes without a partner in a model that explains the data: one may be invented, or of the floor."""
+
 
 def explains(fit: Fit, settings: DiagnoseSettings) -> bool:
-    """True where the model explains the data, and no part deviates more than parts do."""
-    return fit.posterior.error <= settings.error_limit and not outlying_parts(fit, settings)
+    """True where the model explains the data, all measured modes but one, and no part deviates more than parts do."""
+    left = fit.posterior.residuals.unexplained
+    small = fit.posterior.error <= settings.error_limit and left <= MOST_UNEXPLAINED
+    return small and not outlying_parts(fit, settings)
 
 
 def outlying_parts(fit: Fit, settings: DiagnoseSettings) -> dict[str, float]:

@@ -16,7 +16,6 @@ from ema_pipeline.inference import Posterior
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned, wide
-from ema_pipeline.observations.mode_residuals import UNEXPLAINED
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem
 from ema_pipeline.rigs.types import Parameter, Rig
 
@@ -224,7 +223,7 @@ def _notes(fitted: FittedModes) -> tuple[str, ...]:
             f"the model does not explain the data (error {fitted.posterior.error:.1f}): standard deviations of "
             "parameters hold for a model that does"
         )
-    left = round(fitted.posterior.residuals.penalty // UNEXPLAINED)
+    left = fitted.posterior.residuals.unexplained
     for data, match in zip(fitted.observations.data, _matching(fitted), strict=True):
         alone = np.exp(data.log_frequency[match < 0])
         if len(alone):

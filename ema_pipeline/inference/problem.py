@@ -28,6 +28,8 @@ class Residuals:
         Σ ln(σ/σ₀), σ₀ being the uncertainty at the default scatters: the price of wider uncertainties.
     penalty : float
         Further cost, in units of the log posterior: measured modes that the model does not explain.
+    unexplained : int
+        Number of measured modes among them.
     projected : int
         Number of values that were spent on factors of no interest (one per shape).
     relative : ndarray, (m,), optional
@@ -42,6 +44,7 @@ class Residuals:
     log_scale: float = 0.0
     penalty: float = 0.0
     matching: object = None
+    unexplained: int = 0
     projected: int = 0
     relative: NDArray[np.float64] | None = None
 

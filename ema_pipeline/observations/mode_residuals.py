@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.optimize
+import scipy.special
 from numpy.typing import NDArray
 
 from ema_pipeline.inference import Residuals
@@ -29,6 +30,9 @@ _SHAPE_REACH = 0.3
 _FREQUENCY_REACH = 0.1
 """Difference of ln f that costs a pair as much as shapes that have nothing in common; wider while a fit is annealed."""
 _FREQUENCY_REACH_ALONE = 0.3
+_TAIL = 4.0
+"""Degrees of freedom of the t distribution of a shape as a whole. Identified shapes are good but for a few, of close
+modes and of hits that differ, which are far off; a Gaussian would let those few speak for all."""
 _LEAVE = 0.3
 """Cost above the best at which an assignment leaves a measured mode without a partner."""
 
@@ -66,7 +70,11 @@ def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
         log_scale=sum(p.log_scale for p in parts),
         penalty=sum(p.penalty for p in parts),
         matching=tuple(p.matching for p in parts),
+        unexplained=sum(p.unexplained for p in parts),
         projected=sum(p.projected for p in parts),
+        relative=np.concatenate(
+            [np.ones(len(p.values)) if p.relative is None else p.relative for p in parts] or [np.zeros(0)]
+        ),
     )
 
 
@@ -160,7 +168,7 @@ class Comparison:
             self._shapes(solution, predicted, on, to, slopes),
         )
         total = sum(len(r.difference) for r in rows)
-        values, share = np.empty(total), {}
+        values, share, relative = np.empty(total), {}, np.ones(total)
         jacobian = np.zeros((total if derivatives else 0, len(self.x)))
         log_scale, at = 0.0, 0
         for r in rows:
@@ -174,6 +182,12 @@ class Comparison:
             )
             sigma = np.sqrt(variance) * r.heat
             values[here] = r.difference / sigma
+            if r.mode is not None and self.heat == 1.0:
+                robust = _Robust.of(values[here], r.mode)
+                sigma = sigma * robust.relative
+                values[here] /= robust.relative
+                relative[here] = robust.relative
+                log_scale += robust.log_scale
             if slopes is not None:
                 share[r.scatter] = np.zeros(total)
                 share[r.scatter][here] = added / variance
@@ -193,7 +207,9 @@ class Comparison:
             log_scale=log_scale + (self._usual(alone) if len(alone) else 0.0),
             penalty=UNEXPLAINED * len(alone) + UNSEEN * self._unseen(solution, to),
             matching=match,
+            unexplained=len(alone),
             projected=len(on) if self.data.shapes.shape[1] else 0,
+            relative=relative,
         )
 
     def _usual(self, alone: NDArray[np.int64]) -> float:
@@ -205,7 +221,8 @@ class Comparison:
         seen = np.isfinite(d.shapes[alone])
         reach = np.maximum(_SHAPE_REACH, np.abs(d.shapes[alone]))[seen]
         damped = alone[np.isfinite(d.log_damping[alone])]
-        total = -0.5 * int(np.sum(np.any(seen, axis=1)))
+        count = np.sum(seen, axis=1, dtype=float)
+        total = -0.5 * int(np.sum(np.any(seen, axis=1))) + float(np.sum(_cost_of(count, count) - 0.5 * count))
         for own, unit, name in (
             (d.log_frequency_std[alone], 1.0, FREQUENCY),
             (d.log_damping_std[damped], 1.0, DAMPING_SCATTER),
@@ -251,7 +268,8 @@ class Comparison:
             factor = towards[:, None, :] @ dp
             slope = (scale[:, None, None] * dp + p[:, :, None] * factor)[seen]
         difference = (y - scale[:, None] * p)[seen]
-        return _Rows(difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), slope)
+        mode = np.repeat(np.arange(len(on)), np.count_nonzero(seen, axis=1))
+        return _Rows(difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), slope, mode)
 
     def _unseen(self, solution: EigenSolution, to: NDArray[np.int64]) -> int:
         """Model modes well inside the band that no measured mode is paired with."""
@@ -281,7 +299,10 @@ class Comparison:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Differences of one kind: own 1 σ, the unit of the scatter that adds to it, heat, and derivatives of shapes."""
+    """Differences of one kind: own 1 σ, the unit of the scatter that adds to it, heat, and derivatives of shapes.
+
+    `mode` says which mode each difference belongs to, where those of one mode may be wrong together.
+    """
 
     difference: NDArray[np.float64]
     own: NDArray[np.float64]
@@ -289,3 +310,41 @@ class _Rows:
     scatter: str
     heat: float
     slope: NDArray[np.float64] | None = None
+    mode: NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True)
+class _Robust:
+    """The t distribution of every mode's shape as a Gaussian of the same density and slope at this point.
+
+    Attributes
+    ----------
+    relative : ndarray, (m,)
+        Factor on σ: 1/√w, w = (ν + n)/(ν + Q), Q being the sum of squares of the mode's n values.
+    log_scale : float
+        What the density of the t distribution costs beyond that of the Gaussian with these σ.
+
+    References
+    ----------
+    K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am. Stat. Assoc. 84 (1989) 881-896.
+    """
+
+    relative: NDArray[np.float64]
+    log_scale: float
+
+    @classmethod
+    def of(cls, values: NDArray[np.float64], mode: NDArray[np.int64]) -> _Robust:
+        """From values in units of σ and the mode that each belongs to, (m,)."""
+        n, squares = np.zeros(mode[-1] + 1 if len(mode) else 0), np.zeros(mode[-1] + 1 if len(mode) else 0)
+        np.add.at(n, mode, 1.0)
+        np.add.at(squares, mode, values**2)
+        weight = (_TAIL + n) / (_TAIL + squares)
+        beyond = _cost_of(squares, n) - 0.5 * weight * squares
+        return cls(1 / np.sqrt(weight[mode]), float(np.sum(beyond)))
+
+
+def _cost_of(squares: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
+    """-log density of n values of the t distribution, beyond that of Gaussian ones at 0, by their sum of squares."""
+    gammaln = scipy.special.gammaln
+    constant = gammaln((_TAIL + n) / 2) - gammaln(_TAIL / 2) - 0.5 * n * np.log(_TAIL / 2)
+    return np.asarray(0.5 * (_TAIL + n) * np.log1p(squares / _TAIL) - constant)
