@@ -64,8 +64,8 @@ def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, 
     covariance[np.ix_(at, at)] = trained.covariance[np.ix_(to, to)]
     squares, half_log_det = _marginal(found.values, found.jacobian, covariance)
     density = -0.5 * squares - half_log_det - found.log_scale - found.penalty
-    if found.relative is not None:
-        squares, _ = _marginal(found.stated, found.jacobian * found.relative[:, None], covariance)
+    factor = found.in_error
+    squares, _ = _marginal(found.values * factor, found.jacobian * factor[:, None], covariance)
     count = len(found.values) - found.projected
     return squares + 2 * found.penalty, max(count, 1), density
 

@@ -86,10 +86,10 @@ class Posterior:
         The sum of squares at the maximum, priors included, is that of the residual whitened by the covariance of
         everything uncertain: what parts, channels and damping may scatter is in it.
         """
-        stated = self.residuals.stated
-        squares = float(stated @ stated)
+        counted = self.residuals.values * self.residuals.in_error
+        squares = float(counted @ counted)
         squares += 2 * self.residuals.penalty + float(np.sum((self.x / self.prior_std) ** 2))
-        count = len(stated) - self.residuals.projected
+        count = len(counted) - self.residuals.projected
         return float(np.sqrt(squares / max(count, 1)))
 
     def value(self, name: str) -> float:

@@ -33,7 +33,10 @@ class Residuals:
     projected : int
         Number of values that were spent on factors of no interest (one per shape).
     relative : ndarray, (m,), optional
-        σ over the σ that was measured or stated, in which errors count where data have one; 1 where left out.
+        σ over the σ that was measured or stated; 1 where left out.
+    tail : ndarray, (m,), optional
+        Factor on stated values in which errors count, below 1 for values far out on the tail of a distribution that
+        has them; 1 where left out.
     matching : object
         Whatever the problem wants to have back to evaluate the same assignment of data to model again.
     """
@@ -47,11 +50,20 @@ class Residuals:
     unexplained: int = 0
     projected: int = 0
     relative: NDArray[np.float64] | None = None
+    tail: NDArray[np.float64] | None = None
 
     @property
     def stated(self) -> NDArray[np.float64]:
         """Values in units of the uncertainties that were measured or stated, (m,)."""
         return self.values if self.relative is None else self.values * self.relative
+
+    @property
+    def in_error(self) -> NDArray[np.float64]:
+        """Factor that turns values into those in which errors count, (m,)."""
+        factor = np.ones(len(self.values))
+        for one in (self.relative, self.tail):
+            factor = factor if one is None else factor * one
+        return factor
 
     @property
     def cost(self) -> float:

@@ -72,10 +72,15 @@ def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
         matching=tuple(p.matching for p in parts),
         unexplained=sum(p.unexplained for p in parts),
         projected=sum(p.projected for p in parts),
-        relative=np.concatenate(
-            [np.ones(len(p.values)) if p.relative is None else p.relative for p in parts] or [np.zeros(0)]
-        ),
+        relative=_factors([p.relative for p in parts], parts),
+        tail=_factors([p.tail for p in parts], parts),
     )
+
+
+def _factors(given: Sequence[NDArray[np.float64] | None], parts: Sequence[Residuals]) -> NDArray[np.float64]:
+    """Factors of all parts, 1 where a part has none."""
+    filled = [np.ones(len(p.values)) if f is None else f for f, p in zip(given, parts, strict=True)]
+    return np.concatenate(filled or [np.zeros(0)])
 
 
 class Comparison:
@@ -168,7 +173,7 @@ class Comparison:
             self._shapes(solution, predicted, on, to, slopes),
         )
         total = sum(len(r.difference) for r in rows)
-        values, share, relative = np.empty(total), {}, np.ones(total)
+        values, share, relative, tail = np.empty(total), {}, np.ones(total), np.ones(total)
         jacobian = np.zeros((total if derivatives else 0, len(self.x)))
         log_scale, at = 0.0, 0
         for r in rows:
@@ -186,7 +191,7 @@ class Comparison:
                 robust = _Robust.of(values[here], r.mode)
                 sigma = sigma * robust.relative
                 values[here] /= robust.relative
-                relative[here] = robust.relative
+                relative[here], tail[here] = robust.relative, robust.tail
                 log_scale += robust.log_scale
             if slopes is not None:
                 share[r.scatter] = np.zeros(total)
@@ -210,6 +215,7 @@ class Comparison:
             unexplained=len(alone),
             projected=len(on) if self.data.shapes.shape[1] else 0,
             relative=relative,
+            tail=tail,
         )
 
     def _usual(self, alone: NDArray[np.int64]) -> float:
@@ -321,6 +327,9 @@ class _Robust:
     ----------
     relative : ndarray, (m,)
         Factor on σ: 1/√w, w = (ν + n)/(ν + Q), Q being the sum of squares of the mode's n values.
+    tail : ndarray, (m,)
+        Factor that turns values in units of σ into deviance residuals: their squares sum up to n where Q is n,
+        and grows with the logarithm of Q.
     log_scale : float
         What the density of the t distribution costs beyond that of the Gaussian with these σ.
 
@@ -330,6 +339,7 @@ class _Robust:
     """
 
     relative: NDArray[np.float64]
+    tail: NDArray[np.float64]
     log_scale: float
 
     @classmethod
@@ -340,7 +350,9 @@ class _Robust:
         np.add.at(squares, mode, values**2)
         weight = (_TAIL + n) / (_TAIL + squares)
         beyond = _cost_of(squares, n) - 0.5 * weight * squares
-        return cls(1 / np.sqrt(weight[mode]), float(np.sum(beyond)))
+        squares = np.maximum(squares, 1e-12)
+        deviance = n * np.log1p(squares / _TAIL) / np.log1p(n / _TAIL)
+        return cls(1 / np.sqrt(weight[mode]), np.sqrt(deviance / squares)[mode], float(np.sum(beyond)))
 
 
 def _cost_of(squares: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -345,18 +345,18 @@ class ModeProblem:
     def rows(self, found: Residuals) -> list[ModeRows]:
         """Residuals sorted by the mode that they belong to, every measured mode that has a model mode."""
         assert isinstance(found.matching, tuple)
-        out, at = [], 0
+        out, at, stated = [], 0, found.stated
         for data, match in zip(self.observations.data, found.matching, strict=True):
             on = np.flatnonzero(match >= 0)
-            frequency = found.values[at : at + len(on)]
+            frequency = stated[at : at + len(on)]
             at += len(on)
             damped = np.isfinite(data.log_damping[on])
             damping = np.full(len(on), np.nan)
-            damping[damped] = found.values[at : at + int(np.sum(damped))]
+            damping[damped] = stated[at : at + int(np.sum(damped))]
             at += int(np.sum(damped))
             seen = np.isfinite(data.shapes[on])
             shape = np.full(seen.shape, np.nan)
-            shape[seen] = found.values[at : at + int(np.sum(seen))]
+            shape[seen] = stated[at : at + int(np.sum(seen))]
             at += int(np.sum(seen))
             out += [
                 ModeRows(
