@@ -286,7 +286,7 @@ def test_rows_of_the_residuals_stand_by_their_mode_and_sensor() -> None:
     assert not np.isnan(rows[2].damping)
     assert [bool(np.any(np.isnan(r.shape))) for r in rows] == [False, False, True, False, False]
     told = np.concatenate([[r.frequency, r.damping, *r.shape] for r in rows])
-    assert np.nansum(told**2) == pytest.approx(float(found.values @ found.values))
+    assert np.nansum(told**2) == pytest.approx(float(found.stated @ found.stated))
 
 
 def test_folds_hold_every_mode_out_once() -> None:

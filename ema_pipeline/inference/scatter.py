@@ -160,7 +160,9 @@ def _of_residuals_at_once(found: Posterior, scatter: Scatter) -> float:
     With t = (scatter/now)², a residual's variance is 1 - share + share·t times what it is now.
     """
     now = found.scatters[scatter.name]
-    share = found.residuals.share[scatter.name]
+    share = found.residuals.share.get(scatter.name)
+    if share is None:
+        return now
     jacobian = found.residuals.jacobian
     uncertain = np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian)
     square = found.residuals.values**2 + uncertain

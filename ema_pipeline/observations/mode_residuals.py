@@ -19,6 +19,8 @@ from ema_pipeline.observations.rig_model import RigModel
 DAMPING_SCATTER = "damping_scatter"
 FREQUENCY = "frequency_scatter"
 SHAPE = "shape_scatter"
+FREQUENCY_NOISE = "frequency_noise"
+SHAPE_NOISE = "shape_noise"
 
 UNEXPLAINED = 12.0
 """Cost, in the log posterior, of a measured mode without a model mode."""
@@ -180,11 +182,10 @@ class Comparison:
             here = slice(at, at + len(r.difference))
             at = here.stop
             added = (self.scatters[r.scatter] * r.unit) ** 2
-            squared = r.own**2
-            variance = squared + added
-            log_scale += 0.5 * float(
-                np.sum(np.log(variance / (squared + (self.defaults[r.scatter] * r.unit) ** 2)))
-            )
+            own = (r.noise_at(self.scatters) * r.own) ** 2
+            variance = own + added
+            usual = (r.noise_at(self.defaults) * r.own) ** 2 + (self.defaults[r.scatter] * r.unit) ** 2
+            log_scale += 0.5 * float(np.sum(np.log(variance / usual)))
             sigma = np.sqrt(variance) * r.heat
             values[here] = r.difference / sigma
             if r.mode is not None and self.heat == 1.0:
@@ -196,6 +197,9 @@ class Comparison:
             if slopes is not None:
                 share[r.scatter] = np.zeros(total)
                 share[r.scatter][here] = added / variance
+                if r.noise:
+                    share[r.noise] = np.zeros(total)
+                    share[r.noise][here] = own / variance
                 if r.scatter == FREQUENCY:
                     jacobian[here, : slopes.log_frequency.shape[1]] = slopes.log_frequency
                     jacobian[here, self.sensing.drift] = 1.0
@@ -229,12 +233,15 @@ class Comparison:
         damped = alone[np.isfinite(d.log_damping[alone])]
         count = np.sum(seen, axis=1, dtype=float)
         total = -0.5 * int(np.sum(np.any(seen, axis=1))) + float(np.sum(_cost_of(count, count) - 0.5 * count))
-        for own, unit, name in (
-            (d.log_frequency_std[alone], 1.0, FREQUENCY),
-            (d.log_damping_std[damped], 1.0, DAMPING_SCATTER),
-            (d.shape_std[alone][seen], reach, SHAPE),
+        for own, unit, name, noise in (
+            (d.log_frequency_std[alone], 1.0, FREQUENCY, FREQUENCY_NOISE),
+            (d.log_damping_std[damped], 1.0, DAMPING_SCATTER, ""),
+            (d.shape_std[alone][seen], reach, SHAPE, SHAPE_NOISE),
         ):
-            now, usual = (own**2 + (at[name] * unit) ** 2 for at in (self.scatters, self.defaults))
+            now, usual = (
+                (at.get(noise, 1.0) * own) ** 2 + (at[name] * unit) ** 2
+                for at in (self.scatters, self.defaults)
+            )
             total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
         return total
 
@@ -242,7 +249,12 @@ class Comparison:
         d = self.data
         model = np.log(np.maximum(solution.frequency_hz[to], 1e-6)) + self.x[self.sensing.drift]
         return _Rows(
-            d.log_frequency[on] - model, d.log_frequency_std[on], np.ones(len(on)), FREQUENCY, self.heat
+            d.log_frequency[on] - model,
+            d.log_frequency_std[on],
+            np.ones(len(on)),
+            FREQUENCY,
+            self.heat,
+            FREQUENCY_NOISE,
         )
 
     def _damping(self, solution: EigenSolution, on: NDArray[np.int64], to: NDArray[np.int64]) -> _Rows:
@@ -275,7 +287,9 @@ class Comparison:
             slope = (scale[:, None, None] * dp + p[:, :, None] * factor)[seen]
         difference = (y - scale[:, None] * p)[seen]
         mode = np.repeat(np.arange(len(on)), np.count_nonzero(seen, axis=1))
-        return _Rows(difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), slope, mode)
+        return _Rows(
+            difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), SHAPE_NOISE, slope, mode
+        )
 
     def _unseen(self, solution: EigenSolution, to: NDArray[np.int64]) -> int:
         """Model modes well inside the band that no measured mode is paired with."""
@@ -307,7 +321,8 @@ class Comparison:
 class _Rows:
     """Differences of one kind: own 1 σ, the unit of the scatter that adds to it, heat, and derivatives of shapes.
 
-    `mode` says which mode each difference belongs to, where those of one mode may be wrong together.
+    `noise` names the factor on the own 1 σ where that is learned too; `mode` says which mode a difference belongs to,
+    where those of one mode may be wrong together.
     """
 
     difference: NDArray[np.float64]
@@ -315,8 +330,13 @@ class _Rows:
     unit: NDArray[np.float64]
     scatter: str
     heat: float
+    noise: str = ""
     slope: NDArray[np.float64] | None = None
     mode: NDArray[np.int64] | None = None
+
+    def noise_at(self, scatters: Mapping[str, float]) -> float:
+        """Factor on the own 1 σ."""
+        return scatters.get(self.noise, 1.0)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,9 @@ from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_residuals import (
     DAMPING_SCATTER,
     FREQUENCY,
+    FREQUENCY_NOISE,
     SHAPE,
+    SHAPE_NOISE,
     Comparison,
     Sensing,
     stacked,
@@ -63,8 +65,11 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
         Scatter(MASS_SCATTER, "mass of parts", MASS_STD, 1.0, 0.02, 8.0),
         Scatter(CALIBRATION, "calibration", CALIBRATION_STD, 0.7, 0.04),
         Scatter(DAMPING_SCATTER, "ln ζ from mode to mode", rig.modal_damping_scatter, 0.5, 0.5),
-        Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 5.0),
-        Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03, 3.0),
+        Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 5.0, at_once=True),
+        Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03, 3.0, at_once=True),
+        # What hits have in common (drift, aim) is in their scatter, and no error of one mode against another.
+        Scatter(FREQUENCY_NOISE, "stated uncertainty of frequencies", 1.0, 0.5, at_once=True),
+        Scatter(SHAPE_NOISE, "stated uncertainty of shapes", 1.0, 0.5, at_once=True),
     )
     return {s.name: s for s in known}
 
@@ -328,7 +333,7 @@ class ModeProblem:
         for data, match in zip(self.observations.data, found.matching, strict=True):
             own = [r for r in rows if r.configuration == data.configuration]
             modes = self.solution(data.configuration, x)
-            std = np.hypot(data.log_frequency_std, scatters[FREQUENCY])
+            std = np.hypot(scatters[FREQUENCY_NOISE] * data.log_frequency_std, scatters[FREQUENCY])
             for (i, a), (j, b) in pairwise(enumerate(own)):
                 split = float(np.log(modes.frequency_hz[b.model] / max(modes.frequency_hz[a.model], 1e-6)))
                 if abs(split) < _CLOSE_PAIR and a.shape_off > _WRONG and b.shape_off > _WRONG:
