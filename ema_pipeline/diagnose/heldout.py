@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from ema_pipeline.inference import Posterior
+from ema_pipeline.inference import Posterior, Residuals
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, refined, transferred
 
@@ -62,12 +62,24 @@ def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, 
     at = np.array([i for i, k in enumerate(known) if k >= 0], int)
     to = np.array([k for k in known if k >= 0], int)
     covariance[np.ix_(at, at)] = trained.covariance[np.ix_(to, to)]
+    count = max(len(found.values) - found.projected, 1)
+    if found.block is not None:
+        squares, cost = _in_blocks(found, covariance)
+        return squares + 2 * found.penalty, count, -cost - found.log_scale - found.penalty
     squares, half_log_det = _marginal(found.values, found.jacobian, covariance)
     density = -0.5 * squares - half_log_det - found.log_scale - found.penalty
-    factor = found.in_error
-    squares, _ = _marginal(found.values * factor, found.jacobian * factor[:, None], covariance)
-    count = len(found.values) - found.projected
-    return squares + 2 * found.penalty, max(count, 1), density
+    if found.relative is not None:
+        squares, _ = _marginal(found.stated, found.jacobian * found.relative[:, None], covariance)
+    return squares + 2 * found.penalty, count, density
+
+
+def _in_blocks(found: Residuals, covariance: NDArray[np.float64]) -> tuple[float, float]:
+    """Sum of squares in which errors count, and -log density, each value foretold from those before it."""
+    spread = np.eye(len(found.values)) + found.jacobian @ covariance @ found.jacobian.T
+    factor = scipy.linalg.cholesky(spread, lower=True, check_finite=False)
+    values = scipy.linalg.solve_triangular(factor, found.values, lower=True, check_finite=False)
+    whitened = Residuals(values, np.zeros((0, len(covariance))), block=found.block)
+    return whitened.squares, whitened.cost + float(np.sum(np.log(np.diag(factor))))
 
 
 def _marginal(

@@ -66,7 +66,8 @@ def scores(
         )
         if residuals.jacobian.shape[0] != factor.count:
             continue
-        found.append(factor.score(hypothesis, residuals.jacobian[:, at], problem.unknowns.lower[at]))
+        columns = residuals.weighted[1][:, at]
+        found.append(factor.score(hypothesis, columns, problem.unknowns.lower[at]))
     return found
 
 
@@ -75,9 +76,9 @@ class _Marginal:
 
     def __init__(self, base: Fit) -> None:
         p = base.posterior
-        self.residual = p.residuals.values
+        self.residual, jacobian = p.residuals.weighted
         self.count = len(self.residual)
-        self.whitened = p.residuals.jacobian * p.prior_std
+        self.whitened = jacobian * p.prior_std
         information = np.eye(self.whitened.shape[1]) + self.whitened.T @ self.whitened
         self.factor = scipy.linalg.cho_factor(information, check_finite=False)
 

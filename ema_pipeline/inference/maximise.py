@@ -66,7 +66,7 @@ def descend(
     cost = here.cost + _prior_cost(x, std)
     damping = 1e-2
     for _ in range(steps if np.isfinite(cost) else 0):
-        step_from = _Step(unknowns, x, std, here.jacobian, here.values)
+        step_from = _Step(unknowns, x, std, *here.weighted)
         for _ in range(_MOST_TRIALS):
             trial = step_from.to(damping)
             there = problem.residuals(trial, scatters, heat=heat, derivatives=False)
@@ -96,8 +96,8 @@ class _Step:
         unknowns: Unknowns,
         x: NDArray[np.float64],
         std: NDArray[np.float64],
-        jacobian: NDArray[np.float64],
         residual: NDArray[np.float64],
+        jacobian: NDArray[np.float64],
     ) -> None:
         self.unknowns, self.x = unknowns, x
         self.gradient = jacobian.T @ residual + x / std**2

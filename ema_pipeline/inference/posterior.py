@@ -50,20 +50,15 @@ class Posterior:
         """-log posterior up to a constant."""
         return self.residuals.cost + 0.5 * float(np.sum((self.x / self.prior_std) ** 2))
 
-    @cached_property
-    def _whitened(self) -> NDArray[np.float64]:
-        """Derivatives by the unknowns in units of their prior σ, (m, n)."""
-        return np.asarray(self.residuals.jacobian * self.prior_std)
-
-    @cached_property
     def _information(self) -> NDArray[np.float64]:
-        """Posterior precision in units of the prior's, (n, n)."""
-        return np.asarray(np.eye(len(self.x)) + self._whitened.T @ self._whitened)
+        """Posterior precision in units of the prior's, (n, n); not kept: a diagnosis holds hundreds of posteriors."""
+        whitened = self.residuals.weighted[1] * self.prior_std
+        return np.asarray(np.eye(len(self.x)) + whitened.T @ whitened)
 
     @cached_property
     def covariance(self) -> NDArray[np.float64]:
         """Posterior covariance, (n, n)."""
-        inverse = np.linalg.inv(self._information)
+        inverse = np.linalg.inv(self._information())
         return np.asarray(self.prior_std[:, None] * inverse * self.prior_std)
 
     @cached_property
@@ -76,7 +71,7 @@ class Posterior:
         """Natural logarithm of the evidence, up to a constant that is the same for all models of the same data."""
         if not np.isfinite(self.cost):
             return -np.inf
-        _, log_det = np.linalg.slogdet(self._information)
+        _, log_det = np.linalg.slogdet(self._information())
         return -self.cost - 0.5 * float(log_det) - self.scatter_cost
 
     @property
@@ -86,10 +81,9 @@ class Posterior:
         The sum of squares at the maximum, priors included, is that of the residual whitened by the covariance of
         everything uncertain: what parts, channels and damping may scatter is in it.
         """
-        counted = self.residuals.values * self.residuals.in_error
-        squares = float(counted @ counted)
+        squares = self.residuals.squares
         squares += 2 * self.residuals.penalty + float(np.sum((self.x / self.prior_std) ** 2))
-        count = len(counted) - self.residuals.projected
+        count = len(self.residuals.values) - self.residuals.projected
         return float(np.sqrt(squares / max(count, 1)))
 
     def value(self, name: str) -> float:

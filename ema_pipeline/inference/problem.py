@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.inference import tails
 from ema_pipeline.inference.unknowns import Unknowns
 
 
@@ -33,10 +35,9 @@ class Residuals:
     projected : int
         Number of values that were spent on factors of no interest (one per shape).
     relative : ndarray, (m,), optional
-        σ over the σ that was measured or stated; 1 where left out.
-    tail : ndarray, (m,), optional
-        Factor on stated values in which errors count, below 1 for values far out on the tail of a distribution that
-        has them; 1 where left out.
+        σ over the σ that was measured or stated, in which errors count where data have one; 1 where left out.
+    block : ndarray of int, (m,), optional
+        Number of the block of values that may be wrong together, -1 for values on their own; see `tails`.
     matching : object
         Whatever the problem wants to have back to evaluate the same assignment of data to model again.
     """
@@ -50,27 +51,65 @@ class Residuals:
     unexplained: int = 0
     projected: int = 0
     relative: NDArray[np.float64] | None = None
-    tail: NDArray[np.float64] | None = None
+    block: NDArray[np.int64] | None = None
 
     @property
     def stated(self) -> NDArray[np.float64]:
         """Values in units of the uncertainties that were measured or stated, (m,)."""
         return self.values if self.relative is None else self.values * self.relative
 
-    @property
-    def in_error(self) -> NDArray[np.float64]:
-        """Factor that turns values into those in which errors count, (m,)."""
+    @cached_property
+    def blocks(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Sum of squares and number of values of every block, (n_blocks,)."""
+        return in_blocks(self.values, self.block)
+
+    @cached_property
+    def weight(self) -> NDArray[np.float64]:
+        """Factor on values and derivatives for which least squares have the slope of the density, (m,)."""
         factor = np.ones(len(self.values))
-        for one in (self.relative, self.tail):
-            factor = factor if one is None else factor * one
+        if self.block is not None:
+            inside = self.block >= 0
+            factor[inside] = np.sqrt(tails.weight(*self.blocks))[self.block[inside]]
         return factor
+
+    @property
+    def weighted(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Values, (m,), and derivatives, (m, n), as least squares take them."""
+        if self.block is None:
+            return self.values, self.jacobian
+        return self.values * self.weight, self.jacobian * self.weight[:, None]
+
+    @property
+    def squares(self) -> float:
+        """Sum of squares in which errors count."""
+        alone = self.stated if self.block is None else self.stated[self.block < 0]
+        return float(alone @ alone) + float(np.sum(tails.deviance(*self.blocks)))
 
     @property
     def cost(self) -> float:
         """-log likelihood up to a constant; infinite where the model has no answer."""
         if not np.all(np.isfinite(self.values)):
             return float("inf")
-        return 0.5 * float(self.values @ self.values) + self.log_scale + self.penalty
+        alone = self.values if self.block is None else self.values[self.block < 0]
+        return (
+            0.5 * float(alone @ alone)
+            + float(np.sum(tails.cost(*self.blocks)))
+            + self.log_scale
+            + self.penalty
+        )
+
+
+def in_blocks(
+    values: NDArray[np.float64], block: NDArray[np.int64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sum of squares and number of values of every block, (n_blocks,)."""
+    count = 0 if block is None else int(np.max(block, initial=-1)) + 1
+    squares, n = np.zeros(count), np.zeros(count)
+    if block is not None:
+        inside = block >= 0
+        np.add.at(squares, block[inside], values[inside] ** 2)
+        np.add.at(n, block[inside], 1.0)
+    return squares, n
 
 
 class Problem(Protocol):

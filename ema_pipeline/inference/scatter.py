@@ -135,9 +135,9 @@ def _of_residuals(found: Posterior, name: str, now: float) -> tuple[float, int]:
     if share is None or not np.any(share > 0):
         return 0.0, 0
     rows = share > 0
-    jacobian = found.residuals.jacobian[rows]
+    values, jacobian = (a[rows] for a in found.residuals.weighted)
     uncertain = np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian)
-    square = found.residuals.values[rows] ** 2 + uncertain
+    square = values**2 + uncertain
     part = share[rows]
     return float(now**2 * np.sum(part * square + 1.0 - part)), int(np.sum(rows))
 
@@ -163,9 +163,9 @@ def _of_residuals_at_once(found: Posterior, scatter: Scatter) -> float:
     share = found.residuals.share.get(scatter.name)
     if share is None:
         return now
-    jacobian = found.residuals.jacobian
+    values, jacobian = found.residuals.weighted
     uncertain = np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian)
-    square = found.residuals.values**2 + uncertain
+    square = values**2 + uncertain
     log, weight = 0.0, scatter.spread**-2.0
     for _ in range(_NEWTON_STEPS):
         t = np.exp(2 * log)

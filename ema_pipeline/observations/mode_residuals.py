@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.optimize
-import scipy.special
 from numpy.typing import NDArray
 
-from ema_pipeline.inference import Residuals
+from ema_pipeline.inference import Residuals, tails
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
 from ema_pipeline.mechanics.terms import Matrices
 from ema_pipeline.observations.mode_data import ModeData
@@ -32,9 +31,6 @@ _SHAPE_REACH = 0.3
 _FREQUENCY_REACH = 0.1
 """Difference of ln f that costs a pair as much as shapes that have nothing in common; wider while a fit is annealed."""
 _FREQUENCY_REACH_ALONE = 0.3
-_TAIL = 4.0
-"""Degrees of freedom of the t distribution of a shape as a whole. Identified shapes are good but for a few, of close
-modes and of hits that differ, which are far off; a Gaussian would let those few speak for all."""
 _LEAVE = 0.3
 """Cost above the best at which an assignment leaves a measured mode without a partner."""
 
@@ -74,15 +70,20 @@ def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
         matching=tuple(p.matching for p in parts),
         unexplained=sum(p.unexplained for p in parts),
         projected=sum(p.projected for p in parts),
-        relative=_factors([p.relative for p in parts], parts),
-        tail=_factors([p.tail for p in parts], parts),
+        block=_blocks(parts),
     )
 
 
-def _factors(given: Sequence[NDArray[np.float64] | None], parts: Sequence[Residuals]) -> NDArray[np.float64]:
-    """Factors of all parts, 1 where a part has none."""
-    filled = [np.ones(len(p.values)) if f is None else f for f, p in zip(given, parts, strict=True)]
-    return np.concatenate(filled or [np.zeros(0)])
+def _blocks(parts: Sequence[Residuals]) -> NDArray[np.int64] | None:
+    """Blocks of all parts, numbered through."""
+    if all(p.block is None for p in parts):
+        return None
+    numbered, count = [], 0
+    for p in parts:
+        block = np.full(len(p.values), -1) if p.block is None else p.block
+        numbered.append(np.where(block >= 0, block + count, -1))
+        count += int(np.max(block, initial=-1)) + 1
+    return np.concatenate(numbered)
 
 
 class Comparison:
@@ -175,7 +176,7 @@ class Comparison:
             self._shapes(solution, predicted, on, to, slopes),
         )
         total = sum(len(r.difference) for r in rows)
-        values, share, relative, tail = np.empty(total), {}, np.ones(total), np.ones(total)
+        values, share, block = np.empty(total), {}, np.full(total, -1)
         jacobian = np.zeros((total if derivatives else 0, len(self.x)))
         log_scale, at = 0.0, 0
         for r in rows:
@@ -188,12 +189,8 @@ class Comparison:
             log_scale += 0.5 * float(np.sum(np.log(variance / usual)))
             sigma = np.sqrt(variance) * r.heat
             values[here] = r.difference / sigma
-            if r.mode is not None and self.heat == 1.0:
-                robust = _Robust.of(values[here], r.mode)
-                sigma = sigma * robust.relative
-                values[here] /= robust.relative
-                relative[here], tail[here] = robust.relative, robust.tail
-                log_scale += robust.log_scale
+            if r.mode is not None:
+                block[here] = r.mode
             if slopes is not None:
                 share[r.scatter] = np.zeros(total)
                 share[r.scatter][here] = added / variance
@@ -218,8 +215,7 @@ class Comparison:
             matching=match,
             unexplained=len(alone),
             projected=len(on) if self.data.shapes.shape[1] else 0,
-            relative=relative,
-            tail=tail,
+            block=block if self.heat == 1.0 else None,  # far off everything is on the tail
         )
 
     def _usual(self, alone: NDArray[np.int64]) -> float:
@@ -232,7 +228,9 @@ class Comparison:
         reach = np.maximum(_SHAPE_REACH, np.abs(d.shapes[alone]))[seen]
         damped = alone[np.isfinite(d.log_damping[alone])]
         count = np.sum(seen, axis=1, dtype=float)
-        total = -0.5 * int(np.sum(np.any(seen, axis=1))) + float(np.sum(_cost_of(count, count) - 0.5 * count))
+        total = -0.5 * int(np.sum(np.any(seen, axis=1))) + float(
+            np.sum(tails.cost(count, count) - 0.5 * count)
+        )
         for own, unit, name, noise in (
             (d.log_frequency_std[alone], 1.0, FREQUENCY, FREQUENCY_NOISE),
             (d.log_damping_std[damped], 1.0, DAMPING_SCATTER, ""),
@@ -337,46 +335,3 @@ class _Rows:
     def noise_at(self, scatters: Mapping[str, float]) -> float:
         """Factor on the own 1 σ."""
         return scatters.get(self.noise, 1.0)
-
-
-@dataclass(frozen=True)
-class _Robust:
-    """The t distribution of every mode's shape as a Gaussian of the same density and slope at this point.
-
-    Attributes
-    ----------
-    relative : ndarray, (m,)
-        Factor on σ: 1/√w, w = (ν + n)/(ν + Q), Q being the sum of squares of the mode's n values.
-    tail : ndarray, (m,)
-        Factor that turns values in units of σ into deviance residuals: their squares sum up to n where Q is n,
-        and grows with the logarithm of Q.
-    log_scale : float
-        What the density of the t distribution costs beyond that of the Gaussian with these σ.
-
-    References
-    ----------
-    K. L. Lange, R. J. A. Little, J. M. G. Taylor, J. Am. Stat. Assoc. 84 (1989) 881-896.
-    """
-
-    relative: NDArray[np.float64]
-    tail: NDArray[np.float64]
-    log_scale: float
-
-    @classmethod
-    def of(cls, values: NDArray[np.float64], mode: NDArray[np.int64]) -> _Robust:
-        """From values in units of σ and the mode that each belongs to, (m,)."""
-        n, squares = np.zeros(mode[-1] + 1 if len(mode) else 0), np.zeros(mode[-1] + 1 if len(mode) else 0)
-        np.add.at(n, mode, 1.0)
-        np.add.at(squares, mode, values**2)
-        weight = (_TAIL + n) / (_TAIL + squares)
-        beyond = _cost_of(squares, n) - 0.5 * weight * squares
-        squares = np.maximum(squares, 1e-12)
-        deviance = n * np.log1p(squares / _TAIL) / np.log1p(n / _TAIL)
-        return cls(1 / np.sqrt(weight[mode]), np.sqrt(deviance / squares)[mode], float(np.sum(beyond)))
-
-
-def _cost_of(squares: NDArray[np.float64], n: NDArray[np.float64]) -> NDArray[np.float64]:
-    """-log density of n values of the t distribution, beyond that of Gaussian ones at 0, by their sum of squares."""
-    gammaln = scipy.special.gammaln
-    constant = gammaln((_TAIL + n) / 2) - gammaln(_TAIL / 2) - 0.5 * n * np.log(_TAIL / 2)
-    return np.asarray(0.5 * (_TAIL + n) * np.log1p(squares / _TAIL) - constant)
