@@ -161,9 +161,10 @@ def _of_residuals_at_once(found: Posterior, scatter: Scatter) -> float:
     """
     now = found.scatters[scatter.name]
     share = found.residuals.share[scatter.name]
-    jacobian = found.residuals.jacobian
-    uncertain = np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian)
-    square = found.residuals.values**2 + uncertain
+    rows = share > 0  # the others do not depend on it
+    share, jacobian = share[rows], found.residuals.jacobian[rows]
+    uncertain = np.einsum("ij,ij->i", jacobian @ found.covariance, jacobian)
+    square = found.residuals.values[rows] ** 2 + uncertain
     log, weight = 0.0, scatter.spread**-2.0
     for _ in range(_NEWTON_STEPS):
         t = np.exp(2 * log)
