@@ -93,7 +93,11 @@ def diagnose_records(
 def search_pieces(observations: RecordObservations) -> RecordObservations:
     """The same test by pieces of its records."""
     records = [d.record for d in observations.data]
-    return observations.with_records(thinned(records, SEARCHED), thinned(observations.held_out, SEARCHED))
+    return observations.with_records(
+        thinned(records, SEARCHED),
+        thinned(observations.held_out, SEARCHED),
+        observations.basis.calibrated(),
+    )
 
 
 def record_model(

@@ -88,6 +88,18 @@ class Basis:
     zero_std: NDArray[np.float64]
     centre: Mapping[str, float]
 
+    def calibrated(self) -> Basis:
+        """With the first force and the first response exactly calibrated, where no value of the rig is known.
+
+        Loose values take such errors up without a trace, so that they only slow a search down.
+        """
+        if set(self.shared.unknowns.names) != set(self.loose):
+            return self
+        pinned = tuple(
+            (n, 0.0 if k in (0, len(self.inputs)) else s) for k, (n, s) in enumerate(self.calibration)
+        )
+        return dataclasses.replace(self, calibration=pinned)
+
     @cached_property
     def rows(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Rows of the inputs and of the outputs over the rig's coordinates."""

@@ -195,11 +195,15 @@ class RecordObservations:
         return RecordProblem(self, RecordModel(self.basis, [self.scaled(e) for e in effects], scales))
 
     def with_records(
-        self, records: Sequence[DrivenRecord], held_out: Sequence[DrivenRecord]
+        self,
+        records: Sequence[DrivenRecord],
+        held_out: Sequence[DrivenRecord],
+        basis: Basis | None = None,
     ) -> RecordObservations:
         """The same test with other records, or pieces of them."""
+        used = basis or self.basis
         return RecordObservations(
-            self.rig, self.configuration, records, held_out, None, self.basis, self.like or self, self.modal
+            self.rig, self.configuration, records, held_out, None, used, self.like or self, self.modal
         )
 
     def folds(self) -> Sequence[tuple[RecordObservations, RecordObservations]]:
