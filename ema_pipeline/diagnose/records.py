@@ -11,24 +11,23 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
-from ema_pipeline.diagnose.rungs import ladder_of
+from ema_pipeline.diagnose.rungs import ladder_of, make_ladder, parameter_sizes
 from ema_pipeline.diagnose.selection import Progress
 from ema_pipeline.diagnose.sentences import size_text, summary
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Rung
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder, Rung
 from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.errors import EmaError
-from ema_pipeline.mechanics.simulation import coded_law
+from ema_pipeline.mechanics.simulation import COARSE, coded_law
 from ema_pipeline.mechanics.system import LinearSystem
+from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.fitting import Model, learned, refined
 from ema_pipeline.observations.record_data import thinned
 from ema_pipeline.observations.records import RecordObservations
 
 SEARCHED = 4096
 """Samples, in pieces, on which hypotheses are compared: enough for evidence by the hundred, quick enough for all."""
-MOST_COORDINATES = 5
-"""Coordinates of a rig up to which its records are simulated."""
 _SAME_CHANGE = 1e-5
 """Relative difference of two changes of the linear system below which they are the same physics."""
 _TRIAL = 1e-6
@@ -97,6 +96,7 @@ def search_pieces(observations: RecordObservations) -> RecordObservations:
         thinned(records, SEARCHED),
         thinned(observations.held_out, SEARCHED),
         observations.basis.calibrated(),
+        COARSE,
     )
 
 
@@ -157,32 +157,64 @@ def _places(observations: RecordObservations) -> tuple[str, ...]:
 
 
 def whole_ladder(observations: RecordObservations, library: Mapping[str, Effect], searched: Ladder) -> Ladder:
-    """The rungs of a ladder that was found on pieces, fitted to whole records."""
+    """The rungs of a ladder that was found on pieces, fitted to whole records.
+
+    The fit takes its reference channels as exact, which costs nothing. Uncertainties are those with all calibrations.
+    """
     scatters = {s.name: s.learned for s in searched.scatters}
+    records = [d.record for d in observations.data]
+    fast = observations.with_records(records, observations.held_out, observations.basis.calibrated())
     fits = []
     for rung in searched.rungs:
         model = record_model(observations, library, rung.effects)
-        problem = model.problem(observations)
-        x = problem.start()
-        for name, value in rung.unknowns.items():
-            if name in problem.unknowns.index:
-                x[problem.unknowns.index[name]] = value
-        fits.append(refined(observations, model, x, scatters))
-    fits[-1] = learned(observations, fits[-1])
-    ladder = ladder_of(observations, fits)
-    units = _units(observations)
-    rungs = tuple(dataclasses.replace(r, parameters=_with_units(r.parameters, units)) for r in ladder.rungs)
+        fits.append(refined(fast, model, _begun_at(model.problem(fast), rung), scatters, steps=0))
+    fits[-1] = learned(fast, fits[-1])
+    ladder = ladder_of(fast, fits)
+    rungs = tuple(_with_calibration(observations, library, ladder, r) for r in ladder.rungs)
     return dataclasses.replace(ladder, rungs=rungs, note=searched.note)
+
+
+def _begun_at(problem: EffectProblem, rung: Rung) -> NDArray[np.float64]:
+    """Unknowns of a problem as a rung has them, those that it has not at their start."""
+    x = problem.start()
+    for name, value in rung.unknowns.items():
+        if name in problem.unknowns.index:
+            x[problem.unknowns.index[name]] = value
+    return x
+
+
+def _with_calibration(
+    observations: RecordObservations, library: Mapping[str, Effect], ladder: Ladder, rung: Rung
+) -> Rung:
+    """A rung whose sizes hold what all channels' calibration leaves open."""
+    model = record_model(observations, library, rung.effects)
+    problem = model.problem(observations)
+    scatters = {s.name: s.learned for s in ladder.scatters}
+    posterior = refined(observations, model, _begun_at(problem, rung), scatters, steps=0).posterior
+    sizes = parameter_sizes(problem, posterior)
+    units = _units(observations)
+    found = {n: dataclasses.replace(s, unit=s.unit or units.get(n, "")) for n, s in sizes.items()}
+    return dataclasses.replace(rung, parameters=found)
+
+
+def records_ladder(
+    observations: RecordObservations,
+    library: Mapping[str, Effect],
+    effects: Sequence[str],
+    known: Ladder | None,
+) -> Ladder:
+    """The ladder of given effects, fitted on pieces where `known` does not hold just these, then on whole records."""
+    rungs = () if known is None else known.rungs
+    if known is None or not rungs or rungs[-1].effects != tuple(effects):
+        models = [record_model(observations, library, effects[:k]) for k in range(len(effects) + 1)]
+        known = make_ladder(search_pieces(observations), models)
+    return whole_ladder(observations, library, known)
 
 
 def _units(observations: RecordObservations) -> dict[str, str]:
     """Units of the rig's own values."""
     stated = {name: unit for name, (_, unit) in observations.linear_model.stated.items()}
     return {name: p.unit for name, p in observations.basis.rig.parameters.items()} | stated
-
-
-def _with_units(sizes: Mapping[str, EffectSize], units: Mapping[str, str]) -> dict[str, EffectSize]:
-    return {n: dataclasses.replace(s, unit=s.unit or units.get(n, "")) for n, s in sizes.items()}
 
 
 def _with_whole(found: Diagnosis, ladder: Ladder) -> Diagnosis:

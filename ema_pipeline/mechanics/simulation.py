@@ -29,8 +29,9 @@ from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import total_damping
 from ema_pipeline.mechanics.system import LinearSystem
 
-FINEST = 0.35
-"""Phase, in rad, of the highest mode in one step: its error is a ten-thousandth of it then."""
+FINE, COARSE = 0.25, 0.5
+"""Phase, in rad, by which the highest mode may turn in one step. A quarter leaves an error of a hundred thousandth of a
+frequency; laws with kinks, such as hysteresis, need it too. While hypotheses are compared half will do."""
 MOST_SUBSTEPS = 64
 _PADDING = 400
 """Samples by which a record is continued at both ends before it is interpolated."""
@@ -144,11 +145,11 @@ def coded_law(element: Nonlinear) -> tuple[int, tuple[float, float, float, float
     raise EmaError(f"element '{element.name}' has no law that continuous records can be simulated with")
 
 
-def substeps_for(system: LinearSystem, sample_rate_hz: float, headroom: float = 1.0) -> int:
-    """Steps per sample in which the highest mode, its frequency times `headroom`, turns by no more than `FINEST`."""
+def substeps_for(system: LinearSystem, sample_rate_hz: float, phase: float) -> int:
+    """Steps per sample in which the highest mode turns by no more than `phase`, rad; no fewer than 1/phase."""
     squares = scipy.linalg.eigh(system.stiffness, system.mass, eigvals_only=True)
-    highest = headroom * float(np.sqrt(max(np.max(squares), 0.0)))
-    return int(np.clip(np.ceil(highest / sample_rate_hz / FINEST), 2, MOST_SUBSTEPS))
+    highest = float(np.sqrt(max(np.max(squares), 0.0)))
+    return int(np.clip(np.ceil(highest / sample_rate_hz / phase), np.ceil(1 / phase), MOST_SUBSTEPS))
 
 
 def between_samples(forces: NDArray[np.float64], factor: int, periodic: bool = False) -> NDArray[np.float64]:

@@ -20,7 +20,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
 from ema_pipeline.ingest.driven import DrivenRecord
-from ema_pipeline.mechanics.simulation import DrivenSystem, Sensors, Slopes, substeps_for
+from ema_pipeline.mechanics.simulation import FINE, DrivenSystem, Sensors, Slopes, substeps_for
 from ema_pipeline.observations.linear_start import linear_start
 from ema_pipeline.observations.parts import DAMPING
 from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, RecordData
@@ -30,6 +30,8 @@ from ema_pipeline.observations.rig_model import RigModel, SizeMap
 from ema_pipeline.observations.typical import Typical
 from ema_pipeline.rigs.types import Rig
 
+MOST_COORDINATES = 5
+"""Coordinates of a model up to which its records are simulated."""
 _WIDE = 20.0
 """Noise, in units of the discrepancy, with which fits begin: a linear model of a nonlinear rig misses a tenth."""
 _MOST_NOISE = 1e3
@@ -61,6 +63,8 @@ class RecordObservations:
         What these records are a part of: sizes to expect and noise are then counted in its units.
     modal : bool
         True where the rig was made of identified modes: effects can sit where sensors are only.
+    phase : float
+        By which the highest mode may turn in one step, rad.
 
     Raises
     ------
@@ -78,6 +82,7 @@ class RecordObservations:
         basis: Basis | None = None,
         like: RecordObservations | None = None,
         modal: bool = False,
+        phase: float = FINE,
     ) -> None:
         if not records:
             raise EmaError('no record to fit; give at least one use = "fit"')
@@ -85,7 +90,7 @@ class RecordObservations:
         self.data = tuple(RecordData.of(r) for r in records)
         self.held_out = tuple(held_out)
         self.basis = basis or _basis(rig, configuration, records, frfs)
-        self.like, self.modal = like, modal
+        self.like, self.modal, self.phase = like, modal, phase
 
     @cached_property
     def sample_rate_hz(self) -> float:
@@ -124,7 +129,7 @@ class RecordObservations:
     def substeps(self) -> int:
         """Steps per sample."""
         linear = self.linear_model.linear(self.linear_model.start())
-        return substeps_for(linear, self.sample_rate_hz, _HEADROOM)
+        return substeps_for(linear, self.sample_rate_hz, self.phase / _HEADROOM)
 
     def scaled(self, placed: PlacedEffect) -> PlacedEffect:
         """An effect with the starts and prior scales of its sizes as these records suggest, if they can."""
@@ -199,12 +204,14 @@ class RecordObservations:
         records: Sequence[DrivenRecord],
         held_out: Sequence[DrivenRecord],
         basis: Basis | None = None,
+        phase: float | None = None,
     ) -> RecordObservations:
         """The same test with other records, or pieces of them."""
         used = basis or self.basis
         return RecordObservations(
-            self.rig, self.configuration, records, held_out, None, used, self.like or self, self.modal
-        )
+            self.rig, self.configuration, records, held_out, None, used, self.like or self, self.modal,
+            phase or self.phase,
+        )  # fmt: skip
 
     def folds(self) -> Sequence[tuple[RecordObservations, RecordObservations]]:
         """The records that the test holds out; none where it holds out none."""

@@ -59,6 +59,8 @@ def summary(results: RunResults) -> dict[str, Any]:
             content["ladder_compared_s"] = results.shown_ladder.compared_s
         if results.shown_ladder.left_out:
             content["ladder_left_out"] = list(results.shown_ladder.left_out)
+    if results.simulation:
+        content["simulation"] = _simulation(results)
     content["warnings"] = list(cautions(results))
     return content
 
@@ -171,6 +173,21 @@ def _ladder(ladder: Ladder) -> list[dict[str, Any]]:
         | _misfits(ladder, r)
         for r in ladder.rungs
     ]
+
+
+def _simulation(results: RunResults) -> dict[str, Any]:
+    """Free-run errors by record; of several responses by sensor, and the largest share on top."""
+    records: dict[str, Any] = {}
+    for e in results.simulation:
+        one = {"rmse": e.rmse, "unit": e.unit, "relative": e.relative, "rmse_without_effects": e.before}
+        entry = records.setdefault(e.record, {"use": e.use} | one | {"samples": e.samples, "sensors": {}})
+        entry["sensors"][str(e.sensor)] = one
+        if e.relative > entry["relative"]:
+            entry |= one
+    for entry in records.values():
+        if len(entry["sensors"]) == 1:
+            del entry["sensors"]
+    return {"records": records}
 
 
 def _misfits(ladder: Ladder, rung: Rung) -> dict[str, Any]:

@@ -33,7 +33,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Read every record, check it against the description, and scale it to SI."""
     test = test_of(run, configuration)
     limits = cast(ReadLimits, run.settings[NAME])
-    common = {
+    common: dict[str, object] = {
         "sources": file_hashes(test),
         "title": test.title,
         "transducers": tuple(_transducer(c) for c in test.channels),

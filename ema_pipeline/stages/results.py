@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 
 from ema_pipeline.correlate.types import Comparison, Pairing
+from ema_pipeline.diagnose.free_run import RecordError
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
@@ -63,6 +64,7 @@ def load_results(run: Run) -> RunResults:
         comparison_after=run.store.find("diagnose", ALL, "comparison_after", Comparison),
         diagnosis=_diagnosis(run),
         ladder=run.store.find("ladder", ALL, "ladder", Ladder),
+        simulation=_simulation(run),
         sensitivities=run.store.find("correlate", ALL, "sensitivities", tuple[Verdict, ...]) or (),
         deviations=tuple(
             run.store.find(stage, ALL, name, dict[str, float]) or {}
@@ -93,6 +95,14 @@ def _diagnosis(run: Run) -> Diagnosis | None:
     if found is None or run.info.kind != "modes" or found.verdict != "unknown_effect":
         return found
     return replace(found, next_measurement=FOR_A_TABLE)
+
+
+def _simulation(run: Run) -> tuple[RecordError, ...]:
+    """Free-run errors of the model that the user made, or else of the one that the diagnosis proposes."""
+    if run.info.kind != "continuous":
+        return ()
+    own = run.store.find("ladder", ALL, "simulation", tuple[RecordError, ...]) if run.info.effects else None
+    return own or run.store.find("diagnose", ALL, "simulation", tuple[RecordError, ...]) or ()
 
 
 def _system(run: Run, name: str, values: dict[str, float]) -> LinearSystem:
