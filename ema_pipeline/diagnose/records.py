@@ -167,14 +167,14 @@ def whole_ladder(observations: RecordObservations, library: Mapping[str, Effect]
     fits = []
     for rung in searched.rungs:
         model = record_model(observations, library, rung.effects)
-        fits.append(refined(fast, model, _begun_at(model.problem(fast), rung), scatters, steps=0))
+        fits.append(refined(fast, model, begun_at(model.problem(fast), rung), scatters, steps=0))
     fits[-1] = learned(fast, fits[-1])
     ladder = ladder_of(fast, fits)
     rungs = tuple(_with_calibration(observations, library, ladder, r) for r in ladder.rungs)
     return dataclasses.replace(ladder, rungs=rungs, note=searched.note)
 
 
-def _begun_at(problem: EffectProblem, rung: Rung) -> NDArray[np.float64]:
+def begun_at(problem: EffectProblem, rung: Rung) -> NDArray[np.float64]:
     """Unknowns of a problem as a rung has them, those that it has not at their start."""
     x = problem.start()
     for name, value in rung.unknowns.items():
@@ -190,7 +190,7 @@ def _with_calibration(
     model = record_model(observations, library, rung.effects)
     problem = model.problem(observations)
     scatters = {s.name: s.learned for s in ladder.scatters}
-    posterior = refined(observations, model, _begun_at(problem, rung), scatters, steps=0).posterior
+    posterior = refined(observations, model, begun_at(problem, rung), scatters, steps=0).posterior
     sizes = parameter_sizes(problem, posterior)
     units = _units(observations)
     found = {n: dataclasses.replace(s, unit=s.unit or units.get(n, "")) for n, s in sizes.items()}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.free_run import RecordError
+from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
@@ -94,6 +95,8 @@ class RunResults:
         Effects of the model that the diagnosis was made of.
     simulation : tuple of RecordError
         Free-run errors in the records of a continuous test; empty where none were simulated.
+    hysteresis : tuple of HysteresisLoop
+        Loops of Bouc-Wen elements that records were simulated with.
     sensitivities : tuple of Verdict
         Channels whose scale or sign the model contradicts, see `fit.sensitivities`.
     """
@@ -115,6 +118,7 @@ class RunResults:
     diagnosed_on: tuple[str, ...] = ()
     folder: str = ""
     simulation: tuple[RecordError, ...] = ()
+    hysteresis: tuple[HysteresisLoop, ...] = ()
 
     @property
     def diagnosis_is_old(self) -> bool:

@@ -187,7 +187,20 @@ def _simulation(results: RunResults) -> dict[str, Any]:
     for entry in records.values():
         if len(entry["sensors"]) == 1:
             del entry["sensors"]
-    return {"records": records}
+    loops = [
+        {
+            "effect": loop.label,
+            "amplitude_m": loop.amplitude_m,
+            "energy_per_cycle_j": loop.energy_j,
+            "energy_per_cycle_std_j": loop.energy_std_j,
+            "stiffness_n_m": loop.stiffness_n_m,
+            "stiffness_std_n_m": loop.stiffness_std_n_m,
+            "best_told": {"combination": loop.best[0], "std": loop.best[1]},
+            "worst_told": {"combination": loop.worst[0], "std": loop.worst[1]},
+        }
+        for loop in results.hysteresis
+    ]
+    return {"records": records} | ({"hysteresis": loops} if loops else {})
 
 
 def _misfits(ladder: Ladder, rung: Rung) -> dict[str, Any]:

@@ -84,6 +84,7 @@ def _check_alike(records: tuple[DrivenRecord, ...]) -> None:
 def diagnose_run(run: Run, progress: Progress) -> dict[str, object]:
     """What the model is missing, on top of the effects that the user added, and its free-run errors."""
     from ema_pipeline.diagnose.free_run import free_run
+    from ema_pipeline.diagnose.hysteresis_loop import hysteresis_loops
     from ema_pipeline.diagnose.records import diagnose_records
     from ema_pipeline.threads import single_blas_thread
 
@@ -91,13 +92,16 @@ def diagnose_run(run: Run, progress: Progress) -> dict[str, object]:
     with single_blas_thread():
         observations = record_observations(run)
         found = diagnose_records(observations, run.library, run.info.effects, settings, progress)
+        progress(0.95, "free run")
         errors = free_run(observations, run.library, found.ladder)
-    return {"diagnosis": found, "simulation": errors, "on_top_of": run.info.effects}
+        loops = hysteresis_loops(observations, run.library, found.ladder)
+    return {"diagnosis": found, "simulation": errors, "hysteresis": loops, "on_top_of": run.info.effects}
 
 
 def ladder_run(run: Run, progress: Progress) -> dict[str, object]:
     """The effects that the user added, rung by rung, with the free-run errors of the last one."""
     from ema_pipeline.diagnose.free_run import free_run
+    from ema_pipeline.diagnose.hysteresis_loop import hysteresis_loops
     from ema_pipeline.diagnose.records import records_ladder
     from ema_pipeline.threads import single_blas_thread
 
@@ -110,4 +114,8 @@ def ladder_run(run: Run, progress: Progress) -> dict[str, object]:
         searched = run.store.find("diagnose", ALL, "diagnosis", Diagnosis)
         known = None if searched is None else searched.ladder
         ladder: Ladder = records_ladder(observations, run.library, effects, known)
-        return {"ladder": ladder, "simulation": free_run(observations, run.library, ladder)}
+        return {
+            "ladder": ladder,
+            "simulation": free_run(observations, run.library, ladder),
+            "hysteresis": hysteresis_loops(observations, run.library, ladder),
+        }

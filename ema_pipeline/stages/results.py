@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import TypeVar, cast
 
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.free_run import RecordError
+from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
@@ -64,7 +66,8 @@ def load_results(run: Run) -> RunResults:
         comparison_after=run.store.find("diagnose", ALL, "comparison_after", Comparison),
         diagnosis=_diagnosis(run),
         ladder=run.store.find("ladder", ALL, "ladder", Ladder),
-        simulation=_simulation(run),
+        simulation=_of_records(run, "simulation", RecordError),
+        hysteresis=_of_records(run, "hysteresis", HysteresisLoop),
         sensitivities=run.store.find("correlate", ALL, "sensitivities", tuple[Verdict, ...]) or (),
         deviations=tuple(
             run.store.find(stage, ALL, name, dict[str, float]) or {}
@@ -97,12 +100,19 @@ def _diagnosis(run: Run) -> Diagnosis | None:
     return replace(found, next_measurement=FOR_A_TABLE)
 
 
-def _simulation(run: Run) -> tuple[RecordError, ...]:
-    """Free-run errors of the model that the user made, or else of the one that the diagnosis proposes."""
+R = TypeVar("R", RecordError, HysteresisLoop)
+
+
+def _of_records(run: Run, name: str, kind: type[R]) -> tuple[R, ...]:
+    """What simulated records give of the model that the user made, or else of the one that the diagnosis proposes."""
     if run.info.kind != "continuous":
         return ()
-    own = run.store.find("ladder", ALL, "simulation", tuple[RecordError, ...]) if run.info.effects else None
-    return own or run.store.find("diagnose", ALL, "simulation", tuple[RecordError, ...]) or ()
+    stages = ("ladder", "diagnose") if run.info.effects else ("diagnose",)
+    for stage in stages:
+        found = run.store.find(stage, ALL, name, tuple[kind, ...])  # type: ignore[valid-type]
+        if found is not None:
+            return cast("tuple[R, ...]", found)
+    return ()
 
 
 def _system(run: Run, name: str, values: dict[str, float]) -> LinearSystem:
