@@ -28,6 +28,9 @@ LEAST_SAMPLES = 256
 SAME_PERIOD = 0.1
 """Relative difference of the force from one period to the next from which the stated period is none."""
 
+AT_LIMIT = 3
+"""Samples in a row at the very limit of a record that no smooth or random signal has."""
+
 CLIPPED_SHARE = 0.85
 """Share of samples near the top that lie at the very top: 0.5 for smooth peaks, 1 for clipped ones."""
 
@@ -238,12 +241,20 @@ def _check_channel(
             f"{where}: reaches its full scale of {full_scale:.4g} at sample {int(np.argmax(np.abs(samples)))}, so it "
             "is clipped; record again with a larger range"
         )
-    share = flat_top_share(samples)
-    if share > CLIPPED_SHARE:
+    if flat_top_share(samples) > CLIPPED_SHARE or _at_limits(samples) >= AT_LIMIT:
         raise EmaError(
-            f"{where}: is clipped at {top:.4g}: {share:.0%} of the samples near its top lie at the very top; "
-            "record again with a larger range"
+            f"{where}: is clipped at {top:.4g}: its tops are flat; record again with a larger range"
         )
+
+
+def _at_limits(samples: NDArray[np.float64]) -> int:
+    """Longest row of samples at the very top or bottom of a record."""
+    longest = 0
+    for limit in (np.max(samples), np.min(samples)):
+        same = np.abs(samples - limit) <= 1e-9 * abs(limit)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
+        longest = max(longest, int(np.max(edges[1::2] - edges[::2])))
+    return longest
 
 
 def _check_whole(force: NDArray[np.float64], period: int, where: str) -> None:
