@@ -20,7 +20,7 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.driven import DrivenRecord
 from ema_pipeline.verdict import Verdict
 
-AVERAGES = 12
+AVERAGES = 6
 """Blocks side by side that a record is cut into where no length is set; overlap nearly doubles them."""
 _SHORTEST, _LONGEST = 256, 65536
 OVERLAP = 0.5

@@ -35,7 +35,7 @@ class FrfSettings(Settings):
     block_samples: int | None = Field(
         default=None,
         ge=64,
-        description="Samples of a block of random excitation; left out: a power of two that gives about 24 averages",
+        description="Samples of a block of random excitation; left out: a power of two that gives about 12 averages",
     )
     input_coherence: float = Field(
         default=0.99,
