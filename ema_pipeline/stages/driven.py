@@ -6,6 +6,7 @@ from typing import cast
 
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.driven import DrivenRecord
@@ -45,6 +46,22 @@ def linear_rig(run: Run) -> Rig:
     configuration = run.info.configurations[0]
     modal = run.store.load("modal", configuration, "modal", ModalModel)
     return rig_of_modes(modal, configuration, MOST_COORDINATES)
+
+
+def require_model(run: Run, stage: str) -> None:
+    """Make sure that there is a model to work with, and that it has the effects that the user added.
+
+    Raises
+    ------
+    EmaError
+        Without a model, unless it is made of the identified modes, and for effects and places that do not exist.
+    """
+    if not by_records(run):
+        run.require_model(stage)
+        return
+    rig = linear_rig(run)
+    for label in run.info.effects:
+        parse_effect(label, rig, library=run.library)
 
 
 def record_observations(run: Run) -> RecordObservations:
