@@ -45,7 +45,8 @@ def linear_rig(run: Run) -> Rig:
         return run.rig
     configuration = run.info.configurations[0]
     modal = run.store.load("modal", configuration, "modal", ModalModel)
-    return rig_of_modes(modal, configuration, MOST_COORDINATES)
+    frfs = run.store.load("frf", configuration, "frfs", FrfSet)
+    return rig_of_modes(modal, frfs, configuration, MOST_COORDINATES)
 
 
 def require_model(run: Run, stage: str) -> None:
