@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,16 +12,10 @@ from ema_pipeline.diagnose.records import record_model
 from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import Effect
-from ema_pipeline.ingest.driven import DrivenRecord
 from ema_pipeline.observations.records import RecordObservations, RecordProblem
 
-_BEGIN_SAMPLES = 50
-"""Samples from which the state at the start of a record is found where the test states no transient."""
-_ROUNDS = 4
 _SHOWN_SAMPLES = 1500
 _SHOWN_LINES = 400
-_EDGE = 400
-"""Samples behind the first ones that the interpolation of the force sees."""
 
 UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s²"}
 
@@ -104,40 +97,12 @@ def _simulated(
             x[problem.unknowns.index[name]] = value
     states = [i for i, n in enumerate(problem.unknowns.names) if n.startswith("state ")]
     if states and not any(problem.unknowns.names[i] in unknowns for i in states):
-        x[states] = _begin(one, problem, x, states)
+        x = problem.settled(x)
     motions = problem.motions(x)
     if motions is None:
         return np.full(one.data[0].record.responses.T.shape, np.nan)
     common = x[: len(problem.model.unknowns)]
     return motions[0].read * problem.model.gains(common) + problem.model.response_offsets(common, one.rms)
-
-
-def _begin(
-    one: RecordObservations, problem: RecordProblem, x: NDArray[np.float64], states: Sequence[int]
-) -> NDArray[np.float64]:
-    """State at the start, in units of its prior σ, from the first samples alone."""
-    record = one.data[0].record
-    count = min(max(record.transient, _BEGIN_SAMPLES), record.n_samples)
-    part = _first(record, count + _EDGE)
-    short = RecordProblem(one.with_records([part], ()), problem.model)
-    offset = len(problem.model.unknowns)
-    at, weight = x.copy(), 1 / one.rms
-    for _ in range(_ROUNDS):
-        motions = short.motions(at, derivatives=True)
-        if motions is None:
-            return np.zeros(len(states))
-        gains = problem.model.gains(at[:offset])
-        gap = (part.responses.T - motions[0].read * gains)[:count]
-        gap -= problem.model.response_offsets(at[:offset], one.rms)
-        slope = motions[0].change[:count, :, problem.model.marched :] * gains[:, None]
-        rows = (slope * weight[:, None]).reshape(-1, len(states))
-        step = np.linalg.lstsq(rows, (gap * weight).ravel(), rcond=1e-8)[0]
-        at[list(states)] += step
-    return at[list(states)]
-
-
-def _first(record: DrivenRecord, count: int) -> DrivenRecord:
-    return dataclasses.replace(record, force=record.force[:, :count], responses=record.responses[:, :count])
 
 
 def _errors(one: RecordObservations, runs: Sequence[NDArray[np.float64]]) -> list[RecordError]:

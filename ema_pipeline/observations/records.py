@@ -34,6 +34,11 @@ MOST_COORDINATES = 5
 """Coordinates of a model up to which its records are simulated."""
 _WIDE = 20.0
 """Noise, in units of the discrepancy, with which fits begin: a linear model of a nonlinear rig misses a tenth."""
+_BEGIN_SAMPLES = 50
+"""Samples that tell the state at the start of a record which is held out, where the test states no transient."""
+_EDGE = 400
+"""Samples behind these that the interpolation of the force sees."""
+_ROUNDS = 4
 _MOST_NOISE = 1e3
 _LEAST_NOISE = 1e-5
 """Noise, in units of the discrepancy, that nothing falls below."""
@@ -91,6 +96,9 @@ class RecordObservations:
         self.held_out = tuple(held_out)
         self.basis = basis or _basis(rig, configuration, records, frfs)
         self.like, self.modal, self.phase = like, modal, phase
+        self.finds_states = (
+            False  # True where states at the start are found from the first samples, not fitted
+        )
 
     @cached_property
     def sample_rate_hz(self) -> float:
@@ -221,7 +229,9 @@ class RecordObservations:
     def _folds(self) -> tuple[tuple[RecordObservations, RecordObservations], ...]:
         if not self.held_out:
             return ()
-        return ((self, self.with_records(self.held_out, ())),)
+        other = self.with_records(self.held_out, ())
+        other.finds_states = True
+        return ((self, other),)
 
 
 def _basis(rig: Rig, configuration: str, records: Sequence[DrivenRecord], frfs: FrfSet | None) -> Basis:
@@ -317,6 +327,8 @@ class RecordProblem:
         derivatives: bool = True,
     ) -> Residuals:
         """See `Problem`."""
+        if self.observations.finds_states:
+            x = self.settled(x)
         motions = self.motions(x, derivatives)
         if motions is None:
             return Residuals(np.full(1, np.inf), np.zeros((1, len(x))))
@@ -371,6 +383,35 @@ class RecordProblem:
                 return None
             found.append(motion)
         return found
+
+    def settled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """`x` with the states at the start of the records that their first samples alone determine."""
+        found, place = x.copy(), len(self.model.unknowns)
+        for data in self.observations.data:
+            if not data.periodic:
+                part = slice(place, place + self._states)
+                found[part] = self._first_state(data.record, found[: len(self.model.unknowns)])
+                place += self._states
+        return found
+
+    def _first_state(self, record: DrivenRecord, common: NDArray[np.float64]) -> NDArray[np.float64]:
+        """State at the start of one record, in units of its prior σ, by a few Gauss-Newton steps."""
+        count = min(max(record.transient, _BEGIN_SAMPLES), record.n_samples)
+        seen = count + _EDGE
+        part = replace(record, force=record.force[:, :seen], responses=record.responses[:, :seen])
+        short = RecordProblem(self.observations.with_records([part], ()), self.model)
+        rms, gains = self.observations.rms, self.model.gains(common)
+        offsets = self.model.response_offsets(common, rms)
+        x = np.concatenate([common, np.zeros(self._states)])
+        for _ in range(_ROUNDS):
+            motions = short.motions(x, derivatives=True)
+            if motions is None:
+                return np.zeros(self._states)
+            gap = (part.responses.T - motions[0].read * gains - offsets)[:count] / rms
+            slope = motions[0].change[:count, :, self.model.marched :] * (gains / rms)[:, None]
+            step = np.linalg.lstsq(slope.reshape(-1, self._states), gap.ravel(), rcond=1e-8)[0]
+            x[len(common) :] += step
+        return x[len(common) :]
 
     def _rows(
         self,
