@@ -12,7 +12,8 @@ from ema_pipeline.diagnose.records import record_model
 from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import Effect
-from ema_pipeline.observations.records import RecordObservations, RecordProblem
+from ema_pipeline.observations.record_problem import RecordProblem
+from ema_pipeline.observations.records import RecordObservations
 
 _SHOWN_SAMPLES = 1500
 _SHOWN_LINES = 400
