@@ -15,7 +15,7 @@ from ema_pipeline.mechanics.simulation import between_samples
 
 BANDS = 8
 """Bands of frequency, each with a noise of its own: what a model leaves is seldom white."""
-DISCREPANCY = 5e-3
+DISCREPANCY = 1e-2
 """Standard uncertainty of a response as a share of its root mean square: sensors, and a force known at samples only."""
 _LEAST_NOISE = 1e-5
 """Noise, in units of the discrepancy, below which records are not told apart from exact ones."""

@@ -33,7 +33,7 @@ from ema_pipeline.rigs.types import Rig
 
 MOST_COORDINATES = 5
 """Coordinates of a model up to which its records are simulated."""
-_WIDE = 20.0
+_WIDE = 10.0
 """Noise, in units of the discrepancy, with which fits begin: a linear model of a nonlinear rig misses a tenth."""
 _MOST_NOISE = 1e3
 _SET_UP = 0.1
