@@ -27,7 +27,9 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
     campaign = read_campaign(raw)
     kinds = {test.kind for test in campaign.tests}
     if len(kinds) > 1:
-        raise EmaError(f"{raw}: holds hammer and hysteresis tests; run their folders one by one")
+        raise EmaError(
+            f"{raw}: holds tests of several kinds ({', '.join(sorted(kinds))}); run their folders one by one"
+        )
     if kinds == {"hysteresis"}:
         return _describe_loops(campaign, rig, pipeline, overrides)
     source = rig or _rig_of(campaign)
@@ -42,7 +44,7 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
         if len(names) == 1
         else raw.resolve().name
     )
-    return describe_run("hammer", raw, title, rig_text(source), source or "", names, (), settings)
+    return describe_run(kinds.pop(), raw, title, rig_text(source), source or "", names, (), settings)
 
 
 def _describe_loops(
@@ -94,6 +96,9 @@ def check_dofs(test: TestDescription, configuration: str, rig: Rig) -> None:
                 f"'{dof.point}'{did_you_mean(dof.point, known)}"
             )
 
+    for channel in test.forces if test.kind == "continuous" else ():
+        if channel.dof is not None:
+            check(channel.dof, f"channel '{channel.name}'")
     for record in test.records:
         if record.impact is not None:
             check(record.impact, f"record '{record.file}'")

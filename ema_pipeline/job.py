@@ -22,6 +22,7 @@ from ema_pipeline.pipeline import (
     with_effect_files,
 )
 from ema_pipeline.stages.base import Run, RunInfo, load_info, save_info
+from ema_pipeline.stages.driven import by_records, require_model
 from ema_pipeline.store import ALL, Store
 
 DescribeSource = Callable[[Path, str | None, str | None, Iterable[str]], RunInfo]
@@ -159,7 +160,7 @@ def set_effects(
     """
     effect_files = tuple(effect_files)
     run = existing_run(folder, effect_files)
-    run.require_model("add")
+    require_model(run, "add")
     store = Store(folder)
     settings = override(stored_settings(store, run.info), overrides, folder)
     with store.lock():
@@ -167,7 +168,7 @@ def set_effects(
             run.info, effects=change(run.info.effects), pipeline=settings.model_dump_json()
         )
         run = new_run(store, info, effect_files)
-        run.require_model("add")  # refuses unknown effects and places before anything is written
+        require_model(run, "add")  # refuses unknown effects and places before anything is written
         if info.kind == "hysteresis" and run.rig is not None:
             effects_of_loops(run.rig, info.effects, run.library)  # refuses what a loop does not show
         before = load_info(store)
@@ -185,7 +186,7 @@ def set_effects(
 def _take_ladder(run: Run, effect_files: tuple[str, ...]) -> None:
     """Take the diagnosis's ladder where it is of just these effects: one model has one error wherever it stands."""
     found = run.store.find("diagnose", ALL, "diagnosis", Diagnosis)
-    if run.info.kind == "hysteresis" or found is None or not found.ladder.rungs:
+    if run.info.kind == "hysteresis" or by_records(run) or found is None or not found.ladder.rungs:
         return
     before = new_run(run.store, dataclasses.replace(run.info, effects=()), effect_files)
     up_to_date = Keys(before, ("diagnose",))("diagnose", ALL) == run.store.key("diagnose", ALL)

@@ -39,6 +39,7 @@ from ema_pipeline.stages.base import (
     code_fingerprint,
     configurations_of,
     file_hash,
+    lacks_model,
     load_info,
     silent,
     versions,
@@ -55,6 +56,7 @@ STAGES_OF_KIND = {
     "hammer": frozenset(STAGES) - {"loops"},
     "modes": frozenset(STAGES) - {"ingest", "hits", "frf", "levels", "loops"},
     "hysteresis": frozenset({"loops", "ladder", "diagnose", "report"}),
+    "continuous": frozenset(STAGES) - {"hits", "levels", "loops"},
 }
 """Stages that have something to do, by kind of test."""
 
@@ -335,7 +337,7 @@ class Keys:
             self(other, c)
             for other in (*stage.NEEDS, *present)
             if other in STAGES_OF_KIND[run.info.kind]
-            if run.rig is not None or not stage_module(other).NEEDS_RIG
+            if not lacks_model(run) or not stage_module(other).NEEDS_RIG
             for c in (
                 (configuration,) if configuration != ALL else configurations_of(stage_module(other), run)
             )
@@ -373,7 +375,7 @@ def run_stages(run: Run, names: Iterable[str], show: ShowStage | None = None) ->
     keys = Keys(run, names)
     for name in names:
         stage = stage_module(name)
-        if name not in STAGES_OF_KIND[run.info.kind] or (stage.NEEDS_RIG and run.rig is None):
+        if name not in STAGES_OF_KIND[run.info.kind] or (stage.NEEDS_RIG and lacks_model(run)):
             continue
         for configuration in configurations_of(stage, run):
             key = keys(name, configuration)

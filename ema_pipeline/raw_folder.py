@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ema_pipeline.describe import DEFAULT_PIPELINE, checked_rig
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.description import read_campaign
@@ -28,6 +30,25 @@ def check_raw(raw: Path, overrides: Iterable[str] = ()) -> dict[str, tuple[Hit, 
             list(load_records(test, settings.ingest)), settings.hits
         )
     return judged
+
+
+def check_records(raw: Path, overrides: Iterable[str] = ()) -> list[str] | None:
+    """A line on every record of a continuous test, or None for hits; EmaError for a record that is not right."""
+    from ema_pipeline.ingest.driven import load_driven
+
+    tests, settings = read_campaign(raw).tests, load_pipeline(DEFAULT_PIPELINE, overrides)
+    if any(t.kind != "continuous" for t in tests):
+        return None
+    lines = []
+    for test in tests:
+        for r in load_driven(test, settings.ingest):
+            period = f", {r.n_samples // r.period} periods" if r.period else ""
+            level = ", ".join(f"{c.name} {np.std(f):.3g} N" for c, f in zip(r.forces, r.force, strict=True))
+            lines.append(
+                f"{r.name}: {r.n_samples} samples at {r.sample_rate_hz:.6g} Hz{period}, "
+                f"{r.excitation or 'continuous'}, {r.use.replace('_', ' ')}; force {level} (root mean square)"
+            )
+    return lines
 
 
 def draft_raw(raw: Path, overrides: Iterable[str] = ()) -> list[Path]:

@@ -250,9 +250,3 @@ def test_every_description_of_the_test_data_is_understood(test_data: Path) -> No
     for root in roots:
         campaign = read_campaign(root)
         assert all(t.records and t.channels for t in campaign.tests)
-
-
-def test_continuous_excitation_is_refused_in_words(tmp_path: Path) -> None:
-    (tmp_path / "test.toml").write_text('kind = "continuous"\n', encoding="utf-8")
-    with pytest.raises(EmaError, match=r"kind = 'continuous': continuous excitation cannot be analysed yet"):
-        read_campaign(tmp_path)

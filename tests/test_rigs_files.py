@@ -262,7 +262,6 @@ def test_mistakes_in_a_rig_file_name_file_line_and_key(
 
 
 ELEMENT_MISTAKES = [
-    ('name = "two blocks"\n', "", 1, "key 'name' is missing"),
     ('["free", "clamped"]', "[]", 2, "configurations = []"),
     ('["free", "clamped"]', '["free", "free"]', 2, "configuration 'free' is named twice"),
     ("[[masses]]", "[[mases]]", 5, "'mases' (did you mean 'masses'?)"),

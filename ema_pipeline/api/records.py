@@ -150,9 +150,10 @@ def read(raw: str | Path, *, pipeline: str | Path | None = None, settings: Setti
     """
     info = describe(Path(raw), None, None if pipeline is None else str(pipeline), overrides(settings))
     if info.kind != "hammer":
-        raise EmaError(
-            f"{raw}: holds force-displacement loops, which have no FRFs; use ema.run({str(raw)!r})"
-        )
+        held = "force-displacement loops, which have no FRFs"
+        if info.kind == "continuous":
+            held = "a continuous test, which has no hits"
+        raise EmaError(f"{raw}: holds {held}; use ema.run({str(raw)!r})")
     work = Work.new(info)
     run = work.run("ingest", "hits")
     hits = {name: run.store.load("hits", name, "hits", tuple[Hit, ...]) for name in info.configurations}

@@ -22,11 +22,15 @@ def compare(out: Out, effect_file: EffectFiles = None, json: Json = False) -> No
     """Show where model and measurement differ, in units of the measurement's uncertainty."""
     from ema_pipeline.job import run_on
     from ema_pipeline.report import terminal
+    from ema_pipeline.stages.driven import by_records
     from ema_pipeline.stages.results import load_results
 
     with progress(False) as show_stage:
         stages = ["correlate", "ladder"] if _of_loops(out) else ["correlate"]
         run, _ = run_on(out, stages, show=show_stage, effect_files=effect_file or [])
+    if by_records(run):
+        _show_records(run, json)
+        return
     run.require_model("compare")
     if run.info.kind == "hysteresis":
         from ema_pipeline.report.loops import comparison_rows, comparison_screen
@@ -60,11 +64,12 @@ def diagnose(
     from ema_pipeline.job import adding, change_effects, run_on
     from ema_pipeline.report import terminal
     from ema_pipeline.report.cautions import suspicions
+    from ema_pipeline.stages.driven import require_model
     from ema_pipeline.stages.results import load_results
 
     with progress(quiet) as show_stage:
         run, _ = run_on(out, ["diagnose", "report"], set_ or [], show_stage, effect_file or [])
-        run.require_model("diagnose")
+        require_model(run, "diagnose")
         results = load_results(run)
         found = results.diagnosis
         assert found is not None  # the stage has just run
@@ -137,6 +142,19 @@ def ladder(out: Out, effect_file: EffectFiles = None, json: Json = False) -> Non
     from ema_pipeline.pipeline import existing_run
 
     _show_ladder(existing_run(out, effect_file or []), json)
+
+
+def _show_records(run: Run, json: bool) -> None:
+    """Free-run errors in every record."""
+    from ema_pipeline.report.simulation import error_lines
+    from ema_pipeline.stages.results import load_results
+
+    results = load_results(run)
+    if json:
+        _show_json(results, "simulation")
+        return
+    for line in error_lines(results.simulation):
+        show(line)
 
 
 def _of_loops(out: Path) -> bool:

@@ -17,10 +17,15 @@ def check(raw: Raw, set_: Overrides = None, json: Json = False) -> None:
 
     The exit code is 1 where a point has no good hit left.
     """
-    from ema_pipeline.raw_folder import check_raw
+    from ema_pipeline.raw_folder import check_raw, check_records
     from ema_pipeline.report import summary_files, terminal
     from ema_pipeline.stages.hits import require_good_hits
 
+    records = check_records(raw, set_ or [])
+    if records is not None:
+        for line in records:
+            show(line)
+        return
     judged = check_raw(raw, set_ or [])
     if json:
         show_json(summary_files.finite({name: [asdict(h) for h in hits] for name, hits in judged.items()}))

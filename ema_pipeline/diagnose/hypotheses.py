@@ -19,6 +19,10 @@ from ema_pipeline.rigs.types import Rig
 _SAME = 1 - 1e-9
 """Correlation of two changes of all matrices from which they are the same physics."""
 _MOST_STARTS = 4
+_LOG_STARTS = (-1.0, 0.4, 1.5)
+"""Unknowns of yields, times and the like from which fits begin: a factor of about four apart."""
+_SIZE_STARTS = (0.1, 0.6)
+"""The same of sizes that have a sign, in units of their prior 1 σ."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +136,7 @@ def _names(
     own: list[Name] = []
     generic: list[Name] = []
     for effect in library.values():
-        if linear and not effect.linear:
+        if (linear and not effect.linear) or effect.records_only:
             continue
         for place in dict.fromkeys(p for a in assemblies.values() for p in effect.find_places(a)):
             assembly = next(a for a in assemblies.values() if effect.fits(a, place))
@@ -195,3 +199,21 @@ def _matrices(assembly: Assembly) -> NDArray[np.float64]:
     terms = assemble_terms(assembly, {}, lambda e: e.name)
     dense = terms.dense(terms.coefficient)
     return np.concatenate([dense.ravel(), terms.skew.ravel()])
+
+
+def size_starts(placed: PlacedEffect) -> tuple[Mapping[str, float], ...]:
+    """Unknowns from which fits to forces in time begin: the first size, and the shape that follows it."""
+    options = []
+    for k, p in enumerate(placed.effect.parameters):
+        size = SizeMap.of(p, p.scale)
+        low, high = size.bounds
+        starts: tuple[float, ...] = (0.0,)
+        if size.logarithmic and k < 2:
+            starts = _LOG_STARTS
+        elif not size.logarithmic and len(placed.effect.parameters) == 1:
+            starts = _SIZE_STARTS if low == 0.0 else (0.3, -0.3)
+        elif k == 0:
+            starts = (0.3,)
+        name = placed.parameter_name(p.name)
+        options.append([(name, float(np.clip(s, low, high))) for s in starts])
+    return tuple(dict(combination) for combination in product(*options))

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.diagnosis import diagnose
-from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
+from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
 from ema_pipeline.diagnose.selection import Progress
 from ema_pipeline.diagnose.sentences import label_text, size_text, summary
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -26,7 +25,6 @@ from ema_pipeline.observations.loop_data import SAME_FREQUENCY
 from ema_pipeline.observations.loop_forces import IsolatorForce, effects_of_loops
 from ema_pipeline.observations.loop_regions import regions
 from ema_pipeline.observations.loops import LoopObservations, LoopProblem
-from ema_pipeline.observations.rig_model import SizeMap
 
 MOST_EFFECTS = 6
 """Most effects that are added in turn: effects of an isolator act together more often than those of a structure."""
@@ -42,10 +40,6 @@ _FREE = 0.4
 """Prior 1 σ of the logarithm of a family from which the loops determine it."""
 _SAME = 1 - 1e-9
 """Correlation of two changes of the force from which they are the same physics."""
-_LOG_STARTS = (-1.0, 0.4, 1.5)
-"""Unknowns of yields, times and the like from which fits begin: a factor of about four apart."""
-_SIZE_STARTS = (0.1, 0.6)
-"""The same of sizes that have a sign, in units of their prior 1 σ."""
 
 
 def diagnose_loops(
@@ -113,7 +107,7 @@ def loop_hypotheses(
         if placed.label not in skip and observations.isolator.shows(observations.rig, placed):
             _grouped(groups, Name(placed, {}), _change(observations, placed))
     return tuple(
-        Hypothesis(tuple(names), begun=_begun(names[0].placed))
+        Hypothesis(tuple(names), begun=size_starts(names[0].placed))
         for k, (_, names) in enumerate(groups)
         if names and k >= len(free)
     )
@@ -122,7 +116,7 @@ def loop_hypotheses(
 def _placed(observations: LoopObservations, library: Mapping[str, Effect]) -> list[PlacedEffect]:
     """Effects at all their places, the rig's own before generic ones."""
     assembly = observations.rig.assembly(observations.isolator.configuration)
-    own = sorted(library.values(), key=lambda e: e.generic)
+    own = sorted((e for e in library.values() if not e.records_only), key=lambda e: e.generic)
     return [observations.scaled(PlacedEffect(e, place)) for e in own for place in e.find_places(assembly)]
 
 
@@ -166,24 +160,6 @@ def _free_columns(problem: LoopProblem) -> list[NDArray[np.float64]]:
         for i, s in enumerate(problem.model.dependence.unknowns.std)
         if s >= _FREE and np.any(here[:, i])
     ]
-
-
-def _begun(placed: PlacedEffect) -> tuple[Mapping[str, float], ...]:
-    """Unknowns from which fits begin: the first size, and the shape that follows it."""
-    options = []
-    for k, p in enumerate(placed.effect.parameters):
-        size = SizeMap.of(p, p.scale)
-        low, high = size.bounds
-        starts: tuple[float, ...] = (0.0,)
-        if size.logarithmic and k < 2:
-            starts = _LOG_STARTS
-        elif not size.logarithmic and len(placed.effect.parameters) == 1:
-            starts = _SIZE_STARTS if low == 0.0 else (0.3, -0.3)
-        elif k == 0:
-            starts = (0.3,)
-        name = placed.parameter_name(p.name)
-        options.append([(name, float(np.clip(s, low, high))) for s in starts])
-    return tuple(dict(combination) for combination in product(*options))
 
 
 def _told_apart(

@@ -76,6 +76,10 @@ class Effect:
     scales : callable
         ``scales(assembly, place) -> dict``: prior 1 σ of sizes that depend on the rig; the parameters' own where left
         out.
+    records_only : bool
+        True for an effect that is sought in records of continuous excitation only.
+    elsewhere : Effect, optional
+        The same physics, under the same id, with the parameters that it has at places where this effect cannot sit.
     """
 
     id: str
@@ -89,10 +93,22 @@ class Effect:
     other_places: Callable[[Assembly, str], bool] = _no_other_place
     generic: bool = False
     scales: Callable[[Assembly, str], Mapping[str, float]] = _library_scales
+    records_only: bool = False
+    elsewhere: Effect | None = None
 
     def places(self, rig: Rig, configuration: str) -> tuple[str, ...]:
         """Places of `rig` where the effect can sit in this configuration."""
         return self.find_places(rig.assembly(configuration))
+
+    def at(self, assembly: Assembly, place: str) -> Effect:
+        """The effect as it is at `place`: itself, or its form for other places."""
+        if (
+            self.elsewhere is not None
+            and not self.fits(assembly, place)
+            and self.elsewhere.fits(assembly, place)
+        ):
+            return self.elsewhere
+        return self
 
     def fits(self, assembly: Assembly, place: str) -> bool:
         """True where the effect can sit at `place`."""

@@ -158,6 +158,7 @@ def parse_effect(
     effect = get_effect(effect_id.strip(), library)
     configurations = rig.configurations if configuration is None else (configuration,)
     assemblies = [rig.assembly(c) for c in configurations]
+    effect = next((e for a in assemblies if (e := effect.at(a, place)) is not effect), effect)
     if not any(effect.fits(a, place) for a in assemblies):
         known = dict.fromkeys(p for a in assemblies for p in effect.find_places(a))
         where = f" in configuration '{configuration}'" if configuration is not None else ""

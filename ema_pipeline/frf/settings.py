@@ -32,6 +32,17 @@ class FrfSettings(Settings):
         ge=20.0,
         description="Drop of the force autospectrum at which the band ends, dB, unless noise ends it earlier",
     )
+    block_samples: int | None = Field(
+        default=None,
+        ge=64,
+        description="Samples of a block of random excitation; left out: a power of two that gives about 12 averages",
+    )
+    input_coherence: float = Field(
+        default=0.99,
+        gt=0,
+        lt=1,
+        description="Coherence between forces, or of one with all others, from which they count as one and the same",
+    )
     threads: int = Field(default=2, ge=1, description="Number of threads, each with a block of channels")
     minimum_coherence: float = Field(
         default=0.9,

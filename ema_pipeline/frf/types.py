@@ -56,7 +56,18 @@ class FrfSet:
         What is known of the sensor of each output; empty where nothing is. `frf.channels.channel_uncertainty`
         answers in either case.
     hammer : ChannelQuality or None
-        The same of the force channel.
+        The same of the force channel; of several forces at once the worst.
+    excitation : str
+        Of a continuous test; empty for a hammer's.
+    multiple_coherence : ndarray, (n_outputs, n_lines), or None
+        Of several forces at once; `coherence` is then the partial one, each force without what the others explain.
+    input_coherence : ndarray, (n_inputs, n_inputs, n_lines), or None
+        Ordinary coherence between the forces.
+    noise_variance, distortion_variance : ndarray, (n_outputs, n_inputs, n_lines), or None
+        Of a multisine: variance of the FRF by noise, from its scatter over periods, and by nonlinear distortion, from
+        what its scatter over realisations has beyond that (E|H - E H|² of one realisation).
+    detected_distortion : ndarray, (n_outputs, 2, n_lines), or None
+        Root of the power of the response at lines that carry no force, SI, of odd and of even order, NaN elsewhere.
     verdicts : tuple of Verdict
         Checks that need several hits or several points: coherence, driving point, reciprocity.
     """
@@ -79,6 +90,12 @@ class FrfSet:
     verdicts: tuple[Verdict, ...] = ()
     channels: tuple[ChannelQuality, ...] = ()
     hammer: ChannelQuality | None = None
+    excitation: str = ""
+    multiple_coherence: NDArray[np.float64] | None = None
+    input_coherence: NDArray[np.float64] | None = None
+    noise_variance: NDArray[np.float64] | None = None
+    distortion_variance: NDArray[np.float64] | None = None
+    detected_distortion: NDArray[np.float64] | None = None
 
     def accelerance(self, lines: slice = ALL_LINES) -> NDArray[np.complex128]:
         """All FRFs as acceleration over force, (m/s²)/N, shape (n_outputs, n_inputs, n_lines)."""

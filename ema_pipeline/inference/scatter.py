@@ -163,9 +163,11 @@ def _of_residuals_at_once(found: Posterior, scatter: Scatter) -> float:
     share = found.residuals.share.get(scatter.name)
     if share is None:
         return now
+    rows = share > 0  # the others do not depend on it
     values, jacobian = found.residuals.weighted
-    uncertain = np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian)
-    square = values**2 + uncertain
+    share, jacobian = share[rows], jacobian[rows]
+    uncertain = np.einsum("ij,ij->i", jacobian @ found.covariance, jacobian)
+    square = values[rows] ** 2 + uncertain
     log, weight = 0.0, scatter.spread**-2.0
     for _ in range(_NEWTON_STEPS):
         t = np.exp(2 * log)

@@ -14,6 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.files import check_regular, read_bounded
+from ema_pipeline.ingest.driven_entries import check_driven, check_driven_test
 from ema_pipeline.ingest.records import CALIBRATION_STD, TRANSVERSE
 from ema_pipeline.names import check_name
 from ema_pipeline.plain_text import has_control_characters
@@ -28,6 +29,8 @@ _LONGEST_TEXT = 1000
 """Characters of a title or name."""
 
 Quantity = Literal["force", "acceleration", "velocity", "displacement"]
+
+Excitation = Literal["random", "burst_random", "multisine", "chirp", "sweep", "periodic"]
 
 
 def _parse_dof(value: Any) -> Dof:
@@ -98,12 +101,16 @@ class RecordDescription(Settings):
     amplitude_m: float | None = Field(
         default=None, gt=0, description="Displacement amplitude (hysteresis tests)"
     )
-
-
-def _supported(kind: Any) -> Any:
-    if kind == "continuous":
-        raise ValueError("continuous excitation cannot be analysed yet; test with a hammer")
-    return kind
+    name: str = Field(default="", description="Name of the record; that of its file where left out")
+    excitation: Excitation | None = Field(default=None, description="What drove it (continuous tests)")
+    period_samples: int | None = Field(default=None, ge=2, description="Period of a periodic excitation")
+    level: float | None = Field(default=None, gt=0, description="Level of the excitation, in any unit")
+    first_sample: int | None = Field(default=None, ge=0, description="First sample of the part that counts")
+    last_sample: int | None = Field(default=None, ge=0, description="Its last sample, counted from 0 too")
+    use: Literal["fit", "held_out"] = Field(
+        default="fit", description="Whether the model is fitted to it or judged by it (continuous tests)"
+    )
+    transient_samples: int = Field(default=0, ge=0, description="Samples at its start left out of errors")
 
 
 class _TestFile(Settings):
@@ -111,9 +118,7 @@ class _TestFile(Settings):
 
     version: Literal[1] = Field(default=1, alias="schema", description="Version of this file's layout")
     title: str = Field(default="", description="Free text")
-    kind: Annotated[Literal["hammer", "hysteresis"], BeforeValidator(_supported)] = Field(
-        default="hammer", description="Kind of test"
-    )
+    kind: Literal["hammer", "hysteresis", "continuous"] = Field(default="hammer", description="Kind of test")
     rig: str | None = Field(default=None, description="Rig name or file; --rig wins")
     configuration: str | None = Field(default=None, description="One of the rig's configurations")
     sample_rate_hz: float | None = Field(
@@ -144,6 +149,11 @@ class TestDescription(_TestFile):
     def force(self) -> ChannelDescription:
         """The force channel."""
         return next(c for c in self.channels if c.quantity == "force")
+
+    @property
+    def forces(self) -> tuple[ChannelDescription, ...]:
+        """All force channels, in the order of the file; several in continuous tests only."""
+        return tuple(c for c in self.channels if c.quantity == "force")
 
     @property
     def responses(self) -> tuple[ChannelDescription, ...]:
@@ -257,6 +267,7 @@ def _check_texts(test: TestDescription) -> None:
     texts = {"title": test.title, "rig": test.rig or ""}
     texts |= {f"name of channel {i + 1}": c.name for i, c in enumerate(test.channels)}
     texts |= {f"file of record {i + 1}": r.file for i, r in enumerate(test.records)}
+    texts |= {f"name of record {i + 1}": r.name for i, r in enumerate(test.records)}
     for what, text in texts.items():
         if has_control_characters(text):
             raise EmaError(f"{test.file}: {what} '{text[:40]}' holds control characters; remove them")
@@ -274,8 +285,10 @@ def _check_channels(test: TestDescription) -> None:
         raise EmaError(f"{test.file}: channel '{name}' is described {count} times; keep one")
     for channel in test.channels:
         _check_channel(channel, f"{test.file}: channel '{channel.name}'")
-    forces = [c.name for c in test.channels if c.quantity == "force"]
-    if len(forces) != 1:
+    forces = [c.name for c in test.forces]
+    if test.kind == "continuous":
+        check_driven_test(test)
+    elif len(forces) != 1:
         found = "none has" if not forces else f"{', '.join(forces)} have"
         raise EmaError(f'{test.file}: exactly one channel must have quantity = "force"; {found} it')
     if not test.responses:
@@ -323,7 +336,7 @@ def _check_records(test: TestDescription) -> None:
     for record in test.records:
         where = f"{test.file}: record '{record.file}'"
         key = str(PurePosixPath(record.file))
-        if key in seen:
+        if key in seen and test.kind != "continuous":
             raise EmaError(f"{where}: is listed twice; its hits would count twice, keep one")
         seen.add(key)
         _check_file(test, record, where)
@@ -333,7 +346,11 @@ def _check_records(test: TestDescription) -> None:
                 raise EmaError(f"{where}: dofs names an unknown channel '{name}'{did_you_mean(name, known)}")
             if name == test.force.name and test.kind == "hammer":
                 raise EmaError(f"{where}: dofs names the hammer channel '{name}'; its dof is 'impact'")
-        (_check_hammer if test.kind == "hammer" else _check_sine)(test, record, where)
+        if test.kind == "continuous":
+            check_driven(test, record, where)
+        else:
+            _check_not_driven(record, where)
+            (_check_hammer if test.kind == "hammer" else _check_sine)(test, record, where)
 
 
 def _check_file(test: TestDescription, record: RecordDescription, where: str) -> None:
@@ -353,6 +370,16 @@ def _check_file(test: TestDescription, record: RecordDescription, where: str) ->
         check_regular(path)
     except EmaError as error:
         raise EmaError(f"{where}: {error}") from None
+
+
+_DRIVEN_KEYS = ("excitation", "period_samples", "level", "first_sample", "last_sample")
+
+
+def _check_not_driven(record: RecordDescription, where: str) -> None:
+    given = next((key for key in _DRIVEN_KEYS if getattr(record, key) is not None), None)
+    if given is not None or record.use != "fit" or record.transient_samples:
+        named = given or ("use" if record.use != "fit" else "transient_samples")
+        raise EmaError(f'{where}: {named} belongs to kind = "continuous"; remove it or set kind')
 
 
 def _check_hammer(test: TestDescription, record: RecordDescription, where: str) -> None:

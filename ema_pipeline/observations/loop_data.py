@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.loops.types import Loop
 from ema_pipeline.mechanics.fourier import fourier
+from ema_pipeline.observations.typical import Typical
 
 SAME_AMPLITUDE = 0.05
 """Loops whose amplitudes agree to this share are taken as tests at one amplitude."""
@@ -20,8 +21,6 @@ _FEWEST_GROUPS = 3
 """Amplitudes or frequencies from which one can be left out and still be enclosed or extrapolated by two."""
 _ROUGH = 10
 """Harmonic up to which what a model lacks may be as large as at the first: play, stick and slip reach that far."""
-FRICTION_RATE = 0.02
-"""Rate, as a share of the largest, at which dry friction has reached most of its force: a regularisation."""
 _CLEARLY = 0.1
 """Share of the energy by which loops of one frequency and amplitude differ where they are of different settings."""
 
@@ -81,45 +80,11 @@ class LoopData:
         return float(np.hypot(*self.measured[:2]) / max(np.hypot(*x), 1e-300))
 
 
-@dataclass(frozen=True)
-class Typical:
-    """Size of the motion and of the force of several loops, from which sizes of effects follow.
-
-    Attributes
-    ----------
-    amplitude_m : float
-        Largest one.
-    omega : float
-        Mean angular frequency, rad/s.
-    force_n : float
-        Force of the median stiffness at that amplitude.
-    """
-
-    amplitude_m: float
-    omega: float
-    force_n: float
-
-    @classmethod
-    def of(cls, loops: Sequence[LoopData]) -> Typical:
-        """Of these loops."""
-        x = max(d.loop.amplitude_m for d in loops)
-        omega = 2 * np.pi * float(np.mean([d.loop.frequency_hz for d in loops]))
-        return cls(x, omega, x * float(np.median([d.stiffness for d in loops])))
-
-    def size(self, unit: str) -> float | None:
-        """Size of a quantity that makes a force as large as the measured one; None where its unit does not tell."""
-        x, omega, force = self.amplitude_m, self.omega, self.force_n
-        return {
-            "N": force,
-            "N/m": force / x,
-            "N/m²": force / x**2,
-            "N/m³": force / x**3,
-            "N·s/m": force / (x * omega),
-            "m": x,
-            "1/m": 1 / x,
-            "m/s": FRICTION_RATE * x * omega,
-            "s": 1 / omega,
-        }.get(unit)
+def typical_of(loops: Sequence[LoopData]) -> Typical:
+    """The largest motion of these loops, and the force of their median stiffness at it."""
+    x = max(d.loop.amplitude_m for d in loops)
+    omega = 2 * np.pi * float(np.mean([d.loop.frequency_hz for d in loops]))
+    return Typical(x, omega, x * float(np.median([d.stiffness for d in loops])))
 
 
 def fourier_by_order(phase: NDArray[np.float64], harmonics: int) -> NDArray[np.float64]:

@@ -6,7 +6,6 @@ The sensitivities of the two channels are unknowns that all loops share; the off
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,16 +14,17 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.effects.base import EffectParameter, PlacedEffect
+from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, descend, joined
 from ema_pipeline.loops.types import Loop
 from ema_pipeline.mechanics.assembly import Spring
 from ema_pipeline.mechanics.cycles import Cycles
-from ema_pipeline.observations.loop_data import LoopData, Typical, left_out
+from ema_pipeline.observations.loop_data import LoopData, left_out, typical_of
 from ema_pipeline.observations.loop_forces import ForceAtPoint, Isolator, IsolatorForce
 from ema_pipeline.observations.parts import Dependence, dependence, part_key
 from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.observations.typical import SIZE_SHARE, Typical
 from ema_pipeline.rigs.types import Rig
 
 FORCE_SCATTER = "force_scatter"
@@ -45,11 +45,6 @@ CALIBRATION_STD = 0.02
 
 SETTING_STD = 0.7
 """1 σ of the logarithm of a loop's force scale where loops are of several settings: mostly within a factor of four."""
-SIZE_SHARE = 0.5
-"""Prior 1 σ of an effect's force as a share of the measured one."""
-START_SHARE = 0.1
-"""Share of the measured force from which a fit of an effect starts."""
-
 _SPREAD = 1.5
 """Unknowns of shapes from which fits are started: this much below and above their centre, and at it."""
 _TRIAL_STEPS = 4
@@ -104,7 +99,7 @@ class LoopObservations:
         self.data: tuple[LoopData, ...] = tuple(known.get(loop.name) or LoopData.of(loop) for loop in loops)
         self.isolator: Isolator = whole.isolator if whole else Isolator.of(rig)
         self.named: tuple[str, ...] = whole.named if whole else tuple(loop.name for loop in loops)
-        self.typical: Typical = whole.typical if whole else Typical.of(self.data)
+        self.typical: Typical = whole.typical if whole else typical_of(self.data)
         self.shared: Dependence = whole.shared if whole else self._dependence()
         self.starts: dict[tuple[str, ...], NDArray[np.float64]] = whole.starts if whole else {}
 
@@ -166,18 +161,7 @@ class LoopObservations:
 
     def scaled(self, effect: PlacedEffect) -> PlacedEffect:
         """The effect with the starts and prior scales of its sizes as these loops' force and motion suggest."""
-        parameters = tuple(self._scaled(p) for p in effect.effect.parameters)
-        return dataclasses.replace(effect, effect=dataclasses.replace(effect.effect, parameters=parameters))
-
-    def _scaled(self, p: EffectParameter) -> EffectParameter:
-        typical = self.typical.size(p.unit)
-        if typical is None:
-            return p
-        if SizeMap.of(p, p.scale).logarithmic:
-            centre = float(np.clip(typical, p.minimum, p.maximum))
-            return dataclasses.replace(p, null=centre, start=centre)
-        sign = -1.0 if p.start < p.null else 1.0
-        return dataclasses.replace(p, start=p.null + sign * START_SHARE * typical, scale=SIZE_SHARE * typical)
+        return self.typical.scaled(effect)
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> LoopProblem:
         """See `Observations`."""

@@ -18,6 +18,7 @@ from ema_pipeline.report.moving_gear import fill_of, moving_gears
 from ema_pipeline.report.numbers import format_percent, format_value, plain, signed, slug, words
 from ema_pipeline.report.pages import page_templates
 from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.report.simulation import simulation_context
 from ema_pipeline.report.summary_files import finite
 from ema_pipeline.report.test_sheet import set_up_table, transducers_table
 
@@ -161,6 +162,7 @@ def page_context(results: RunResults, live: bool = False) -> dict[str, Any]:
         "worst_dofs": tables.worst_dofs_table(compared) if compared and compared.dofs else None,
         "worst_bands": tables.worst_bands_table(compared) if compared and compared.bands else None,
         "fill_of": fill_of,
+        "simulation": simulation_context(results),
     }
 
 
@@ -180,6 +182,7 @@ def _sections(results: RunResults, figures: tuple[str, ...]) -> tuple[tuple[str,
         "model": results.diagnosis is not None or results.shown_ladder is not None or "errors" in figures,
         "modes": any(c.modal and c.modal.modes for c in results.configurations),
         "pairing": "mac" in figures or any(c.pairing for c in results.configurations),
+        "simulation": bool(results.simulation),
         "levels": any(c.levels and has_to_say(c.levels) for c in results.configurations),
         "fit": results.fit is not None,
         "hits": any(c.hits for c in results.configurations),
@@ -191,6 +194,7 @@ def _sections(results: RunResults, figures: tuple[str, ...]) -> tuple[tuple[str,
         "model": "Model and missing physics",
         "modes": "Modes",
         "pairing": "Pairing and MAC",
+        "simulation": "Simulated records",
         "levels": "Does it depend on how hard you hit?",
         "fit": "Fitted parameters",
         "hits": "Hits",

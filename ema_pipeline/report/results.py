@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ema_pipeline.correlate.types import Comparison, Pairing
+from ema_pipeline.diagnose.free_run import RecordError
+from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
@@ -91,6 +93,10 @@ class RunResults:
         Effects that the user added, ``id@place``.
     diagnosed_on : tuple of str
         Effects of the model that the diagnosis was made of.
+    simulation : tuple of RecordError
+        Free-run errors in the records of a continuous test; empty where none were simulated.
+    hysteresis : tuple of HysteresisLoop
+        Loops of Bouc-Wen elements that records were simulated with.
     sensitivities : tuple of Verdict
         Channels whose scale or sign the model contradicts, see `fit.sensitivities`.
     """
@@ -111,6 +117,8 @@ class RunResults:
     added: tuple[str, ...] = ()
     diagnosed_on: tuple[str, ...] = ()
     folder: str = ""
+    simulation: tuple[RecordError, ...] = ()
+    hysteresis: tuple[HysteresisLoop, ...] = ()
 
     @property
     def diagnosis_is_old(self) -> bool:

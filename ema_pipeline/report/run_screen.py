@@ -18,6 +18,7 @@ from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.limits import LOW_MAC
 from ema_pipeline.report.numbers import below, format_percent, format_value, plain, signed
 from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.report.simulation import error_lines
 from ema_pipeline.report.summary import changed_words
 from ema_pipeline.report.tables import Row, Table
 from ema_pipeline.report.terminal import build_table, console_text
@@ -28,6 +29,9 @@ SCREEN_LINES = 15
 MOST_CAUTIONS = 3
 LEAST_MODES = 3
 """Rows of modes that later cautions do not push out."""
+
+_MOST_RECORDS = 4
+"""Records whose errors a screen has room for."""
 
 
 class RunScreen:
@@ -53,6 +57,8 @@ class RunScreen:
             return textwrap.wrap(clean(text), width, subsequent_indent=indent, break_long_words=False) or [""]
 
         head = wrapped(verdict_line(self._results)) + wrapped(data_line(self._results))
+        for line in error_lines(self._results.simulation)[:_MOST_RECORDS]:
+            head += wrapped(f"{line}.", "  ")
         table = modes_table(self._results)
         total = len(table.rows)
         # the head of the table is a line of its own, and so is the count of modes that are not shown

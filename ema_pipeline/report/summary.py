@@ -12,6 +12,7 @@ from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_ERROR
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.report.simulation import error_lines, loop_words
 
 __all__ = ["cautions", "fails", "findings", "identified_words", "stiffnesses"]
 
@@ -30,6 +31,8 @@ def findings(results: RunResults) -> tuple[str, ...]:
         lines += [] if not results.diagnosis_is_old else [changed_words(results)]
         lines.append(diagnosis.compact(results.diagnosis))
     lines += [_measured(c) for c in results.configurations]
+    lines += [f"{line}." for line in error_lines(results.simulation)]
+    lines += [loop_words(loop) for loop in results.hysteresis]
     lines += [
         f"{c.name}: {c.levels.summary}" for c in results.configurations if c.levels and has_to_say(c.levels)
     ]
@@ -102,7 +105,8 @@ def _measured(c: ConfigurationResults) -> str:
     text = f"{c.name}: {used} of {len(c.hits)} hits used" if c.hits else f"{c.name}:"
     if c.frfs is not None:
         text += (
-            f"{',' if c.hits else ''} {len(c.frfs.outputs)} responses × {len(c.frfs.inputs)} impact points"
+            f"{',' if c.hits else ''} {_count(len(c.frfs.outputs), 'response')} × "
+            f"{_count(len(c.frfs.inputs), 'force' if c.frfs.excitation else 'impact point')}"
         )
     if c.modal is None:
         return text + "; no modes identified yet."

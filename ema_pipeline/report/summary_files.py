@@ -59,6 +59,8 @@ def summary(results: RunResults) -> dict[str, Any]:
             content["ladder_compared_s"] = results.shown_ladder.compared_s
         if results.shown_ladder.left_out:
             content["ladder_left_out"] = list(results.shown_ladder.left_out)
+    if results.simulation:
+        content["simulation"] = _simulation(results)
     content["warnings"] = list(cautions(results))
     return content
 
@@ -171,6 +173,34 @@ def _ladder(ladder: Ladder) -> list[dict[str, Any]]:
         | _misfits(ladder, r)
         for r in ladder.rungs
     ]
+
+
+def _simulation(results: RunResults) -> dict[str, Any]:
+    """Free-run errors by record; of several responses by sensor, and the largest share on top."""
+    records: dict[str, Any] = {}
+    for e in results.simulation:
+        one = {"rmse": e.rmse, "unit": e.unit, "relative": e.relative, "rmse_without_effects": e.before}
+        entry = records.setdefault(e.record, {"use": e.use} | one | {"samples": e.samples, "sensors": {}})
+        entry["sensors"][str(e.sensor)] = one
+        if e.relative > entry["relative"]:
+            entry |= one
+    for entry in records.values():
+        if len(entry["sensors"]) == 1:
+            del entry["sensors"]
+    loops = [
+        {
+            "effect": loop.label,
+            "amplitude_m": loop.amplitude_m,
+            "energy_per_cycle_j": loop.energy_j,
+            "energy_per_cycle_std_j": loop.energy_std_j,
+            "stiffness_n_m": loop.stiffness_n_m,
+            "stiffness_std_n_m": loop.stiffness_std_n_m,
+            "best_told": {"combination": loop.best[0], "std": loop.best[1]},
+            "worst_told": {"combination": loop.worst[0], "std": loop.worst[1]},
+        }
+        for loop in results.hysteresis
+    ]
+    return {"records": records} | ({"hysteresis": loops} if loops else {})
 
 
 def _misfits(ladder: Ladder, rung: Rung) -> dict[str, Any]:

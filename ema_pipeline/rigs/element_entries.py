@@ -124,7 +124,7 @@ class SensorEntry(Settings):
 class ElementRigFile(Settings):
     """A rig file from scratch: its coordinates are the DOFs of its masses."""
 
-    name: str = Field(min_length=1, description="name of the rig")
+    name: str = Field("rig of elements", min_length=1, description="name of the rig")
     configurations: tuple[str, ...] = Field(("default",), min_length=1, description="configurations")
     modal_damping_ratio: float = Field(
         0.01, ge=0, lt=1, description="damping ratio of every mode, 30 % tolerance"

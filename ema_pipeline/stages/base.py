@@ -37,7 +37,7 @@ class RunInfo:
     Attributes
     ----------
     kind : str
-        ``"hammer"``, ``"modes"`` (a table of modes in place of raw data) or ``"hysteresis"``.
+        ``"hammer"``, ``"modes"`` (a table of modes in place of raw data), ``"hysteresis"`` or ``"continuous"``.
     raw : str
         Folder that the records came from, or the file with the table of modes.
     title : str
@@ -182,6 +182,11 @@ class Stage(Protocol):
     def work(self, run: Run, configuration: str, progress: Progress) -> dict[str, object]:
         """Do the work; the results go into the store under their names."""
         ...
+
+
+def lacks_model(run: Run) -> bool:
+    """True where there is no model to compare with; that of a continuous test without a rig are its own modes."""
+    return run.rig is None and run.info.kind != "continuous"
 
 
 def configurations_of(stage: Stage, run: Run) -> tuple[str, ...]:

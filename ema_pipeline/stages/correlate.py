@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.rigs.types import Rig
+from ema_pipeline.stages import driven
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.modes import measured_frfs, measured_modes
 from ema_pipeline.store import ALL
@@ -31,6 +32,8 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Pair the modes at the fitted parameters, then compare modes, shapes and FRFs; so for the base model's modes."""
+    if driven.by_records(run) or run.rig is None:
+        return {}
     from ema_pipeline.fit.parameters import restored
     from ema_pipeline.observations.fitting import Model
     from ema_pipeline.stages.models import base_unknowns, known_model, mode_observations

@@ -9,7 +9,7 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.stages import loop_ladder
+from ema_pipeline.stages import driven, loop_ladder
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.correlate import correlate
 from ema_pipeline.stages.levels import level_studies
@@ -34,6 +34,10 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit every effect of the library on top of the model as it stands, and judge what the data support."""
     if run.info.kind == "hysteresis":
         return loop_ladder.diagnose_run(run, progress)
+    if driven.by_records(run):
+        return driven.diagnose_run(run, progress)
+    if run.rig is None:
+        return {}
     found = _diagnosed(run, progress)
     results: dict[str, object] = {
         "diagnosis": found,

@@ -9,6 +9,7 @@ from typing import cast
 from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.types import FitResult, ParameterEstimate
+from ema_pipeline.stages import driven
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.modes import measured_modes, modes_key
 from ema_pipeline.store import ALL
@@ -26,7 +27,12 @@ def inputs(run: Run, configuration: str) -> str:
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
-    """Fit all parameters to all configurations at once, and the base model beside the one with added effects."""
+    """Fit all parameters to all configurations at once, and the base model beside the one with added effects.
+
+    Where records are simulated, the diagnosis and the ladder hold the fitted values.
+    """
+    if driven.by_records(run) or run.rig is None:
+        return {}
     from ema_pipeline.fit.parameters import deviations_of, fit_modes, fit_result
     from ema_pipeline.observations.fitting import Model
     from ema_pipeline.stages.models import (

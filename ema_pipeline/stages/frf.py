@@ -1,4 +1,4 @@
-"""Hits → FRFs and coherence."""
+"""Hits, or records of continuous excitation → FRFs and coherence."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import cast
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.hits import accepted_hits
+from ema_pipeline.stages.ingest import driven_records
 
 NAME = "frf"
 NEEDS = ("ingest", "hits")
@@ -15,13 +16,17 @@ NEEDS_RIG = False
 
 
 def inputs(run: Run, configuration: str) -> str:
-    """Nothing but the hits."""
+    """Nothing but the hits, or the records."""
     return ""
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
-    """Average the accepted hits of every impact point."""
+    """Average the accepted hits of every impact point, or the blocks of continuous records."""
     from ema_pipeline.frf.estimate import estimate_frfs
 
     settings = cast(FrfSettings, run.settings[NAME])
+    if run.info.kind == "continuous":
+        from ema_pipeline.frf.driven import estimate_driven_frfs
+
+        return {"frfs": estimate_driven_frfs(driven_records(run.store, configuration), settings)}
     return {"frfs": estimate_frfs(accepted_hits(run.store, configuration, progress), settings)}

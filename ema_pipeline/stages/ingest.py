@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 from ema_pipeline.ingest.description import ChannelDescription, TestDescription, read_campaign
+from ema_pipeline.ingest.driven import DrivenRecord, load_driven
 from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Record, Transducer
 from ema_pipeline.stages.base import Progress, Run, file_hash
+from ema_pipeline.store import Store
+
+R = TypeVar("R", Record, DrivenRecord)
 
 NAME = "ingest"
+DRIVEN = "driven"
 NEEDS: tuple[str, ...] = ()
 PER_CONFIGURATION = True
 NEEDS_RIG = False
@@ -28,12 +33,21 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Read every record, check it against the description, and scale it to SI."""
     test = test_of(run, configuration)
     limits = cast(ReadLimits, run.settings[NAME])
-    return {
+    common: dict[str, object] = {
         "sources": file_hashes(test),
         "title": test.title,
         "transducers": tuple(_transducer(c) for c in test.channels),
-        "records": _with_progress(load_records(test, limits), len(test.records), progress),
     }
+    if test.kind == "continuous":
+        return common | {
+            DRIVEN: tuple(_with_progress(load_driven(test, limits), len(test.records), progress))
+        }
+    return common | {"records": _with_progress(load_records(test, limits), len(test.records), progress)}
+
+
+def driven_records(store: Store, configuration: str) -> tuple[DrivenRecord, ...]:
+    """Records of a continuous test of one configuration."""
+    return store.load(NAME, configuration, DRIVEN, tuple[DrivenRecord, ...])
 
 
 def _transducer(channel: ChannelDescription) -> Transducer:
@@ -49,7 +63,7 @@ def _transducer(channel: ChannelDescription) -> Transducer:
     )
 
 
-def _with_progress(records: Iterator[Record], count: int, progress: Progress) -> Iterator[Record]:
+def _with_progress(records: Iterator[R], count: int, progress: Progress) -> Iterator[R]:
     for index, record in enumerate(records):
         progress(index / count, record.file)
         yield record

@@ -5,7 +5,7 @@ from __future__ import annotations
 from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
-from ema_pipeline.stages import loop_ladder
+from ema_pipeline.stages import driven, loop_ladder
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.models import diagnosed_scatters, earlier_unknowns
 
@@ -25,6 +25,8 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit the base model and every rung above it; without added effects there is no ladder."""
     if run.info.kind == "hysteresis":
         return loop_ladder.ladder_run(run, progress)
+    if driven.by_records(run):
+        return driven.ladder_run(run, progress)
     if not run.info.effects:
         return {}
     if run.rig is None:

@@ -29,6 +29,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     from ema_pipeline.correlate.measured import to_modal_model
     from ema_pipeline.correlate.mode_table import read_mode_table
     from ema_pipeline.modal.circle import attach_circles, identify_by_circle
+    from ema_pipeline.modal.identify import identify
     from ema_pipeline.modal.moving import identify_hits
     from ema_pipeline.modal.pooling import pooled
 
@@ -39,6 +40,8 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     frfs = run.store.load("frf", configuration, "frfs", FrfSet)
     if settings.method == "circle":
         return {"modal": identify_by_circle(frfs, settings.circle)}
+    if run.info.kind == "continuous":
+        return {"modal": attach_circles(frfs, identify(frfs, settings.identify, progress), settings.circle)}
     found = identify_hits(
         lambda: accepted_hits(run.store, configuration),
         frfs,

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from typing import TypeVar, cast
 
 from ema_pipeline.correlate.types import Comparison, Pairing
+from ema_pipeline.diagnose.free_run import RecordError
+from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
@@ -63,6 +66,8 @@ def load_results(run: Run) -> RunResults:
         comparison_after=run.store.find("diagnose", ALL, "comparison_after", Comparison),
         diagnosis=_diagnosis(run),
         ladder=run.store.find("ladder", ALL, "ladder", Ladder),
+        simulation=_of_records(run, "simulation", RecordError),
+        hysteresis=_of_records(run, "hysteresis", HysteresisLoop),
         sensitivities=run.store.find("correlate", ALL, "sensitivities", tuple[Verdict, ...]) or (),
         deviations=tuple(
             run.store.find(stage, ALL, name, dict[str, float]) or {}
@@ -93,6 +98,21 @@ def _diagnosis(run: Run) -> Diagnosis | None:
     if found is None or run.info.kind != "modes" or found.verdict != "unknown_effect":
         return found
     return replace(found, next_measurement=FOR_A_TABLE)
+
+
+R = TypeVar("R", RecordError, HysteresisLoop)
+
+
+def _of_records(run: Run, name: str, kind: type[R]) -> tuple[R, ...]:
+    """What simulated records give of the model that the user made, or else of the one that the diagnosis proposes."""
+    if run.info.kind != "continuous":
+        return ()
+    stages = ("ladder", "diagnose") if run.info.effects else ("diagnose",)
+    for stage in stages:
+        found = run.store.find(stage, ALL, name, tuple[kind, ...])  # type: ignore[valid-type]
+        if found is not None:
+            return cast("tuple[R, ...]", found)
+    return ()
 
 
 def _system(run: Run, name: str, values: dict[str, float]) -> LinearSystem:

@@ -61,6 +61,7 @@ def packed_frfs(frfs: FrfSet, high_hz: float, points: int | None = POINTS) -> di
         "step": float(frfs.frequency_hz[1] - frfs.frequency_hz[0]) if frfs.frequency_hz.size > 1 else 1.0,
         "lines": int(lines.sum()),
         "total": len(all_pairs),
+        "average": "block" if frfs.excitation else "hit",
         "outputs": [d.point for d in frfs.outputs],
         "inputs": [d.point for d in frfs.inputs],
         "pairs": [[o, i, int(frfs.hits[o, i])] for o, i in kept],

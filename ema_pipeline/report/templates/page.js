@@ -112,7 +112,7 @@ var EmaPage = (function () {
     options(byId("frf-input"), inputs.map(function (i) { return c.frfs.inputs[i]; }), inputs.indexOf(chosen.input));
     var note = byId("frf-note"), hits = c.frfs.pairs.filter(function (p) { return p[0] === chosen.output && p[1] === chosen.input; })[0][2];
     var some = c.frfs.pairs.length < c.frfs.total ? "; " + c.frfs.pairs.length + " of " + c.frfs.total + " FRFs are kept in this page" : "";
-    note.textContent = c.name + ": " + c.frfs.outputs[chosen.output] + " ← " + c.frfs.inputs[chosen.input] + ", " + (hits === 1 ? "one hit: no coherence, no scatter" : "mean of " + hits + " hits") + some;
+    note.textContent = c.name + ": " + c.frfs.outputs[chosen.output] + " ← " + c.frfs.inputs[chosen.input] + ", " + (hits === 1 ? "one " + c.frfs.average + ": no coherence, no scatter" : "mean of " + hits + " " + c.frfs.average + "s") + some;
     refill(["frf"]);
   }
   function empty(names) { var out = {}; names.forEach(function (n) { out[n] = []; }); return out; }

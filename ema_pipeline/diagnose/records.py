@@ -1,0 +1,319 @@
+"""Diagnosis by simulation of continuous records: hypotheses, the search on pieces, the ladder on whole records."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.diagnose.diagnosis import diagnose
+from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
+from ema_pipeline.diagnose.rungs import ladder_of, make_ladder, parameter_sizes
+from ema_pipeline.diagnose.selection import Progress
+from ema_pipeline.diagnose.sentences import size_text, summary
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder, Rung
+from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.effects.library import parse_effect
+from ema_pipeline.errors import EmaError
+from ema_pipeline.mechanics.simulation import COARSE, coded_law
+from ema_pipeline.mechanics.system import LinearSystem
+from ema_pipeline.observations.base import EffectProblem
+from ema_pipeline.observations.fitting import Model, learned, refined
+from ema_pipeline.observations.record_data import thinned
+from ema_pipeline.observations.records import RecordObservations
+
+SEARCHED = 4096
+"""Samples, in pieces, on which hypotheses are compared: enough for evidence by the hundred, quick enough for all."""
+_SAME_CHANGE = 1e-5
+"""Relative difference of two changes of the linear system below which they are the same physics."""
+_TRIAL = 1e-6
+"""Change of a logarithm by which a matrix is differentiated."""
+_GENERIC = (
+    "cubic_spring",
+    "quadratic_spring",
+    "dry_friction",
+    "hysteresis",
+    "quadratic_damping",
+    "spring",
+    "mass",
+    "damper",
+)
+"""Effects that are sought at every DOF and between any two bodies; what is simplest to say comes first."""
+
+
+def diagnose_records(
+    observations: RecordObservations,
+    library: Mapping[str, Effect],
+    known: Sequence[str] = (),
+    settings: DiagnoseSettings | None = None,
+    progress: Progress = lambda share, text: None,
+    notes: Sequence[str] = (),
+) -> Diagnosis:
+    """Which physics is the model missing?
+
+    Parameters
+    ----------
+    observations : RecordObservations
+    library : dict of str to Effect
+    known : sequence of str
+        Effects ``id@place`` that the model has already.
+    settings : DiagnoseSettings, optional
+    progress : callable, optional
+    notes : sequence of str
+        Remarks on the data.
+
+    Returns
+    -------
+    Diagnosis
+        Its search used pieces of the records; its ladder holds the whole ones.
+    """
+    settings = settings or DiagnoseSettings()
+    pieces = search_pieces(observations)
+    hypotheses = record_hypotheses(observations, library, known)
+    found = diagnose(
+        pieces,
+        observations.rig,
+        library,
+        record_model(observations, library, known),
+        settings,
+        lambda share, text: progress(0.85 * share, text),
+        notes,
+        hypotheses=hypotheses,
+    )
+    progress(0.85, "whole records")
+    ladder = whole_ladder(observations, library, found.ladder)
+    return _with_whole(found, ladder)
+
+
+def search_pieces(observations: RecordObservations) -> RecordObservations:
+    """The same test by pieces of its records."""
+    records = [d.record for d in observations.data]
+    return observations.with_records(
+        thinned(records, SEARCHED),
+        thinned(observations.held_out, SEARCHED),
+        observations.basis.calibrated(),
+        COARSE,
+    )
+
+
+def record_model(
+    observations: RecordObservations, library: Mapping[str, Effect], labels: Iterable[str]
+) -> Model:
+    """The rig with effects ``id@place``; EmaError for effects and places that do not exist."""
+    rig, configuration = observations.basis.rig, observations.configuration
+    return Model(
+        tuple(observations.scaled(parse_effect(label, rig, configuration, library)) for label in labels)
+    )
+
+
+def record_hypotheses(
+    observations: RecordObservations, library: Mapping[str, Effect], known: Iterable[str] = ()
+) -> tuple[Hypothesis, ...]:
+    """The generic effects, and the user's own, at every DOF and between any two bodies.
+
+    What changes the linear system as a loose value of the rig does, is that value.
+    """
+    skip = set(known)
+    assembly = observations.basis.rig.assembly(observations.configuration)
+    own = (
+        [] if observations.modal else [e for e in library.values() if e.id not in _GENERIC and not e.generic]
+    )
+    placed = [PlacedEffect(e, place) for e in own for place in e.find_places(assembly)]
+    for place in _places(observations):
+        for effect_id in _GENERIC:
+            effect = library[effect_id].at(assembly, place)
+            if effect.fits(assembly, place) and not (observations.modal and effect.linear):
+                placed.append(PlacedEffect(effect, place))
+    loose = _loose_columns(observations)
+    groups: list[tuple[NDArray[np.float64] | None, list[Name]]] = []
+    for one in placed:
+        if one.label in skip or not _can_be_simulated(observations, one):
+            continue
+        scaled = observations.scaled(one)
+        change = _linear_change(observations, scaled)
+        if change is None or not _spanned(change, loose):
+            _grouped(groups, Name(scaled, {}), change)
+    return tuple(Hypothesis(tuple(names), begun=size_starts(names[0].placed)) for _, names in groups)
+
+
+def _places(observations: RecordObservations) -> tuple[str, ...]:
+    """Measured DOFs, other DOFs, and pairs of bodies that elements join or that share a direction."""
+    assembly = observations.basis.rig.assembly(observations.configuration)
+    measured = [d.point for d in observations.basis.outputs]
+    if observations.modal:
+        return tuple(dict.fromkeys(measured))
+    dofs = tuple(dict.fromkeys([*measured, *assembly.dofs]))
+    pairs = (
+        f"{a}-{b}"
+        for a, b in combinations(assembly.bodies, 2)
+        if {d.rpartition(".")[2] for d in assembly.coordinates(a)}
+        & {d.rpartition(".")[2] for d in assembly.coordinates(b)}
+    )
+    return (*dofs, *pairs)
+
+
+def whole_ladder(observations: RecordObservations, library: Mapping[str, Effect], searched: Ladder) -> Ladder:
+    """The rungs of a ladder that was found on pieces, fitted to whole records.
+
+    The fit takes its reference channels as exact, which costs nothing. Uncertainties are those with all calibrations.
+    """
+    scatters = {s.name: s.learned for s in searched.scatters}
+    records = [d.record for d in observations.data]
+    fast = observations.with_records(records, observations.held_out, observations.basis.calibrated())
+    fits = []
+    for rung in searched.rungs:
+        model = record_model(observations, library, rung.effects)
+        fits.append(refined(fast, model, begun_at(model.problem(fast), rung), scatters, steps=0))
+    fits[-1] = learned(fast, fits[-1])
+    ladder = ladder_of(fast, fits)
+    rungs = tuple(_with_calibration(observations, library, ladder, r) for r in ladder.rungs)
+    return dataclasses.replace(ladder, rungs=rungs, note=searched.note)
+
+
+def begun_at(problem: EffectProblem, rung: Rung) -> NDArray[np.float64]:
+    """Unknowns of a problem as a rung has them, those that it has not at their start."""
+    x = problem.start()
+    for name, value in rung.unknowns.items():
+        if name in problem.unknowns.index:
+            x[problem.unknowns.index[name]] = value
+    return x
+
+
+def _with_calibration(
+    observations: RecordObservations, library: Mapping[str, Effect], ladder: Ladder, rung: Rung
+) -> Rung:
+    """A rung whose sizes hold what all channels' calibration leaves open."""
+    model = record_model(observations, library, rung.effects)
+    problem = model.problem(observations)
+    scatters = {s.name: s.learned for s in ladder.scatters}
+    posterior = refined(observations, model, begun_at(problem, rung), scatters, steps=0).posterior
+    sizes = parameter_sizes(problem, posterior)
+    units = _units(observations)
+    found = {n: dataclasses.replace(s, unit=s.unit or units.get(n, "")) for n, s in sizes.items()}
+    return dataclasses.replace(rung, parameters=found)
+
+
+def records_ladder(
+    observations: RecordObservations,
+    library: Mapping[str, Effect],
+    effects: Sequence[str],
+    known: Ladder | None,
+) -> Ladder:
+    """The ladder of given effects, fitted on pieces where `known` does not hold just these, then on whole records."""
+    rungs = () if known is None else known.rungs
+    if known is None or not rungs or rungs[-1].effects != tuple(effects):
+        models = [record_model(observations, library, effects[:k]) for k in range(len(effects) + 1)]
+        known = make_ladder(search_pieces(observations), models)
+    return whole_ladder(observations, library, known)
+
+
+def _units(observations: RecordObservations) -> dict[str, str]:
+    """Units of the rig's own values."""
+    stated = {name: unit for name, (_, unit) in observations.linear_model.stated.items()}
+    return {name: p.unit for name, p in observations.basis.rig.parameters.items()} | stated
+
+
+def _with_whole(found: Diagnosis, ladder: Ladder) -> Diagnosis:
+    """The diagnosis with the sizes and errors of whole records."""
+    last = ladder.rungs[-1]
+    candidates = tuple(_with_sizes(c, last) for c in found.candidates)
+    told = [(c.label, size_text(c.parameters)) for c in candidates if c.claimed]
+    first = ladder.rungs[0]
+    words = found.summary
+    if found.verdict == "effect":
+        words = summary("effect", told, (first.error, last.error), found.null_probability)
+    return dataclasses.replace(
+        found,
+        candidates=candidates,
+        ladder=ladder,
+        summary=words,
+        error=first.error,
+        heldout_error=first.heldout_error,
+    )
+
+
+def _with_sizes(candidate: Candidate, rung: Rung) -> Candidate:
+    if candidate.label not in rung.effects:
+        return candidate
+    sizes = {n: rung.parameters.get(f"{candidate.label}.{n}", s) for n, s in candidate.parameters.items()}
+    return dataclasses.replace(candidate, parameters=sizes)
+
+
+def _linear_change(observations: RecordObservations, placed: PlacedEffect) -> NDArray[np.float64] | None:
+    """Change of the linear system by one prior 1 σ of the only size; None for effects that are not linear."""
+    if len(placed.effect.parameters) != 1 or not placed.effect.linear:
+        return None
+    p = placed.effect.parameters[0]
+    assembly = observations.basis.rig.assembly(observations.configuration)
+    edited = placed.effect.edit(assembly, placed.place, {p.name: p.null + p.scale})
+    return _matrices(observations, edited.system()) - _matrices(observations, assembly.system())
+
+
+def _loose_columns(observations: RecordObservations) -> NDArray[np.float64]:
+    """Changes of the linear system by the values that the records determine anyway, (3·n·n, n_loose)."""
+    model = observations.linear_model.rig_model
+    zero = np.zeros(len(model.unknowns))
+    before = model.system(observations.configuration, zero)
+    found = []
+    for name in observations.basis.loose:
+        x = zero.copy()
+        x[model.unknowns.index[name]] = _TRIAL
+        change = _matrices(observations, model.system(observations.configuration, x))
+        found.append((change - _matrices(observations, before)) / _TRIAL)
+    n = len(before.mass)
+    if model.has_ratio and n == 1:  # one coordinate: a damper and a damping ratio are the same
+        found.append(np.array([0.0, 1.0, 0.0]))
+    return np.array(found).reshape(-1, 3 * n * n).T
+
+
+def _matrices(observations: RecordObservations, system: LinearSystem) -> NDArray[np.float64]:
+    """Mass, damping and stiffness in units of the rig's own, (3·n·n,)."""
+    whole = observations.basis.rig.system(observations.configuration)
+    stiffness = float(np.max(np.abs(whole.stiffness))) or 1.0
+    mass = float(np.max(np.abs(whole.mass)))
+    damping = np.sqrt(stiffness * mass)
+    parts = (system.mass / mass, system.damping / damping, system.stiffness / stiffness)
+    return np.concatenate([m.ravel() for m in parts])
+
+
+def _can_be_simulated(observations: RecordObservations, placed: PlacedEffect) -> bool:
+    """True for an effect that leaves the coordinates as they are and has a response in time."""
+    assembly = observations.basis.rig.assembly(observations.configuration)
+    edited = placed.effect.edit(assembly, placed.place, {p.name: p.start for p in placed.effect.parameters})
+    if edited.dofs != assembly.dofs or np.any(edited.system().structural):
+        return False
+    try:
+        for element in edited.nonlinear:
+            coded_law(element)
+    except EmaError:
+        return False
+    return True
+
+
+def _spanned(change: NDArray[np.float64], loose: NDArray[np.float64]) -> bool:
+    """True where loose values of the rig make the same change together."""
+    if not np.any(change):
+        return True
+    factors = np.linalg.lstsq(loose, change, rcond=1e-12)[0]
+    return float(np.linalg.norm(change - loose @ factors)) < _SAME_CHANGE * float(np.linalg.norm(change))
+
+
+def _grouped(
+    groups: list[tuple[NDArray[np.float64] | None, list[Name]]],
+    name: Name,
+    change: NDArray[np.float64] | None,
+) -> None:
+    """Put an effect beside those of the same physics."""
+    size = 0.0 if change is None else float(np.linalg.norm(change))
+    for known, names in groups:
+        if known is None or change is None:
+            continue
+        reference = float(np.linalg.norm(known))
+        if float(known @ change) > (1 - _SAME_CHANGE) * reference * size:
+            names.append(dataclasses.replace(name, relative=size / reference))
+            return
+    groups.append((change, [name]))

@@ -1,0 +1,37 @@
+"""A spring whose force grows with the square of its stretch: stiffer one way than the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ema_pipeline.effects.base import Effect, EffectParameter
+from ema_pipeline.effects.generic import bodies_pairs_and_dofs, is_place, place_rows
+from ema_pipeline.mechanics.assembly import Assembly
+from ema_pipeline.mechanics.laws import PolynomialSpring
+
+
+def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
+    if values["stiffness"] == 0.0:
+        return assembly
+    rows = place_rows(assembly, place)
+    return assembly.add(
+        *(
+            PolynomialSpring(f"quadratic spring {i} at {place}", r, quadratic=values["stiffness"])
+            for i, r in enumerate(rows)
+        )
+    )
+
+
+EFFECT = Effect(
+    id="quadratic_spring",
+    title="spring whose stiffness differs between pull and push",
+    parameters=(EffectParameter("stiffness", "N/m²", 0.0, 1e8, 1e9, -1e14, 1e14, "quadratic stiffness"),),
+    find_places=bodies_pairs_and_dofs,
+    edit=_edit,
+    signs="second harmonics, and a mean that moves with the level",
+    reference="K. Worden, G. R. Tomlinson, Nonlinearity in Structural Dynamics (2001), chapter 2",
+    linear=False,
+    other_places=is_place,
+    generic=True,
+    records_only=True,
+)

@@ -1,0 +1,108 @@
+"""Noise and nonlinear distortion of a periodic test, told apart.
+
+Noise differs from period to period. Distortion repeats with the period and differs from one realisation of the phases
+to the next. Where a multisine leaves lines without force, what the response has there is distortion: of even order at
+even lines, of odd order at odd ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import rfft
+
+from ema_pipeline.ingest.driven import DrivenRecord
+
+_EXCITED = 1e-6
+"""Share of the largest power of the force above which a line is excited."""
+_FEWEST = 8
+"""Excited lines, and lines without force among them, from which orders are told apart."""
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """Variances of a FRF, (n_outputs, 1, n_lines); NaN where they are unknown.
+
+    Attributes
+    ----------
+    noise : ndarray
+        Of the mean over all periods and realisations, from the scatter over periods.
+    distortion : ndarray
+        Of one realisation, by distortion.
+    total : ndarray
+        Of the mean over all realisations: noise and distortion.
+    detected : ndarray, (n_outputs, 2, n_lines)
+        Amplitude of the response at lines without force, SI: odd lines, even lines; NaN elsewhere.
+
+    References
+    ----------
+    R. Pintelon, J. Schoukens, System Identification: A Frequency Domain Approach, 2nd ed. (2012), sections 3 and 4.
+    """
+
+    noise: NDArray[np.float64]
+    distortion: NDArray[np.float64]
+    total: NDArray[np.float64]
+    detected: NDArray[np.float64]
+
+
+def distortion(records: Sequence[DrivenRecord], period: int) -> Distortion:
+    """Variances of the FRF of one force from records of whole periods, one realisation each.
+
+    Parameters
+    ----------
+    records : sequence of DrivenRecord
+    period : int
+        Samples.
+    """
+    means, noises = [], []
+    lines = period // 2 + 1
+    force_power, responses = np.zeros(lines), []
+    for record in records:
+        skipped = min(-(-record.transient // period), record.n_samples // period - 1)
+        f = np.asarray(rfft(record.force.reshape(1, -1, period)[0, skipped:], axis=-1))
+        y = np.asarray(
+            rfft(record.responses.reshape(len(record.responses), -1, period)[:, skipped:], axis=-1)
+        )
+        mean_f, mean_y, count = f.mean(axis=0), y.mean(axis=1), f.shape[0]
+        force_power += np.abs(mean_f) ** 2
+        excited = np.abs(mean_f) ** 2 > _EXCITED * np.max(np.abs(mean_f[1:]) ** 2)
+        safe = np.where(excited, mean_f, 1.0)
+        h = np.where(excited, mean_y / safe, np.nan)
+        means.append(h)
+        responses.append(mean_y)
+        if count > 1:
+            apart = (y - mean_y[:, None]) - h[:, None] * (f - mean_f)
+            power = np.sum(np.abs(apart) ** 2, axis=1) / (count - 1) / count
+            noises.append(np.where(excited, power / np.abs(safe) ** 2, np.nan))
+    unknown = np.full_like(means[0].real, np.nan)
+    m = len(means)
+    noise = np.mean(noises, axis=0) if noises else unknown
+    total = np.var(means, axis=0, ddof=1) if m > 1 else unknown
+    stray = np.maximum(total - np.nan_to_num(noise), 0.0) if m > 1 else unknown
+    mean = total / m if m > 1 else noise
+    return Distortion(
+        noise=noise[:, None] / m,
+        distortion=stray[:, None],
+        total=np.asarray(mean)[:, None],
+        detected=_detected(np.sqrt(np.mean(np.abs(responses) ** 2, axis=0)) * 2 / period, force_power),
+    )
+
+
+def _detected(size: NDArray[np.float64], force_power: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Response at lines without force between excited ones, split by parity, (n_outputs, 2, n_lines)."""
+    found = np.full((len(size), 2, size.shape[1]), np.nan)
+    excited = force_power > _EXCITED * np.max(force_power[1:])
+    on = np.flatnonzero(excited[1:]) + 1
+    if len(on) < _FEWEST:
+        return found
+    lines = np.arange(size.shape[1])
+    silent = ~excited & (lines > on[0]) & (lines < on[-1])
+    if np.count_nonzero(silent) < _FEWEST:
+        return found
+    for k, parity in enumerate((1, 0)):
+        at = silent & (lines % 2 == parity)
+        found[:, k, at] = size[:, at]
+    return found

@@ -1,0 +1,362 @@
+"""Free-run simulation of an assembly under measured forces, with exact derivatives by any parameters.
+
+The force between samples is what a band-limited signal has there. A straight line between samples would take a tenth of
+the force away at a quarter of the sample rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.mechanics.assembly import Assembly
+from ema_pipeline.mechanics.dissipation import HystereticSpring, SquareDamper
+from ema_pipeline.mechanics.laws import (
+    BoucWen,
+    DryFriction,
+    Maxwell,
+    Nonlinear,
+    PartingSpring,
+    PolynomialSpring,
+)
+from ema_pipeline.mechanics.marching import element_rows
+from ema_pipeline.mechanics.modes import total_damping
+from ema_pipeline.mechanics.system import LinearSystem
+
+FINE, COARSE = 0.25, 0.5
+"""Phase, in rad, by which the highest mode may turn in one step. A quarter leaves an error of a hundred thousandth of a
+frequency; laws with kinks, such as hysteresis, need it too. While hypotheses are compared half will do."""
+MOST_SUBSTEPS = 64
+_PADDING = 400
+"""Samples by which a record is continued at both ends before it is interpolated."""
+_NO_LOSS = 1e-6
+"""Least σ of a Bouc-Wen law: below it, it is a spring."""
+
+
+@dataclass(frozen=True)
+class DrivenSystem:
+    """What the compiled loop marches: accelerations by displacements, velocities, forces and elements.
+
+    Attributes
+    ----------
+    stiffness, damping : ndarray, (n, n)
+        M⁻¹K and M⁻¹C of the linear elements.
+    inputs : ndarray, (n, n_inputs)
+        M⁻¹ times the rows of the forces.
+    push : ndarray, (n, m)
+        M⁻¹ times the rows of the nonlinear elements.
+    numbers : ndarray, (m, 4)
+        Of the elements' laws.
+    rows : ndarray, (m, n)
+    kinds : ndarray of int, (m,)
+    """
+
+    stiffness: NDArray[np.float64]
+    damping: NDArray[np.float64]
+    inputs: NDArray[np.float64]
+    push: NDArray[np.float64]
+    numbers: NDArray[np.float64]
+    rows: NDArray[np.float64]
+    kinds: NDArray[np.int64]
+
+    @property
+    def size(self) -> int:
+        """Number of states: displacements, velocities, memories."""
+        return 2 * len(self.stiffness) + len(self.kinds)
+
+    @property
+    def varied(self) -> tuple[NDArray[np.float64], ...]:
+        """The arrays that parameters change."""
+        return self.stiffness, self.damping, self.inputs, self.push, self.numbers
+
+    def scaled_inputs(self, factor: NDArray[np.float64]) -> DrivenSystem:
+        """With every force times a factor, (n_inputs,)."""
+        return replace(self, inputs=self.inputs * factor)
+
+
+def driven_system(
+    assembly: Assembly, in_rows: NDArray[np.float64], linear: LinearSystem | None = None
+) -> DrivenSystem:
+    """The arrays of an assembly that forces drive along `in_rows`, (n_inputs, n).
+
+    Parameters
+    ----------
+    assembly : Assembly
+    in_rows : ndarray, (n_inputs, n)
+    linear : LinearSystem, optional
+        Matrices of the assembly, tangents included, where parts have values of their own.
+
+    Raises
+    ------
+    EmaError
+        For structural damping, which has no time response, and for elements that the loop does not know.
+    """
+    system = linear or assembly.system()
+    if np.any(system.structural):
+        raise EmaError(
+            "a loss factor holds at steady state only and has no time response; replace it by a damper"
+        )
+    elements = assembly.nonlinear
+    rows = element_rows(assembly, elements)
+    tangent = np.array([e.tangent_stiffness for e in elements])
+    stiffness = system.stiffness - rows.T @ (tangent[:, None] * rows)
+    factor = scipy.linalg.cho_factor(system.mass)
+    coded = [coded_law(e) for e in elements]
+
+    def solved(right: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.ascontiguousarray(scipy.linalg.cho_solve(factor, right, check_finite=False))
+
+    return DrivenSystem(
+        stiffness=solved(stiffness),
+        damping=solved(total_damping(system)),
+        inputs=solved(in_rows.T),
+        push=solved(rows.T),
+        numbers=np.array([numbers for _, numbers in coded]).reshape(len(elements), 4),
+        rows=np.ascontiguousarray(rows),
+        kinds=np.array([kind for kind, _ in coded], dtype=np.int64),
+    )
+
+
+def coded_law(element: Nonlinear) -> tuple[int, tuple[float, float, float, float]]:
+    """Law and numbers of an element as `mechanics.driven` has them; EmaError for one that it does not know."""
+    if isinstance(element, PolynomialSpring):
+        return 0, (element.quadratic, element.cubic, 0.0, 0.0)
+    if isinstance(element, DryFriction):
+        return 1, (element.limit, element.velocity, 0.0, 0.0)
+    if isinstance(element, SquareDamper):
+        return 2, (element.coefficient, 0.0, 0.0, 0.0)
+    if isinstance(element, HystereticSpring):
+        return 3, (element.stiffness, element.force, element.shape, element.exponent)
+    if isinstance(element, BoucWen):
+        sigma = max(element.sigma, _NO_LOSS)
+        force = element.limit / sigma ** (1 / element.exponent)
+        return 3, (element.tangent_stiffness, force, (1 - sigma) / sigma, element.exponent)
+    if isinstance(element, PartingSpring):
+        far = 1e6  # m: a contact that never parts
+        return 4, (element.stiffness, min(element.preload, far), min(element.gap, far), 0.0)
+    if isinstance(element, Maxwell):
+        return 5, (element.stiffness, element.time, 0.0, 0.0)
+    raise EmaError(f"element '{element.name}' has no law that continuous records can be simulated with")
+
+
+def substeps_for(system: LinearSystem, sample_rate_hz: float, phase: float) -> int:
+    """Steps per sample in which the highest mode turns by no more than `phase`, rad; no fewer than 1/phase."""
+    squares = scipy.linalg.eigh(system.stiffness, system.mass, eigvals_only=True)
+    highest = float(np.sqrt(max(np.max(squares), 0.0)))
+    return int(np.clip(np.ceil(highest / sample_rate_hz / phase), np.ceil(1 / phase), MOST_SUBSTEPS))
+
+
+def between_samples(forces: NDArray[np.float64], factor: int, periodic: bool = False) -> NDArray[np.float64]:
+    """Band-limited signals at `factor` points per sample, (n_points, n_forces), for n_samples samples each.
+
+    Parameters
+    ----------
+    forces : ndarray, (n_forces, n_samples)
+    factor : int
+    periodic : bool
+        True where the record is one period, or several: its end joins its start. The first sample then stands at the
+        end once more, so that there are n_samples + 1 of them.
+    """
+    count = forces.shape[1]
+    if periodic:
+        fine = _resampled(forces, factor)
+        return np.ascontiguousarray(np.concatenate([fine, fine[:, :1]], axis=1).T)
+    pad = min(_PADDING, count - 1)
+    whole = next_fast_len(count + 2 * pad, real=True)
+    before = 2 * forces[:, :1] - forces[:, pad:0:-1]
+    after = 2 * forces[:, -1:] - forces[:, -2 : -pad - 2 : -1]
+    rest = whole - count - 2 * pad
+    # a straight way back to the start, so that the ends of what is transformed meet
+    way = after[:, -1:] + (before[:, :1] - after[:, -1:]) * np.arange(1, rest + 1) / (rest + 1)
+    fine = _resampled(np.concatenate([before, forces, after, way], axis=1), factor)
+    return np.ascontiguousarray(fine[:, pad * factor : (pad + count - 1) * factor + 1].T)
+
+
+def _resampled(signals: NDArray[np.float64], factor: int) -> NDArray[np.float64]:
+    count = signals.shape[1]
+    spectrum = np.asarray(rfft(signals, axis=1))
+    if count % 2 == 0:
+        spectrum[:, -1] *= 0.5  # its other half lies at the negative frequency
+    return np.asarray(irfft(spectrum, factor * count, axis=1)) * factor
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """Derivatives of a `DrivenSystem` and of the first state by p parameters: arrays with p last."""
+
+    stiffness: NDArray[np.float64]
+    damping: NDArray[np.float64]
+    inputs: NDArray[np.float64]
+    push: NDArray[np.float64]
+    numbers: NDArray[np.float64]
+    begin: NDArray[np.float64]
+
+    @classmethod
+    def none(cls, system: DrivenSystem, count: int) -> Slopes:
+        """Zeros to be filled in, of `count` parameters."""
+        stiffness, damping, inputs, push, numbers = (np.zeros((*a.shape, count)) for a in system.varied)
+        return cls(stiffness, damping, inputs, push, numbers, np.zeros((system.size, count)))
+
+    def first(self, count: int) -> Slopes:
+        """The derivatives by the first `count` parameters."""
+        arrays = (self.stiffness, self.damping, self.inputs, self.push, self.numbers, self.begin)
+        return Slopes(*(np.ascontiguousarray(a[..., :count]) for a in arrays))
+
+    def set_difference(self, column: int, low: DrivenSystem, high: DrivenSystem, step: float) -> None:
+        """Fill in one parameter from the systems `step` apart."""
+        for mine, a, b in zip(
+            (self.stiffness, self.damping, self.inputs, self.push, self.numbers),
+            low.varied,
+            high.varied,
+            strict=True,
+        ):
+            mine[..., column] = (b - a) / step
+
+
+def march(
+    system: DrivenSystem,
+    sample_rate_hz: float,
+    substeps: int,
+    force: NDArray[np.float64],
+    begin: NDArray[np.float64],
+    slopes: Slopes | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """States at every sample, and their derivatives.
+
+    Parameters
+    ----------
+    system : DrivenSystem
+    sample_rate_hz : float
+    substeps : int
+        Steps per sample.
+    force : ndarray, (2·substeps·(n_samples - 1) + 1, n_inputs)
+        N, see `between_samples`.
+    begin : ndarray, (2n + m,)
+    slopes : Slopes, optional
+
+    Returns
+    -------
+    states : ndarray, (n_samples, 2n + m)
+    derivatives : ndarray, (n_samples, 2n + m, p)
+        (n_samples, 2n + m, 0) without slopes.
+        None where the motion grows without bound.
+
+    References
+    ----------
+    E. Hairer, S. P. Norsett, G. Wanner, *Solving Ordinary Differential Equations I* (1993), sections II.1 and I.14
+    (variational equations).
+    """
+    from ema_pipeline.mechanics import driven  # compiled on first use
+
+    step = 1 / (sample_rate_hz * substeps)
+    count = (len(force) - 1) // (2 * substeps) + 1
+    states = np.empty((count, system.size))
+    fixed = (
+        system.stiffness, system.damping, system.inputs, system.push, system.rows, system.kinds,
+        system.numbers, force, begin, step, substeps,
+    )  # fmt: skip
+    if slopes is None:
+        if not driven.march(*fixed, states):
+            return None
+        return states, np.empty((count, system.size, 0))
+    derivatives = np.empty((count, system.size, slopes.begin.shape[1]))
+    if not driven.march_with_slopes(
+        *fixed, slopes.stiffness, slopes.damping, slopes.inputs, slopes.push, slopes.numbers, slopes.begin,
+        states, derivatives,
+    ):  # fmt: skip
+        return None
+    return states, derivatives
+
+
+def resolved(
+    system: DrivenSystem, step: float, slopes: Slopes | None = None
+) -> tuple[DrivenSystem, Slopes | None]:
+    """The system with friction no sharper than a step, s, resolves, and its derivatives: else it rings."""
+    numbers = system.numbers.copy()
+    change = None if slopes is None else slopes.numbers.copy()
+    for j in np.flatnonzero(system.kinds == 1):
+        per_newton = abs(float(system.rows[j] @ system.push[:, j])) * step
+        if numbers[j, 1] < per_newton * abs(numbers[j, 0]):
+            numbers[j, 1] = per_newton * abs(numbers[j, 0])
+            if change is not None:
+                change[j, 1] = per_newton * np.sign(numbers[j, 0]) * change[j, 0]
+    return replace(system, numbers=numbers), None if slopes is None or change is None else replace(
+        slopes, numbers=change
+    )
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """What sensors read of the states: displacements, velocities, or accelerations.
+
+    Attributes
+    ----------
+    rows : ndarray, (n_outputs, n)
+    quantities : tuple of str
+    """
+
+    rows: NDArray[np.float64]
+    quantities: Sequence[str]
+
+    def read(
+        self,
+        system: DrivenSystem,
+        states: NDArray[np.float64],
+        force: NDArray[np.float64],
+        derivatives: NDArray[np.float64] | None = None,
+        slopes: Slopes | None = None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Readings (n_samples, n_outputs) and their derivatives (n_samples, n_outputs, p).
+
+        Parameters
+        ----------
+        system : DrivenSystem
+        states : ndarray, (n_samples, 2n + m)
+        force : ndarray, (n_samples, n_inputs)
+            At the samples, N.
+        derivatives : ndarray, (n_samples, 2n + m, p), optional
+        slopes : Slopes, optional
+            What the derivatives were marched with.
+        """
+        n, p = len(system.stiffness), 0 if derivatives is None else derivatives.shape[2]
+        read = np.empty((len(states), len(self.rows)))
+        change = np.empty((len(states), len(self.rows), p))
+        rates: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+        for o, (row, quantity) in enumerate(zip(self.rows, self.quantities, strict=True)):
+            if quantity == "acceleration":
+                rates = rates or accelerations(system, states, force, derivatives, slopes)
+                source, moved = rates
+            else:
+                part = slice(0, n) if quantity == "displacement" else slice(n, 2 * n)
+                source = states[:, part]
+                moved = np.empty((len(states), n, 0)) if derivatives is None else derivatives[:, part]
+            read[:, o] = source @ row
+            change[:, o] = np.einsum("tnp,n->tp", moved, row)
+        return read, change
+
+
+def accelerations(
+    system: DrivenSystem,
+    states: NDArray[np.float64],
+    force: NDArray[np.float64],
+    derivatives: NDArray[np.float64] | None = None,
+    slopes: Slopes | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Accelerations (n_samples, n) at marched states, and their derivatives (n_samples, n, p)."""
+    from ema_pipeline.mechanics import driven
+
+    p = 0 if derivatives is None else derivatives.shape[2]
+    tangent = np.empty((len(states), system.size, 0)) if derivatives is None else derivatives
+    given = slopes or Slopes.none(system, p)
+    found: tuple[NDArray[np.float64], NDArray[np.float64]] = driven.accelerations(
+        system.stiffness, system.damping, system.inputs, system.push, system.rows, system.kinds, system.numbers,
+        np.ascontiguousarray(force), states, tangent,
+        given.stiffness, given.damping, given.inputs, given.push, given.numbers,
+    )  # fmt: skip
+    return found

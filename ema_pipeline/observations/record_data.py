@@ -1,0 +1,163 @@
+"""One record of continuous excitation, prepared for comparison: its force between samples, its lines, their noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import rfft
+
+from ema_pipeline.ingest.driven import DrivenRecord
+from ema_pipeline.mechanics.simulation import between_samples
+
+BANDS = 8
+"""Bands of frequency, each with a noise of its own: what a model leaves is seldom white."""
+DISCREPANCY = 1e-2
+"""Standard uncertainty of a response as a share of its root mean square: sensors, and a force known at samples only."""
+_LEAST_NOISE = 1e-5
+"""Noise, in units of the discrepancy, below which records are not told apart from exact ones."""
+_RESTLESS = 1.5
+"""A first period that differs from the mean by this many times what others do holds a transient."""
+_BLOCKS = 4
+"""Pieces of a long record that stand for it while hypotheses are compared."""
+_LEAST_BLOCK = 1024
+"""Shortest such piece, samples."""
+_GLIDING = ("sweep", "chirp")
+
+
+@dataclass(frozen=True)
+class RecordData:
+    """What is compared of one record.
+
+    Attributes
+    ----------
+    record : DrivenRecord
+        Of a periodic one the mean period.
+    noise : ndarray, (n_outputs, BANDS)
+        1 σ of a sample of the response within each band, from its scatter over periods; 0 where there is none.
+    """
+
+    record: DrivenRecord
+    noise: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, record: DrivenRecord) -> RecordData:
+        """A record, its periods averaged where it has some."""
+        none = np.zeros((len(record.channels), BANDS))
+        if not record.period:
+            return cls(record, none)
+        force = record.force.reshape(len(record.force), -1, record.period)
+        responses = record.responses.reshape(len(record.responses), -1, record.period)
+        steady = _steady(responses, -(-record.transient // record.period))
+        force, responses = force[:, steady:], responses[:, steady:]
+        mean = replace(record, force=force.mean(axis=1), responses=responses.mean(axis=1), transient=0)
+        count = responses.shape[1]
+        if count < 2:
+            return cls(mean, none)
+        lines = _lines(responses - responses.mean(axis=1, keepdims=True))
+        band = _bands(record.period)
+        power = np.sum(lines**2, axis=1) / (count - 1) / count
+        return cls(mean, np.sqrt([[float(np.mean(p[band == b])) for b in range(BANDS)] for p in power]))
+
+    @property
+    def periodic(self) -> bool:
+        """True for a steady response, whose state at the start follows from the force."""
+        return self.record.period > 0
+
+    @cached_property
+    def rms(self) -> NDArray[np.float64]:
+        """Root mean square of every response about its mean, (n_outputs,)."""
+        return np.asarray(np.std(self.record.responses, axis=1))
+
+    @property
+    def compared(self) -> slice:
+        """Samples that are compared."""
+        return slice(0 if self.periodic else self.record.transient, None)
+
+    @cached_property
+    def measured(self) -> NDArray[np.float64]:
+        """Lines of the responses, (n_outputs, n_rows), SI."""
+        return self.lines(self.record.responses[:, self.compared])
+
+    def lines(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Lines of signals, (n_outputs, ..., n_samples) to (n_outputs, ..., n_rows), means of displacements included.
+
+        What other sensors give as a mean is their offset.
+        """
+        found = _lines(samples)
+        for o, channel in enumerate(self.record.channels):
+            if channel.quantity != "displacement":
+                found[o, ..., 0] = 0.0
+        return found
+
+    @cached_property
+    def band(self) -> NDArray[np.int64]:
+        """Band of every row of `measured`, (n_rows,)."""
+        return _bands(self.record.n_samples - (self.compared.start or 0))
+
+    def fine_force(self, substeps: int) -> NDArray[np.float64]:
+        """Force at the ends and middles of the steps, and a column of ones, see `between_samples`."""
+        known: dict[int, NDArray[np.float64]] = self.__dict__.setdefault("_fine", {})
+        if substeps not in known:
+            fine = between_samples(self.record.force, 2 * substeps, self.periodic)
+            known[substeps] = np.concatenate([fine, np.ones((len(fine), 1))], axis=1)
+        return known[substeps]
+
+
+def _lines(samples: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The mean, real and imaginary parts of the lines of signals, (..., n_rows): white noise stays white."""
+    count = samples.shape[-1]
+    spectrum = np.asarray(rfft(samples, axis=-1))
+    waves = spectrum[..., 1 : (count + 1) // 2] * np.sqrt(2 / count)
+    return np.concatenate([spectrum[..., :1].real / np.sqrt(count), waves.real, waves.imag], axis=-1)
+
+
+def _bands(count: int) -> NDArray[np.int64]:
+    lines = (count + 1) // 2 - 1
+    band = np.minimum(BANDS * np.arange(lines) // max(lines, 1), BANDS - 1)
+    return np.asarray(np.concatenate([[0], band, band]), dtype=np.int64)
+
+
+def _steady(responses: NDArray[np.float64], least: int) -> int:
+    """Number of periods at the start that hold a transient."""
+    count = responses.shape[1]
+    if least or count < 4:
+        return min(least, count - 1)
+    mean = responses[:, 1:].mean(axis=1, keepdims=True)
+    away = np.sqrt(np.mean((responses - mean) ** 2, axis=(0, 2)))
+    return 1 if away[0] > _RESTLESS * float(np.max(away[1:])) else 0
+
+
+def thinned(records: Sequence[DrivenRecord], samples: int) -> list[DrivenRecord]:
+    """Pieces of long records that stand for them; periodic ones and sweeps stay whole.
+
+    Parameters
+    ----------
+    records : sequence of DrivenRecord
+    samples : int
+        Of all pieces together.
+    """
+    long = [r for r in records if not r.period and r.excitation not in _GLIDING]
+    found = [r for r in records if all(r is not other for other in long)]
+    share = samples // max(len(long), 1)
+    for record in long:
+        size = max(share // _BLOCKS, _LEAST_BLOCK)
+        if record.n_samples <= _BLOCKS * size:
+            found.append(record)
+            continue
+        last = record.n_samples - size
+        for k in range(_BLOCKS):
+            start = k * last // (_BLOCKS - 1)
+            found.append(
+                replace(
+                    record,
+                    name=f"{record.name} from sample {start}",
+                    force=record.force[:, start : start + size],
+                    responses=record.responses[:, start : start + size],
+                    first=record.first + start,
+                )
+            )
+    return found

@@ -1,0 +1,96 @@
+"""Raw folders of continuous tests, simulated from the equations of motion in plain Python."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+RATE = 512.0
+MASS, DAMPING, STIFFNESS = 2.0, 20.0, 5e4
+Law = Callable[[float, float], float]
+
+
+class Multisine:
+    """Sum of cosines of equal size and random phases, one period of `samples`."""
+
+    def __init__(self, samples: int, low_hz: float, high_hz: float, rms: float, seed: int) -> None:
+        self.samples, random = samples, np.random.default_rng(seed)
+        first, last = int(np.ceil(low_hz * samples / RATE)), int(high_hz * samples / RATE)
+        self.omega = 2 * np.pi * np.arange(first, last + 1) * RATE / samples
+        self.phase = random.uniform(0, 2 * np.pi, len(self.omega))
+        self.size = rms * np.sqrt(2 / len(self.omega))
+
+    def __call__(self, time: NDArray[np.float64] | float) -> NDArray[np.float64]:
+        angle = np.multiply.outer(np.asarray(time), self.omega) + self.phase
+        return np.asarray(self.size * np.sum(np.cos(angle), axis=-1))
+
+
+def respond(
+    force: Multisine, law: Law, samples: int, skipped: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Force and displacement of an oscillator with one more force law(x, v), from rest, `skipped` samples left out."""
+    fine = 8
+    count = (samples + skipped) * fine
+    grid = np.arange(2 * count + 1) / (2 * RATE * fine)
+    known = np.concatenate([force(part) for part in np.array_split(grid, 64)])
+    x, v, step = 0.0, 0.0, 1 / (RATE * fine)
+    found = np.empty(samples)
+
+    def rate(x: float, v: float, f: float) -> tuple[float, float]:
+        return v, (f - DAMPING * v - STIFFNESS * x - law(x, v)) / MASS
+
+    for k in range(count):
+        if k % fine == 0 and k // fine >= skipped:
+            found[k // fine - skipped] = x
+        a = rate(x, v, known[2 * k])
+        b = rate(x + step / 2 * a[0], v + step / 2 * a[1], known[2 * k + 1])
+        c = rate(x + step / 2 * b[0], v + step / 2 * b[1], known[2 * k + 1])
+        d = rate(x + step * c[0], v + step * c[1], known[2 * k + 2])
+        x += step / 6 * (a[0] + 2 * b[0] + 2 * c[0] + d[0])
+        v += step / 6 * (a[1] + 2 * b[1] + 2 * c[1] + d[1])
+    return known[:: 2 * fine][skipped : skipped + samples], found
+
+
+def write_oscillator(folder: Path, law: Law, noise: float = 0.005, seed: int = 1) -> Path:
+    """A raw folder with a record to fit and one held out."""
+    folder.mkdir(parents=True, exist_ok=True)
+    random = np.random.default_rng(seed)
+    with h5py.File(folder / "records.h5", "w") as file:
+        forces, responses = [], []
+        for k, samples in enumerate((2048, 1024)):
+            force, x = respond(Multisine(8192, 5.0, 60.0, 30.0, seed + k), law, samples, 512)
+            forces.append(force)
+            responses.append(x + noise * np.std(x) * random.standard_normal(len(x)))
+        file["force"], file["x"] = np.concatenate(forces), np.concatenate(responses)
+    (folder / "test.toml").write_text(
+        f"""schema = 1
+kind = "continuous"
+sample_rate_hz = {RATE}
+channels = [
+  {{ name = "force", quantity = "force", unit = "N", dof = "mass.x" }},
+  {{ name = "x", quantity = "displacement", unit = "m", dof = "mass.x" }},
+]
+[[records]]
+file = "records.h5"
+name = "one"
+excitation = "multisine"
+last_sample = 2047
+[[records]]
+file = "records.h5"
+name = "two"
+excitation = "multisine"
+first_sample = 2048
+use = "held_out"
+transient_samples = 50
+"""
+    )
+    return folder
+
+
+RIG = """masses = [{ at = "mass.x", value = 1.0 }]
+springs = [{ at = "mass.x", value = 1e4 }]
+"""
