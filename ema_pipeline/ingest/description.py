@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import os
 from collections import Counter
 from dataclasses import dataclass
@@ -51,6 +52,22 @@ def _check_share(value: float) -> float:
 
 
 Share = Annotated[float, AfterValidator(_check_share)]
+
+
+def _iso_date(value: Any) -> Any:
+    if isinstance(value, dt.date):  # a date and time is one, too
+        return value.isoformat()
+    try:
+        return dt.datetime.fromisoformat(value).date().isoformat() if len(value) == 10 else _iso_time(value)
+    except (TypeError, ValueError):
+        raise ValueError("give a date as 2025-03-31, or a date and time as 2025-03-31T14:05:00") from None
+
+
+def _iso_time(value: str) -> str:
+    return dt.datetime.fromisoformat(value).isoformat()
+
+
+DateText = Annotated[str, BeforeValidator(_iso_date)]
 
 
 class ChannelDescription(Settings):
@@ -114,6 +131,8 @@ class _TestFile(Settings):
     kind: Annotated[Literal["hammer", "hysteresis"], BeforeValidator(_supported)] = Field(
         default="hammer", description="Kind of test"
     )
+    serial_number: str = Field(default="", description="Which specimen was tested")
+    date: DateText = Field(default="", validate_default=False, description="When it was tested, ISO 8601")
     rig: str | None = Field(default=None, description="Rig name or file; --rig wins")
     configuration: str | None = Field(default=None, description="One of the rig's configurations")
     sample_rate_hz: float | None = Field(
@@ -254,7 +273,7 @@ def _check_texts(test: TestDescription) -> None:
     """Texts end up on screens and in reports, names in file names too."""
     if test.configuration is not None:
         check_name(test.configuration, f"{test.file}: configuration")
-    texts = {"title": test.title, "rig": test.rig or ""}
+    texts = {"title": test.title, "serial_number": test.serial_number, "rig": test.rig or ""}
     texts |= {f"name of channel {i + 1}": c.name for i, c in enumerate(test.channels)}
     texts |= {f"file of record {i + 1}": r.file for i, r in enumerate(test.records)}
     for what, text in texts.items():
