@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ema_pipeline.inference import Residuals
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
-from ema_pipeline.mechanics.terms import Matrices
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.rig_model import RigModel
 
@@ -67,6 +66,98 @@ def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
     )
 
 
+@dataclass(frozen=True)
+class Rows:
+    """Differences of one kind.
+
+    Attributes
+    ----------
+    difference : ndarray, (k,)
+        Measurement minus model.
+    own : ndarray, (k,)
+        1 σ of the test.
+    unit : ndarray, (k,)
+        Unit of the scatter that adds to it.
+    scatter : str
+        Name of that scatter.
+    heat : float
+        Factor on all σ while a fit is annealed.
+    mode : ndarray of int, (k,)
+        Measured mode that each belongs to.
+    sensor : ndarray of int, (k,), optional
+        Sensor that each belongs to, of shapes.
+    slope : ndarray, (k, n), optional
+        Derivatives of the model's values by all unknowns.
+    """
+
+    difference: NDArray[np.float64]
+    own: NDArray[np.float64]
+    unit: NDArray[np.float64]
+    scatter: str
+    heat: float
+    mode: NDArray[np.int64]
+    sensor: NDArray[np.int64] | None = None
+    slope: NDArray[np.float64] | None = None
+
+    def __len__(self) -> int:
+        return len(self.difference)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """All differences of one configuration, and the cost of what has no partner.
+
+    Attributes
+    ----------
+    rows : tuple of Rows
+        Frequencies, damping ratios, shapes.
+    match : ndarray of int, (m,)
+        Model mode of every measured one, -1 for none.
+    log_scale, penalty : float
+        As in `Residuals`, of modes without a partner.
+    projected : int
+    """
+
+    rows: tuple[Rows, ...]
+    match: NDArray[np.int64]
+    log_scale: float
+    penalty: float
+    projected: int
+
+
+def whitened(
+    found: Compared, scatters: Mapping[str, float], defaults: Mapping[str, float], n: int
+) -> Residuals:
+    """Differences in units of their standard uncertainties, `n` unknowns."""
+    total = sum(len(r) for r in found.rows)
+    derivatives = all(r.slope is not None for r in found.rows)
+    values, share = np.empty(total), {}
+    jacobian = np.zeros((total if derivatives else 0, n))
+    log_scale, at = 0.0, 0
+    for r in found.rows:
+        here = slice(at, at + len(r))
+        at = here.stop
+        added, squared = (scatters[r.scatter] * r.unit) ** 2, r.own**2
+        variance = squared + added
+        usual = squared + (defaults[r.scatter] * r.unit) ** 2
+        log_scale += 0.5 * float(np.sum(np.log(variance / usual)))
+        sigma = np.sqrt(variance) * r.heat
+        values[here] = r.difference / sigma
+        if derivatives and r.slope is not None:
+            share[r.scatter] = np.zeros(total)
+            share[r.scatter][here] = added / variance
+            jacobian[here] = r.slope / -sigma[:, None]
+    return Residuals(
+        values=values,
+        jacobian=jacobian,
+        share=share,
+        log_scale=log_scale + found.log_scale,
+        penalty=found.penalty,
+        matching=found.match,
+        projected=found.projected,
+    )
+
+
 class Comparison:
     """Residuals of one configuration at one point.
 
@@ -100,13 +191,34 @@ class Comparison:
 
     def residuals(self, matching: object, derivatives: bool) -> Residuals:
         """Residuals with the pairs of `matching`, or with new ones where it is no array."""
+        found = self.compared(matching, derivatives)
+        if found is None:
+            return Residuals(np.full(1, np.inf), np.zeros((1, len(self.x))), matching=matching)
+        return whitened(found, self.scatters, self.defaults, len(self.x))
+
+    def compared(self, matching: object, derivatives: bool) -> Compared | None:
+        """Differences with the pairs of `matching`, or with new ones; None where the model has no modes."""
         own = self.x[: len(self.model.unknowns)]
         matrices, solution = self.model.modes(self.data.configuration, own, derivatives)
         if solution is None:
-            return Residuals(np.full(1, np.inf), np.zeros((1, len(self.x))), matching=matching)
+            return None
         predicted = self.seen(solution)
         match = matching if isinstance(matching, np.ndarray) else self.matched(solution, predicted)
-        return self._compared(matrices, solution, predicted, match, derivatives)
+        on, alone = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
+        to = match[on]
+        slopes = ModeDerivatives.of(matrices, solution, to, self.model.has_ratio) if derivatives else None
+        rows = (
+            self._frequencies(solution, on, to, slopes),
+            self._damping(solution, on, to, slopes),
+            self._shapes(solution, predicted, on, to, slopes),
+        )
+        return Compared(
+            rows=rows,
+            match=match,
+            log_scale=self._usual(alone) if len(alone) else 0.0,
+            penalty=UNEXPLAINED * len(alone) + UNSEEN * self._unseen(solution, to),
+            projected=len(on) if self.data.shapes.shape[1] else 0,
+        )
 
     def seen(self, solution: EigenSolution) -> NDArray[np.float64]:
         """What the sensors read of every shape, (s, n); complex shapes turned as measured ones are, and made real."""
@@ -134,63 +246,6 @@ class Comparison:
         column = scipy.optimize.linear_sum_assignment(padded)[1]
         return np.where(column < cost.shape[1], column, -1)
 
-    def _compared(
-        self,
-        matrices: Matrices,
-        solution: EigenSolution,
-        predicted: NDArray[np.float64],
-        match: NDArray[np.int64],
-        derivatives: bool,
-    ) -> Residuals:
-        paired = match >= 0
-        on, alone = np.flatnonzero(paired), np.flatnonzero(~paired)
-        to = match[on]
-        slopes = None
-        if derivatives:
-            slopes = ModeDerivatives.of(matrices, solution, to, self.model.has_ratio)
-        damped = np.isfinite(self.data.log_damping[on])
-        rows = (
-            self._frequencies(solution, on, to),
-            self._damping(solution, on[damped], to[damped]),
-            self._shapes(solution, predicted, on, to, slopes),
-        )
-        total = sum(len(r.difference) for r in rows)
-        values, share = np.empty(total), {}
-        jacobian = np.zeros((total if derivatives else 0, len(self.x)))
-        log_scale, at = 0.0, 0
-        for r in rows:
-            here = slice(at, at + len(r.difference))
-            at = here.stop
-            added = (self.scatters[r.scatter] * r.unit) ** 2
-            squared = r.own**2
-            variance = squared + added
-            log_scale += 0.5 * float(
-                np.sum(np.log(variance / (squared + (self.defaults[r.scatter] * r.unit) ** 2)))
-            )
-            sigma = np.sqrt(variance) * r.heat
-            values[here] = r.difference / sigma
-            if slopes is not None:
-                share[r.scatter] = np.zeros(total)
-                share[r.scatter][here] = added / variance
-                if r.scatter == FREQUENCY:
-                    jacobian[here, : slopes.log_frequency.shape[1]] = slopes.log_frequency
-                    jacobian[here, self.sensing.drift] = 1.0
-                elif r.scatter == DAMPING_SCATTER:
-                    ratio = solution.damping_ratio[to[damped], None]
-                    jacobian[here, : slopes.damping_ratio.shape[1]] = slopes.damping_ratio[damped] / ratio
-                else:
-                    jacobian[here] = r.slope
-                jacobian[here] /= -sigma[:, None]
-        return Residuals(
-            values=values,
-            jacobian=jacobian,
-            share=share,
-            log_scale=log_scale + (self._usual(alone) if len(alone) else 0.0),
-            penalty=UNEXPLAINED * len(alone) + UNSEEN * self._unseen(solution, to),
-            matching=match,
-            projected=len(on) if self.data.shapes.shape[1] else 0,
-        )
-
     def _usual(self, alone: NDArray[np.int64]) -> float:
         """What modes without a partner would cost on average if they were explained.
 
@@ -210,17 +265,55 @@ class Comparison:
             total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
         return total
 
-    def _frequencies(self, solution: EigenSolution, on: NDArray[np.int64], to: NDArray[np.int64]) -> _Rows:
+    def _frequencies(
+        self,
+        solution: EigenSolution,
+        on: NDArray[np.int64],
+        to: NDArray[np.int64],
+        slopes: ModeDerivatives | None,
+    ) -> Rows:
         d = self.data
         model = np.log(np.maximum(solution.frequency_hz[to], 1e-6)) + self.x[self.sensing.drift]
-        return _Rows(
-            d.log_frequency[on] - model, d.log_frequency_std[on], np.ones(len(on)), FREQUENCY, self.heat
+        slope = None
+        if slopes is not None:
+            slope = np.zeros((len(on), len(self.x)))
+            slope[:, : slopes.log_frequency.shape[1]] = slopes.log_frequency
+            slope[:, self.sensing.drift] = 1.0
+        return Rows(
+            d.log_frequency[on] - model,
+            d.log_frequency_std[on],
+            np.ones(len(on)),
+            FREQUENCY,
+            self.heat,
+            on,
+            slope=slope,
         )
 
-    def _damping(self, solution: EigenSolution, on: NDArray[np.int64], to: NDArray[np.int64]) -> _Rows:
+    def _damping(
+        self,
+        solution: EigenSolution,
+        on: NDArray[np.int64],
+        to: NDArray[np.int64],
+        slopes: ModeDerivatives | None,
+    ) -> Rows:
         d = self.data
-        difference = d.log_damping[on] - np.log(solution.damping_ratio[to])
-        return _Rows(difference, d.log_damping_std[on], np.ones(len(on)), DAMPING_SCATTER, 1.0)
+        damped = np.isfinite(d.log_damping[on])
+        modes, of = on[damped], to[damped]
+        difference = d.log_damping[modes] - np.log(solution.damping_ratio[of])
+        slope = None
+        if slopes is not None:
+            slope = np.zeros((len(modes), len(self.x)))
+            by_model = slopes.damping_ratio[damped] / solution.damping_ratio[of, None]
+            slope[:, : by_model.shape[1]] = by_model
+        return Rows(
+            difference,
+            d.log_damping_std[modes],
+            np.ones(len(modes)),
+            DAMPING_SCATTER,
+            1.0,
+            modes,
+            slope=slope,
+        )
 
     def _shapes(
         self,
@@ -229,7 +322,7 @@ class Comparison:
         on: NDArray[np.int64],
         to: NDArray[np.int64],
         slopes: ModeDerivatives | None,
-    ) -> _Rows:
+    ) -> Rows:
         """Shapes with the factor projected out that fits them best."""
         d, p = self.data, predicted[:, to].T
         seen = d.seen[on] > 0
@@ -246,7 +339,10 @@ class Comparison:
             factor = towards[:, None, :] @ dp
             slope = (scale[:, None, None] * dp + p[:, :, None] * factor)[seen]
         difference = (y - scale[:, None] * p)[seen]
-        return _Rows(difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), slope)
+        mode, sensor = np.nonzero(seen)
+        return Rows(
+            difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode], sensor, slope
+        )
 
     def _unseen(self, solution: EigenSolution, to: NDArray[np.int64]) -> int:
         """Model modes well inside the band that no measured mode is paired with."""
@@ -271,15 +367,3 @@ class Comparison:
         has = np.flatnonzero(s.transverse >= 0)
         slope[:, has, s.transverse[has]] += (self.gain[:, None] * (s.across @ shapes[:width])).T[:, has]
         return slope
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Differences of one kind: own 1 σ, the unit of the scatter that adds to it, heat, and derivatives of shapes."""
-
-    difference: NDArray[np.float64]
-    own: NDArray[np.float64]
-    unit: NDArray[np.float64]
-    scatter: str
-    heat: float
-    slope: NDArray[np.float64] | None = None
