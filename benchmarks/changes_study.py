@@ -1,8 +1,8 @@
 """Pairs of tests of imperfect rigs, before and after a change, and unchanged: what `ema changes` makes of them.
 
-Each case draws a rig (parts scatter 3 %, sensors 4 %, damping by half) and three tests of it with the same sensors, hits
-5 degrees off and frequencies that drift by 0.1 % from hit to hit: A, A again, and B with one effect of FACTOR times the
-limit that A and A again state. The rig that the program is given is nominal.
+Each case draws a rig (parts scatter 3 %, sensors 4 %, damping by half) and three tests of it with the same sensors,
+hits 5 degrees off and frequencies that drift by 0.1 % from hit to hit: A, A again, and B with one effect of FACTOR
+times the limit that A and A again state. The rig that the program is given is nominal.
 
     python benchmarks/changes_study.py [CASES] [--first N] [--json FILE]
 """
@@ -10,6 +10,7 @@ limit that A and A again state. The rig that the program is given is nominal.
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import shutil
 import sys
@@ -21,22 +22,24 @@ from typing import Any
 import numpy as np
 import scipy.stats
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "tests"))
-from bench import RIG
-
 from ema_pipeline.changes.compare import Changes, changes_content, compare_runs, open_test
-from ema_pipeline.pipeline import existing_run
+from ema_pipeline.observations.pair import RepeatSettings
 from ema_pipeline.simulate import simulate_campaign
 from ema_pipeline.stages.base import Run
 
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests"))
+RIG = importlib.import_module("bench").RIG
+
 FACTOR = 2.2
 EFFECTS = ("mass", "spring", "damper")
+AS_SIMULATED = RepeatSettings(frequency=1e-4, damping=2e-3, shape=5e-4)
+"""Hits that are off and a rig that drifts move damping and shapes by about as much; nothing is taken apart between tests."""
 INTERVAL = float(scipy.stats.norm.ppf(0.95))
 """Half width of a 90 % interval in standard deviations."""
 
 
-def test_of(folder: Path, name: str, case: int, seed: int, effects: tuple[str, ...] = ()) -> Run:
+def test_of(folder: Path, name: str, case: int, seed: int, effects: tuple[str, ...]) -> Run:
     """One test, simulated and run up to its modes."""
     simulate_campaign(
         folder / name,
@@ -56,14 +59,14 @@ def test_of(folder: Path, name: str, case: int, seed: int, effects: tuple[str, .
     return open_test(folder / name, str(folder / "bench.toml"), folder / "out" / name)
 
 
-def one_case(case: int) -> dict[str, Any]:
+def one_case(case: int, repeat: RepeatSettings) -> dict[str, Any]:
     """An unchanged pair, and a pair with one effect."""
     folder = Path(tempfile.mkdtemp(prefix="changes-study-"))
     (folder / "bench.toml").write_text(RIG, encoding="utf-8")
     random = np.random.default_rng(case)
-    a = test_of(folder, "a", case, 10 * case + 1)
-    again = test_of(folder, "again", case, 10 * case + 2)
-    same = changes_content(compare_runs(a, again))
+    a = test_of(folder, "a", case, 10 * case + 1, ())
+    again = test_of(folder, "again", case, 10 * case + 2, ())
+    same = changes_content(compare_runs(a, again, repeat=repeat))
     limits = [
         x
         for x in same["diagnosis"]["limits"]
@@ -76,7 +79,7 @@ def one_case(case: int) -> dict[str, Any]:
         size = sign * FACTOR * chosen["size"]
         effect = f"{chosen['label']}:{chosen['parameter']}={size:.8g}"
         b = test_of(folder, "b", case, 10 * case + 3, (effect,))
-        compared: Changes = compare_runs(existing_run(a.store.folder), b)
+        compared: Changes = compare_runs(open_test(a.store.folder, None, folder), b, repeat=repeat)
         found |= _judged(changes_content(compared), chosen["label"], size) | {"effect": effect}
     shutil.rmtree(folder)
     return found
@@ -112,10 +115,14 @@ def main() -> None:
     parser.add_argument("cases", nargs="?", type=int, default=60)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--json", type=Path)
+    parser.add_argument(
+        "--as-simulated", action="store_true", help="state the repeatability that is simulated"
+    )
     given = parser.parse_args()
+    repeat = AS_SIMULATED if given.as_simulated else RepeatSettings()
     start, rows = time.perf_counter(), []
     for case in range(given.first, given.first + given.cases):
-        rows.append(one_case(case))
+        rows.append(one_case(case, repeat))
         print(rows[-1], flush=True)
         if given.json:
             given.json.write_text(json.dumps(rows), encoding="utf-8")

@@ -14,6 +14,7 @@ from ema_pipeline.describe import checked_rig
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import replace_file
 from ema_pipeline.job import run_raw
+from ema_pipeline.observations.pair import RepeatSettings
 from ema_pipeline.pipeline import ShowStage, existing_run
 from ema_pipeline.report.summary_files import finite
 from ema_pipeline.stages.base import Run
@@ -89,7 +90,9 @@ def open_test(path: Path, rig: str | None, into: Path, show: ShowStage | None = 
     return run
 
 
-def compare_runs(a: Run, b: Run, progress: Progress = lambda share, text: None) -> Changes:
+def compare_runs(
+    a: Run, b: Run, progress: Progress = lambda share, text: None, repeat: RepeatSettings | None = None
+) -> Changes:
     """What changed from one run to another; physically where both have a rig."""
     of_a, of_b = measured_modes(a), measured_modes(b)
     if not any(c in of_b for c in of_a):
@@ -97,7 +100,7 @@ def compare_runs(a: Run, b: Run, progress: Progress = lambda share, text: None) 
             f"{a.store.folder} and {b.store.folder}: no configuration in common ({', '.join(of_a)}; "
             f"{', '.join(of_b)}); compare tests of the same configurations"
         )
-    physics = physical_change(a, b, progress) if a.rig is not None and b.rig is not None else None
+    physics = physical_change(a, b, progress, repeat) if a.rig is not None and b.rig is not None else None
     return Changes(a.info.raw, b.info.raw, mode_changes(of_a, of_b), physics)
 
 

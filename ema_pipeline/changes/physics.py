@@ -12,7 +12,7 @@ from ema_pipeline.diagnose.types import Candidate, Diagnosis
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import merged
 from ema_pipeline.observations.modes import ModeObservations
-from ema_pipeline.observations.pair import A, B, PairObservations
+from ema_pipeline.observations.pair import A, B, PairObservations, RepeatSettings
 from ema_pipeline.stages.base import Run
 from ema_pipeline.stages.models import known_model, mode_observations
 from ema_pipeline.stages.modes import measured_modes
@@ -41,7 +41,9 @@ class PhysicalChange:
         return tuple(c for c in self.diagnosis.candidates if c.claimed)
 
 
-def physical_change(a: Run, b: Run, progress: Progress = lambda share, text: None) -> PhysicalChange:
+def physical_change(
+    a: Run, b: Run, progress: Progress = lambda share, text: None, repeat: RepeatSettings | None = None
+) -> PhysicalChange:
     """What the rig of two tests is missing in B alone, or else in A alone.
 
     Many effects have one sign only (a mass is added, a stiffness is lost): what is nothing that B has more than A may
@@ -52,17 +54,19 @@ def physical_change(a: Run, b: Run, progress: Progress = lambda share, text: Non
     a, b : Run
         With one rig, and modes.
     progress : callable
+    repeat : RepeatSettings, optional
+        What two tests of one structure differ by.
 
     Raises
     ------
     EmaError
         If the tests have no configuration, or no pair of modes, in common.
     """
-    forward = PhysicalChange(_diagnosed(a, b, lambda share, text: progress(0.6 * share, text)))
+    forward = PhysicalChange(_diagnosed(a, b, lambda share, text: progress(0.6 * share, text), repeat))
     if forward.diagnosis.verdict == "effect":
         return forward
     backward = PhysicalChange(
-        _diagnosed(b, a, lambda share, text: progress(0.6 + 0.4 * share, text)), reverse=True
+        _diagnosed(b, a, lambda share, text: progress(0.6 + 0.4 * share, text), repeat), reverse=True
     )
     better = backward.claimed and _gain(backward) > _gain(forward) + 1.0
     return backward if better else forward
@@ -73,14 +77,14 @@ def _gain(found: PhysicalChange) -> float:
     return found.diagnosis.ladder.rungs[-1].log_evidence if found.claimed else 0.0
 
 
-def _diagnosed(a: Run, b: Run, progress: Progress) -> Diagnosis:
+def _diagnosed(a: Run, b: Run, progress: Progress, repeat: RepeatSettings | None) -> Diagnosis:
     from ema_pipeline.diagnose.diagnosis import diagnose
     from ema_pipeline.threads import single_blas_thread
 
     model = b.require_model("changes")
     with single_blas_thread():
         return diagnose(
-            pair_observations(a, b),
+            pair_observations(a, b, repeat),
             model,
             b.library,
             known_model(b),
@@ -89,7 +93,7 @@ def _diagnosed(a: Run, b: Run, progress: Progress) -> Diagnosis:
         )
 
 
-def pair_observations(a: Run, b: Run) -> PairObservations:
+def pair_observations(a: Run, b: Run, repeat: RepeatSettings | None = None) -> PairObservations:
     """The modes of two runs as one observation."""
     of_a, of_b = measured_modes(a), measured_modes(b)
     common = [c for c in of_a if c in of_b]
@@ -112,4 +116,4 @@ def pair_observations(a: Run, b: Run) -> PairObservations:
         return ModeObservations(first.rig, data, channels, first.shared, sensors, name)
 
     pairs = {c: p for c, p in pairs.items() if any(d.configuration == c for d in first.data)}
-    return PairObservations(observed(first, A), observed(second, B), pairs, a.info.effects)
+    return PairObservations(observed(first, A), observed(second, B), pairs, a.info.effects, repeat)

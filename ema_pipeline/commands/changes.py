@@ -13,6 +13,8 @@ from ema_pipeline.commands.screen import progress, show, show_json
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from ema_pipeline.observations.pair import RepeatSettings
+
 TestA = Annotated[Path, typer.Argument(metavar="A", help="Results folder or raw folder.")]
 TestB = Annotated[Path, typer.Argument(metavar="B", help="Results folder or raw folder.")]
 
@@ -24,6 +26,14 @@ def changes(
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for the answer; results/changes_A_B if left out."),
+    ] = None,
+    repeat: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--repeat",
+            metavar="KEY=VALUE",
+            help="How well tests repeat, 1 σ: frequency=1e-4, damping=0.02, shape=0.003 if left out.",
+        ),
     ] = None,
     quiet: Quiet = False,
     json: Json = False,
@@ -37,15 +47,16 @@ def changes(
     from ema_pipeline.changes.page import write_page
     from ema_pipeline.changes.tables import notes, short_modes_table, verdict_text
 
+    repeats = _repeats(repeat or [])
     folder = out or Path("results") / f"changes_{a.resolve().name}_{b.resolve().name}"
     with progress(quiet) as show_stage:
         run_a = open_test(a, rig, folder / "A", show_stage)
         run_b = open_test(b, rig, folder / "B", show_stage)
         if show_stage is None:
-            found = compare_runs(run_a, run_b)
+            found = compare_runs(run_a, run_b, repeat=repeats)
         else:
             with show_stage("changes") as tell:
-                found = compare_runs(run_a, run_b, tell)
+                found = compare_runs(run_a, run_b, tell, repeats)
     folder.mkdir(parents=True, exist_ok=True)
     written = write_changes(found, folder)
     page = write_page(found, run_a, run_b, folder)
@@ -59,6 +70,17 @@ def changes(
         for line in notes(found):
             show(line)
         show(f"Report: {page}; {written}")
+
+
+def _repeats(texts: list[str]) -> RepeatSettings:
+    from ema_pipeline.observations.pair import RepeatSettings
+    from ema_pipeline.pipeline import toml_value
+    from ema_pipeline.settings import parse
+
+    pairs = [text.partition("=") for text in texts]
+    return parse(
+        RepeatSettings, {name.strip(): toml_value(value.strip()) for name, _, value in pairs}, "--repeat"
+    )
 
 
 def _limits(diagnosis: Any) -> str:

@@ -88,6 +88,8 @@ class Rows:
         Sensor that each belongs to, of shapes.
     slope : ndarray, (k, n), optional
         Derivatives of the model's values by all unknowns.
+    model : ndarray, (k,), optional
+        The model's values, of damping: ln ζ.
     """
 
     difference: NDArray[np.float64]
@@ -98,6 +100,7 @@ class Rows:
     mode: NDArray[np.int64]
     sensor: NDArray[np.int64] | None = None
     slope: NDArray[np.float64] | None = None
+    model: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.difference)
@@ -299,21 +302,16 @@ class Comparison:
         d = self.data
         damped = np.isfinite(d.log_damping[on])
         modes, of = on[damped], to[damped]
-        difference = d.log_damping[modes] - np.log(solution.damping_ratio[of])
+        model = np.log(solution.damping_ratio[of])
         slope = None
         if slopes is not None:
             slope = np.zeros((len(modes), len(self.x)))
             by_model = slopes.damping_ratio[damped] / solution.damping_ratio[of, None]
             slope[:, : by_model.shape[1]] = by_model
         return Rows(
-            difference,
-            d.log_damping_std[modes],
-            np.ones(len(modes)),
-            DAMPING_SCATTER,
-            1.0,
-            modes,
-            slope=slope,
-        )
+            d.log_damping[modes] - model, d.log_damping_std[modes], np.ones(len(modes)), DAMPING_SCATTER, 1.0, modes,
+            slope=slope, model=model,
+        )  # fmt: skip
 
     def _shapes(
         self,

@@ -15,6 +15,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Residuals, Scatter, Unknowns
@@ -29,18 +30,35 @@ from ema_pipeline.observations.mode_residuals import (
 )
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem
 from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.settings import Settings
 
 A, B = "A", "B"
 """Names of the two tests."""
 
-REPEAT = {
-    FREQUENCY: Scatter("frequency_repeat", "frequency from test to test", 1e-4, 0.7, 3e-4, 5.0),
-    DAMPING_SCATTER: Scatter("damping_repeat", "ln ζ from test to test", 0.02, 0.7, 0.05, 4.0),
-    SHAPE: Scatter("shape_repeat", "shapes from test to test", 0.003, 0.7, 0.01, 4.0),
-}
-"""What differs from one test to the next beside each test's own scatter: aim, mounting, where the hits drifted to.
 
-By the scatter of the model that it takes the place of in the difference of two tests."""
+class RepeatSettings(Settings):
+    """What two tests of one structure differ by, 1 σ, beside each test's own scatter and a drift of all frequencies.
+
+    Two tests cannot tell it from a change: it is stated, not learned.
+    """
+
+    frequency: float = Field(1e-4, gt=0, lt=0.1, description="of each frequency, relative")
+    damping: float = Field(
+        0.02,
+        gt=0,
+        lt=2,
+        description="of ln ζ: a structure taken apart and bolted together again may need 0.1",
+    )
+    shape: float = Field(0.003, gt=0, lt=1, description="of a shape's entries, in units of the largest")
+
+    def scatters(self) -> dict[str, Scatter]:
+        """As scatters that are known, by the scatter of the model that each takes the place of in a difference."""
+        return {
+            FREQUENCY: Scatter("frequency_repeat", "frequency from test to test", self.frequency, 0.0),
+            DAMPING_SCATTER: Scatter("damping_repeat", "ln ζ from test to test", self.damping, 0.0),
+            SHAPE: Scatter("shape_repeat", "shapes from test to test", self.shape, 0.0),
+        }
+
 
 Pairs = Mapping[str, NDArray[np.int64]]
 """Mode of B for every mode of A, -1 for none, by configuration."""
@@ -57,14 +75,22 @@ class PairObservations:
         Which modes are the same, see `Pairs`.
     common : sequence of str
         Labels of effects that the rig had in both tests.
+    repeat : RepeatSettings, optional
     """
 
     def __init__(
-        self, a: ModeObservations, b: ModeObservations, pairs: Pairs, common: Sequence[str] = ()
+        self,
+        a: ModeObservations,
+        b: ModeObservations,
+        pairs: Pairs,
+        common: Sequence[str] = (),
+        repeat: RepeatSettings | None = None,
     ) -> None:
         self.a, self.pairs, self.common = a, dict(pairs), frozenset(common)
+        self.settings = repeat or RepeatSettings()
+        self.repeat = self.settings.scatters()
         self.b = b.with_data([self._commensurate(d) for d in b.data])
-        self.scatters = {**a.scatters, **{s.name: s for s in REPEAT.values()}}
+        self.scatters = {**a.scatters, **{s.name: s for s in self.repeat.values()}}
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> PairProblem:
         """See `Observations`."""
@@ -113,7 +139,7 @@ class PairObservations:
             pairs[c] = np.where((of_kept >= 0) & keep_b[c][of_kept], new[of_kept], -1)
         a = self.a.with_data([d.only(keep_a[d.configuration]) for d in self.a.data])
         b = self.b.with_data([d.only(keep_b[d.configuration]) for d in self.b.data])
-        return PairObservations(a, b, pairs, tuple(self.common))
+        return PairObservations(a, b, pairs, tuple(self.common), self.settings)
 
     def _commensurate(self, d: ModeData) -> ModeData:
         """The modes of a configuration in B with their shapes in the scale of their partners in A."""
@@ -291,7 +317,7 @@ class PairProblem:
         return stacked(parts, n)
 
     def _alone(self, r: Rows, scatters: Mapping[str, float], n: int) -> Residuals:
-        repeat = REPEAT[r.scatter].name
+        repeat = self.observations.repeat[r.scatter].name
         now, usual = ((s[r.scatter] * r.unit) ** 2 for s in (scatters, self._defaults))
         repeat_now, repeat_usual = ((s[repeat] * r.unit) ** 2 for s in (scatters, self._defaults))
         variance = r.own**2 + now + repeat_now
@@ -309,19 +335,29 @@ class PairProblem:
     ) -> Residuals:
         """Rows of B given their partners in A: what the model misses of a mode is the same in both."""
         a, b = _taken(first, i), _taken(second, j)
-        repeat = REPEAT[a.scatter].name
-        slope_of, variance, shares = _conditional(a, b, scatters[a.scatter], scatters[repeat], repeat)
-        usual = _conditional(a, b, self._defaults[a.scatter], self._defaults[repeat], repeat)[1]
-        slope = None
-        if a.slope is not None and b.slope is not None:
-            slope = b.slope - slope_of[:, None] * a.slope
-        return _scaled(b.difference - slope_of * a.difference, slope, variance, usual, shares, a.heat, n)
+        repeat = self.observations.repeat[a.scatter].name
+        told = _conditional(a, b, scatters[a.scatter], scatters[repeat], repeat)
+        usual = _conditional(a, b, self._defaults[a.scatter], self._defaults[repeat], repeat).variance
+        if a.scatter == DAMPING_SCATTER:
+            difference, slope = _damping_given(a, b, told.slope)
+        else:
+            difference, slope = b.difference - told.slope * a.difference, None
+            if a.slope is not None and b.slope is not None:
+                slope = b.slope - told.slope[:, None] * a.slope
+        return _scaled(difference, slope, told.variance, usual, told.shares, a.heat, n)
 
 
-def _conditional(
-    a: Rows, b: Rows, scatter: float, repeat: float, name: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64], dict[str, NDArray[np.float64]]]:
-    """Regression of B's differences on A's, variance of what is left, and the scatters' shares of it.
+@dataclass(frozen=True)
+class _Conditional:
+    """Regression of B's differences on A's, variance of what is left, and the scatters' shares of it."""
+
+    slope: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    shares: dict[str, NDArray[np.float64]]
+
+
+def _conditional(a: Rows, b: Rows, scatter: float, repeat: float, name: str) -> _Conditional:
+    """What A tells of B.
 
     Differences are d = u·δ + e, with one δ ~ N(0, scatter²) in both tests and an e of each test's own.
     """
@@ -331,7 +367,33 @@ def _conditional(
     left = (scatter * (b.unit - slope * a.unit)) ** 2
     variance = left + own_b + slope**2 * own_a
     again = (repeat * b.unit) ** 2 + (slope * repeat * a.unit) ** 2
-    return slope, variance, {a.scatter: left / variance, name: again / variance}
+    return _Conditional(slope, variance, {a.scatter: left / variance, name: again / variance})
+
+
+_LEAST_DAMPING = 0.05
+"""Least damping ratio of B, as a share of the model's, that is taken for possible."""
+
+
+def _damping_given(
+    a: Rows, b: Rows, regression: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Differences of ln ζ in B given A, and derivatives of what the model says of it.
+
+    What the model misses of a mode's damping, A tells; what an effect adds to it in B is added to the true damping of
+    the mode, not to the model's: ζ_B = ζ_A·exp(regression·difference) + (ζ_B - ζ_A of the model).
+    """
+    assert a.model is not None
+    assert b.model is not None
+    base, own, changed = np.exp(a.model + regression * a.difference), np.exp(a.model), np.exp(b.model)
+    expected = base + changed - own
+    kept = expected > _LEAST_DAMPING * changed
+    expected = np.where(kept, expected, _LEAST_DAMPING * changed)
+    difference = b.difference + b.model - np.log(expected)
+    if a.slope is None or b.slope is None:
+        return difference, None
+    of_a = base * (1 - regression) - own
+    slope = (of_a[:, None] * a.slope + changed[:, None] * b.slope) / expected[:, None]
+    return difference, np.where(kept[:, None], slope, b.slope)
 
 
 def _taken(r: Rows, at: NDArray[np.int64]) -> Rows:
@@ -344,6 +406,7 @@ def _taken(r: Rows, at: NDArray[np.int64]) -> Rows:
         mode=r.mode[at],
         sensor=None if r.sensor is None else r.sensor[at],
         slope=None if r.slope is None else r.slope[at],
+        model=None if r.model is None else r.model[at],
     )
 
 
