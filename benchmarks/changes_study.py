@@ -34,7 +34,7 @@ RIG = importlib.import_module("bench").RIG
 FACTOR = 2.2
 EFFECTS = ("mass", "spring", "damper")
 AS_SIMULATED = RepeatSettings(frequency=1e-4, damping=2e-3, shape=5e-4)
-"""Hits that are off and a rig that drifts move damping and shapes by about as much; nothing is taken apart between tests."""
+"""Hits off their mark move damping and shapes by about as much; nothing is taken apart between the tests."""
 INTERVAL = float(scipy.stats.norm.ppf(0.95))
 """Half width of a 90 % interval in standard deviations."""
 

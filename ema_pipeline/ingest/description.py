@@ -269,6 +269,27 @@ def read_description(folder: Path) -> TestDescription:
     return test
 
 
+def read_channels(folder: Path) -> TestDescription:
+    """Read the ``test.toml`` of a test that is being made: records may be missing, and so may their files.
+
+    Raises
+    ------
+    EmaError
+        Where the file is not valid TOML, or what it says of the channels is wrong.
+    """
+    path = folder / DESCRIPTION_FILE
+    keys = parse(_TestFile, {"records": [], **read_toml(path)}, path)
+    test = TestDescription.model_construct(folder=folder, **dict(keys))
+    _check_texts(test)
+    _check_channels(test)
+    if test.kind != "hammer":
+        raise EmaError(f"{path}: is of kind '{test.kind}'; only hammer tests have hits to judge")
+    for channel in test.responses:
+        if channel.dof is None:
+            raise EmaError(f"{path}: response channel '{channel.name}' has no dof; add it")
+    return test
+
+
 def _check_texts(test: TestDescription) -> None:
     """Texts end up on screens and in reports, names in file names too."""
     if test.configuration is not None:
