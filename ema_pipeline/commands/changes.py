@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,9 +11,11 @@ from ema_pipeline.commands.options import Json, Quiet, RigOption
 from ema_pipeline.commands.screen import progress, show, show_json
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.table import Table as Screen
 
+    from ema_pipeline.diagnose.types import Diagnosis
     from ema_pipeline.observations.pair import RepeatSettings
+    from ema_pipeline.report.tables import Table
 
 TestA = Annotated[Path, typer.Argument(metavar="A", help="Results folder or raw folder.")]
 TestB = Annotated[Path, typer.Argument(metavar="B", help="Results folder or raw folder.")]
@@ -83,7 +85,7 @@ def _repeats(texts: list[str]) -> RepeatSettings:
     )
 
 
-def _limits(diagnosis: Any) -> str:
+def _limits(diagnosis: Diagnosis) -> str:
     from ema_pipeline.report.diagnosis_tables import detection_table
 
     rows = detection_table(diagnosis).rows
@@ -92,7 +94,7 @@ def _limits(diagnosis: Any) -> str:
     )
 
 
-def _screen(table: Any) -> Table:
+def _screen(table: Table) -> Screen:
     from rich import box
     from rich.table import Table as Screen
 

@@ -19,6 +19,8 @@ from ema_pipeline.commands.screen import program, show, show_json
 from ema_pipeline.plain_text import printable
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from ema_pipeline.series.database import SeriesDatabase
     from ema_pipeline.series.rows import TestRow
     from ema_pipeline.series.run import SeriesRun, Watch
@@ -58,7 +60,7 @@ def run(
     from ema_pipeline.series.export import export_series
     from ema_pipeline.series.run import run_series
 
-    go_on_with(f"finished tests are kept: {shlex.join(sys.argv[1:])}")
+    go_on_with(shlex.join(sys.argv[1:]))
     with _progress(quiet or json) as watch:
         done = run_series(
             tree,
@@ -85,13 +87,10 @@ def run(
     database.close()
 
 
-def _show_run(done: SeriesRun, tests: object) -> None:
-    import pandas as pd
-
+def _show_run(done: SeriesRun, tests: DataFrame) -> None:
     from ema_pipeline.series.database import rows_of
     from ema_pipeline.series.screens import verdict_counts
 
-    assert isinstance(tests, pd.DataFrame)
     show(f"{done.found} tests: {done.computed} run, {done.skipped} unchanged, {done.failed} without results.")
     if done.computed:
         grown = "" if done.growth != done.growth else f", last tenth {done.growth:.2f} times the first tenth"

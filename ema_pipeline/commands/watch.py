@@ -5,12 +5,15 @@ from __future__ import annotations
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ema_pipeline.commands.interrupts import go_on_with
 from ema_pipeline.commands.screen import program, show
+
+if TYPE_CHECKING:
+    from ema_pipeline.watch.session import Told
 
 
 def watch(
@@ -63,14 +66,11 @@ def watch(
         show(f"Next: {program()} run {folder}")
 
 
-def _tell(told: object, json: bool) -> None:
-    from ema_pipeline.watch.session import Told
-
-    assert isinstance(told, Told)
+def _tell(told: Told, json: bool) -> None:
     if not json:
         show(told.text)
         return
-    import json as encoder
+    from json import dumps
 
     from ema_pipeline.report.summary_files import finite
 
@@ -79,4 +79,4 @@ def _tell(told: object, json: bool) -> None:
         content |= {"impact": str(told.record.impact), "good_hits": told.record.good}
         content |= {"faults": list(told.record.faults), "remarks": list(told.record.remarks)}
         content["coherence"] = dict(told.record.coherence)
-    typer.echo(encoder.dumps(finite(content)))
+    typer.echo(dumps(finite(content)))

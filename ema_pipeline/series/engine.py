@@ -23,6 +23,8 @@ Work = Callable[[Task], TestRow]
 
 _TESTS_PER_WORKER = 100
 """A process is replaced after so many tests: what libraries keep in memory does not add up."""
+_PER_THREAD = 2
+"""Tests that the cluster holds for each thread of its workers, so that none waits for this process."""
 _RETRIES = 2
 LOST = "its process ended without an answer, mostly for want of memory; run the series again with fewer jobs"
 
@@ -111,14 +113,13 @@ def on_cluster(tasks: Iterable[Task], address: str, work: Work = run_task) -> It
 
         def submit(count: int) -> list[Any]:
             futures = []
-            for task in islice(source, count):
+            for task in islice(source, max(count, 0)):
                 future = client.submit(work, task, pure=False, retries=_RETRIES)
                 asked[str(future.key)] = task
                 futures.append(future)
             return futures
 
-        threads = sum(client.nthreads().values())
-        running = as_completed(submit(2 * max(threads, 1)))
+        running = as_completed(submit(1), loop=client.loop)
         for future in running:
             task = asked.pop(str(future.key))
             if future.status == "finished":
@@ -126,7 +127,8 @@ def on_cluster(tasks: Iterable[Task], address: str, work: Work = run_task) -> It
             else:
                 yield failed_row(task.name, task.raw, "", _lost_on_cluster(future), "lost")
             future.release()
-            for new in submit(1):
+            wanted = max(1, _PER_THREAD * sum(client.nthreads().values()))  # workers come and go
+            for new in submit(wanted - running.count()):
                 running.add(new)
 
 

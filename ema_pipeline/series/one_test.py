@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import resource
-import sys
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from ema_pipeline.processes import peak_memory_mb
 from ema_pipeline.series.rows import Row, TestRow, failed_row
 
 
@@ -62,7 +61,11 @@ def run_task(task: Task) -> TestRow:
         path = write_crash_report(error)
         reason = f"a fault in ema itself ({type(error).__name__}); the details are in {path}"
         row = failed_row(task.name, task.raw, task.key, reason)
-    cost: Row = {"test": task.name, "seconds": time.perf_counter() - start, "peak_memory_mb": _peak_mb()}
+    cost: Row = {
+        "test": task.name,
+        "seconds": time.perf_counter() - start,
+        "peak_memory_mb": peak_memory_mb(),
+    }
     return replace(row, cost=cost)
 
 
@@ -81,9 +84,3 @@ def _run(task: Task) -> TestRow:
         "date": max((t.date for t in tests), default=""),
     }
     return row_of(task.name, task.raw, load_results(run), about, task.key)
-
-
-def _peak_mb() -> float:
-    """Largest memory that this process has had so far, MB."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1e6 if sys.platform == "darwin" else 1e3)

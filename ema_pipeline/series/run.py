@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import resource
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +12,7 @@ from pathlib import Path
 from ema_pipeline.describe import DEFAULT_PIPELINE, checked_rig, rig_text
 from ema_pipeline.errors import EmaError
 from ema_pipeline.pipeline import load_pipeline
+from ema_pipeline.processes import peak_memory_mb
 from ema_pipeline.series.database import SeriesDatabase
 from ema_pipeline.series.engine import Work, in_processes, on_cluster
 from ema_pipeline.series.find import FoundTest, find_tests, raw_fingerprint
@@ -180,11 +179,6 @@ def _kept(
         database.write(row)
         costs.append(float(row.cost.get("seconds") or 0.0))
         if done <= max(2, total // 10):
-            settled = _memory_mb()
+            settled = peak_memory_mb()
         watch(done, total, row)
-    return costs, (_memory_mb(), max(0.0, _memory_mb() - settled) if costs else 0.0)
-
-
-def _memory_mb() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+    return costs, (peak_memory_mb(), max(0.0, peak_memory_mb() - settled) if costs else 0.0)
