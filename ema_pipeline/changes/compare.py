@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -56,7 +57,13 @@ class Changes:
         return "changed" if self.physics.claimed else "same"
 
 
-def open_test(path: Path, rig: str | None, into: Path, show: ShowStage | None = None) -> Run:
+def open_test(
+    path: Path,
+    rig: str | None,
+    into: Path,
+    show: ShowStage | None = None,
+    effect_files: Sequence[str] = (),
+) -> Run:
     """A test as a run with modes: a results folder as it is, a raw folder run up to its modes.
 
     Parameters
@@ -67,6 +74,8 @@ def open_test(path: Path, rig: str | None, into: Path, show: ShowStage | None = 
     into : Path
         Where the results of a raw folder go.
     show : callable, optional
+    effect_files : sequence of str
+        Python files with the user's own effects.
 
     Raises
     ------
@@ -74,13 +83,13 @@ def open_test(path: Path, rig: str | None, into: Path, show: ShowStage | None = 
         If there are no modes, or the rig does not know the test's configurations.
     """
     if (path / RESULTS_FILE).is_file():
-        run = existing_run(path)
+        run = existing_run(path, effect_files)
         if run.info.kind == "hysteresis":
             raise EmaError(f"{path}: force-displacement loops have no modes; compare hammer tests")
         if rig is not None:
             run = dataclasses.replace(run, built_rig=checked_rig(rig))
     else:
-        run, _ = run_raw(path, rig, into, None, [MEASURING], show)
+        run, _ = run_raw(path, rig, into, None, [MEASURING], show, effect_files=effect_files)
     for name in run.info.configurations:
         if not run.store.key("modal", name):
             raise EmaError(f"{path}: has no modes of '{name}'; run 'ema run' to its end")

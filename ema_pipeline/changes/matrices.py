@@ -81,12 +81,14 @@ def mac_with_model(run: Run) -> list[MacMatrix]:
     EmaError
         If the run has no rig, or fewer than two DOFs.
     """
-    run.require_model("mac")
-    systems = {c.name: c.system for c in load_results(run).configurations}
+    model = run.require_model("mac")
+    systems = {c: model.system(c, {}) for c in run.info.configurations}
+    if run.built_rig is None:
+        systems |= {c.name: c.system for c in load_results(run).configurations if c.system is not None}
     found = []
     for name, modes in measured_modes(run).items():
         system = systems[name]
-        if system is None or modes.shapes is None or len(modes.dofs) < 2:
+        if modes.shapes is None or len(modes.dofs) < 2:
             continue
         hz, shapes = normal_modes(system)
         read = sensor_rows(system, modes.dofs) @ shapes

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ema_pipeline.commands.options import Json, Quiet, RigOption
+from ema_pipeline.commands.options import EffectFiles, Json, Quiet, RigOption
 from ema_pipeline.commands.screen import progress, show, show_json
 
 if TYPE_CHECKING:
@@ -37,6 +37,7 @@ def changes(
             help="How well tests repeat, 1 σ: frequency=1e-4, damping=0.02, shape=0.003 if left out.",
         ),
     ] = None,
+    effect_file: EffectFiles = None,
     quiet: Quiet = False,
     json: Json = False,
 ) -> None:
@@ -52,8 +53,8 @@ def changes(
     repeats = _repeats(repeat or [])
     folder = out or Path("results") / f"changes_{a.resolve().name}_{b.resolve().name}"
     with progress(quiet) as show_stage:
-        run_a = open_test(a, rig, folder / "A", show_stage)
-        run_b = open_test(b, rig, folder / "B", show_stage)
+        run_a = open_test(a, rig, folder / "A", show_stage, effect_file or [])
+        run_b = open_test(b, rig, folder / "B", show_stage, effect_file or [])
         if show_stage is None:
             found = compare_runs(run_a, run_b, repeat=repeats)
         else:

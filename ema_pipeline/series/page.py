@@ -200,7 +200,11 @@ def _outlier_table(compared: Comparison) -> dict[str, Any] | None:
     for o in rows_of(compared.outliers.head(_OUTLIERS)):
         scale, unit = shown_in(o.feature, str(compared.table.loc[o.feature, "unit"]))
         value = format_value(scale * o.value, scale * o.std, unit)
-        rows.append(Row((o.test, o.feature, value, plain(scale * o.typical, 6), f"{o.z:+.1f}")))
+        rows.append(
+            Row(
+                (o.test, o.feature, value, format_value(scale * o.typical, float("nan"), unit), f"{o.z:+.1f}")
+            )
+        )
     return {
         "table": Table(head, tuple(rows), frozenset({2, 3, 4})),
         "caption": "By value: modified z-score above 3.5, the farthest first",

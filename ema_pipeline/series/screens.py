@@ -79,7 +79,13 @@ def outlier_table(found: Comparison) -> Table:
     for row in rows_of(found.outliers.head(OUTLIERS_SHOWN)):
         scale, unit = shown_in(row.feature, str(found.table.loc[row.feature, "unit"]))
         value = format_value(scale * row.value, scale * row.std, unit)
-        table.add_row(str(row.test), row.feature, value, plain(scale * row.typical, 6), f"{row.z:+.1f} σ")
+        table.add_row(
+            str(row.test),
+            row.feature,
+            value,
+            format_value(scale * row.typical, float("nan"), unit),
+            f"{row.z:+.1f} σ",
+        )
     return table
 
 
