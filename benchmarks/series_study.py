@@ -2,7 +2,7 @@
 
     python benchmarks/series_study.py [TESTS] [--broken 5] [--kills 10] [--dask]
 
-Printed: wall time with one process and with two and their ratio, work per test of the first and of the last tenth,
+Printed: wall time with one process and with two and their ratio, processor time per test and its growth,
 memory of the driver, whether a series killed at random moments and resumed has the same table, and the same on a
 cluster of a scheduler and two workers in processes of their own, one of which is killed.
 """
@@ -143,7 +143,8 @@ def main() -> None:
         f"one process {one['wall']:.1f} s, two {two['wall']:.1f} s: {one['wall'] / two['wall']:.2f} times the speed"
     )
     print(
-        f"work per test {one['seconds_per_test']:.2f} s, last tenth {one['growth'] or 1:.2f} times the first tenth"
+        f"processor time per test {one['seconds_per_test']:.2f} s, "
+        f"of the last tenth {one['growth'] or 1:.2f} times that of the first tenth"
     )
     print(
         f"driver {one['driver_mb']:.0f} MB, {one['driver_growth_mb']:.1f} MB more than after the first tenth"

@@ -95,7 +95,7 @@ def _show_run(done: SeriesRun, tests: DataFrame) -> None:
     if done.computed:
         grown = "" if done.growth != done.growth else f", last tenth {done.growth:.2f} times the first tenth"
         show(
-            f"Took {done.seconds:.0f} s; {done.seconds_per_test:.1f} s of work per test{grown}; "
+            f"Took {done.seconds:.0f} s; {done.seconds_per_test:.1f} s of processor time per test{grown}; "
             f"this process used {done.driver_mb:.0f} MB, {done.driver_growth_mb:.0f} MB more than at the start."
         )
     show(verdict_counts(tests))

@@ -57,7 +57,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
     ),
     "parameters": ("test", "name", "value", "std", "unit", "identified"),
     "effects": ("test", "effect", "at", "name", "value", "std", "unit", "probability"),
-    "cost": ("test", "seconds", "peak_memory_mb"),
+    "cost": ("test", "seconds", "processor_seconds", "peak_memory_mb"),
 }  # fmt: skip
 """Columns of every table of ``series.db``."""
 

@@ -40,9 +40,9 @@ class SeriesRun:
     seconds : float
         Wall time.
     seconds_per_test : float
-        Mean work of one test, of those that were run; NaN for none.
+        Mean processor time of one test, of those that were run; NaN for none.
     growth : float
-        Mean work of the last tenth of them over that of the first tenth; NaN for fewer than 20.
+        The same of the last tenth of them over that of the first tenth; NaN for fewer than 20.
     driver_mb, driver_growth_mb : float
         Memory of this process at its largest, and by how much that rose after the first tests.
     """
@@ -172,12 +172,12 @@ def _done(task: Task, known: tuple[str, str] | None) -> bool:
 def _kept(
     database: SeriesDatabase, rows: Iterator[TestRow], total: int, watch: Watch
 ) -> tuple[list[float], tuple[float, float]]:
-    """Write rows as they come; the work of each, s, and this process's memory, MB."""
+    """Write rows as they come; the processor time of each, s, and this process's memory, MB."""
     costs: list[float] = []
     settled = 0.0
     for done, row in enumerate(rows, 1):
         database.write(row)
-        costs.append(float(row.cost.get("seconds") or 0.0))
+        costs.append(float(row.cost.get("processor_seconds") or 0.0))
         if done <= max(2, total // 10):
             settled = peak_memory_mb()
         watch(done, total, row)
