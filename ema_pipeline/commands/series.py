@@ -121,13 +121,15 @@ def _progress(quiet: bool) -> Iterator[Watch]:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn
 
-        with Progress(BarColumn(), TextColumn("{task.fields[now]}"), console=Console(stderr=True)) as bars:
+        columns = BarColumn(), TextColumn("{task.fields[now]}")
+        # No thread that draws: workers are forked from this process.
+        with Progress(*columns, console=Console(stderr=True), auto_refresh=False) as bars:
             bar = bars.add_task("", total=1.0, now="")
 
             def draw(done: int, total: int, row: TestRow) -> None:
                 nonlocal failed
                 failed += row.test["state"] != "ok"
-                bars.update(bar, completed=done / total, now=words(done, total))
+                bars.update(bar, completed=done / total, now=words(done, total), refresh=True)
 
             yield draw
     else:
