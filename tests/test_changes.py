@@ -75,7 +75,8 @@ def test_an_added_mass_is_found_with_its_size(root: Path, capsys: pytest.Capture
     assert found == json.loads((out / "changes.json").read_text(encoding="utf-8"))
     assert found["verdict"] == "changed"
     (change,) = found["changes"]
-    assert "mass@m2" in (f"{change['effect']}@{change['at']}", *change["also_called"])
+    assert (change["effect"], change["at"]) == ("mass", "m2")
+    assert "sensor_mass@m2" in change["also_called"]
     assert abs(change["value"] - 0.06) < 3 * change["std"] < 0.02
     assert change["probability"] > 0.9
     assert found["modes"][0]["frequency_change"] < 0

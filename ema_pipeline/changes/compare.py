@@ -135,7 +135,6 @@ def changes_content(found: Changes) -> dict[str, Any]:
         ]  # fmt: skip
         content["diagnosis"] = {
             "verdict": diagnosis.verdict,
-            "summary": diagnosis.summary,
             "in": "A" if found.physics.reverse else "B",
             "error_before": diagnosis.ladder.rungs[0].error,
             "error_after": diagnosis.ladder.rungs[-1].error,

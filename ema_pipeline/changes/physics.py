@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 from ema_pipeline.correlate.matching import match_modes
@@ -83,7 +83,7 @@ def _diagnosed(a: Run, b: Run, progress: Progress, repeat: RepeatSettings | None
 
     model = b.require_model("changes")
     with single_blas_thread():
-        return diagnose(
+        found = diagnose(
             pair_observations(a, b, repeat),
             model,
             b.library,
@@ -91,6 +91,19 @@ def _diagnosed(a: Run, b: Run, progress: Progress, repeat: RepeatSettings | None
             cast(DiagnoseSettings, b.settings["diagnose"]),
             progress,
         )
+    return replace(found, candidates=tuple(_as_change(c) for c in found.candidates))
+
+
+_OF_THE_SENSORS, _OTHERWISE = "sensor_mass", "mass"
+
+
+def _as_change(c: Candidate) -> Candidate:
+    """A mass that came between two tests with the same sensors is called a mass, where it may be either."""
+    other = f"{_OTHERWISE}@{c.at}"
+    if c.effect != _OF_THE_SENSORS or other not in c.equivalents:
+        return c
+    names = (c.label, *(e for e in c.equivalents if e != other))
+    return replace(c, effect=_OTHERWISE, title="mass at a body", equivalents=names)
 
 
 def pair_observations(a: Run, b: Run, repeat: RepeatSettings | None = None) -> PairObservations:
