@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import socket
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -26,6 +27,8 @@ _TESTS_PER_WORKER = 100
 _PER_THREAD = 2
 """Tests that the cluster holds for each thread of its workers, so that none waits for this process."""
 _RETRIES = 2
+_ANSWERS_S = 10.0
+"""Time that a scheduler is given to answer."""
 LOST = "its process ended without an answer, mostly for want of memory; run the series again with fewer jobs"
 
 
@@ -99,13 +102,17 @@ def on_cluster(tasks: Iterable[Task], address: str, work: Work = run_task) -> It
     """
     try:
         from distributed import Client, as_completed
+        from distributed.comm.addressing import get_address_host_port
     except ImportError:
         raise EmaError(
             "--scheduler needs Dask; install it with: pip install 'ema-pipeline[dask]', or use --jobs"
         ) from None
     try:
-        client = Client(address, timeout="10s", set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
+        # Asked first by a bare connection: a client without a scheduler takes its time to give up, and says so twice.
+        with socket.create_connection(get_address_host_port(address), timeout=_ANSWERS_S):
+            pass
+        client = Client(address, timeout=_ANSWERS_S, set_as_default=False)
+    except (OSError, ValueError) as error:
         raise EmaError(f"--scheduler {address}: no Dask scheduler answers there ({error})") from None
     with client:
         source = iter(tasks)
