@@ -39,7 +39,7 @@ def commands_page() -> str:
     """Every command with its arguments and options, from its own help."""
     parts = ["# Commands\n"]
     group: Any = typer.main.get_command(app)
-    for name, command in group.commands.items():
+    for name, command in _commands(group):
         context = command.make_context(f"ema {name}", [], resilient_parsing=True)
         usage = " ".join(command.collect_usage_pieces(context))
         parts.append(f"## ema {name}\n\n{command.help}\n\n```sh\nema {name} {usage}\n```\n")
@@ -47,6 +47,17 @@ def commands_page() -> str:
         if rows:
             parts.append("| | |\n|---|---|\n" + "\n".join(rows) + "\n")
     return "\n".join(parts)
+
+
+def _commands(group: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    """All commands with their full names, those of groups within the group as well."""
+    found: list[tuple[str, Any]] = []
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            found += _commands(command, f"{prefix}{name} ")
+        else:
+            found.append((f"{prefix}{name}", command))
+    return found
 
 
 def _row(parameter: Any) -> str:

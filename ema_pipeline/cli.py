@@ -11,7 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from ema_pipeline import __version__
-from ema_pipeline.commands import diagnosis, listings, raw, runs
+from ema_pipeline.commands import changes, diagnosis, listings, raw, runs, series, watch
 from ema_pipeline.commands.interrupts import INTERRUPTED, answer_ctrl_c
 from ema_pipeline.commands.screen import program
 from ema_pipeline.crash import write_crash_report
@@ -116,6 +116,8 @@ for _verb in (
     diagnosis.add,
     diagnosis.remove,
     diagnosis.ladder,
+    changes.changes,
+    changes.mac,
     runs.view,
     runs.export,
     listings.rigs,
@@ -124,8 +126,10 @@ for _verb in (
     listings.settings,
     listings.reproduce,
     raw.simulate,
+    watch.watch,
 ):
     app.command()(_verb)
+app.add_typer(series.series, name="series")
 
 
 if __name__ == "__main__":

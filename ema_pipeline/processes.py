@@ -30,6 +30,16 @@ def workers_die_with_us() -> Iterator[None]:
         _holders -= 1
 
 
+def peak_memory_mb() -> float:
+    """Largest memory that this process has had so far, MB; NaN where the system does not tell."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return float("nan")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1e6 if sys.platform == "darwin" else 1e3)
+
+
 def die_with_parent(parent: int) -> None:
     """Have the system kill this process as soon as the process `parent`, which started it, is gone.
 

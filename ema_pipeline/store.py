@@ -30,6 +30,7 @@ ALL = "all"
 """Name that stands for all configurations together."""
 
 LOCK_FILE = ".lock"
+RESULTS_FILE = "ema.h5"
 
 _FORMAT = 1
 _LIBRARY = ("v110", "v110")
@@ -71,7 +72,7 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.path = folder / "ema.h5"
+        self.path = folder / RESULTS_FILE
 
     @classmethod
     def existing(cls, folder: Path) -> Store:

@@ -21,7 +21,9 @@ def normal(name: str) -> str:
 
 def declared() -> set[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    return {normal(re.split(r"[\[<>=!~; ]", line)[0]) for line in project["dependencies"]}
+    extras = [lines for name, lines in project["optional-dependencies"].items() if name != "dev"]
+    lines = sum(extras, project["dependencies"])
+    return {normal(re.split(r"[\[<>=!~; ]", line)[0]) for line in lines}
 
 
 def imported(file: Path) -> set[str]:

@@ -15,7 +15,6 @@ from ema_pipeline.inference import widened
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters
 
-
 HELD_OUT_TIE = 1.0
 """Log density of data held out by which a claim may be behind: a base model that bends one part beyond all scatter
 foretells as well as the effect that it stands for; what that bend costs is in the evidence."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import os
 from collections import Counter
 from dataclasses import dataclass
@@ -54,6 +55,22 @@ def _check_share(value: float) -> float:
 
 
 Share = Annotated[float, AfterValidator(_check_share)]
+
+
+def _iso_date(value: Any) -> Any:
+    if isinstance(value, dt.date):  # a date and time is one, too
+        return value.isoformat()
+    try:
+        return dt.datetime.fromisoformat(value).date().isoformat() if len(value) == 10 else _iso_time(value)
+    except (TypeError, ValueError):
+        raise ValueError("give a date as 2025-03-31, or a date and time as 2025-03-31T14:05:00") from None
+
+
+def _iso_time(value: str) -> str:
+    return dt.datetime.fromisoformat(value).isoformat()
+
+
+DateText = Annotated[str, BeforeValidator(_iso_date)]
 
 
 class ChannelDescription(Settings):
@@ -119,6 +136,8 @@ class _TestFile(Settings):
     version: Literal[1] = Field(default=1, alias="schema", description="Version of this file's layout")
     title: str = Field(default="", description="Free text")
     kind: Literal["hammer", "hysteresis", "continuous"] = Field(default="hammer", description="Kind of test")
+    serial_number: str = Field(default="", description="Which specimen was tested")
+    date: DateText = Field(default="", validate_default=False, description="When it was tested, ISO 8601")
     rig: str | None = Field(default=None, description="Rig name or file; --rig wins")
     configuration: str | None = Field(default=None, description="One of the rig's configurations")
     sample_rate_hz: float | None = Field(
@@ -260,11 +279,32 @@ def read_description(folder: Path) -> TestDescription:
     return test
 
 
+def read_channels(folder: Path) -> TestDescription:
+    """Read the ``test.toml`` of a test that is being made: records may be missing, and so may their files.
+
+    Raises
+    ------
+    EmaError
+        Where the file is not valid TOML, or what it says of the channels is wrong.
+    """
+    path = folder / DESCRIPTION_FILE
+    keys = parse(_TestFile, {"records": [], **read_toml(path)}, path)
+    test = TestDescription.model_construct(folder=folder, **dict(keys))
+    _check_texts(test)
+    _check_channels(test)
+    if test.kind != "hammer":
+        raise EmaError(f"{path}: is of kind '{test.kind}'; only hammer tests have hits to judge")
+    for channel in test.responses:
+        if channel.dof is None:
+            raise EmaError(f"{path}: response channel '{channel.name}' has no dof; add it")
+    return test
+
+
 def _check_texts(test: TestDescription) -> None:
     """Texts end up on screens and in reports, names in file names too."""
     if test.configuration is not None:
         check_name(test.configuration, f"{test.file}: configuration")
-    texts = {"title": test.title, "rig": test.rig or ""}
+    texts = {"title": test.title, "serial_number": test.serial_number, "rig": test.rig or ""}
     texts |= {f"name of channel {i + 1}": c.name for i, c in enumerate(test.channels)}
     texts |= {f"file of record {i + 1}": r.file for i, r in enumerate(test.records)}
     texts |= {f"name of record {i + 1}": r.name for i, r in enumerate(test.records)}

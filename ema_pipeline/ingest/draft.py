@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -350,6 +350,23 @@ def _impact_stated(raw: RawRecord, hammer: str | None, nodes: Mapping[str, str])
         return None
     dof = Dof.parse(stated.pop())
     return str(Dof(nodes.get(dof.body, dof.body), dof.direction, dof.sign))
+
+
+def impact_of(stem: str, raw: RawRecord, dofs: Sequence[Dof], hammer: str) -> Dof | None:
+    """The DOF that was struck, as the file's name or the file itself tells it; None where neither does.
+
+    Parameters
+    ----------
+    stem : str
+        Name of the file without its ending.
+    raw : RawRecord
+    dofs : sequence of Dof
+        Where sensors sit.
+    hammer : str
+        Name of the hammer's channel.
+    """
+    found = _impact_in(stem, {d.body.casefold(): d.body for d in dofs}) or _impact_stated(raw, hammer, {})
+    return None if found is None else Dof.parse(found)
 
 
 def _blow_key(stem: str) -> str:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ema_pipeline.inference import Residuals, tails
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
-from ema_pipeline.mechanics.terms import Matrices
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.rig_model import RigModel
 
@@ -86,6 +85,120 @@ def _blocks(parts: Sequence[Residuals]) -> NDArray[np.int64] | None:
     return np.concatenate(numbered)
 
 
+@dataclass(frozen=True)
+class Rows:
+    """Differences of one kind.
+
+    Attributes
+    ----------
+    difference : ndarray, (k,)
+        Measurement minus model.
+    own : ndarray, (k,)
+        1 σ of the test.
+    unit : ndarray, (k,)
+        Unit of the scatter that adds to it.
+    scatter : str
+        Name of that scatter.
+    heat : float
+        Factor on all σ while a fit is annealed.
+    mode : ndarray of int, (k,)
+        Measured mode that each belongs to.
+    sensor : ndarray of int, (k,), optional
+        Sensor that each belongs to, of shapes.
+    slope : ndarray, (k, n), optional
+        Derivatives of the model's values by all unknowns.
+    model : ndarray, (k,), optional
+        The model's values, of damping: ln ζ.
+    noise : str
+        Name of the factor on the test's own 1 σ where that is learned too.
+    """
+
+    difference: NDArray[np.float64]
+    own: NDArray[np.float64]
+    unit: NDArray[np.float64]
+    scatter: str
+    heat: float
+    mode: NDArray[np.int64]
+    sensor: NDArray[np.int64] | None = None
+    slope: NDArray[np.float64] | None = None
+    model: NDArray[np.float64] | None = None
+    noise: str = ""
+
+    def __len__(self) -> int:
+        return len(self.difference)
+
+    def noise_at(self, scatters: Mapping[str, float]) -> float:
+        """Factor on the test's own 1 σ."""
+        return scatters.get(self.noise, 1.0)
+
+
+@dataclass(frozen=True)
+class Compared:
+    """All differences of one configuration, and the cost of what has no partner.
+
+    Attributes
+    ----------
+    rows : tuple of Rows
+        Frequencies, damping ratios, shapes.
+    match : ndarray of int, (m,)
+        Model mode of every measured one, -1 for none.
+    log_scale, penalty : float
+        As in `Residuals`, of modes without a partner.
+    unexplained, projected : int
+    """
+
+    rows: tuple[Rows, ...]
+    match: NDArray[np.int64]
+    log_scale: float
+    penalty: float
+    unexplained: int
+    projected: int
+
+    @property
+    def heated(self) -> bool:
+        """True while a fit is annealed."""
+        return any(r.heat != 1.0 for r in self.rows)
+
+
+def whitened(
+    found: Compared, scatters: Mapping[str, float], defaults: Mapping[str, float], n: int
+) -> Residuals:
+    """Differences in units of their standard uncertainties, `n` unknowns."""
+    total = sum(len(r) for r in found.rows)
+    derivatives = all(r.slope is not None for r in found.rows)
+    values, share, block = np.empty(total), {}, np.full(total, -1)
+    jacobian = np.zeros((total if derivatives else 0, n))
+    log_scale, at = 0.0, 0
+    for r in found.rows:
+        here = slice(at, at + len(r))
+        at = here.stop
+        added, own = (scatters[r.scatter] * r.unit) ** 2, (r.noise_at(scatters) * r.own) ** 2
+        variance = own + added
+        usual = (r.noise_at(defaults) * r.own) ** 2 + (defaults[r.scatter] * r.unit) ** 2
+        log_scale += 0.5 * float(np.sum(np.log(variance / usual)))
+        sigma = np.sqrt(variance) * r.heat
+        values[here] = r.difference / sigma
+        if r.sensor is not None:  # a shape may be wrong as a whole
+            block[here] = np.unique(r.mode, return_inverse=True)[1]
+        if derivatives and r.slope is not None:
+            for name, part in ((r.scatter, added), (r.noise, own)):
+                if name:
+                    share[name] = np.zeros(total)
+                    share[name][here] = part / variance
+            jacobian[here] = r.slope / -sigma[:, None]
+    return Residuals(
+        values=values,
+        jacobian=jacobian,
+        share=share,
+        log_scale=log_scale + found.log_scale,
+        penalty=found.penalty,
+        matching=found.match,
+        unexplained=found.unexplained,
+        projected=found.projected,
+        block=None if found.heated else block,  # far off everything is on the tail
+    )
+
+
 class Comparison:
     """Residuals of one configuration at one point.
 
@@ -121,13 +234,35 @@ class Comparison:
 
     def residuals(self, matching: object, derivatives: bool) -> Residuals:
         """Residuals with the pairs of `matching`, or with new ones where it is no array."""
+        found = self.compared(matching, derivatives)
+        if found is None:
+            return Residuals(np.full(1, np.inf), np.zeros((1, len(self.x))), matching=matching)
+        return whitened(found, self.scatters, self.defaults, len(self.x))
+
+    def compared(self, matching: object, derivatives: bool) -> Compared | None:
+        """Differences with the pairs of `matching`, or with new ones; None where the model has no modes."""
         own = self.x[: len(self.model.unknowns)]
         matrices, solution = self.model.modes(self.data.configuration, own, derivatives)
         if solution is None:
-            return Residuals(np.full(1, np.inf), np.zeros((1, len(self.x))), matching=matching)
+            return None
         predicted = self.seen(solution)
         match = matching if isinstance(matching, np.ndarray) else self.matched(solution, predicted)
-        return self._compared(matrices, solution, predicted, match, derivatives)
+        on, alone = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
+        to = match[on]
+        slopes = ModeDerivatives.of(matrices, solution, to, self.model.has_ratio) if derivatives else None
+        rows = (
+            self._frequencies(solution, on, to, slopes),
+            self._damping(solution, on, to, slopes),
+            self._shapes(solution, predicted, on, to, slopes),
+        )
+        return Compared(
+            rows=rows,
+            match=match,
+            log_scale=self._usual(alone) if len(alone) else 0.0,
+            penalty=UNEXPLAINED * len(alone) + UNSEEN * self._unseen(solution, to),
+            unexplained=len(alone),
+            projected=len(on) if self.data.shapes.shape[1] else 0,
+        )
 
     def seen(self, solution: EigenSolution) -> NDArray[np.float64]:
         """What the sensors read of every shape, (s, n); complex shapes turned as measured ones are, and made real."""
@@ -155,69 +290,6 @@ class Comparison:
         column = scipy.optimize.linear_sum_assignment(padded)[1]
         return np.where(column < cost.shape[1], column, -1)
 
-    def _compared(
-        self,
-        matrices: Matrices,
-        solution: EigenSolution,
-        predicted: NDArray[np.float64],
-        match: NDArray[np.int64],
-        derivatives: bool,
-    ) -> Residuals:
-        paired = match >= 0
-        on, alone = np.flatnonzero(paired), np.flatnonzero(~paired)
-        to = match[on]
-        slopes = None
-        if derivatives:
-            slopes = ModeDerivatives.of(matrices, solution, to, self.model.has_ratio)
-        damped = np.isfinite(self.data.log_damping[on])
-        rows = (
-            self._frequencies(solution, on, to),
-            self._damping(solution, on[damped], to[damped]),
-            self._shapes(solution, predicted, on, to, slopes),
-        )
-        total = sum(len(r.difference) for r in rows)
-        values, share, block = np.empty(total), {}, np.full(total, -1)
-        jacobian = np.zeros((total if derivatives else 0, len(self.x)))
-        log_scale, at = 0.0, 0
-        for r in rows:
-            here = slice(at, at + len(r.difference))
-            at = here.stop
-            added = (self.scatters[r.scatter] * r.unit) ** 2
-            own = (r.noise_at(self.scatters) * r.own) ** 2
-            variance = own + added
-            usual = (r.noise_at(self.defaults) * r.own) ** 2 + (self.defaults[r.scatter] * r.unit) ** 2
-            log_scale += 0.5 * float(np.sum(np.log(variance / usual)))
-            sigma = np.sqrt(variance) * r.heat
-            values[here] = r.difference / sigma
-            if r.mode is not None:
-                block[here] = r.mode
-            if slopes is not None:
-                share[r.scatter] = np.zeros(total)
-                share[r.scatter][here] = added / variance
-                if r.noise:
-                    share[r.noise] = np.zeros(total)
-                    share[r.noise][here] = own / variance
-                if r.scatter == FREQUENCY:
-                    jacobian[here, : slopes.log_frequency.shape[1]] = slopes.log_frequency
-                    jacobian[here, self.sensing.drift] = 1.0
-                elif r.scatter == DAMPING_SCATTER:
-                    ratio = solution.damping_ratio[to[damped], None]
-                    jacobian[here, : slopes.damping_ratio.shape[1]] = slopes.damping_ratio[damped] / ratio
-                else:
-                    jacobian[here] = r.slope
-                jacobian[here] /= -sigma[:, None]
-        return Residuals(
-            values=values,
-            jacobian=jacobian,
-            share=share,
-            log_scale=log_scale + (self._usual(alone) if len(alone) else 0.0),
-            penalty=UNEXPLAINED * len(alone) + UNSEEN * self._unseen(solution, to),
-            matching=match,
-            unexplained=len(alone),
-            projected=len(on) if self.data.shapes.shape[1] else 0,
-            block=block if self.heat == 1.0 else None,  # far off everything is on the tail
-        )
-
     def _usual(self, alone: NDArray[np.int64]) -> float:
         """What modes without a partner would cost on average if they were explained.
 
@@ -243,22 +315,51 @@ class Comparison:
             total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
         return total
 
-    def _frequencies(self, solution: EigenSolution, on: NDArray[np.int64], to: NDArray[np.int64]) -> _Rows:
+    def _frequencies(
+        self,
+        solution: EigenSolution,
+        on: NDArray[np.int64],
+        to: NDArray[np.int64],
+        slopes: ModeDerivatives | None,
+    ) -> Rows:
         d = self.data
         model = np.log(np.maximum(solution.frequency_hz[to], 1e-6)) + self.x[self.sensing.drift]
-        return _Rows(
+        slope = None
+        if slopes is not None:
+            slope = np.zeros((len(on), len(self.x)))
+            slope[:, : slopes.log_frequency.shape[1]] = slopes.log_frequency
+            slope[:, self.sensing.drift] = 1.0
+        return Rows(
             d.log_frequency[on] - model,
             d.log_frequency_std[on],
             np.ones(len(on)),
             FREQUENCY,
             self.heat,
-            FREQUENCY_NOISE,
+            on,
+            slope=slope,
+            noise=FREQUENCY_NOISE,
         )
 
-    def _damping(self, solution: EigenSolution, on: NDArray[np.int64], to: NDArray[np.int64]) -> _Rows:
+    def _damping(
+        self,
+        solution: EigenSolution,
+        on: NDArray[np.int64],
+        to: NDArray[np.int64],
+        slopes: ModeDerivatives | None,
+    ) -> Rows:
         d = self.data
-        difference = d.log_damping[on] - np.log(solution.damping_ratio[to])
-        return _Rows(difference, d.log_damping_std[on], np.ones(len(on)), DAMPING_SCATTER, 1.0)
+        damped = np.isfinite(d.log_damping[on])
+        modes, of = on[damped], to[damped]
+        model = np.log(solution.damping_ratio[of])
+        slope = None
+        if slopes is not None:
+            slope = np.zeros((len(modes), len(self.x)))
+            by_model = slopes.damping_ratio[damped] / solution.damping_ratio[of, None]
+            slope[:, : by_model.shape[1]] = by_model
+        return Rows(
+            d.log_damping[modes] - model, d.log_damping_std[modes], np.ones(len(modes)), DAMPING_SCATTER, 1.0, modes,
+            slope=slope, model=model,
+        )  # fmt: skip
 
     def _shapes(
         self,
@@ -267,7 +368,7 @@ class Comparison:
         on: NDArray[np.int64],
         to: NDArray[np.int64],
         slopes: ModeDerivatives | None,
-    ) -> _Rows:
+    ) -> Rows:
         """Shapes with the factor projected out that fits them best."""
         d, p = self.data, predicted[:, to].T
         seen = d.seen[on] > 0
@@ -284,10 +385,11 @@ class Comparison:
             factor = towards[:, None, :] @ dp
             slope = (scale[:, None, None] * dp + p[:, :, None] * factor)[seen]
         difference = (y - scale[:, None] * p)[seen]
-        mode = np.repeat(np.arange(len(on)), np.count_nonzero(seen, axis=1))
-        return _Rows(
-            difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), SHAPE_NOISE, slope, mode
-        )
+        mode, sensor = np.nonzero(seen)
+        return Rows(
+            difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode], sensor, slope,
+            noise=SHAPE_NOISE,
+        )  # fmt: skip
 
     def _unseen(self, solution: EigenSolution, to: NDArray[np.int64]) -> int:
         """Model modes well inside the band that no measured mode is paired with."""
@@ -313,25 +415,3 @@ class Comparison:
             has = np.flatnonzero(unknown >= 0)
             slope[:, has, unknown[has]] += (self.gain[:, None] * (across @ shapes[:width])).T[:, has]
         return slope
-
-
-@dataclass(frozen=True)
-class _Rows:
-    """Differences of one kind: own 1 σ, the unit of the scatter that adds to it, heat, and derivatives of shapes.
-
-    `noise` names the factor on the own 1 σ where that is learned too; `mode` says which mode a difference belongs to,
-    where those of one mode may be wrong together.
-    """
-
-    difference: NDArray[np.float64]
-    own: NDArray[np.float64]
-    unit: NDArray[np.float64]
-    scatter: str
-    heat: float
-    noise: str = ""
-    slope: NDArray[np.float64] | None = None
-    mode: NDArray[np.int64] | None = None
-
-    def noise_at(self, scatters: Mapping[str, float]) -> float:
-        """Factor on the own 1 σ."""
-        return scatters.get(self.noise, 1.0)

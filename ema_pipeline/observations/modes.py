@@ -88,6 +88,8 @@ class ModeObservations:
         Of the rig, where it is known already.
     sensors : tuple of str, optional
         DOFs whose calibration is unknown; those of `data` where left out.
+    test : str
+        Name of the test among several whose unknowns are shared: its drift is its own.
     """
 
     def __init__(
@@ -97,8 +99,9 @@ class ModeObservations:
         channels: Mapping[str, ChannelQuality] | None = None,
         shared: Dependence | None = None,
         sensors: tuple[str, ...] = (),
+        test: str = "",
     ) -> None:
-        self.rig = rig
+        self.rig, self.test = rig, test
         self.data = tuple(d for d in data if len(d))
         self.sensors = sensors or tuple(dict.fromkeys(d.point for one in data for d in one.dofs))
         self.channels = dict(channels or {})
@@ -123,7 +126,7 @@ class ModeObservations:
 
     def with_data(self, data: Sequence[ModeData]) -> ModeObservations:
         """The same rig and channels with other modes."""
-        return ModeObservations(self.rig, data, self.channels, self.shared, self.sensors)
+        return ModeObservations(self.rig, data, self.channels, self.shared, self.sensors, self.test)
 
     def folds(self, count: int = 4) -> list[tuple[ModeObservations, ModeObservations]]:
         """Every `count`-th mode held out in turn, over all configurations."""
@@ -145,9 +148,9 @@ def _calibration(sensor: str, channel: ChannelQuality) -> str:
     return f"calibration of {channel.name or sensor}"
 
 
-def _drift(configuration: str) -> str:
+def _drift(configuration: str, test: str) -> str:
     """Name of the unknown: temperature and time move all frequencies of one configuration alike."""
-    return f"drift of {configuration}"
+    return f"drift of {configuration}{' in ' + test if test else ''}"
 
 
 def _transverse(sensor: str, direction: str) -> str:
@@ -232,7 +235,7 @@ class ModeProblem:
             others = self._directions_across(s)
             if c.transverse > 0:
                 across |= {_transverse(s, d): c.transverse / np.sqrt(len(others)) for d in others}
-        drifts = [_drift(d.configuration) for d in self.observations.data]
+        drifts = [_drift(d.configuration, self.observations.test) for d in self.observations.data]
         return joined(
             self.model.unknowns,
             Unknowns.plain(drifts, DRIFT_STD),
@@ -278,7 +281,7 @@ class ModeProblem:
                 transverse[k, i] = self.unknowns.index.get(_transverse(dof.point, direction), -1)
                 if transverse[k, i] >= 0 and self.observations.has(d.configuration, other):
                     across[k, i] = self.model.sensor_rows(d.configuration, (other,))[0]
-        drift = self.unknowns.index.get(_drift(d.configuration), -1)
+        drift = self.unknowns.index.get(_drift(d.configuration, self.observations.test), -1)
         return Sensing(along, across, gain, transverse, drift)
 
     def paired(
@@ -292,13 +295,14 @@ class ModeProblem:
         if solution is None:
             return None
         if match is None:
-            at = self._at(data, x, {})
+            at = self.comparison(data, x, {})
             match = at.matched(solution, at.seen(solution))
         return Paired(solution, match)
 
-    def _at(
+    def comparison(
         self, data: ModeData, x: NDArray[np.float64], scatters: Mapping[str, float], heat: float = 1.0
     ) -> Comparison:
+        """One configuration's modes against the model's at `x`."""
         return Comparison(self.model, data, self.sensing(data), x, scatters, self._defaults, heat)
 
     def _modes(self, configuration: str, x: NDArray[np.float64]) -> EigenSolution | None:
@@ -388,7 +392,7 @@ class ModeProblem:
         """See `Problem`."""
         given = matching if isinstance(matching, tuple) else (None,) * len(self.observations.data)
         parts = [
-            self._at(d, x, scatters, heat).residuals(m, derivatives)
+            self.comparison(d, x, scatters, heat).residuals(m, derivatives)
             for d, m in zip(self.observations.data, given, strict=True)
         ]
         return stacked(parts, len(x))

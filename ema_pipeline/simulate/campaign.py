@@ -105,7 +105,8 @@ def simulate_campaign(
     chosen = _known(configurations or base.configurations, base.configurations, "configuration")
     made = true_rig(base, effects, library, options)
     random = np.random.default_rng(options.seed)
-    true = true_values(made.rig, values or {}, options.scatter, random)
+    of_values = random if options.rig_seed is None else np.random.default_rng(options.rig_seed)
+    true = true_values(made.rig, values or {}, options.scatter, of_values)
     _check_bad_hits(options, chosen)
 
     out.mkdir(parents=True, exist_ok=True)
@@ -187,7 +188,7 @@ def _tests(
     if options.imperfections.none:
         return tuple(tests)
     measured = [dof.point for c in base.configurations for dof in _sensors_of(base, c, sensors)]
-    channels = draw_channels(measured, options.imperfections, options.seed)
+    channels = draw_channels(measured, options.imperfections, options.seed_of_rig)
     return tuple(replace(test, channels=channels) for test in tests)
 
 

@@ -62,6 +62,12 @@ class SimulationSettings(Settings):
     overloads: tuple[str, ...] = Field((), description="hits that clip the hammer channel, written alike")
     format: RecordFormat = Field("uff", description="format of the record files")
     seed: int = Field(0, ge=0, description="seed of all random numbers")
+    rig_seed: int | None = Field(
+        None,
+        ge=0,
+        description="seed of what belongs to rig and sensors (parts, damping, gains); that of all where left out. Two "
+        "tests with one rig_seed and different seeds are of one rig with one set of sensors",
+    )
 
     @field_validator("peak_force_n", "double_hits", "overloads", mode="before")
     @classmethod
@@ -70,6 +76,11 @@ class SimulationSettings(Settings):
         if isinstance(given, str):
             return [part.strip() for part in given.split(",") if part.strip()]
         return given if isinstance(given, list | tuple) else [given]
+
+    @property
+    def seed_of_rig(self) -> int:
+        """Seed of parts, damping and channels."""
+        return self.seed if self.rig_seed is None else self.rig_seed
 
     @property
     def imperfections(self) -> Imperfections:

@@ -48,8 +48,8 @@ def true_rig(
     options : SimulationSettings
     """
     sizes = options.imperfections
-    parts = draw_parts(base, sizes.part_scatter, options.seed) if sizes.part_scatter else {}
+    parts = draw_parts(base, sizes.part_scatter, options.seed_of_rig) if sizes.part_scatter else {}
     own = scattered_rig(base, parts) if parts else base
     rig: Rig = rig_with_effects(own, [parse_sized(e) for e in effects], library)
-    damping = draw_damping(rig, sizes.damping_scatter, options.seed) if sizes.damping_scatter else {}
+    damping = draw_damping(rig, sizes.damping_scatter, options.seed_of_rig) if sizes.damping_scatter else {}
     return TrueRig(damped_rig(rig, base, damping) if damping else rig, parts, damping)

@@ -1,0 +1,124 @@
+"""What changed as sentences and tables, for the screen and for the page."""
+
+from __future__ import annotations
+
+import math
+
+from ema_pipeline.changes.compare import Changes
+from ema_pipeline.changes.modes import LEVEL, ModeChange
+from ema_pipeline.diagnose.sentences import label_text
+from ema_pipeline.report.numbers import format_percent, format_value
+from ema_pipeline.report.tables import Row, Table
+
+
+def verdict_text(found: Changes) -> str:
+    """The answer in one or two sentences."""
+    if found.physics is None:
+        return _of_modes(found)
+    if found.physics.claimed:
+        return f"Changed: {'; '.join(change_lines(found))}."
+    diagnosis = found.physics.diagnosis
+    error = diagnosis.ladder.rungs[0].error
+    if diagnosis.verdict == "unknown_effect":
+        return (
+            f"The rig's model does not explain both tests with one rig (error {error:.2f}), and no effect of the "
+            f"library explains what differs. {_of_modes(found)}"
+        )
+    if diagnosis.verdict == "not_enough_data":
+        return f"The tests have too few modes in common to tell a physical change. {_of_modes(found)}"
+    odds = 100 * diagnosis.null_probability
+    return f"The same within what these tests can show (probability that nothing changed: {odds:.0f} %)."
+
+
+def _of_modes(found: Changes) -> str:
+    changed = [m for m in found.modes.modes if m.changed]
+    count, level = len(found.modes.modes), f"(p < {LEVEL:g} over all that was compared)"
+    if not changed:
+        return f"None of {count} modes in common changed beyond its interval {level}."
+    return f"{len(changed)} of {count} modes in common changed beyond their intervals {level}."
+
+
+def change_lines(found: Changes) -> list[str]:
+    """Each claimed effect with its size and probability."""
+    if found.physics is None:
+        return []
+    where = " in A, not in B" if found.physics.reverse else ""
+    lines = []
+    for c in found.physics.claimed:
+        sizes = ", ".join(
+            f"{name} {format_value(s.value, s.std, s.unit)}" for name, s in c.parameters.items()
+        )
+        same = f", the same as {', '.join(map(label_text, c.equivalents))}" if c.equivalents else ""
+        lines.append(f"{label_text(c.label)}{where}, {sizes} (probability {100 * c.probability:.0f} %{same})")
+    return lines
+
+
+def notes(found: Changes) -> list[str]:
+    """What a reader should know beside the verdict."""
+    lines = []
+    for c, (value, std) in found.modes.common_shift.items():
+        if math.isfinite(value):
+            lines.append(f"{c}: all frequencies together moved by {format_percent(value, std)}.")
+    for name, lone in (("A", found.modes.only_a), ("B", found.modes.only_b)):
+        if lone:
+            told = ", ".join(f"{c} mode {k} at {f:.2f} Hz" for c, k, f in lone[:6])
+            lines.append(f"Modes of {name} alone: {told}{' …' if len(lone) > 6 else ''}.")
+    lines.append(
+        "Intervals (± 1 σ) hold each test's own scatter; what a new set-up changes besides (temperature, mounting, "
+        "suspension) is a change to them."
+    )
+    return lines
+
+
+def modes_table(found: Changes) -> Table:
+    """Every pair of modes with its changes."""
+    head = (
+        "configuration", "A", "B", "frequency in A, Hz", "change, %", "p", "damping in A, %", "change, %", "p", "MAC",
+        "usual above", "p", "changed",
+    )  # fmt: skip
+    rows = tuple(Row(_mode_cells(m), alert=bool(m.changed)) for m in found.modes.modes)
+    return Table(head, rows, frozenset(range(1, 12)))
+
+
+def short_modes_table(found: Changes) -> Table:
+    """The same for a screen of 80 columns."""
+    several = len({m.configuration for m in found.modes.modes}) > 1
+    rows = []
+    for m in found.modes.modes:
+        cells = _mode_cells(m)
+        own, other = f"{m.mode_a}", f"{m.mode_b}"
+        name = f"{m.configuration + ' ' if several else ''}{own if own == other else f'{own} → {other}'}"
+        rows.append(Row((name, cells[3], cells[4], cells[7], cells[9], cells[12]), alert=bool(m.changed)))
+    head = ("mode", "frequency in A, Hz", "change, %", "change of damping, %", "MAC", "changed")
+    return Table(head, tuple(rows), frozenset({1, 2, 3, 4}))
+
+
+def _mode_cells(m: ModeChange) -> tuple[str, ...]:
+    frequency, damping = m.frequency_change, m.damping_change
+    return (
+        m.configuration,
+        str(m.mode_a),
+        str(m.mode_b),
+        format_value(m.frequency_a, m.frequency_a_std),
+        _percent(frequency),
+        _p(m.frequency_p),
+        format_value(100 * m.damping_a, 100 * m.damping_a_std),
+        _percent(damping),
+        _p(m.damping_p),
+        _mac(m.mac),
+        _mac(m.mac_usual),
+        _p(m.mac_p),
+        ", ".join(m.changed) or "–",
+    )
+
+
+def _percent(change: tuple[float, float]) -> str:
+    return format_value(100 * change[0], 100 * change[1]) if math.isfinite(change[0]) else "–"
+
+
+def _p(value: float) -> str:
+    return "–" if math.isnan(value) else "<1e-6" if value < 1e-6 else f"{value:.2g}"
+
+
+def _mac(value: float) -> str:
+    return "–" if math.isnan(value) else f"{value:.3f}" if value < 0.999 else f"{value:.5f}"

@@ -1,0 +1,143 @@
+"""Two tests: what changed, and MAC."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ema_pipeline.commands.options import EffectFiles, Json, Quiet, RigOption
+from ema_pipeline.commands.screen import progress, show, show_json
+
+if TYPE_CHECKING:
+    from rich.table import Table as Screen
+
+    from ema_pipeline.diagnose.types import Diagnosis
+    from ema_pipeline.observations.pair import RepeatSettings
+    from ema_pipeline.report.tables import Table
+
+TestA = Annotated[Path, typer.Argument(metavar="A", help="Results folder or raw folder.")]
+TestB = Annotated[Path, typer.Argument(metavar="B", help="Results folder or raw folder.")]
+
+
+def changes(
+    a: TestA,
+    b: TestB,
+    rig: RigOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for the answer; results/changes_A_B if left out."),
+    ] = None,
+    repeat: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--repeat",
+            metavar="KEY=VALUE",
+            help="How well tests repeat, 1 σ: frequency=1e-4, damping=0.02, shape=0.003 if left out.",
+        ),
+    ] = None,
+    effect_file: EffectFiles = None,
+    quiet: Quiet = False,
+    json: Json = False,
+) -> None:
+    """Say what changed from test A to test B: effect, place, size, or 'the same within what these tests can show'.
+
+    With a rig both tests are fitted as one problem, in which parts, sensors and calibration are the same. Without one
+    modes are matched and compared one by one.
+    """
+    from ema_pipeline.changes.compare import changes_content, compare_runs, open_test, write_changes
+    from ema_pipeline.changes.page import write_page
+    from ema_pipeline.changes.tables import notes, short_modes_table, verdict_text
+
+    repeats = _repeats(repeat or [])
+    folder = out or Path("results") / f"changes_{a.resolve().name}_{b.resolve().name}"
+    with progress(quiet) as show_stage:
+        run_a = open_test(a, rig, folder / "A", show_stage, effect_file or [])
+        run_b = open_test(b, rig, folder / "B", show_stage, effect_file or [])
+        if show_stage is None:
+            found = compare_runs(run_a, run_b, repeat=repeats)
+        else:
+            with show_stage("changes") as tell:
+                found = compare_runs(run_a, run_b, tell, repeats)
+    folder.mkdir(parents=True, exist_ok=True)
+    written = write_changes(found, folder)
+    page = write_page(found, run_a, run_b, folder)
+    if json:
+        show_json(changes_content(found))
+    elif not quiet:
+        show(verdict_text(found))
+        if found.physics is not None and found.physics.diagnosis.detection_limits and found.verdict == "same":
+            show(_limits(found.physics.diagnosis))
+        show(_screen(short_modes_table(found)))
+        for line in notes(found):
+            show(line)
+        show(f"Report: {page}; {written}")
+
+
+def _repeats(texts: list[str]) -> RepeatSettings:
+    from ema_pipeline.observations.pair import RepeatSettings
+    from ema_pipeline.pipeline import toml_value
+    from ema_pipeline.settings import parse
+
+    pairs = [text.partition("=") for text in texts]
+    return parse(
+        RepeatSettings, {name.strip(): toml_value(value.strip()) for name, _, value in pairs}, "--repeat"
+    )
+
+
+def _limits(diagnosis: Diagnosis) -> str:
+    from ema_pipeline.report.diagnosis_tables import detection_table
+
+    rows = detection_table(diagnosis).rows
+    return "These tests would show, nine times in ten: " + "; ".join(
+        f"{row.cells[0]} {row.cells[1]} from {row.cells[2]}" for row in rows
+    )
+
+
+def _screen(table: Table) -> Screen:
+    from rich import box
+    from rich.table import Table as Screen
+
+    made = Screen(box=box.SIMPLE)
+    for k, name in enumerate(table.head):
+        made.add_column(name, justify="right" if k in table.numeric else "left", overflow="fold")
+    for row in table.rows:
+        made.add_row(*row.cells)
+    return made
+
+
+def mac(
+    a: TestA,
+    b: Annotated[Path | None, typer.Argument(metavar="[B]", help="The model of A if left out.")] = None,
+    rig: RigOption = None,
+    json: Json = False,
+) -> None:
+    """Show the MAC of the modes of test A with those of test B, or with those of the rig's model."""
+    import tempfile
+
+    from ema_pipeline.changes.compare import open_test
+    from ema_pipeline.changes.matrices import mac_with_model, mac_with_test
+
+    with tempfile.TemporaryDirectory(prefix="ema-mac-") as scratch, progress(True) as show_stage:
+        run_a = open_test(a, rig, Path(scratch) / "A", show_stage)
+        if b is None:
+            found = mac_with_model(run_a)
+        else:
+            found = mac_with_test(run_a, open_test(b, rig, Path(scratch) / "B", show_stage))
+    if json:
+        show_json({"configurations": [m.content() for m in found]})
+        return
+    from rich import box
+    from rich.table import Table as Screen
+
+    for m in found:
+        table = Screen(
+            title=f"MAC, {m.configuration}: A down, {m.other} across", title_justify="left", box=box.SIMPLE
+        )
+        table.add_column("Hz", justify="right")
+        for hz in m.columns_hz:
+            table.add_column(f"{hz:.2f}", justify="right")
+        for hz, row in zip(m.rows_hz, m.values, strict=True):
+            table.add_row(f"{hz:.2f}", *(f"{v:.2f}" for v in row))
+        show(table)

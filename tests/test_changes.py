@@ -1,0 +1,241 @@
+"""What changed from one test to another: one rig, one set of sensors, an effect in B or none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bench import RIG, ema
+
+from ema_pipeline.changes.modes import mode_changes
+from ema_pipeline.changes.physics import pair_observations
+from ema_pipeline.correlate.matching import match_modes
+from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.dof import Dof
+from ema_pipeline.job import run_raw
+from ema_pipeline.observations.fitting import Model, fit_base
+from ema_pipeline.simulate import simulate_campaign
+
+TESTS = {"before": (1, ()), "again": (2, ()), "after": (3, ("mass@m2:mass=0.06",))}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three tests of one imperfect rig with one set of sensors; the last one with a mass added."""
+    root = tmp_path_factory.mktemp("changes")
+    (root / "bench.toml").write_text(RIG, encoding="utf-8")
+    for name, (seed, effects) in TESTS.items():
+        simulate_campaign(
+            root / name,
+            str(root / "bench.toml"),
+            sensors=["m1.x", "m2.x", "m3.x"],
+            impacts=["m1.x", "m3.x"],
+            sample_rate_hz=1024.0,
+            contact_s=2e-3,
+            hits=3,
+            format="hdf5",
+            seed=seed,
+            rig_seed=11,
+            effects=effects,
+            imperfection="normal",
+        )
+    return root
+
+
+def _told(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, object]:
+    code, said, err = ema(capsys, "changes", *arguments, "--json")
+    assert code == 0, err
+    return json.loads(said)  # type: ignore[no-any-return]
+
+
+def _results(root: Path, name: str) -> Path:
+    """The test run up to its modes, once."""
+    from ema_pipeline.changes.compare import MEASURING
+
+    run_raw(root / name, str(root / "bench.toml"), root / "out" / name, None, [MEASURING])
+    return root / "out" / name
+
+
+def test_two_tests_share_rig_and_sensors(root: Path) -> None:
+    """The same parts, damping and gains, other noise and other hits."""
+    truths = [json.loads((root / n / "truth.json").read_text())["imperfections"] for n in ("before", "again")]
+    for what in ("parts", "damping_factors", "channels"):
+        assert truths[0][what] == truths[1][what]
+    records = [json.loads((root / n / "truth.json").read_text())["configurations"]["default"] for n in TESTS]
+    assert records[0]["records"][0]["aim_deg"] != records[1]["records"][0]["aim_deg"]
+
+
+def test_an_added_mass_is_found_with_its_size(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From raw folders, and back again: what B has, A has not."""
+    out = root / "changed"
+    before, after = _results(root, "before"), _results(root, "after")
+    found = _told(capsys, before, after, "--rig", root / "bench.toml", "--out", out)
+    assert found == json.loads((out / "changes.json").read_text(encoding="utf-8"))
+    assert found["verdict"] == "changed"
+    (change,) = found["changes"]
+    assert (change["effect"], change["at"]) == ("mass", "m2")
+    assert "sensor_mass@m2" in change["also_called"]
+    assert abs(change["value"] - 0.06) < 3 * change["std"] < 0.02
+    assert change["probability"] > 0.9
+    assert found["modes"][0]["frequency_change"] < 0
+    assert "mass" in (out / "report.html").read_text(encoding="utf-8")
+
+    back = _told(capsys, after, before, "--rig", root / "bench.toml", "--out", root / "back")
+    assert back["verdict"] == "changed"
+    value = back["changes"][0]["value"]
+    assert abs(value + 0.06) < 4 * back["changes"][0]["std"]
+
+
+def test_an_unchanged_rig_is_the_same_with_limits(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """No change is claimed, and the least mass that would show is far below what one test shows."""
+    before, again = _results(root, "before"), _results(root, "again")
+    found = _told(capsys, before, again, "--rig", root / "bench.toml", "--out", root / "same")
+    assert found["verdict"] == "same"
+    assert found["changes"] == []
+    limits = {x["label"]: x["size"] for x in found["diagnosis"]["limits"]}  # type: ignore[index]
+    assert 0 < limits["mass@m2"] < 0.03
+    code, said, _ = ema(
+        capsys, "changes", before, again, "--rig", root / "bench.toml", "--out", root / "same"
+    )
+    assert code == 0
+    assert "The same within what these tests can show" in said
+    assert "These tests would show, nine times in ten: " in said
+
+
+def test_derivatives_of_the_pair_are_exact(root: Path) -> None:
+    """By all unknowns, against differences; the sum of the log scale is that of the joint covariance."""
+    from ema_pipeline.effects.library import parse_effect
+    from ema_pipeline.pipeline import existing_run
+
+    runs = [existing_run(_results(root, name)) for name in ("before", "after")]
+    observations = pair_observations(*runs)
+    assert runs[0].rig is not None
+    problem = observations.problem([parse_effect("mass@m2", runs[0].rig)], {})
+    random = np.random.default_rng(0)
+    scatters = {n: s.default * 1.3 for n, s in observations.scatters.items()}
+    x = 0.3 * problem.unknowns.prior_std(scatters) * random.standard_normal(len(problem.unknowns))
+    x[problem.unknowns.index["mass@m2.mass"]] = 0.2
+    here = problem.residuals(x, scatters)
+    for k in range(len(x)):
+        step = np.zeros(len(x))
+        step[k] = 1e-6
+        ends = [problem.residuals(x + s, scatters, matching=here.matching).values for s in (step, -step)]
+        assert here.jacobian[:, k] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-3, abs=2e-2)
+    drifts = [n for n in problem.unknowns.names if n.startswith("drift")]
+    assert drifts == ["drift of default in B", "drift of default in A"]
+
+
+def test_held_out_pairs_stay_together(root: Path) -> None:
+    """What is left out of A is left out of B; nothing is lost."""
+    from ema_pipeline.pipeline import existing_run
+
+    observations = pair_observations(*(existing_run(_results(root, n)) for n in ("before", "again")))
+    folds = observations.folds()
+    assert sum(len(d) for _, out in folds for d in out.a.data) == 3
+    for kept, out in folds:
+        assert sum(len(d) for d in kept.a.data) + sum(len(d) for d in out.a.data) == 3
+        for part in (kept, out):
+            for data in part.a.data:
+                pairs = part.pairs[data.configuration]
+                other = next(d for d in part.b.data if d.configuration == data.configuration)
+                assert np.allclose(data.log_frequency, other.log_frequency[pairs], atol=0.01)
+    base = fit_base(observations, Model())
+    assert base.posterior.error < 1.5
+
+
+def _modes(
+    frequencies: list[float], shapes: list[list[float]], std: float = 1e-3, sign: float = 1.0
+) -> MeasuredModes:
+    count = len(frequencies)
+    dofs = tuple(Dof.parse(n) for n in ("a.x", "b.x", "c.x"))
+    return MeasuredModes(
+        "default", np.array(frequencies), std * np.array(frequencies), np.full(count, 0.01), np.full(count, 1e-4),
+        sign * np.array(shapes, complex), np.full((count, 3), 0.01), dofs,
+    )  # fmt: skip
+
+
+SHAPES = [[1.0, 0.8, 0.3], [0.5, -0.6, 1.0], [0.9, -0.2, -0.7]]
+
+
+def test_modes_that_cross_are_matched_by_shape() -> None:
+    """The order of frequencies is another one in B."""
+    a = _modes([10.0, 20.0, 21.0], SHAPES)
+    b = _modes([10.1, 20.2, 20.8], [SHAPES[0], SHAPES[2], SHAPES[1]], sign=-2.0)
+    assert list(match_modes(a, b)) == [0, 2, 1]
+    found = mode_changes({"default": a}, {"default": b})
+    assert [(m.mode_a, m.mode_b) for m in found.modes] == [(1, 1), (2, 3), (3, 2)]
+    assert found.modes[0].mac == pytest.approx(1.0)
+
+
+def test_a_mode_of_one_test_alone_is_said() -> None:
+    """It has no partner."""
+    found = mode_changes(
+        {"default": _modes([10.0, 20.0], SHAPES[:2])},
+        {"default": _modes([10.0, 30.0], [SHAPES[0], SHAPES[2]])},
+    )
+    assert [m.mode_a for m in found.modes] == [1]
+    assert found.only_a == (("default", 2, 20.0),)
+    assert found.only_b == (("default", 2, 30.0),)
+
+
+def test_false_changes_are_as_rare_as_stated() -> None:
+    """200 pairs of tests of one structure, noise as stated: changes in 1 % of them, over all that is compared."""
+    random = np.random.default_rng(2)
+    false = 0
+    true = _modes([10.0, 20.0, 30.0], SHAPES)
+    assert true.shapes is not None
+    for _ in range(200):
+        tests = []
+        for _ in "ab":
+            frequency = true.frequency_hz + true.frequency_std_hz * random.standard_normal(3)
+            damping = true.damping_ratio + true.damping_std * random.standard_normal(3)
+            noise = random.standard_normal((3, 3)) + 1j * random.standard_normal((3, 3))
+            tests.append(
+                MeasuredModes(
+                    "default", frequency, true.frequency_std_hz, damping, true.damping_std,
+                    true.shapes + 0.01 * noise, true.shape_std, true.dofs,
+                )
+            )  # fmt: skip
+        false += mode_changes({"default": tests[0]}, {"default": tests[1]}).changed
+    assert false <= 7
+
+
+@pytest.mark.parametrize("what", ["frequency", "damping", "shape"])
+def test_a_true_change_of_a_mode_is_told(what: str) -> None:
+    """Each by itself, well beyond its interval."""
+    a = _modes([10.0, 20.0, 30.0], SHAPES)
+    b = _modes([10.0, 20.3 if what == "frequency" else 20.0, 30.0], SHAPES)
+    if what == "damping":
+        b.damping_ratio[1] = 0.012
+    if what == "shape":
+        assert b.shapes is not None
+        b.shapes[1, 0] += 0.15
+    changed = [m.changed for m in mode_changes({"default": a}, {"default": b}).modes]
+    assert changed == [(), (what,), ()]
+
+
+def test_mac_of_tests_and_of_the_model(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Near 1 on the diagonal."""
+    before, after = _results(root, "before"), _results(root, "after")
+    for arguments in ((before, after), (before,)):
+        code, said, _ = ema(capsys, "mac", *arguments, "--json")
+        assert code == 0
+        values = np.array(json.loads(said)["configurations"][0]["mac"])
+        assert values.shape == (3, 3)
+        assert np.diag(values).min() > 0.95
+        assert ema(capsys, "mac", *arguments)[0] == 0
+
+
+def test_wrong_tests_are_said_in_one_line(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No folder, no model, another rig."""
+    before = _results(root, "before")
+    assert (
+        "there is no such folder" in ema(capsys, "changes", before, tmp_path / "x", "-o", tmp_path / "o")[2]
+    )
+    code, _, err = ema(capsys, "changes", before, before, "--rig", "planetary", "-o", tmp_path / "o")
+    assert code == 1
+    assert "is not one of rig 'planetary'" in err
