@@ -22,6 +22,7 @@ from ema_pipeline.mechanics.modes import normal_modes
 from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
 from ema_pipeline.observations.fitting import Fit, Model
 from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.mode_residuals import FREQUENCY_NOISE, SHAPE_NOISE
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs import load_rig
 from ema_pipeline.rigs.types import ModelMode
@@ -186,14 +187,15 @@ def test_a_table_of_frequencies_is_sorted_and_none_may_be_zero() -> None:
 
 
 def as_drawn(measured: MeasuredModes, scatter: float) -> FittedModes:
-    """The true model beside measured modes, everything that scatters scattering by `scatter` of its default."""
+    """The true model beside measured modes, all but the test itself scattering by `scatter` of its default."""
     rig = load_rig("planetary")
     observations = ModeObservations(rig, [prepare(measured)])
     problem = observations.problem((), {})
     x = np.zeros(len(problem.unknowns))
     for name, value in TRUTH.items():
         x[problem.unknowns.index[name]] = np.log(value / rig.parameters[name].value)
-    scatters = {n: scatter * s.default for n, s in observations.scatters.items()}
+    own = (FREQUENCY_NOISE, SHAPE_NOISE)
+    scatters = {n: s.default * (1.0 if n in own else scatter) for n, s in observations.scatters.items()}
     posterior = Posterior(problem.unknowns, x, scatters, problem.residuals(x, scatters))
     return FittedModes(observations, problem, Fit(Model(), posterior))
 

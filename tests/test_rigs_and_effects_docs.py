@@ -90,7 +90,7 @@ def test_effect_of_the_page_is_diagnosed_and_laddered_by_its_file(
     assert ladder is not None
     base, added = ladder.rungs
     assert added.effects == ("oil_film@storey2",)
-    assert added.heldout_error < 1.5 < base.heldout_error / 5
+    assert added.heldout_error < 1.5 < base.heldout_error / 3
     for name, value in truth.items():
         size = added.parameters[f"oil_film@storey2.{name}"]
         assert abs(size.value - value) < 3 * size.std
