@@ -253,7 +253,7 @@ def test_a_fault_of_the_program_writes_a_report_and_says_where(
 
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
-    monkeypatch.setattr("ema_pipeline.raw_folder.check_raw", fail)
+    monkeypatch.setattr("ema_pipeline.raw_folder.check_records", fail)
     code, out, err = ema(capsys, "check", tmp_path)
     assert code == 1
     assert out == ""
@@ -273,7 +273,7 @@ def test_a_full_disk_is_one_line_wherever_it_is_met(
     def fail(*_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(tmp_path / "truth.json"))
 
-    monkeypatch.setattr("ema_pipeline.raw_folder.check_raw", fail)
+    monkeypatch.setattr("ema_pipeline.raw_folder.check_records", fail)
     code, _, err = ema(capsys, "check", tmp_path)
     assert code == 1
     assert "truth.json: No space left on device" in one_line(err)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -233,18 +232,8 @@ def test_a_folder_that_is_missing_empty_or_a_file_says_so(tmp_path: Path) -> Non
         read_campaign(file)
 
 
-def is_continuous(description: Path) -> bool:
-    """True for tests with continuous excitation, a kind that is refused in one line."""
-    return tomllib.loads(description.read_text(encoding="utf-8")).get("kind") == "continuous"
-
-
-def test_continuous_excitation_is_refused_in_one_line(test_data: Path) -> None:
-    with pytest.raises(EmaError, match="kind = 'continuous'"):
-        read_campaign(test_data / "realdata" / "silverbox")
-
-
 def test_every_description_of_the_test_data_is_understood(test_data: Path) -> None:
-    roots = {p.parent for p in test_data.glob("realdata/*/test.toml") if not is_continuous(p)}
+    roots = {p.parent for p in test_data.glob("realdata/*/test.toml")}
     roots |= {p.parent.parent for p in test_data.glob("blind/*/*/test.toml")}
     assert len(roots) >= 9
     for root in roots:
