@@ -316,7 +316,7 @@ def test_a_run_killed_again_and_again_ends_with_the_same_tables(
     for _ in range(10):
         process = subprocess.Popen([*RUN, str(small_raw), *RIG, "--out", str(out), "--quiet"])
         try:
-            process.wait(float(rng.uniform(0.6, 3.5)))
+            process.wait(float(rng.uniform(0.3, 1.8)))
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGKILL)
             process.wait()
