@@ -24,12 +24,11 @@ import scipy.stats
 
 from ema_pipeline.changes.compare import Changes, changes_content, compare_runs, open_test
 from ema_pipeline.observations.pair import RepeatSettings
-from ema_pipeline.simulate import simulate_campaign
 from ema_pipeline.stages.base import Run
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
-RIG = importlib.import_module("bench").RIG
+BENCH = importlib.import_module("bench")
 
 FACTOR = 2.2
 EFFECTS = ("mass", "spring", "damper")
@@ -41,28 +40,15 @@ INTERVAL = float(scipy.stats.norm.ppf(0.95))
 
 def test_of(folder: Path, name: str, case: int, seed: int, effects: tuple[str, ...]) -> Run:
     """One test, simulated and run up to its modes."""
-    simulate_campaign(
-        folder / name,
-        str(folder / "bench.toml"),
-        sensors=["m1.x", "m2.x", "m3.x"],
-        impacts=["m1.x", "m3.x"],
-        sample_rate_hz=1024.0,
-        contact_s=2e-3,
-        hits=3,
-        format="hdf5",
-        seed=seed,
-        rig_seed=1000 + case,
-        effects=effects,
-        imperfection="normal",
-        aim_deg=5.0,
+    raw = BENCH.write_bench(
+        folder, name, seed=seed, rig_seed=1000 + case, effects=effects, imperfection="normal", aim_deg=5.0
     )
-    return open_test(folder / name, str(folder / "bench.toml"), folder / "out" / name)
+    return open_test(raw, str(folder / "bench.toml"), folder / "out" / name)
 
 
 def one_case(case: int, repeat: RepeatSettings) -> dict[str, Any]:
     """An unchanged pair, and a pair with one effect."""
     folder = Path(tempfile.mkdtemp(prefix="changes-study-"))
-    (folder / "bench.toml").write_text(RIG, encoding="utf-8")
     random = np.random.default_rng(case)
     a = test_of(folder, "a", case, 10 * case + 1, ())
     again = test_of(folder, "again", case, 10 * case + 2, ())

@@ -22,34 +22,17 @@ import time
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
-from ema_pipeline.series.database import SeriesDatabase
-from ema_pipeline.simulate import simulate_campaign
-
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
-RIG = importlib.import_module("bench").RIG
+BENCH = importlib.import_module("bench")
 EMA = [sys.executable, "-m", "ema_pipeline.cli"]
 
 
 def simulate(root: Path, count: int, broken: int) -> Path:
     """Tests of one lot, every tenth with a mass added, and broken folders among them."""
-    (root / "bench.toml").write_text(RIG, encoding="utf-8")
     for i in range(count):
-        simulate_campaign(
-            root / "tree" / f"unit{i:04d}",
-            str(root / "bench.toml"),
-            sensors=["m1.x", "m2.x", "m3.x"],
-            impacts=["m1.x", "m3.x"],
-            sample_rate_hz=1024.0,
-            contact_s=2e-3,
-            hits=2,
-            format="hdf5",
-            seed=i,
-            imperfection="good",
-            effects=["mass@m2:mass=0.3"] if i % 10 == 7 else [],
-        )
+        effects = ["mass@m2:mass=0.3"] if i % 10 == 7 else []
+        BENCH.write_bench(root, f"tree/unit{i:04d}", hits=2, seed=i, imperfection="good", effects=effects)
     faults: tuple[Any, ...] = (
         lambda f: (f / "test.toml").write_text("channels = ["),
         lambda f: next(f.glob("*.h5")).write_bytes(b"rubbish"),
@@ -77,17 +60,11 @@ def timed(root: Path, out: str, jobs: int) -> dict[str, Any]:
     return {**json.loads(said.stdout), "wall": time.perf_counter() - start}
 
 
-def table(folder: Path) -> dict[str, pd.DataFrame]:
-    """What a series found, without where it lies and what it cost."""
-    database = SeriesDatabase.existing(folder)
-    found = {name: database.table(name) for name in ("tests", "modes", "parameters", "effects")}
-    database.close()
-    found["tests"] = found["tests"].drop(columns=["results"])
-    return found
-
-
 def same(a: Path, b: Path) -> bool:
-    return all(x.equals(y) for x, y in zip(table(a).values(), table(b).values(), strict=True))
+    return all(
+        x.equals(y)
+        for x, y in zip(BENCH.facts_of_series(a).values(), BENCH.facts_of_series(b).values(), strict=True)
+    )
 
 
 def killed(root: Path, out: str, kills: int, wall: float) -> None:
@@ -149,7 +126,7 @@ def main() -> None:
     print(
         f"driver {one['driver_mb']:.0f} MB, {one['driver_growth_mb']:.1f} MB more than after the first tenth"
     )
-    tests = table(root / "one")["tests"]
+    tests = BENCH.facts_of_series(root / "one")["tests"]
     failed = tests[tests["state"] != "ok"]
     print(f"{(tests['state'] == 'ok').sum()} rows with results, {len(failed)} with a reason:")
     for row in failed.itertuples():

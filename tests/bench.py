@@ -5,9 +5,11 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from ema_pipeline import cli
+from ema_pipeline.series.database import SeriesDatabase
 from ema_pipeline.simulate import simulate_campaign
 
 RIG = """
@@ -54,19 +56,30 @@ at = "m3.x"
 """
 
 
-def write_bench(folder: Path, **settings: object) -> Path:
-    """Write ``folder/bench.toml`` and a hammer test of it, ``folder/raw``; returns the raw folder."""
+def write_bench(folder: Path, name: str = "raw", **settings: object) -> Path:
+    """Write ``folder/bench.toml`` and a hammer test of it, ``folder/name``; returns the raw folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "bench.toml").write_text(RIG, encoding="utf-8")
-    given = {"sample_rate_hz": 1024.0, "contact_s": 2e-3, "hits": 3, "format": "hdf5", "seed": 4, **settings}
-    simulate_campaign(
-        folder / "raw",
-        str(folder / "bench.toml"),
-        sensors=["m1.x", "m2.x", "m3.x"],
-        impacts=["m1.x", "m3.x"],
-        **given,
-    )
-    return folder / "raw"
+    given = {
+        "sensors": ["m1.x", "m2.x", "m3.x"],
+        "impacts": ["m1.x", "m3.x"],
+        "sample_rate_hz": 1024.0,
+        "contact_s": 2e-3,
+        "hits": 3,
+        "format": "hdf5",
+        "seed": 4,
+    }
+    simulate_campaign(folder / name, str(folder / "bench.toml"), **given | settings)
+    return folder / name
+
+
+def facts_of_series(folder: Path) -> dict[str, pd.DataFrame]:
+    """All that a series found out, without where it lies and what it cost."""
+    database = SeriesDatabase.existing(folder)
+    found = {name: database.table(name) for name in ("tests", "modes", "parameters", "effects")}
+    database.close()
+    found["tests"] = found["tests"].drop(columns=["results"])
+    return found
 
 
 def ema(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:

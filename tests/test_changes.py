@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bench import RIG, ema
+from bench import ema, write_bench
 
 from ema_pipeline.changes.modes import mode_changes
 from ema_pipeline.changes.physics import pair_observations
@@ -16,7 +16,6 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.job import run_raw
 from ema_pipeline.observations.fitting import Model, fit_base
-from ema_pipeline.simulate import simulate_campaign
 
 TESTS = {"before": (1, ()), "again": (2, ()), "after": (3, ("mass@m2:mass=0.06",))}
 
@@ -25,22 +24,8 @@ TESTS = {"before": (1, ()), "again": (2, ()), "after": (3, ("mass@m2:mass=0.06",
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three tests of one imperfect rig with one set of sensors; the last one with a mass added."""
     root = tmp_path_factory.mktemp("changes")
-    (root / "bench.toml").write_text(RIG, encoding="utf-8")
     for name, (seed, effects) in TESTS.items():
-        simulate_campaign(
-            root / name,
-            str(root / "bench.toml"),
-            sensors=["m1.x", "m2.x", "m3.x"],
-            impacts=["m1.x", "m3.x"],
-            sample_rate_hz=1024.0,
-            contact_s=2e-3,
-            hits=3,
-            format="hdf5",
-            seed=seed,
-            rig_seed=11,
-            effects=effects,
-            imperfection="normal",
-        )
+        write_bench(root, name, seed=seed, rig_seed=11, effects=effects, imperfection="normal")
     return root
 
 

@@ -16,6 +16,7 @@ import report_example as example
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import (
     Candidate,
     DetectionLimit,
@@ -163,9 +164,9 @@ def test_three_that_fit_alike_are_counted_in_the_heading() -> None:
 
 
 def test_probability_is_never_rounded_to_certainty_or_to_nothing() -> None:
-    words = [diagnosis.probability_words(p) for p in (1.0, 0.99951, 0.9949, 0.97, 0.5, 0.032, 0.0004, 0.0)]
+    words = [probability_text(p) for p in (1.0, 0.99951, 0.9949, 0.97, 0.5, 0.032, 0.0004, 0.0)]
     assert words == [">99.9 %", ">99.9 %", "99.5 %", "97 %", "50 %", "3.2 %", "<0.1 %", "<0.1 %"]
-    assert diagnosis.probability_words(0.9951) != "100 %"
+    assert probability_text(0.9951) != "100 %"
 
 
 def test_commands_add_what_is_claimed_and_leave_out_what_is_in_the_model() -> None:

@@ -13,31 +13,18 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from bench import RIG, ema
+from bench import ema, facts_of_series, write_bench
 
 from ema_pipeline.series.database import SeriesDatabase
 from ema_pipeline.series.engine import LOST, in_processes
 from ema_pipeline.series.find import find_tests
 from ema_pipeline.series.one_test import Task
 from ema_pipeline.series.rows import TestRow, failed_row
-from ema_pipeline.simulate import simulate_campaign
 
 
 def _simulate(root: Path, names: list[str], **settings: object) -> Path:
-    (root / "bench.toml").write_text(RIG, encoding="utf-8")
     for i, name in enumerate(names):
-        simulate_campaign(
-            root / "tree" / name,
-            str(root / "bench.toml"),
-            sensors=["m1.x", "m2.x", "m3.x"],
-            impacts=["m1.x"],
-            sample_rate_hz=1024.0,
-            contact_s=2e-3,
-            hits=2,
-            format="hdf5",
-            seed=50 + i,
-            **settings,
-        )
+        write_bench(root, f"tree/{name}", impacts=["m1.x"], hits=2, seed=50 + i, **settings)
     return root / "tree"
 
 
@@ -53,15 +40,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def _facts(folder: Path) -> dict[str, pd.DataFrame]:
-    """All that a series found out, without what it cost."""
-    database = SeriesDatabase.existing(folder)
-    found = {name: database.table(name) for name in ("tests", "modes", "parameters", "effects")}
-    database.close()
-    found["tests"] = found["tests"].drop(columns=["results"])
-    return found
-
-
 def test_series_from_raw_folders_to_a_table(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Right rows, one reason, unchanged tests skipped, a changed one run again."""
     out = root / "S"
@@ -70,7 +48,7 @@ def test_series_from_raw_folders_to_a_table(root: Path, capsys: pytest.CaptureFi
     assert code == 0
     assert "4 tests: 4 run, 0 unchanged, 1 without results" in said
     assert "broken" in said
-    tests = _facts(out)["tests"].set_index("test")
+    tests = facts_of_series(out)["tests"].set_index("test")
     assert list(tests.index) == ["b1", "broken", "lot1/a1", "lot1/a2"]
     assert list(tests["state"]) == ["ok", "failed", "ok", "ok"]
     assert "channels" in tests.loc["broken", "reason"]
@@ -78,7 +56,7 @@ def test_series_from_raw_folders_to_a_table(root: Path, capsys: pytest.CaptureFi
     assert tests.loc["b1", "date"] == "2025-03-31"
     assert tests.loc["b1", "hits_used"] == 2
 
-    modes = _facts(out)["modes"]
+    modes = facts_of_series(out)["modes"]
     own = json.loads((out / "tests/lot1/a1/summary.json").read_text())["configurations"]["default"]["modes"]
     mine = modes[modes["test"] == "lot1/a1"]
     assert list(mine["frequency_hz"]) == pytest.approx([m["frequency_hz"] for m in own])
@@ -87,13 +65,13 @@ def test_series_from_raw_folders_to_a_table(root: Path, capsys: pytest.CaptureFi
     assert wide.loc["lot1/a1", "default.mode2.frequency_hz"] == pytest.approx(own[1]["frequency_hz"])
     assert list(pd.read_csv(out / "tests.csv").columns) == ["test", *wide.columns]
 
-    before = _facts(out)
+    before = facts_of_series(out)
     code, said, _ = ema(capsys, *command)
     assert "4 tests: 0 run, 4 unchanged, 1 without results" in said
     (root / "tree/lot1/a2/test.toml").touch()
     code, said, _ = ema(capsys, *command, "--json")
     assert json.loads(said)["computed"] == 1
-    after = _facts(out)
+    after = facts_of_series(out)
     for name in ("modes", "parameters"):
         pd.testing.assert_frame_equal(before[name], after[name])
 
@@ -163,7 +141,7 @@ def test_killed_and_resumed_gives_the_same_table(root: Path, tmp_path: Path) -> 
     assert 0 < len(database.table("tests")) < 4
     database.close()
     subprocess.run([*command, str(resumed)], check=True)
-    one, other = _facts(whole), _facts(resumed)
+    one, other = facts_of_series(whole), facts_of_series(resumed)
     for name in one:
         pd.testing.assert_frame_equal(one[name], other[name])
 
@@ -209,10 +187,10 @@ def test_dask_cluster_survives_a_lost_worker(root: Path, tmp_path: Path) -> None
         for process in (scheduler, *workers):
             process.kill()
             process.wait()
-    tests = _facts(out)["tests"]
+    tests = facts_of_series(out)["tests"]
     assert list(tests["test"]) == [f"u{i}" for i in range(8)]
     assert set(tests["state"]) == {"ok"}
-    assert len(_facts(out)["modes"]) == 8 * 3
+    assert len(facts_of_series(out)["modes"]) == 8 * 3
 
 
 @pytest.mark.parametrize("address", ["nonsense", "tcp://127.0.0.1:9"])

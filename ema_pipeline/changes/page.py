@@ -9,7 +9,7 @@ from typing import Any
 from ema_pipeline.changes.compare import Changes
 from ema_pipeline.changes.figures import overlays
 from ema_pipeline.changes.tables import change_lines, modes_table, notes, verdict_text
-from ema_pipeline.diagnose.sentences import label_text, size_text
+from ema_pipeline.diagnose.sentences import label_text, probability_text, size_text
 from ema_pipeline.files import replace_file
 from ema_pipeline.report.diagnosis_tables import detection_table
 from ema_pipeline.report.pages import page_templates
@@ -72,7 +72,7 @@ def _candidates(found: Changes) -> Table:
             (
                 label_text(c.label) + (" (in A)" if found.physics.reverse else ""),
                 size_text(c.parameters),
-                f"{100 * c.probability:.1f} %",
+                probability_text(c.probability),
                 f"{c.error_before:.2f} → {c.error_after:.2f}",
                 "claimed" if c.claimed else c.why,
             ),

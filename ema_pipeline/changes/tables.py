@@ -6,7 +6,7 @@ import math
 
 from ema_pipeline.changes.compare import Changes
 from ema_pipeline.changes.modes import LEVEL, ModeChange
-from ema_pipeline.diagnose.sentences import label_text
+from ema_pipeline.diagnose.sentences import label_text, probability_text
 from ema_pipeline.report.numbers import format_percent, format_value
 from ema_pipeline.report.tables import Row, Table
 
@@ -26,8 +26,8 @@ def verdict_text(found: Changes) -> str:
         )
     if diagnosis.verdict == "not_enough_data":
         return f"The tests have too few modes in common to tell a physical change. {_of_modes(found)}"
-    odds = 100 * diagnosis.null_probability
-    return f"The same within what these tests can show (probability that nothing changed: {odds:.0f} %)."
+    odds = probability_text(diagnosis.null_probability)
+    return f"The same within what these tests can show (probability that nothing changed: {odds})."
 
 
 def _of_modes(found: Changes) -> str:
@@ -49,7 +49,9 @@ def change_lines(found: Changes) -> list[str]:
             f"{name} {format_value(s.value, s.std, s.unit)}" for name, s in c.parameters.items()
         )
         same = f", the same as {', '.join(map(label_text, c.equivalents))}" if c.equivalents else ""
-        lines.append(f"{label_text(c.label)}{where}, {sizes} (probability {100 * c.probability:.0f} %{same})")
+        lines.append(
+            f"{label_text(c.label)}{where}, {sizes} (probability {probability_text(c.probability)}{same})"
+        )
     return lines
 
 

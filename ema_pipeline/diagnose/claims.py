@@ -10,6 +10,7 @@ from ema_pipeline.diagnose.heldout import HeldOut, held_out
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import Named, named, sizes_of
 from ema_pipeline.diagnose.ranking import Ranked, Ranking
+from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import widened
 from ema_pipeline.observations.base import Observations
@@ -96,7 +97,7 @@ def _weak(ranked: Ranked, gain: float, settings: DiagnoseSettings, nothing: floa
     if gain < settings.claim:
         return f"the log evidence that it gains, {gain:.1f}, is below {settings.claim:g}"
     if nothing > settings.doubt:
-        return f"that nothing is missing has a probability of {100 * nothing:.0f} %"
+        return f"that nothing is missing has a probability of {probability_text(nothing)}"
     if not ranked.hypothesis.extends:
         p = ranked.hypothesis.placed.effect.parameters[0]
         i = ranked.fit.posterior.unknowns.index[ranked.hypothesis.placed.parameter_name(p.name)]

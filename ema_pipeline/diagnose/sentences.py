@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from ema_pipeline.diagnose.types import NOT_TOLD, EffectSize, VerdictWord
@@ -17,6 +18,21 @@ def label_text(label: str) -> str:
     if effect == OUT_OF_TOLERANCE:
         return f"parameter {place} out of tolerance"
     return f"{effect.replace('_', ' ')} at {place}"
+
+
+def probability_text(p: float) -> str:
+    """A probability in per cent that is never rounded to certainty.
+
+    >>> probability_text(0.97), probability_text(0.99996), probability_text(1e-7)
+    ('97 %', '>99.9 %', '<0.1 %')
+    """
+    if not math.isfinite(p):
+        return "–"
+    if p > 0.999:
+        return ">99.9 %"
+    if p < 0.001:
+        return "<0.1 %"
+    return f"{100 * p:.1f} %" if p < 0.0995 or p > 0.9895 else f"{100 * p:.0f} %"
 
 
 def size_text(sizes: Mapping[str, EffectSize]) -> str:
@@ -52,7 +68,7 @@ def summary(
     if verdict == "ambiguous":
         return f"Several effects explain the data alike: {named}. The error falls from {before:.2f} to {after:.2f}."
     if verdict == "adequate":
-        odds = f"Probability that nothing is missing: {100 * nothing:.0f} %."
+        odds = f"Probability that nothing is missing: {probability_text(nothing)}."
         return f"The model explains the data: error {before:.2f}. {odds}"
     if verdict == "unknown_effect":
         best = f" The best that the library has is {named}." if named else ""

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ema_pipeline.effects.base import Effect, EffectParameter
-from ema_pipeline.effects.generic import bodies_pairs_and_dofs, is_place, place_rows
+from ema_pipeline.effects.generic import bodies_pairs_and_dofs, is_place, with_polynomial_springs
 from ema_pipeline.effects.places import bodies_with_bearings
 from ema_pipeline.mechanics.assembly import Assembly
-from ema_pipeline.mechanics.laws import PolynomialSpring
 
 
 def _places(assembly: Assembly) -> tuple[str, ...]:
@@ -18,15 +17,7 @@ def _places(assembly: Assembly) -> tuple[str, ...]:
 
 
 def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
-    if values["stiffness"] == 0.0:
-        return assembly
-    rows = place_rows(assembly, place)
-    return assembly.add(
-        *(
-            PolynomialSpring(f"cubic spring {i} at {place}", r, cubic=values["stiffness"])
-            for i, r in enumerate(rows)
-        )
-    )
+    return with_polynomial_springs(assembly, place, "cubic spring", cubic=values["stiffness"])
 
 
 EFFECT = Effect(

@@ -8,6 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from ema_pipeline.mechanics.assembly import Assembly, Mass, Row, difference
+from ema_pipeline.mechanics.laws import PolynomialSpring
 
 
 def bodies_and_dofs(assembly: Assembly) -> tuple[str, ...]:
@@ -55,6 +56,14 @@ def place_rows(assembly: Assembly, place: str) -> tuple[Row, ...]:
     return tuple(
         difference(assembly.row(f"{a}.{d}"), assembly.row(f"{b}.{d}")) for d in _shared(assembly, a, b)
     )
+
+
+def with_polynomial_springs(assembly: Assembly, place: str, title: str, **term: float) -> Assembly:
+    """The assembly with a nonlinear spring along every motion at a place; `term` is one of the law's coefficients."""
+    if not any(term.values()):
+        return assembly
+    rows = place_rows(assembly, place)
+    return assembly.add(*(PolynomialSpring(f"{title} {i} at {place}", r, **term) for i, r in enumerate(rows)))
 
 
 def usual_stiffness(assembly: Assembly) -> float:

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import datetime as dt
-import os
 from collections import Counter
 from dataclasses import dataclass
-from difflib import get_close_matches
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.errors import EmaError, did_you_mean
-from ema_pipeline.files import check_regular, read_bounded
-from ema_pipeline.ingest.driven_entries import check_driven, check_driven_test
+from ema_pipeline.errors import EmaError
+from ema_pipeline.files import read_bounded
+from ema_pipeline.ingest.driven_entries import check_driven_test
+from ema_pipeline.ingest.record_entries import check_records
 from ema_pipeline.ingest.records import CALIBRATION_STD, TRANSVERSE
 from ema_pipeline.names import check_name
 from ema_pipeline.plain_text import has_control_characters
@@ -275,7 +274,7 @@ def read_description(folder: Path) -> TestDescription:
     test = TestDescription.model_construct(folder=folder, **dict(keys))
     _check_texts(test)
     _check_channels(test)
-    _check_records(test)
+    check_records(test)
     return test
 
 
@@ -367,88 +366,6 @@ def _check_channel(channel: ChannelDescription, where: str) -> None:
         )
     if channel.full_scale is not None and channel.full_scale_v is not None:
         raise EmaError(f"{where}: give full_scale or full_scale_v, not both")
-
-
-def _check_records(test: TestDescription) -> None:
-    if not test.records:
-        raise EmaError(f"{test.file}: no records; add a [[records]] table for each record file")
-    seen: set[str] = set()
-    for record in test.records:
-        where = f"{test.file}: record '{record.file}'"
-        key = str(PurePosixPath(record.file))
-        if key in seen and test.kind != "continuous":
-            raise EmaError(f"{where}: is listed twice; its hits would count twice, keep one")
-        seen.add(key)
-        _check_file(test, record, where)
-        known = [c.name for c in test.channels]
-        for name in record.dofs:
-            if name not in known:
-                raise EmaError(f"{where}: dofs names an unknown channel '{name}'{did_you_mean(name, known)}")
-            if name == test.force.name and test.kind == "hammer":
-                raise EmaError(f"{where}: dofs names the hammer channel '{name}'; its dof is 'impact'")
-        if test.kind == "continuous":
-            check_driven(test, record, where)
-        else:
-            _check_not_driven(record, where)
-            (_check_hammer if test.kind == "hammer" else _check_sine)(test, record, where)
-
-
-def _check_file(test: TestDescription, record: RecordDescription, where: str) -> None:
-    relative = Path(record.file)
-    if relative.is_absolute() or ".." in relative.parts:
-        raise EmaError(f"{where}: lies outside {test.folder}; copy it there and name it without '..'")
-    path = test.path_of(record)
-    if not os.path.exists(path):  # False for names that no file can have, where Path.exists raises
-        try:
-            others = [p.name for p in path.parent.iterdir() if p.is_file() and p.name != DESCRIPTION_FILE]
-        except OSError:
-            others = []
-        close = get_close_matches(path.name, others, n=1, cutoff=0.6)
-        hint = f" (did you mean '{close[0]}'?)" if close else ""
-        raise EmaError(f"{where}: there is no such file{hint}; correct 'file' or remove the record")
-    try:
-        check_regular(path)
-    except EmaError as error:
-        raise EmaError(f"{where}: {error}") from None
-
-
-_DRIVEN_KEYS = ("excitation", "period_samples", "level", "first_sample", "last_sample")
-
-
-def _check_not_driven(record: RecordDescription, where: str) -> None:
-    given = next((key for key in _DRIVEN_KEYS if getattr(record, key) is not None), None)
-    if given is not None or record.use != "fit" or record.transient_samples:
-        named = given or ("use" if record.use != "fit" else "transient_samples")
-        raise EmaError(f'{where}: {named} belongs to kind = "continuous"; remove it or set kind')
-
-
-def _check_hammer(test: TestDescription, record: RecordDescription, where: str) -> None:
-    if record.impact is None:
-        raise EmaError(f'{where}: impact is missing; add the dof that the hammer strikes, impact = "sun.y"')
-    if record.frequency_hz is not None or record.amplitude_m is not None:
-        raise EmaError(f'{where}: frequency_hz and amplitude_m belong to kind = "hysteresis"; remove them')
-    taken: dict[str, str] = {}
-    for channel in test.responses:
-        dof = test.dof_of(channel, record)
-        if dof is None:
-            raise EmaError(
-                f"{where}: response channel '{channel.name}' has no dof; add dof to the channel or "
-                f'dofs = {{ {channel.name} = "body.direction" }} to the record'
-            )
-        if dof.point in taken:
-            raise EmaError(
-                f"{where}: channels '{taken[dof.point]}' and '{channel.name}' both measure {dof.point}; "
-                "correct one dof"
-            )
-        taken[dof.point] = channel.name
-
-
-def _check_sine(test: TestDescription, record: RecordDescription, where: str) -> None:
-    for key in ("frequency_hz", "amplitude_m"):
-        if getattr(record, key) is None:
-            raise EmaError(f"{where}: {key} is missing; a hysteresis record needs it")
-    if record.impact is not None:
-        raise EmaError(f"{where}: a hysteresis record has no impact; remove it or drop kind")
 
 
 def _check_campaign(raw: Path, tests: tuple[TestDescription, ...]) -> None:

@@ -6,6 +6,7 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.response_entries import check_no_sine, check_responses
 
 if TYPE_CHECKING:
     from ema_pipeline.ingest.description import RecordDescription, TestDescription
@@ -61,22 +62,8 @@ def check_driven(test: TestDescription, record: RecordDescription, where: str) -
         raise EmaError(
             f"{where}: a continuous record has no impact; remove it, the force channels have the dofs"
         )
-    if record.frequency_hz is not None or record.amplitude_m is not None:
-        raise EmaError(f'{where}: frequency_hz and amplitude_m belong to kind = "hysteresis"; remove them')
-    taken: dict[str, str] = {}
-    for channel in test.responses:
-        dof = test.dof_of(channel, record)
-        if dof is None:
-            raise EmaError(
-                f"{where}: response channel '{channel.name}' has no dof; add dof to the channel or "
-                f'dofs = {{ {channel.name} = "body.direction" }} to the record'
-            )
-        if dof.point in taken:
-            raise EmaError(
-                f"{where}: channels '{taken[dof.point]}' and '{channel.name}' both measure {dof.point}; "
-                "correct one dof"
-            )
-        taken[dof.point] = channel.name
+    check_no_sine(record, where)
+    check_responses(test, record, where)
     first, last = record.first_sample or 0, record.last_sample
     if last is not None and last <= first:
         raise EmaError(f"{where}: last_sample {last} does not lie behind first_sample {first}; correct one")

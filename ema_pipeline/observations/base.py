@@ -14,7 +14,10 @@ from ema_pipeline.observations.rig_model import SizeMap
 
 
 class EffectProblem(Problem, Protocol):
-    """The data and one model: the rig with a list of effects."""
+    """The data and one model: the rig with a list of effects.
+
+    A kind of data that inherits from it has no barriers, and needs no help with sizes, unless it says so.
+    """
 
     @property
     def sizes(self) -> Mapping[str, SizeMap]:
@@ -27,13 +30,13 @@ class EffectProblem(Problem, Protocol):
 
     def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
         """`x` with the sizes of the effect added last where a descent finds its way; None where it does anyway."""
-        ...
+        return None
 
     def escapes(
         self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
     ) -> list[NDArray[np.float64]]:
         """Points beyond a barrier that no descent passes, where the fit at `x` looks stuck before one."""
-        ...
+        return []
 
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """Values of the rig's parameters and of the effects' sizes."""

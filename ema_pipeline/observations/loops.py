@@ -20,6 +20,7 @@ from ema_pipeline.inference import Residuals, Scatter, Unknowns, descend, joined
 from ema_pipeline.loops.types import Loop
 from ema_pipeline.mechanics.assembly import Spring
 from ema_pipeline.mechanics.cycles import Cycles
+from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.loop_data import LoopData, left_out, typical_of
 from ema_pipeline.observations.loop_forces import ForceAtPoint, Isolator, IsolatorForce
 from ema_pipeline.observations.parts import Dependence, dependence, part_key
@@ -203,7 +204,7 @@ class LoopObservations:
         return pairs
 
 
-class LoopProblem:
+class LoopProblem(EffectProblem):
     """Measured loops and the isolator with a list of effects."""
 
     def __init__(self, observations: LoopObservations, model: RigModel) -> None:
@@ -226,16 +227,6 @@ class LoopProblem:
             Unknowns.plain((FORCE, DISPLACEMENT), np.maximum(std, 1e-9)),
             Unknowns.plain([f"force scale of {name}" for name in scales], SETTING_STD),
         )
-
-    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
-        """See `EffectProblem`: forces change with every size."""
-        return None
-
-    def escapes(
-        self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
-    ) -> list[NDArray[np.float64]]:
-        """See `EffectProblem`: none."""
-        return []
 
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""

@@ -21,6 +21,7 @@ from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
 from ema_pipeline.ingest.records import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
+from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_residuals import (
     DAMPING_SCATTER,
@@ -198,7 +199,7 @@ class Paired:
     match: NDArray[np.int64]
 
 
-class ModeProblem:
+class ModeProblem(EffectProblem):
     """Measured modes and the rig with a list of effects."""
 
     def __init__(self, observations: ModeObservations, model: RigModel) -> None:
@@ -215,10 +216,6 @@ class ModeProblem:
     def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
         """See `EffectProblem`."""
         return np.concatenate([self.model.start(sizes), np.zeros(len(self.unknowns) - self.offset)])
-
-    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
-        """See `EffectProblem`: modes change with every size."""
-        return None
 
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""

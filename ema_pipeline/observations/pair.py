@@ -19,6 +19,7 @@ from pydantic import Field
 
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Residuals, Scatter, Unknowns
+from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_residuals import (
     DAMPING_SCATTER,
@@ -171,7 +172,7 @@ class _Side:
     data: ModeData
 
 
-class PairProblem:
+class PairProblem(EffectProblem):
     """Two tests and the rig with a list of effects in B."""
 
     def __init__(self, observations: PairObservations, a: ModeProblem, b: ModeProblem) -> None:
@@ -204,16 +205,6 @@ class PairProblem:
         x = np.zeros(len(self.unknowns))
         x[self._to_b] = self.b.start(sizes)
         return x
-
-    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
-        """See `EffectProblem`: modes change with every size."""
-        return None
-
-    def escapes(
-        self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
-    ) -> list[NDArray[np.float64]]:
-        """See `EffectProblem`: none, the order of close modes is told by both tests."""
-        return []
 
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.inference import Residuals, Unknowns, joined
 from ema_pipeline.ingest.driven import DrivenRecord
+from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, RecordData
 from ema_pipeline.observations.record_model import RecordModel
 from ema_pipeline.observations.record_motion import Motion
@@ -29,7 +30,7 @@ _LEAST_NOISE = 1e-5
 """Noise, in units of the discrepancy, that nothing falls below."""
 
 
-class RecordProblem:
+class RecordProblem(EffectProblem):
     """Records and the rig with a list of effects."""
 
     def __init__(self, observations: RecordObservations, model: RecordModel) -> None:
@@ -63,16 +64,6 @@ class RecordProblem:
         return np.concatenate(
             [self.model.start(sizes), np.zeros(len(self.unknowns) - len(self.model.unknowns))]
         )
-
-    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
-        """See `EffectProblem`: responses change with every size."""
-        return None
-
-    def escapes(
-        self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
-    ) -> list[NDArray[np.float64]]:
-        """See `EffectProblem`: none."""
-        return []
 
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""

@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import Diagnosis, Rung
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.culprit import CulpritDrawing, culprit_drawing
@@ -132,9 +133,9 @@ def _against(found: Diagnosis) -> tuple[str, ...]:
     lines = list(diagnosis.group_words(found))
     named = {c.label for c in diagnosis.leading(found)}
     if found.verdict in ("effect", "ambiguous", "unknown_effect"):
-        nothing = diagnosis.probability_words(found.null_probability)
+        nothing = probability_text(found.null_probability)
         others = [
-            f"{diagnosis.label_words(c.label)} ({diagnosis.probability_words(c.probability)})"
+            f"{diagnosis.label_words(c.label)} ({probability_text(c.probability)})"
             for c in found.candidates
             if c.label not in named
         ][:_OTHERS]

@@ -6,7 +6,7 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 
-from ema_pipeline.diagnose.sentences import label_text
+from ema_pipeline.diagnose.sentences import label_text, probability_text
 from ema_pipeline.diagnose.types import (
     NOT_TOLD,
     OUT_OF_TOLERANCE,
@@ -64,21 +64,6 @@ def size_words(parameters: Mapping[str, EffectSize], between: str = "; ") -> str
         f"{words(n)} {format_value(s.value, s.std, s.unit) if s.told else NOT_TOLD}"
         for n, s in parameters.items()
     )
-
-
-def probability_words(p: float) -> str:
-    """A probability in per cent that is never rounded to certainty.
-
-    >>> probability_words(0.97), probability_words(0.99996), probability_words(1e-7)
-    ('97 %', '>99.9 %', '<0.1 %')
-    """
-    if not math.isfinite(p):
-        return "–"
-    if p > 0.999:
-        return ">99.9 %"
-    if p < 0.001:
-        return "<0.1 %"
-    return f"{100 * p:.1f} %" if p < 0.0995 or p > 0.9895 else f"{100 * p:.0f} %"
 
 
 def standing(found: Diagnosis, candidate: Candidate) -> str:
@@ -214,7 +199,7 @@ def group_words(found: Diagnosis) -> tuple[str, ...]:
 def compact(found: Diagnosis) -> str:
     """Verdict, best candidates with probability and size, error before and after, in a sentence or two."""
     if found.verdict == "adequate":
-        odds = probability_words(found.null_probability)
+        odds = probability_text(found.null_probability)
         return (
             f"Diagnosis: {_lower(heading(found))} (probability {odds}); error {plain(found.error, 3)}, "
             f"{plain(found.heldout_error, 3)} on held-out data."
@@ -231,7 +216,7 @@ def _named(found: Diagnosis) -> str:
     named = "; ".join(
         f"{missing}{label_words(c.label)}"
         + (f", {size_words(c.parameters, ', ')}" if c.parameters else "")
-        + f" (probability {probability_words(c.probability)}, "
+        + f" (probability {probability_text(c.probability)}, "
         + f"error {plain(c.error_before, 3)} → {plain(c.error_after, 3)})"
         for c in leading(found)
     )

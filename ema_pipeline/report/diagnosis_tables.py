@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import (
     EXTRA_COORDINATE,
     OUT_OF_TOLERANCE,
@@ -20,7 +21,6 @@ from ema_pipeline.report.diagnosis import (
     limit_words,
     limits_by_effect,
     of_modes,
-    probability_words,
     reasons,
     rung_words,
     size_words,
@@ -42,7 +42,7 @@ def candidates_table(found: Diagnosis) -> Table:
                 words(c.effect),
                 words(c.at),
                 size_words(c.parameters),
-                probability_words(c.probability),
+                probability_text(c.probability),
                 standing(found, c),
                 _change(c.error_before, c.error_after),
                 _change(c.heldout_before, c.heldout_error_after),
@@ -58,7 +58,7 @@ def candidates_table(found: Diagnosis) -> Table:
                 "nothing missing",
                 "",
                 "",
-                probability_words(found.null_probability),
+                probability_text(found.null_probability),
                 "",
                 plain(found.error, 3),
                 plain(found.heldout_error, 3),
@@ -82,7 +82,7 @@ def short_candidates_table(found: Diagnosis) -> Table:
             (
                 label_words(c.label),
                 size_words(c.parameters, ";\n"),
-                probability_words(c.probability),
+                probability_text(c.probability),
                 plain(c.error_after, 3),
                 plain(c.heldout_error_after, 3),
             ),
@@ -95,7 +95,7 @@ def short_candidates_table(found: Diagnosis) -> Table:
             (
                 "nothing missing",
                 "",
-                probability_words(found.null_probability),
+                probability_text(found.null_probability),
                 plain(found.error, 3),
                 plain(found.heldout_error, 3),
             ),

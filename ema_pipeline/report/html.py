@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ema_pipeline.correlate.types import ModeDifference
+from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.files import replace_file
 from ema_pipeline.report import diagnosis, diagnosis_tables, levels, summary, tables
 from ema_pipeline.report.band import band_of
@@ -209,7 +210,7 @@ def _diagnosis(results: RunResults) -> dict[str, Any]:
     return {
         "candidates": [_candidate(results, c) for c in found.candidates],
         "null": {
-            "probability": diagnosis.probability_words(found.null_probability),
+            "probability": probability_text(found.null_probability),
             "share": found.null_probability,
             "error": plain(found.error, 3),
             "held": plain(found.heldout_error, 3),
@@ -228,7 +229,7 @@ def _candidate(results: RunResults, c: Any) -> dict[str, Any]:
         "label": c.label,
         "name": diagnosis.label_words(c.label),
         "size": diagnosis.size_words(c.parameters),
-        "probability": diagnosis.probability_words(c.probability),
+        "probability": probability_text(c.probability),
         "share": c.probability,
         "standing": diagnosis.standing(found, c),
         "before": plain(c.error_before, 3),

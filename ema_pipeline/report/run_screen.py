@@ -11,6 +11,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.text import Text
 
 from ema_pipeline.correlate.types import percent_off
+from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import Weight, cautions, left_out, suspicions
@@ -118,7 +119,7 @@ def _diagnosed(found: Diagnosis) -> str:
     error = found.error
     heading = diagnosis.heading(found)
     if found.verdict == "adequate":
-        odds = diagnosis.probability_words(found.null_probability)
+        odds = probability_text(found.null_probability)
         return f"{heading} (probability {odds}, error {plain(error, 3)})."
     if found.verdict == "not_enough_data":
         return f"{heading}. {found.summary}"
@@ -132,7 +133,7 @@ def _diagnosed(found: Diagnosis) -> str:
         named.append(diagnosis.label_words(c.label) + (f", {shown}" if shown else ""))
     if found.verdict == "effect":
         mine = diagnosis.claimed(found)
-        odds = diagnosis.probability_words(min((c.probability for c in mine), default=math.nan))
+        odds = probability_text(min((c.probability for c in mine), default=math.nan))
         rungs = found.ladder.rungs
         fall = f", error {plain(error, 3)} → {plain(rungs[-1].error, 3)}" if rungs else ""
         return f"Missing: {'; '.join(named)} (probability {odds}{fall})."

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import scipy.stats
 
-from ema_pipeline.diagnose.sentences import label_text
+from ema_pipeline.diagnose.sentences import label_text, probability_text
 from ema_pipeline.report.numbers import format_value, plain
 from ema_pipeline.series.database import SeriesDatabase, rows_of
 from ema_pipeline.series.features import DAMPING, FREQUENCY, MAC, Features, features_of, modes_of_tests
@@ -163,7 +163,6 @@ def effects_text(effects: pd.DataFrame) -> str:
     told = []
     for (effect, at), sizes in effects.groupby(["effect", "at"], sort=False):
         listed = ", ".join(f"{s.name} {format_value(s.value, s.std, s.unit)}" for s in rows_of(sizes))
-        told.append(
-            f"{label_text(f'{effect}@{at}')}, {listed} (probability {100 * float(sizes['probability'].iloc[0]):.0f} %)"
-        )
+        odds = probability_text(float(sizes["probability"].iloc[0]))
+        told.append(f"{label_text(f'{effect}@{at}')}, {listed} (probability {odds})")
     return "; ".join(told)

@@ -12,7 +12,7 @@ from urllib.parse import quote
 import numpy as np
 import pandas as pd
 
-from ema_pipeline.diagnose.sentences import label_text
+from ema_pipeline.diagnose.sentences import label_text, probability_text
 from ema_pipeline.files import replace_file
 from ema_pipeline.report.numbers import format_value, plain
 from ema_pipeline.report.pages import page_templates
@@ -181,7 +181,7 @@ def _effect_table(effects: pd.DataFrame) -> dict[str, Any] | None:
                 label_text(f"{e.effect}@{e.at}"),
                 str(e.test),
                 f"{e.name} {format_value(e.value, e.std, e.unit)}",
-                f"{100 * e.probability:.0f} %",
+                probability_text(e.probability),
             )
         )
         for e in rows_of(effects.sort_values(["effect", "at", "test"]))

@@ -17,8 +17,9 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from ema_pipeline.correlate.types import Comparison, ModeDifference, Unpaired
+from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import Diagnosis, Ladder, Rung
-from ema_pipeline.report.diagnosis import NOTHING, label_words, probability_words, rung_words
+from ema_pipeline.report.diagnosis import NOTHING, label_words, rung_words
 from ema_pipeline.report.figures.comparison import severity, worst_per_body
 from ema_pipeline.report.figures.shapes import draw_gear
 from ema_pipeline.report.numbers import plain
@@ -78,7 +79,7 @@ def candidate_probabilities(found: Diagnosis) -> Figure:
             hatch="" if supported else "////",
             lw=0.8,
         )
-        text = probability_words(p) + (" ◆" if supported else "")
+        text = probability_text(p) + (" ◆" if supported else "")
         inside = p > 0.6
         ax.text(
             0.03 if inside else p + 0.02,
