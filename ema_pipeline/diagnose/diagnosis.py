@@ -79,7 +79,7 @@ def diagnose(
     said = [(j.hypothesis, j.named.name) for j in found.claimed]
     rungs = rungs_of(observations, [in_said_names(observations, f, said) for f in fits])
     in_model = set(found.final.model.labels)
-    left = scores(observations, found.final, [h for h in hypotheses if h.label not in in_model])
+    further = [h for h in hypotheses if h.label not in in_model]
     group = alike(found, settings)
     candidates = _candidates(found, settings, group)
     fails = not explains(found.final, settings)
@@ -100,13 +100,13 @@ def diagnose(
         candidates=candidates,
         indistinguishable=_groups(found, group),
         next_measurement=next_measurement(observations, found, group, verdict),
-        localisation=localise(left) if fails else (),
+        localisation=localise(scores(observations, found.final, further)) if fails else (),
         probabilities=dict(found.rounds[0].probabilities),
         error=rungs[0].error,
         heldout_error=rungs[0].heldout_error,
         ladder=ladder,
         notes=tuple(r for r in remarks if r),
-        detection_limits=() if fails else detection_limits(left, hypotheses, settings),
+        detection_limits=() if fails else detection_limits(observations, found.final, hypotheses, settings),
     )
 
 

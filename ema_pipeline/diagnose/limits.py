@@ -2,52 +2,166 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.expected_gain import Change, ExpectedGain
+from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
 from ema_pipeline.diagnose.probability import needed
-from ema_pipeline.diagnose.score import Score
+from ema_pipeline.diagnose.score import Marginal
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import DetectionLimit
+from ema_pipeline.inference import Residuals
+from ema_pipeline.observations.base import EffectProblem, Observations
+from ema_pipeline.observations.fitting import Fit, Model, transferred
 from ema_pipeline.observations.rig_model import SizeMap
 
 _NINE_OF_TEN = 1.2816
 """Quantile of the normal distribution: in nine tests of ten the estimate is no further than this below the truth."""
+_UNSEEN = 1e6
+"""1 σ of a size, in units of its prior, from which the data hold nothing of it."""
+_TRIALS = 6
+_NEAR = 0.03
+"""Relative accuracy of the gain at a limit."""
+_LARGEST_STEP = 1.4
+"""Largest step in the logarithm of a limit from one trial to the next."""
+_SLOPES = (0.3, 3.0)
+"""Least and largest power of the size with which the gain is taken to grow."""
 
 
 def detection_limits(
-    found: Iterable[Score], hypotheses: Sequence[Hypothesis], settings: DiagnoseSettings
+    observations: Observations,
+    fit: Fit,
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
 ) -> tuple[DetectionLimit, ...]:
-    """Limit of every effect, from the information that the data hold of its size beside everything uncertain.
+    """Limit of every effect, from what the data hold of its size beside everything uncertain.
 
-    An effect of size z·σ gains z²/2 in log evidence, less what its freedom costs, ½ ln(1 + (prior σ/σ)²). It has to
-    gain as much as a claim needs among so many hypotheses.
+    Its expected gain in log evidence (`ExpectedGain`), less what its freedom costs, ½ ln(1 + (prior σ/σ)²), has to be
+    as much as a claim needs among so many hypotheses. How far an effect moves the predictions is calculated at its
+    size: twice the damper does not move ln ζ twice as far.
+
+    Parameters
+    ----------
+    observations : Observations
+    fit : Fit
+        The model that explains the data; an effect that it has already is held against the model without it.
+    hypotheses : sequence of Hypothesis
+        All that compete.
+    settings : DiagnoseSettings
     """
-    limits = []
-    for score in found:
-        parameter = score.hypothesis.placed.effect.parameters[0]
-        name = score.hypothesis.placed.parameter_name(parameter.name)
-        size = SizeMap.of(parameter, score.hypothesis.scales.get(name, parameter.scale))
-        gain = needed(score.hypothesis, hypotheses, settings, found=0)
-        sigmas = max(settings.sigmas, float(np.sqrt(2 * gain + np.log1p(score.std**-2.0))))
-        unknown = score.std * (sigmas + _NINE_OF_TEN)
-        least = abs(size.slope(0.0)) * unknown
-        if least > parameter.maximum - parameter.null:
-            least = float("inf")
-        for name_of in score.hypothesis.names:
-            own = name_of.placed.effect.parameters[0]
-            own_size = SizeMap.of(own, name_of.scales.get(own.name, own.scale))
-            ratio = score.hypothesis.representative.relative / name_of.relative
-            limits.append(
-                DetectionLimit(
-                    name_of.label,
-                    own.name,
-                    least
-                    if name_of.label == score.hypothesis.label
-                    else abs(own_size.slope(0.0)) * unknown * ratio,
-                    own.unit,
-                )
+    had, limits = set(fit.model.labels), []
+    whole = ExpectedGain(fit.posterior, observations.scatters, Marginal(fit))
+    for hypothesis in hypotheses:
+        if hypothesis.extends:
+            continue
+        own = hypothesis.label in had
+        model = fit.model if own else fit.model.plus(hypothesis.placed, hypothesis.scales)
+        gains = whole
+        if own:
+            gains = ExpectedGain(
+                fit.posterior, observations.scatters, Marginal(fit, without=hypothesis.label)
             )
+        shown = _Shown.of(observations, fit, model, hypothesis, gains)
+        if shown is None:
+            continue
+        least = shown.least(needed(hypothesis, hypotheses, settings, found=0), settings.sigmas)
+        limits += [_under(name, hypothesis, least) for name in hypothesis.names]
     return tuple(limits)
+
+
+def _under(name: Name, hypothesis: Hypothesis, unknown: float) -> DetectionLimit:
+    """The limit as a size of one name."""
+    own = name.placed.effect.parameters[0]
+    size = SizeMap.of(own, name.scales.get(own.name, own.scale))
+    least = abs(size.slope(0.0)) * unknown * hypothesis.representative.relative / name.relative
+    seen = least <= own.maximum - own.null
+    return DetectionLimit(name.label, own.name, least if seen else float("inf"), own.unit)
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """How far one effect moves the predictions.
+
+    Attributes
+    ----------
+    problem : EffectProblem
+    null : ndarray, (n,)
+        Unknowns with the effect at nothing.
+    at : int
+        Position of its first size.
+    scatters : dict of str to float
+    before : Residuals
+        At `null`, with derivatives.
+    gains : ExpectedGain
+    std : float
+        1 σ of the unknown at nothing.
+    """
+
+    problem: EffectProblem
+    null: NDArray[np.float64]
+    at: int
+    scatters: Mapping[str, float]
+    before: Residuals
+    gains: ExpectedGain
+    std: float
+
+    @classmethod
+    def of(
+        cls, observations: Observations, fit: Fit, model: Model, hypothesis: Hypothesis, gains: ExpectedGain
+    ) -> _Shown | None:
+        """Of one hypothesis; None where these data hold nothing of it."""
+        problem, scatters = model.problem(observations), fit.posterior.scatters
+        null = transferred(fit.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+        size = hypothesis.placed.effect.parameters[0].name
+        at = problem.unknowns.index[hypothesis.placed.parameter_name(size)]
+        null[at] = 0.0
+        before = problem.residuals(null, scatters, matching=fit.posterior.residuals.matching)
+        if len(before.values) != gains.marginal.count or not np.all(np.isfinite(before.values)):
+            return None
+        std = 1 / np.sqrt(max(gains.change(before.jacobian[:, at]).total, 1e-300))
+        if std > _UNSEEN:
+            return None
+        return cls(problem, null, at, scatters, before, gains, float(std))
+
+    def least(self, gain: float, sigmas: float) -> float:
+        """Unknown of the least size that gains so much in nine tests of ten; infinite where none does."""
+        wanted = max(gain + 0.5 * float(np.log1p(self.std**-2.0)), 0.5 * sigmas**2)
+        most = float(self.problem.unknowns.upper[self.at])
+        unknown = self.std * (np.sqrt(2 * wanted) + _NINE_OF_TEN)
+        known: list[tuple[float, float]] = []
+        for _ in range(_TRIALS):
+            unknown = min(unknown, most)
+            log, off = float(np.log(unknown)), float(np.log(max(self._gained(unknown), 1e-9) / wanted))
+            if abs(off) < _NEAR or (unknown == most and off < 0):
+                break
+            slope = 2.0
+            if known and log != known[-1][0]:
+                slope = float(np.clip((off - known[-1][1]) / (log - known[-1][0]), *_SLOPES))
+            known.append((log, off))
+            unknown = float(np.exp(log - np.clip(off / slope, -_LARGEST_STEP, _LARGEST_STEP)))
+        return unknown if unknown < most or off >= 0 else float("inf")
+
+    def _gained(self, unknown: float) -> float:
+        """Log evidence that a size gains in nine tests of ten."""
+        change = self._moved(unknown)
+        distance = float(np.sqrt(max(change.total, 1e-300)))
+        return self.gains.of(change, max(1 - _NINE_OF_TEN / distance, 0.0) ** 2)
+
+    def _moved(self, unknown: float) -> Change:
+        """How far the predictions move; to first order where modes change their partners."""
+        x = self.null.copy()
+        x[self.at] = unknown
+        there = self.problem.residuals(x, self.scatters, derivatives=False)
+        if _same_pairs(there.matching, self.before.matching) and np.all(np.isfinite(there.values)):
+            return self.gains.change(there.values - self.before.values)
+        return self.gains.change(self.before.jacobian[:, self.at] * unknown)
+
+
+def _same_pairs(a: object, b: object) -> bool:
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(_same_pairs(x, y) for x, y in zip(a, b, strict=True))
+    return bool(np.array_equal(np.asarray(a), np.asarray(b)))

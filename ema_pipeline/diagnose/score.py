@@ -52,7 +52,7 @@ def scores(
         The base model with each hypothesis, by its label, where they are at hand.
     """
     found = []
-    factor = _Marginal(base)
+    factor = Marginal(base)
     for hypothesis in hypotheses:
         if hypothesis.extends:
             continue
@@ -66,27 +66,48 @@ def scores(
         )
         if residuals.jacobian.shape[0] != factor.count:
             continue
-        columns = residuals.weighted[1][:, at]
+        columns = residuals.jacobian[:, at] * factor.weight[:, None]
         found.append(factor.score(hypothesis, columns, problem.unknowns.lower[at]))
     return found
 
 
-class _Marginal:
-    """Residual and information of new directions once everything that is uncertain already is allowed for."""
+class Marginal:
+    """Residual and information of new directions once everything that is uncertain already is allowed for.
 
-    def __init__(self, base: Fit) -> None:
+    Parameters
+    ----------
+    base : Fit
+    without : str
+        Label of an effect of the model whose sizes are not counted among what is uncertain.
+    """
+
+    def __init__(self, base: Fit, without: str = "") -> None:
         p = base.posterior
         self.residual, jacobian = p.residuals.weighted
-        self.count = len(self.residual)
-        self.whitened = jacobian * p.prior_std
+        self.weight, self.count = p.residuals.weight, len(self.residual)
+        self.kept = np.array([not without or not n.startswith(without + ".") for n in p.unknowns.names], bool)
+        self.whitened = (jacobian * p.prior_std)[:, self.kept]
         information = np.eye(self.whitened.shape[1]) + self.whitened.T @ self.whitened
         self.factor = scipy.linalg.cho_factor(information, check_finite=False)
 
     def information(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Fisher information of directions, the rest marginalised, (k, k)."""
+        """Fisher information of weighted directions, the rest marginalised, (k, k)."""
         shared = self.whitened.T @ columns
         solved = scipy.linalg.cho_solve(self.factor, shared, check_finite=False)
         return np.asarray(columns.T @ columns - shared.T @ solved)
+
+    def left(self, change: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What a change of the residuals, (m,), leaves of them when all that is uncertain has followed it.
+
+        Returns
+        -------
+        residuals : ndarray, (m,)
+        unknowns : ndarray, (n,)
+            How far they have moved, in units of their prior σ.
+        """
+        weighted = change * self.weight
+        moved = -scipy.linalg.cho_solve(self.factor, self.whitened.T @ weighted, check_finite=False)
+        return weighted + self.whitened @ moved, moved
 
     def score(
         self, hypothesis: Hypothesis, columns: NDArray[np.float64], lower: NDArray[np.float64]

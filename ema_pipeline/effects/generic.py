@@ -31,9 +31,11 @@ def bodies_and_lone_dofs(assembly: Assembly) -> tuple[str, ...]:
 
 
 def bodies_pairs_and_dofs(assembly: Assembly) -> tuple[str, ...]:
-    """Bodies, pairs of bodies that share a direction, then single DOFs."""
-    pairs = (f"{a}-{b}" for a, b in combinations(assembly.bodies, 2) if _shared(assembly, a, b))
-    return (*assembly.bodies, *pairs, *assembly.dofs)
+    """Bodies, pairs of bodies that share a direction, then single DOFs and pairs of DOFs of one direction."""
+    bodies = [(a, b, _shared(assembly, a, b)) for a, b in combinations(assembly.bodies, 2)]
+    pairs = [f"{a}-{b}" for a, b, shared in bodies if shared]
+    lone = [f"{a}.{d}-{b}.{d}" for a, b, shared in bodies if len(shared) > 1 for d in shared]
+    return (*assembly.bodies, *pairs, *assembly.dofs, *lone)
 
 
 def is_place(assembly: Assembly, place: str) -> bool:

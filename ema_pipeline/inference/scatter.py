@@ -87,12 +87,16 @@ def widened(found: Posterior, scatters: Mapping[str, Scatter]) -> dict[str, floa
         if not scatter.spread:
             result[name] = now
             continue
-        governed = found.unknowns.governed(name)
-        told = float(np.sum(1 - np.minimum(found.std[governed] / found.prior_std[governed], 1.0) ** 2))
-        share = found.residuals.share.get(name)
-        told += 0.0 if share is None else float(np.sum(share))
-        result[name] = now * float(np.exp(1 / (2 * told + scatter.spread**-2.0)))
+        result[name] = now * float(np.exp(1 / (2 * determined(found, name) + scatter.spread**-2.0)))
     return result
+
+
+def determined(found: Posterior, name: str) -> float:
+    """Number of unknowns and residuals that determine a scatter, each by the share that the data hold of it."""
+    governed = found.unknowns.governed(name)
+    told = float(np.sum(1 - np.minimum(found.std[governed] / found.prior_std[governed], 1.0) ** 2))
+    share = found.residuals.share.get(name)
+    return told + (0.0 if share is None else float(np.sum(share)))
 
 
 _RELAXATION = 1.5
