@@ -14,7 +14,7 @@ from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import widened
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, at_scatters
+from ema_pipeline.observations.fitting import Fit, at_scatters, within_scatter
 
 HELD_OUT_TIE = 1.0
 """Log density of data held out by which a claim may be behind: a base model that bends one part beyond all scatter
@@ -79,6 +79,7 @@ def judge(
     name = named(ranked.hypothesis, ranked.fit)
     gain = ranked.gain + name.advantage
     base = at_scatters(observations, ranking.base, ranked.fit.posterior.scatters)
+    base = within_scatter(observations, base)
     before = after = HeldOut(float("nan"), float("nan"))
     doubt = _weak(ranked, gain, settings, nothing)
     if not doubt:

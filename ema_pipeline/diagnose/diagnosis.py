@@ -71,7 +71,7 @@ def diagnose(
     if hypotheses is None:
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
     found = select(observations, known, hypotheses, settings, progress)
-    verdict = verdict_of(found, settings)
+    verdict = verdict_of(observations, found, settings)
     start = found.rounds[0].ranking.base
     fits = [start, *(j.ranked.fit for j in found.claimed)]
     if found.claimed:
@@ -82,7 +82,7 @@ def diagnose(
     further = [h for h in hypotheses if h.label not in in_model]
     group = alike(found, settings)
     candidates = _candidates(found, settings, group)
-    fails = not explains(found.final, settings)
+    fails = not explains(observations, found.final, settings)
     told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.claimed]
     if verdict == "ambiguous":
         names = [j.named.label for j in group]
@@ -91,7 +91,7 @@ def diagnose(
     scatter = learned_scatters(observations, found.final)
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found), scatters=scatter)
     remarks = list(notes)
-    outlying = outlying_parts(found.final, settings)
+    outlying = outlying_parts(found.final)
     remarks.insert(0, sentences.standing_out(outlying, found.final.posterior.scatters.get(PART_SCATTER, 0.0)))
     return Diagnosis(
         verdict=verdict,

@@ -8,9 +8,9 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from ema_pipeline.inference import Posterior, Residuals
+from ema_pipeline.inference import Bounded, Posterior, Residuals, descend
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, refined, transferred
+from ema_pipeline.observations.fitting import PARTS, Fit, transferred
 
 _STEPS = 8
 
@@ -36,12 +36,16 @@ NOTHING_HELD_OUT = HeldOut(float("nan"), float("nan"))
 
 
 def held_out(observations: Observations, fit: Fit) -> HeldOut:
-    """Fit to all but one part, foretell that part, in turn; scatters as they are in `fit`."""
+    """Fit to all but one part, foretell that part, in turn; scatters as they are in `fit`.
+
+    No part may lie further out than parts scatter: a model that bends one as far as an effect would has the effect,
+    under another name, and foretells as well.
+    """
     squares, count, density = 0.0, 0, 0.0
     for kept, out in observations.folds():
-        problem = fit.model.problem(kept)
+        problem, scatters = fit.model.problem(kept), fit.posterior.scatters
         start = transferred(fit.posterior, problem.unknowns, problem.start())
-        trained = refined(kept, fit.model, start, fit.posterior.scatters, steps=_STEPS).posterior
+        trained = descend(Bounded(problem, scatters, PARTS), scatters, start, steps=_STEPS)
         part = _predicted(out, fit, trained)
         squares, count, density = squares + part[0], count + part[1], density + part[2]
     if not count:

@@ -162,6 +162,11 @@ class _Shown:
 
 
 def _same_pairs(a: object, b: object) -> bool:
-    if isinstance(a, tuple) and isinstance(b, tuple):
+    """True where two assignments of data to the model, nested in any way, are the same."""
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return np.array_equal(a, b)
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return a.keys() == b.keys() and all(_same_pairs(a[k], b[k]) for k in a)
+    if isinstance(a, Sequence) and isinstance(b, Sequence) and not isinstance(a, str):
         return len(a) == len(b) and all(_same_pairs(x, y) for x, y in zip(a, b, strict=True))
-    return bool(np.array_equal(np.asarray(a), np.asarray(b)))
+    return a is b or bool(a == b)

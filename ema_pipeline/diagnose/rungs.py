@@ -9,7 +9,16 @@ from ema_pipeline.diagnose.types import EffectSize, Ladder, LearnedScatter, Rung
 from ema_pipeline.inference import Posterior
 from ema_pipeline.inference.maximise import ANNEALING, anneal
 from ema_pipeline.observations.base import EffectProblem, Observations
-from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned, refined, transferred
+from ema_pipeline.observations.fitting import (
+    Fit,
+    Model,
+    at_scatters,
+    fit_base,
+    learned,
+    refined,
+    transferred,
+    within_scatter,
+)
 
 
 def rungs_of(observations: Observations, fits: Sequence[Fit]) -> tuple[Rung, ...]:
@@ -21,8 +30,9 @@ def rungs_of(observations: Observations, fits: Sequence[Fit]) -> tuple[Rung, ...
 
 
 def rung(observations: Observations, fit: Fit, base_evidence: float, held: HeldOut) -> Rung:
-    """One model of the ladder."""
-    problem = fit.model.problem(observations)
+    """One model of the ladder, no part further out than parts scatter; its evidence is the whole fit's."""
+    evidence = fit.log_evidence - base_evidence
+    problem, fit = fit.model.problem(observations), within_scatter(observations, fit)
     return Rung(
         effects=fit.model.labels,
         error=fit.posterior.error,
@@ -30,7 +40,7 @@ def rung(observations: Observations, fit: Fit, base_evidence: float, held: HeldO
         chi2=float(fit.posterior.residuals.values @ fit.posterior.residuals.values),
         objective=2 * fit.posterior.cost,
         parameters=parameter_sizes(problem, fit.posterior),
-        log_evidence=fit.log_evidence - base_evidence,
+        log_evidence=evidence,
         unexplained=fit.posterior.residuals.unexplained,
         unknowns=fit.unknowns,
     )

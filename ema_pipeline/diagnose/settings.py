@@ -49,12 +49,6 @@ class DiagnoseSettings(Settings):
     error_limit: float = Field(
         default=1.5, gt=1, description="Error up to which a model counts as one that explains the data."
     )
-    part_limit: float = Field(
-        default=4.0,
-        gt=1,
-        description="Deviation of a single part, in units of the learned scatter of parts, from which it is itself a "
-        "finding: one healthy rig of 40 parts in 400 has such a part.",
-    )
     folds: int = Field(default=4, ge=2, le=20, description="Parts that the modes are held out in, in turn.")
     most_effects: int = Field(default=3, ge=1, le=6, description="Most effects that are added in turn.")
     candidates: int = Field(default=5, ge=1, description="Number of candidates that are reported.")

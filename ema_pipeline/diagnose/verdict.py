@@ -8,27 +8,27 @@ from ema_pipeline.diagnose.claims import Judged
 from ema_pipeline.diagnose.selection import Selection
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import VerdictWord
-from ema_pipeline.observations.fitting import Fit
-from ema_pipeline.observations.parts import FREE_STD, MASS_SCATTER, PART_SCATTER
+from ema_pipeline.inference import beyond_scatter
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import PARTS, Fit, within_scatter
+from ema_pipeline.observations.parts import FREE_STD
 
 MOST_UNEXPLAINED = 1
 """Measured modes without a partner in a model that explains the data: one may be invented, or of the floor."""
 
 
-def explains(fit: Fit, settings: DiagnoseSettings) -> bool:
-    """True where the model explains the data, all measured modes but one, and no part deviates more than parts do."""
-    left = fit.posterior.residuals.unexplained
-    small = fit.posterior.error <= settings.error_limit and left <= MOST_UNEXPLAINED
-    return small and not outlying_parts(fit, settings)
+def explains(observations: Observations, fit: Fit, settings: DiagnoseSettings) -> bool:
+    """True where the model explains the data, all measured modes but one, no part further out than parts scatter."""
+    found = within_scatter(observations, fit).posterior
+    return found.error <= settings.error_limit and found.residuals.unexplained <= MOST_UNEXPLAINED
 
 
-def outlying_parts(fit: Fit, settings: DiagnoseSettings) -> dict[str, float]:
-    """Relative deviation of every part that lies further out than the scatter of parts allows, furthest first."""
-    governed = fit.posterior.unknowns.governed(PART_SCATTER) | fit.posterior.unknowns.governed(MASS_SCATTER)
-    far = np.abs(fit.posterior.x) > settings.part_limit * fit.posterior.prior_std
+def outlying_parts(fit: Fit) -> dict[str, float]:
+    """Relative deviation of every part that lies further out than the scatter of parts reaches, furthest first."""
+    names = fit.posterior.unknowns.names
     found = {
-        fit.posterior.unknowns.names[i]: float(np.expm1(fit.posterior.x[i]))
-        for i in np.flatnonzero(governed & far)
+        names[i]: float(np.expm1(fit.posterior.x[i]))
+        for i in np.flatnonzero(beyond_scatter(fit.posterior, PARTS))
     }
     return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
 
@@ -44,11 +44,11 @@ def too_few(fit: Fit) -> bool:
     return len(residuals.values) - residuals.projected <= len(loose) + 1
 
 
-def verdict_of(found: Selection, settings: DiagnoseSettings) -> VerdictWord:
+def verdict_of(observations: Observations, found: Selection, settings: DiagnoseSettings) -> VerdictWord:
     """What the data support."""
     if not found.claimed and too_few(found.final):
         return "not_enough_data"
-    if not explains(found.final, settings):
+    if not explains(observations, found.final, settings):
         return "unknown_effect"
     if not found.claimed:
         return "adequate"

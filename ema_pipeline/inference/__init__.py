@@ -4,6 +4,7 @@ Knows no rig, no mode and no effect. A problem hands over its unknowns and its r
 everything else that a user sees is read from the `Posterior`.
 """
 
+from ema_pipeline.inference.bounded import Bounded, beyond_scatter
 from ema_pipeline.inference.maximise import anneal, descend
 from ema_pipeline.inference.posterior import Posterior
 from ema_pipeline.inference.problem import Problem, Residuals
@@ -11,12 +12,14 @@ from ema_pipeline.inference.scatter import Scatter, learn, widened
 from ema_pipeline.inference.unknowns import Unknowns, joined
 
 __all__ = [
+    "Bounded",
     "Posterior",
     "Problem",
     "Residuals",
     "Scatter",
     "Unknowns",
     "anneal",
+    "beyond_scatter",
     "descend",
     "joined",
     "learn",

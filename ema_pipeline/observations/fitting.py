@@ -10,10 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect
-from ema_pipeline.inference import Posterior, Unknowns, anneal, descend, learn
+from ema_pipeline.inference import Bounded, Posterior, Unknowns, anneal, beyond_scatter, descend, learn
 from ema_pipeline.inference.maximise import ANNEALING
 from ema_pipeline.observations.base import EffectProblem, Observations
+from ema_pipeline.observations.parts import MASS_SCATTER, PART_SCATTER
 
+PARTS = (PART_SCATTER, MASS_SCATTER)
+"""Scatters of what the model is made of. A channel may be off by any factor, the model is none the worse for it."""
 _MOST_ESCAPES = 4
 """Barriers that a fit is led past, one after the other."""
 
@@ -154,6 +157,18 @@ def learned(observations: Observations, fit: Fit) -> Fit:
 def at_scatters(observations: Observations, fit: Fit, scatters: Mapping[str, float]) -> Fit:
     """The fit at given scatters, so that the errors of several models compare."""
     return refined(observations, fit.model, fit.posterior.x, scatters)
+
+
+def within_scatter(observations: Observations, fit: Fit) -> Fit:
+    """The fit with no part further out than parts scatter; the same where none is.
+
+    A model that bends one part ten standard deviations follows the data, but it is no longer the model that was meant.
+    """
+    p = fit.posterior
+    if not np.any(beyond_scatter(p, PARTS)):
+        return fit
+    problem = Bounded(fit.model.problem(observations), p.scatters, PARTS)
+    return replace(fit, posterior=descend(problem, p.scatters, p.x))
 
 
 def fit_base(observations: Observations, model: Model, start: Fit | None = None) -> Fit:
