@@ -141,10 +141,10 @@ def sizes(lines: Iterable[Line]) -> list[float]:
 
 
 def parameters(lines: Iterable[Line]) -> list[float]:
-    """The same of the model's own parameters, where nothing is hidden or all that is was named."""
+    """The same of the model's own parameters where nothing is hidden: the fit is that of the model without effects."""
     z = []
     for line in lines:
-        if line.get("failed") or outcome(line) != "right":
+        if line.get("failed") or line["truth"]:
             continue
         for name, (value, std) in line["fit"].items():
             if name in line["values"] and value is not None and std:

@@ -101,7 +101,8 @@ def test_coverage_ranks_and_calibration_of_known_draws() -> None:
     assert tally.coverage(2 * z) < 0.65
     assert min(tally.ranks(z)) > 340
     assert tally.sizes([line()]) == [pytest.approx(1.0)]
-    assert tally.parameters([line()]) == [pytest.approx(1.0)]
+    assert tally.parameters([line(truth=[])]) == [pytest.approx(1.0)]
+    assert tally.parameters([line()]) == []  # fitted without what is hidden
     assert tally.calibration_error([(0.75, True)] * 3 + [(0.75, False)]) == pytest.approx(0.0)
     assert tally.calibration_error([(0.95, False)] * 4) == pytest.approx(0.95)
     assert tally.statements([line()]) == [(0.9, True)]

@@ -23,8 +23,8 @@ _NINE_OF_TEN = 1.2816
 """Quantile of the normal distribution: in nine tests of ten the estimate is no further than this below the truth."""
 _UNSEEN = 1e6
 """1 σ of a size, in units of its prior, from which the data hold nothing of it."""
-_TRIALS = 6
-_NEAR = 0.03
+_TRIALS = 5
+_NEAR = 0.1
 """Relative accuracy of the gain at a limit."""
 _LARGEST_STEP = 1.4
 """Largest step in the logarithm of a limit from one trial to the next."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from ema_pipeline.diagnose.heldout import HeldOut, held_out
 from ema_pipeline.diagnose.types import EffectSize, Ladder, LearnedScatter, Rung
 from ema_pipeline.inference import Posterior
@@ -15,6 +17,7 @@ from ema_pipeline.observations.fitting import (
     at_scatters,
     fit_base,
     learned,
+    made_up_of,
     refined,
     transferred,
     within_scatter,
@@ -56,9 +59,8 @@ def parameter_sizes(problem: EffectProblem, posterior: Posterior) -> dict[str, E
             continue
         size = problem.sizes.get(name)
         slope = abs(size.slope(float(posterior.x[i]))) if size is not None else abs(value)
-        found[name] = EffectSize(
-            value, float(posterior.std[i]) * slope, "" if size is None else size.parameter.unit
-        )
+        std = float(np.sqrt(posterior.of_sums([made_up_of(problem, name)])[0][0, 0]))
+        found[name] = EffectSize(value, std * slope, "" if size is None else size.parameter.unit)
     return found
 
 

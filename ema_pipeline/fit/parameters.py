@@ -15,7 +15,7 @@ from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate, Ste
 from ema_pipeline.inference import Posterior
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned, wide
+from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned, made_up_of, wide
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem
 from ema_pipeline.rigs.types import Parameter, Rig
 
@@ -140,8 +140,7 @@ def fit_result(
     posterior = fitted.posterior
     estimates = _estimates(fitted, rig, settings)
     names = tuple(n for n in estimates if n in posterior.unknowns.index)
-    at = [posterior.unknowns.index[n] for n in names]
-    covariance = posterior.covariance[np.ix_(at, at)]
+    covariance, _ = posterior.of_sums([made_up_of(fitted.problem, n) for n in names])
     deviation = np.sqrt(np.diag(covariance))
     sweeps, steps = seed_route(rig, measured, settings)
     count = len(posterior.residuals.values) - posterior.residuals.projected
@@ -176,20 +175,24 @@ def _estimate(fitted: FittedModes, p: Parameter, value: float, settings: FitSett
     posterior = fitted.posterior
     i = posterior.unknowns.index.get(p.name)
     prior = float("nan") if p.free else abs(p.tolerance * p.value)
-    if i is None or (p.free and posterior.narrowing(p.name) > _UNTOUCHED):
+    if i is None:
+        return _not_measured(p, value, prior)
+    terms = made_up_of(fitted.problem, p.name)
+    after, before = (float(np.sqrt(c[0, 0])) for c in posterior.of_sums([terms]))
+    narrowing = after / before
+    if p.free and narrowing > _UNTOUCHED:
         return _not_measured(p, value, prior)
     size = fitted.problem.sizes.get(p.name)
     slope = abs(value) if size is None else abs(size.slope(float(posterior.x[i])))
-    std = float(posterior.std[i]) * slope
+    std = after * slope
     low, high = value - std, value + std
     if size is None:  # a logarithm: the interval is one of factors
-        factor = float(np.exp(posterior.std[i]))
+        factor = float(np.exp(after))
         low, high = max(value / factor, p.minimum), min(value * factor, p.maximum)
-    narrowing = posterior.narrowing(p.name)
     identified = narrowing < settings.narrowed
     if p.free and size is None:
-        identified = identified and float(posterior.std[i]) < settings.relative_std_limit
-    shift = float("nan") if p.free else float(posterior.x[i] / posterior.prior_std[i])
+        identified = identified and after < settings.relative_std_limit
+    shift = float("nan") if p.free else sum(w * posterior.value(n) for n, w in terms.items()) / before
     notes = []
     if np.isfinite(shift) and abs(shift) > _OUT_OF_TOLERANCE:
         notes.append(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -85,6 +85,16 @@ class Posterior:
         squares += 2 * self.residuals.penalty + float(np.sum((self.x / self.prior_std) ** 2))
         count = len(self.residuals.values) - self.residuals.projected
         return float(np.sqrt(squares / max(count, 1)))
+
+    def of_sums(
+        self, terms: Sequence[Mapping[str, float]]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Posterior and prior covariance of weighted sums of unknowns, (k, k) each; weights by the unknowns' names."""
+        weights = np.zeros((len(terms), len(self.x)))
+        for row, term in zip(weights, terms, strict=True):
+            for name, weight in term.items():
+                row[self.unknowns.index[name]] = weight
+        return weights @ self.covariance @ weights.T, (weights * self.prior_std**2) @ weights.T
 
     def value(self, name: str) -> float:
         """Maximum a posteriori of one unknown."""

@@ -128,6 +128,11 @@ class AmplitudeProblem:
         """See `EffectProblem`: none."""
         return []
 
+    @property
+    def sole_parts(self) -> Mapping[str, tuple[str, float]]:
+        """See `EffectProblem`."""
+        return self.modes.sole_parts
+
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""
         return self.modes.parameter_values(x)

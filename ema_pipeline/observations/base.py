@@ -24,6 +24,11 @@ class EffectProblem(Problem, Protocol):
         """How the effects' sizes follow from their unknowns, by ``id@place.name``."""
         ...
 
+    @property
+    def sole_parts(self) -> Mapping[str, tuple[str, float]]:
+        """The only part of a family with its power, by the family's name: both make up the parameter's value."""
+        return {}
+
     def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
         """Nominal values with the effects at `sizes`, or at their start values, (n,)."""
         ...

@@ -89,6 +89,12 @@ def transferred(
     return unknowns.clipped(x)
 
 
+def made_up_of(problem: EffectProblem, name: str) -> dict[str, float]:
+    """Unknowns whose weighted sum is the unknown of a parameter: its own, and that of its only part."""
+    part, power = problem.sole_parts.get(name, (name, 1.0))
+    return {name: 1.0, part: power}
+
+
 def wide(observations: Observations) -> dict[str, float]:
     """The scatters at which fits begin."""
     return {name: s.start for name, s in observations.scatters.items()}

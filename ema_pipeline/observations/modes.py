@@ -217,6 +217,11 @@ class ModeProblem(EffectProblem):
         """See `EffectProblem`."""
         return np.concatenate([self.model.start(sizes), np.zeros(len(self.unknowns) - self.offset)])
 
+    @property
+    def sole_parts(self) -> Mapping[str, tuple[str, float]]:
+        """See `EffectProblem`."""
+        return self.model.dependence.sole_parts
+
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""
         return self.model.parameter_values(x[: self.offset])

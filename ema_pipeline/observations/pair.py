@@ -206,6 +206,11 @@ class PairProblem(EffectProblem):
         x[self._to_b] = self.b.start(sizes)
         return x
 
+    @property
+    def sole_parts(self) -> Mapping[str, tuple[str, float]]:
+        """See `EffectProblem`."""
+        return self.b.sole_parts
+
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """See `EffectProblem`."""
         return self.b.parameter_values(x[self._to_b])

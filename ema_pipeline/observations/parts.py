@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +54,22 @@ class Dependence:
     elements: Mapping[str, Mapping[PartKey, NDArray[np.float64]]]
     families: tuple[str, ...]
     geometric: tuple[str, ...]
+
+    @cached_property
+    def sole_parts(self) -> dict[str, tuple[str, float]]:
+        """The only part of a family, and what the family's logarithm changes per logarithm of the part, by family.
+
+        What such a part deviates is its family's: the value that a reader looks for is that of the part.
+        """
+        count, found = len(self.families), {}
+        rows = [row for elements in self.elements.values() for row in elements.values()]
+        for i, family in enumerate(self.families):
+            own = {tuple(row) for row in rows if row[i]}
+            row = np.array(own.pop()) if len(own) == 1 else np.zeros(0)
+            parts = count + np.flatnonzero(row[count:])
+            if len(parts) == 1 and np.count_nonzero(row[:count]) == 1:
+                found[family] = (self.unknowns.names[parts[0]], float(row[parts[0]] / row[i]))
+        return found
 
 
 def part_key(element: Element) -> PartKey:

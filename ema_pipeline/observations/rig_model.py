@@ -209,11 +209,13 @@ class RigModel:
         return {name: size.value(float(x[self.unknowns.index[name]])) for name, size in self.sizes.items()}
 
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
-        """Values of the rig's parameters and of the effects' at `x`; parts are left out."""
-        values = {name: p.value for name, p in self.rig.parameters.items()}
+        """Values of the rig's parameters and of the effects' at `x`, of the part itself where a family has one only."""
+        values, index = {name: p.value for name, p in self.rig.parameters.items()}, self.unknowns.index
         for name in (*self.dependence.families, *self.dependence.geometric, DAMPING):
-            if name in self.unknowns.index:
-                values[name] *= float(np.exp(x[self.unknowns.index[name]]))
+            if name in index:
+                values[name] *= float(np.exp(x[index[name]]))
+        for name, (part, power) in self.dependence.sole_parts.items():
+            values[name] *= float(np.exp(power * x[index[part]]))
         return values | self.size_values(x)
 
     def modes(
