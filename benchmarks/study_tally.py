@@ -97,11 +97,12 @@ def over_limit(line: Line) -> float | None:
     ratios = []
     for t in line["truth"]:
         own = [
-            x for x in line["limits"] if is_truth(line, x["label"], t) and x["parameter"] == t["parameter"]
+            x for x in line.get("limits", ()) if is_truth(line, x["label"], t) and x["parameter"] == t["parameter"]
         ]
-        if not own or not own[0]["size"]:
+        if not own:
             return None
-        ratio = abs(t["size"]) / own[0]["size"]
+        limit = own[0]["size"]  # none: not to be seen, whatever its size
+        ratio = abs(t["size"]) / limit if limit else 0.0
         ratios.append(1 / ratio if t["label"].partition("@")[0] in DECIDED_BY_LESS else ratio)
     return min(ratios) if ratios else None
 

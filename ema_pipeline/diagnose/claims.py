@@ -17,8 +17,7 @@ from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, within_scatter
 
 HELD_OUT_TIE = 1.0
-"""Log density of data held out by which a claim may be behind: a base model that bends one part beyond all scatter
-foretells as well as the effect that it stands for; what that bend costs is in the evidence."""
+"""Log density of data held out by which a claim may be behind: few modes foretell a small effect no better than none."""
 
 
 @dataclass(frozen=True)
