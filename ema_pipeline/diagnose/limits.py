@@ -152,13 +152,18 @@ class _Shown:
         return self.gains.of(change, max(1 - _NINE_OF_TEN / distance, 0.0) ** 2)
 
     def _moved(self, unknown: float) -> Change:
-        """How far the predictions move; to first order where modes change their partners."""
+        """How far the predictions move: as calculated, or to first order where that is less.
+
+        What is uncertain follows a size to first order only. Beyond, close modes turn into each other in ways that a
+        fit would follow, so that a larger change than that of first order says nothing.
+        """
+        first = self.gains.change(self.before.jacobian[:, self.at] * unknown)
         x = self.null.copy()
         x[self.at] = unknown
         there = self.problem.residuals(x, self.scatters, derivatives=False)
-        if _same_pairs(there.matching, self.before.matching) and np.all(np.isfinite(there.values)):
-            return self.gains.change(there.values - self.before.values)
-        return self.gains.change(self.before.jacobian[:, self.at] * unknown)
+        if not _same_pairs(there.matching, self.before.matching) or not np.all(np.isfinite(there.values)):
+            return first
+        return min(first, self.gains.change(there.values - self.before.values), key=lambda c: c.total)
 
 
 def _same_pairs(a: object, b: object) -> bool:
