@@ -71,7 +71,7 @@ def run_task(task: Task) -> TestRow:
 
 
 def _run(task: Task) -> TestRow:
-    from ema_pipeline.ingest.description import read_campaign
+    from ema_pipeline.ingest.campaign import read_campaign
     from ema_pipeline.job import run_raw
     from ema_pipeline.series.rows import row_of
     from ema_pipeline.stages.results import load_results
