@@ -204,3 +204,46 @@ def test_no_scheduler_is_one_line(root: Path, tmp_path: Path, address: str) -> N
     assert ended.returncode == 1
     assert ended.stderr.startswith(f"ema: --scheduler {address}: no Dask scheduler answers there")
     assert len(ended.stderr.splitlines()) == 1
+
+
+def test_own_effects_run_where_they_are_named_and_nowhere_else(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The user's effect competes in every test; without the option its code does not run, whatever S remembers."""
+    marker, file, out = tmp_path / "ran", tmp_path / "film.py", tmp_path / "S"
+    file.write_text(
+        f"from pathlib import Path\nPath({str(marker)!r}).touch()\nfrom dataclasses import replace\n"
+        "from ema_pipeline.effects.spring import EFFECT as SHIPPED\nEFFECT = replace(SHIPPED, id='film')\n",
+        encoding="utf-8",
+    )
+    command = (
+        "series",
+        "run",
+        root / "tree" / "lot1",
+        "--rig",
+        root / "bench.toml",
+        "--out",
+        out,
+        "-j",
+        2,
+        "-q",
+    )
+    code, _, err = ema(capsys, *command, "--effect-file", file)
+    assert (code, err) == (0, "")
+    assert marker.exists()
+    summaries = [out / "tests" / name / "summary.json" for name in ("a1", "a2")]
+    assert all("film@" in s.read_text(encoding="utf-8") for s in summaries)
+    assert ema(capsys, *command, "--effect-file", file, "--json")[1].count('"computed": 0')
+
+    marker.unlink()
+    assert ema(capsys, *command)[0] == 0
+    assert not marker.exists()
+    assert not any("film@" in s.read_text(encoding="utf-8") for s in summaries)
+
+    file.write_text("EFFECT = 3\n", encoding="utf-8")
+    code, _, err = ema(capsys, *command, "--effect-file", file)
+    assert (code, err.count("\n")) == (1, 1)
+    assert "film.py" in err
+    code, _, err = ema(capsys, *command, "--effect-file", tmp_path / "none.py")
+    assert (code, err.count("\n")) == (1, 1)
+    assert "no such effect file" in err
