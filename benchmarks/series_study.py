@@ -99,9 +99,10 @@ def growth(root: Path, sizes: list[int]) -> None:
         for folder in sorted((root / "tree").iterdir())[:size]:
             (part / "tree" / folder.name).symlink_to(folder)
         told = timed(part, "S", 2)
+        grown = "" if told["growth"] is None else f" (last tenth {told['growth']:.2f} times the first)"
         print(
-            f"{size} tests: {told['seconds_per_test']:.2f} s of processor time per test (last tenth {told['growth'] or 1:.2f} "
-            f"times the first), {told['wall'] / size:.2f} s of wall time; driver {told['driver_mb']:.0f} MB, "
+            f"{size} tests: {told['seconds_per_test']:.2f} s of processor time per test{grown}, "
+            f"{told['wall'] / size:.2f} s of wall time; driver {told['driver_mb']:.0f} MB, "
             f"{told['driver_growth_mb']:.1f} MB more than after the first tenth",
             flush=True,
         )

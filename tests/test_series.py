@@ -20,6 +20,7 @@ from ema_pipeline.series.engine import LOST, in_processes
 from ema_pipeline.series.find import find_tests
 from ema_pipeline.series.one_test import Task
 from ema_pipeline.series.rows import TestRow, failed_row
+from ema_pipeline.series.run import run_series
 
 
 def _simulate(root: Path, names: list[str], **settings: object) -> Path:
@@ -115,6 +116,20 @@ def test_a_task_that_kills_its_process_is_one_row() -> None:
     bad = next(r for r in rows if r.name == "bad")
     assert (bad.test["state"], bad.test["reason"], bad.test["key"]) == ("lost", LOST, "")
     assert all(str(r.test["reason"]).startswith("seen by") for r in rows if r.name != "bad")
+
+
+def _lost(task: Task) -> TestRow:
+    return failed_row(task.name, task.raw, "", LOST, "lost")
+
+
+def test_a_series_of_which_all_tests_are_lost_ends(tmp_path: Path) -> None:
+    """Twenty tests without a cost: nothing is divided by it."""
+    for i in range(20):
+        (tmp_path / "tree" / f"t{i:02d}").mkdir(parents=True)
+        (tmp_path / "tree" / f"t{i:02d}" / "test.toml").write_text("schema = 1\n", encoding="utf-8")
+    done = run_series(tmp_path / "tree", tmp_path / "S", jobs=2, work=_lost)
+    assert (done.computed, done.failed) == (20, 20)
+    assert done.growth != done.growth
 
 
 def test_killed_and_resumed_gives_the_same_table(root: Path, tmp_path: Path) -> None:

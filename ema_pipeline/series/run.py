@@ -43,7 +43,8 @@ class SeriesRun:
     seconds_per_test : float
         Mean processor time of one test, of those that were run; NaN for none.
     growth : float
-        The same of the last tenth of them over that of the first tenth; NaN for fewer than 20.
+        The same of the last tenth of them over that of the first tenth; NaN for fewer than 20, or where the first were
+        lost.
     driver_mb, driver_growth_mb : float
         Memory of this process at its largest, and by how much that rose after the first tests.
     """
@@ -124,11 +125,12 @@ def run_series(
         finally:
             database.close()
     tenth = len(costs) // 10
+    first = sum(costs[:tenth])
     return SeriesRun(
         out, len(tests), len(costs), len(tests) - len(tasks), failed, removed,
         time.perf_counter() - start,
         sum(costs) / len(costs) if costs else float("nan"),
-        sum(costs[-tenth:]) / sum(costs[:tenth]) if tenth > 1 else float("nan"),
+        sum(costs[-tenth:]) / first if tenth > 1 and first > 0 else float("nan"),
         *memory,
     )  # fmt: skip
 
