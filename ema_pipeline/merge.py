@@ -9,16 +9,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import scipy.stats
-from numpy.typing import NDArray
 
 from ema_pipeline.correlate.matching import match_modes
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import cannot_write
+from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.parts import gain_ratios
+from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE, TestDescription
@@ -27,6 +29,7 @@ from ema_pipeline.names import check_name
 from ema_pipeline.pipeline import ShowStage, existing_run
 from ema_pipeline.significance import holm
 from ema_pipeline.stages.base import Run
+from ema_pipeline.stages.hits import accepted_hits
 from ema_pipeline.stages.modes import measured_frfs, measured_modes
 from ema_pipeline.store import RESULTS_FILE
 
@@ -148,8 +151,8 @@ def merge(
             _copy(part, folder / part.name)
         _check_one_rig(parts, folder)
         run, _ = run_raw(folder, None, Path(scratch) / "results", None, [_JOINING], show)
-        ((_, frfs),) = measured_frfs(run).items()
-        gains = gain_ratios({p.name: p.frfs for p in parts}) if _same_lines(parts) else {}
+        ((configuration, frfs),) = measured_frfs(run).items()
+        gains = gain_ratios({p.name: _frfs_of(run, configuration, p.name) for p in parts})
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
             shutil.move(folder, out)
@@ -246,9 +249,10 @@ def _check_one_state(modes: Sequence[CommonMode]) -> None:
         )
 
 
-def _same_lines(parts: Sequence[Part]) -> bool:
-    first: NDArray[np.float64] = parts[0].frfs.frequency_hz
-    return all(np.array_equal(p.frfs.frequency_hz, first) for p in parts)
+def _frfs_of(run: Run, configuration: str, part: str) -> FrfSet:
+    """FRFs of one part of a merged test, of hits as long as those of the others."""
+    hits = (h for h in accepted_hits(run.store, configuration) if h.hit.part == part)
+    return estimate_frfs(hits, cast(FrfSettings, run.settings["frf"]))
 
 
 def _check_one_rig(parts: Sequence[Part], folder: Path) -> None:
