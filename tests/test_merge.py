@@ -227,6 +227,28 @@ def test_two_tests_of_one_configuration_name_the_remedy(tips: Path, tmp_path: Pa
         read_campaign(tmp_path / "raw")
 
 
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        (('part = "../up"', 'part = "b"'), "part '../up'"),
+        (('part = "a"', 'part = "a"'), "both part 'a'"),
+        (('part = "a"', ""), "both describe configuration"),
+        (('part = "a"\nband_hz = [5.0, 2.0]', 'part = "b"'), "is no band"),
+        (('part = "a"\nband_hz = [5.0]', 'part = "b"'), "band_hz"),
+    ],
+)
+def test_parts_written_by_hand_are_checked(
+    tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], keys: tuple[str, str], said: str
+) -> None:
+    for name, key in zip(("one", "two"), keys, strict=True):
+        shutil.copytree(tips / "hard", tmp_path / "raw" / name)
+        file = tmp_path / "raw" / name / "test.toml"
+        file.write_text(f"{key}\n{file.read_text(encoding='utf-8')}", encoding="utf-8")
+    code, _, err = ema(capsys, "run", tmp_path / "raw", "--out", tmp_path / "out")
+    assert (code, err.count("\n")) == (1, 1), err
+    assert said in err, err
+
+
 def _frfs(std: float, band_hz: tuple[float, float], seed: int, gain: float = 1.0, lines: int = 801) -> FrfSet:
     """One driving point, H = (1 + 1j)·gain with noise of a known deviation."""
     noise = np.random.default_rng(seed).standard_normal((2, 1, 1, lines)) * std / np.sqrt(2)

@@ -95,11 +95,15 @@ def test_campaigns_are_one_test(tmp_path: Path) -> None:
         (tmp_path / name).mkdir(parents=True)
         line = f'configuration = "{configuration}"' if configuration else ""
         (tmp_path / name / "test.toml").write_text(line, encoding="utf-8")
+    for name in ("u4/soft", "u4/hard"):
+        (tmp_path / name).mkdir(parents=True)
+        part = f'part = "{Path(name).name}"\nconfiguration = "same"\n'
+        (tmp_path / name / "test.toml").write_text(part, encoding="utf-8")
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "ema.h5").touch()
     (tmp_path / "results" / "test.toml").touch()
     found = [t.name for t in find_tests(tmp_path, tmp_path / "S")]
-    assert found == ["u1", "u2/a", "u2/b", "u3"]
+    assert found == ["u1", "u2/a", "u2/b", "u3", "u4"]
 
 
 def _sometimes_dies(task: Task) -> TestRow:
