@@ -1,10 +1,14 @@
 """A series of small simulated tests: speed of two processes, killed and resumed, broken folders, a Dask cluster.
 
     python benchmarks/series_study.py [TESTS] [--broken 5] [--kills 10] [--dask]
+    python benchmarks/series_study.py --growth 10 40 160 [--driver 10 100 1000]
 
 Printed: wall time with one process and with two and their ratio, processor time per test and its growth,
 memory of the driver, whether a series killed at random moments and resumed has the same table, and the same on a
 cluster of a scheduler and two workers in processes of their own, one of which is killed.
+
+With --growth: the cost of one test in series of several sizes, each run anew. With --driver: the cost of everything but
+the tests themselves (finding, fingerprints, processes, table), with rows that were made before.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import multiprocessing
 import os
 import random
 import signal
@@ -21,6 +26,10 @@ import tempfile
 import time
 from pathlib import Path
 from typing import Any
+
+from ema_pipeline.series.one_test import Task
+from ema_pipeline.series.rows import COLUMNS, TestRow
+from ema_pipeline.series.run import run_series
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests"))
@@ -80,6 +89,56 @@ def killed(root: Path, out: str, kills: int, wall: float) -> None:
     subprocess.run(command(root, out, "--jobs", "2", "-q"), check=True)
 
 
+def growth(root: Path, sizes: list[int]) -> None:
+    """Series of several sizes, each anew with two processes: cost per test, and memory of the driver."""
+    simulate(root, max(sizes), 0)
+    for size in sizes:
+        part = root / f"series{size}"
+        (part / "tree").mkdir(parents=True)
+        (part / "bench.toml").write_bytes((root / "bench.toml").read_bytes())
+        for folder in sorted((root / "tree").iterdir())[:size]:
+            (part / "tree" / folder.name).symlink_to(folder)
+        told = timed(part, "S", 2)
+        grown = "" if told["growth"] is None else f" (last tenth {told['growth']:.2f} times the first)"
+        print(
+            f"{size} tests: {told['seconds_per_test']:.2f} s of processor time per test{grown}, "
+            f"{told['wall'] / size:.2f} s of wall time; driver {told['driver_mb']:.0f} MB, "
+            f"{told['driver_growth_mb']:.1f} MB more than after the first tenth",
+            flush=True,
+        )
+
+
+def row_made_before(task: Task) -> TestRow:
+    """The row of a test as one that was run has it: seven numbers per mode, three modes, four parameters."""
+    test = dict.fromkeys(COLUMNS["tests"], "some text of a usual length") | {
+        "test": task.name,
+        "key": task.key,
+    }
+    rows = {
+        name: tuple({**dict.fromkeys(COLUMNS[name], 1.0), "test": task.name} for _ in range(count))
+        for name, count in (("modes", 3), ("parameters", 4), ("effects", 1))
+    }
+    cost = {"test": task.name, "seconds": 0.0, "processor_seconds": 0.0, "peak_memory_mb": 0.0}
+    return TestRow(test | {"state": "failed"}, cost=cost, **rows)
+
+
+def driver_alone(root: Path, size: int) -> None:
+    """Everything but the tests themselves, in a process of its own: what one test costs the driver."""
+    tree = root / "tree"
+    for i in range(size):
+        folder = tree / f"unit{i:05d}"
+        folder.mkdir(parents=True)
+        (folder / "test.toml").write_text("schema = 1\n")
+    begun, start = time.process_time(), time.perf_counter()
+    told = run_series(tree, root / "S", jobs=2, work=row_made_before)
+    print(
+        f"driver with {size} tests: {1e3 * (time.process_time() - begun) / size:.1f} ms of processor time and "
+        f"{1e3 * (time.perf_counter() - start) / size:.1f} ms of wall time per test, {told.driver_mb:.0f} MB, "
+        f"{told.driver_growth_mb:.1f} MB more than after the first tenth",
+        flush=True,
+    )
+
+
 def on_dask(root: Path, out: str) -> None:
     """Run a series on a cluster of three processes; one worker is killed when a third of the tests are done."""
     file = root / "scheduler.json"
@@ -111,7 +170,19 @@ def main() -> None:
     parser.add_argument("--broken", type=int, default=5)
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--dask", action="store_true")
+    parser.add_argument("--growth", type=int, nargs="+", default=[])
+    parser.add_argument("--driver", type=int, nargs="+", default=[])
     given = parser.parse_args()
+    if given.growth or given.driver:
+        if given.growth:
+            growth(Path(tempfile.mkdtemp(prefix="series-growth-")), given.growth)
+        for size in given.driver:
+            alone = multiprocessing.get_context("fork").Process(
+                target=driver_alone, args=(Path(tempfile.mkdtemp(prefix="series-driver-")), size)
+            )
+            alone.start()
+            alone.join()
+        return
     root = Path(tempfile.mkdtemp(prefix="series-study-"))
     simulate(root, given.tests, given.broken)
     print(f"{given.tests} tests in {root}", flush=True)

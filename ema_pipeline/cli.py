@@ -11,7 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from ema_pipeline import __version__
-from ema_pipeline.commands import changes, diagnosis, listings, raw, runs, series, watch
+from ema_pipeline.commands import changes, diagnosis, listings, merge, raw, runs, series, watch
 from ema_pipeline.commands.interrupts import INTERRUPTED, answer_ctrl_c
 from ema_pipeline.commands.screen import program
 from ema_pipeline.crash import write_crash_report
@@ -118,6 +118,7 @@ for _verb in (
     diagnosis.ladder,
     changes.changes,
     changes.mac,
+    merge.merge,
     runs.view,
     runs.export,
     listings.rigs,

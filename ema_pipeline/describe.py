@@ -10,7 +10,8 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.isolators import isolators
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.files import read_bounded
-from ema_pipeline.ingest.description import Campaign, TestDescription, read_campaign
+from ema_pipeline.ingest.campaign import Campaign, read_campaign
+from ema_pipeline.ingest.description import TestDescription
 from ema_pipeline.names import check_name
 from ema_pipeline.pipeline import describe_run, load_pipeline, shipped_pipelines
 from ema_pipeline.rigs import Rig, load_rig, rig_names
@@ -34,10 +35,11 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
         return _describe_loops(campaign, rig, pipeline, overrides)
     source = rig or _rig_of(campaign)
     model = None if source is None else checked_rig(source)
-    names = tuple(_configuration(test, model) for test in campaign.tests)
+    of_tests = [_configuration(test, model) for test in campaign.tests]
     if model is not None:
-        for test, name in zip(campaign.tests, names, strict=True):
+        for test, name in zip(campaign.tests, of_tests, strict=True):
             check_dofs(test, name, model)
+    names = tuple(dict.fromkeys(of_tests))
     settings = load_pipeline(pipeline or _pipeline_for(model), overrides)
     title = (
         next((t.title for t in campaign.tests if t.title), raw.name)

@@ -10,12 +10,13 @@ import numpy as np
 
 from ema_pipeline.describe import DEFAULT_PIPELINE, checked_rig
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.description import read_campaign
+from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.pipeline import load_pipeline, toml_value
 
 if TYPE_CHECKING:
+    from ema_pipeline.ingest.description import TestDescription
     from ema_pipeline.simulate.campaign import SimulatedCampaign
 
 
@@ -24,12 +25,13 @@ def check_raw(raw: Path, overrides: Iterable[str] = ()) -> dict[str, tuple[Hit, 
     from ema_pipeline.ingest.quality import hits_of_test
 
     settings = load_pipeline(DEFAULT_PIPELINE, overrides)
-    judged = {}
+    tests: dict[str, list[TestDescription]] = {}
     for test in read_campaign(raw).tests:
-        judged[test.configuration or "default"] = hits_of_test(
-            list(load_records(test, settings.ingest)), settings.hits
-        )
-    return judged
+        tests.setdefault(test.configuration or "default", []).append(test)
+    return {
+        name: hits_of_test(list(load_records(*parts, limits=settings.ingest)), settings.hits)
+        for name, parts in tests.items()
+    }
 
 
 def check_records(raw: Path, overrides: Iterable[str] = ()) -> list[str] | None:

@@ -21,7 +21,7 @@ import study_cases  # noqa: E402
 import study_own_rigs  # noqa: E402
 import study_tally as tally  # noqa: E402
 
-from ema_pipeline.ingest.description import read_campaign  # noqa: E402
+from ema_pipeline.ingest.campaign import read_campaign  # noqa: E402
 from ema_pipeline.rigs import load_rig  # noqa: E402
 
 

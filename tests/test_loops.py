@@ -11,7 +11,7 @@ import pytest
 from ema_pipeline import codec
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.isolator import analyse_loops, identify_isolator
-from ema_pipeline.ingest.description import read_campaign
+from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.loops.closed_form import bouc_wen_steps, damping_from_energies, hysteresis_force
 from ema_pipeline.loops.extract import measure_loop
 from ema_pipeline.loops.simulate import PRINTED, simulate_sine_test, write_sine_tests

@@ -16,7 +16,7 @@ from ema_pipeline.diagnose.rungs import make_ladder
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.effects.library import shipped_effects
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.description import read_campaign
+from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.loops.extract import measure_loop, share_noise
 from ema_pipeline.loops.read import load_loops
 from ema_pipeline.loops.settings import LoopSettings

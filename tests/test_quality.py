@@ -197,7 +197,7 @@ def test_noise_is_measured_beside_a_hit_an_offset_and_hum() -> None:
 
 
 def test_real_hits_raise_no_false_alarm(test_data: Path) -> None:
-    from ema_pipeline.ingest.description import read_campaign
+    from ema_pipeline.ingest.campaign import read_campaign
     from ema_pipeline.ingest.load import load_records
 
     folders = [

@@ -20,6 +20,7 @@ from ema_pipeline.series.engine import LOST, in_processes
 from ema_pipeline.series.find import find_tests
 from ema_pipeline.series.one_test import Task
 from ema_pipeline.series.rows import TestRow, failed_row
+from ema_pipeline.series.run import run_series
 
 
 def _simulate(root: Path, names: list[str], **settings: object) -> Path:
@@ -94,11 +95,15 @@ def test_campaigns_are_one_test(tmp_path: Path) -> None:
         (tmp_path / name).mkdir(parents=True)
         line = f'configuration = "{configuration}"' if configuration else ""
         (tmp_path / name / "test.toml").write_text(line, encoding="utf-8")
+    for name in ("u4/soft", "u4/hard"):
+        (tmp_path / name).mkdir(parents=True)
+        part = f'part = "{Path(name).name}"\nconfiguration = "same"\n'
+        (tmp_path / name / "test.toml").write_text(part, encoding="utf-8")
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / "ema.h5").touch()
     (tmp_path / "results" / "test.toml").touch()
     found = [t.name for t in find_tests(tmp_path, tmp_path / "S")]
-    assert found == ["u1", "u2/a", "u2/b", "u3"]
+    assert found == ["u1", "u2/a", "u2/b", "u3", "u4"]
 
 
 def _sometimes_dies(task: Task) -> TestRow:
@@ -115,6 +120,20 @@ def test_a_task_that_kills_its_process_is_one_row() -> None:
     bad = next(r for r in rows if r.name == "bad")
     assert (bad.test["state"], bad.test["reason"], bad.test["key"]) == ("lost", LOST, "")
     assert all(str(r.test["reason"]).startswith("seen by") for r in rows if r.name != "bad")
+
+
+def _lost(task: Task) -> TestRow:
+    return failed_row(task.name, task.raw, "", LOST, "lost")
+
+
+def test_a_series_of_which_all_tests_are_lost_ends(tmp_path: Path) -> None:
+    """Twenty tests without a cost: nothing is divided by it."""
+    for i in range(20):
+        (tmp_path / "tree" / f"t{i:02d}").mkdir(parents=True)
+        (tmp_path / "tree" / f"t{i:02d}" / "test.toml").write_text("schema = 1\n", encoding="utf-8")
+    done = run_series(tmp_path / "tree", tmp_path / "S", jobs=2, work=_lost)
+    assert (done.computed, done.failed) == (20, 20)
+    assert done.growth != done.growth
 
 
 def test_killed_and_resumed_gives_the_same_table(root: Path, tmp_path: Path) -> None:
@@ -204,3 +223,46 @@ def test_no_scheduler_is_one_line(root: Path, tmp_path: Path, address: str) -> N
     assert ended.returncode == 1
     assert ended.stderr.startswith(f"ema: --scheduler {address}: no Dask scheduler answers there")
     assert len(ended.stderr.splitlines()) == 1
+
+
+def test_own_effects_run_where_they_are_named_and_nowhere_else(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The user's effect competes in every test; without the option its code does not run, whatever S remembers."""
+    marker, file, out = tmp_path / "ran", tmp_path / "film.py", tmp_path / "S"
+    file.write_text(
+        f"from pathlib import Path\nPath({str(marker)!r}).touch()\nfrom dataclasses import replace\n"
+        "from ema_pipeline.effects.spring import EFFECT as SHIPPED\nEFFECT = replace(SHIPPED, id='film')\n",
+        encoding="utf-8",
+    )
+    command = (
+        "series",
+        "run",
+        root / "tree" / "lot1",
+        "--rig",
+        root / "bench.toml",
+        "--out",
+        out,
+        "-j",
+        2,
+        "-q",
+    )
+    code, _, err = ema(capsys, *command, "--effect-file", file)
+    assert (code, err) == (0, "")
+    assert marker.exists()
+    summaries = [out / "tests" / name / "summary.json" for name in ("a1", "a2")]
+    assert all("film@" in s.read_text(encoding="utf-8") for s in summaries)
+    assert ema(capsys, *command, "--effect-file", file, "--json")[1].count('"computed": 0')
+
+    marker.unlink()
+    assert ema(capsys, *command)[0] == 0
+    assert not marker.exists()
+    assert not any("film@" in s.read_text(encoding="utf-8") for s in summaries)
+
+    file.write_text("EFFECT = 3\n", encoding="utf-8")
+    code, _, err = ema(capsys, *command, "--effect-file", file)
+    assert (code, err.count("\n")) == (1, 1)
+    assert "film.py" in err
+    code, _, err = ema(capsys, *command, "--effect-file", tmp_path / "none.py")
+    assert (code, err.count("\n")) == (1, 1)
+    assert "no such effect file" in err

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import http.client
 import json
-import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from live_page import Page, opened
 
 from ema_pipeline.job import change_effects, removing, run_raw
 from ema_pipeline.pipeline import existing_run
@@ -75,48 +71,6 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def out(results: Path, tmp_path: Path) -> Path:
     """A copy of the results that a test may change."""
     return Path(shutil.copytree(results, tmp_path / "out"))
-
-
-class Page:
-    """A running ``ema view``: its process, port and address with the token."""
-
-    def __init__(self, folder: Path) -> None:
-        command = [
-            sys.executable,
-            "-c",
-            "from ema_pipeline.cli import main; main()",
-            "view",
-            str(folder),
-            "--no-browser",
-        ]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-        assert self.process.stdout is not None
-        found = re.search(r"http://127\.0\.0\.1:(\d+)/\?token=\S+", self.process.stdout.readline())
-        assert found is not None
-        self.address, self.port = found[0], int(found[1])
-
-    @property
-    def origin(self) -> str:
-        return f"http://127.0.0.1:{self.port}"
-
-    def ask(
-        self, method: str, path: str, body: str | None = None, **headers: str
-    ) -> http.client.HTTPResponse:
-        """One request with these headers, an underscore in a name standing for a dash."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
-        connection.request(method, path, body, {k.replace("_", "-"): v for k, v in headers.items()})
-        return connection.getresponse()
-
-    def enter(self) -> str:
-        """The cookie for the token."""
-        answer = self.ask("GET", self.address.removeprefix(self.origin))
-        assert answer.status == 303
-        return str(answer.headers["set-cookie"])
-
-    def stop(self) -> int:
-        """Ctrl-C."""
-        self.process.send_signal(signal.SIGINT)
-        return self.process.wait(timeout=15)
 
 
 @pytest.fixture
@@ -207,32 +161,6 @@ def test_undone_state_is_the_file_that_was_there_before(out: Path) -> None:
 
 
 # in a browser
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """Debian's Chromium, driven by Playwright."""
-    sync_api = pytest.importorskip(
-        "playwright.sync_api", reason="Playwright is not installed: pip install playwright"
-    )
-    path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if path is None:
-        pytest.skip("no Chromium on this machine: apt-get install chromium")
-    sandbox = [] if os.geteuid() else ["--no-sandbox"]  # Chromium refuses its sandbox to root
-    with sync_api.sync_playwright() as driver:
-        started = driver.chromium.launch(executable_path=path, args=sandbox)
-        yield started
-        started.close()
-
-
-def opened(context, address: str):
-    """A tab whose page has started; what its script complains of is kept in ``faults``."""
-    tab = context.new_page()
-    tab.faults = []
-    tab.on("pageerror", lambda error: tab.faults.append(str(error)))
-    tab.goto(address)
-    tab.wait_for_selector("html[data-ready]", timeout=30_000)
-    return tab
 
 
 def errors_shown(tab) -> tuple[float, float]:

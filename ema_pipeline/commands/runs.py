@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ema_pipeline.commands.interrupts import go_on_with
 from ema_pipeline.commands.options import EffectFiles, Json, Out, Overrides, Quiet, RigOption, Verbose
 from ema_pipeline.commands.screen import program, progress, show, show_json
 
@@ -193,25 +194,56 @@ def levels(out: Out, effect_file: EffectFiles = None, set_: Overrides = None, js
 
 
 def view(
-    out: Out,
+    out: Annotated[
+        Path,
+        typer.Argument(metavar="OUT", help="Results folder; or a raw folder whose hits are to be judged."),
+    ],
     browser: Annotated[bool, typer.Option(help="Open the page in the web browser.")] = True,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port on this machine; 0: a free one.")] = 0,
     effect_file: EffectFiles = None,
+    point: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--point", metavar="DOF", help="Raw folder: point to strike; in this order, once for each."
+        ),
+    ] = None,
+    hits: Annotated[int, typer.Option(min=1, help="Raw folder: good hits that a point needs.")] = 3,
+    poll: Annotated[
+        bool, typer.Option("--poll", help="Raw folder: look again and again, for network shares.")
+    ] = False,
 ) -> None:
-    """Open the live page of OUT: add and remove effects and watch the error. It stops with Ctrl-C."""
-    from ema_pipeline.pipeline import existing_run
+    """Open the live page of OUT: add and remove effects and watch the error. It stops with Ctrl-C.
 
-    if existing_run(out, effect_file or []).info.kind == "hysteresis":
-        _open_report(out, browser)  # loops have a report, but no live page
-        return
-    from ema_pipeline.view.server import serve
+    Of a raw folder it shows what 'ema watch' says: how good each hit was, what to strike next, which points are done.
+    """
+    from ema_pipeline.pipeline import existing_run
 
     def ready(address: str) -> None:
         show(f"The page of {out} is at {address}\nIt is for one browser on this machine; stop with Ctrl-C.")
         if browser and _has_screen():
             typer.launch(address)
 
+    if _is_raw(out):
+        from ema_pipeline.view.hits import serve_hits
+
+        go_on_with(f"run {out}")
+        serve_hits(out, point or (), hits, poll, port, ready)
+        show(f"Next: {program()} run {out}")
+        return
+    if existing_run(out, effect_file or []).info.kind == "hysteresis":
+        _open_report(out, browser)  # loops have a report, but no live page
+        return
+    from ema_pipeline.view.server import serve
+
     serve(out, effect_file or [], port, ready)
+
+
+def _is_raw(folder: Path) -> bool:
+    """True for a folder with a test description and without results."""
+    from ema_pipeline.ingest.description import DESCRIPTION_FILE
+    from ema_pipeline.store import RESULTS_FILE
+
+    return (folder / DESCRIPTION_FILE).is_file() and not (folder / RESULTS_FILE).exists()
 
 
 def _open_report(out: Path, browser: bool) -> None:

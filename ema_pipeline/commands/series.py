@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ema_pipeline.commands.interrupts import go_on_with
-from ema_pipeline.commands.options import Json, Overrides, Quiet, RigOption
+from ema_pipeline.commands.options import EffectFiles, Json, Overrides, Quiet, RigOption
 from ema_pipeline.commands.screen import program, show, show_json
 from ema_pipeline.plain_text import printable
 
@@ -48,6 +48,7 @@ def run(
         str | None, typer.Option("--pipeline", "-p", help="Pipeline: a shipped one's name, or a TOML file.")
     ] = None,
     parquet: Annotated[bool, typer.Option("--parquet", help="Write the tables as Parquet too.")] = False,
+    effect_file: EffectFiles = None,
     set_: Overrides = None,
     quiet: Quiet = False,
     json: Json = False,
@@ -70,6 +71,7 @@ def run(
             scheduler=scheduler,
             pipeline=pipeline,
             overrides=set_ or [],
+            effect_files=effect_file or [],
             watch=watch,
         )
     database = SeriesDatabase.existing(out)

@@ -15,6 +15,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import ChannelQuality, merged
 from ema_pipeline.frf.checks import check_frfs
+from ema_pipeline.frf.parts import joined
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.frf.warp import WarpedTransform
@@ -63,6 +64,9 @@ def estimate_frfs(
     lines) stands above the hammer's noise and is not `band_drop_db` below its largest, narrow zeros of the
     spectrum aside, for nine tenths of all inputs, and at most to the sample rate over 2.56.
 
+    Hits of different parts of a test (two hammers, two sets of sensors) are averaged part by part; `parts.joined`
+    puts the parts together.
+
     Parameters
     ----------
     hits : iterable of HitSamples
@@ -89,14 +93,19 @@ def estimate_frfs(
        Wiley, 2010, sections 6.1, 9.2.
     """
     settings = settings or FrfSettings()
-    total = _Total()
+    totals: dict[str, _Total] = {}
     with ThreadPoolExecutor(settings.threads) as pool:
         for hit in hits:
+            total = totals.setdefault(hit.hit.part, _Total())
             _accumulate(total.sheet_of(hit), hit, settings, shifts, pool)
-        first = total.first
-        if first is None:
-            raise EmaError("no accepted hit: there is nothing to estimate FRFs from; see the hits' verdicts")
-        frfs = _finish(total, first, settings, pool)
+        parts = {
+            name: _finish(total, total.first, settings, pool)
+            for name, total in totals.items()
+            if total.first is not None
+        }
+    if not parts:
+        raise EmaError("no accepted hit: there is nothing to estimate FRFs from; see the hits' verdicts")
+    frfs = joined(parts)
     return replace(frfs, verdicts=check_frfs(frfs, settings))
 
 
@@ -288,7 +297,7 @@ def _finish(total: _Total, first: HitSamples, settings: FrfSettings, pool: Threa
         record_s=float(n_samples / rate),
         response_decay_rad_s=decay_rate(settings, n_samples / rate) + first.window_decay_rad_s,
         delay_s=np.array([float(np.mean(total.delays[p])) for p in inputs]),
-        band_hz=_band(forces, frequency, rate, settings.band_drop_db),
+        band_hz=_within(_band(forces, frequency, rate, settings.band_drop_db), first),
         force_calibrated=first.force_calibrated,
         sensor_mass_kg=np.array([total.masses[p] for p in outputs]),
         channels=tuple(total.channels[p] for p in outputs),
@@ -331,6 +340,23 @@ def _finish_one(
         cross *= gain
         variance *= gain**2
     auto[:] = coherence if n > 1 else np.nan
+
+
+def _within(band_hz: tuple[float, float], hit: HitSamples) -> tuple[float, float]:
+    """The band, no wider than the description states.
+
+    Raises
+    ------
+    EmaError
+        If the force carries nothing in the stated band.
+    """
+    low, high = max(band_hz[0], hit.band_hz[0]), min(band_hz[1], hit.band_hz[1])
+    if not low < high:
+        raise EmaError(
+            f"{hit.hit.file}: band_hz = [{hit.band_hz[0]:g}, {hit.band_hz[1]:g}] is stated, but the force carries "
+            f"enough energy from {band_hz[0]:.4g} to {band_hz[1]:.4g} Hz only; correct band_hz or leave it out"
+        )
+    return low, high
 
 
 def _forces(total: _Total, inputs: list[str]) -> list[NDArray[np.float64]]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from ema_pipeline.ingest.campaign import Campaign, read_campaign
 from ema_pipeline.ingest.description import (
-    Campaign,
     ChannelDescription,
     RecordDescription,
     TestDescription,
-    read_campaign,
     read_description,
 )
 from ema_pipeline.ingest.draft import draft_description, write_drafts

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime as dt
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -12,14 +11,13 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
-from ema_pipeline.files import read_bounded
 from ema_pipeline.ingest.driven_entries import check_driven_test
 from ema_pipeline.ingest.record_entries import check_records
 from ema_pipeline.ingest.records import CALIBRATION_STD, TRANSVERSE
 from ema_pipeline.names import check_name
 from ema_pipeline.plain_text import has_control_characters
 from ema_pipeline.settings import Settings, parse
-from ema_pipeline.toml_text import LARGEST_BYTES, read_toml
+from ema_pipeline.toml_text import read_toml
 from ema_pipeline.units import SI_SYMBOL, Unit, parse_unit
 
 DESCRIPTION_FILE = "test.toml"
@@ -142,6 +140,13 @@ class _TestFile(Settings):
     sample_rate_hz: float | None = Field(
         default=None, gt=0, description="Required unless the record files carry it"
     )
+    part: str = Field(
+        default="", description="Name of this set-up (hammer, sensors) where several make up one test"
+    )
+    band_hz: tuple[float, float] | None = Field(
+        default=None,
+        description="Band that its FRFs may speak for; left out: what its force spectrum carries",
+    )
     exponential_window_rad_s: float = Field(
         default=0.0,
         ge=0,
@@ -187,79 +192,6 @@ class TestDescription(_TestFile):
         return self.folder / record.file
 
 
-@dataclass(frozen=True)
-class Campaign:
-    """All tests of a raw folder.
-
-    Attributes
-    ----------
-    root : Path
-        The raw folder.
-    tests : tuple of TestDescription
-        One per ``test.toml``; several tests have distinct configurations.
-    rig_file : Path or None
-        A ``rig.toml`` that lies beside the test descriptions.
-    """
-
-    root: Path
-    tests: tuple[TestDescription, ...]
-    rig_file: Path | None = None
-
-    @property
-    def rig(self) -> str | None:
-        """The rig that the tests name, if any."""
-        return next((t.rig for t in self.tests if t.rig is not None), None)
-
-
-def read_campaign(raw: Path) -> Campaign:
-    """Read a raw folder: one ``test.toml``, or sub-folders that hold one each.
-
-    Parameters
-    ----------
-    raw : Path
-        Folder with ``test.toml``, or with sub-folders that each hold one.
-
-    Raises
-    ------
-    EmaError
-        Where there is no such folder or no description in it, where a description is wrong, or where
-        the descriptions of a campaign contradict each other.
-    """
-    folders = description_folders(raw)
-    if not folders:
-        raise EmaError(f"{raw}: no test.toml here or in its sub-folders; 'ema init {raw}' drafts one")
-    tests = tuple(read_description(folder) for folder in folders)
-    if len(tests) > 1:
-        tests = tuple(
-            t if t.configuration else t.model_copy(update={"configuration": t.folder.name}) for t in tests
-        )
-    _check_campaign(raw, tests)
-    return Campaign(root=raw, tests=tests, rig_file=_find_rig_file(raw, folders))
-
-
-def description_folders(raw: Path) -> list[Path]:
-    """Return the folders of `raw` that hold a ``test.toml``: itself, or its sub-folders.
-
-    Raises
-    ------
-    EmaError
-        Where `raw` is not a folder, or holds a description beside sub-folders with descriptions.
-    """
-    if not raw.exists():
-        raise EmaError(f"{raw}: there is no such folder; give the folder that holds test.toml")
-    if not raw.is_dir():
-        raise EmaError(f"{raw}: is a file, not a folder; give the folder that holds test.toml")
-    below = sorted(p.parent for p in raw.glob(f"*/{DESCRIPTION_FILE}") if not p.parent.name.startswith("."))
-    if not (raw / DESCRIPTION_FILE).exists():
-        return below
-    if below:
-        raise EmaError(
-            f"{raw}: holds test.toml and so does its sub-folder '{below[0].name}'; keep one description per "
-            "folder, and for a campaign only those in the sub-folders"
-        )
-    return [raw]
-
-
 def read_description(folder: Path) -> TestDescription:
     """Read and check the ``test.toml`` of one folder.
 
@@ -274,6 +206,7 @@ def read_description(folder: Path) -> TestDescription:
     test = TestDescription.model_construct(folder=folder, **dict(keys))
     _check_texts(test)
     _check_channels(test)
+    _check_part(test)
     check_records(test)
     return test
 
@@ -303,6 +236,8 @@ def _check_texts(test: TestDescription) -> None:
     """Texts end up on screens and in reports, names in file names too."""
     if test.configuration is not None:
         check_name(test.configuration, f"{test.file}: configuration")
+    if test.part:
+        check_name(test.part, f"{test.file}: part")
     texts = {"title": test.title, "serial_number": test.serial_number, "rig": test.rig or ""}
     texts |= {f"name of channel {i + 1}": c.name for i, c in enumerate(test.channels)}
     texts |= {f"file of record {i + 1}": r.file for i, r in enumerate(test.records)}
@@ -368,25 +303,14 @@ def _check_channel(channel: ChannelDescription, where: str) -> None:
         raise EmaError(f"{where}: give full_scale or full_scale_v, not both")
 
 
-def _check_campaign(raw: Path, tests: tuple[TestDescription, ...]) -> None:
-    seen: dict[str | None, TestDescription] = {}
-    for test in tests:
-        other = seen.setdefault(test.configuration, test)
-        if other is not test:
-            raise EmaError(
-                f"{raw}: '{other.folder.name}' and '{test.folder.name}' both describe configuration "
-                f"'{test.configuration}'; name them differently, or put their records under one test.toml"
-            )
-    rigs = sorted({t.rig for t in tests if t.rig is not None})
-    if len(rigs) > 1:
-        raise EmaError(f"{raw}: its tests name different rigs ({', '.join(rigs)}); one campaign has one rig")
-
-
-def _find_rig_file(raw: Path, folders: list[Path]) -> Path | None:
-    if (raw / RIG_FILE).is_file():
-        return raw / RIG_FILE
-    found = [folder / RIG_FILE for folder in folders if (folder / RIG_FILE).is_file()]
-    for other in found[1:]:
-        if read_bounded(other, LARGEST_BYTES) != read_bounded(found[0], LARGEST_BYTES):
-            raise EmaError(f"{found[0]} and {other} differ; put one rig.toml into {raw}")
-    return found[0] if found else None
+def _check_part(test: TestDescription) -> None:
+    if test.kind != "hammer" and (test.part or test.band_hz is not None):
+        named = "part" if test.part else "band_hz"
+        raise EmaError(
+            f"{test.file}: {named} belongs to hammer tests, this one is of kind '{test.kind}'; remove it"
+        )
+    if test.band_hz is not None and not 0 <= test.band_hz[0] < test.band_hz[1]:
+        low, high = test.band_hz
+        raise EmaError(
+            f"{test.file}: band_hz = [{low:g}, {high:g}] is no band; give its lower end first, in Hz"
+        )

@@ -89,6 +89,7 @@ def find_hits(record: Record, settings: HitSettings | None = None) -> tuple[Hit,
             peak=peak,
             peak_force=float(deviation[peak]),
             force_unit="N" if record.force_calibrated else "V",
+            part=record.part,
         )
         for number, (peak, (start, stop)) in enumerate(zip(peaks, bounds, strict=True))
     )
@@ -100,9 +101,9 @@ def align_hits(
     """Give all hits of a test one length, so that their FRFs share a frequency axis.
 
     Hits that are equally long already stay as they are. Otherwise the common length is the one that keeps
-    most time in all, number of hits × length, while every impact point keeps a hit; it is rounded down to a
-    length that is fast to transform. A hit with less room than that is rejected, with a verdict. Check hits
-    (`check_hit`) after this, since a cut may leave responses that have not decayed.
+    most time in all, number of hits × length, while every impact point of every part of the test keeps a
+    hit; it is rounded down to a length that is fast to transform. A hit with less room than that is rejected,
+    with a verdict. Check hits (`check_hit`) after this, since a cut may leave responses that have not decayed.
 
     Parameters
     ----------
@@ -123,9 +124,10 @@ def align_hits(
     guard = _guard(sample_rate_hz, settings)
     starts = [max(h.start, h.peak - guard) for h in hits]
     room = np.array([h.stop - start for h, start in zip(hits, starts, strict=True)])
-    longest: dict[str, int] = defaultdict(int)
+    longest: dict[tuple[str, str], int] = defaultdict(int)
     for hit, length in zip(hits, room, strict=True):
-        longest[hit.impact.point] = max(longest[hit.impact.point], int(length))
+        key = hit.impact.point, hit.part
+        longest[key] = max(longest[key], int(length))
     allowed = np.unique(room[room <= min(longest.values())])
     best = max(allowed, key=lambda length: int(length) * int(np.sum(room >= length)))
     length = _fast_length_below(int(best))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from ema_pipeline.ingest.description import ChannelDescription, RecordDescriptio
 from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers import read_raw
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord, Samples, split_unit
-from ema_pipeline.ingest.records import Record, ResponseChannel
+from ema_pipeline.ingest.records import ANY_BAND_HZ, Record, ResponseChannel
 from ema_pipeline.ingest.swap import find_swap
 from ema_pipeline.lazy_samples import LazySamples
 from ema_pipeline.units import Unit, find_unit
@@ -75,12 +75,13 @@ class _ScaledSamples(LazySamples):
         return self._sources[row].scaled(start, stop)
 
 
-def load_records(test: TestDescription, limits: ReadLimits | None = None) -> Iterator[Record]:
+def load_records(*tests: TestDescription, limits: ReadLimits | None = None) -> Iterator[Record]:
     """Load the records of a hammer test one after the other.
 
     Parameters
     ----------
-    test : TestDescription
+    *tests : TestDescription
+        One test, or all of its parts, whose records are then named ``part/file``.
     limits : ReadLimits, optional
         How large a record file may be.
 
@@ -90,14 +91,17 @@ def load_records(test: TestDescription, limits: ReadLimits | None = None) -> Ite
         As `load_record`, and where sample rates differ between the records.
     """
     first: Record | None = None
-    for entry in test.records:
+    for test, entry in ((t, e) for t in tests for e in t.records):
         record = load_record(test, entry, limits)
+        if test.part:
+            record = replace(record, file=f"{test.part}/{record.file}")
         if first is None:
             first = record
         elif abs(record.sample_rate_hz / first.sample_rate_hz - 1) > RATE_TOLERANCE:
+            remedy = "record all parts at one rate" if test.part else "put it into a test of its own"
             raise EmaError(
                 f"{test.path_of(entry)}: sample rate {record.sample_rate_hz:.10g} Hz differs from "
-                f"{first.sample_rate_hz:.10g} Hz of '{first.file}'; put it into a test of its own"
+                f"{first.sample_rate_hz:.10g} Hz of '{first.file}'; {remedy}"
             )
         yield record
 
@@ -167,6 +171,8 @@ def load_record(test: TestDescription, entry: RecordDescription, limits: ReadLim
         window_decay_rad_s=test.exponential_window_rad_s,
         force_calibration_std=test.force.calibration_std,
         force_transverse=test.force.transverse,
+        part=test.part,
+        band_hz=ANY_BAND_HZ if test.band_hz is None else test.band_hz,
     )
 
 

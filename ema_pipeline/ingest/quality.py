@@ -134,7 +134,7 @@ def _silent_hit(record: Record, reason: str, settings: HitSettings) -> Hit:
     fault, name = reason.removeprefix(f"{record.file}: "), record.force_name
     limit = settings.trigger_noise
     verdict = judged("force level", 0.0, limit, False, "", "reject_hit", fault, channel=name, unit="×")
-    return Hit(record.file, 0, record.impact, 0, record.force.size, 0, 0.0, (verdict,))
+    return Hit(record.file, 0, record.impact, 0, record.force.size, 0, 0.0, (verdict,), part=record.part)
 
 
 def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> Hit:

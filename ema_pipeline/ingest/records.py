@@ -18,6 +18,8 @@ modal hammers usually claim, 3 to 5 % at two sigma."""
 TRANSVERSE = 0.03
 """Transverse sensitivity where none is stated, 1 σ: data sheets promise less than 3 to 5 %."""
 
+ANY_BAND_HZ = (0.0, float("inf"))
+
 
 @dataclass(frozen=True)
 class Transducer:
@@ -103,6 +105,10 @@ class Record:
         Decay rate of the exponential window that was on force and responses when they were recorded; 0 for none.
     force_calibration_std, force_transverse : float
         Of the hammer, as in `ResponseChannel`.
+    part : str
+        Set-up (hammer, sensors) of which several make up the test; empty where there is but one.
+    band_hz : tuple of float
+        Band that the description lets the record speak for.
     """
 
     file: str
@@ -117,6 +123,8 @@ class Record:
     window_decay_rad_s: float = 0.0
     force_calibration_std: float = CALIBRATION_STD
     force_transverse: float = TRANSVERSE
+    part: str = ""
+    band_hz: tuple[float, float] = ANY_BAND_HZ
 
 
 @dataclass(frozen=True)
@@ -141,6 +149,8 @@ class Hit:
         Outcome of every check that could be made.
     force_unit : str
         ``"N"``, ``"V"`` for an uncalibrated hammer.
+    part : str
+        As in `Record`.
     """
 
     file: str
@@ -152,6 +162,7 @@ class Hit:
     peak_force: float
     verdicts: tuple[Verdict, ...] = ()
     force_unit: str = "N"
+    part: str = ""
 
     @property
     def accepted(self) -> bool:
@@ -193,6 +204,8 @@ class HitSamples:
         Name of the hammer channel; empty where unknown.
     force_calibration_std, force_transverse : float
         As in `Record`.
+    band_hz : tuple of float
+        As in `Record`.
     """
 
     hit: Hit
@@ -205,6 +218,7 @@ class HitSamples:
     force_name: str = ""
     force_calibration_std: float = CALIBRATION_STD
     force_transverse: float = TRANSVERSE
+    band_hz: tuple[float, float] = ANY_BAND_HZ
 
 
 def cut_hit(record: Record, hit: Hit) -> HitSamples:
@@ -221,4 +235,5 @@ def cut_hit(record: Record, hit: Hit) -> HitSamples:
         force_name=record.force_name,
         force_calibration_std=record.force_calibration_std,
         force_transverse=record.force_transverse,
+        band_hz=record.band_hz,
     )

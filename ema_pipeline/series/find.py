@@ -33,8 +33,8 @@ class FoundTest:
 def find_tests(tree: Path, out: Path) -> list[FoundTest]:
     """All raw folders at or below `tree`, by name.
 
-    A folder whose sub-folders each describe another configuration is one test, a campaign. Hidden folders, results
-    folders and `out` are passed over.
+    A folder whose sub-folders each describe another configuration, or another part of one test, is one test. Hidden
+    folders, results folders and `out` are passed over.
 
     Raises
     ------
@@ -74,14 +74,15 @@ def _sub_folders(folder: Path, out: Path) -> list[Path]:
 
 
 def _is_campaign(folders: Sequence[Path]) -> bool:
-    """True for several tests that state configurations which are all different."""
+    """True for several tests that state configurations, or parts of one test, which are all different."""
     stated = []
     for folder in folders:
-        name = None
+        keys = {}
         with suppress(EmaError):  # what is wrong with it is said once it is run
-            name = read_toml(folder / DESCRIPTION_FILE).get("configuration")
-        stated.append(name)
-    return len(stated) > 1 and None not in stated and len({str(s) for s in stated}) == len(stated)
+            keys = read_toml(folder / DESCRIPTION_FILE)
+        names = [str(keys[key]) for key in ("configuration", "part") if keys.get(key)]
+        stated.append(" ".join(names))
+    return len(stated) > 1 and "" not in stated and len(set(stated)) == len(stated)
 
 
 def raw_fingerprint(raw: Path) -> str:

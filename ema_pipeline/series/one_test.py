@@ -23,6 +23,8 @@ class Task:
     rig, pipeline : str or None
     overrides : tuple of str
         ``stage.key=value``.
+    effect_files : tuple of str
+        Files with the user's own effects, named by whoever runs the series: their code runs.
     """
 
     name: str
@@ -32,6 +34,7 @@ class Task:
     rig: str | None = None
     pipeline: str | None = None
     overrides: tuple[str, ...] = ()
+    effect_files: tuple[str, ...] = ()
 
 
 SERIES_SETTINGS = ("diagnose.processes=1",)
@@ -71,14 +74,14 @@ def run_task(task: Task) -> TestRow:
 
 
 def _run(task: Task) -> TestRow:
-    from ema_pipeline.ingest.description import read_campaign
+    from ema_pipeline.ingest.campaign import read_campaign
     from ema_pipeline.job import run_raw
     from ema_pipeline.series.rows import row_of
     from ema_pipeline.stages.results import load_results
 
     raw, out = Path(task.raw), Path(task.out)
     settings = (*SERIES_SETTINGS, *task.overrides)
-    run, _ = run_raw(raw, task.rig, out, task.pipeline, settings)
+    run, _ = run_raw(raw, task.rig, out, task.pipeline, settings, effect_files=task.effect_files)
     tests = read_campaign(raw).tests
     about = {
         "serial_number": next((t.serial_number for t in tests if t.serial_number), ""),

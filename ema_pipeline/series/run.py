@@ -6,10 +6,11 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ema_pipeline.describe import DEFAULT_PIPELINE, checked_rig, rig_text
+from ema_pipeline.effects.library import effect_library
 from ema_pipeline.errors import EmaError
 from ema_pipeline.pipeline import load_pipeline
 from ema_pipeline.processes import peak_memory_mb
@@ -18,7 +19,7 @@ from ema_pipeline.series.engine import Work, in_processes, on_cluster
 from ema_pipeline.series.find import FoundTest, find_tests, raw_fingerprint
 from ema_pipeline.series.one_test import Task, run_task
 from ema_pipeline.series.rows import TestRow
-from ema_pipeline.stages.base import code_fingerprint
+from ema_pipeline.stages.base import code_fingerprint, file_hash
 from ema_pipeline.store import RESULTS_FILE, Store
 
 TESTS_FOLDER = "tests"
@@ -42,7 +43,8 @@ class SeriesRun:
     seconds_per_test : float
         Mean processor time of one test, of those that were run; NaN for none.
     growth : float
-        The same of the last tenth of them over that of the first tenth; NaN for fewer than 20.
+        The same of the last tenth of them over that of the first tenth; NaN for fewer than 20, or where the first were
+        lost.
     driver_mb, driver_growth_mb : float
         Memory of this process at its largest, and by how much that rose after the first tests.
     """
@@ -69,6 +71,7 @@ def run_series(
     scheduler: str | None = None,
     pipeline: str | None = None,
     overrides: Sequence[str] = (),
+    effect_files: Sequence[str] = (),
     watch: Watch = lambda done, total, row: None,
     work: Work = run_task,
 ) -> SeriesRun:
@@ -88,6 +91,8 @@ def run_series(
         Name or file of the pipeline.
     overrides : sequence of str
         ``stage.key=value``.
+    effect_files : sequence of str
+        Files with the user's own effects; on a cluster all workers must see them under the same paths.
     watch : callable
         Told of every test that is done.
     work : callable
@@ -96,11 +101,11 @@ def run_series(
     Raises
     ------
     EmaError
-        If the tree holds no tests, or rig, settings or the series' folder are wrong. What is wrong with a single test
-        is in its row.
+        If the tree holds no tests, or rig, settings, effects or the series' folder are wrong. What is wrong with a
+        single test is in its row.
     """
     start = time.perf_counter()
-    made_of = _made_of(rig, pipeline, overrides)
+    made_of = _made_of(rig, pipeline, overrides, effect_files)
     tests = find_tests(tree, out)
     with Store(out).lock():
         database = SeriesDatabase(out)
@@ -108,7 +113,11 @@ def run_series(
             _check_tree(database, tree)
             known = database.keys()
             removed = database.keep_only([t.name for t in tests])
-            described = _tasks(tests, out, made_of, _absolute(rig), _absolute(pipeline), overrides)
+            same = Task(
+                "", "", "", made_of, _absolute(rig), _absolute(pipeline), tuple(overrides),
+                tuple(str(Path(file).resolve()) for file in effect_files),
+            )  # fmt: skip
+            described = _tasks(tests, out, same)
             tasks = [t for t in described if not _done(t, known.get(t.name))]
             engine = on_cluster(tasks, scheduler, work) if scheduler else in_processes(tasks, jobs, work)
             costs, memory = _kept(database, engine, len(tasks), watch)
@@ -116,21 +125,26 @@ def run_series(
         finally:
             database.close()
     tenth = len(costs) // 10
+    first = sum(costs[:tenth])
     return SeriesRun(
         out, len(tests), len(costs), len(tests) - len(tasks), failed, removed,
         time.perf_counter() - start,
         sum(costs) / len(costs) if costs else float("nan"),
-        sum(costs[-tenth:]) / sum(costs[:tenth]) if tenth > 1 else float("nan"),
+        sum(costs[-tenth:]) / first if tenth > 1 and first > 0 else float("nan"),
         *memory,
     )  # fmt: skip
 
 
-def _made_of(rig: str | None, pipeline: str | None, overrides: Sequence[str]) -> str:
-    """Fingerprint of all that the tests share; rig and settings are checked before anything is written."""
-    if rig is not None:
-        checked_rig(rig)
+def _made_of(
+    rig: str | None, pipeline: str | None, overrides: Sequence[str], effect_files: Sequence[str]
+) -> str:
+    """Fingerprint of all that the tests share; all of it is checked before anything is written."""
+    model = None if rig is None else checked_rig(rig)
+    if effect_files:
+        effect_library(effect_files, model)
+    effects = [file_hash(Path(file)) for file in effect_files]
     settings = load_pipeline(pipeline or DEFAULT_PIPELINE, overrides).model_dump_json()
-    return json.dumps([code_fingerprint(), rig_text(rig), pipeline, list(overrides), settings])
+    return json.dumps([code_fingerprint(), rig_text(rig), pipeline, list(overrides), settings, *effects])
 
 
 def _absolute(name_or_path: str | None) -> str | None:
@@ -148,18 +162,12 @@ def _check_tree(database: SeriesDatabase, tree: Path) -> None:
     database.tell("tree", now)
 
 
-def _tasks(
-    tests: Sequence[FoundTest],
-    out: Path,
-    made_of: str,
-    rig: str | None,
-    pipeline: str | None,
-    overrides: Sequence[str],
-) -> Iterator[Task]:
+def _tasks(tests: Sequence[FoundTest], out: Path, same: Task) -> Iterator[Task]:
+    """A task for each test, from one with what all share."""
     for t in tests:
-        key = hashlib.sha256(f"{made_of} {raw_fingerprint(t.raw)}".encode()).hexdigest()
+        key = hashlib.sha256(f"{same.key} {raw_fingerprint(t.raw)}".encode()).hexdigest()
         folder = (out / TESTS_FOLDER / t.name).resolve()
-        yield Task(t.name, str(t.raw.resolve()), str(folder), key, rig, pipeline, tuple(overrides))
+        yield replace(same, name=t.name, raw=str(t.raw.resolve()), out=str(folder), key=key)
 
 
 def _done(task: Task, known: tuple[str, str] | None) -> bool:

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TypeVar, cast
 
-from ema_pipeline.ingest.description import ChannelDescription, TestDescription, read_campaign
+from ema_pipeline.ingest.campaign import read_campaign
+from ema_pipeline.ingest.description import ChannelDescription, TestDescription
 from ema_pipeline.ingest.driven import DrivenRecord, load_driven
 from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.load import load_records
@@ -26,23 +27,25 @@ NEEDS_RIG = False
 
 def inputs(run: Run, configuration: str) -> str:
     """Hashes of the description and of every record file."""
-    return json.dumps(file_hashes(test_of(run, configuration)))
+    return json.dumps(file_hashes(*tests_of(run, configuration)))
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Read every record, check it against the description, and scale it to SI."""
-    test = test_of(run, configuration)
+    tests = tests_of(run, configuration)
+    test = tests[0]
     limits = cast(ReadLimits, run.settings[NAME])
     common: dict[str, object] = {
-        "sources": file_hashes(test),
+        "sources": file_hashes(*tests),
         "title": test.title,
-        "transducers": tuple(_transducer(c) for c in test.channels),
+        "transducers": tuple({repr(x): x for t in tests for x in map(_transducer, t.channels)}.values()),
     }
     if test.kind == "continuous":
         return common | {
             DRIVEN: tuple(_with_progress(load_driven(test, limits), len(test.records), progress))
         }
-    return common | {"records": _with_progress(load_records(test, limits), len(test.records), progress)}
+    count = sum(len(t.records) for t in tests)
+    return common | {"records": _with_progress(load_records(*tests, limits=limits), count, progress)}
 
 
 def driven_records(store: Store, configuration: str) -> tuple[DrivenRecord, ...]:
@@ -69,13 +72,21 @@ def _with_progress(records: Iterator[R], count: int, progress: Progress) -> Iter
         yield record
 
 
-def file_hashes(test: TestDescription) -> dict[str, str]:
-    """SHA-256 of the description and of every record file, by file name."""
-    files = [test.file, *(test.path_of(entry) for entry in test.records)]
-    return {str(path.relative_to(test.folder)): file_hash(path) for path in files}
+def file_hashes(*tests: TestDescription) -> dict[str, str]:
+    """SHA-256 of the description and of every record file, by file name; ``part/file`` in tests of several parts."""
+    return {
+        str(Path(test.part) / path.relative_to(test.folder)): file_hash(path)
+        for test in tests
+        for path in (test.file, *(test.path_of(entry) for entry in test.records))
+    }
+
+
+def tests_of(run: Run, configuration: str) -> tuple[TestDescription, ...]:
+    """Descriptions of the test of one configuration: one, or one per part."""
+    tests = read_campaign(Path(run.info.raw)).tests
+    return tuple(t for t in tests if (t.configuration or run.info.configurations[0]) == configuration)
 
 
 def test_of(run: Run, configuration: str) -> TestDescription:
-    """Description of the test of one configuration."""
-    tests = read_campaign(Path(run.info.raw)).tests
-    return next(t for t in tests if (t.configuration or run.info.configurations[0]) == configuration)
+    """Description of the test of one configuration that has no parts."""
+    return tests_of(run, configuration)[0]

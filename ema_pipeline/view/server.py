@@ -5,13 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-import socket
 from collections.abc import AsyncIterator, Callable, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse
@@ -19,8 +16,7 @@ from starlette.routing import Route
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.report import html
-from ema_pipeline.report.summary_files import finite
-from ema_pipeline.view.guard import Guard
+from ema_pipeline.view.serving import script, serve_guarded, started_soon
 from ema_pipeline.view.session import Session
 from ema_pipeline.view.worker import VERBS
 
@@ -28,7 +24,7 @@ _LARGEST_BODY = 4096
 _LONGEST_LABEL = 300
 _BEAT_S = 1.0
 """How often the time of a running action is told anew."""
-_SCRIPT = "text/javascript; charset=utf-8"
+_QUIET_S = 15.0
 
 
 def serve(
@@ -52,25 +48,7 @@ def serve(
         If the folder holds no results, or the port is taken.
     """
     session = Session(folder, effect_files)
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind(("127.0.0.1", port))
-    except OSError as error:
-        raise EmaError(f"port {port} cannot be used ({error.strerror}); leave --port out") from None
-    guard = Guard(
-        application(session, lambda: ready(guard.address) if ready else None), listener.getsockname()[1]
-    )
-    config = uvicorn.Config(
-        guard,
-        ws="none",
-        log_level="critical",
-        access_log=False,
-        server_header=False,
-        timeout_graceful_shutdown=1,
-    )
-    with contextlib.suppress(KeyboardInterrupt), contextlib.closing(listener):
-        uvicorn.Server(config).run(sockets=[listener])
+    serve_guarded(lambda started: application(session, started), port, ready)
 
 
 def application(session: Session, started: Callable[[], None] = lambda: None) -> Starlette:
@@ -79,7 +57,7 @@ def application(session: Session, started: Callable[[], None] = lambda: None) ->
     @contextlib.asynccontextmanager
     async def lifespan(app: Starlette) -> AsyncIterator[None]:
         watching = asyncio.create_task(session.watch())
-        asyncio.get_running_loop().call_later(0.2, started)  # the socket listens already
+        started_soon(started)
         yield
         watching.cancel()
         await asyncio.wait([watching])
@@ -95,10 +73,13 @@ def application(session: Session, started: Callable[[], None] = lambda: None) ->
         return _json(html.script_json(await asyncio.to_thread(session.model)))
 
     async def events(request: Request) -> Response:
-        return StreamingResponse(_events(session), media_type="text/event-stream")
+        return StreamingResponse(
+            session.listeners.events(session.state, lambda: _BEAT_S if session.job else _QUIET_S),
+            media_type="text/event-stream",
+        )
 
-    async def script(request: Request) -> Response:
-        return Response(_asset(request.url.path.removeprefix("/")), media_type=_SCRIPT)
+    async def scripts(request: Request) -> Response:
+        return script(request.url.path.removeprefix("/"))
 
     async def commands(request: Request) -> Response:
         return PlainTextResponse("#!/bin/sh\nset -e\n" + "".join(f"{c}\n" for c in session.commands))
@@ -123,10 +104,10 @@ def application(session: Session, started: Callable[[], None] = lambda: None) ->
             Route("/model", model),
             Route("/events", events),
             Route("/commands", commands),
-            Route("/bokeh.js", script),
-            Route("/numbers.js", script),
-            Route("/page.js", script),
-            Route("/live.js", script),
+            Route("/bokeh.js", scripts),
+            Route("/numbers.js", scripts),
+            Route("/page.js", scripts),
+            Route("/live.js", scripts),
             Route("/action", action, methods=["POST"]),
         ],
         lifespan=lifespan,
@@ -158,24 +139,5 @@ async def _wanted(request: Request) -> tuple[str, str]:
     return verb, label
 
 
-async def _events(session: Session) -> AsyncIterator[str]:
-    """The session's state whenever it changes, and every second while something runs."""
-    queue = session.listen()
-    try:
-        while True:
-            yield f"data: {json.dumps(finite(session.state()))}\n\n"
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(queue.get(), _BEAT_S if session.job else 15.0)
-    finally:
-        session.leave(queue)
-
-
 def _json(text: str) -> Response:
     return Response(text, media_type="application/json")
-
-
-def _asset(name: str) -> str:
-    """A script of the page; only names of the routes come here."""
-    if name == "bokeh.js":
-        return html.bokeh_script()
-    return resources.files("ema_pipeline.report").joinpath("templates", name).read_text(encoding="utf-8")

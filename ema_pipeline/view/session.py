@@ -19,6 +19,7 @@ from ema_pipeline.pipeline import existing_run
 from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.stages.results import load_results
+from ema_pipeline.view.serving import Listeners
 from ema_pipeline.view.snapshots import Snapshots
 
 PARTS = ("band", "candidates", "model_details", "mode_rows", "gears")
@@ -70,7 +71,7 @@ class Session:
         self.commands: list[str] = []
         self.preview: list[dict[str, Any]] | None = None
         self._snapshots = Snapshots(folder)
-        self._listeners: set[asyncio.Queue[None]] = set()
+        self.listeners = Listeners()
         self._worker: asyncio.subprocess.Process | None = None
         self._running: asyncio.Task[None] | None = None
         self._seen: tuple[int, int] = (0, 0)
@@ -111,21 +112,6 @@ class Session:
             "data": model_data(self.results),
         }
 
-    def listen(self) -> asyncio.Queue[None]:
-        """A queue that gets an item whenever the state changes."""
-        queue: asyncio.Queue[None] = asyncio.Queue(maxsize=1)
-        self._listeners.add(queue)
-        return queue
-
-    def leave(self, queue: asyncio.Queue[None]) -> None:
-        """Stop listening."""
-        self._listeners.discard(queue)
-
-    def _tell(self) -> None:
-        for queue in self._listeners:
-            with contextlib.suppress(asyncio.QueueFull):
-                queue.put_nowait(None)
-
     # what is done
 
     async def act(self, verb: str, label: str) -> None:
@@ -140,7 +126,7 @@ class Session:
             raise EmaError(f"'{self.job.verb}' is under way; wait for it or cancel it")
         self.job = Job(verb, label)
         self.message, self.preview, self._cancelled = "", None, False
-        self._tell()
+        self.listeners.tell()
         self._running = asyncio.create_task(self._run_alone(self.job))
 
     async def cancel(self) -> None:
@@ -165,7 +151,7 @@ class Session:
             await asyncio.to_thread(self.load)
             self._log(before, self.results.added)
         self.message = "Undone."
-        self._tell()
+        self.listeners.tell()
 
     async def watch(self) -> None:
         """Keep a worker ready, and follow changes that are made on the command line."""
@@ -177,7 +163,7 @@ class Session:
                     await asyncio.to_thread(self.load)
                     self._snapshots.clear()
                     self.message = "The results were changed outside this page."
-                    self._tell()
+                    self.listeners.tell()
 
     async def close(self) -> None:
         """Stop what is under way, as `cancel` does, and remove the snapshots."""
@@ -216,7 +202,7 @@ class Session:
         except (EmaError, OSError) as error:
             self.message = str(error)
         self.job, self.preview = None, None
-        self._tell()
+        self.listeners.tell()
 
     async def _work(self, job: Job) -> dict[str, Any]:
         """Have the worker do it; its last message."""
@@ -248,7 +234,7 @@ class Session:
         else:
             job.stage, job.text = str(told["stage"]), str(told.get("text", ""))
             job.done = min(job.before + _SHARES.get(job.stage, 0.1) * float(told["done"]), 1.0)
-        self._tell()
+        self.listeners.tell()
 
     def _outcome(self) -> str:
         """What an action has brought, in one line."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from ema_pipeline.ingest.readers import read_raw
 from ema_pipeline.ingest.records import HitSamples
 from ema_pipeline.plain_text import printable
 from ema_pipeline.report.numbers import plain
+from ema_pipeline.toml_text import parse_toml
 from ema_pipeline.watch.arrivals import Arrival
 from ema_pipeline.watch.judge import JudgedRecord, judge_record
 
@@ -45,6 +47,25 @@ class Told:
     record: JudgedRecord | None = None
 
 
+@dataclass(frozen=True)
+class PointState:
+    """How far a point is.
+
+    Attributes
+    ----------
+    point : Dof
+    good, wanted : int
+        Good hits so far, and those that it needs.
+    coherence : dict of str to float
+        As in `JudgedRecord`, after the last record on it.
+    """
+
+    point: Dof
+    good: int
+    wanted: int
+    coherence: Mapping[str, float]
+
+
 class Session:
     """One folder.
 
@@ -69,12 +90,14 @@ class Session:
         listed = [r.impact for r in self.test.records if r.impact is not None]
         self.points = tuple(dict.fromkeys([Dof.parse(p) for p in points] or listed))
         self._entries = {r.file: r for r in self.test.records}
+        self._judged: dict[str, JudgedRecord] = {}
         self._good: dict[str, list[HitSamples]] = {}
         self._impacts: dict[str, Dof] = {}
 
     def take(self, arrival: Arrival) -> Told:
         """Judge a file that is complete, and list it in test.toml; in place of what was said of it before."""
         name = arrival.path.name
+        self._judged.pop(name, None)
         self._good.pop(name, None)
         self._impacts.pop(name, None)
         try:
@@ -82,8 +105,8 @@ class Session:
             before = self._samples(entry.impact)
             record, samples = judge_record(self.test, entry, before)
         except EmaError as error:
-            return self._told(arrival, False, f"✗ {name}: {_short(str(error), self.folder)}")
-        self._good[name], self._impacts[name] = samples, record.impact
+            return self._told(arrival, False, f"✗ {name}: {_short(str(error), arrival.path)}")
+        self._good[name], self._impacts[name], self._judged[name] = samples, record.impact, record
         if name not in self._entries:
             self._list(entry)
         return self._told(arrival, bool(record.good) and not record.faults, self._line(record), record)
@@ -110,14 +133,22 @@ class Session:
 
     def _list(self, entry: RecordDescription) -> None:
         """Add a record to test.toml."""
+        self._entries[entry.file] = entry
         text = self.test.file.read_text(encoding="utf-8-sig").rstrip("\n")
+        if entry.file in _listed(text):
+            return  # by hand meanwhile, or by another watch on this folder
         file, impact = json.dumps(entry.file, ensure_ascii=False), json.dumps(str(entry.impact))
         replace_file(self.test.file, f"{text}\n\n[[records]]\nfile = {file}\nimpact = {impact}\n")
-        self._entries[entry.file] = entry
 
     def _samples(self, impact: Dof | None) -> list[HitSamples]:
         """Good hits on a point so far."""
         return [h for name, hits in self._good.items() if self._impacts[name] == impact for h in hits]
+
+    def states(self) -> tuple[PointState, ...]:
+        """How far every point is: those to strike in their order, then those that were struck besides."""
+        points = dict.fromkeys([*self.points, *self._impacts.values()])
+        coherence = {r.impact: dict(r.coherence) for r in self._judged.values()}
+        return tuple(PointState(p, self.count(p), self.wanted, coherence.get(p, {})) for p in points)
 
     def count(self, point: Dof) -> int:
         """Good hits on a point so far."""
@@ -127,6 +158,12 @@ class Session:
     def next_point(self) -> Dof | None:
         """The first point that still needs hits; None where all are done or none are known."""
         return next((p for p in self.points if self.count(p) < self.wanted), None)
+
+    @property
+    def to_strike(self) -> Dof | None:
+        """The point that was struck last while it needs hits, then `next_point`."""
+        last = next(reversed(self._impacts.values()), None)
+        return last if last is not None and self.count(last) < self.wanted else self.next_point
 
     @property
     def done(self) -> bool:
@@ -161,5 +198,14 @@ class Session:
         return [name for name in self._entries if not (self.folder / name).exists()]
 
 
-def _short(text: str, folder: Path) -> str:
-    return text.replace(f"{folder}/", "")
+def _listed(text: str) -> set[object]:
+    """Files of the records in a description; none of one that is being edited."""
+    with suppress(EmaError):
+        records = parse_toml(text, "test.toml").get("records")
+        return {r.get("file") for r in records if isinstance(r, dict)} if isinstance(records, list) else set()
+    return set()
+
+
+def _short(text: str, path: Path) -> str:
+    """What is wrong with a file, without its name in front."""
+    return text.replace(f"{path.parent}/", "").removeprefix(f"{path.name}: ")

@@ -1,0 +1,342 @@
+"""Several set-ups of one state as one test: two hammers, roving sensors, and what cannot be merged."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.linalg
+from bench import ema
+from numpy.typing import NDArray
+
+from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.dof import Dof
+from ema_pipeline.errors import EmaError
+from ema_pipeline.frf.channels import ChannelQuality
+from ema_pipeline.frf.parts import gain_ratios, joined
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.merge import merge
+from ema_pipeline.pipeline import existing_run
+from ema_pipeline.simulate import simulate_campaign
+from ema_pipeline.stages.modes import measured_frfs, measured_modes
+
+BODIES = 6
+STIFFNESS = [5e6 * (1 + 0.1 * k) for k in range(1, BODIES + 1)]
+MASS = [0.5 + 0.05 * k for k in range(1, BODIES + 1)]
+SOFT = {"contact_s": 4e-3, "peak_force_n": 300.0, "seed": 1}
+HARD = {"contact_s": 4e-4, "peak_force_n": 60.0, "seed": 2}
+MEASURE = 'stages=["ingest","hits","frf","modal"]'
+
+
+def _truth() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Frequencies in Hz and shapes (bodies, modes) of the chain, from its own matrices."""
+    k = np.diag([a + b for a, b in zip(STIFFNESS, [*STIFFNESS[1:], 0.0], strict=True)])
+    k -= np.diag(STIFFNESS[1:], 1) + np.diag(STIFFNESS[1:], -1)
+    squares, shapes = scipy.linalg.eigh(k, np.diag(MASS))
+    return np.sqrt(squares) / (2 * np.pi), shapes
+
+
+def _rig(path: Path) -> Path:
+    lines = ['name = "chain"', "modal_damping_ratio = 0.01", "[parameters]"]
+    names = range(1, BODIES + 1)
+    lines += [
+        f'k{i} = {{ value = {k}, unit = "N/m", tolerance = 0.05 }}'
+        for i, k in zip(names, STIFFNESS, strict=True)
+    ]
+    lines += [f'[[masses]]\nat = "m{i}.x"\nvalue = {m}' for i, m in zip(names, MASS, strict=True)]
+    lines += ['[[springs]]\nname = "k1"\nvalue = "k1"\nat = "m1.x"']
+    lines += [
+        f'[[springs]]\nname = "k{i}"\nvalue = "k{i}"\nbetween = ["m{i - 1}.x", "m{i}.x"]'
+        for i in names
+        if i > 1
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def _simulate(folder: Path, **settings: object) -> Path:
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    given = {
+        "hits": 3, "sample_rate_hz": 5120.0, "duration_s": 1.0, "acceleration_noise": 0.5, "format": "hdf5",
+        "impacts": ["m1.x", "m6.x"],
+    }  # fmt: skip
+    simulate_campaign(folder, str(_rig(folder.parent / "chain.toml")), **given | settings)
+    return folder
+
+
+def _modes(capsys: pytest.CaptureFixture[str], raw: Path, out: Path) -> MeasuredModes:
+    code, _, err = ema(capsys, "run", raw, "--out", out, "--set", MEASURE, "--quiet")
+    assert code == 0, err
+    return measured_modes(existing_run(out))["default"]
+
+
+def _nearest(modes: MeasuredModes, frequency_hz: float) -> int:
+    return int(np.argmin(np.abs(modes.frequency_hz - frequency_hz)))
+
+
+@pytest.fixture(scope="module")
+def tips(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A soft tip that strikes hard and carries nothing above 700 Hz, a hard tip that is weak."""
+    root = tmp_path_factory.mktemp("tips")
+    _simulate(root / "soft", **SOFT)
+    _simulate(root / "hard", **HARD)
+    # another hammer, whose certificate is 3 % off
+    text = (root / "hard" / "test.toml").read_text(encoding="utf-8")
+    assert "sensitivity_mv = 2.25" in text
+    (root / "hard" / "test.toml").write_text(
+        text.replace("sensitivity_mv = 2.25", "sensitivity_mv = 2.3175"), encoding="utf-8"
+    )
+    return root
+
+
+def test_two_tips_are_as_good_as_each_on_its_own_band(
+    tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Frequencies by the chain's own matrices; as precise as the better tip, mode by mode."""
+    code, _out, err = ema(
+        capsys, "merge", tips / "soft", tips / "hard", "--out", tmp_path / "both", "--quiet"
+    )
+    assert (code, err) == (0, "")
+    both = _modes(capsys, tmp_path / "both", tmp_path / "out")
+    alone = [_modes(capsys, tips / name, tmp_path / f"out_{name}") for name in ("soft", "hard")]
+    assert len(alone[0]) < BODIES <= len(both)
+    for frequency in _truth()[0]:
+        k = _nearest(both, frequency)
+        error, std = both.frequency_hz[k] - frequency, both.frequency_std_hz[k]
+        assert abs(error) < 4 * std + 2e-6 * frequency, frequency
+        stds = [m.frequency_std_hz[_nearest(m, frequency)] for m in alone if _has(m, frequency)]
+        assert std < 1.3 * min(stds), frequency
+    # the low modes are the soft tip's, the high ones exist only by the hard tip
+    low = _truth()[0][0]
+    assert both.frequency_std_hz[0] < 0.2 * alone[1].frequency_std_hz[_nearest(alone[1], low)]
+
+
+def _has(modes: MeasuredModes, frequency_hz: float) -> bool:
+    return bool(np.min(np.abs(modes.frequency_hz / frequency_hz - 1)) < 1e-3)
+
+
+def test_what_merge_says(tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = ema(capsys, "merge", tips / "soft", tips / "hard", "--out", tmp_path / "both", "--json")
+    found = json.loads(out)
+    assert code == 0
+    soft, hard = found["parts"]
+    assert (
+        375 < soft["band_hz"][1] < 800 < 1900 < hard["band_hz"][1] <= 2000
+    )  # half-sine of 4 ms: zero at 375 Hz
+    assert found["band_hz"][1] == hard["band_hz"][1]
+    (gain,) = found["gains"]
+    # FRFs of the hard tip are 3 % too small: its sensitivity is stated 3 % too high, so its force is read too low
+    assert gain["ln_ratio"] == pytest.approx(-np.log(1.03), abs=4 * gain["std"] + 1e-3)
+    text = (tmp_path / "both" / "soft" / "test.toml").read_text(encoding="utf-8")
+    assert text.startswith('part = "soft"\nband_hz = [')
+    code, out, _ = ema(capsys, "check", tmp_path / "both", "--json")
+    files = {h["file"] for hits in json.loads(out).values() for h in hits}
+    assert code == 0
+    assert len(files) == 12
+    assert "hard/m1_x_60N_1.h5" in files
+
+
+def test_roving_sensors_make_whole_shapes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Three sensors at a time, one hammer: shapes over all bodies as the chain's matrices have them."""
+    for name, sensors, seed in (
+        ("first", ("m1.x", "m2.x", "m3.x"), 1),
+        ("second", ("m4.x", "m5.x", "m6.x"), 2),
+    ):
+        _simulate(tmp_path / name, **HARD | {"seed": seed, "sensors": list(sensors)})
+    code, _out, err = ema(
+        capsys, "merge", tmp_path / "first", tmp_path / "second", "--out", tmp_path / "all", "--quiet"
+    )
+    assert (code, err) == (0, "")
+    modes = _modes(capsys, tmp_path / "all", tmp_path / "out")
+    frequencies, shapes = _truth()
+    order = [[d.point for d in modes.dofs].index(f"m{i}.x") for i in range(1, BODIES + 1)]
+    for k, frequency in enumerate(frequencies):
+        found = modes.shapes[_nearest(modes, frequency)][order]
+        mac = abs(np.vdot(found, shapes[:, k])) ** 2 / (
+            np.vdot(found, found).real * np.vdot(shapes[:, k], shapes[:, k])
+        )
+        assert mac > 0.999, frequency
+
+
+def test_tests_of_two_states_are_refused(
+    tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A mass of 30 g between the two set-ups."""
+    _simulate(tmp_path / "later", effects=["mass@m3.x"], values={"mass@m3.x.mass": 0.03}, **HARD)
+    _refused(capsys, tmp_path / "both", "are not of one state", "mode at", tips / "soft", tmp_path / "later")
+    code, _, err = ema(
+        capsys,
+        "merge",
+        tips / "soft",
+        tmp_path / "later",
+        "--out",
+        tmp_path / "both",
+        "--tolerance",
+        "0.05",
+        "--quiet",
+    )
+    assert (code, err) == (0, "")
+
+
+def test_what_cannot_be_one_test_is_refused(
+    tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "both"
+    _simulate(tmp_path / "slow", **SOFT | {"sample_rate_hz": 2560.0})
+    _refused(capsys, out, "sample rate", "record all parts at one rate", tips / "hard", tmp_path / "slow")
+    _simulate(tmp_path / "apart", **HARD | {"impacts": ["m2.x"], "sensors": ["m3.x"]})
+    _simulate(tmp_path / "alone", **HARD | {"impacts": ["m1.x"], "sensors": ["m1.x"]})
+    _refused(capsys, out, "strikes no point", "leave one sensor", tmp_path / "alone", tmp_path / "apart")
+    _refused(capsys, out, "nothing to merge", "two or more", tips / "hard")
+    _refused(capsys, out, "called 'hard', too", "rename one", tips / "hard", tips / "hard")
+    shutil.copytree(tips / "hard", tmp_path / "other")
+    description = tmp_path / "other" / "test.toml"
+    text = description.read_text(encoding="utf-8")
+    description.write_text(text.replace("sensitivity_mv = 2.3175", "sensitivity_mv = 22.5"), encoding="utf-8")
+    _refused(capsys, out, "differ by a factor of 9.7", "sensitivity_mv", tips / "hard", tmp_path / "other")
+    description.write_text(text.replace('impact = "m6.x"', 'impact = "-m6.x"'), encoding="utf-8")
+    _refused(capsys, out, "opposite signs", "reversed", tips / "hard", tmp_path / "other")
+    description.write_text(
+        'configuration = "else"\n' + text.replace("configuration =", "# "), encoding="utf-8"
+    )
+    _refused(capsys, out, "only tests of one configuration", "'else'", tips / "hard", tmp_path / "other")
+    out.mkdir()
+    code, _, err = ema(capsys, "merge", tips / "soft", tips / "hard", "--out", out)
+    assert code == 1
+    assert "exists already" in err
+
+
+def _refused(capsys: pytest.CaptureFixture[str], out: Path, what: str, remedy: str, *sources: Path) -> None:
+    code, _, err = ema(capsys, "merge", *sources, "--out", out, "--quiet")
+    assert (code, err.count("\n")) == (1, 1), err
+    assert what in err, err
+    assert remedy in err, err
+    assert not out.exists()
+
+
+def test_two_tests_of_one_configuration_name_the_remedy(tips: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(tips / "hard", tmp_path / "raw" / name)
+    from ema_pipeline.ingest import read_campaign
+
+    with pytest.raises(EmaError, match=r"both describe configuration 'default'.*ema merge"):
+        read_campaign(tmp_path / "raw")
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        (('part = "../up"', 'part = "b"'), "part '../up'"),
+        (('part = "a"', 'part = "a"'), "both part 'a'"),
+        (('part = "a"', ""), "both describe configuration"),
+        (('part = "a"\nband_hz = [5.0, 2.0]', 'part = "b"'), "is no band"),
+        (('part = "a"\nband_hz = [5.0]', 'part = "b"'), "band_hz"),
+    ],
+)
+def test_parts_written_by_hand_are_checked(
+    tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], keys: tuple[str, str], said: str
+) -> None:
+    for name, key in zip(("one", "two"), keys, strict=True):
+        shutil.copytree(tips / "hard", tmp_path / "raw" / name)
+        file = tmp_path / "raw" / name / "test.toml"
+        file.write_text(f"{key}\n{file.read_text(encoding='utf-8')}", encoding="utf-8")
+    code, _, err = ema(capsys, "run", tmp_path / "raw", "--out", tmp_path / "out")
+    assert (code, err.count("\n")) == (1, 1), err
+    assert said in err, err
+
+
+def _frfs(std: float, band_hz: tuple[float, float], seed: int, gain: float = 1.0, lines: int = 801) -> FrfSet:
+    """One driving point, H = (1 + 1j)·gain with noise of a known deviation."""
+    noise = np.random.default_rng(seed).standard_normal((2, 1, 1, lines)) * std / np.sqrt(2)
+    shape = (1, 1, lines)
+    return FrfSet(
+        frequency_hz=np.arange(lines, dtype=float),
+        frf=gain * (np.full(shape, 1 + 1j) + noise[0] + 1j * noise[1]),
+        coherence=np.full(shape, 0.99),
+        variance=np.full(shape, (gain * std) ** 2),
+        outputs=(Dof.parse("a.x"),),
+        inputs=(Dof.parse("a.x"),),
+        quantities=("acceleration",),
+        hits=np.full((1, 1), 3),
+        estimator="H1",
+        record_s=1.0,
+        response_decay_rad_s=0.0,
+        delay_s=np.zeros(1),
+        band_hz=band_hz,
+        force_calibrated=True,
+        sensor_mass_kg=np.zeros(1),
+        channels=(ChannelQuality("a"),),
+        hammer=ChannelQuality("hammer"),
+    )
+
+
+def test_overlap_is_weighted_by_the_inverse_variance() -> None:
+    """Each alone in its own band, and in the overlap the least variance that two parts can give."""
+    soft, hard = _frfs(0.01, (1, 500), 1), _frfs(0.03, (200, 800), 2)
+    both = joined({"soft": soft, "hard": hard})
+    assert both.band_hz == (1, 800)
+    gain = both.frf[0, 0, 100] / soft.frf[0, 0, 100]  # the noise of the ratio of two equal gains
+    assert abs(gain - 1) < 0.005
+    np.testing.assert_allclose(both.frf[0, 0, 1:200], gain * soft.frf[0, 0, 1:200], rtol=1e-9)
+    overlap = both.variance[0, 0, 201:500]
+    np.testing.assert_allclose(overlap, 1 / (1 / 0.01**2 + 1 / 0.03**2), rtol=0.02)
+    np.testing.assert_allclose(both.variance[0, 0, 501:], 0.03**2, rtol=0.02)
+    error = np.mean(np.abs(both.frf[0, 0, 201:500] - (1 + 1j)) ** 2)
+    assert error == pytest.approx(
+        float(np.mean(overlap)), rel=0.35
+    )  # 299 lines: 6 %, and the common gain's error
+    assert both.hits[0, 0] == 6
+
+
+def test_gains_of_two_hammers_meet_in_the_middle() -> None:
+    soft, hard = _frfs(0.01, (1, 500), 1), _frfs(0.01, (200, 800), 2, gain=1.04)
+    ((value, std),) = gain_ratios({"soft": soft, "hard": hard}).values()
+    assert value == pytest.approx(-np.log(1.04), abs=4 * std)
+    both = joined({"soft": soft, "hard": hard})
+    level = np.abs(both.frf[0, 0]) / np.sqrt(2)
+    # equal calibrations: the geometric mean, without a step from one band to the other
+    assert np.mean(level[1:200]) == pytest.approx(np.sqrt(1.04), abs=3e-3)
+    assert np.mean(level[501:]) == pytest.approx(np.sqrt(1.04), abs=3e-3)
+    exact = dataclasses.replace(soft, hammer=ChannelQuality("hammer", 0.0))
+    level = np.abs(joined({"soft": exact, "hard": hard}).frf[0, 0]) / np.sqrt(2)
+    assert np.mean(level[501:]) == pytest.approx(1.0, abs=3e-3)  # the one that is known better rules
+
+
+def test_a_gap_between_bands_is_refused() -> None:
+    with pytest.raises(EmaError, match="no part speaks for 300 to 400 Hz"):
+        joined({"soft": _frfs(0.01, (1, 300), 1), "hard": _frfs(0.01, (400, 800), 2)})
+
+
+def test_a_band_that_is_stated_holds(tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(tips / "hard", tmp_path / "raw")
+    file = tmp_path / "raw" / "test.toml"
+    text = file.read_text(encoding="utf-8")
+    file.write_text("band_hz = [300.0, 1200.0]\n" + text, encoding="utf-8")
+    code, _, err = ema(
+        capsys, "run", tmp_path / "raw", "--out", tmp_path / "out", "--set", MEASURE, "--quiet"
+    )
+    assert code == 0, err
+    run = existing_run(tmp_path / "out")
+    assert measured_frfs(run)["default"].band_hz == (300.0, 1200.0)
+    frequencies = measured_modes(run)["default"].frequency_hz
+    assert len(frequencies) == 5
+    assert frequencies.min() > 300
+    for stated, said in (("[900, 300]", "is no band"), ("[2200.0, 2500.0]", "carries")):
+        file.write_text(f"band_hz = {stated}\n" + text, encoding="utf-8")
+        code, _, err = ema(
+            capsys, "run", tmp_path / "raw", "--out", tmp_path / "bad", "--set", MEASURE, "--quiet"
+        )
+        assert (code, err.count("\n")) == (1, 1), err
+        assert said in err, err
+
+
+def test_merge_takes_results_folders(tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _modes(capsys, tips / "soft", tmp_path / "out")
+    merged = merge([tmp_path / "out", tips / "hard"], tmp_path / "both")
+    assert [p.name for p in merged.parts] == ["soft", "hard"]
+    assert (tmp_path / "both" / "hard" / "test.toml").is_file()
+    assert (tmp_path / "both" / "rig.toml").is_file()
