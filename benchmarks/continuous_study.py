@@ -1,9 +1,9 @@
-"""Simulated oscillators and three-mass chains with one hidden nonlinear effect, or none, from raw records to the verdict.
+"""Simulated oscillators and three-mass chains with one hidden nonlinear effect, or none, from records to the verdict.
 
     python benchmarks/continuous_study.py [CASES] [FIRST]
 
-Every sixth case is linear. The equations of motion are integrated by steps of a hundredth of the fastest period or less,
-in code that shares nothing with the program: dry friction sticks and slips, forces between samples are continuous. All
+Every sixth case is linear. The equations of motion are integrated by steps of a hundredth of the fastest period or
+less, in code that shares nothing with the program: dry friction sticks and slips, forces are continuous in time. All
 channels carry 1 % noise and sensitivities that are wrong by 2 % (1 sigma). Drawn by lot are random force or multisine,
 accelerometers or displacement sensors, and for oscillators a rig file or none. Rig files are wrong by a factor.
 A case is right where exactly the hidden effect is claimed, at its place; nothing, where there is none.
@@ -140,7 +140,7 @@ def sized(
     chain: Chain, effect: str, force: NDArray[np.float64], driven: int, random: np.random.Generator
 ) -> tuple[int, NDArray[np.float64]]:
     """Law and numbers of an effect of 5 to 20 % of the force of the spring or twice that of the damper beside it."""
-    x, a = respond(chain, 5, np.zeros(4), force, driven)
+    x, _ = respond(chain, 5, np.zeros(4), force, driven)
     along = x @ chain.row
     size, rate = float(np.std(along)), float(np.std(np.gradient(along) * RATE))
     k, c = float(chain.stiffness[np.argmax(chain.row)]), float(chain.damping[np.argmax(chain.row)])
@@ -164,13 +164,15 @@ def respond(
     x = np.zeros((count, len(chain.mass)))
     a = np.zeros_like(x)
     force = np.append(force, force[-1])  # the end of the last step
-    _march(chain.mass, chain.stiffness, chain.damping, chain.row, law, numbers, force, driven, FINE, RATE, x, a)
+    _march(
+        chain.mass, chain.stiffness, chain.damping, chain.row, law, numbers, force, driven, FINE, RATE, x, a
+    )
     return x, a
 
 
 @numba.njit(cache=True)
 def _pull(law, n, d, v, z):  # type: ignore[no-untyped-def]
-    """Force of the hidden effect; `z` is the memory: of hysteresis its force, of friction the stretch of its bristles."""
+    """Force of the hidden effect; `z` is the force that hysteresis and friction remember."""
     if law == 0:
         return n[0] * d**3
     if law == 1:
@@ -230,7 +232,7 @@ def _march(m, k, c, row, law, n, force, driven, fine, rate, found, rates):  # ty
 
 
 def write_rig(path: Path, chain: Chain, random: np.random.Generator) -> None:
-    """A rig file whose masses and springs are right within a factor of one and a half, and whose dampers are guesses."""
+    """A rig file whose masses and springs are right within a factor of one and a half; its dampers are guesses."""
     factor = np.exp(0.4 * random.standard_normal(2 * len(chain.mass)))
     masses, springs, dampers = [], [], []
     for k, (m, s) in enumerate(zip(chain.mass, chain.stiffness, strict=True)):
@@ -246,7 +248,14 @@ def run(folder: Path) -> tuple[str, list[tuple[str, float]]]:
     """Verdict and claims ``id@place``, each with its first size."""
     rig = folder / "rig.toml"
     given = ["--rig", str(rig)] if rig.exists() else []
-    command = [sys.executable, "-c", "from ema_pipeline.cli import main; main()", "run", str(folder / "raw"), *given]
+    command = [
+        sys.executable,
+        "-c",
+        "from ema_pipeline.cli import main; main()",
+        "run",
+        str(folder / "raw"),
+        *given,
+    ]
     done = subprocess.run([*command, "--out", str(folder / "out"), "--quiet"], capture_output=True, text=True)
     if done.returncode:
         return "failed", [(done.stderr.strip()[:120], float("nan"))]

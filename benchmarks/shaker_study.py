@@ -2,11 +2,11 @@
 
     python benchmarks/shaker_study.py [SEEDS]
 
-Two rigs, both with exactly repeated modes: a ring of six equal masses (two pairs), and a chain of three masses that move
-in x and y alike (three pairs). Responses follow from the eigenvalue problem and the force's Fourier transform; nothing
-of the program is used to make them. All channels carry 1 % noise, of the
-largest response for the sensors. Printed are the modes found of six, and their largest
-errors of frequency and damping, each also over its stated standard deviation.
+Rigs with exactly repeated modes: a ring of six equal masses (two pairs), and a chain of three masses that move in x
+and y alike (three pairs), driven at one end or at both. Responses follow from the eigenvalue problem and the force's
+Fourier transform; nothing of the program is used to make them. Forces carry 1 % noise, all sensors that of the largest
+response. Printed are the modes found of six, and their largest errors of frequency and damping, each also over its
+stated standard deviation.
 """
 
 from __future__ import annotations

@@ -67,7 +67,16 @@ class ContinuousTest(Report):
             for r in records
             for f, samples in zip(r.forces, r.force, strict=True)
         ]
-        columns = ["configuration", "record", "excitation", "use", "samples", "period", "drives", "rms_force_n"]
+        columns = [
+            "configuration",
+            "record",
+            "excitation",
+            "use",
+            "samples",
+            "period",
+            "drives",
+            "rms_force_n",
+        ]
         return pd.DataFrame(rows, columns=columns)
 
     def plot(self, ax: Axes | None = None) -> Axes:

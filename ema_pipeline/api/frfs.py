@@ -162,7 +162,8 @@ class Frfs(Report):
         lines = []
         for name, s in self.sets.items():
             low, high = s.band_hz
-            size = f"{len(s.outputs)} responses × {len(s.inputs)} {'forces' if s.excitation else 'impact points'} × {s.frequency_hz.size} lines"
+            driven = "forces" if s.excitation else "impact points"
+            size = f"{len(s.outputs)} responses × {len(s.inputs)} {driven} × {s.frequency_hz.size} lines"
             lines.append(f"{name}: {size}, excited from {low:.4g} to {high:.4g} Hz, {s.estimator}")
             lines += [f"! {v.message}" for v in s.verdicts if not v.passes and v.message]
         return ["Frequency response functions", *lines]

@@ -154,7 +154,9 @@ def read(
     """
     info = describe(Path(raw), None, None if pipeline is None else str(pipeline), overrides(settings))
     if info.kind == "hysteresis":
-        raise EmaError(f"{raw}: holds force-displacement loops, which have no FRFs; use ema.run({str(raw)!r})")
+        raise EmaError(
+            f"{raw}: holds force-displacement loops, which have no FRFs; use ema.run({str(raw)!r})"
+        )
     work = Work.new(info)
     if info.kind == "continuous":
         work.run("ingest")

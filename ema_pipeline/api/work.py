@@ -143,8 +143,13 @@ class Work:
             effects=(),
         )
         made = Work.new(info)
-        stages = (*MEASURED, *(["ingest"] if info.kind == "continuous" else []))  # whose records are simulated
-        _copy_measured(self.store, made.store, stages, dict(zip(self.info.configurations, names, strict=True)))
+        stages = (
+            *MEASURED,
+            *(["ingest"] if info.kind == "continuous" else []),
+        )  # whose records are simulated
+        _copy_measured(
+            self.store, made.store, stages, dict(zip(self.info.configurations, names, strict=True))
+        )
         made = dataclasses.replace(made, rig=None if named else model, effect_files=files)
         info = with_effect_files(made.store, made.info, files)
         return dataclasses.replace(made, info=info).with_settings(settings)

@@ -19,7 +19,7 @@ from ema_pipeline.mechanics.simulation import DrivenSystem, Slopes, march
 _ROUNDS = 12
 """Periods or Newton steps after which the response is left to settle by itself."""
 _CLOSED = 1e-7
-"""Gap after one period, over the largest motion, at which the response counts as periodic; the next step is quadratic."""
+"""Gap after one period, over the largest motion, at which the response counts as periodic."""
 WITH_MEMORY = (3, 5)
 """Kinds of elements, as `simulation.coded_law` has them, that have a memory: hysteresis and relaxation."""
 _STABLE = 1 - 1e-6
@@ -58,13 +58,17 @@ def steady_response(
         if found is None or _gap(found[0]) < _CLOSED:
             break
         begin = found[0][-1].copy()
-        varied = march(system, sample_rate_hz, substeps, force, begin, _by_begin(Slopes.none(system, 0), free))
+        varied = march(
+            system, sample_rate_hz, substeps, force, begin, _by_begin(Slopes.none(system, 0), free)
+        )
         if varied is None:
             return None
         step = _returning(varied[1][-1, free], varied[0][-1, free] - begin[free])
         begin[free] += step
         found = march(system, sample_rate_hz, substeps, force, begin)
-        if found is None or _gap(found[0]) > _gap(varied[0]):  # too far for Newton: let it settle for a period
+        if found is None or _gap(found[0]) > _gap(
+            varied[0]
+        ):  # too far for Newton: let it settle for a period
             found = varied
     if found is None or not _gap(found[0]) < _CLOSED:
         return None
@@ -92,8 +96,9 @@ def _by_begin(slopes: Slopes, free: NDArray[np.intp]) -> Slopes:
     """Slopes whose first state depends on nothing but itself, with derivatives by its free parts added."""
     size = len(slopes.begin)
     arrays = (slopes.stiffness, slopes.damping, slopes.inputs, slopes.push, slopes.numbers)
-    padded = (np.concatenate([a, np.zeros((*a.shape[:-1], len(free)))], axis=-1) for a in arrays)
-    return Slopes(*padded, np.hstack([np.zeros(slopes.begin.shape), np.eye(size)[:, free]]))
+    begin = np.hstack([np.zeros(slopes.begin.shape), np.eye(size)[:, free]])
+    more = [np.concatenate([a, np.zeros((*a.shape[:-1], len(free)))], axis=-1) for a in arrays]
+    return Slopes(more[0], more[1], more[2], more[3], more[4], begin)
 
 
 def _settles(monodromy: NDArray[np.float64]) -> bool:
@@ -103,6 +108,4 @@ def _settles(monodromy: NDArray[np.float64]) -> bool:
 
 def _gap(states: NDArray[np.float64]) -> float:
     """Largest change of a state over one period, over its largest value."""
-    return float(
-        np.max(np.abs(states[-1] - states[0]) / np.maximum(np.max(np.abs(states), axis=0), 1e-300))
-    )
+    return float(np.max(np.abs(states[-1] - states[0]) / np.maximum(np.max(np.abs(states), axis=0), 1e-300)))
