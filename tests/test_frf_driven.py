@@ -65,7 +65,7 @@ def test_two_forces_at_once_give_the_matrix_and_a_variance_that_is_true(estimato
     on = (frfs.frequency_hz > 8) & (frfs.frequency_hz < 60)
     known = receptance(RIG.system(), frfs.frequency_hz[on], np.eye(2), np.eye(2))
     gap = np.abs(frfs.frf[:, :, on] - known)
-    assert np.median(gap / np.abs(known)) < 0.08
+    assert np.median(gap / np.abs(known)) < 0.04
     if estimator == "H1":
         sigma = np.sqrt(frfs.variance[:, :, on])
         assert 0.3 < np.median(gap / sigma) < 1.6  # the median of |error|/σ of a complex value is 0.83

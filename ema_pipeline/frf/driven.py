@@ -15,6 +15,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import ChannelQuality, merged
 from ema_pipeline.frf.checks import check_frfs
 from ema_pipeline.frf.distortion import Distortion, distortion
+from ema_pipeline.frf.local import local_spectra, long_enough
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.spectra import Spectra, solved
 from ema_pipeline.frf.types import FrfSet
@@ -101,8 +102,8 @@ def estimate_driven_frfs(records: Sequence[DrivenRecord], settings: FrfSettings 
 
     With sums over blocks, H1 = Gyf·Gff⁻¹, the least-squares answer to noise on the responses alone; Hv is the answer to
     noise on forces and responses alike, by total least squares of scaled spectra [1]_; H2 = H1 over the coherence, for
-    one force. Periods and bursts are taken whole; other records are cut into blocks with a Hann window, half of each
-    overlapping.
+    one force. Periods and bursts are taken whole. Other records of one force are cut into blocks with a Hann window,
+    half of each overlapping; those of several forces are summed over neighbouring lines, see `frf.local`.
 
     The variance of H1 is that of least squares, S·(ΣFFᴴ)⁻¹ with S the residual power over n - n_inputs averages. The
     partial coherence of a response and a force is what is left of it once all other forces are taken out of both.
@@ -130,13 +131,8 @@ def estimate_driven_frfs(records: Sequence[DrivenRecord], settings: FrfSettings 
     settings = settings or FrfSettings()
     kept = _alike([r for r in records if not r.held_out] or list(records))
     first = kept[0]
-    blocks = Blocks.of(kept, settings)
-    frequency = np.asarray(np.fft.rfftfreq(blocks.samples, 1 / first.sample_rate_hz), dtype=np.float64)
     n_in, n_out = len(first.forces), len(first.channels)
-    total = Spectra.none(n_in, n_out, len(frequency))
-    for record in kept:
-        for force, response in blocks.cut(record):
-            total.add(force, response)
+    total, frequency, blocks = _summed(kept, settings)
     apart = distortion(kept, blocks.samples) if blocks.whole and n_in == 1 and first.period else None
     excited = total.excited(_NOTHING) if apart is None else apart.excited
     band = _band(total.force_power if apart is None else apart.excited[None], frequency, first.sample_rate_hz)
@@ -176,6 +172,25 @@ def estimate_driven_frfs(records: Sequence[DrivenRecord], settings: FrfSettings 
     )
     verdicts = (*check_frfs(frfs, settings), *_notable(first, coherence, excited & inside, settings))
     return replace(frfs, verdicts=verdicts)
+
+
+def _summed(
+    records: Sequence[DrivenRecord], settings: FrfSettings
+) -> tuple[Spectra, NDArray[np.float64], Blocks]:
+    """Sums over periods, bursts or blocks; of several random forces over neighbouring lines of whole records."""
+    first = records[0]
+    n_in, count = len(first.forces), first.n_samples - first.transient
+    random = not first.period and not first.frame
+    if n_in > 1 and random and settings.block_samples is None and long_enough(records, _SHORTEST // 2):
+        total, frequency = local_spectra(records)
+        return total, frequency, Blocks(count, count, np.ones(count), 1.0, False)
+    blocks = Blocks.of(records, settings)
+    frequency = np.asarray(np.fft.rfftfreq(blocks.samples, 1 / first.sample_rate_hz), dtype=np.float64)
+    total = Spectra.none(n_in, len(first.channels), len(frequency))
+    for record in records:
+        for force, response in blocks.cut(record):
+            total.add(force, response)
+    return total, frequency, blocks
 
 
 def _bridged(values: NDArray[Any], excited: NDArray[np.bool_]) -> NDArray[Any]:
