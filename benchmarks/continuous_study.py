@@ -28,7 +28,7 @@ RATE, PERIOD, FINE, LEAD = 512.0, 2048, 12, 2048
 FIT, HELD_OUT = 2 * PERIOD, PERIOD
 EFFECTS = ("cubic_spring", "quadratic_spring", "dry_friction", "quadratic_damping", "hysteresis", "linear")
 NOISE, GAIN_STD = 0.01, 0.02
-STUCK = 0.002
+STUCK = 0.0005
 """Way that a dry contact gives before it slips, over the root mean square of its motion."""
 
 
@@ -245,7 +245,7 @@ def write_rig(path: Path, chain: Chain, random: np.random.Generator) -> None:
 
 
 def run(folder: Path) -> tuple[str, list[tuple[str, float]]]:
-    """Verdict and claims ``id@place``, each with its first size."""
+    """Verdict and claims ``id@place``, each with its size."""
     rig = folder / "rig.toml"
     given = ["--rig", str(rig)] if rig.exists() else []
     command = [
@@ -261,11 +261,14 @@ def run(folder: Path) -> tuple[str, list[tuple[str, float]]]:
         return "failed", [(done.stderr.strip()[:120], float("nan"))]
     found = json.loads((folder / "out" / "summary.json").read_text())["diagnosis"]
     claimed = [
-        (f"{c['effect']}@{c['at']}", next(iter(c["parameters"].values()))["value"])
-        for c in found["candidates"]
-        if c["claimed"]
+        (f"{c['effect']}@{c['at']}", _size(c["parameters"])) for c in found["candidates"] if c["claimed"]
     ]
     return found["verdict"], claimed
+
+
+def _size(parameters: dict[str, dict[str, float]]) -> float:
+    """The first parameter; of hysteresis, which has several, its stiffness."""
+    return parameters.get("stiffness", next(iter(parameters.values())))["value"]
 
 
 if __name__ == "__main__":
