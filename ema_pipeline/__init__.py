@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from ema_pipeline.api.continuous import ContinuousTest
     from ema_pipeline.api.diagnosis import Diagnosis, diagnose
     from ema_pipeline.api.fits import Fit, fit
     from ema_pipeline.api.frfs import Frfs
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from ema_pipeline.errors import EmaError
 
 _HOMES = {
+    "ContinuousTest": "api.continuous",
     "Diagnosis": "api.diagnosis",
     "EmaError": "errors",
     "Fit": "api.fits",
@@ -51,6 +53,7 @@ _HOMES = {
 """Public name to the module that defines it."""
 
 __all__ = [
+    "ContinuousTest",
     "Diagnosis",
     "EmaError",
     "Fit",

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+import ema_pipeline as ema
 from ema_pipeline.cli import app
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.description import read_description
@@ -139,3 +140,18 @@ def test_bouc_wen(test_data: Path, tmp_path: Path) -> None:
     assert records["sweep"]["rmse"] < 5e-6
     (loop,) = found["simulation"]["hysteresis"]
     assert loop["energy_per_cycle_j"] > 5 * loop["energy_per_cycle_std_j"] > 0
+
+
+def test_the_python_interface_reads_identifies_and_diagnoses(tmp_path: Path) -> None:
+    test = ema.read(write_oscillator(tmp_path / "raw", lambda x, v: 3e9 * x**3))
+    assert isinstance(test, ema.ContinuousTest)
+    (one, two) = test.records["default"]
+    assert one.force.shape == (1, 2048)
+    assert two.held_out
+    assert list(test.table()["drives"]) == ["mass.x", "mass.x"]
+    assert "1 held out" in test._repr_html_()
+    assert test.plot().get_ylabel().endswith("N²/Hz")
+    modes = ema.identify(test.frfs())
+    (tmp_path / "rig.toml").write_text(RIG)
+    found = ema.diagnose(tmp_path / "rig.toml", modes)
+    assert [c.label for c in found.candidates if c.claimed] == ["cubic_spring@mass.x"]

@@ -63,7 +63,7 @@ class Frfs(Report):
 
     @property
     def variance(self) -> NDArray[np.float64]:
-        """Variance of `h` from the scatter over hits, (n_outputs, n_inputs, n_lines)."""
+        """Variance of `h` from the scatter over hits or blocks, (n_outputs, n_inputs, n_lines)."""
         return self._one().variance
 
     @property
@@ -78,7 +78,7 @@ class Frfs(Report):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """DOFs that were struck."""
+        """DOFs that were struck or driven."""
         return tuple(d.point for d in self._one().inputs)
 
     def _one(self) -> FrfSet:
@@ -162,7 +162,8 @@ class Frfs(Report):
         lines = []
         for name, s in self.sets.items():
             low, high = s.band_hz
-            size = f"{len(s.outputs)} responses × {len(s.inputs)} impact points × {s.frequency_hz.size} lines"
+            driven = "forces" if s.excitation else "impact points"
+            size = f"{len(s.outputs)} responses × {len(s.inputs)} {driven} × {s.frequency_hz.size} lines"
             lines.append(f"{name}: {size}, excited from {low:.4g} to {high:.4g} Hz, {s.estimator}")
             lines += [f"! {v.message}" for v in s.verdicts if not v.passes and v.message]
         return ["Frequency response functions", *lines]

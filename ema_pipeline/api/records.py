@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ema_pipeline.api.continuous import ContinuousTest
 from ema_pipeline.api.display import Report, axes_or_new
 from ema_pipeline.api.frfs import Frfs, frfs_of
 from ema_pipeline.api.work import Settings, Work, overrides
@@ -117,8 +118,10 @@ class Test(Report):
         return [self.title or "Test", *used]
 
 
-def read(raw: str | Path, *, pipeline: str | Path | None = None, settings: Settings | None = None) -> Test:
-    """Read a raw folder: records in SI units, and the hits found in them with their verdicts.
+def read(
+    raw: str | Path, *, pipeline: str | Path | None = None, settings: Settings | None = None
+) -> Test | ContinuousTest:
+    """Read a raw folder: records in SI units, and of a hammer test the hits found in them with their verdicts.
 
     Parameters
     ----------
@@ -131,7 +134,8 @@ def read(raw: str | Path, *, pipeline: str | Path | None = None, settings: Setti
 
     Returns
     -------
-    Test
+    Test or ContinuousTest
+        By the `kind` that the folder states.
 
     Raises
     ------
@@ -149,12 +153,14 @@ def read(raw: str | Path, *, pipeline: str | Path | None = None, settings: Setti
     True
     """
     info = describe(Path(raw), None, None if pipeline is None else str(pipeline), overrides(settings))
-    if info.kind != "hammer":
-        held = "force-displacement loops, which have no FRFs"
-        if info.kind == "continuous":
-            held = "a continuous test, which has no hits"
-        raise EmaError(f"{raw}: holds {held}; use ema.run({str(raw)!r})")
+    if info.kind == "hysteresis":
+        raise EmaError(
+            f"{raw}: holds force-displacement loops, which have no FRFs; use ema.run({str(raw)!r})"
+        )
     work = Work.new(info)
+    if info.kind == "continuous":
+        work.run("ingest")
+        return ContinuousTest(info.title, info.configurations, work)
     run = work.run("ingest", "hits")
     hits = {name: run.store.load("hits", name, "hits", tuple[Hit, ...]) for name in info.configurations}
     return Test(info.title, info.configurations, hits, work)

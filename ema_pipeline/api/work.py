@@ -143,7 +143,13 @@ class Work:
             effects=(),
         )
         made = Work.new(info)
-        _copy_measured(self.store, made.store, dict(zip(self.info.configurations, names, strict=True)))
+        stages = (
+            *MEASURED,
+            *(["ingest"] if info.kind == "continuous" else []),
+        )  # whose records are simulated
+        _copy_measured(
+            self.store, made.store, stages, dict(zip(self.info.configurations, names, strict=True))
+        )
         made = dataclasses.replace(made, rig=None if named else model, effect_files=files)
         info = with_effect_files(made.store, made.info, files)
         return dataclasses.replace(made, info=info).with_settings(settings)
@@ -166,10 +172,10 @@ def _names_in(rig: Rig, measured: Sequence[str]) -> tuple[str, ...]:
     return tuple(measured)
 
 
-def _copy_measured(source: Store, target: Store, names: Mapping[str, str]) -> None:
-    """Copy what a model is compared with, under the rig's names of the configurations; no samples."""
+def _copy_measured(source: Store, target: Store, stages: Iterable[str], names: Mapping[str, str]) -> None:
+    """Copy what a model is compared with, under the rig's names of the configurations."""
     with source.reading() as old, target.changing() as new:
-        for stage in MEASURED:
+        for stage in stages:
             for before, now in names.items():
                 if f"stages/{stage}/{before}" in old:
                     old.copy(f"stages/{stage}/{before}", new, f"stages/{stage}/{now}")

@@ -83,7 +83,8 @@ def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict
                 passes=True,
                 clause=COHERENCE,
                 consequence="warn",
-                message="one hit per point has no coherence: take three or more to know the scatter",
+                message=f"one {'average has' if frfs.excitation else 'hit per point has'} no coherence: take three or "
+                "more to know the scatter",
             )
         ]
     verdicts = []
@@ -97,6 +98,18 @@ def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict
         power = power[peaks]
         total = float(power.sum())
         coherence = float(frfs.coherence[o, i, inside][peaks] @ power / total)
+        name = f"{frfs.outputs[o]} over {frfs.inputs[i]}"
+        enough = n >= HITS_FOR_COHERENCE
+        good = not enough or coherence >= settings.minimum_coherence
+        low = f"coherence of {name} is {coherence:.3f} where its FRF is largest"
+        least = settings.minimum_coherence
+        judgement = judged("coherence", coherence, least, good, COHERENCE, "warn", low, channel=name)
+        if not enough:
+            few = f"two {'averages' if frfs.excitation else 'hits'} are too few to judge coherence by ({coherence:.3f})"
+            judgement = replace(judgement, message=few)
+        verdicts.append(judgement)
+        if frfs.excitation:  # blocks and periods are no blows, whose place and direction could differ
+            continue
         # Variance of one hit's FRF, not of the mean over n. Noise is there at all lines, scatter of the blows
         # only where the structure answers. Lines count by their accuracy: the force fades towards the zeros of
         # its spectrum.
@@ -104,22 +117,12 @@ def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict
         seen = np.maximum(variance[peaks], 1e-20 * float(power.max()))
         excess = (seen - _floor(variance, peaks)).clip(min=0.0)
         scatter = float(np.sqrt(n * np.sum(excess / seen) / np.sum(power / seen)))
-        name = f"{frfs.outputs[o]} over {frfs.inputs[i]}"
-        enough = n >= HITS_FOR_COHERENCE
-        good = not enough or coherence >= settings.minimum_coherence
         steady = scatter <= settings.repeatability
-        low = f"coherence of {name} is {coherence:.3f} where its FRF is largest"
-        least = settings.minimum_coherence
-        judgement = judged("coherence", coherence, least, good, COHERENCE, "warn", low, channel=name)
-        if not enough:
-            few = f"two hits are too few to judge coherence by ({coherence:.3f})"
-            judgement = replace(judgement, message=few)
         loose = f"single hits of {name} scatter by {scatter:.0%}: strike one spot, one way"
         most = settings.repeatability
-        verdicts += [
-            judgement,
-            judged("repeatability", scatter, most, steady, REPEATABILITY, "warn", loose, channel=name),
-        ]
+        verdicts.append(
+            judged("repeatability", scatter, most, steady, REPEATABILITY, "warn", loose, channel=name)
+        )
     return verdicts
 
 
@@ -159,6 +162,7 @@ def _floor(variance: NDArray[np.float64], lines: NDArray[np.intp]) -> NDArray[np
 def _driving_points(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict]:
     """Sign of driving points: a passive structure takes power in, so that Im(accelerance) ≥ 0."""
     verdicts = []
+    driver = "force" if frfs.excitation else "hammer"
     for o, output in enumerate(frfs.outputs):
         if output not in frfs.inputs or frfs.hits[o, frfs.inputs.index(output)] == 0:
             continue
@@ -167,9 +171,9 @@ def _driving_points(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[
         total = float(np.sum(loss**2))
         wrong = float(np.sum(loss[loss < 0] ** 2)) / total if total > 0 else 0.0
         if wrong > 0.5:
-            what = "point the wrong way; sensor or hammer is reversed, put '-' before its dof"
+            what = f"point the wrong way; sensor or {driver} is reversed, put '-' before its dof"
         else:
-            what = "differ in sign; hammer and sensor are not at one point"
+            what = f"differ in sign; {driver} and sensor are not at one point"
         fault, limit = f"driving point {output}: resonances {what}", settings.negative_driving_point
         name, passes = f"{output} over {output}", wrong <= limit
         verdicts.append(

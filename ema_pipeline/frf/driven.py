@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import ChannelQuality, merged
 from ema_pipeline.frf.checks import check_frfs
 from ema_pipeline.frf.distortion import Distortion, distortion
+from ema_pipeline.frf.local import local_spectra, long_enough
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.spectra import Spectra, solved
 from ema_pipeline.frf.types import FrfSet
@@ -32,7 +34,7 @@ _NOTHING = 1e-6
 BAND_OVER_RATE = 1 / 2.56
 """Converters' anti-alias filters are flat up to the sample rate over 2.56."""
 _DROP = 1e-4
-"""Drop of a force's power at which its band ends."""
+"""Drop of a force's power at which its band ends, where its noise is not known."""
 _NOTABLE = 0.5
 """Coherence between forces from which it is worth a word."""
 
@@ -100,8 +102,8 @@ def estimate_driven_frfs(records: Sequence[DrivenRecord], settings: FrfSettings 
 
     With sums over blocks, H1 = Gyf·Gff⁻¹, the least-squares answer to noise on the responses alone; Hv is the answer to
     noise on forces and responses alike, by total least squares of scaled spectra [1]_; H2 = H1 over the coherence, for
-    one force. Periods and bursts are taken whole; other records are cut into blocks with a Hann window, half of each
-    overlapping.
+    one force. Periods and bursts are taken whole. Other records of one force are cut into blocks with a Hann window,
+    half of each overlapping; those of several forces are summed over neighbouring lines, see `frf.local`.
 
     The variance of H1 is that of least squares, S·(ΣFFᴴ)⁻¹ with S the residual power over n - n_inputs averages. The
     partial coherence of a response and a force is what is left of it once all other forces are taken out of both.
@@ -129,30 +131,25 @@ def estimate_driven_frfs(records: Sequence[DrivenRecord], settings: FrfSettings 
     settings = settings or FrfSettings()
     kept = _alike([r for r in records if not r.held_out] or list(records))
     first = kept[0]
-    blocks = Blocks.of(kept, settings)
-    frequency = np.asarray(np.fft.rfftfreq(blocks.samples, 1 / first.sample_rate_hz), dtype=np.float64)
     n_in, n_out = len(first.forces), len(first.channels)
-    total = Spectra.none(n_in, n_out, len(frequency))
-    for record in kept:
-        for force, response in blocks.cut(record):
-            total.add(force, response)
-    band = _band(total, frequency, first.sample_rate_hz)
+    total, frequency, blocks = _summed(kept, settings)
+    apart = distortion(kept, blocks.samples) if blocks.whole and n_in == 1 and first.period else None
+    excited = total.excited(_NOTHING) if apart is None else apart.excited
+    band = _band(total.force_power if apart is None else apart.excited[None], frequency, first.sample_rate_hz)
     inside = _inside(frequency, band)
-    excited = total.excited(_NOTHING)
     averages = total.count * blocks.independent
     coherence = total.input_coherence()
     _check_inputs(first, total, averages, excited & inside, blocks, settings)
     found = solved(total, averages, excited, settings.estimator)
-    apart = distortion(kept, blocks.samples) if blocks.whole and n_in == 1 and first.period else None
     hits = np.full((n_out, n_in), max(int(averages), 1), dtype=np.int64)
     hammer: ChannelQuality | None = None
     for f in first.forces:
         hammer = merged(hammer, ChannelQuality(f.name, f.calibration_std, f.transverse))
     frfs = FrfSet(
         frequency_hz=frequency,
-        frf=found.frf,
-        coherence=found.coherence,
-        variance=found.variance if apart is None else _wider(found.variance, apart),
+        frf=_bridged(found.frf, excited),
+        coherence=_bridged(found.coherence, excited),
+        variance=_bridged(found.variance if apart is None else _wider(found.variance, apart), excited),
         outputs=tuple(replace(c.dof, sign=1) for c in first.channels),
         inputs=tuple(replace(f.dof, sign=1) for f in first.forces),
         quantities=tuple(c.quantity for c in first.channels),
@@ -175,6 +172,37 @@ def estimate_driven_frfs(records: Sequence[DrivenRecord], settings: FrfSettings 
     )
     verdicts = (*check_frfs(frfs, settings), *_notable(first, coherence, excited & inside, settings))
     return replace(frfs, verdicts=verdicts)
+
+
+def _summed(
+    records: Sequence[DrivenRecord], settings: FrfSettings
+) -> tuple[Spectra, NDArray[np.float64], Blocks]:
+    """Sums over periods, bursts or blocks; of several random forces over neighbouring lines of whole records."""
+    first = records[0]
+    n_in, count = len(first.forces), first.n_samples - first.transient
+    random = not first.period and not first.frame
+    if n_in > 1 and random and settings.block_samples is None and long_enough(records, _SHORTEST // 2):
+        total, frequency = local_spectra(records)
+        return total, frequency, Blocks(count, count, np.ones(count), 1.0, False)
+    blocks = Blocks.of(records, settings)
+    frequency = np.asarray(np.fft.rfftfreq(blocks.samples, 1 / first.sample_rate_hz), dtype=np.float64)
+    total = Spectra.none(n_in, len(first.channels), len(frequency))
+    for record in records:
+        for force, response in blocks.cut(record):
+            total.add(force, response)
+    return total, frequency, blocks
+
+
+def _bridged(values: NDArray[Any], excited: NDArray[np.bool_]) -> NDArray[Any]:
+    """Values at lines that a multisine leaves without force, on straight lines between those that have some."""
+    lines, on = np.arange(values.shape[-1]), np.flatnonzero(excited)
+    found = values.copy()
+    if len(on) < 2:
+        return found
+    inside = lines[(lines > on[0]) & (lines < on[-1]) & ~excited]
+    for o, i in np.ndindex(values.shape[:-1]):
+        found[o, i, inside] = np.interp(inside, on, values[o, i, on])
+    return found
 
 
 def _wider(variance: NDArray[np.float64], apart: Distortion) -> NDArray[np.float64]:
@@ -203,10 +231,10 @@ def _inside(frequency: NDArray[np.float64], band: tuple[float, float]) -> NDArra
     return np.asarray((frequency >= band[0]) & (frequency <= band[1]))
 
 
-def _band(total: Spectra, frequency: NDArray[np.float64], rate: float) -> tuple[float, float]:
+def _band(powers: NDArray[Any], frequency: NDArray[np.float64], rate: float) -> tuple[float, float]:
     """Band in which all forces carry power: from the first line to the last within `_DROP` of the largest."""
     low, high = float(frequency[1]), rate * BAND_OVER_RATE
-    for power in total.force_power:
+    for power in powers:
         strong = np.flatnonzero(power[1:] >= _DROP * np.max(power[1:])) + 1
         low, high = max(low, float(frequency[strong[0]])), min(high, float(frequency[strong[-1]]))
     return low, max(high, low + float(frequency[1]))

@@ -67,7 +67,8 @@ class FrfSet:
         Of a multisine: variance of the FRF by noise, from its scatter over periods, and by nonlinear distortion, from
         what its scatter over realisations has beyond that (E|H - E H|² of one realisation).
     detected_distortion : ndarray, (n_outputs, 2, n_lines), or None
-        Root of the power of the response at lines that carry no force, SI, of odd and of even order, NaN elsewhere.
+        Response at lines that carry no force, over the typical force of a line that does, SI: distortion of odd and
+        of even order; NaN elsewhere.
     verdicts : tuple of Verdict
         Checks that need several hits or several points: coherence, driving point, reciprocity.
     """

@@ -121,7 +121,8 @@ def credible(
     needed = np.where((zeta > PLAIN_DAMPING) | twin, SURE_VOTES, MIN_VOTES)
     share = votes(estimate)
     support = np.maximum(share / needed, np.where(twin, 0.0, plain))
-    support = np.where(_incoherent(solution), 0.0, support)
+    # any mix of two modes at one pole is a shape of that pole, complex ones too
+    support = np.where(_incoherent(solution) & ~twin, 0.0, support)
     support = np.where(explained, np.maximum(support, 1.0), support)
     # where the polish finds no place for a mode, it is one only if most orders and the FRFs show it plainly
     support = np.where(fit.held, np.minimum(plain, share / SURE_VOTES), support)

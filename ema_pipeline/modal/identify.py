@@ -300,7 +300,7 @@ def _notes(data: FitData, scaling: str) -> tuple[str, ...]:
     notes = [scaling] if scaling else []
     if data.measured.shape[1] == 1:
         notes.append(
-            "one reference cannot show a multiplicity: modes of equal frequency appear as one; hit or "
+            "one reference cannot show a multiplicity: modes of equal frequency appear as one; excite or "
             "measure at a second point to tell them apart"
         )
     return tuple(notes)

@@ -25,6 +25,9 @@ _LEAST_STD = 0.05
 _POWER = {"displacement": 0, "velocity": 1, "acceleration": 2}
 _DAMPING = 0.02
 """Damping ratio from which the search begins."""
+_ROOM, _DAMPING_ROOM = 9.0, 2.5
+"""Largest change of a logarithm: four decades; of the common damping ratio to 0.16 % or 24 %, so that a broad peak
+that is bent by a nonlinearity is not taken for an overdamped mode."""
 _FAR = 60.0
 """Sum of squares of a pair of FRFs with nothing in common."""
 
@@ -131,10 +134,12 @@ def linear_start(
                 return np.full(2 * measured.log.size, _FAR)
         return np.nan_to_num(found, nan=_FAR, posinf=_FAR, neginf=-_FAR)
 
+    room = np.full(len(names), _ROOM)
+    room[len(loose) :] = _DAMPING_ROOM
     best: scipy.optimize.OptimizeResult | None = None
     for start in _starts(model, configuration, names, damping, measured, residual):
         found = scipy.optimize.least_squares(
-            residual, start, method="trf", loss="soft_l1", bounds=(start - 9.0, start + 9.0), max_nfev=60
+            residual, start, method="trf", loss="soft_l1", bounds=(start - room, start + room), max_nfev=60
         )
         if best is None or found.cost < best.cost:
             best = found

@@ -40,8 +40,8 @@ LINEAR_STD = 0.35
 rig answers with up to twice or half of its stiffness at rest."""
 _OFFSET_STD = 0.3
 """Prior 1 σ of a force channel's offset, as a share of the force's root mean square."""
-_MODE_STD = 0.5
-"""1 σ of the logarithm of a mode's damping about the common ratio."""
+_MODE_STD = 0.3
+"""1 σ of the logarithm of a mode's damping about the common ratio, the default of `modal_damping_scatter`."""
 _START_RATIO = 0.01
 """Damping ratio of a rig that states no damping at all."""
 _STEP = 1e-4

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.mechanics.periodic import steady_response
 from ema_pipeline.mechanics.simulation import DrivenSystem, Sensors, Slopes, march, resolved
 from ema_pipeline.observations.record_data import RecordData
 
@@ -50,7 +51,8 @@ def simulated(
     substeps : int
         Steps per sample.
     slowest_rad_s : float
-        Least decay rate of a mode: a periodic record is run through until all have died out.
+        Least decay rate of a mode: a periodic record whose steady response is not found by shooting is run through
+        until all have died out.
     sensors : Sensors
     system : DrivenSystem
         Its inputs are the forces and their offset.
@@ -58,17 +60,20 @@ def simulated(
         State at the first sample; of a periodic record, at the start of what comes before.
     slopes : Slopes, optional
     """
-    fine, before = data.fine_force(substeps), 0
+    fine = data.fine_force(substeps)
     rate, period = data.record.sample_rate_hz, data.record.n_samples
-    if data.periodic:
+    system, slopes = resolved(system, 1 / (rate * substeps), slopes)
+    found = steady_response(system, rate, substeps, fine, slopes) if data.periodic else None
+    before = 0
+    if data.periodic and found is None:  # it settles by itself, if at all
         before = int(np.ceil(min(DIED_OUT / slowest_rad_s * rate, _MOST_PERIODS * period)))
         fine = _led_in(data, fine, substeps, before)
-    system, slopes = resolved(system, 1 / (rate * substeps), slopes)
-    found = march(system, rate, substeps, fine, begin, slopes)
+    if found is None:
+        found = march(system, rate, substeps, fine, begin, slopes)
     if found is None:
         return None
     kept = slice(before, before + period)
-    states, change = found[0][kept], found[1][kept]
+    states, change = found[0][kept], np.ascontiguousarray(found[1][kept])
     force = fine[:: 2 * substeps][kept]
     read, slope = sensors.read(system, states, force, change, slopes)
     return Motion(states, read, slope)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Residuals, Unknowns, joined
 from ema_pipeline.ingest.driven import DrivenRecord
 from ema_pipeline.observations.base import EffectProblem
@@ -111,11 +112,14 @@ class RecordProblem(EffectProblem):
         )
 
     def motions(self, x: NDArray[np.float64], derivatives: bool = False) -> list[Motion] | None:
-        """What the model does in every record; None where it grows without bound in one."""
+        """What the model does in every record; None where it grows without bound in one, or has no positive mass."""
         o, common = self.observations, len(self.model.unknowns)
-        here = self.model.driven(x[:common])
         states = self._states
-        slopes = self.model.slopes(x[:common], here, states) if derivatives else None
+        try:
+            here = self.model.driven(x[:common])
+            slopes = self.model.slopes(x[:common], here, states) if derivatives else None
+        except (EmaError, np.linalg.LinAlgError):  # a step of the search past what can exist
+            return None
         found, place = [], common
         for data in o.data:
             begin, mine = np.zeros(here.size), slopes

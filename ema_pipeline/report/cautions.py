@@ -127,14 +127,16 @@ def _of_configuration(c: ConfigurationResults) -> Iterator[tuple[Weight, str]]:
     yield from ((Weight.LEFT_OUT, text) for text in left_out(c))
     if c.frfs is not None:
         if not c.frfs.force_calibrated:
-            yield Weight.SCALE, "the hammer is not calibrated: FRFs and shapes have no absolute scale"
+            what = "force" if c.frfs.excitation else "hammer"
+            yield Weight.SCALE, f"the {what} is not calibrated: FRFs and shapes have no absolute scale"
         for v in c.frfs.verdicts:
             if not v.passes and not _of_sensor(v):
                 yield Weight.SCATTER, v.message or f"{v.check} fails"
         singles = int((c.frfs.hits == 1).sum())
         if singles:
             rests = "FRF rests" if singles == 1 else "FRFs rest"
-            yield Weight.SCATTER, f"{singles} {rests} on one hit: no coherence and no scatter to judge by"
+            what = "average" if c.frfs.excitation else "hit"
+            yield Weight.SCATTER, f"{singles} {rests} on one {what}: no coherence and no scatter to judge by"
     if c.modal is not None:
         if not c.modal.scaled and c.modal.dofs:
             yield Weight.SCALE, c.modal.scaling_note or "shapes are unscaled: no driving point"

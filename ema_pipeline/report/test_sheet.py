@@ -15,7 +15,10 @@ _WINDOWS = (("force_window", "force window"), ("exponential_window", "exponentia
 def set_up_table(results: RunResults, c: ConfigurationResults) -> Table:
     """One row per item: structure, excitation, responses, resolution, windows, averaging, band."""
     rows = [("structure", f"{results.title}, {c.name}"), ("model", results.rig or "none")]
-    rows.append(("hits", f"{sum(h.accepted for h in c.hits)} of {len(c.hits)} used"))
+    if c.frfs is not None and c.frfs.excitation:
+        rows.append(("excitation", c.frfs.excitation.replace("_", " ")))
+    else:
+        rows.append(("hits", f"{sum(h.accepted for h in c.hits)} of {len(c.hits)} used"))
     if c.hits:
         peaks = [abs(h.peak_force) for h in c.hits if h.accepted] or [math.nan]
         unit = "N" if c.frfs is None or c.frfs.force_calibrated else "V"
@@ -25,13 +28,13 @@ def set_up_table(results: RunResults, c: ConfigurationResults) -> Table:
         counts = f.hits[f.hits > 0]
         step = float(f.frequency_hz[1] - f.frequency_hz[0]) if f.frequency_hz.size > 1 else math.nan
         rows += [
-            ("impact points", ", ".join(d.point for d in f.inputs)),
+            ("driven points" if f.excitation else "impact points", ", ".join(d.point for d in f.inputs)),
             ("response points", ", ".join(d.point for d in f.outputs)),
             ("sample rate", f"{plain(2 * float(f.frequency_hz[-1]), 5)} Hz"),
             ("record", f"{plain(f.record_s, 4)} s, lines every {plain(step, 3)} Hz"),
             (
                 "estimator",
-                f"{f.estimator}, {counts.min()} to {counts.max()} hits per FRF"
+                f"{f.estimator}, {counts.min()} to {counts.max()} {'averages' if f.excitation else 'hits'} per FRF"
                 if counts.size
                 else f.estimator,
             ),

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 from bokeh.embed import json_item
 from bokeh.layouts import column
-from bokeh.models import BasicTicker, FactorRange, FixedTicker, LinearColorMapper, Range1d
+from bokeh.models import BasicTicker, ColumnDataSource, FactorRange, FixedTicker, LinearColorMapper, Range1d
 from bokeh.models.annotations import ColorBar
 from bokeh.palettes import Blues256
 
+from ema_pipeline.report.interactive.packing import LEVELS
 from ema_pipeline.report.interactive.theme import (
     ACCENT,
     AFTER,
@@ -32,6 +33,7 @@ def frf_viewer(log_x: bool = False) -> Any:
     x_type = "log" if log_x else "linear"
     measured = source("frf.measured", "f", "magnitude", "phase", "coherence", "low", "high")
     models = [(source(f"frf.{k}", "f", "magnitude", "phase"), k) for k in ("before", "after")]
+    levels = {name: source(f"frf.{name}", "f", "level", "floor") for name in LEVELS}
     modes = source("frf.modes", "f", "text")
     selected = source("frf.selected", "f")
     styles = {"before": (BEFORE, "dashed", "base model"), "after": (AFTER, "solid", "with effects")}
@@ -44,6 +46,7 @@ def frf_viewer(log_x: bool = False) -> Any:
         )  # fmt: skip
         top.yaxis.name = f"{name}.axis"
         top.varea("f", "low", "high", source=measured, color=INK, alpha=0.22, legend_label="measured ± 2σ")
+        _noise_and_distortion(top, levels)
         line = top.line("f", "magnitude", source=measured, color=INK, line_width=1.6, legend_label="measured")
         line.glyph.tags = [INK_TAG]
         for data, key in models:
@@ -79,6 +82,24 @@ def frf_viewer(log_x: bool = False) -> Any:
         if log_x:
             log_axis(one.xaxis[0], ticks)
     return column(*made, phase, coherence, sizing_mode="stretch_width")
+
+
+def _noise_and_distortion(top: Any, levels: Mapping[str, ColumnDataSource]) -> None:
+    """What a multisine tells apart: bands up to 1 σ of noise and of distortion, marks at lines without force."""
+    top.varea(
+        "f", "floor", "level", source=levels["distortion"], fill_color=ACCENT, fill_alpha=0.12, hatch_pattern="/",
+        hatch_color=ACCENT, hatch_alpha=0.5, legend_label="distortion",
+        name="frf.level.distortion",
+    )  # fmt: skip
+    top.varea(
+        "f", "floor", "level", source=levels["noise"], fill_color=INK, fill_alpha=0.3,
+        legend_label="noise", name="frf.level.noise",
+    )  # fmt: skip
+    for name, marker, color in (("odd", "triangle", THIRD), ("even", "square", BEFORE)):
+        top.scatter(
+            "f", "level", source=levels[name], marker=marker, size=5, line_color=color, fill_color=None,
+            legend_label=f"{name} lines", name=f"frf.level.{name}",
+        )  # fmt: skip
 
 
 def error_per_mode() -> Any:

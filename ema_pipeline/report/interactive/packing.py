@@ -61,7 +61,7 @@ def packed_frfs(frfs: FrfSet, high_hz: float, points: int | None = POINTS) -> di
         "step": float(frfs.frequency_hz[1] - frfs.frequency_hz[0]) if frfs.frequency_hz.size > 1 else 1.0,
         "lines": int(lines.sum()),
         "total": len(all_pairs),
-        "average": "block" if frfs.excitation else "hit",
+        "average": _average(frfs),
         "outputs": [d.point for d in frfs.outputs],
         "inputs": [d.point for d in frfs.inputs],
         "pairs": [[o, i, int(frfs.hits[o, i])] for o, i in kept],
@@ -71,7 +71,40 @@ def packed_frfs(frfs: FrfSet, high_hz: float, points: int | None = POINTS) -> di
         "sigma": _packed(sigma.astype(np.uint8)),
         "decades": DECADES,
         "sigma_decades": SIGMA_DECADES,
+        "levels": _levels(frfs, kept, lines),
     }  # fmt: skip
+
+
+def _average(frfs: FrfSet) -> str:
+    """What was averaged."""
+    if not frfs.excitation:
+        return "hit"
+    return "block" if frfs.noise_variance is None else "period"
+
+
+LEVELS = ("noise", "distortion", "odd", "even")
+"""Of a multisine: 1 σ of the FRF by noise and by distortion, and distortion of odd and even order."""
+
+
+def _levels(frfs: FrfSet, kept: list[tuple[int, int]], lines: NDArray[np.bool_]) -> dict[str, str] | None:
+    """Levels of noise and distortion of the kept FRFs as accelerance; None where a test does not tell them apart."""
+    noise, distortion, detected = frfs.noise_variance, frfs.distortion_variance, frfs.detected_distortion
+    if noise is None or distortion is None or detected is None or not np.isfinite(noise).any():
+        return None
+    omega = 2 * np.pi * frfs.frequency_hz[lines]
+    power = {"acceleration": 0, "velocity": 1, "displacement": 2}
+    found: dict[str, list[NDArray[np.float64]]] = {name: [] for name in LEVELS}
+    for o, i in kept:
+        sizes = (np.sqrt(noise[o, i]), np.sqrt(distortion[o, i]), *detected[o])
+        for name, size in zip(LEVELS, sizes, strict=True):
+            found[name].append(size[lines] * omega ** power[frfs.quantities[o]])
+    return {name: _packed(_differences(_level_steps(np.stack(rows)))) for name, rows in found.items()}
+
+
+def _level_steps(sizes: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Steps as those of the magnitude; 65535 where there is nothing."""
+    there = np.isfinite(sizes) & (sizes > 10.0 ** DECADES[0])
+    return np.where(there, _steps(np.log10(np.where(there, sizes, 1.0)), DECADES, 65534), 65535)
 
 
 def packed_cmif(frfs: FrfSet, high_hz: float, most: int = 1500) -> dict[str, list[float]]:

@@ -22,9 +22,13 @@ var EmaNumbers = (function () {
     var packed = configuration.frfs;
     if (!frfs[configuration.name]) {
       frfs[configuration.name] = Promise.all(["magnitude", "phase", "coherence", "sigma"].map(function (key) { return inflate(packed[key]); })).then(function (raw) {
-        var f = new Float64Array(packed.lines);
+        var levels = Object.keys(packed.levels || {});
+        return Promise.all(levels.map(function (key) { return inflate(packed.levels[key]); })).then(function (more) {
+        var f = new Float64Array(packed.lines), level = {};
+        levels.forEach(function (key, k) { level[key] = words16(more[k], packed.lines); });
         for (var k = 0; k < packed.lines; k++) { f[k] = packed.start + k * packed.step; }
-        return { f: f, magnitude: words16(raw[0], packed.lines), phase: words16(raw[1], packed.lines), coherence: raw[2], sigma: raw[3] };
+        return { f: f, magnitude: words16(raw[0], packed.lines), phase: words16(raw[1], packed.lines), coherence: raw[2], sigma: raw[3], level: level };
+        });
       });
     }
     return frfs[configuration.name];
@@ -44,6 +48,18 @@ var EmaNumbers = (function () {
       out.low[i] = size * Math.max(1 - 2 * share, 0.02);
       out.high[i] = size * (1 + 2 * share);
     }
+    return out;
+  }
+  /* Noise and distortion of one FRF, each with the lines at which it is known. */
+  function levels(all, packed, k) {
+    var n = packed.lines, low = packed.decades[0], span = packed.decades[1] - low, out = {};
+    ["noise", "distortion", "odd", "even"].forEach(function (key) {
+      var words = all.level[key], f = [], level = [];
+      for (var i = 0; words && i < n; i++) {
+        if (words[k * n + i] !== 65535) { f.push(all.f[i]); level.push(Math.pow(10, low + span * words[k * n + i] / 65534)); }
+      }
+      out[key] = { f: f, level: level, floor: level.map(function () { return Math.pow(10, low); }) };
+    });
     return out;
   }
   /* Acceleration over force of a model: the sum over its poles. */
@@ -89,5 +105,5 @@ var EmaNumbers = (function () {
     }
     return ticks;
   }
-  return { unpacked: unpacked, row: row, modelled: modelled, ticksOf: ticksOf };
+  return { unpacked: unpacked, row: row, levels: levels, modelled: modelled, ticksOf: ticksOf };
 }());

@@ -112,12 +112,20 @@ var EmaPage = (function () {
     options(byId("frf-input"), inputs.map(function (i) { return c.frfs.inputs[i]; }), inputs.indexOf(chosen.input));
     var note = byId("frf-note"), hits = c.frfs.pairs.filter(function (p) { return p[0] === chosen.output && p[1] === chosen.input; })[0][2];
     var some = c.frfs.pairs.length < c.frfs.total ? "; " + c.frfs.pairs.length + " of " + c.frfs.total + " FRFs are kept in this page" : "";
-    note.textContent = c.name + ": " + c.frfs.outputs[chosen.output] + " ← " + c.frfs.inputs[chosen.input] + ", " + (hits === 1 ? "one " + c.frfs.average + ": no coherence, no scatter" : "mean of " + hits + " " + c.frfs.average + "s") + some;
+    note.textContent = c.name + ": " + c.frfs.outputs[chosen.output] + " ← " + c.frfs.inputs[chosen.input] + ", " + (hits === 1 ? "one " + c.frfs.average + ": no coherence, no scatter" : "mean of " + hits + " " + c.frfs.average + "s") + some + said(c.frfs.levels);
     refill(["frf"]);
   }
+  function said(levels) { return levels ? ". Shaded: noise, 1σ of the mean; hatched: nonlinear distortion, 1σ of one realisation; triangles and squares: distortion at odd and even lines that carry no force." : ""; }
   function empty(names) { var out = {}; names.forEach(function (n) { out[n] = []; }); return out; }
   function shortModel(k) { return data.model.models[k] || "model"; }
 
+  /* Curves, with their entry in the legend, that a test has or has not. */
+  function shown(figure, name, there) {
+    documents[figure]._all_models.forEach(function (m) {
+      if (m.type === "LegendItem" && m.renderers.some(function (r) { return r.name === name; })) { m.setv({ visible: there }); }
+      if (m.name === name) { m.setv({ visible: there }); }
+    });
+  }
   /* Names of the models that are compared; a curve that is not there has no entry. */
   function legend(figure) {
     documents[figure]._all_models.forEach(function (m) {
@@ -140,6 +148,12 @@ var EmaPage = (function () {
         var k = packed.pairs.findIndex(function (p) { return p[0] === chosen.output && p[1] === chosen.input; });
         var rowed = EmaNumbers.row(all, packed, k, byId("frf-band").checked), models = data.model.frfs[c.name] || [];
         columns("frf", "frf.measured", rowed);
+        var levels = EmaNumbers.levels(all, packed, k), banded = byId("frf-band").checked, quiet = [];
+        Object.keys(levels).forEach(function (key) {
+          quiet = quiet.concat(levels[key].level);
+          columns("frf", "frf." + key, banded ? levels[key] : empty(["f", "level", "floor"]));
+          shown("frf", "frf.level." + key, banded && levels[key].f.length > 0);
+        });
         ["before", "after"].forEach(function (key) {
           var hidden = key === "after" && chosen.after === chosen.before;
           var curve = hidden ? null : modelled(variant(models, chosen[key]), chosen.output, chosen.input, all.f);
@@ -151,7 +165,9 @@ var EmaPage = (function () {
         markMode();
         var low = Infinity, sizes = Array.prototype.slice.call(rowed.magnitude).sort(function (a, b) { return a - b; });
         var high = sizes[sizes.length - 1] * 2, end = all.f[all.f.length - 1];
-        low = Math.max(sizes[Math.floor(0.005 * sizes.length)] / 2, high * 1e-7);
+        low = sizes[Math.floor(0.005 * sizes.length)] / 2;
+        if (banded && quiet.length) { quiet.sort(function (a, b) { return a - b; }); low = Math.min(low, quiet[Math.floor(0.02 * quiet.length)] / 3); }
+        low = Math.max(low, high * 1e-7);
         var start = lines.length ? Math.max(all.f[0], 0.4 * Math.min.apply(null, lines)) : all.f[0];
         if (documents.frf.shownFor !== c.name) { set("frf", "frf.x", { start: start, end: end }); documents.frf.shownFor = c.name; }
         set("frf", "frf.log.y", { start: low, end: high });
