@@ -97,7 +97,9 @@ def over_limit(line: Line) -> float | None:
     ratios = []
     for t in line["truth"]:
         own = [
-            x for x in line.get("limits", ()) if is_truth(line, x["label"], t) and x["parameter"] == t["parameter"]
+            x
+            for x in line.get("limits", ())
+            if is_truth(line, x["label"], t) and x["parameter"] == t["parameter"]
         ]
         if not own:
             return None

@@ -1,6 +1,7 @@
 """Retake the pictures of the report and of the live page from results of the sample.
 
-    .venv/bin/ema run sample_data/hidden_effect --rig planetary && .venv/bin/python docs/pictures.py results/hidden_effect
+    .venv/bin/ema run sample_data/hidden_effect --rig planetary
+    .venv/bin/python docs/pictures.py results/hidden_effect
 
 Needs Chromium at /usr/bin/chromium. The results are left with the effect that the live page adds.
 """
@@ -14,10 +15,10 @@ import sys
 from pathlib import Path
 
 from PIL import Image
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 FIGURES = Path(__file__).parent / "figures"
-SETTLED_MS = 2500
+SETTLED_MS = 4000
 """Time in which a page has drawn its figures."""
 FRAME_MS = 2500
 
@@ -47,7 +48,8 @@ def live(browser: Browser, results: Path) -> None:
     """The story on the live page, frame by frame, and its end in dark colours."""
     ema = Path(sys.executable).with_name("ema")
     command = [str(ema), "view", str(results), "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    try:
         assert server.stdout is not None
         address = next(m[0] for line in server.stdout if (m := re.search(r"http://\S+", line)))
         page = opened(browser, address, 1080, 1130)
@@ -58,9 +60,7 @@ def live(browser: Browser, results: Path) -> None:
         add.click()
         page.wait_for_timeout(600)
         frames.append(page.screenshot())
-        page.wait_for_function(
-            "document.querySelector('#band h2').innerText.includes('In the model')", timeout=120_000
-        )
+        expect(page.locator("#band h2")).to_contain_text("In the model", timeout=120_000)
         page.wait_for_selector("#cancel", state="hidden", timeout=120_000)
         page.evaluate("window.scrollTo(0, 0)")
         page.wait_for_timeout(SETTLED_MS)
@@ -68,6 +68,7 @@ def live(browser: Browser, results: Path) -> None:
         page.emulate_media(color_scheme="dark")
         page.wait_for_timeout(SETTLED_MS)
         page.screenshot(path=FIGURES / "live_dark.png")
+    finally:
         server.terminate()
     pictures = [Image.open(io.BytesIO(f)).convert("RGB").resize((810, 848)) for f in frames]
     pictures[0].save(

@@ -260,7 +260,7 @@ def test_an_effect_of_twice_its_limit_is_seen_and_one_far_below_it_is_not(label:
         return with_it.log_evidence - start.log_evidence >= needed(h, hypotheses, settings, 0)
 
     at = np.mean([seen(2.0 * limit.size, 20 + i) for i in range(4)])
-    below = np.mean([seen(0.2 * limit.size, 40 + i) for i in range(3)])
+    below = np.mean([seen(0.1 * limit.size, 40 + i) for i in range(3)])
     assert at >= 0.75
     assert below == 0
 

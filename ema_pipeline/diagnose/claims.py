@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ema_pipeline.diagnose.heldout import HeldOut, held_out
+from ema_pipeline.diagnose.heldout import NOTHING_HELD_OUT, HeldOut, held_out
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import Named, named, sizes_of
 from ema_pipeline.diagnose.ranking import Ranked, Ranking
@@ -17,7 +17,8 @@ from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, within_scatter
 
 HELD_OUT_TIE = 1.0
-"""Log density of data held out by which a claim may be behind: few modes foretell a small effect no better than none."""
+"""Log density of data held out by which a claim may be behind: few modes foretell a small effect no better than
+none."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,8 @@ class Judged:
     named : Named
     gain : float
         Log evidence gained, under the name that is said.
-    base : Fit
-        The model without it, at the same scatters.
+    base, after : Fit
+        The model without and with it, at the same scatters, no part further out than parts scatter.
     held_before, held_after : HeldOut
         Of data held out, without and with it.
     doubt : str
@@ -42,6 +43,7 @@ class Judged:
     named: Named
     gain: float
     base: Fit
+    after: Fit
     held_before: HeldOut
     held_after: HeldOut
     doubt: str
@@ -78,14 +80,14 @@ def judge(
     name = named(ranked.hypothesis, ranked.fit)
     gain = ranked.gain + name.advantage
     base = at_scatters(observations, ranking.base, ranked.fit.posterior.scatters)
-    base = within_scatter(observations, base)
-    before = after = HeldOut(float("nan"), float("nan"))
+    base, mended = within_scatter(observations, base), within_scatter(observations, ranked.fit)
+    before = after = NOTHING_HELD_OUT
     doubt = _weak(ranked, gain, settings, nothing)
     if not doubt:
-        before, after = held_out(observations, base), held_out(observations, ranked.fit)
-        doubt = _contradicted(ranked, base, before, after)
+        before, after = held_out(observations, base), held_out(observations, mended)
+        doubt = _contradicted(base, mended, before, after)
         name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, _widened(observations, ranked.fit)))
-    return Judged(ranked, name, gain, base, before, after, doubt)
+    return Judged(ranked, name, gain, base, mended, before, after, doubt)
 
 
 def _widened(observations: Observations, fit: Fit) -> Fit:
@@ -115,8 +117,8 @@ def _std_of_first(ranked: Ranked) -> float:
     return float(1 / np.sqrt(max(np.linalg.pinv(own)[0, 0], 1e-300)))
 
 
-def _contradicted(ranked: Ranked, base: Fit, before: HeldOut, after: HeldOut) -> str:
-    if ranked.fit.posterior.error >= base.posterior.error:
+def _contradicted(base: Fit, mended: Fit, before: HeldOut, after: HeldOut) -> str:
+    if mended.posterior.error >= base.posterior.error:
         return "the error does not fall with it"
     if after.log_density < before.log_density - HELD_OUT_TIE:
         return "data held out are predicted worse with it"

@@ -135,7 +135,7 @@ def _candidate(
         probability=probabilities.get(j.named.label, 0.0),
         parameters=dict(j.named.sizes),
         error_before=j.base.posterior.error,
-        error_after=j.ranked.fit.posterior.error,
+        error_after=j.after.posterior.error,
         heldout_before=j.held_before.error,
         heldout_error_after=j.held_after.error,
         gain=j.gain,

@@ -12,7 +12,7 @@ from ema_pipeline.inference import Bounded, Posterior, Residuals, descend
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import PARTS, Fit, transferred
 
-_STEPS = 8
+_STEPS = 20
 
 
 @dataclass(frozen=True)

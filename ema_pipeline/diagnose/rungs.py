@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ema_pipeline.diagnose.heldout import HeldOut, held_out
+from ema_pipeline.diagnose.heldout import held_out
 from ema_pipeline.diagnose.types import EffectSize, Ladder, LearnedScatter, Rung
 from ema_pipeline.inference import Posterior
 from ema_pipeline.inference.maximise import ANNEALING, anneal
@@ -29,13 +29,13 @@ def rungs_of(observations: Observations, fits: Sequence[Fit]) -> tuple[Rung, ...
     scatters = fits[-1].posterior.scatters
     alike = tuple(at_scatters(observations, f, scatters) for f in fits)
     base = alike[0].log_evidence
-    return tuple(rung(observations, f, base, held_out(observations, f)) for f in alike)
+    return tuple(_rung(observations, f, f.log_evidence - base) for f in alike)
 
 
-def rung(observations: Observations, fit: Fit, base_evidence: float, held: HeldOut) -> Rung:
-    """One model of the ladder, no part further out than parts scatter; its evidence is the whole fit's."""
-    evidence = fit.log_evidence - base_evidence
+def _rung(observations: Observations, fit: Fit, evidence: float) -> Rung:
+    """One model of the ladder, no part further out than parts scatter; its evidence is that of the whole fit."""
     problem, fit = fit.model.problem(observations), within_scatter(observations, fit)
+    held = held_out(observations, fit)
     return Rung(
         effects=fit.model.labels,
         error=fit.posterior.error,
