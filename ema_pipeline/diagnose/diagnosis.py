@@ -71,7 +71,8 @@ def diagnose(
     if hypotheses is None:
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
     found = select(observations, known, hypotheses, settings, progress)
-    verdict = verdict_of(observations, found, settings)
+    explained = explains(observations, found.final, settings)
+    verdict = verdict_of(found, settings, explained)
     start = found.rounds[0].ranking.base
     fits = [start, *(j.ranked.fit for j in found.claimed)]
     if found.claimed:
@@ -82,7 +83,6 @@ def diagnose(
     further = [h for h in hypotheses if h.label not in in_model]
     group = alike(found, settings)
     candidates = _candidates(found, settings, group)
-    fails = not explains(observations, found.final, settings)
     told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.claimed]
     if verdict == "ambiguous":
         names = [j.named.label for j in group]
@@ -100,13 +100,15 @@ def diagnose(
         candidates=candidates,
         indistinguishable=_groups(found, group),
         next_measurement=next_measurement(observations, found, group, verdict),
-        localisation=localise(scores(observations, found.final, further)) if fails else (),
+        localisation=() if explained else localise(scores(observations, found.final, further)),
         probabilities=dict(found.rounds[0].probabilities),
         error=rungs[0].error,
         heldout_error=rungs[0].heldout_error,
         ladder=ladder,
         notes=tuple(r for r in remarks if r),
-        detection_limits=() if fails else detection_limits(observations, found.final, hypotheses, settings),
+        detection_limits=detection_limits(observations, found.final, hypotheses, settings)
+        if explained
+        else (),
     )
 
 

@@ -44,11 +44,11 @@ def too_few(fit: Fit) -> bool:
     return len(residuals.values) - residuals.projected <= len(loose) + 1
 
 
-def verdict_of(observations: Observations, found: Selection, settings: DiagnoseSettings) -> VerdictWord:
-    """What the data support."""
+def verdict_of(found: Selection, settings: DiagnoseSettings, explained: bool) -> VerdictWord:
+    """What the data support; `explained` where the final model explains them, see `explains`."""
     if not found.claimed and too_few(found.final):
         return "not_enough_data"
-    if not explains(observations, found.final, settings):
+    if not explained:
         return "unknown_effect"
     if not found.claimed:
         return "adequate"

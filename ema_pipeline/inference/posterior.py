@@ -99,8 +99,3 @@ class Posterior:
     def value(self, name: str) -> float:
         """Maximum a posteriori of one unknown."""
         return float(self.x[self.unknowns.index[name]])
-
-    def narrowing(self, name: str) -> float:
-        """Posterior over prior σ of one unknown: 1 where the data say nothing of it."""
-        i = self.unknowns.index[name]
-        return float(self.std[i] / self.prior_std[i])
