@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from ema_pipeline.choices import NO_CHOICES, Choices
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.free_run import RecordError
 from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
@@ -89,10 +90,8 @@ class RunResults:
         Versions, files, hashes, dates: what a reader needs to do the run again.
     settings : mapping of str to mapping
         Stage to its settings, as text.
-    added : tuple of str
-        Effects that the user added, ``id@place``.
-    diagnosed_on : tuple of str
-        Effects of the model that the diagnosis was made of.
+    choices, diagnosed_choices : Choices
+        Hits and modes that the user excluded or included: now, and when the diagnosis was made.
     simulation : tuple of RecordError
         Free-run errors in the records of a continuous test; empty where none were simulated.
     hysteresis : tuple of HysteresisLoop
@@ -116,14 +115,17 @@ class RunResults:
     deviations: tuple[dict[str, float], ...] = ({}, {}, {})
     added: tuple[str, ...] = ()
     diagnosed_on: tuple[str, ...] = ()
+    choices: Choices = NO_CHOICES
+    diagnosed_choices: Choices = NO_CHOICES
     folder: str = ""
     simulation: tuple[RecordError, ...] = ()
     hysteresis: tuple[HysteresisLoop, ...] = ()
 
     @property
     def diagnosis_is_old(self) -> bool:
-        """True where effects were added or removed since the diagnosis was made."""
-        return self.diagnosis is not None and self.added != self.diagnosed_on
+        """True where effects, hits or modes were added or taken out since the diagnosis was made."""
+        then, now = (self.diagnosed_on, self.diagnosed_choices), (self.added, self.choices)
+        return self.diagnosis is not None and now != then
 
     @property
     def shown_ladder(self) -> Ladder | None:

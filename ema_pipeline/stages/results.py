@@ -20,6 +20,7 @@ from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.stages.base import Run
+from ema_pipeline.stages.models import diagnosed_choices
 from ema_pipeline.stages.modes import level_study
 from ema_pipeline.store import ALL
 from ema_pipeline.verdict import Verdict
@@ -65,7 +66,7 @@ def load_results(run: Run) -> RunResults:
         comparison_base=run.store.find("correlate", ALL, "comparison_base", Comparison),
         comparison_after=run.store.find("diagnose", ALL, "comparison_after", Comparison),
         diagnosis=_diagnosis(run),
-        ladder=run.store.find("ladder", ALL, "ladder", Ladder),
+        ladder=_own_ladder(run),
         simulation=_of_records(run, "simulation", RecordError),
         hysteresis=_of_records(run, "hysteresis", HysteresisLoop),
         sensitivities=run.store.find("correlate", ALL, "sensitivities", tuple[Verdict, ...]) or (),
@@ -79,6 +80,8 @@ def load_results(run: Run) -> RunResults:
         ),
         added=run.info.effects,
         diagnosed_on=run.store.find("diagnose", ALL, "on_top_of", tuple[str, ...]) or (),
+        choices=run.info.choices,
+        diagnosed_choices=diagnosed_choices(run),
         folder=str(run.store.folder),
         provenance=provenance(run),
         settings={name: _flat(json.loads(s.model_dump_json())) for name, s in run.settings.items()},
@@ -98,6 +101,14 @@ def _diagnosis(run: Run) -> Diagnosis | None:
     if found is None or run.info.kind != "modes" or found.verdict != "unknown_effect":
         return found
     return replace(found, next_measurement=FOR_A_TABLE)
+
+
+def _own_ladder(run: Run) -> Ladder | None:
+    """The ladder of added effects; that of the base model alone only while the diagnosis is of other data."""
+    bare = not run.info.effects and run.info.kind != "hysteresis"
+    if bare and diagnosed_choices(run) == run.info.choices:
+        return None
+    return run.store.find("ladder", ALL, "ladder", Ladder)
 
 
 R = TypeVar("R", RecordError, HysteresisLoop)
