@@ -126,9 +126,14 @@ def split_mode(text: str, configurations: Sequence[str]) -> tuple[str, float]:
     """
     configuration, found, hertz = text.rpartition(":")
     if not found or configuration not in configurations:
-        configuration, hertz = _only(text, "mode", "CONFIGURATION:HERTZ", configurations), hertz if found else text
+        configuration, hertz = (
+            _only(text, "mode", "CONFIGURATION:HERTZ", configurations),
+            hertz if found else text,
+        )
         if found:
-            raise EmaError(f"there is no configuration '{text.rpartition(':')[0]}'; it is one of {_list(configurations)}")
+            raise EmaError(
+                f"there is no configuration '{text.rpartition(':')[0]}'; it is one of {_list(configurations)}"
+            )
     try:
         frequency = float(hertz)
     except ValueError:
@@ -140,7 +145,9 @@ def split_mode(text: str, configurations: Sequence[str]) -> tuple[str, float]:
 
 def _only(text: str, what: str, form: str, configurations: Sequence[str]) -> str:
     if len(configurations) != 1:
-        raise EmaError(f"{what} '{text}': name it as {form}, with one of the configurations {_list(configurations)}")
+        raise EmaError(
+            f"{what} '{text}': name it as {form}, with one of the configurations {_list(configurations)}"
+        )
     return configurations[0]
 
 

@@ -11,8 +11,15 @@ from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.modal.chosen import REACH, nearest_mode, pole_of_chart
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.pipeline import STAGES_OF_KIND, ShowStage, existing_run, new_run, run_stages, stored_settings
-from ema_pipeline.stages.base import Run, RunInfo, save_info
+from ema_pipeline.pipeline import (
+    STAGES_OF_KIND,
+    ShowStage,
+    existing_run,
+    new_run,
+    run_stages,
+    stored_settings,
+)
+from ema_pipeline.stages.base import Run, save_info
 from ema_pipeline.stages.hits import CHOICE
 from ema_pipeline.stages.modes import modes_of_structure
 from ema_pipeline.store import Store
@@ -84,11 +91,11 @@ def excluding(hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Change:
     def change(run: Run) -> Choices:
         choices = run.info.choices
         for text in hits:
-            choice = _hit(run, text)
-            if choice in choices.excluded_hits:
-                raise EmaError(f"hit '{choice}' is excluded already")
-            choices = dataclasses.replace(choices, excluded_hits=(*choices.excluded_hits, choice))
-            _require_others(run, choices, choice)
+            hit = _hit(run, text)
+            if hit in choices.excluded_hits:
+                raise EmaError(f"hit '{hit}' is excluded already")
+            choices = dataclasses.replace(choices, excluded_hits=(*choices.excluded_hits, hit))
+            _require_others(run, choices, hit)
         for text in modes:
             configuration, frequency = split_mode(text, run.info.configurations)
             mine = _near(choices.included_modes, configuration, frequency)
@@ -117,7 +124,11 @@ def including(hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Change:
             choice = _hit(run, text)
             if choice not in choices.excluded_hits:
                 reason = _found_hit(run, choice).reason
-                why = f"a check has rejected it ({reason}); the limits are settings" if reason else "it is in use"
+                why = (
+                    f"a check has rejected it ({reason}); the limits are settings"
+                    if reason
+                    else "it is in use"
+                )
                 raise EmaError(f"hit '{choice}' was not excluded by you: {why}")
             left = tuple(x for x in choices.excluded_hits if x != choice)
             choices = dataclasses.replace(choices, excluded_hits=left)
@@ -125,11 +136,13 @@ def including(hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Change:
             configuration, frequency = split_mode(text, run.info.configurations)
             mine = _near(choices.excluded_modes, configuration, frequency)
             if mine is not None:
-                left = tuple(x for x in choices.excluded_modes if x is not mine)
-                choices = dataclasses.replace(choices, excluded_modes=left)
+                rest = tuple(x for x in choices.excluded_modes if x is not mine)
+                choices = dataclasses.replace(choices, excluded_modes=rest)
                 continue
             if run.info.kind == "modes":
-                raise EmaError(f"{run.store.folder}: a table of modes has no stabilisation chart to take a mode from")
+                raise EmaError(
+                    f"{run.store.folder}: a table of modes has no stabilisation chart to take a mode from"
+                )
             found = pole_of_chart(_modal(run, configuration), configuration, frequency)
             choices = dataclasses.replace(choices, included_modes=(*choices.included_modes, found))
         return choices
@@ -141,7 +154,9 @@ def _near(chosen: Sequence[ModeChoice], configuration: str, frequency_hz: float)
     """The choice that a frequency names."""
     mine = [x for x in chosen if x.configuration == configuration]
     best = min(mine, key=lambda x: abs(x.frequency_hz - frequency_hz), default=None)
-    return best if best is not None and abs(best.frequency_hz - frequency_hz) <= REACH * frequency_hz else None
+    return (
+        best if best is not None and abs(best.frequency_hz - frequency_hz) <= REACH * frequency_hz else None
+    )
 
 
 def _hit(run: Run, text: str) -> HitChoice:
@@ -152,7 +167,9 @@ def _hit(run: Run, text: str) -> HitChoice:
         files = sorted({h.file for h in _hits(run, configuration)})
         raise EmaError(f"{configuration}: there is no record '{file}'{did_you_mean(file, files)}")
     if number is None and len(mine) > 1:
-        raise EmaError(f"{configuration}/{file}: holds {len(mine)} hits; name one, e.g. '{configuration}/{file}#1'")
+        raise EmaError(
+            f"{configuration}/{file}: holds {len(mine)} hits; name one, e.g. '{configuration}/{file}#1'"
+        )
     wanted = 1 if number is None else number
     if wanted not in {h.number + 1 for h in mine}:
         raise EmaError(f"{configuration}/{file}: holds {len(mine)} hits, none is number {wanted}")
@@ -161,9 +178,7 @@ def _hit(run: Run, text: str) -> HitChoice:
 
 def _found_hit(run: Run, choice: HitChoice) -> Hit:
     return next(
-        h
-        for h in _hits(run, choice.configuration)
-        if (h.file, h.number + 1) == (choice.file, choice.number)
+        h for h in _hits(run, choice.configuration) if (h.file, h.number + 1) == (choice.file, choice.number)
     )
 
 
@@ -200,14 +215,14 @@ def _mode(run: Run, configuration: str, frequency_hz: float) -> ModeChoice:
     if at is None:
         near = min(modal.modes, key=lambda m: abs(m.frequency_hz - frequency_hz), default=None)
         hint = "" if near is None else f"; the nearest is at {near.frequency_hz:.6g} Hz"
-        raise EmaError(
-            f"{configuration}: no mode within {100 * REACH:.0f} % of {frequency_hz:.6g} Hz{hint}"
-        )
+        raise EmaError(f"{configuration}: no mode within {100 * REACH:.0f} % of {frequency_hz:.6g} Hz{hint}")
     mode = modal.modes[at]
     return ModeChoice(configuration, mode.frequency_hz, mode.damping_ratio)
 
 
 def _modal(run: Run, configuration: str) -> ModalModel:
     if not run.store.key("modal", configuration):
-        raise EmaError(f"{run.store.folder}: holds no modes of '{configuration}'; run 'ema modal {run.store.folder}'")
+        raise EmaError(
+            f"{run.store.folder}: holds no modes of '{configuration}'; run 'ema modal {run.store.folder}'"
+        )
     return modes_of_structure(run, configuration)

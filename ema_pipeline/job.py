@@ -220,15 +220,13 @@ def removing(label: str) -> Callable[[tuple[str, ...]], tuple[str, ...]]:
 
 
 def _with_decisions_of(store: Store, info: RunInfo) -> RunInfo:
-    """Keep the effects added to the same rig in an earlier run, and what was chosen of the same raw data."""
+    """Keep the effects added to the same rig in an earlier run, and the choices of hits and modes."""
     before = load_info(store) if store.path.is_file() else None
     if before is None:
         return info
     if before.rig == info.rig:
         info = dataclasses.replace(info, effects=before.effects)
-    if Path(before.raw).resolve() == Path(info.raw).resolve():
-        info = dataclasses.replace(info, choices=before.choices.among(info.configurations))
-    return info
+    return dataclasses.replace(info, choices=before.choices.among(info.configurations))
 
 
 @contextlib.contextmanager

@@ -61,10 +61,17 @@ def without(modal: ModalModel, excluded: Sequence[ModeChoice]) -> ModalModel:
         modal,
         modes=tuple(modal.modes[k] for k in kept),
         chart=replace(modal.chart, selected=place[modal.chart.selected]),
-        notes=(*modal.notes, *(f"the mode at {m.frequency_hz:.5g} Hz is {EXCLUDED}" for m in dropped), *notes),
+        notes=(
+            *modal.notes,
+            *(f"the mode at {m.frequency_hz:.5g} Hz is {EXCLUDED}" for m in dropped),
+            *notes,
+        ),
         left_out=tuple(
             sorted(
-                (*modal.left_out, *(LeftOut(m.frequency_hz, m.damping_ratio, "mode", EXCLUDED) for m in dropped)),
+                (
+                    *modal.left_out,
+                    *(LeftOut(m.frequency_hz, m.damping_ratio, "mode", EXCLUDED) for m in dropped),
+                ),
                 key=lambda entry: entry.frequency_hz,
             )
         ),
@@ -121,7 +128,11 @@ def pole_of_chart(modal: ModalModel, configuration: str, frequency_hz: float) ->
     near = physical & (np.abs(chart.frequency_hz - frequency_hz) <= REACH * frequency_hz)
     if not near.any():
         others = chart.frequency_hz[chart.stable & physical]
-        hint = f"; the nearest is at {others[np.argmin(np.abs(others - frequency_hz))]:.6g} Hz" if others.size else ""
+        hint = (
+            f"; the nearest is at {others[np.argmin(np.abs(others - frequency_hz))]:.6g} Hz"
+            if others.size
+            else ""
+        )
         raise EmaError(
             f"{configuration}: the stabilisation chart has no pole within {100 * REACH:.0f} % of {frequency_hz:.6g} Hz"
             + hint
@@ -138,5 +149,7 @@ def pole_of_chart(modal: ModalModel, configuration: str, frequency_hz: float) ->
     )
     for k, mode in enumerate(modal.modes):
         if abs(mode.frequency_hz - found.frequency_hz) <= SAME * mode.damping_ratio * mode.frequency_hz:
-            raise EmaError(f"{configuration}: mode {k + 1} at {mode.frequency_hz:.6g} Hz stands for these poles already")
+            raise EmaError(
+                f"{configuration}: mode {k + 1} at {mode.frequency_hz:.6g} Hz stands for these poles already"
+            )
     return found

@@ -177,7 +177,12 @@ def refined(
         near, also = between(sure.poles, low, high), between(weak.poles, low, high)
         inside = np.concatenate([sure.poles[near], weak.poles[also]])
         seen, asked = plain.between(part.low, part.high), wanted.between(part.low, part.high)
-        if not window.from_hits and not len(seen.poles) and not len(asked.poles) and not between(inside, part.low, part.high).any():
+        if (
+            not window.from_hits
+            and not len(seen.poles)
+            and not len(asked.poles)
+            and not between(inside, part.low, part.high).any()
+        ):
             continue
         lines = replace(
             window.lines(part.first, part.stop), far=sure.take(~near), far_shapes=everywhere[:, ~near]

@@ -36,8 +36,8 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 def _identified(run: Run, configuration: str, progress: Progress) -> ModalModel:
     from ema_pipeline.correlate.measured import to_modal_model
     from ema_pipeline.correlate.mode_table import read_mode_table
-    from ema_pipeline.modal.circle import attach_circles, identify_by_circle
     from ema_pipeline.modal.chosen import wanted
+    from ema_pipeline.modal.circle import attach_circles, identify_by_circle
     from ema_pipeline.modal.identify import identify
     from ema_pipeline.modal.moving import identify_hits
     from ema_pipeline.modal.pooling import pooled

@@ -8,7 +8,15 @@ from typing import Any
 
 from bokeh.embed import json_item
 from bokeh.layouts import column
-from bokeh.models import BasicTicker, ColumnDataSource, FactorRange, FixedTicker, LinearColorMapper, Range1d
+from bokeh.models import (
+    BasicTicker,
+    ColumnDataSource,
+    FactorRange,
+    FixedTicker,
+    LinearColorMapper,
+    Range1d,
+    TapTool,
+)
 from bokeh.models.annotations import ColorBar
 from bokeh.palettes import Blues256
 
@@ -236,9 +244,12 @@ def stabilisation(log_x: bool = False) -> Any:
                 line_color=color,
                 legend_label=label,
                 fill_color=color if key == "voted" else None,
+                selection_line_color=ACCENT,
+                nonselection_alpha=1,
             )
         )
     made.vspan("f", source=source("stab.selected", "f"), line_color=ACCENT, line_width=2)
+    made.add_tools(TapTool(renderers=[*shown], mode="replace"))
     hover(made, shown, ("f", "@f{0.00} Hz"), ("order", "@order"), ("damping", "@damping{0.00} %"))
     place_legend(made)
     return made

@@ -56,8 +56,23 @@ var EmaPage = (function () {
       followTicks(figure);
       style(figure);
       fill[figure]();
+      if (figure === "stab") { followPoles(); }
       place.style.minHeight = "0";
       place.dataset.state = "shown";
+    });
+  }
+  /* A pole of the stabilisation chart that is clicked: its mode is chosen; of one without a mode the page is told. */
+  function followPoles() {
+    ["loose", "stable", "voted"].forEach(function (key) {
+      var source = documents.stab.get_model_by_name("stab." + key);
+      source.selected.change.connect(function () {
+        var k = source.selected.indices[0], f = source.data.f[k], c = currentConfiguration();
+        if (k === undefined || !c) { return; }
+        if (key !== "voted") { document.dispatchEvent(new CustomEvent("pole", { detail: f })); return; }
+        var off = c.modes.map(function (m) { return Math.abs(m.f - f); });
+        chosen.picked = true;
+        chooseMode(c.name, off.indexOf(Math.min.apply(null, off)));
+      });
     });
   }
   function watch() {
@@ -425,5 +440,5 @@ var EmaPage = (function () {
     }
     document.documentElement.dataset.ready = "yes";
   }
-  return { start: start, newModel: newModel, copied: copied };
+  return { start: start, newModel: newModel, copied: copied, configuration: function () { return chosen.mode && chosen.mode[0]; } };
 }());
