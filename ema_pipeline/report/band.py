@@ -92,6 +92,8 @@ def _changed(results: RunResults) -> str:
 
 def _heading_without_diagnosis(results: RunResults) -> str:
     count = sum(len(c.modal.modes) for c in results.configurations if c.modal)
+    if results.loops is not None:
+        return f"{len(results.loops.loops)} loops identified; not diagnosed yet"
     if not count:
         return "No modes have been identified yet"
     return f"{count} modes identified" + ("" if results.rig else "; there is no model to compare them with")

@@ -16,6 +16,7 @@ from ema_pipeline.files import replace_file
 from ema_pipeline.report import diagnosis, diagnosis_tables, levels, summary, tables
 from ema_pipeline.report.band import band_of
 from ema_pipeline.report.levels import has_to_say
+from ema_pipeline.report.loops import loops_context
 from ema_pipeline.report.moved_modes import Seen, error_words, moved_table, still
 from ema_pipeline.report.moving_gear import fill_of, moving_gears
 from ema_pipeline.report.numbers import format_percent, format_value, plain, signed, slug, words
@@ -138,6 +139,8 @@ def page_context(
         ),
         "traces": bool(results.shown_ladder and results.shown_ladder.traces),
         "sweeps": bool(fit and fit.sweeps),
+        "loops": bool(results.loops and results.loops.models),
+        "loss": bool(results.loops and any(one.loss for one in results.loops.isolators.values())),
     }
     figures = tuple(name for name, there in shown.items() if there)
     return {
@@ -170,6 +173,7 @@ def page_context(
         "worst_dofs": tables.worst_dofs_table(compared) if compared and compared.dofs else None,
         "worst_bands": tables.worst_bands_table(compared) if compared and compared.bands else None,
         "fill_of": fill_of,
+        "loops": None if results.loops is None else loops_context(results, results.loops),
         "simulation": simulation_context(results),
         "choices": _choices(results),
         "moved": None if moved is None else _moved(*moved),
@@ -208,6 +212,9 @@ def _sections(results: RunResults, figures: tuple[str, ...]) -> tuple[tuple[str,
         "summary": True,
         "frf": "frf" in figures,
         "model": results.diagnosis is not None or results.shown_ladder is not None or "errors" in figures,
+        "loops": results.loops is not None,
+        "parameters": results.loops is not None,
+        "loss": results.loops is not None,
         "modes": any(c.modal and c.modal.modes for c in results.configurations),
         "pairing": "mac" in figures or any(c.pairing for c in results.configurations),
         "simulation": bool(results.simulation),
@@ -220,6 +227,9 @@ def _sections(results: RunResults, figures: tuple[str, ...]) -> tuple[tuple[str,
         "summary": "Summary",
         "frf": "FRFs",
         "model": "Model and missing physics",
+        "loops": "Loops",
+        "parameters": "Parameters",
+        "loss": "Energy and loss factor",
         "modes": "Modes",
         "pairing": "Pairing and MAC",
         "simulation": "Simulated records",

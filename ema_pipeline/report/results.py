@@ -14,6 +14,7 @@ from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit, Transducer
 from ema_pipeline.levels.types import LevelStudy
+from ema_pipeline.loops.types import IsolatorResult, Loop, LoopModel
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.verdict import Verdict
@@ -59,6 +60,30 @@ class ConfigurationResults:
 
 
 @dataclass(frozen=True)
+class LoopResults:
+    """Results of a test of force-displacement loops.
+
+    Attributes
+    ----------
+    isolators : mapping of str to IsolatorResult
+        By configuration.
+    loops : tuple of Loop
+        Of all configurations.
+    models : tuple of LoopModel
+        Of the ladder, the linear spring first; empty before there was one.
+    """
+
+    isolators: Mapping[str, IsolatorResult]
+    loops: tuple[Loop, ...]
+    models: tuple[LoopModel, ...] = ()
+
+    @property
+    def compared(self) -> tuple[LoopModel, ...]:
+        """The linear spring and the last model, once where they are the same."""
+        return self.models if len(self.models) < 2 else (self.models[0], self.models[-1])
+
+
+@dataclass(frozen=True)
 class RunResults:
     """Results of one run over one or several configurations.
 
@@ -96,6 +121,8 @@ class RunResults:
         Free-run errors in the records of a continuous test; empty where none were simulated.
     hysteresis : tuple of HysteresisLoop
         Loops of Bouc-Wen elements that records were simulated with.
+    loops : LoopResults or None
+        Of a test of force-displacement loops.
     sensitivities : tuple of Verdict
         Channels whose scale or sign the model contradicts, see `fit.sensitivities`.
     """
@@ -120,6 +147,7 @@ class RunResults:
     folder: str = ""
     simulation: tuple[RecordError, ...] = ()
     hysteresis: tuple[HysteresisLoop, ...] = ()
+    loops: LoopResults | None = None
 
     @property
     def diagnosis_is_old(self) -> bool:

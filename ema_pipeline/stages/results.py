@@ -18,8 +18,9 @@ from ema_pipeline.levels.sentences import flagged
 from ema_pipeline.loops.types import IsolatorResult
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.report.results import ConfigurationResults, LoopResults, RunResults
 from ema_pipeline.stages.base import Run
+from ema_pipeline.stages.loop_ladder import loops_of, models_of
 from ema_pipeline.stages.models import diagnosed_choices
 from ema_pipeline.stages.modes import level_study
 from ema_pipeline.store import ALL
@@ -69,6 +70,7 @@ def load_results(run: Run) -> RunResults:
         ladder=_own_ladder(run),
         simulation=_of_records(run, "simulation", RecordError),
         hysteresis=_of_records(run, "hysteresis", HysteresisLoop),
+        loops=_loops(run) if loops else None,
         sensitivities=run.store.find("correlate", ALL, "sensitivities", tuple[Verdict, ...]) or (),
         deviations=tuple(
             run.store.find(stage, ALL, name, dict[str, float]) or {}
@@ -124,6 +126,13 @@ def _of_records(run: Run, name: str, kind: type[R]) -> tuple[R, ...]:
         if found is not None:
             return cast("tuple[R, ...]", found)
     return ()
+
+
+def _loops(run: Run) -> LoopResults | None:
+    """Loops of all configurations; None before they were identified."""
+    if not all(run.store.key("loops", name) for name in run.info.configurations):
+        return None
+    return LoopResults(isolators(run), loops_of(run), models_of(run))
 
 
 def _system(run: Run, name: str, values: dict[str, float]) -> LinearSystem:

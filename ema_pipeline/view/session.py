@@ -28,7 +28,7 @@ from ema_pipeline.stages.results import load_results
 from ema_pipeline.view.serving import Listeners
 from ema_pipeline.view.snapshots import Snapshots
 
-PARTS = ("band", "candidates", "model_details", "choices", "mode_rows", "gears")
+PARTS = ("band", "candidates", "loop_model", "model_details", "choices", "mode_rows", "gears")
 """Parts of the page that change with the model, by the names of their templates."""
 
 _LOOK_S = 1.0
@@ -262,7 +262,9 @@ class Session:
             if stage == "ladder":
                 rungs = await asyncio.to_thread(self._rungs)
                 self.preview = [self._error_before(), *rungs[-1:]] if job.chooses and rungs else rungs
-            if stage == "correlate":  # all is there but the report on disk
+            if stage == (
+                "correlate" if self.results.loops is None else "ladder"
+            ):  # all is there but the report
                 await asyncio.to_thread(self._load_once)
         else:
             job.stage, job.text = str(told["stage"]), str(told.get("text", ""))

@@ -20,6 +20,7 @@ from bokeh.models import (
 from bokeh.models.annotations import ColorBar
 from bokeh.palettes import Blues256
 
+from ema_pipeline.report.interactive.loops import loops_figure, loss_figure
 from ema_pipeline.report.interactive.packing import LEVELS
 from ema_pipeline.report.interactive.theme import (
     ACCENT,
@@ -363,6 +364,8 @@ _FIGURES: dict[str, Callable[[], Any]] = {
     "levels": levels,
     "traces": traces,
     "sweeps": sweeps,
+    "loops": loops_figure,
+    "loss": loss_figure,
 }
 
 

@@ -308,6 +308,33 @@ var EmaPage = (function () {
       columns("traces", "traces.signals", { t: t.signals[0].map(function (_, k) { return k * t.step; }), measured: t.signals[0], before: t.signals[1], after: t.signals[2] });
       set("traces", "traces.axis", { axis_label: t.quantity + ", " + ({ acceleration: "m/s²", velocity: "m/s", displacement: "m" }[t.quantity] || "") });
     },
+    loops: function () {
+      var pick = (byId("loops-pick") || { value: "0" }).value, some = data.model.loops.filter(function (_, k) { return pick === "0" || Number(pick) === k + 1; });
+      var curves = empty(["x", "measured", "before", "after"]), left = empty(["share", "before", "after"]);
+      some.forEach(function (l) {
+        var models = [l.models[0], chosen.after === chosen.before ? null : l.models[1]];
+        l.x.concat(l.x[0], NaN).forEach(function (x, i) { /* closed, and apart from the next one */
+          var k = i < l.x.length ? i : 0;
+          function at(values) { return values && !isNaN(x) ? values[k] : NaN; }
+          curves.x.push(x); curves.measured.push(at(l.measured)); curves.before.push(at(models[0])); curves.after.push(at(models[1]));
+        });
+        l.share.concat(NaN).forEach(function (share, k) {
+          function off(values) { return values && k < l.share.length ? l.measured[k] - values[k] : NaN; }
+          left.share.push(share); left.before.push(off(models[0])); left.after.push(off(models[1]));
+        });
+      });
+      columns("loops", "loops.curves", curves); columns("loops", "loops.left", left);
+      legend("loops");
+    },
+    loss: function () {
+      var colors = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"], lines = empty(["xs", "ys", "text", "color"]), dots = empty(["x", "y", "low", "high", "text", "color"]);
+      data.model.loss.forEach(function (l, k) {
+        var color = colors[k % colors.length];
+        lines.xs.push(l.points.map(function (p) { return p[0]; })); lines.ys.push(l.points.map(function (p) { return p[1]; })); lines.text.push(l.name); lines.color.push(color);
+        l.points.forEach(function (p) { dots.x.push(p[0]); dots.y.push(p[1]); dots.low.push(p[1] - 2 * p[2]); dots.high.push(p[1] + 2 * p[2]); dots.text.push(l.name); dots.color.push(color); });
+      });
+      columns("loss", "loss.lines", lines); columns("loss", "loss.points", dots);
+    },
     sweeps: function () {
       var colors = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"], s = data.model.sweeps;
       columns("sweeps", "sweeps.lines", { xs: s.map(function (x) { return x.x; }), ys: s.map(function (x) { return x.y.map(function (v) { return v === null ? NaN : v; }); }), text: s.map(function (x) { return x.text; }), color: s.map(function (_, k) { return colors[k % colors.length]; }) });
@@ -417,6 +444,7 @@ var EmaPage = (function () {
     ["frf-linear", "frf-band", "frf-alike"].forEach(function (id) { on(id, "change", function () { refill(["frf"]); }); });
     on("errors-quantity", "change", function () { refill(["errors"]); });
     on("mac-pick", "change", function () { refill(["mac"]); });
+    on("loops-pick", "change", function () { refill(["loops"]); });
     on("traces-pick", "change", function () { refill(["traces"]); });
     on("nyquist-pick", "change", function (e) { chosen.circle = Number(e.target.value); circleText(); refill(["nyquist"]); });
     document.addEventListener("click", function (e) {
@@ -430,6 +458,7 @@ var EmaPage = (function () {
     tellingFrf();
     chooseFrf();
     options(byId("mac-pick"), matrices().map(function (m) { return m.name; }), 0);
+    options(byId("loops-pick"), ["all"].concat(data.model.loops.map(function (l) { return l.name; })), 0);
     options(byId("traces-pick"), data.model.traces.map(function (t) { return t.name; }), 0);
     var first = document.querySelector("button.pick");
     if (first) { chooseMode(first.dataset.configuration, Number(first.dataset.mode)); }
