@@ -213,7 +213,8 @@ def test_commands_and_report_tell_the_story_of_the_loops(tmp_path: Path) -> None
     assert page.index("In the model: viscous damping at isolator") < page.index('data-figure="loops"')
     assert "<img" not in page
     own = page.replace(bokeh_script(), "")
-    assert "http" not in own.replace("http://www.w3.org", "")
+    assert "http:" not in own.replace("http://www.w3.org", "")
+    assert "https:" not in own
     data = json.loads(re.findall(r'id="ema-data">(.*?)</script>', own, re.S)[0])
     (loop, *_), names = data["model"]["loops"], data["model"]["models"]
     assert len(data["model"]["loops"]) == 4

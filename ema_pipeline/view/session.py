@@ -43,7 +43,7 @@ _SHARES_OF_CHOICES = {
 
 @dataclass
 class Job:
-    """An action under way: its verb, the stage that runs, and how much of all is done (0 to 1)."""
+    """An action under way: its verb, its stage, how much is done (0 to 1), and whether the page shows its outcome."""
 
     verb: str
     label: str
@@ -51,6 +51,7 @@ class Job:
     text: str = ""
     done: float = 0.0
     before: float = 0.0
+    shown_already: bool = False
     began: float = field(default_factory=time.monotonic)
 
     @property
@@ -218,6 +219,8 @@ class Session:
             self._snapshots.take()
             outcome = await self._work(job)
             if outcome.get("outcome") == "done":
+                if job.shown_already:  # but for the report, which is a file of its own
+                    self._seen = self._stamp()
                 await asyncio.to_thread(self._load_once)
                 self._log(before, self.results, job)
                 self.message = self._outcome(job)
@@ -255,19 +258,22 @@ class Session:
         return {"outcome": "failed", "why": "the refit has ended before its time; nothing was changed"}
 
     async def _follow(self, job: Job, told: dict[str, Any]) -> None:
+        stage = str(told.get("finished", told.get("stage")))
+        if self.preview is None and (stage == "fit" or told.get("finished") == "ladder"):
+            rungs = await asyncio.to_thread(
+                self._rungs
+            )  # known before "fit" begins, be it from the diagnosis
+            self.preview = [self._error_before(), *rungs[-1:]] if job.chooses and rungs else rungs
         if "finished" in told:
-            stage = str(told["finished"])
             job.before = min(job.before + job.share(stage), 1.0)
             job.done = job.before
-            if stage == "ladder":
-                rungs = await asyncio.to_thread(self._rungs)
-                self.preview = [self._error_before(), *rungs[-1:]] if job.chooses and rungs else rungs
             if stage == (
                 "correlate" if self.results.loops is None else "ladder"
             ):  # all is there but the report
                 await asyncio.to_thread(self._load_once)
+                job.shown_already = True
         else:
-            job.stage, job.text = str(told["stage"]), str(told.get("text", ""))
+            job.stage, job.text = stage, str(told.get("text", ""))
             job.done = min(job.before + job.share(job.stage) * float(told["done"]), 1.0)
         self.listeners.tell()
 
