@@ -227,7 +227,7 @@ def stabilisation(log_x: bool = False) -> Any:
     cmif = source("stab.cmif", "f", "y")
     made.line(
         "f", "y", source=cmif, color=INK, alpha=0.5, line_width=1.2, legend_label="mode indicator (log)"
-    )
+    ).glyph.tags = [INK_TAG]
     shown = []
     for key, marker, color, label in (
         ("loose", "x", INK, "not stable"),
@@ -250,6 +250,7 @@ def stabilisation(log_x: bool = False) -> Any:
             )
         )
     made.vspan("f", source=source("stab.selected", "f"), line_color=ACCENT, line_width=2)
+    shown[0].glyph.tags = [INK_TAG]
     made.add_tools(TapTool(renderers=[*shown], mode="replace"))
     hover(made, shown, ("f", "@f{0.00} Hz"), ("order", "@order"), ("damping", "@damping{0.00} %"))
     place_legend(made)

@@ -42,6 +42,7 @@
     document.querySelectorAll("button.act").forEach(function (b) { b.disabled = busy && b.id !== "cancel"; });
     if (byId("undo")) { byId("undo").disabled = !state.undo; }
     byId("cancel").hidden = byId("progress").hidden = !busy;
+    byId("live").classList.toggle("busy", busy);
   }
   function follow(now) {
     state = now;
