@@ -68,6 +68,13 @@ def live(browser: Browser, results: Path) -> None:
         page.emulate_media(color_scheme="dark")
         page.wait_for_timeout(SETTLED_MS)
         page.screenshot(path=FIGURES / "live_dark.png")
+        page.emulate_media(color_scheme="light")
+        page.locator("button[data-verb=exclude_mode]").nth(2).click()
+        expect(page.locator("#moved")).to_be_visible(timeout=120_000)
+        expect(page.locator("#status")).to_contain_text("Modes", timeout=120_000)
+        page.locator("#choices").screenshot(path=FIGURES / "live_choices.png")
+        page.locator("#undo").click()
+        expect(page.locator("#status")).to_contain_text("Undone", timeout=60_000)
     finally:
         server.terminate()
     pictures = [Image.open(io.BytesIO(f)).convert("RGB").resize((810, 848)) for f in frames]

@@ -82,6 +82,7 @@ ROUTES = (
     "/events",
     "/commands",
     "/numbers.js",
+    "/figures.js",
     "/page.js",
     "/bokeh.js",
     "/live.js",

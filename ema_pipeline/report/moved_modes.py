@@ -88,9 +88,9 @@ def moved_table(before: Seen, after: Seen) -> Table:
         rows.append(Row(((either.configuration,) if several else ()) + cells, old is None or new is None))
     head = (("",) if several else ()) + (
         "mode",
-        "f before",
+        "f before, Hz",
         "f after, Hz",
-        "ζ before",
+        "ζ before, %",
         "ζ after, %",
         "moved, σ",
     )

@@ -106,6 +106,7 @@ def application(session: Session, started: Callable[[], None] = lambda: None) ->
             Route("/commands", commands),
             Route("/bokeh.js", scripts),
             Route("/numbers.js", scripts),
+            Route("/figures.js", scripts),
             Route("/page.js", scripts),
             Route("/live.js", scripts),
             Route("/action", action, methods=["POST"]),
