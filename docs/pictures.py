@@ -40,6 +40,7 @@ def opened(browser: Browser, address: str, width: int, height: int, dark: bool =
     scheme = "dark" if dark else "light"
     page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
     page.goto(address)
+    page.wait_for_selector("[data-figure=frf][data-state=shown] canvas", state="attached", timeout=120_000)
     page.wait_for_timeout(SETTLED_MS)
     return page
 
@@ -58,7 +59,7 @@ def live(browser: Browser, results: Path) -> None:
         add.scroll_into_view_if_needed()
         frames.append(page.screenshot())
         add.click()
-        page.wait_for_timeout(600)
+        page.wait_for_selector("#progress:not([hidden])", timeout=30_000)
         frames.append(page.screenshot())
         expect(page.locator("#band h2")).to_contain_text("In the model", timeout=120_000)
         page.wait_for_selector("#cancel", state="hidden", timeout=120_000)

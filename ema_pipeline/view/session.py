@@ -98,6 +98,7 @@ class Session:
         self._seen: tuple[int, int] = (0, 0)
         self._cancelled = False
         self._moved: tuple[Seen, Seen] | None = None
+        self._before = seen(RunResults(""))
         self._changing = asyncio.Lock()
         self.load()
 
