@@ -40,7 +40,7 @@ def opened(browser: Browser, address: str, width: int, height: int, dark: bool =
     scheme = "dark" if dark else "light"
     page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
     page.goto(address)
-    page.wait_for_selector("[data-figure=frf][data-state=shown] canvas", state="attached", timeout=120_000)
+    page.wait_for_selector("html[data-ready]", timeout=120_000)
     page.wait_for_timeout(SETTLED_MS)
     return page
 
@@ -54,6 +54,8 @@ def live(browser: Browser, results: Path) -> None:
         assert server.stdout is not None
         address = next(m[0] for line in server.stdout if (m := re.search(r"http://\S+", line)))
         page = opened(browser, address, 1080, 1130)
+        page.wait_for_selector("[data-figure=frf][data-state=shown]", timeout=120_000)
+        page.wait_for_timeout(SETTLED_MS)
         frames = [page.screenshot()]
         add = page.locator("button.act.add").first
         add.scroll_into_view_if_needed()
