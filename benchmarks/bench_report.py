@@ -8,6 +8,8 @@ OUT is copied first. The browser is Chromium, driven by Playwright; without one 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import os
 import re
 import shutil
 import signal
@@ -15,6 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -65,7 +68,7 @@ def peak_mb(process: int) -> float:
     return int(found[1]) / 1e3 if found else float("nan")
 
 
-def in_browser(browser: Any, reports: list[Path], out: Path, effect: str) -> None:
+def in_browser(browser: Any, reports: list[Path], out: Path, effects: list[str]) -> None:
     """Load times of the reports, and the live page from a click to the new model."""
     for path in reports:
         tab = browser.new_page()
@@ -89,17 +92,57 @@ def in_browser(browser: Any, reports: list[Path], out: Path, effect: str) -> Non
         tab = browser.new_page()
         tab.goto(address[0])
         tab.wait_for_selector("html[data-ready]")
-        tab.wait_for_timeout(4000)  # the worker has started
-        version = int(tab.locator("html").get_attribute("data-version"))
-        start = time.perf_counter()
-        tab.locator("#add-label").fill(effect)
-        tab.locator("#add-form button").click()
-        tab.locator("#status", has_text="→").wait_for(timeout=120_000)
-        print(f"click to the new error:     {time.perf_counter() - start:.2f} s")
-        tab.locator(f"html[data-version='{version + 1}']").wait_for(timeout=120_000)
-        print(f"click to all figures:       {time.perf_counter() - start:.2f} s")
+        tab.wait_for_timeout(6000)  # the worker has started
+        for effect in effects:
+            tab.locator("#add-label").fill(effect)
+            timed(tab, server.pid, f"add {effect}", tab.locator("#add-form button").click)
+            timed(tab, server.pid, "undo", tab.locator("#undo").click, "Undone")
+        for verb in ("exclude_mode", "exclude_hit"):
+            button = tab.locator(f"button[data-verb={verb}]").first
+            if button.count():
+                timed(tab, server.pid, verb.replace("_", " a "), lambda b=button: b.dispatch_event("click"))
+                timed(tab, server.pid, "undo", tab.locator("#undo").click, "Undone")
         print(f"peak memory of the server:  {peak_mb(server.pid):.0f} MB")
         server.send_signal(signal.SIGINT)
+
+
+def timed(tab: Any, server: int, what: str, click: Callable[[], Any], told: str = "→") -> None:
+    """Print the time from a click until the page tells what came of it, and until all is done."""
+    version, used = tab.locator("html").get_attribute("data-version"), processor_s(server)
+    start = time.perf_counter()
+    click()
+    tab.locator("#status", has_text=told).wait_for(timeout=300_000)
+    told_s, told_used = time.perf_counter() - start, processor_s(server) - used
+    tab.locator(f"html[data-ready]:not([data-version='{version}'])").wait_for(timeout=300_000)
+    drawn_s, drawn_used = time.perf_counter() - start, processor_s(server) - used
+    tab.locator("#status", has_text=re.compile(r"[.]$")).wait_for(timeout=300_000)
+    print(
+        f"{what}: new error {told_s:.2f} s ({told_used:.2f} s of processors), "
+        f"all figures {drawn_s:.2f} s ({drawn_used:.2f} s of processors), "
+        f"all done {time.perf_counter() - start:.2f} s ({processor_s(server) - used:.2f} s of processors)"
+    )
+
+
+def processor_s(server: int) -> float:
+    """Processor time so far of a server and its workers; NaN where the system does not tell."""
+    total, tick = 0.0, os.sysconf("SC_CLK_TCK")
+    children = {server}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            fields = path.read_text().rpartition(") ")[2].split()
+            if int(path.parent.name) in children or int(fields[1]) in children:
+                children.add(int(path.parent.name))
+                total += sum(map(int, fields[11:15])) / tick
+    return total if Path("/proc/self/stat").is_file() else float("nan")
+
+
+def likely(results: RunResults) -> list[str]:
+    """The effect that the diagnosis names, whose fit it has kept, and the next one, which has to be fitted."""
+    found = results.diagnosis
+    if found is None:
+        return []
+    first = diagnosis.leading(found)[0].label
+    return [first, *[c.label for c in found.candidates if c.label != first][:1]]
 
 
 def main() -> None:
@@ -108,7 +151,11 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("out", type=Path)
-    parser.add_argument("--effect", help="the most probable one if left out")
+    parser.add_argument(
+        "--effect",
+        action="append",
+        help="the most probable one, and one less so, if left out; may be repeated",
+    )
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         out = Path(shutil.copytree(given.out, Path(place) / "out"))
@@ -120,7 +167,7 @@ def main() -> None:
         if results.configurations[0].frfs is not None:
             reports.append(Path(place) / f"report_{CHANNELS}_channels.html")
             written(many_channels(results), reports[1])
-        effect = given.effect or (diagnosis.leading(results.diagnosis)[0].label if results.diagnosis else "")
+        effects = given.effect or likely(results)
         path = shutil.which("chromium") or shutil.which("google-chrome")
         if path is None:
             print("no Chromium on this machine: the browser's times are left out")
@@ -129,7 +176,7 @@ def main() -> None:
 
         with sync_playwright() as driver:
             browser = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
-            in_browser(browser, reports, out, effect)
+            in_browser(browser, reports, out, effects)
             browser.close()
 
 

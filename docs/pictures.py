@@ -40,6 +40,7 @@ def opened(browser: Browser, address: str, width: int, height: int, dark: bool =
     scheme = "dark" if dark else "light"
     page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
     page.goto(address)
+    page.wait_for_selector("html[data-ready]", timeout=120_000)
     page.wait_for_timeout(SETTLED_MS)
     return page
 
@@ -53,12 +54,14 @@ def live(browser: Browser, results: Path) -> None:
         assert server.stdout is not None
         address = next(m[0] for line in server.stdout if (m := re.search(r"http://\S+", line)))
         page = opened(browser, address, 1080, 1130)
+        page.wait_for_selector("[data-figure=frf][data-state=shown]", timeout=120_000)
+        page.wait_for_timeout(SETTLED_MS)
         frames = [page.screenshot()]
         add = page.locator("button.act.add").first
         add.scroll_into_view_if_needed()
         frames.append(page.screenshot())
         add.click()
-        page.wait_for_timeout(600)
+        page.wait_for_selector("#progress:not([hidden])", timeout=30_000)
         frames.append(page.screenshot())
         expect(page.locator("#band h2")).to_contain_text("In the model", timeout=120_000)
         page.wait_for_selector("#cancel", state="hidden", timeout=120_000)
@@ -68,6 +71,13 @@ def live(browser: Browser, results: Path) -> None:
         page.emulate_media(color_scheme="dark")
         page.wait_for_timeout(SETTLED_MS)
         page.screenshot(path=FIGURES / "live_dark.png")
+        page.emulate_media(color_scheme="light")
+        page.locator("button[data-verb=exclude_mode]").nth(2).click()
+        expect(page.locator("#moved")).to_be_visible(timeout=120_000)
+        expect(page.locator("#status")).to_contain_text("Modes", timeout=120_000)
+        page.locator("#choices").screenshot(path=FIGURES / "live_choices.png")
+        page.locator("#undo").click()
+        expect(page.locator("#status")).to_contain_text("Undone", timeout=60_000)
     finally:
         server.terminate()
     pictures = [Image.open(io.BytesIO(f)).convert("RGB").resize((810, 848)) for f in frames]

@@ -11,7 +11,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from ema_pipeline import __version__
-from ema_pipeline.commands import changes, diagnosis, listings, merge, raw, runs, series, watch
+from ema_pipeline.commands import changes, choices, diagnosis, listings, merge, raw, runs, series, watch
 from ema_pipeline.commands.interrupts import INTERRUPTED, answer_ctrl_c
 from ema_pipeline.commands.screen import program
 from ema_pipeline.crash import write_crash_report
@@ -116,6 +116,8 @@ for _verb in (
     diagnosis.add,
     diagnosis.remove,
     diagnosis.ladder,
+    choices.exclude,
+    choices.include,
     changes.changes,
     changes.mac,
     merge.merge,

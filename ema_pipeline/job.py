@@ -80,7 +80,7 @@ def run_raw(
             store, info, effect_files
         ).library  # a file that is not right is refused before anything is written
     with _tidy(out), store.lock():
-        info = _with_effects_of(store, info)
+        info = _with_decisions_of(store, info)
         save_info(store, info)
         run = new_run(store, info, effect_files)
         stages = stored_settings(store, info).stages
@@ -219,14 +219,14 @@ def removing(label: str) -> Callable[[tuple[str, ...]], tuple[str, ...]]:
     return change
 
 
-def _with_effects_of(store: Store, info: RunInfo) -> RunInfo:
-    """Keep the effects that the user had added to the same rig in an earlier run."""
-    if not store.path.is_file():
+def _with_decisions_of(store: Store, info: RunInfo) -> RunInfo:
+    """Keep the effects added to the same rig in an earlier run, and the choices of hits and modes."""
+    before = load_info(store) if store.path.is_file() else None
+    if before is None:
         return info
-    before = load_info(store)
-    if before is None or before.rig != info.rig:
-        return info
-    return dataclasses.replace(info, effects=before.effects)
+    if before.rig == info.rig:
+        info = dataclasses.replace(info, effects=before.effects)
+    return dataclasses.replace(info, choices=before.choices.among(info.configurations))
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.loops.simulate import simulate_sine_test, write_sine_tests
 from ema_pipeline.loops.types import Loop, LoopModel
 from ema_pipeline.observations.loops import LoopObservations
+from ema_pipeline.report.html import bokeh_script
 from ema_pipeline.rigs.isolator import isolator
 
 SPRING = {"stiffness": 9e4}
@@ -208,8 +210,18 @@ def test_commands_and_report_tell_the_story_of_the_loops(tmp_path: Path) -> None
     )
     assert "linear spring + viscous damping at isolator" in ema("compare", str(out))
     page = (out / "report.html").read_text(encoding="utf-8")
-    assert page.index("Missing: viscous damping at isolator") < page.index("<img")
-    assert "http" not in page.replace("http://www.w3.org", "")
+    assert page.index("In the model: viscous damping at isolator") < page.index('data-figure="loops"')
+    assert "<img" not in page
+    own = page.replace(bokeh_script(), "")
+    assert "http:" not in own.replace("http://www.w3.org", "")
+    assert "https:" not in own
+    data = json.loads(re.findall(r'id="ema-data">(.*?)</script>', own, re.S)[0])
+    (loop, *_), names = data["model"]["loops"], data["model"]["models"]
+    assert len(data["model"]["loops"]) == 4
+    assert names == ["linear spring", "with viscous damping at isolator"]
+    left = [max(abs(m - f) for m, f in zip(loop["measured"], model, strict=True)) for model in loop["models"]]
+    assert left[1] < 0.3 * left[0]
+    assert loop["x"][0] == pytest.approx(min(loop["x"]), abs=0.01)
     ema("remove", str(out), "viscous_damping@isolator")
     assert "linear spring + " not in ema("compare", str(out))
     for label in ("viscous_dampin@isolator", "sensor_mass@mass"):  # no such effect; none that a loop shows

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from chain_rig import RIG
 from live_page import Page, opened
 
 from ema_pipeline.job import change_effects, removing, run_raw
@@ -20,33 +24,6 @@ from ema_pipeline.view.snapshots import FOLDER, Snapshots
 
 HOSTILE = "<img src=x onerror=document.title=1>"
 CULPRIT = "mass@b"
-RIG = """
-name = "chain"
-modal_damping_ratio = 0.01
-[parameters]
-link = { value = 1e6, unit = "N/m", tolerance = 0.05 }
-[[masses]]
-at = "a.x"
-value = 1.0
-[[masses]]
-at = "b.x"
-value = 1.0
-[[masses]]
-at = "c.x"
-value = 1.0
-[[springs]]
-name = "foot"
-at = "a.x"
-value = "link"
-[[springs]]
-name = "middle"
-between = ["a.x", "b.x"]
-value = "link"
-[[springs]]
-name = "top"
-between = ["b.x", "c.x"]
-value = "link"
-"""
 
 
 @pytest.fixture(scope="module")
@@ -105,6 +82,7 @@ ROUTES = (
     "/events",
     "/commands",
     "/numbers.js",
+    "/figures.js",
     "/page.js",
     "/bokeh.js",
     "/live.js",
@@ -212,6 +190,65 @@ def test_refit_that_is_cancelled_leaves_the_folder_as_it_was(browser, page: Page
     expect(tab.locator("#band h2")).to_contain_text("Missing: mass at b")
     tab.locator(f'button.act.add[data-label="{CULPRIT}"]').click()  # a new worker does it
     expect(tab.locator("#band h2")).to_contain_text("In the model", timeout=60_000)
+    context.close()
+
+
+def test_mode_is_excluded_and_one_included_and_the_commands_repeat_it(browser, page: Page, out: Path) -> None:
+    from playwright.sync_api import expect
+
+    original = Path(shutil.copytree(out, out.with_name("original")))
+    context = browser.new_context()
+    tab = opened(context, page.address)
+    assert tab.locator("button.pick").count() == 3
+    tab.locator("button[data-verb=exclude_mode]").nth(2).click()
+    expect(tab.locator("#moved")).to_contain_text("Modes 3 → 2", timeout=60_000)
+    expect(tab.locator("#moved")).to_contain_text("gone")
+    expect(tab.locator("button.pick")).to_have_count(2, timeout=20_000)
+    expect(tab.locator("#band h2")).to_contain_text("Other hits or modes than in the diagnosis")
+    expect(tab.locator("#status")).to_contain_text("Modes 3 → 2", timeout=60_000)
+    chosen = existing_run(out).info.choices
+    assert len(chosen.excluded_modes) == 1
+
+    tab.locator("#include-hertz").fill("not a number")
+    tab.locator("#include-form button").click()
+    expect(tab.locator("#status")).to_contain_text("name it by its frequency", timeout=20_000)
+    assert existing_run(out).info.choices == chosen
+
+    commands = tab.locator("#commands").text_content()
+    for line in commands.replace(str(out), str(original)).splitlines():
+        subprocess.run(
+            [sys.executable, "-c", "from ema_pipeline.cli import main; main()", *shlex.split(line)[1:]],
+            check=True,
+        )
+    assert existing_run(original).info.choices == chosen
+
+    tab.locator("#undo").click()
+    expect(tab.locator("button.pick")).to_have_count(3, timeout=20_000)
+    expect(tab.locator("#commands")).to_contain_text(f"ema include {out} --mode default:", timeout=20_000)
+    assert not existing_run(out).info.choices
+    expect(tab.locator("[data-figure=stab]")).to_be_attached()
+    assert tab.faults == []
+    context.close()
+
+
+def test_a_pole_of_the_chart_that_is_clicked_is_the_one_to_include(browser, page: Page) -> None:
+    context = browser.new_context()
+    tab = opened(context, page.address)
+    tab.locator("[data-figure=stab]").scroll_into_view_if_needed()
+    tab.wait_for_selector("[data-figure=stab][data-state=shown] canvas", state="attached", timeout=20_000)
+    tab.evaluate(
+        """() => {
+          const chart = Bokeh.documents.find(d => d.get_model_by_name("stab.loose"));
+          const source = chart.get_model_by_name("stab.loose");
+          source.data = { f: [123.456], order: [9], damping: [1.0] };
+          source.selected.indices = [0];
+          const voted = chart.get_model_by_name("stab.voted");
+          voted.selected.indices = [voted.data.f.length - 1];
+        }"""
+    )
+    assert tab.locator("#include-hertz").input_value() == "123.456"
+    assert "mode 1" not in tab.locator("#mode-title").inner_text()
+    assert tab.faults == []
     context.close()
 
 

@@ -16,6 +16,7 @@ from ema_pipeline.api.frfs import Frfs, frfs_of
 from ema_pipeline.api.ladder import Ladder
 from ema_pipeline.api.modes import Modes, modes_of
 from ema_pipeline.api.work import Settings, Work, overrides
+from ema_pipeline.choosing import change_choices, excluding, including
 from ema_pipeline.errors import EmaError
 from ema_pipeline.job import adding, change_effects, removing, run_raw
 from ema_pipeline.pipeline import existing_run
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 class Results(Report):
     """A results folder as it was when it was opened.
 
-    What its properties give is a copy: only `add` and `remove` change the folder.
+    What its properties give is a copy: only `add`, `remove`, `exclude` and `include` change the folder.
 
     Attributes
     ----------
@@ -116,6 +117,25 @@ class Results(Report):
     def remove(self, effect: str) -> Results:
         """Take an added effect out of the model in the folder again."""
         change_effects(self.folder, removing(effect), effect_files=self._effect_files)
+        return open(self.folder, effect_files=self._effect_files)
+
+    def exclude(self, *, hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Results:
+        """Leave hits and modes out in the folder, refit, and write its report again; raw data stay as they are.
+
+        Parameters
+        ----------
+        hits : sequence of str
+            ``"configuration/file#number"``; the number may be left out where the file holds one hit, the configuration
+            where there is one.
+        modes : sequence of str
+            ``"configuration:hertz"``, to within 1 %.
+        """
+        change_choices(self.folder, excluding(hits, modes), effect_files=self._effect_files)
+        return open(self.folder, effect_files=self._effect_files)
+
+    def include(self, *, hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Results:
+        """Take modes in from the stabilisation chart, or what was excluded; parameters are those of `exclude`."""
+        change_choices(self.folder, including(hits, modes), effect_files=self._effect_files)
         return open(self.folder, effect_files=self._effect_files)
 
     def table(self) -> pd.DataFrame:

@@ -216,7 +216,6 @@ def view(
 
     Of a raw folder it shows what 'ema watch' says: how good each hit was, what to strike next, which points are done.
     """
-    from ema_pipeline.pipeline import existing_run
 
     def ready(address: str) -> None:
         show(f"The page of {out} is at {address}\nIt is for one browser on this machine; stop with Ctrl-C.")
@@ -230,9 +229,6 @@ def view(
         serve_hits(out, point or (), hits, poll, port, ready)
         show(f"Next: {program()} run {out}")
         return
-    if existing_run(out, effect_file or []).info.kind == "hysteresis":
-        _open_report(out, browser)  # loops have a report, but no live page
-        return
     from ema_pipeline.view.server import serve
 
     serve(out, effect_file or [], port, ready)
@@ -244,14 +240,6 @@ def _is_raw(folder: Path) -> bool:
     from ema_pipeline.store import RESULTS_FILE
 
     return (folder / DESCRIPTION_FILE).is_file() and not (folder / RESULTS_FILE).exists()
-
-
-def _open_report(out: Path, browser: bool) -> None:
-    from ema_pipeline.export import report_path
-
-    path = report_path(out)
-    if not (browser and _has_screen() and typer.launch(path.as_uri()) == 0):
-        show(str(path))
 
 
 def export(

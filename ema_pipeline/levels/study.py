@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.choices import NO_CHOICES, Choices
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels.settings import LevelSettings
@@ -46,6 +47,7 @@ def study_levels(
     frf_settings: FrfSettings,
     modal_settings: ModalSettings,
     progress: Progress,
+    choices: Choices = NO_CHOICES,
 ) -> LevelStudy:
     """Follow every mode over the force levels of the hits.
 
@@ -64,6 +66,8 @@ def study_levels(
         Those that `modal` was identified with.
     progress : callable
         Called with the share done (0…1) and a word on what is being done.
+    choices : Choices, optional
+        Modes that the user excluded from `modal` or included; the levels' own modes follow them.
 
     Returns
     -------
@@ -98,7 +102,7 @@ def study_levels(
         level_force = float(np.median(force[place == k]))
         progress(0.7 * k / n_levels, f"modes at {level_force:.3g} {unit}")
         chosen = tuple(n for n, p in zip(names, place, strict=True) if p == k)
-        levels += (_level(hits, chosen, level_force, unit, frf_settings, modal_settings),)
+        levels += (_level(hits, chosen, level_force, unit, frf_settings, modal_settings, choices),)
     progress(0.7, "modes of single hits")
     level_of = dict(zip(names, place.tolist(), strict=True))
 
@@ -133,20 +137,23 @@ def study_levels(
 
 def _level(
     hits: Hits,
-    chosen: tuple[str, ...],
+    names: tuple[str, ...],
     force_n: float,
     unit: str,
     frf_settings: FrfSettings,
     modal_settings: ModalSettings,
+    choices: Choices,
 ) -> ForceLevel:
     """FRFs and modes of some of the hits alone."""
     from ema_pipeline.frf.estimate import estimate_frfs
+    from ema_pipeline.modal.chosen import chosen, wanted
     from ema_pipeline.modal.identify import identify
 
-    wanted = set(chosen)
-    some = (h for h in hits() if f"{h.hit.file}#{h.hit.number}" in wanted)
+    some = (h for h in hits() if f"{h.hit.file}#{h.hit.number}" in names)
     frfs = estimate_frfs(some, frf_settings)
-    return ForceLevel(force_n, chosen, frfs, identify(frfs, modal_settings), unit)
+    asked = wanted(choices.included_modes, frfs.response_decay_rad_s)
+    modal = chosen(identify(frfs, modal_settings, wanted=asked), choices)
+    return ForceLevel(force_n, names, frfs, modal, unit)
 
 
 def _modes(modal: ModalModel, levels: Sequence[ForceLevel], n_inputs: int) -> tuple[ModeLevels, ...]:

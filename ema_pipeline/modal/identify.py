@@ -59,6 +59,7 @@ def identify(
     settings: ModalSettings,
     progress: Progress | None = None,
     peaks: KnownPeaks = NO_PEAKS,
+    wanted: KnownPeaks = NO_PEAKS,
 ) -> ModalModel:
     """Identify the modes that the FRFs show, with uncertainties.
 
@@ -70,6 +71,8 @@ def identify(
         Called with the share done, 0…1, and a few words.
     peaks : KnownPeaks, optional
         Peaks of which single hits show that one mode is there.
+    wanted : KnownPeaks, optional
+        Poles that make a mode whatever the tests on candidates say of them.
 
     Returns
     -------
@@ -83,10 +86,12 @@ def identify(
     """
     tell = progress or (lambda share, text: None)
     with single_blas_thread():
-        return _identify(frfs, settings, tell, peaks)
+        return _identify(frfs, settings, tell, peaks, wanted)
 
 
-def _identify(frfs: FrfSet, settings: ModalSettings, tell: Progress, peaks: KnownPeaks) -> ModalModel:
+def _identify(
+    frfs: FrfSet, settings: ModalSettings, tell: Progress, peaks: KnownPeaks, wanted: KnownPeaks
+) -> ModalModel:
     band = analysis_band(frfs, settings)
     data = arrange(frfs, band)
     window, level = _first_noise(data)
@@ -108,10 +113,10 @@ def _identify(frfs: FrfSet, settings: ModalSettings, tell: Progress, peaks: Know
         return tracked(poles_of_all_orders(window, known.variance, 2, settings))
 
     plain = plain_peaks(frfs, band)
-    modes = refined(window, bands, charts, sure, weak, search, iterations, peaks, plain)
+    modes = refined(window, bands, charts, sure, weak, search, iterations, peaks, plain, wanted)
     tell(0.9, "shapes and synthesis")
     cores = [chart.take(between(chart.pole, b.low, b.high)) for chart, b in zip(charts, bands, strict=True)]
-    return _model(frfs, settings, band, window, modes, cores, peaks, plain)
+    return _model(frfs, settings, band, window, modes, cores, peaks, plain.joined(wanted))
 
 
 def _first_noise(data: FitData) -> tuple[Window, Real]:

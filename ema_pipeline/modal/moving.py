@@ -15,6 +15,7 @@ from ema_pipeline.modal.data import analysis_band
 from ema_pipeline.modal.drift.align import NOTICED, Alignment, PeakMovement, align
 from ema_pipeline.modal.drift.windows import Hits
 from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel, Mode
 from ema_pipeline.threads import single_blas_thread
@@ -58,6 +59,7 @@ def identify_hits(
     frf_settings: FrfSettings,
     settings: ModalSettings,
     progress: Progress | None = None,
+    wanted: KnownPeaks = NO_PEAKS,
 ) -> HitModes:
     """Identify modes from hits whose frequencies may differ from hit to hit.
 
@@ -71,6 +73,8 @@ def identify_hits(
         With which they were estimated.
     settings : ModalSettings
     progress : callable, optional
+    wanted : KnownPeaks, optional
+        As in `identify`.
 
     Returns
     -------
@@ -79,7 +83,7 @@ def identify_hits(
     """
     with single_blas_thread():
         alignment = align(hits, frfs, frf_settings, analysis_band(frfs, settings))
-    modal = identify(alignment.frfs, settings, progress, alignment.known_peaks())
+    modal = identify(alignment.frfs, settings, progress, alignment.known_peaks(), wanted)
     return HitModes(with_movement(modal, alignment, frfs.response_decay_rad_s), alignment.frfs, alignment)
 
 

@@ -162,10 +162,12 @@ def refined(
     iterations: int,
     peaks: KnownPeaks = NO_PEAKS,
     plain: KnownPeaks = NO_PEAKS,
+    wanted: KnownPeaks = NO_PEAKS,
 ) -> FittedModes:
     """Final fit, sub-band by sub-band, with the modes of the other sub-bands taken off the data.
 
-    `peaks` make one mode each, as single hits show; each of the `plain` ones makes a mode at least.
+    `peaks` make one mode each, as single hits show; each of the `plain` ones makes a mode at least, and each of the
+    `wanted` ones makes one whatever the tests on candidates say.
     """
     parts: list[FittedModes] = []
     data = window.data
@@ -174,8 +176,13 @@ def refined(
         low, high = float(data.omega[part.first]), float(data.omega[part.stop - 1])
         near, also = between(sure.poles, low, high), between(weak.poles, low, high)
         inside = np.concatenate([sure.poles[near], weak.poles[also]])
-        seen = plain.between(part.low, part.high)
-        if not window.from_hits and not len(seen.poles) and not between(inside, part.low, part.high).any():
+        seen, asked = plain.between(part.low, part.high), wanted.between(part.low, part.high)
+        if (
+            not window.from_hits
+            and not len(seen.poles)
+            and not len(asked.poles)
+            and not between(inside, part.low, part.high).any()
+        ):
             continue
         lines = replace(
             window.lines(part.first, part.stop), far=sure.take(~near), far_shapes=everywhere[:, ~near]
@@ -183,6 +190,7 @@ def refined(
         few = compress(lines)
         fit = _fit_part(few, sure.take(near), weak.take(also), _voters(chart), search, iterations, peaks)
         fit = _with_peaks(few, fit, seen.absent(fit.estimate), _voters(chart), iterations, peaks)
+        fit = _with_wanted(few, fit, asked.absent(fit.estimate), iterations, peaks)
         if len(fit.estimate.poles):
             parts.append(_final(lines, few.data, fit, part))
     n_rows, n_ref = data.measured.shape
@@ -276,6 +284,27 @@ def _with_peaks(
         placed=np.isin(start.poles, absent.poles),
     )
     return more if len(more.estimate.poles) > len(fit.estimate.poles) else fit
+
+
+def _with_wanted(
+    few: Local, fit: SegmentFit, absent: KnownPeaks, iterations: int, peaks: KnownPeaks
+) -> SegmentFit:
+    """The fit with modes at wanted poles that it lacks, polished with the others unless that drives them away."""
+    if not len(absent.poles):
+        return fit
+    start = fit.estimate
+    for pole in absent.poles:
+        start = start.joined(at_peak(few.data, complex(pole)))
+    return fit_segment(
+        few.data,
+        few.hits,
+        fit.noise if len(fit.estimate.poles) else few.noise,
+        start,
+        lambda data, found: np.zeros(len(found.estimate.poles), dtype=bool),
+        iterations,
+        evident=lambda data, estimate, solution: np.ones(len(estimate.poles), dtype=bool),
+        peaks=peaks.joined(absent),
+    )
 
 
 def _apart(weak: Estimate, known: Estimate) -> NDArray[np.bool_]:

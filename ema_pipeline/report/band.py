@@ -69,10 +69,9 @@ def band_of(results: RunResults) -> Band:
         folder = shlex.quote(results.folder) if results.folder else "OUT"
         commands = [*commands, f"ema diagnose {folder}", f"ema remove {folder} {results.added[-1]}"]
     known = Band("", "", _tiles(results), commands=tuple(commands), drawing=_drawing(results))
-    if results.diagnosed_on != results.added:
-        names = " + ".join(map(diagnosis.label_words, results.added)) or "no effects"
+    if results.diagnosis_is_old:
         told = "The diagnosis below was made before; make it anew to see what is still missing."
-        return replace(known, heading=f"In the model: {names}", summary=told)
+        return replace(known, heading=_changed(results), summary=told)
     return replace(
         known,
         heading=diagnosis.heading(found),
@@ -83,8 +82,18 @@ def band_of(results: RunResults) -> Band:
     )
 
 
+def _changed(results: RunResults) -> str:
+    """What is different from what the diagnosis was made of."""
+    names = " + ".join(map(diagnosis.label_words, results.added)) or "no effects"
+    if results.added == results.diagnosed_on:
+        return "Other hits or modes than in the diagnosis"
+    return f"In the model: {names}"
+
+
 def _heading_without_diagnosis(results: RunResults) -> str:
     count = sum(len(c.modal.modes) for c in results.configurations if c.modal)
+    if results.loops is not None:
+        return f"{len(results.loops.loops)} loops identified; not diagnosed yet"
     if not count:
         return "No modes have been identified yet"
     return f"{count} modes identified" + ("" if results.rig else "; there is no model to compare them with")

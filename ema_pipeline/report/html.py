@@ -9,12 +9,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from ema_pipeline.choices import NO_CHOICES, HitChoice, ModeChoice, options_between
 from ema_pipeline.correlate.types import ModeDifference
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.files import replace_file
 from ema_pipeline.report import diagnosis, diagnosis_tables, levels, summary, tables
 from ema_pipeline.report.band import band_of
 from ema_pipeline.report.levels import has_to_say
+from ema_pipeline.report.loops import loops_context
+from ema_pipeline.report.moved_modes import Seen, error_words, moved_table, still
 from ema_pipeline.report.moving_gear import fill_of, moving_gears
 from ema_pipeline.report.numbers import format_percent, format_value, plain, signed, slug, words
 from ema_pipeline.report.pages import page_templates
@@ -68,9 +71,9 @@ def page_parts(context: dict[str, Any], names: Sequence[str]) -> dict[str, str]:
     return {name: _templates().get_template(f"{name}.html.j2").render(context) for name in names}
 
 
-def live_page(results: RunResults) -> str:
-    """The live page's text; its data are fetched apart."""
-    return str(_templates().get_template("live.html.j2").render(page_context(results, live=True)))
+def live_page(context: dict[str, Any]) -> str:
+    """The live page's text, from `page_context`; its data are fetched apart."""
+    return str(_templates().get_template("live.html.j2").render(context))
 
 
 def live_data(results: RunResults) -> str:
@@ -109,8 +112,13 @@ def _log_frequency(results: RunResults) -> bool:
     return bool(all_hz) and max(all_hz) > 8 * min(all_hz) > 0
 
 
-def page_context(results: RunResults, live: bool = False) -> dict[str, Any]:
-    """Everything that the templates show, as text and tables; what is not there is None or empty."""
+def page_context(
+    results: RunResults, live: bool = False, moved: tuple[Seen, Seen] | None = None
+) -> dict[str, Any]:
+    """Everything that the templates show, as text and tables; what is not there is None or empty.
+
+    `moved` are modes and errors before and after the last change of hits or modes.
+    """
     fit, compared, found = results.fit, results.comparison, results.diagnosis
     configurations = [_configuration(results, c) for c in results.configurations]
     ladder = _ladder(results)
@@ -131,6 +139,8 @@ def page_context(results: RunResults, live: bool = False) -> dict[str, Any]:
         ),
         "traces": bool(results.shown_ladder and results.shown_ladder.traces),
         "sweeps": bool(fit and fit.sweeps),
+        "loops": bool(results.loops and results.loops.models),
+        "loss": bool(results.loops and any(one.loss for one in results.loops.isolators.values())),
     }
     figures = tuple(name for name, there in shown.items() if there)
     return {
@@ -163,7 +173,28 @@ def page_context(results: RunResults, live: bool = False) -> dict[str, Any]:
         "worst_dofs": tables.worst_dofs_table(compared) if compared and compared.dofs else None,
         "worst_bands": tables.worst_bands_table(compared) if compared and compared.bands else None,
         "fill_of": fill_of,
+        "loops": None if results.loops is None else loops_context(results, results.loops),
         "simulation": simulation_context(results),
+        "choices": _choices(results),
+        "moved": None if moved is None else _moved(*moved),
+    }
+
+
+def _choices(results: RunResults) -> list[dict[str, str]]:
+    """What the user excluded and included: in words, and the verb that takes it back."""
+    return [
+        {"what": f"{'included' if verb == 'exclude' else 'excluded'}: {option.removeprefix('--')} {name}",
+         "verb": f"{verb}_{option.removeprefix('--')}", "label": name}
+        for verb, option, name in options_between(results.choices, NO_CHOICES)
+    ]  # fmt: skip
+
+
+def _moved(before: Seen, after: Seen) -> dict[str, Any]:
+    table = moved_table(before, after)
+    return {
+        "table": table if table.rows else None,
+        "still": still(before, after),
+        "words": error_words(before, after),
     }
 
 
@@ -181,6 +212,9 @@ def _sections(results: RunResults, figures: tuple[str, ...]) -> tuple[tuple[str,
         "summary": True,
         "frf": "frf" in figures,
         "model": results.diagnosis is not None or results.shown_ladder is not None or "errors" in figures,
+        "loops": results.loops is not None,
+        "parameters": results.loops is not None,
+        "loss": results.loops is not None,
         "modes": any(c.modal and c.modal.modes for c in results.configurations),
         "pairing": "mac" in figures or any(c.pairing for c in results.configurations),
         "simulation": bool(results.simulation),
@@ -193,6 +227,9 @@ def _sections(results: RunResults, figures: tuple[str, ...]) -> tuple[tuple[str,
         "summary": "Summary",
         "frf": "FRFs",
         "model": "Model and missing physics",
+        "loops": "Loops",
+        "parameters": "Parameters",
+        "loss": "Energy and loss factor",
         "modes": "Modes",
         "pairing": "Pairing and MAC",
         "simulation": "Simulated records",
@@ -273,6 +310,7 @@ def _configuration(results: RunResults, c: ConfigurationResults) -> dict[str, An
         "gears": moving_gears(c),
         "hit_count": len(hits),
         "used": sum(h.accepted for h in hits),
+        "hit_rows": _hit_rows(results, c),
         "rejected": tables.rejected_hits_table(hits),
         "verdicts": tables.verdicts_table(listed),
         "listed": len(listed),
@@ -281,6 +319,23 @@ def _configuration(results: RunResults, c: ConfigurationResults) -> dict[str, An
         "check_limits": tables.checks_table(hits) if hits else None,
         "checks": tables.failed_checks_table(c.frfs.verdicts) if c.frfs else None,
     }
+
+
+def _hit_rows(results: RunResults, c: ConfigurationResults) -> list[dict[str, Any]]:
+    """One row per hit, with what the live page needs to exclude it."""
+    table, excluded = tables.hits_table(c.hits), results.choices.of(c.name).excluded_hits
+    rows = []
+    for hit, row in zip(c.hits[:HITS_LISTED], table.rows, strict=False):
+        choice = HitChoice(c.name, hit.file, hit.number + 1)
+        rows.append(
+            {
+                "cells": row.cells,
+                "label": str(choice),
+                "accepted": hit.accepted,
+                "excluded": choice in excluded,
+            }
+        )
+    return rows
 
 
 def _mode_rows(results: RunResults, c: ConfigurationResults) -> list[dict[str, Any]]:
@@ -301,6 +356,7 @@ def _mode_rows(results: RunResults, c: ConfigurationResults) -> list[dict[str, A
         rows.append(
             {
                 "number": k + 1,
+                "label": str(ModeChoice(c.name, mode.frequency_hz, mode.damping_ratio)),
                 "frequency": format_value(mode.frequency_hz, mode.frequency_std_hz),
                 "damping": format_percent(mode.damping_ratio, mode.damping_std).removesuffix(" %"),
                 "mac": "–" if m is None else f"{m.mac:.2f}",

@@ -1,8 +1,7 @@
-"""summary.json, report.html, plots and screens of hysteresis tests: the story of the loops."""
+"""summary.json, tables, plots and screens of tests of force-displacement loops."""
 
 from __future__ import annotations
 
-import base64
 import json
 import shlex
 from collections.abc import Mapping, Sequence
@@ -15,63 +14,18 @@ from matplotlib.figure import Figure
 from ema_pipeline.files import replace_file
 from ema_pipeline.loops.summary import summary, terminal_lines
 from ema_pipeline.loops.types import Estimate, IsolatorResult, Loop, LoopModel
-from ema_pipeline.report import diagnosis, diagnosis_tables, style, summary_files
+from ema_pipeline.report import diagnosis, style, summary_files
 from ema_pipeline.report.numbers import format_value, plain, words
-from ema_pipeline.report.pages import page_templates
-from ema_pipeline.report.results import RunResults
+from ema_pipeline.report.results import LoopResults, RunResults
 from ema_pipeline.report.tables import Row, Table
 
-SECTIONS = (
-    ("diagnosis", "What is missing"),
-    ("loops", "Loops, measured and modelled"),
-    ("parameters", "Parameters"),
-    ("loss", "Energy and loss factor"),
-    ("published", "The published steps"),
-    ("provenance", "Settings and provenance"),
-)
-_CAPTIONS = {
-    "models": "Measured loops, the linear spring, and the last model of the ladder",
-    "misfit": "What each model leaves of the force along the cycle, one line per loop",
-    "candidates": "Probability of every effect as the first that the linear spring is missing",
-    "ladder": "Error rung by rung, on all loops and on loops held out",
-    "energy": "Energy per cycle over frequency, and the damper that its slope means; bars are two standard deviations",
-    "loss_factor": "Loss factor over amplitude and frequency; bars are two standard deviations",
-    "loops": "Measured loops and the published model: one set of parameters, and where that misses energies by more "
-    "than 3 % also each loop by itself",
-}
 
-
-def write_loops_report(
-    isolators: Mapping[str, IsolatorResult],
-    results: RunResults,
-    loops: Sequence[Loop],
-    models: Sequence[LoopModel],
-    folder: Path,
-) -> None:
-    """Write ``summary.json`` and ``report.html`` into `folder`.
-
-    Parameters
-    ----------
-    isolators : mapping of configuration to IsolatorResult
-    results : RunResults
-        Diagnosis, ladder, settings and provenance.
-    loops : sequence of Loop
-        Of all configurations.
-    models : sequence of LoopModel
-        Of the ladder, the linear spring first; empty before it was climbed.
-    folder : Path
-    """
+def write_loops_summary(results: RunResults, found: LoopResults, path: Path) -> None:
+    """Write ``summary.json``; its configurations are those of the isolators."""
     content = summary_files.summary(results)
-    content["configurations"] = {name: summary(one) for name, one in isolators.items()}
+    content["configurations"] = {name: summary(one) for name, one in found.isolators.items()}
     text = json.dumps(summary_files.finite(content), indent=2, ensure_ascii=False)
-    replace_file(folder / "summary.json", text + "\n")
-    images = _images(_figures(isolators, results, loops, models))
-    page = (
-        page_templates()
-        .get_template("loops.html.j2")
-        .render(_context(isolators, results, loops, models) | {"images": images})
-    )
-    replace_file(folder / "report.html", page)
+    replace_file(path, text + "\n")
 
 
 def run_screen(isolators: Mapping[str, IsolatorResult], results: RunResults, out: str) -> str:
@@ -122,23 +76,12 @@ def comparison_screen(loops: Sequence[Loop], models: Sequence[LoopModel]) -> str
     return "\n".join(lines)
 
 
-def _context(
-    isolators: Mapping[str, IsolatorResult],
-    results: RunResults,
-    loops: Sequence[Loop],
-    models: Sequence[LoopModel],
-) -> dict[str, Any]:
-    found, ladder = results.diagnosis, results.shown_ladder
+def loops_context(results: RunResults, found: LoopResults) -> dict[str, Any]:
+    """What the page shows of the loops beside its figures: the last model, tables, and what cannot be."""
     return {
-        "results": results,
-        "sections": SECTIONS,
-        "number": {name: k for k, (name, _) in enumerate(SECTIONS, start=1)},
-        "diagnosis": None if found is None else _diagnosis_context(results),
         "sizes": _cards(results),
-        "ladder": None if ladder is None else _filled(diagnosis_tables.ladder_table(ladder)),
-        "ladder_note": "" if ladder is None else ladder.note,
-        "users_ladder": results.ladder is not None,
-        "loops_table": _loops_table(loops, models),
+        "table": _loops_table(found.loops, found.models),
+        "flags": [flag for one in found.isolators.values() for flag in one.flags],
         "tests": [
             {
                 "name": name,
@@ -147,27 +90,10 @@ def _context(
                 "relaxation": _estimates_table(one.relaxation) if one.relaxation else None,
                 "energy": _energy_table(one) if one.energy else None,
                 "loss": _loss_table(one),
-                "flags": one.flags,
                 "notes": one.notes,
             }
-            for name, one in isolators.items()
+            for name, one in found.isolators.items()
         ],
-    }
-
-
-def _diagnosis_context(results: RunResults) -> dict[str, Any]:
-    found = results.diagnosis
-    assert found is not None
-    return {
-        "heading": diagnosis.heading(found),
-        "summary": found.summary,
-        "reasons": diagnosis.reasons(found),
-        "alike": diagnosis.group_words(found),
-        "next": found.next_measurement,
-        "candidates": diagnosis_tables.candidates_table(found),
-        "localisation": diagnosis_tables.localisation_table(found) if found.localisation else None,
-        "notes": found.notes,
-        "error": plain(found.error, 3),
     }
 
 
@@ -294,53 +220,28 @@ def _unit(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
-def write_loops_plots(
-    isolators: Mapping[str, IsolatorResult],
-    results: RunResults,
-    loops: Sequence[Loop],
-    models: Sequence[LoopModel],
-    folder: Path,
-) -> None:
-    """Write every figure as PNG and SVG into `folder`; parameters as in `write_loops_report`."""
+def write_loops_plots(results: RunResults, found: LoopResults, folder: Path) -> None:
+    """Write every figure as PNG and SVG into `folder`."""
     folder.mkdir(exist_ok=True)
-    for name, figure in _figures(isolators, results, loops, models).items():
+    for name, figure in _figures(results, found).items():
         replace_file(folder / f"{name}.png", style.png(figure))
         replace_file(folder / f"{name}.svg", style.svg(figure))
 
 
-def _figures(
-    isolators: Mapping[str, IsolatorResult],
-    results: RunResults,
-    loops: Sequence[Loop],
-    models: Sequence[LoopModel],
-) -> dict[str, Figure]:
+def _figures(results: RunResults, found: LoopResults) -> dict[str, Figure]:
     """Figures by name."""
     from ema_pipeline.report.figures.diagnosis import candidate_probabilities, ladder_errors
     from ema_pipeline.report.figures.loops import isolator_figures, misfit_figure, models_figure
 
     figures: dict[str, Figure] = {}
-    found, ladder = results.diagnosis, results.shown_ladder
-    if models:
-        figures["models"] = models_figure(loops, models)
-        figures["misfit"] = misfit_figure(loops, models)
-    if found is not None:
-        figures["candidates"] = candidate_probabilities(found)
+    ladder = results.shown_ladder
+    if found.models:
+        figures["models"] = models_figure(found.loops, found.models)
+        figures["misfit"] = misfit_figure(found.loops, found.models)
+    if results.diagnosis is not None:
+        figures["candidates"] = candidate_probabilities(results.diagnosis)
     if ladder is not None and ladder.rungs:
         figures["ladder"] = ladder_errors(ladder)
-    for name, one in isolators.items():
+    for name, one in found.isolators.items():
         figures |= {f"{name}_{kind}": figure for kind, figure in isolator_figures(one).items()}
     return figures
-
-
-def _images(figures: Mapping[str, Figure]) -> dict[str, dict[str, str]]:
-    """Figures by name, to be embedded in the page."""
-    images = {}
-    for name, figure in figures.items():
-        uri = f"data:image/png;base64,{base64.b64encode(style.png(figure)).decode('ascii')}"
-        caption = _CAPTIONS.get(name) or _CAPTIONS[next(k for k in _CAPTIONS if name.endswith(f"_{k}"))]
-        images[name] = {
-            "uri": uri,
-            "caption": caption,
-            "half": "half" if name in ("candidates", "ladder") else "",
-        }
-    return images

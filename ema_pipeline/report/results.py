@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from ema_pipeline.choices import NO_CHOICES, Choices
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.free_run import RecordError
 from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
@@ -13,6 +14,7 @@ from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit, Transducer
 from ema_pipeline.levels.types import LevelStudy
+from ema_pipeline.loops.types import IsolatorResult, Loop, LoopModel
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.verdict import Verdict
@@ -58,6 +60,30 @@ class ConfigurationResults:
 
 
 @dataclass(frozen=True)
+class LoopResults:
+    """Results of a test of force-displacement loops.
+
+    Attributes
+    ----------
+    isolators : mapping of str to IsolatorResult
+        By configuration.
+    loops : tuple of Loop
+        Of all configurations.
+    models : tuple of LoopModel
+        Of the ladder, the linear spring first; empty before there was one.
+    """
+
+    isolators: Mapping[str, IsolatorResult]
+    loops: tuple[Loop, ...]
+    models: tuple[LoopModel, ...] = ()
+
+    @property
+    def compared(self) -> tuple[LoopModel, ...]:
+        """The linear spring and the last model, once where they are the same."""
+        return self.models if len(self.models) < 2 else (self.models[0], self.models[-1])
+
+
+@dataclass(frozen=True)
 class RunResults:
     """Results of one run over one or several configurations.
 
@@ -89,14 +115,14 @@ class RunResults:
         Versions, files, hashes, dates: what a reader needs to do the run again.
     settings : mapping of str to mapping
         Stage to its settings, as text.
-    added : tuple of str
-        Effects that the user added, ``id@place``.
-    diagnosed_on : tuple of str
-        Effects of the model that the diagnosis was made of.
+    choices, diagnosed_choices : Choices
+        Hits and modes that the user excluded or included: now, and when the diagnosis was made.
     simulation : tuple of RecordError
         Free-run errors in the records of a continuous test; empty where none were simulated.
     hysteresis : tuple of HysteresisLoop
         Loops of Bouc-Wen elements that records were simulated with.
+    loops : LoopResults or None
+        Of a test of force-displacement loops.
     sensitivities : tuple of Verdict
         Channels whose scale or sign the model contradicts, see `fit.sensitivities`.
     """
@@ -116,14 +142,18 @@ class RunResults:
     deviations: tuple[dict[str, float], ...] = ({}, {}, {})
     added: tuple[str, ...] = ()
     diagnosed_on: tuple[str, ...] = ()
+    choices: Choices = NO_CHOICES
+    diagnosed_choices: Choices = NO_CHOICES
     folder: str = ""
     simulation: tuple[RecordError, ...] = ()
     hysteresis: tuple[HysteresisLoop, ...] = ()
+    loops: LoopResults | None = None
 
     @property
     def diagnosis_is_old(self) -> bool:
-        """True where effects were added or removed since the diagnosis was made."""
-        return self.diagnosis is not None and self.added != self.diagnosed_on
+        """True where effects, hits or modes were added or taken out since the diagnosis was made."""
+        then, now = (self.diagnosed_on, self.diagnosed_choices), (self.added, self.choices)
+        return self.diagnosis is not None and now != then
 
     @property
     def shown_ladder(self) -> Ladder | None:

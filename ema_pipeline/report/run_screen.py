@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.text import Text
 
+from ema_pipeline.choices import Choices
 from ema_pipeline.correlate.types import percent_off
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import Diagnosis
@@ -144,22 +145,36 @@ def _diagnosed(found: Diagnosis) -> str:
 
 def data_line(results: RunResults) -> str:
     """Hits, modes and pairs of every configuration, and what was left out."""
-    return "; ".join(_data_words(c, len(results.configurations) > 1) for c in results.configurations) + "."
+    several = len(results.configurations) > 1
+    return (
+        "; ".join(_data_words(c, several, results.choices.of(c.name)) for c in results.configurations) + "."
+    )
 
 
-def _data_words(c: ConfigurationResults, several: bool) -> str:
+def _data_words(c: ConfigurationResults, several: bool, choices: Choices) -> str:
     parts = []
     if c.hits:
         dropped = " (channels left out of some)" if any(t.startswith("channel") for t in left_out(c)) else ""
-        parts.append(f"{sum(h.accepted for h in c.hits)} of {len(c.hits)} hits used{dropped}")
+        yours = f" ({len(choices.excluded_hits)} excluded by you)" if choices.excluded_hits else ""
+        parts.append(f"{sum(h.accepted for h in c.hits)} of {len(c.hits)} hits used{yours}{dropped}")
     if c.modal is not None:
-        parts.append(_count(len(c.modal.modes), "mode"))
+        parts.append(_count(len(c.modal.modes), "mode") + _chosen_words(choices))
     if c.pairing is not None:
         weak = sum(p.mac < LOW_MAC for p in c.pairing.pairs)
         parts.append(f"{len(c.pairing.pairs)} paired" + (f", {weak} of these doubtfully" if weak else ""))
     if c.levels is not None and has_to_say(c.levels) and c.levels.level_dependent:
         parts.append("some move with the force")
     return (f"{c.name}: " if several else "") + (", ".join(parts) or "nothing analysed yet")
+
+
+def _chosen_words(choices: Choices) -> str:
+    """What the user excluded from the modes and included in them; empty for nothing."""
+    words = [
+        f"{len(chosen)} {what}"
+        for chosen, what in ((choices.excluded_modes, "excluded"), (choices.included_modes, "included"))
+        if chosen
+    ]
+    return f" ({', '.join(words)} by you)" if words else ""
 
 
 def next_lines(results: RunResults, out: str, program: str) -> tuple[str, ...]:

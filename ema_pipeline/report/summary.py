@@ -72,6 +72,9 @@ def changed_words(results: RunResults) -> str:
     named = " and ".join(diagnosis.label_words(x) for x in results.added)
     error = "" if results.fit is None else f" (error {plain(results.fit.error, 3)})"
     holds = f"The model holds {named} now{error}" if named else f"The model has no added effects now{error}"
+    if results.added == results.diagnosed_on:
+        changed = f"Other hits or modes were chosen{error}"
+        return f"{changed}; the diagnosis was made before: 'ema diagnose' renews it."
     before = " and ".join(diagnosis.label_words(x) for x in results.diagnosed_on)
     of = f"the model with {before}" if before else "the base model"
     return f"{holds}; the diagnosis is of {of}: 'ema diagnose' renews it."

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ema_pipeline.choices import Choices
 from ema_pipeline.correlate.types import Comparison, percent_off
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Rung
 from ema_pipeline.exchange.tables import csv_text, modes_table
@@ -46,12 +47,16 @@ def summary(results: RunResults) -> dict[str, Any]:
         "effects": list(results.added),
         "configurations": {c.name: _configuration(c) for c in results.configurations},
     }
+    if results.choices:
+        content["choices"] = choices_summary(results.choices)
     if results.fit is not None:
         content["fit"] = _fit(results.fit)
     if results.comparison is not None:
         content["comparison"] = _comparison(results.comparison)
     if results.diagnosis is not None:
         content["diagnosis"] = _diagnosis(results.diagnosis) | {"on_top_of": list(results.diagnosed_on)}
+        if results.choices or results.diagnosed_choices:
+            content["diagnosis"]["choices"] = choices_summary(results.diagnosed_choices)
     if results.shown_ladder is not None:
         content["ladder"] = _ladder(results.shown_ladder)
         content["ladder_note"] = results.shown_ladder.note
@@ -63,6 +68,11 @@ def summary(results: RunResults) -> dict[str, Any]:
         content["simulation"] = _simulation(results)
     content["warnings"] = list(cautions(results))
     return content
+
+
+def choices_summary(choices: Choices) -> dict[str, list[str]]:
+    """What the user excluded and included, as `ema exclude` and `ema include` name it."""
+    return {kind: [str(x) for x in listed] for kind, listed in vars(choices).items()}
 
 
 def _comparison(compared: Comparison) -> dict[str, Any]:

@@ -45,6 +45,10 @@ def set_up_table(results: RunResults, c: ConfigurationResults) -> Table:
     if c.modal is not None:
         scaled = "mass-normalised" if c.modal.scaled else f"not scaled: {c.modal.scaling_note}"
         rows.append(("modes", f"{len(c.modal.modes)}; shapes {scaled}"))
+    chosen = results.choices.of(c.name)
+    for what, listed in vars(chosen).items():
+        if listed:
+            rows.append((f"{words(what)} by hand", ", ".join(map(str, listed))))
     return Table(("item", c.name), tuple(Row(r) for r in rows))
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ema_pipeline import __version__, codec
+from ema_pipeline.choices import NO_CHOICES, Choices
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.effects.rig import rig_with_effects
@@ -54,6 +55,8 @@ class RunInfo:
         Versions of the program, Python and the libraries that compute.
     effect_hashes : dict of str to str
         SHA-256 of the files with the user's own effects, by path, as they were when they last ran.
+    choices : Choices
+        Hits and modes that the user excluded or included.
     """
 
     kind: str
@@ -66,6 +69,7 @@ class RunInfo:
     pipeline: str
     versions: dict[str, str]
     effect_hashes: dict[str, str] = field(default_factory=dict)
+    choices: Choices = NO_CHOICES
 
 
 @dataclass(frozen=True)

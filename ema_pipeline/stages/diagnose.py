@@ -32,6 +32,10 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Fit every effect of the library on top of the model as it stands, and judge what the data support."""
+    return _found(run, progress) | {"choices": run.info.choices}
+
+
+def _found(run: Run, progress: Progress) -> dict[str, object]:
     if run.info.kind == "hysteresis":
         return loop_ladder.diagnose_run(run, progress)
     if driven.by_records(run):

@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import fields, replace
 from typing import Any, cast, get_type_hints
 
 import h5py
 
 from ema_pipeline import codec
+from ema_pipeline.choices import Choices, HitChoice
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.records import Hit, HitSamples, Record, cut_hit
 from ema_pipeline.lazy_samples import StoredSamples
 from ema_pipeline.stages.base import Progress, Run, silent
 from ema_pipeline.store import Store
+from ema_pipeline.verdict import Verdict
 
 NAME = "hits"
 NEEDS = ("ingest",)
 PER_CONFIGURATION = True
 NEEDS_RIG = False
 
+CHOICE = "choice"
+"""Name of the verdict on hits that the user excluded."""
+
 
 def inputs(run: Run, configuration: str) -> str:
-    """Nothing but the records."""
-    return ""
+    """The records, and the hits that the user excluded."""
+    return Choices(run.info.choices.of(configuration).excluded_hits).fingerprint()
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
@@ -35,8 +40,18 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     settings = cast(HitSettings, run.settings[NAME])
     with stored_records(run.store, configuration) as records:
         hits = hits_of_test(records, settings)
+    hits = without_excluded(hits, run.info.choices.of(configuration).excluded_hits)
     require_good_hits(hits, configuration)
     return {"hits": hits}
+
+
+def without_excluded(hits: tuple[Hit, ...], excluded: Collection[HitChoice]) -> tuple[Hit, ...]:
+    """The hits, with a verdict that rejects those that the user excluded."""
+    named = {(x.file, x.number) for x in excluded}
+    verdict = Verdict(CHOICE, 1.0, 0.0, "1", False, "", "reject_hit", message="excluded by the user")
+    return tuple(
+        replace(h, verdicts=(*h.verdicts, verdict)) if (h.file, h.number + 1) in named else h for h in hits
+    )
 
 
 def require_good_hits(hits: tuple[Hit, ...], configuration: str) -> None:

@@ -7,7 +7,7 @@ from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.errors import EmaError
 from ema_pipeline.stages import driven, loop_ladder
 from ema_pipeline.stages.base import Progress, Run
-from ema_pipeline.stages.models import diagnosed_scatters, earlier_unknowns
+from ema_pipeline.stages.models import diagnosed_choices, diagnosed_scatters, earlier_unknowns
 
 NAME = "ladder"
 NEEDS = ("modal",)
@@ -18,16 +18,22 @@ NEEDS_RIG = True
 
 def inputs(run: Run, configuration: str) -> str:
     """Measured with the settings of the diagnosis; the user's own effects take part."""
-    return run.settings["diagnose"].model_dump_json() + run.effect_hashes()
+    alone = "base model" if _stands_in(run) else ""
+    return run.settings["diagnose"].model_dump_json() + run.effect_hashes() + alone
+
+
+def _stands_in(run: Run) -> bool:
+    """True where the diagnosis is of other hits or modes, so that the error of the base model is not known from it."""
+    return not run.info.effects and diagnosed_choices(run) != run.info.choices
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
-    """Fit the base model and every rung above it; without added effects there is no ladder."""
+    """Fit the base model and every rung above it; without added effects that is left to the diagnosis."""
     if run.info.kind == "hysteresis":
         return loop_ladder.ladder_run(run, progress)
     if driven.by_records(run):
         return driven.ladder_run(run, progress)
-    if not run.info.effects:
+    if not run.info.effects and not _stands_in(run):
         return {}
     if run.rig is None:
         raise EmaError(f"{run.store.folder}: a ladder needs a model; run again with --rig")

@@ -45,6 +45,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
         cast(FrfSettings, run.settings["frf"]),
         modal_settings.identify,
         progress,
+        run.info.choices.of(configuration),
     )
     return {"study": with_circles(study, modal_settings.circle)}
 

@@ -11,6 +11,7 @@ from ema_pipeline.stages.base import Progress, Run, file_hash
 from ema_pipeline.stages.hits import accepted_hits
 
 if TYPE_CHECKING:
+    from ema_pipeline.modal.types import ModalModel
     from ema_pipeline.pipeline import ModalStageSettings
 
 NAME = "modal"
@@ -20,14 +21,22 @@ NEEDS_RIG = False
 
 
 def inputs(run: Run, configuration: str) -> str:
-    """Nothing but the FRFs, or the table of modes in place of them."""
-    return file_hash(Path(run.info.raw)) if run.info.kind == "modes" else ""
+    """What the user chose, and the table of modes where it stands in place of FRFs."""
+    table = file_hash(Path(run.info.raw)) if run.info.kind == "modes" else ""
+    return table + run.info.choices.of(configuration).of_modes().fingerprint()
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
-    """Identify the modes, and look at each of them with circle fits."""
+    """Identify the modes, look at each of them with circle fits, and take out what the user excluded."""
+    from ema_pipeline.modal.chosen import chosen
+
+    return {"modal": chosen(_identified(run, configuration, progress), run.info.choices.of(configuration))}
+
+
+def _identified(run: Run, configuration: str, progress: Progress) -> ModalModel:
     from ema_pipeline.correlate.measured import to_modal_model
     from ema_pipeline.correlate.mode_table import read_mode_table
+    from ema_pipeline.modal.chosen import wanted
     from ema_pipeline.modal.circle import attach_circles, identify_by_circle
     from ema_pipeline.modal.identify import identify
     from ema_pipeline.modal.moving import identify_hits
@@ -35,19 +44,22 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
     if run.info.kind == "modes":
         measured = read_mode_table(Path(run.info.raw), run.require_model(NAME))
-        return {"modal": to_modal_model(measured[configuration])}
+        return to_modal_model(measured[configuration])
     settings = cast("ModalStageSettings", run.settings[NAME])
     frfs = run.store.load("frf", configuration, "frfs", FrfSet)
     if settings.method == "circle":
-        return {"modal": identify_by_circle(frfs, settings.circle)}
+        return identify_by_circle(frfs, settings.circle)
+    asked = wanted(run.info.choices.of(configuration).included_modes, frfs.response_decay_rad_s)
     if run.info.kind == "continuous":
-        return {"modal": attach_circles(frfs, identify(frfs, settings.identify, progress), settings.circle)}
+        modal = identify(frfs, settings.identify, progress, wanted=asked)
+        return attach_circles(frfs, modal, settings.circle)
     found = identify_hits(
         lambda: accepted_hits(run.store, configuration),
         frfs,
         cast(FrfSettings, run.settings["frf"]),
         settings.identify,
         progress,
+        asked,
     )
     modal = attach_circles(found.frfs, found.modal, settings.circle)
-    return {"modal": pooled(modal, found.alignment, frfs.record_s, frfs.response_decay_rad_s)}
+    return pooled(modal, found.alignment, frfs.record_s, frfs.response_decay_rad_s)

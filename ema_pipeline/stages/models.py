@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import cast
 
+from ema_pipeline.choices import NO_CHOICES, Choices
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.effects.library import depends_on_level, parse_effect
 from ema_pipeline.errors import EmaError
@@ -92,6 +93,13 @@ def diagnosed_scatters(run: Run) -> dict[str, float]:
     """The scatters at which the diagnosis compares models, so that one model has one error; empty without one."""
     found = run.store.find("diagnose", ALL, "diagnosis", Diagnosis)
     return {} if found is None else {s.name: s.learned for s in found.ladder.scatters}
+
+
+def diagnosed_choices(run: Run) -> Choices:
+    """What the user had excluded and included when the diagnosis was made; as it is now where there is none."""
+    if not run.store.key("diagnose", ALL):
+        return run.info.choices
+    return run.store.find("diagnose", ALL, "choices", Choices) or NO_CHOICES
 
 
 def rung_unknowns(ladder: Ladder | None, effects: Sequence[str]) -> dict[str, float]:

@@ -8,8 +8,7 @@ from typing import cast
 
 from ema_pipeline.report.settings import ReportSettings
 from ema_pipeline.stages.base import Progress, Run, silent
-from ema_pipeline.stages.loop_ladder import loops_of, models_of
-from ema_pipeline.stages.results import isolators, load_results
+from ema_pipeline.stages.results import load_results
 
 NAME = "report"
 NEEDS: tuple[str, ...] = ()
@@ -27,18 +26,18 @@ def inputs(run: Run, configuration: str) -> str:
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Write every file of the results folder but the store."""
     from ema_pipeline.report.html import write_report
-    from ema_pipeline.report.loops import write_loops_report
+    from ema_pipeline.report.loops import write_loops_summary
     from ema_pipeline.report.summary_files import write_modes_csv, write_summary
 
     settings = cast(ReportSettings, run.settings[NAME])
     folder = run.store.folder
     results = load_results(run)
-    if run.info.kind == "hysteresis":
-        write_loops_report(isolators(run), results, loops_of(run), models_of(run), folder)
+    if results.loops is not None:
+        write_loops_summary(results, results.loops, folder / "summary.json")
     else:
         write_summary(results, folder / "summary.json")
         write_modes_csv(results, folder / "modes.csv")
-        write_report(results, folder / "report.html")
+    write_report(results, folder / "report.html")
     if settings.plots:
         draw(run, progress)
     return {"files": OUTPUTS}
@@ -46,15 +45,15 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
 def draw(run: Run, progress: Progress = silent) -> Path:
     """Draw every figure for print, as PNG and SVG, into the folder ``plots`` beside the store."""
-    folder = run.store.folder / "plots"
-    if run.info.kind == "hysteresis":
+    folder, results = run.store.folder / "plots", load_results(run)
+    if results.loops is not None:
         from ema_pipeline.report.loops import write_loops_plots
 
-        write_loops_plots(isolators(run), load_results(run), loops_of(run), models_of(run), folder)
+        write_loops_plots(results, results.loops, folder)
     else:
         from ema_pipeline.report.plots import write_plots
 
-        write_plots(load_results(run), folder, lambda k, count, name: progress(0.95 * k / count, name))
+        write_plots(results, folder, lambda k, count, name: progress(0.95 * k / count, name))
     return folder
 
 

@@ -18,8 +18,10 @@ from ema_pipeline.levels.sentences import flagged
 from ema_pipeline.loops.types import IsolatorResult
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.report.results import ConfigurationResults, LoopResults, RunResults
 from ema_pipeline.stages.base import Run
+from ema_pipeline.stages.loop_ladder import loops_of, models_of
+from ema_pipeline.stages.models import diagnosed_choices
 from ema_pipeline.stages.modes import level_study
 from ema_pipeline.store import ALL
 from ema_pipeline.verdict import Verdict
@@ -65,9 +67,10 @@ def load_results(run: Run) -> RunResults:
         comparison_base=run.store.find("correlate", ALL, "comparison_base", Comparison),
         comparison_after=run.store.find("diagnose", ALL, "comparison_after", Comparison),
         diagnosis=_diagnosis(run),
-        ladder=run.store.find("ladder", ALL, "ladder", Ladder),
+        ladder=_own_ladder(run),
         simulation=_of_records(run, "simulation", RecordError),
         hysteresis=_of_records(run, "hysteresis", HysteresisLoop),
+        loops=_loops(run) if loops else None,
         sensitivities=run.store.find("correlate", ALL, "sensitivities", tuple[Verdict, ...]) or (),
         deviations=tuple(
             run.store.find(stage, ALL, name, dict[str, float]) or {}
@@ -79,6 +82,8 @@ def load_results(run: Run) -> RunResults:
         ),
         added=run.info.effects,
         diagnosed_on=run.store.find("diagnose", ALL, "on_top_of", tuple[str, ...]) or (),
+        choices=run.info.choices,
+        diagnosed_choices=diagnosed_choices(run),
         folder=str(run.store.folder),
         provenance=provenance(run),
         settings={name: _flat(json.loads(s.model_dump_json())) for name, s in run.settings.items()},
@@ -100,6 +105,14 @@ def _diagnosis(run: Run) -> Diagnosis | None:
     return replace(found, next_measurement=FOR_A_TABLE)
 
 
+def _own_ladder(run: Run) -> Ladder | None:
+    """The ladder of added effects; that of the base model alone only while the diagnosis is of other data."""
+    bare = not run.info.effects and run.info.kind != "hysteresis"
+    if bare and diagnosed_choices(run) == run.info.choices:
+        return None
+    return run.store.find("ladder", ALL, "ladder", Ladder)
+
+
 R = TypeVar("R", RecordError, HysteresisLoop)
 
 
@@ -113,6 +126,13 @@ def _of_records(run: Run, name: str, kind: type[R]) -> tuple[R, ...]:
         if found is not None:
             return cast("tuple[R, ...]", found)
     return ()
+
+
+def _loops(run: Run) -> LoopResults | None:
+    """Loops of all configurations; None before they were identified."""
+    if not all(run.store.key("loops", name) for name in run.info.configurations):
+        return None
+    return LoopResults(isolators(run), loops_of(run), models_of(run))
 
 
 def _system(run: Run, name: str, values: dict[str, float]) -> LinearSystem:

@@ -64,7 +64,7 @@ def application(session: Session, started: Callable[[], None] = lambda: None) ->
         await session.close()
 
     async def page(request: Request) -> Response:
-        return HTMLResponse(await asyncio.to_thread(html.live_page, session.results))
+        return HTMLResponse(await asyncio.to_thread(session.page))
 
     async def measured(request: Request) -> Response:
         return _json(await asyncio.to_thread(html.live_data, session.results))
@@ -106,6 +106,7 @@ def application(session: Session, started: Callable[[], None] = lambda: None) ->
             Route("/commands", commands),
             Route("/bokeh.js", scripts),
             Route("/numbers.js", scripts),
+            Route("/figures.js", scripts),
             Route("/page.js", scripts),
             Route("/live.js", scripts),
             Route("/action", action, methods=["POST"]),

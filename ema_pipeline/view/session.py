@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import json
+import math
 import os
 import shlex
 import sys
@@ -14,26 +16,34 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ema_pipeline.choices import options_between
 from ema_pipeline.errors import EmaError
 from ema_pipeline.pipeline import existing_run
+from ema_pipeline.report.moved_modes import Seen, error_words, seen
 from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.results import RunResults
+from ema_pipeline.stages.base import Run
+from ema_pipeline.stages.modes import modes_key
 from ema_pipeline.stages.results import load_results
 from ema_pipeline.view.serving import Listeners
 from ema_pipeline.view.snapshots import Snapshots
 
-PARTS = ("band", "candidates", "model_details", "mode_rows", "gears")
+PARTS = ("band", "candidates", "loop_model", "model_details", "choices", "mode_rows", "gears")
 """Parts of the page that change with the model, by the names of their templates."""
 
 _LOOK_S = 1.0
 """How often the folder is looked at for changes that somebody else made."""
 _SHARES = {"ladder": 0.25, "fit": 0.4, "correlate": 0.2, "report": 0.15, "diagnose": 0.85}
-"""Shares of the time that stages take, roughly."""
+_SHARES_OF_CHOICES = {
+    "hits": 0.03, "frf": 0.03, "modal": 0.42, "levels": 0.05, "ladder": 0.18, "fit": 0.06, "correlate": 0.05,
+    "report": 0.18,
+}  # fmt: skip
+"""Shares of the time that stages take, roughly: of a change of the model, and of hits or modes."""
 
 
 @dataclass
 class Job:
-    """An action under way: its verb, the stage that runs, and how much of all is done (0 to 1)."""
+    """An action under way: its verb, its stage, how much is done (0 to 1), and whether the page shows its outcome."""
 
     verb: str
     label: str
@@ -41,7 +51,18 @@ class Job:
     text: str = ""
     done: float = 0.0
     before: float = 0.0
+    shown_already: bool = False
     began: float = field(default_factory=time.monotonic)
+
+    @property
+    def chooses(self) -> bool:
+        """True where hits or modes are excluded or included."""
+        return self.verb.partition("_")[0] in ("exclude", "include")
+
+    def share(self, stage: str) -> float:
+        """Part of the whole that a stage takes."""
+        shares = _SHARES_OF_CHOICES if self.chooses else _SHARES
+        return shares.get(stage.partition(" ")[0], 0.1)
 
     def shown(self) -> dict[str, Any]:
         """For the page."""
@@ -76,6 +97,8 @@ class Session:
         self._running: asyncio.Task[None] | None = None
         self._seen: tuple[int, int] = (0, 0)
         self._cancelled = False
+        self._moved: tuple[Seen, Seen] | None = None
+        self._before = seen(RunResults(""))
         self._changing = asyncio.Lock()
         self.load()
 
@@ -84,7 +107,9 @@ class Session:
     def load(self) -> None:
         """Read the folder anew."""
         seen = self._stamp()
-        self.results: RunResults = load_results(existing_run(self.folder, self._effect_files))
+        run = existing_run(self.folder, self._effect_files)
+        self.results: RunResults = load_results(run)
+        self._measured = _measured_key(run)
         self._seen = seen
         self.version += 1
 
@@ -99,14 +124,21 @@ class Session:
             "preview": self.preview,
         }
 
+    def page(self) -> str:
+        """The page itself."""
+        from ema_pipeline.report.html import live_page, page_context
+
+        return live_page(page_context(self.results, live=True, moved=self._moved))
+
     def model(self) -> dict[str, Any]:
-        """What changes with the model: data of the figures, and parts of the page."""
+        """What changes with the model: data of the figures, parts of the page, and a key of what was measured."""
         from ema_pipeline.report.html import page_context, page_parts
         from ema_pipeline.report.interactive.data import model_data
 
-        context = page_context(self.results, live=True)
+        context = page_context(self.results, live=True, moved=self._moved)
         return {
             "version": self.version,
+            "measured": self._measured,
             "figures": list(context["figures"]),
             "parts": page_parts(context, PARTS),
             "data": model_data(self.results),
@@ -146,10 +178,10 @@ class Session:
         if self.job is not None or not len(self._snapshots):
             raise EmaError("there is nothing to undo")
         async with self._changing:
-            before = self.results.added
+            before, self._moved = self.results, None
             await asyncio.to_thread(self._snapshots.restore)
             await asyncio.to_thread(self.load)
-            self._log(before, self.results.added)
+            self._log(before, self.results)
         self.message = "Undone."
         self.listeners.tell()
 
@@ -182,15 +214,19 @@ class Session:
             await self._run(job)
 
     async def _run(self, job: Job) -> None:
-        before, stamp = self.results.added, self._stamp()
+        before, stamp = self.results, self._stamp()
+        self._before = seen(before)
         try:
             self._snapshots.take()
             outcome = await self._work(job)
             if outcome.get("outcome") == "done":
+                if job.shown_already:  # but for the report, which is a file of its own
+                    self._seen = self._stamp()
                 await asyncio.to_thread(self._load_once)
-                self._log(before, self.results.added, job)
-                self.message = self._outcome()
+                self._log(before, self.results, job)
+                self.message = self._outcome(job)
             else:
+                self._moved = None
                 if self._stamp() == stamp:
                     self._snapshots.drop()
                 else:
@@ -223,21 +259,34 @@ class Session:
         return {"outcome": "failed", "why": "the refit has ended before its time; nothing was changed"}
 
     async def _follow(self, job: Job, told: dict[str, Any]) -> None:
+        stage = str(told.get("finished", told.get("stage")))
+        if self.preview is None and (stage == "fit" or told.get("finished") == "ladder"):
+            rungs = await asyncio.to_thread(
+                self._rungs
+            )  # known before "fit" begins, be it from the diagnosis
+            self.preview = [self._error_before(), *rungs[-1:]] if job.chooses and rungs else rungs
         if "finished" in told:
-            stage = str(told["finished"])
-            job.before = min(job.before + _SHARES.get(stage, 0.1), 1.0)
+            job.before = min(job.before + job.share(stage), 1.0)
             job.done = job.before
-            if stage == "ladder":
-                self.preview = await asyncio.to_thread(self._rungs)
-            if stage == "correlate":  # all is there but the report on disk
+            if stage == (
+                "correlate" if self.results.loops is None else "ladder"
+            ):  # all is there but the report
                 await asyncio.to_thread(self._load_once)
+                job.shown_already = True
         else:
-            job.stage, job.text = str(told["stage"]), str(told.get("text", ""))
-            job.done = min(job.before + _SHARES.get(job.stage, 0.1) * float(told["done"]), 1.0)
+            job.stage, job.text = stage, str(told.get("text", ""))
+            job.done = min(job.before + job.share(job.stage) * float(told["done"]), 1.0)
         self.listeners.tell()
 
-    def _outcome(self) -> str:
+    def _error_before(self) -> dict[str, Any]:
+        """The error of the model before an action, as a rung of the ladder shows it."""
+        held = self._before.heldout_error
+        return {"error": self._before.error, "held": held if math.isfinite(held) else None}
+
+    def _outcome(self, job: Job) -> str:
         """What an action has brought, in one line."""
+        if job.chooses:
+            return error_words(self._before, seen(self.results)) or "Done."
         ladder = self.results.shown_ladder
         if ladder is None or len(ladder.rungs) < 2:
             return "Done."
@@ -248,7 +297,10 @@ class Session:
     def _load_once(self) -> None:
         """Load unless the model on screen is that in the folder already."""
         if self._stamp() != self._seen:
+            chosen = self.results.choices
             self.load()
+            if self.results.choices != chosen:
+                self._moved = self._before, seen(self.results)
 
     def _rungs(self) -> list[dict[str, Any]]:
         from ema_pipeline.diagnose.types import Ladder
@@ -265,9 +317,13 @@ class Session:
         )  # fmt: skip
         return self._worker
 
-    def _log(self, before: tuple[str, ...], after: tuple[str, ...], job: Job | None = None) -> None:
-        """The commands that lead from one list of effects to the other."""
-        folder = shlex.quote(str(self.folder))
+    def _log(self, was: RunResults, now: RunResults, job: Job | None = None) -> None:
+        """The commands that lead from one list of effects, and from one set of choices, to the other."""
+        folder, before, after = shlex.quote(str(self.folder)), was.added, now.added
+        self.commands += [
+            f"ema {verb} {folder} {option} {shlex.quote(name)}"
+            for verb, option, name in options_between(was.choices, now.choices)
+        ]
         if job is not None and job.verb == "diagnose":
             self.commands.append(f"ema diagnose {folder}")
             return
@@ -284,3 +340,9 @@ class Session:
     def _stamp(self) -> tuple[int, int]:
         found = (self.folder / "ema.h5").stat()
         return found.st_ino, found.st_mtime_ns
+
+
+def _measured_key(run: Run) -> str:
+    """Key of hits, FRFs and modes: an equal key means that a page shows the same measurements."""
+    keys = [run.store.key(stage, c) for stage in ("hits", "frf") for c in run.info.configurations]
+    return hashlib.sha256(" ".join([*keys, modes_key(run)]).encode()).hexdigest()

@@ -19,7 +19,8 @@ from ema_pipeline.pipeline import ShowStage
 from ema_pipeline.processes import die_with_parent
 from ema_pipeline.stages.base import Progress
 
-VERBS = ("add", "remove", "diagnose")
+VERBS = ("add", "remove", "diagnose", "exclude_hit", "exclude_mode", "include_hit", "include_mode")
+"""What the page can ask for; the part after the underscore is the option of that verb on the command line."""
 
 Tell = Callable[[dict[str, Any]], None]
 
@@ -32,6 +33,7 @@ def act(folder: Path, effect_files: tuple[str, ...], verb: str, label: str, show
     EmaError
         As the command line would print it.
     """
+    from ema_pipeline.choosing import change_choices, excluding, including
     from ema_pipeline.job import adding, change_effects, removing, run_on
 
     if verb == "add":
@@ -40,6 +42,10 @@ def act(folder: Path, effect_files: tuple[str, ...], verb: str, label: str, show
         change_effects(folder, removing(label), (), show, effect_files)
     elif verb == "diagnose":
         run_on(folder, ["diagnose", "report"], (), show, effect_files)
+    elif verb in VERBS:
+        action, _, what = verb.partition("_")
+        change = (excluding if action == "exclude" else including)(**{f"{what}s": [label]})
+        change_choices(folder, change, show, effect_files)
     else:
         raise EmaError(f"'{verb}' is no verb of the live page")
 

@@ -21,6 +21,7 @@ from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
 from ema_pipeline.modal.assurance import auto_mac
 from ema_pipeline.modal.types import CircleFit, ModalModel, Mode
 from ema_pipeline.report.diagnosis import label_words, rung_words
+from ema_pipeline.report.interactive.loops import loop_model_names, loops_data, loss_data
 from ema_pipeline.report.interactive.packing import POINTS, packed_cmif, packed_frfs
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.numbers import format_percent, format_value, plain, words
@@ -63,11 +64,15 @@ def model_data(results: RunResults) -> dict[str, Any]:
         "ladder": ladder_data(results.shown_ladder),
         "sweeps": _sweeps(results),
         "traces": _traces(results),
+        "loops": loops_data(results.loops),
+        "loss": loss_data(results.loops),
     }
 
 
 def model_names(results: RunResults) -> list[str]:
     """Names of the models that stand beside each other, the base model first."""
+    if results.loops is not None:
+        return loop_model_names(results.loops)
     named = ["base model" if results.fit is not None else "model at nominal values"]
     if results.added:
         named.append("with " + " + ".join(map(label_words, results.added)))

@@ -8,10 +8,19 @@ from typing import Any
 
 from bokeh.embed import json_item
 from bokeh.layouts import column
-from bokeh.models import BasicTicker, ColumnDataSource, FactorRange, FixedTicker, LinearColorMapper, Range1d
+from bokeh.models import (
+    BasicTicker,
+    ColumnDataSource,
+    FactorRange,
+    FixedTicker,
+    LinearColorMapper,
+    Range1d,
+    TapTool,
+)
 from bokeh.models.annotations import ColorBar
 from bokeh.palettes import Blues256
 
+from ema_pipeline.report.interactive.loops import loops_figure, loss_figure
 from ema_pipeline.report.interactive.packing import LEVELS
 from ema_pipeline.report.interactive.theme import (
     ACCENT,
@@ -218,7 +227,7 @@ def stabilisation(log_x: bool = False) -> Any:
     cmif = source("stab.cmif", "f", "y")
     made.line(
         "f", "y", source=cmif, color=INK, alpha=0.5, line_width=1.2, legend_label="mode indicator (log)"
-    )
+    ).glyph.tags = [INK_TAG]
     shown = []
     for key, marker, color, label in (
         ("loose", "x", INK, "not stable"),
@@ -236,9 +245,13 @@ def stabilisation(log_x: bool = False) -> Any:
                 line_color=color,
                 legend_label=label,
                 fill_color=color if key == "voted" else None,
+                selection_line_color=ACCENT,
+                nonselection_alpha=1,
             )
         )
     made.vspan("f", source=source("stab.selected", "f"), line_color=ACCENT, line_width=2)
+    shown[0].glyph.tags = [INK_TAG]
+    made.add_tools(TapTool(renderers=[*shown], mode="replace"))
     hover(made, shown, ("f", "@f{0.00} Hz"), ("order", "@order"), ("damping", "@damping{0.00} %"))
     place_legend(made)
     return made
@@ -352,6 +365,8 @@ _FIGURES: dict[str, Callable[[], Any]] = {
     "levels": levels,
     "traces": traces,
     "sweeps": sweeps,
+    "loops": loops_figure,
+    "loss": loss_figure,
 }
 
 

@@ -1,7 +1,7 @@
 /* The live page: follows the server's state, and asks it for actions. */
 (function () {
   "use strict";
-  var shown = 0, loading = false, figures = "", state = null;
+  var shown = 0, loading = false, figures = "", measured = "", state = null;
   function byId(id) { return document.getElementById(id); }
   function json(url) { return fetch(url, { credentials: "same-origin" }).then(function (r) { if (!r.ok) { throw new Error(r.status); } return r.json(); }); }
   function ask(verb, label) {
@@ -12,15 +12,13 @@
   function replaceParts(parts) {
     var focus = document.activeElement && document.activeElement.dataset ? document.activeElement.dataset.label : null;
     Object.keys(parts).forEach(function (id) { var e = byId(id); if (e) { e.innerHTML = parts[id]; } });
-    if (focus) {
-      document.querySelectorAll("button.act").forEach(function (b) { if (b.dataset.label === focus) { b.focus(); } });
-    }
+    focused(focus);
   }
   function update() {
     if (loading || state.version === shown) { return; }
     loading = true;
     json("/model").then(function (model) {
-      if (figures && figures !== model.figures.join()) { location.reload(); return; }
+      if (figures !== model.figures.join() || measured !== model.measured) { again(); return; }
       shown = model.version;
       replaceParts(model.parts);
       EmaPage.newModel(model.data);
@@ -30,17 +28,27 @@
       update();
     }, function () { loading = false; });
   }
+  /* Other measurements: the whole page is made anew, and what was focused stays so. */
+  function again() {
+    var focus = document.activeElement && document.activeElement.dataset ? document.activeElement.dataset.label : "";
+    sessionStorage.setItem("focus", focus || "");
+    location.reload();
+  }
+  function focused(label) {
+    document.querySelectorAll("button.act").forEach(function (b) { if (label && b.dataset.label === label) { b.focus(); } });
+  }
   function buttons() {
     var busy = !!state.job;
     document.querySelectorAll("button.act").forEach(function (b) { b.disabled = busy && b.id !== "cancel"; });
     if (byId("undo")) { byId("undo").disabled = !state.undo; }
     byId("cancel").hidden = byId("progress").hidden = !busy;
+    byId("live").classList.toggle("busy", busy);
   }
   function follow(now) {
     state = now;
     var job = now.job, status = byId("status"), text = now.message;
     if (job) {
-      text = { add: "Adding ", remove: "Removing ", diagnose: "Diagnosing " }[job.verb] + job.label + ": " + job.stage + (job.text ? ", " + job.text : "") + ", " + Math.round(job.seconds) + " s";
+      text = { add: "Adding ", remove: "Removing ", diagnose: "Diagnosing ", exclude: "Excluding ", include: "Including " }[job.verb.split("_")[0]] + job.label + ": " + job.stage + (job.text ? ", " + job.text : "") + ", " + Math.round(job.seconds) + " s";
       byId("progress").value = job.done;
       if (now.preview && now.preview.length) {
         var first = now.preview[0], end = now.preview[now.preview.length - 1];
@@ -55,7 +63,7 @@
   }
   document.addEventListener("click", function (e) {
     var b = e.target.closest("button.act");
-    if (b) { ask(b.dataset.verb, b.dataset.label); }
+    if (b && b.dataset.verb) { ask(b.dataset.verb, b.dataset.label); }
   });
   if (byId("add-form")) {
     byId("add-form").addEventListener("submit", function (e) {
@@ -63,12 +71,23 @@
       if (byId("add-label").value.trim()) { ask("add", byId("add-label").value.trim()); byId("add-label").value = ""; }
     });
   }
+  if (byId("include-form")) {
+    document.addEventListener("pole", function (e) { byId("include-hertz").value = Number(e.detail.toPrecision(7)); byId("include-hertz").focus({ preventScroll: true }); });
+    byId("include-form").addEventListener("submit", function (e) {
+      var hertz = byId("include-hertz").value.trim();
+      e.preventDefault();
+      if (hertz && EmaPage.configuration()) { ask("include_mode", EmaPage.configuration() + ":" + hertz); byId("include-hertz").value = ""; }
+    });
+  }
   byId("copy-commands").addEventListener("click", function (e) { EmaPage.copied(e.target, state.commands.join("\n") + "\n"); });
   Promise.all([json("/measured"), json("/model")]).then(function (got) {
     shown = got[1].version;
     figures = got[1].figures.join();
+    measured = got[1].measured;
     EmaPage.start({ items: got[0].items, measured: got[0].measured, model: got[1].data });
     document.documentElement.dataset.version = String(shown);
+    focused(sessionStorage.getItem("focus"));
+    sessionStorage.removeItem("focus");
     var events = new EventSource("/events");
     events.onmessage = function (e) { follow(JSON.parse(e.data)); };
     events.onerror = function () { byId("status").textContent = "The server does not answer: has 'ema view' ended?"; };
