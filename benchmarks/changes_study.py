@@ -1,12 +1,12 @@
 """Pairs of tests of imperfect rigs, before and after a change, and unchanged: what `ema changes` makes of them.
 
-Each case draws a rig of two to eight masses (parts scatter 3 %, sensors 4 %, damping by half) and three tests of it with
-the same sensors, hits 5 degrees off and frequencies that drift by 0.1 % from hit to hit: A, A again, and B with one
-effect of FACTOR times the limit that A and A again state. The rig that the program is given is nominal.
+Each case draws a rig of two to eight masses (parts scatter 3 %, sensors 4 %, damping by half) and three tests of it
+with the same sensors, hits 5 degrees off and frequencies that drift by 0.1 % from hit to hit: A, A again, and B with
+one effect of FACTOR times the limit that A and A again state. The rig that the program is given is nominal.
 
     python benchmarks/changes_study.py [CASES] [--first N] [--json FILE] [--keep FOLDER]
 
-With --keep, simulated tests and their modes stay in a folder, and a second study of the same cases takes them from there.
+With --keep, simulated tests and their modes stay in a folder; a second study of the same cases takes them from there.
 """
 
 from __future__ import annotations

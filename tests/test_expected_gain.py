@@ -16,6 +16,7 @@ from ema_pipeline.observations.fitting import Fit, Model
 
 Array = NDArray[np.float64]
 ROWS = 30
+OFFSET = Unknowns.plain(["offset"], 0.5)
 SCATTERS = {
     "noise": Scatter("noise", "factor on the stated noise", 1.0, 0.5, at_once=True),
     "repeat": Scatter("repeat", "from test to test", 0.3, 1.5, 0.0, 10.0, at_once=True),
@@ -31,7 +32,7 @@ class Repeated:
     """Differences between two tests: the first half with a stated noise of 1, the rest with one of 0.1."""
 
     y: Array
-    unknowns: Unknowns = Unknowns.plain(["offset"], 0.5)
+    unknowns: Unknowns = OFFSET
 
     def residuals(
         self,
