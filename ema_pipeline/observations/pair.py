@@ -66,7 +66,7 @@ class RepeatSettings(Settings):
         }
 
 
-_SPREAD, _MOST = 1.5, 10.0
+_SPREAD, _MOST = 1.0, 5.0
 """1 σ of the logarithm of how well two tests repeat, and its largest value in units of what is stated: some tests of a
 rig that nobody touched agree to their last digit, and a bolt that was tightened anew may change ln ζ by a tenth."""
 
