@@ -331,7 +331,7 @@ class PairProblem(EffectProblem):
         shares = {r.scatter: now / variance, repeat: repeat_now / variance}
         if r.noise:
             shares[r.noise] = own / variance
-        return _scaled(r.difference, r.slope, variance, own_usual + usual + repeat_usual, shares, r.heat, n)
+        return _scaled(r, r.difference, r.slope, variance, own_usual + usual + repeat_usual, shares, n)
 
     def _given(
         self,
@@ -353,7 +353,7 @@ class PairProblem(EffectProblem):
             difference, slope = b.difference - told.slope * a.difference, None
             if a.slope is not None and b.slope is not None:
                 slope = b.slope - told.slope[:, None] * a.slope
-        return _scaled(difference, slope, told.variance, usual, told.shares, a.heat, n)
+        return _scaled(b, difference, slope, told.variance, usual, told.shares, n)
 
 
 @dataclass(frozen=True)
@@ -424,18 +424,21 @@ def _taken(r: Rows, at: NDArray[np.int64]) -> Rows:
 
 
 def _scaled(
+    r: Rows,
     difference: NDArray[np.float64],
     slope: NDArray[np.float64] | None,
     variance: NDArray[np.float64],
     usual: NDArray[np.float64],
     share: Mapping[str, NDArray[np.float64]],
-    heat: float,
     n: int,
 ) -> Residuals:
-    sigma = np.sqrt(variance) * heat
+    """Differences that stand for the rows `r` in units of their standard uncertainties."""
+    sigma = np.sqrt(variance) * r.heat
+    whole = r.sensor is not None and r.heat == 1.0  # a shape may be wrong as a whole; far off everything is
     return Residuals(
         values=difference / sigma,
         jacobian=np.zeros((0, n)) if slope is None else slope / -sigma[:, None],
         share=dict(share) if slope is not None else {},
         log_scale=0.5 * float(np.sum(np.log(variance / usual))),
+        block=np.unique(r.mode, return_inverse=True)[1] if whole else None,
     )
