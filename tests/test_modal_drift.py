@@ -83,6 +83,18 @@ def test_common_factors_are_told_from_movement_of_one_mode_and_from_what_a_point
     assert np.argmax(found.point_spread) == 4
 
 
+@pytest.mark.parametrize(("second", "shared"), [(1.0, 1.5e-3), (-1.0, 0.0)])
+def test_drift_from_point_to_point_is_no_mixture_of_modes(second: float, shared: float) -> None:
+    """Two peaks that move alike between two points have drifted; two that move apart have not."""
+    rng = np.random.default_rng(8)
+    point, noise = np.repeat([0, 1], 3), np.full((6, 2), 1e-5)
+    step = np.array([-0.75e-3, 0.75e-3])
+    shift = np.outer(step[point], [1.0, second]) + noise * rng.standard_normal((6, 2))
+    found = movement(shift, noise, np.ones((6, 2)), point)
+    assert found.common[3:].mean() - found.common[:3].mean() == pytest.approx(shared, abs=2e-4)
+    assert (found.point_spread.max() > 5e-4) == (second < 0)
+
+
 def test_drift_of_all_frequencies_makes_no_twins_and_is_in_the_intervals() -> None:
     found = identified(SYSTEM, 2, [0, 3, 5], drift=1.5e-3)
     modes = found.modal.modes

@@ -98,7 +98,7 @@ def diagnose(
         summary=sentences.summary(verdict, told, (rungs[0].error, rungs[-1].error), nothing),
         null_probability=nothing,
         candidates=candidates,
-        indistinguishable=_groups(found, group),
+        indistinguishable=_groups(found, group, settings),
         next_measurement=next_measurement(observations, found, group, verdict),
         localisation=() if explained else localise(scores(observations, found.final, further)),
         probabilities=dict(found.rounds[0].probabilities),
@@ -149,12 +149,16 @@ def _candidate(
     )
 
 
-def _groups(found: Selection, group: Sequence[Judged]) -> tuple[tuple[str, ...], ...]:
-    """What cannot be told apart: several effects, or several names of one."""
+def _groups(
+    found: Selection, group: Sequence[Judged], settings: DiagnoseSettings
+) -> tuple[tuple[str, ...], ...]:
+    """What cannot be told apart: several effects, several names of one, and generic ones beside the rig's own."""
     groups = [tuple(j.named.label for j in group)] if len(group) > 1 else []
-    for j in found.claimed:
-        if j.named.equivalents:
-            groups.append((j.named.label, *j.named.equivalents))
+    for j, of in zip(found.claimed, found.rounds, strict=False):
+        near = [n.named.label for n in of.alike(settings) if n.hypothesis.label != j.hypothesis.label]
+        names = (j.named.label, *j.named.equivalents, *(n for n in near if not any(n in g for g in groups)))
+        if len(names) > 1:
+            groups.append(names)
     return tuple(groups)
 
 

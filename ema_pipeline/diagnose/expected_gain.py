@@ -12,35 +12,40 @@ from ema_pipeline.diagnose.score import Marginal
 from ema_pipeline.inference import Posterior, Scatter
 from ema_pipeline.inference.scatter import determined
 
-_LOGS = np.linspace(0.0, 1.0, 33)
+_STEPS = 12
+_LONGEST = 1.5
+"""Steps, and longest step in the logarithm of a variance, of the search for the scatters that take a change up."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """Squared distance by which an effect moves the predictions, everything uncertain having followed.
+    """How far an effect moves the predictions and, everything uncertain having followed, the unknowns.
 
     Attributes
     ----------
-    of_scatter : dict of str to float
-        Parts that a learned scatter can take up, by its name.
+    residuals : ndarray, (m,)
+        Squared, in squared standard deviations, of every residual.
+    unknowns : ndarray, (k,)
+        Squared, summed over the unknowns that each of k scatters governs.
     rest : float
-        What none can.
+        Squared, of unknowns whose prior is not learned.
     """
 
-    of_scatter: Mapping[str, float]
+    residuals: NDArray[np.float64]
+    unknowns: NDArray[np.float64]
     rest: float
 
     @property
     def total(self) -> float:
         """Squared distance in standard deviations."""
-        return self.rest + sum(self.of_scatter.values())
+        return self.rest + float(np.sum(self.residuals) + np.sum(self.unknowns))
 
 
 class ExpectedGain:
     """Gains on top of one fitted model.
 
-    A model without the effect can take it for scatter. A scatter that n values determine rises until it explains
-    them, so that a distance z gains n/2·ln(1 + z²/n), as in Student's test, and not z²/2.
+    A model without the effect can take it for scatter: its scatters rise together until they explain it best. One that
+    n values determine makes a squared distance z² gain n/2·ln(1 + z²/n), as in Student's test, and not z²/2.
 
     Parameters
     ----------
@@ -52,33 +57,57 @@ class ExpectedGain:
 
     def __init__(self, fit: Posterior, scatters: Mapping[str, Scatter], marginal: Marginal) -> None:
         self.marginal = marginal
-        learned = {n: s for n, s in scatters.items() if s.spread and n in fit.scatters}
-        self.unknowns = {n: fit.unknowns.governed(n)[marginal.kept] for n in learned}
-        self.shares = {n: fit.residuals.share[n] for n in learned if n in fit.residuals.share}
-        self.values = {n: determined(fit, n) for n in learned}
-        self.spread = {n: s.spread for n, s in learned.items()}
-        self.widest = {
-            n: max(2 * float(np.log(s.most * s.default / fit.scatters[n])), 0.0) for n, s in learned.items()
-        }
+        learned = [s for n, s in scatters.items() if s.spread and n in fit.scatters]
+        values, jacobian = fit.residuals.weighted
+        self._governed = [fit.unknowns.governed(s.name)[marginal.kept] for s in learned]
+        self._shares = np.zeros((marginal.count, len(learned)))
+        for k, s in enumerate(learned):
+            self._shares[:, k] = fit.residuals.share.get(s.name, 0.0)
+        self._square = values**2 + np.einsum("ij,jk,ik->i", jacobian, fit.covariance, jacobian)
+        of_residuals = np.sum(self._shares, axis=0)
+        self._values = np.array([determined(fit, s.name) for s in learned]) - of_residuals
+        now = np.array([np.log(fit.scatters[s.name]) for s in learned])
+        self._above = np.where(of_residuals > 0, now - np.log([s.default for s in learned]), 0.0)
+        self._weight = np.array([s.spread**-2.0 for s in learned])
+        self._widest = np.maximum(2 * (np.log([s.most * s.default for s in learned]) - now), 0.0)
+        self._least = self._cost(np.zeros(marginal.count), np.zeros(len(learned)))
 
     def change(self, residuals: NDArray[np.float64]) -> Change:
         """Of a change of the residuals, (m,)."""
         left, moved = self.marginal.left(residuals)
-        parts = {
-            n: float(np.sum(moved[at] ** 2)) + float(np.sum(self.shares.get(n, np.zeros(1)) * left**2))
-            for n, at in self.unknowns.items()
-        }
-        return Change(parts, max(float(left @ left + moved @ moved) - sum(parts.values()), 0.0))
+        square = moved**2
+        unknowns = np.array([np.sum(square[at]) for at in self._governed])
+        return Change(left**2, unknowns, max(float(np.sum(square) - np.sum(unknowns)), 0.0))
 
     def of(self, change: Change, factor: float = 1.0) -> float:
         """Expected gain where the squared distance is `factor` times as large."""
-        gain = 0.5 * factor * change.rest
-        for name, square in change.of_scatter.items():
-            gain += self._beside_scatter(name, factor * square)
-        return gain
+        cost = self._cost(factor * change.residuals, factor * change.unknowns) - self._least
+        return 0.5 * factor * change.rest + max(cost, 0.0)
 
-    def _beside_scatter(self, name: str, square: float) -> float:
-        """Least cost of a squared distance over all values of the scatter that may take it up."""
-        n, logs = self.values[name], _LOGS * self.widest[name]
-        prior = 0.5 * (0.5 * logs / self.spread[name]) ** 2
-        return float(np.min(0.5 * (n * logs + (n + square) * np.exp(-logs) - n) + prior))
+    def _cost(self, residuals: NDArray[np.float64], unknowns: NDArray[np.float64]) -> float:
+        """Least cost of squared distances over all values of the scatters, in units of log evidence.
+
+        With t = (scatter/now)², a residual's variance is 1 - share + share·t times what it is now, summed over the
+        scatters; that of unknowns is t.
+        """
+        square, count, of_unknowns = self._square + residuals, self._values, self._values + unknowns
+        fixed = 1 - np.sum(self._shares, axis=1)
+        log = np.zeros(len(self._weight))
+        best = np.inf
+        for _ in range(_STEPS):
+            added = self._shares * np.exp(log)
+            variance = fixed + np.sum(added, axis=1)
+            above = self._above + 0.5 * log
+            inverse = np.exp(-log)
+            cost = 0.5 * float(
+                np.sum(np.log(variance) + square / variance)
+                + np.sum(count * log + of_unknowns * inverse + self._weight * above**2)
+            )
+            best = min(best, cost)
+            part, excess = added / variance[:, None], square / variance
+            slope = 0.5 * (part.T @ (1 - excess) + count - of_unknowns * inverse + self._weight * above)
+            curvature = 0.5 * (part.T @ (np.maximum(excess, 1.0)[:, None] * part))
+            curvature[np.diag_indices_from(curvature)] += 0.5 * of_unknowns * inverse + 0.25 * self._weight
+            step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST, _LONGEST)
+            log = np.minimum(log + step, self._widest)
+        return best

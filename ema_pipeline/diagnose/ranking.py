@@ -36,6 +36,8 @@ Schedule = tuple[tuple[float, int], ...]
 
 FINALISTS = 5
 """Hypotheses for which the scatters are learned."""
+_PROMISING = 2
+"""Further finalists: what promises most beside learned scatters, which may be far narrower than those begun with."""
 _SCREENED = 14
 """Generic hypotheses, best first by their score, that are fitted in full."""
 _UNSEEN = 1e6
@@ -123,7 +125,7 @@ def rank(
     found = _bettered(found, _CONTENDERS, partial(_free, observations), processes)
     base, found = _begun_again(observations, base, found, processes, _CONTENDERS, steps=12)
     progress(0.8, "scatter of parts and channels")
-    return _finals(observations, base, found, processes)
+    return _finals(observations, base, found, _promising(observations, base, hypotheses, models), processes)
 
 
 def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) -> list[Hypothesis]:
@@ -264,10 +266,38 @@ def _spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes
     return [Fit(fit.model, p) for fit, p in zip(fits, spread(job, fits, processes), strict=True)]
 
 
-def _finals(observations: Observations, base: Fit, found: Found, processes: int) -> Ranking:
+def _promising(
+    observations: Observations, base: Fit, hypotheses: Sequence[Hypothesis], models: Mapping[str, Model]
+) -> Found:
+    """What promises most on top of the base model with learned scatters, each begun at the size of its score."""
+    settled = learned(observations, base)
+    found: Found = {}
+    best = sorted(scores(observations, settled, hypotheses, models), key=lambda s: -s.gain)
+    for score in [s for s in best[:FINALISTS] if s.gain > 0]:
+        model = models[score.hypothesis.label]
+        unknowns = model.problem(observations).unknowns
+        x = transferred(settled.posterior, unknowns, np.zeros(len(unknowns)))
+        placed = score.hypothesis.placed
+        for parameter, size in zip(placed.effect.parameters, score.size, strict=True):
+            x[unknowns.index[placed.parameter_name(parameter.name)]] = size
+        fit = refined(observations, model, unknowns.clipped(x), settled.posterior.scatters)
+        found[score.hypothesis.label] = (score.hypothesis, fit)
+    return found
+
+
+def _finals(observations: Observations, base: Fit, found: Found, promising: Found, processes: int) -> Ranking:
     """Scatters learned for the base model and the best hypotheses, each from what the others know."""
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
-    best = [fit for _, fit in order[:FINALISTS]]
+    leading = [h.label for h, _ in order[:FINALISTS]]
+    further = [pair for label, pair in promising.items() if label not in leading][:_PROMISING]
+    taken = [h.label for h, _ in further]
+    order = [
+        *order[:FINALISTS],
+        *further,
+        *(pair for pair in order[FINALISTS:] if pair[0].label not in taken),
+    ]
+    count = len(leading) + len(further)
+    best = [fit for _, fit in order[:count]]
     job = partial(_final, observations, (base, *best[:2]))
     first = _spread_fits(job, [base, *best], processes)
     leaders = sorted(first[1:], key=lambda f: -f.log_evidence)[:2]
@@ -276,15 +306,15 @@ def _finals(observations: Observations, base: Fit, found: Found, processes: int)
     final_base = second[0]
     ranked = []
     for i, (hypothesis, fit) in enumerate(order):
-        if i < FINALISTS:
+        if i < count:
             fit = second[1 + i]
             ranked.append(Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True))
         else:
             ranked.append(Ranked(hypothesis, fit, fit.log_evidence - base.log_evidence, False))
-    finals = sorted(ranked[:FINALISTS], key=lambda r: -r.gain)
+    finals = sorted(ranked[:count], key=lambda r: -r.gain)
     least = finals[-1].gain if finals else 0.0
     # An effect that is no finalist was behind at wide scatters; it cannot lead at learned ones.
-    rest = [Ranked(r.hypothesis, r.fit, min(r.gain, least), False) for r in ranked[FINALISTS:]]
+    rest = [Ranked(r.hypothesis, r.fit, min(r.gain, least), False) for r in ranked[count:]]
     return Ranking(final_base, (*finals, *rest))
 
 

@@ -40,12 +40,12 @@ A, B = "A", "B"
 class RepeatSettings(Settings):
     """What two tests of one structure differ by, 1 σ, beside each test's own scatter and a drift of all frequencies.
 
-    Two tests cannot tell it from a change: it is stated, not learned.
+    Medians of the priors: how well these two tests repeat is learned from the modes that do not change.
     """
 
     frequency: float = Field(1e-4, gt=0, lt=0.1, description="of each frequency, relative")
     damping: float = Field(
-        0.02,
+        0.01,
         gt=0,
         lt=2,
         description="of ln ζ: a structure taken apart and bolted together again may need 0.1",
@@ -53,13 +53,22 @@ class RepeatSettings(Settings):
     shape: float = Field(0.003, gt=0, lt=1, description="of a shape's entries, in units of the largest")
 
     def scatters(self) -> dict[str, Scatter]:
-        """As scatters that are known, by the scatter of the model that each takes the place of in a difference."""
+        """As scatters, by the scatter of the model that each takes the place of in a difference."""
         return {
-            FREQUENCY: Scatter("frequency_repeat", "frequency from test to test", self.frequency, 0.0),
-            DAMPING_SCATTER: Scatter("damping_repeat", "ln ζ from test to test", self.damping, 0.0),
-            SHAPE: Scatter("shape_repeat", "shapes from test to test", self.shape, 0.0),
+            kind: Scatter(
+                f"{name}_repeat", f"{title} from test to test", stated, _SPREAD, 0.0, _MOST, at_once=True
+            )
+            for kind, name, title, stated in (
+                (FREQUENCY, "frequency", "frequency", self.frequency),
+                (DAMPING_SCATTER, "damping", "ln ζ", self.damping),
+                (SHAPE, "shape", "shapes", self.shape),
+            )
         }
 
+
+_SPREAD, _MOST = 1.0, 5.0
+"""1 σ of the logarithm of how well two tests repeat, and its largest value in units of what is stated: some tests of a
+rig that nobody touched agree to their last digit, and a bolt that was tightened anew may change ln ζ by a tenth."""
 
 Pairs = Mapping[str, NDArray[np.int64]]
 """Mode of B for every mode of A, -1 for none, by configuration."""
@@ -317,9 +326,12 @@ class PairProblem(EffectProblem):
         repeat = self.observations.repeat[r.scatter].name
         now, usual = ((s[r.scatter] * r.unit) ** 2 for s in (scatters, self._defaults))
         repeat_now, repeat_usual = ((s[repeat] * r.unit) ** 2 for s in (scatters, self._defaults))
-        variance = r.own**2 + now + repeat_now
+        own, own_usual = ((r.noise_at(s) * r.own) ** 2 for s in (scatters, self._defaults))
+        variance = own + now + repeat_now
         shares = {r.scatter: now / variance, repeat: repeat_now / variance}
-        return _scaled(r.difference, r.slope, variance, r.own**2 + usual + repeat_usual, shares, r.heat, n)
+        if r.noise:
+            shares[r.noise] = own / variance
+        return _scaled(r, r.difference, r.slope, variance, own_usual + usual + repeat_usual, shares, n)
 
     def _given(
         self,
@@ -333,15 +345,15 @@ class PairProblem(EffectProblem):
         """Rows of B given their partners in A: what the model misses of a mode is the same in both."""
         a, b = _taken(first, i), _taken(second, j)
         repeat = self.observations.repeat[a.scatter].name
-        told = _conditional(a, b, scatters[a.scatter], scatters[repeat], repeat)
-        usual = _conditional(a, b, self._defaults[a.scatter], self._defaults[repeat], repeat).variance
+        told = _conditional(a, b, scatters, repeat)
+        usual = _conditional(a, b, self._defaults, repeat).variance
         if a.scatter == DAMPING_SCATTER:
             difference, slope = _damping_given(a, b, told.slope)
         else:
             difference, slope = b.difference - told.slope * a.difference, None
             if a.slope is not None and b.slope is not None:
                 slope = b.slope - told.slope[:, None] * a.slope
-        return _scaled(difference, slope, told.variance, usual, told.shares, a.heat, n)
+        return _scaled(b, difference, slope, told.variance, usual, told.shares, n)
 
 
 @dataclass(frozen=True)
@@ -353,18 +365,22 @@ class _Conditional:
     shares: dict[str, NDArray[np.float64]]
 
 
-def _conditional(a: Rows, b: Rows, scatter: float, repeat: float, name: str) -> _Conditional:
+def _conditional(a: Rows, b: Rows, scatters: Mapping[str, float], repeat: str) -> _Conditional:
     """What A tells of B.
 
     Differences are d = u·δ + e, with one δ ~ N(0, scatter²) in both tests and an e of each test's own.
     """
-    own_a, own_b = a.own**2 + (repeat * a.unit) ** 2, b.own**2 + (repeat * b.unit) ** 2
-    model_a = (scatter * a.unit) ** 2
-    slope = scatter**2 * a.unit * b.unit / (own_a + model_a)
+    scatter, again = scatters[a.scatter], scatters[repeat]
+    noise_a, noise_b = ((r.noise_at(scatters) * r.own) ** 2 for r in (a, b))
+    again_a, again_b = ((again * r.unit) ** 2 for r in (a, b))
+    slope = scatter**2 * a.unit * b.unit / (noise_a + again_a + (scatter * a.unit) ** 2)
     left = (scatter * (b.unit - slope * a.unit)) ** 2
-    variance = left + own_b + slope**2 * own_a
-    again = (repeat * b.unit) ** 2 + (slope * repeat * a.unit) ** 2
-    return _Conditional(slope, variance, {a.scatter: left / variance, name: again / variance})
+    noise, repeated = noise_b + slope**2 * noise_a, again_b + slope**2 * again_a
+    variance = left + noise + repeated
+    shares = {a.scatter: left / variance, repeat: repeated / variance}
+    if a.noise:
+        shares[a.noise] = noise / variance
+    return _Conditional(slope, variance, shares)
 
 
 _LEAST_DAMPING = 0.05
@@ -408,18 +424,21 @@ def _taken(r: Rows, at: NDArray[np.int64]) -> Rows:
 
 
 def _scaled(
+    r: Rows,
     difference: NDArray[np.float64],
     slope: NDArray[np.float64] | None,
     variance: NDArray[np.float64],
     usual: NDArray[np.float64],
     share: Mapping[str, NDArray[np.float64]],
-    heat: float,
     n: int,
 ) -> Residuals:
-    sigma = np.sqrt(variance) * heat
+    """Differences that stand for the rows `r` in units of their standard uncertainties."""
+    sigma = np.sqrt(variance) * r.heat
+    whole = r.sensor is not None and r.heat == 1.0  # a shape may be wrong as a whole; far off everything is
     return Residuals(
         values=difference / sigma,
         jacobian=np.zeros((0, n)) if slope is None else slope / -sigma[:, None],
         share=dict(share) if slope is not None else {},
         log_scale=0.5 * float(np.sum(np.log(variance / usual))),
+        block=np.unique(r.mode, return_inverse=True)[1] if whole else None,
     )

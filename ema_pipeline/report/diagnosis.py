@@ -29,7 +29,7 @@ def heading(found: Diagnosis) -> str:
             f"Missing: {' and '.join(label_words(c.label) for c in claimed(found)) or 'see the candidates'}"
         )
     if found.verdict == "ambiguous":
-        count = max((len(g) for g in found.indistinguishable), default=2)
+        count = len(found.indistinguishable[0]) if found.indistinguishable else 2
         return f"{_COUNTS.get(count, str(count))} explanations fit equally well"
     return {
         "adequate": "Nothing is missing as far as these data can tell",

@@ -2,11 +2,12 @@
 
 The frequency of peak c in hit h on point p, relative to its own mean, is taken as
 
-    e_hc = m_c + d_h + k_pc + x_hc + noise ,
+    e_hc = m_c + g_p + d_h + k_pc + x_hc + noise ,
 
-d_h what all peaks have in common, k_pc what the peak shows alike in all hits of a point, x_hc its own movement.
+g_p + d_h what all peaks have in common, g_p alike in all hits of a point, for a rig drifts while the hammer moves from
+point to point; k_pc what the peak shows alike in all hits of a point, x_hc its own movement.
 k_pc is mostly no movement but a second mode under the peak, or the flank of a stronger one, which another point
-excites in another ratio: it grows as the peak itself gets weaker, and so may x_hc. The variances of d, k and x
+excites in another ratio: it grows as the peak itself gets weaker, and so may x_hc. The variances of g, d, k and x
 are estimated with them (expectation-maximisation).
 
 References
@@ -39,9 +40,9 @@ class Movement:
     Attributes
     ----------
     common, common_std : ndarray, (n_hits,)
-        Factor d of every hit, shrunk towards 0 by its own variance.
+        Factor g + d of every hit, shrunk towards 0 by its own variance.
     spread : float
-        Standard deviation of d.
+        Standard deviation of g + d.
     mean : ndarray, (n_peaks,)
         m, the mean over hits of every peak.
     own : ndarray, (n_hits, n_peaks)
@@ -83,40 +84,46 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     n_hits, n_peaks = shift.shape
     known = np.isfinite(std)
     repeated = np.bincount(point, minlength=int(point.max()) + 1)[point] > 1
-    design, groups = _design(known, point, repeated)
+    design, groups, of_point = _design(known, point, repeated)
+    n_points = of_point.shape[1]
     hit, peak = np.nonzero(known)
     value = shift[hit, peak]
     noise = std[hit, peak] ** 2
     weak = 1.0 / np.clip(strength[hit, peak], 1e-2, 3.0) ** 2
     start = np.array([_robust_variance(value[peak == c]) for c in range(n_peaks)])
     common = float(np.median(start[start > 0])) if np.any(start > 0) else FLOOR
+    moving = common
     own, per_point = 0.5 * start + FLOOR, 0.5 * start + FLOOR
     tail = np.ones(len(value))
+    hits = slice(n_peaks, n_peaks + n_hits)
+    points = slice(hits.stop, hits.stop + n_points)
     for _ in range(ITERATIONS):
         error = (noise + own[peak] * weak) / tail
-        prior = np.concatenate([np.full(n_peaks, np.inf), np.full(n_hits, common), per_point[groups]])
+        prior = np.concatenate(
+            [np.full(n_peaks, np.inf), np.full(n_hits, common), np.full(n_points, moving), per_point[groups]]
+        )
         found = _posterior(design, value, error, prior)
         left = value - found.fitted
         square = left**2 + found.fitted_variance
         tail = (TAIL + 1) / (TAIL + square / (error * tail))
-        hits = slice(n_peaks, n_peaks + n_hits)
-        common = max(float(np.mean(found.mean[hits] ** 2 + found.variance[hits])), FLOOR)
+        common = _variance(found, hits)
+        if n_points:
+            moving = _variance(found, points)
         for c in range(n_peaks):
-            mine = n_peaks + n_hits + np.flatnonzero(groups == c)
+            mine = points.stop + np.flatnonzero(groups == c)
             if len(mine):
                 per_point[c] = max(float(np.mean(found.mean[mine] ** 2 + found.variance[mine])), FLOOR)
             own[c] = _own_variance(
                 own[c], square[peak == c], noise[peak == c], weak[peak == c], tail[peak == c]
             )
-    hits = slice(n_peaks, n_peaks + n_hits)
     single = np.zeros(shift.shape)
     # What a weak peak seems to move beyond what a strong one does is the flank of another: no movement to undo.
     spread = own[peak] * np.minimum(weak, 1.0)
     single[hit, peak] = (value - found.fitted) * spread / (own[peak] * weak + noise)
     return Movement(
-        common=found.mean[hits],
-        common_std=np.sqrt(found.variance[hits]),
-        spread=float(np.sqrt(common)),
+        common=found.mean[hits] + of_point @ found.mean[points],
+        common_std=np.sqrt(found.variance[hits] + of_point @ found.variance[points]),
+        spread=float(np.sqrt(common + (moving if n_points else 0.0))),
         mean=found.mean[:n_peaks],
         own=single,
         own_spread=np.sqrt(own),
@@ -126,20 +133,30 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
 
 def _design(
     known: NDArray[np.bool_], point: NDArray[np.int64], repeated: NDArray[np.bool_]
-) -> tuple[Real, NDArray[np.int64]]:
-    """Columns of m, d and k for every value, and the peak of each k."""
+) -> tuple[Real, NDArray[np.int64], Real]:
+    """Columns of m, d, g and k for every value, the peak of each k, and which hits share each g, (n_hits, n_g)."""
     n_hits, n_peaks = known.shape
     hit, peak = np.nonzero(known)
+    # At one point g would be the mean of all peaks.
+    moved = np.unique(point[repeated]) if len(np.unique(point)) > 1 else np.zeros(0, int)
+    of_point = (point[:, None] == moved).astype(float)
     pairs = sorted({(int(point[h]), int(c)) for h, c in zip(hit, peak, strict=True) if repeated[h]})
     place = {pair: k for k, pair in enumerate(pairs)}
-    design = np.zeros((len(hit), n_peaks + n_hits + len(pairs)))
+    before = n_peaks + n_hits
+    design = np.zeros((len(hit), before + len(moved) + len(pairs)))
     row = np.arange(len(hit))
     design[row, peak] = 1.0
     design[row, n_peaks + hit] = 1.0
+    design[:, before : before + len(moved)] = of_point[hit]
     for k, (h, c) in enumerate(zip(hit, peak, strict=True)):
         if repeated[h]:
-            design[k, n_peaks + n_hits + place[int(point[h]), int(c)]] = 1.0
-    return design, np.array([c for _, c in pairs], dtype=np.int64)
+            design[k, before + len(moved) + place[int(point[h]), int(c)]] = 1.0
+    return design, np.array([c for _, c in pairs], dtype=np.int64), of_point
+
+
+def _variance(found: _Posterior, of: slice) -> float:
+    """Expected mean square of some of the unknowns."""
+    return max(float(np.mean(found.mean[of] ** 2 + found.variance[of])), FLOOR)
 
 
 def _posterior(design: Real, value: Real, error: Real, prior: Real) -> _Posterior:

@@ -1,0 +1,93 @@
+"""What an effect is expected to gain, against what it gains: the model without it fitted anew, its scatters learned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ema_pipeline.diagnose.expected_gain import ExpectedGain
+from ema_pipeline.diagnose.score import Marginal
+from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns, descend, learn
+from ema_pipeline.observations.fitting import Fit, Model
+
+Array = NDArray[np.float64]
+ROWS = 30
+OFFSET = Unknowns.plain(["offset"], 0.5)
+SCATTERS = {
+    "noise": Scatter("noise", "factor on the stated noise", 1.0, 0.5, at_once=True),
+    "repeat": Scatter("repeat", "from test to test", 0.3, 1.5, 0.0, 10.0, at_once=True),
+}
+KNOWN = {
+    "noise": Scatter("noise", "factor on the stated noise", 1.0, 0.0),
+    "repeat": Scatter("repeat", "from test to test", 0.3, 0.0),
+}
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """Differences between two tests: the first half with a stated noise of 1, the rest with one of 0.1."""
+
+    y: Array
+    unknowns: Unknowns = OFFSET
+
+    def residuals(
+        self,
+        x: Array,
+        scatters: Mapping[str, float],
+        *,
+        heat: float = 1.0,
+        matching: object = None,
+        derivatives: bool = True,
+    ) -> Residuals:
+        own = np.repeat([1.0, 0.1], ROWS // 2)
+        noise, repeat = (scatters["noise"] * own) ** 2, np.full(ROWS, scatters["repeat"] ** 2)
+        variance = noise + repeat
+        sigma = np.sqrt(variance) * heat
+        return Residuals(
+            (self.y - x[0]) / sigma,
+            -np.ones((ROWS, 1)) / sigma[:, None] if derivatives else np.zeros((0, 1)),
+            share={"noise": noise / variance, "repeat": repeat / variance},
+            log_scale=0.5 * float(np.sum(np.log(variance / (own**2 + 0.3**2)))),
+        )
+
+
+def fitted(y: Array, scatters: Mapping[str, Scatter]) -> Posterior:
+    problem = Repeated(y)
+    start = descend(problem, {n: s.default for n, s in scatters.items()}, np.zeros(1))
+    return learn(problem, start, scatters, rounds=40)
+
+
+def quiet() -> Array:
+    """Tests that repeat far better than is stated."""
+    return 0.02 * np.random.default_rng(3).standard_normal(ROWS)
+
+
+@pytest.mark.parametrize("size", [0.1, 0.3, 1.0])
+@pytest.mark.parametrize("rows", [slice(15, 18), slice(15, 30, 2)])
+def test_a_model_without_the_effect_takes_it_for_scatter(size: float, rows: slice) -> None:
+    """Scatters that are far below what was stated rise together: the effect gains far less than half its square."""
+    effect = np.zeros(ROWS)
+    effect[rows] = size
+    before, after = fitted(quiet(), SCATTERS), fitted(quiet() + effect, SCATTERS)
+    gains = ExpectedGain(before, SCATTERS, Marginal(Fit(Model(), before)))
+    sigma = np.sqrt(
+        (before.scatters["noise"] * np.repeat([1.0, 0.1], 15)) ** 2 + before.scatters["repeat"] ** 2
+    )
+    change = gains.change(effect / sigma)
+    true = before.log_evidence - after.log_evidence
+    assert gains.of(change) == pytest.approx(true, rel=0.15, abs=0.7)
+    assert gains.of(change) < 0.4 * 0.5 * change.total
+    assert gains.of(change, 0.25) < gains.of(change)
+
+
+def test_scatters_that_are_known_take_nothing_up() -> None:
+    found = fitted(quiet(), KNOWN)
+    gains = ExpectedGain(found, KNOWN, Marginal(Fit(Model(), found)))
+    change = gains.change(np.eye(ROWS)[20] * 4.0)
+    assert change.total == pytest.approx(16.0, rel=0.1)  # but for the offset, which follows a little
+    assert gains.of(change) == pytest.approx(0.5 * change.total)
+    assert gains.of(gains.change(np.zeros(ROWS))) == 0.0
