@@ -6,11 +6,48 @@ soon as anything else runs on the machine.
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
 
 from threadpoolctl import threadpool_limits
+
+WORTH_A_THREAD = 1 << 16
+"""Numbers that a compiled loop goes through in about 0.1 ms; with fewer a second thread costs more than it saves."""
 
 
 def single_blas_thread() -> AbstractContextManager[object]:
     """Context in which BLAS and LAPACK use one thread."""
     return threadpool_limits(limits=1, user_api="blas")
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+Rows = Callable[[slice], object]
+"""Work on some rows that neither reads nor writes what belongs to others."""
+
+
+@contextmanager
+def over_rows(n_rows: int, numbers: int) -> Iterator[Callable[[Rows], None]]:
+    """A function that does work on all rows, in a block per processor where that is worth it.
+
+    Results do not depend on how many blocks there are, as long as the work treats every row by itself.
+
+    Parameters
+    ----------
+    n_rows : int
+    numbers : int
+        Size of what is worked on.
+    """
+    n = min(cores(), n_rows, numbers // WORTH_A_THREAD)
+    if n < 2:
+        yield lambda work: (work(slice(0, n_rows)), None)[1]
+        return
+    edges = [n_rows * k // n for k in range(n + 1)]
+    blocks = [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
+    with ThreadPoolExecutor(n) as pool:
+        yield lambda work: (list(pool.map(work, blocks)), None)[1]
