@@ -24,12 +24,16 @@ from numpy.typing import NDArray
 
 from ema_pipeline.modal.basis import real_columns, residual_columns
 from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.gram_kernel import products
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
 
-LINES_AT_ONCE = 64
-"""Block of lines in a Gram matrix."""
+LINES_AT_ONCE = 128
+"""Block of lines in a Gram matrix, at least."""
+
+PRODUCTS_AT_ONCE = 1 << 16
+"""Products of columns kept at a time, 0.5 MB."""
 
 COLUMNS_AT_ONCE = 4096
 """Lines for which the functions of frequency are made at a time: of many modes they outgrow the FRFs."""
@@ -126,20 +130,18 @@ def weighted_grams(columns: Complex, weight: Real, data: Complex) -> tuple[Real,
     """
     n = len(columns)
     upper = np.triu_indices(n)
-    re, im = np.ascontiguousarray(columns.real), np.ascontiguousarray(columns.imag)
     packed = np.zeros((len(weight), len(upper[0])))
     moment, power = np.zeros((len(weight), n)), np.zeros(len(weight))
-    for start in range(0, columns.shape[1], LINES_AT_ONCE):  # small blocks stay in the cache
-        block = slice(start, start + LINES_AT_ONCE)
-        products = re[:, block][upper[0]]
-        products *= re[:, block][upper[1]]
-        other = im[:, block][upper[0]]
-        other *= im[:, block][upper[1]]
-        products += other
-        packed += weight[:, block] @ products.T
+    at_once = max(LINES_AT_ONCE, PRODUCTS_AT_ONCE // len(upper[0]))
+    for start in range(0, columns.shape[1], at_once):  # small blocks stay in the cache
+        block = slice(start, start + at_once)
+        re, im = columns.real[:, block].copy(), columns.imag[:, block].copy()
+        of_pairs = np.empty((len(upper[0]), re.shape[1]))
+        products(re, im, of_pairs)
+        packed += weight[:, block] @ of_pairs.T
         weighted = weight[:, block] * data[:, block]
-        moment += weighted.real @ re[:, block].T
-        moment += weighted.imag @ im[:, block].T
+        moment += weighted.real @ re.T
+        moment += weighted.imag @ im.T
         power += np.sum(weighted.real * data[:, block].real + weighted.imag * data[:, block].imag, axis=1)
     gram = np.empty((len(weight), n, n))
     gram[:, upper[0], upper[1]] = packed
