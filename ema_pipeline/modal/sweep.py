@@ -22,7 +22,7 @@ from ema_pipeline.modal.credibility import (
 )
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.engines import MODES_PER_PEAK, SPARE_MODES
-from ema_pipeline.modal.fit import Estimate, free_participations, normalised, solve_linear
+from ema_pipeline.modal.fit import Estimate, best_shapes, free_participations, normalised, solve_linear
 from ema_pipeline.modal.missed import Search, missed
 from ema_pipeline.modal.noise import NoiseLaw
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, at_peak
@@ -211,7 +211,7 @@ def _shapes(window: Window, estimate: Estimate) -> Complex:
     shapes = []
     for rows in window.data.row_blocks():
         some = window.rows(rows).near()
-        shapes.append(solve_linear(some.data, some.noise.weight(some.data.measured), estimate).shapes)
+        shapes.append(best_shapes(some.data, some.noise.weight(some.data.measured), estimate))
     return np.concatenate(shapes)
 
 
@@ -347,16 +347,15 @@ def _linear_fit(window: Window, estimate: Estimate) -> tuple[FitData, SegmentFit
     data, noise = local.data, local.noise
     for _ in range(2):
         weight = noise.weight(data.measured)
-        solution = solve_linear(data, weight, estimate)
-        noise = measured_noise(data, local.hits, estimate, solution, weight)
+        shapes = best_shapes(data, weight, estimate)
+        noise = measured_noise(data, local.hits, estimate, shapes, weight)
     solution = solve_linear(data, noise.weight(data.measured), estimate)
     return data, SegmentFit(estimate, solution, noise, np.zeros(len(estimate.poles), dtype=bool))
 
 
 def _shapes_and_stds(data: FitData, fit: SegmentFit, parameters: Real) -> tuple[Complex, Real]:
     """Shapes of some rows and their standard deviations, (n_rows, n_modes)."""
-    weight = fit.noise.weight(data.measured)
-    cov = shape_covariance(data, weight, fit.estimate, fit.solution, fit.noise, parameters)
+    cov = shape_covariance(data, fit.estimate, fit.solution, fit.noise, parameters)
     diagonal = np.einsum("oaa->oa", cov)
     return fit.solution.shapes, np.sqrt(0.5 * (diagonal[:, 0::2] + diagonal[:, 1::2]))
 
