@@ -7,9 +7,11 @@ soon as anything else runs on the machine.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -25,6 +27,33 @@ def single_blas_thread() -> AbstractContextManager[object]:
 def cores() -> int:
     """Processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+A = TypeVar("A")
+R = TypeVar("R")
+
+_inner = threading.local()
+
+
+def in_order(work: Callable[[A], R], items: Sequence[A]) -> Iterator[R]:
+    """``map(work, items)`` over a thread per processor; what threads call in turn stays in their thread.
+
+    Worth it where NumPy or compiled loops do the work, which leave the other threads running.
+    """
+    n = min(_free_cores(), len(items))
+    if n < 2:
+        yield from map(work, items)
+        return
+    with ThreadPoolExecutor(n, initializer=_enter) as pool:
+        yield from pool.map(work, items)
+
+
+def _enter() -> None:
+    _inner.thread = True
+
+
+def _free_cores() -> int:
+    return 1 if getattr(_inner, "thread", False) else cores()
 
 
 Rows = Callable[[slice], object]
@@ -43,7 +72,7 @@ def over_rows(n_rows: int, numbers: int) -> Iterator[Callable[[Rows], None]]:
     numbers : int
         Size of what is worked on.
     """
-    n = min(cores(), n_rows, numbers // WORTH_A_THREAD)
+    n = min(_free_cores(), n_rows, numbers // WORTH_A_THREAD)
     if n < 2:
         yield lambda work: (work(slice(0, n_rows)), None)[1]
         return

@@ -36,6 +36,7 @@ from ema_pipeline.modal.uncertainty import (
     scores_of_points,
     shape_covariance,
 )
+from ema_pipeline.threads import in_order
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -208,11 +209,12 @@ def _voters(poles: PoleSet) -> Callable[[Estimate], Real]:
 
 def _shapes(window: Window, estimate: Estimate) -> Complex:
     """Shapes that fit best on all lines, (n_rows, n_modes)."""
-    shapes = []
-    for rows in window.data.row_blocks():
+
+    def of_rows(rows: slice) -> Complex:
         some = window.rows(rows).near()
-        shapes.append(best_shapes(some.data, some.noise.weight(some.data.measured), estimate))
-    return np.concatenate(shapes)
+        return best_shapes(some.data, some.noise.weight(some.data.measured), estimate)
+
+    return np.concatenate(list(in_order(of_rows, window.data.row_blocks())))
 
 
 def _fit_part(
@@ -303,17 +305,18 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand) -> Fitt
     parameters = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
     transposed = window.data.transposed
     if compressible(window.data):
-        made, scores = [], []
-        information = np.zeros_like(parameters)
-        for rows in window.data.row_blocks():
+        first = parameters
+
+        def of_rows(rows: slice) -> tuple[Complex, Real, Real, Real]:
             linear = _linear_fit(window.rows(rows), estimate)
-            made.append(_shapes_and_stds(*linear, parameters))
-            score, more = scores_of_points(transposed, estimate, linear[1].solution)
-            scores.append(score)
-            information += more
-        shapes, stds = np.concatenate([s for s, _ in made]), np.concatenate([s for _, s in made])
+            scores = scores_of_points(transposed, estimate, linear[1].solution)
+            return *_shapes_and_stds(*linear, first), *scores
+
+        each = zip(*in_order(of_rows, window.data.row_blocks()), strict=True)
+        some_shapes, some_stds, scores, information = (list(x) for x in each)
+        shapes, stds = np.concatenate(some_shapes), np.concatenate(some_stds)
         points = np.concatenate(scores) if transposed else np.sum(scores, axis=0)
-        parameters = _widened(parameters, scatter_over_points(points, information))
+        parameters = _widened(parameters, scatter_over_points(points, np.sum(information, axis=0)))
     else:
         scatter = scatter_over_points(*scores_of_points(transposed, estimate, fit.solution))
         parameters = _widened(parameters, scatter)
