@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import multiprocessing
 import os
 import platform
 import re
@@ -81,8 +82,7 @@ class Store:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.path = folder / RESULTS_FILE
-        self.turns: contextlib.AbstractContextManager[object] = contextlib.nullcontext()
-        """Held while the file is changed; processes that share the store share a lock."""
+        self._turns: contextlib.AbstractContextManager[object] = contextlib.nullcontext()
 
     @classmethod
     def existing(cls, folder: Path) -> Store:
@@ -132,6 +132,15 @@ class Store:
                 self._drop_old_parts()
 
     @contextlib.contextmanager
+    def shared(self) -> Iterator[None]:
+        """While the block is open, processes forked from this one may save their results, too."""
+        self._turns = multiprocessing.get_context("fork").Lock()
+        try:
+            yield
+        finally:
+            self._turns = contextlib.nullcontext()
+
+    @contextlib.contextmanager
     def reading(self) -> Iterator[h5py.File]:
         """The HDF5 file, open for reading."""
         try:
@@ -179,7 +188,7 @@ class Store:
     @contextlib.contextmanager
     def changing(self) -> Iterator[h5py.File]:
         """A copy of the HDF5 file to change; it replaces the file when the block ends without an error."""
-        with self.turns, replacing(self.path) as scratch:
+        with self._turns, replacing(self.path) as scratch:
             new = not self.path.exists()
             if not new:
                 shutil.copyfile(self.path, scratch)
