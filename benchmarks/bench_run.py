@@ -4,9 +4,10 @@
     python benchmarks/bench_run.py --growth              # 12, 100 and 400 channels
     python benchmarks/bench_run.py --raw sample_data/hidden_effect --rig planetary
 
-A hammer test is simulated into a temporary raw folder, and `ema run` goes over it once, in a process of its own. Of every
-stage: wall time, processor time of the run and its workers, and the largest resident memory of all of them together, looked
-at ten times a second. The floor beside it is the time to read all record files once and to Fourier-transform all channels.
+A hammer test is simulated into a temporary raw folder, and `ema run` goes over it once, in a process of its own. Of
+every stage: wall time, processor time of the run and its workers, and the largest memory of all of them together,
+looked at ten times a second. The floor beside it is the time to read all record files once and to Fourier-transform
+all channels. Stages of several configurations run at the same time; then processor time and memory are those of all.
 """
 
 from __future__ import annotations
@@ -125,7 +126,12 @@ def inside(arguments: list[str]) -> None:
     raw, rig, out, *overrides = arguments
     job.run_raw(Path(raw), rig or None, Path(out), None, overrides, show)  # type: ignore[arg-type]
     stop.set()
-    row = {"stage": "whole run", "wall": time.perf_counter() - started, "cpu": _processor_s() - used, "mb": 0.0}
+    row = {
+        "stage": "whole run",
+        "wall": time.perf_counter() - started,
+        "cpu": _processor_s() - used,
+        "mb": 0.0,
+    }
     print(json.dumps(row), flush=True)
 
 

@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from typing import Any
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -108,7 +109,9 @@ def side_by_side(
         What the first of the items that failed raised; the others are done to the end.
     """
     context = multiprocessing.get_context("fork")
-    left, running, failed = list(enumerate(items)), {}, {}
+    left = list(enumerate(items))
+    running: dict[Connection, tuple[int, BaseProcess]] = {}
+    failed: dict[int, Exception] = {}
     try:
         while left or running:
             while left and len(running) < processes:
@@ -118,8 +121,10 @@ def side_by_side(
                 process.start()
                 theirs.close()
                 running[mine] = (index, process)
-            for connection in wait(list(running)):
-                index, process = running[connection]
+            ready = wait(list(running))
+            for connection, (index, process) in list(running.items()):
+                if connection not in ready:
+                    continue
                 try:
                     kind, content = connection.recv()
                 except EOFError:  # killed, for want of memory most likely

@@ -170,7 +170,9 @@ class Store:
                 return
             part = self._part_of(link)
             file.close()  # the part is never changed, whatever becomes of the link
-            if not part.is_file():  # left behind when the folder was copied, or deleted because it was damaged
+            if (
+                not part.is_file()
+            ):  # left behind when the folder was copied, or deleted because it was damaged
                 yield None
                 return
             try:
@@ -181,7 +183,12 @@ class Store:
     def _part_of(self, link: h5py.ExternalLink) -> Path:
         """The file that a link leads to, if it is one of ours."""
         part = self.folder / link.filename
-        if link.path != "/" or not _PART.fullmatch(link.filename) or part.is_symlink() or part.parent.is_symlink():
+        if (
+            link.path != "/"
+            or not _PART.fullmatch(link.filename)
+            or part.is_symlink()
+            or part.parent.is_symlink()
+        ):
             raise EmaError(f"{self.path}: leads out of the folder, which ema never writes; do not trust it")
         return part
 
@@ -225,12 +232,14 @@ class Store:
         scratch = self.folder / f".{stage}.{os.getpid()}.tmp"
         finished = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
         try:
-            with contextlib.closing(ScratchFile(scratch)) as disk:
-                with h5py.File(disk, "w", libver=_LIBRARY) as file:
-                    codec.write(file, "provenance", Provenance(key, settings, __version__, finished, seconds))
-                    for name, value in results.items():
-                        whole = _until_full(value, disk) if isinstance(value, Iterator) else value
-                        codec.write(file, name, whole)
+            with (
+                contextlib.closing(ScratchFile(scratch)) as disk,
+                h5py.File(disk, "w", libver=_LIBRARY) as file,
+            ):
+                codec.write(file, "provenance", Provenance(key, settings, __version__, finished, seconds))
+                for name, value in results.items():
+                    whole = _until_full(value, disk) if isinstance(value, Iterator) else value
+                    codec.write(file, name, whole)
             disk.check()
             self._take(stage, configuration, key, scratch)
         except OSError as error:

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
+from itertools import pairwise
 from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -74,9 +75,17 @@ def over_rows(n_rows: int, numbers: int) -> Iterator[Callable[[Rows], None]]:
     """
     n = min(_free_cores(), n_rows, numbers // WORTH_A_THREAD)
     if n < 2:
-        yield lambda work: (work(slice(0, n_rows)), None)[1]
+
+        def at_once(work: Rows) -> None:
+            work(slice(0, n_rows))
+
+        yield at_once
         return
     edges = [n_rows * k // n for k in range(n + 1)]
-    blocks = [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
-    with ThreadPoolExecutor(n) as pool:
-        yield lambda work: (list(pool.map(work, blocks)), None)[1]
+    with ThreadPoolExecutor(n, initializer=_enter) as pool:
+
+        def in_blocks(work: Rows) -> None:
+            for _ in pool.map(work, [slice(a, b) for a, b in pairwise(edges)]):
+                pass
+
+        yield in_blocks

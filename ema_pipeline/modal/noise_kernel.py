@@ -17,7 +17,6 @@ _loop = numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz
 """Compiled to vector instructions: with Python's rules a division by zero would have to be looked for."""
 
 
-
 @_loop
 def quiet_lines(
     power: Real, response: Complex, measured: NDArray[np.bool_], least: float, floor: Real, quiet: Real

@@ -100,4 +100,3 @@ def _running(process: str) -> bool:
     except OSError:
         return True
     return True
-
