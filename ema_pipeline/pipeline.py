@@ -47,7 +47,7 @@ from ema_pipeline.stages.base import (
     versions,
 )
 from ema_pipeline.store import ALL, Store
-from ema_pipeline.threads import cores
+from ema_pipeline.threads import cores, share_cores
 from ema_pipeline.toml_text import parse_toml, read_toml
 
 STAGES = (
@@ -414,6 +414,8 @@ def _side_by_side(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | N
         return _in_turn(stages, run, keys, show)
 
     def job(configuration: str, send: Send) -> None:
+        share_cores(processes)
+
         @contextmanager
         def tell(label: str) -> Iterator[Progress]:
             send((label, "begins"))

@@ -11,8 +11,10 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkProcess
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -110,7 +112,7 @@ def side_by_side(
     """
     context = multiprocessing.get_context("fork")
     left = list(enumerate(items))
-    running: dict[Connection, tuple[int, BaseProcess]] = {}
+    running: dict[Connection, tuple[int, ForkProcess]] = {}
     failed: dict[int, Exception] = {}
     try:
         while left or running:

@@ -25,9 +25,20 @@ def single_blas_thread() -> AbstractContextManager[object]:
     return threadpool_limits(limits=1, user_api="blas")
 
 
+_sharers = 1
+"""Processes among which the processors are shared."""
+
+
 def cores() -> int:
     """Processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    all_ = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, all_ // _sharers)
+
+
+def share_cores(processes: int) -> None:
+    """From here on use only this process's share of the processors: others work beside it."""
+    global _sharers
+    _sharers = processes
 
 
 A = TypeVar("A")
