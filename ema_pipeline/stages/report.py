@@ -26,16 +26,17 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Write every file of the results folder but the store."""
-    from ema_pipeline.report.html import write_report
-    from ema_pipeline.report.loops import write_loops_report
-    from ema_pipeline.report.summary_files import write_modes_csv, write_summary
-
     settings = cast(ReportSettings, run.settings[NAME])
     folder = run.store.folder
     results = load_results(run)
     if run.info.kind == "hysteresis":
+        from ema_pipeline.report.loops import write_loops_report
+
         write_loops_report(isolators(run), results, loops_of(run), models_of(run), folder)
     else:
+        from ema_pipeline.report.html import write_report
+        from ema_pipeline.report.summary_files import write_modes_csv, write_summary
+
         write_summary(results, folder / "summary.json")
         write_modes_csv(results, folder / "modes.csv")
         write_report(results, folder / "report.html")
