@@ -9,6 +9,7 @@ import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
+from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.data import analysis_band
@@ -54,7 +55,7 @@ class HitModes:
 
 def identify_hits(
     hits: Hits,
-    frfs: FrfSet,
+    measured: Callable[[], FrfSet],
     frf_settings: FrfSettings,
     settings: ModalSettings,
     progress: Progress | None = None,
@@ -65,8 +66,8 @@ def identify_hits(
     ----------
     hits : callable
         Gives the accepted hits, as often as it is called.
-    frfs : FrfSet
-        Of these hits, as measured.
+    measured : callable
+        Gives the FRFs of these hits as measured, so that they need not be kept beside the aligned ones.
     frf_settings : FrfSettings
         With which they were estimated.
     settings : ModalSettings
@@ -77,10 +78,14 @@ def identify_hits(
     HitModes
         The intervals of frequencies hold their scatter over hits.
     """
+    frfs = measured()
     with single_blas_thread():
         alignment = align(hits, frfs, frf_settings, analysis_band(frfs, settings))
-    modal = identify(alignment.frfs, settings, progress, alignment.known_peaks())
-    return HitModes(with_movement(modal, alignment, frfs.response_decay_rad_s), alignment.frfs, alignment)
+        if alignment.shifts is not None:
+            del frfs
+            frfs = estimate_frfs(hits(), frf_settings, alignment.shifts)
+    modal = identify(frfs, settings, progress, alignment.known_peaks())
+    return HitModes(with_movement(modal, alignment, frfs.response_decay_rad_s), frfs, alignment)
 
 
 def with_movement(modal: ModalModel, alignment: Alignment, decay_rad_s: float = 0.0) -> ModalModel:

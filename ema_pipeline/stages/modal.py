@@ -37,17 +37,21 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
         measured = read_mode_table(Path(run.info.raw), run.require_model(NAME))
         return {"modal": to_modal_model(measured[configuration])}
     settings = cast("ModalStageSettings", run.settings[NAME])
-    frfs = run.store.load("frf", configuration, "frfs", FrfSet)
+
+    def load_frfs() -> FrfSet:
+        return run.store.load("frf", configuration, "frfs", FrfSet)
+
     if settings.method == "circle":
-        return {"modal": identify_by_circle(frfs, settings.circle)}
+        return {"modal": identify_by_circle(load_frfs(), settings.circle)}
     if run.info.kind == "continuous":
+        frfs = load_frfs()
         return {"modal": attach_circles(frfs, identify(frfs, settings.identify, progress), settings.circle)}
     found = identify_hits(
         lambda: accepted_hits(run.store, configuration),
-        frfs,
+        load_frfs,
         cast(FrfSettings, run.settings["frf"]),
         settings.identify,
         progress,
     )
     modal = attach_circles(found.frfs, found.modal, settings.circle)
-    return {"modal": pooled(modal, found.alignment, frfs.record_s, frfs.response_decay_rad_s)}
+    return {"modal": pooled(modal, found.alignment, found.frfs.record_s, found.frfs.response_decay_rad_s)}
