@@ -159,19 +159,19 @@ def _of_hit(
     places = {d.point: o for o, d in enumerate(frfs.outputs)}
     outputs = [places[c.dof.point] for c in hit.channels]
     quantity_power = np.array([power[c.quantity] for c in hit.channels])
-    widths = [_width(complex(poles[task.mode]), float(axis[1])) for task in tasks]
-    windows = [_lines(axis, complex(poles[t.mode]), w) for t, w in zip(tasks, widths, strict=True)]
-    about = [np.empty((len(outputs), w.stop - w.start), dtype=np.complex128) for w in windows]
+    spectra = np.empty((len(outputs), len(axis)), dtype=np.complex128)
     for k, channel in enumerate(hit.channels):
-        spectrum = np.asarray(rfft(np.asarray(hit.responses[k]))) * float(channel.dof.sign)
-        for rows, lines in zip(about, windows, strict=True):
-            rows[k] = spectrum[lines] * (2j * np.pi * axis[lines]) ** quantity_power[k]
+        factor = float(channel.dof.sign) * (2j * np.pi * axis) ** quantity_power[k]
+        np.multiply(np.asarray(rfft(np.asarray(hit.responses[k]))), factor, out=spectra[k])
     force = np.asarray(rfft(hit.force)) * hit.hit.impact.sign
     start_s = (hit.hit.peak - hit.hit.start) / rate
     curves = []
-    for task, width, lines, spectra in zip(tasks, widths, windows, about, strict=True):
+    for task in tasks:
         pole = complex(poles[task.mode])
+        width = _width(pole, float(axis[1]))
         centre = pole.imag / (2 * np.pi)
+        first, stop = np.searchsorted(axis, [centre - CUT * width, centre + CUT * width])
+        lines = slice(max(int(first), 1), int(stop))
         own = residues[task.mode, outputs, i]
         weight = _weights(own, frfs.variance[outputs, i, lines])
         u, _ = pole_functions(2 * np.pi * axis[lines], poles, n / rate - start_s)
@@ -180,7 +180,7 @@ def _of_hit(
         other_share = residues[:, outputs, i].conj() @ weight
         mine = u[task.mode] * force[lines]
         others = (share @ u + other_share @ mirrored) * force[lines] - mine
-        signal = weight @ spectra - others
+        signal = weight @ spectra[:, lines] - others
         band = _Band(axis[lines], lines.start, n, rate, centre, width)
         scatter = frfs.variance[outputs, i, lines] * frfs.hits[outputs, i, None]
         scatter *= (2 * np.pi * axis[lines]) ** (2 * quantity_power[:, None])
@@ -192,13 +192,6 @@ def _of_hit(
             name = f"{hit.hit.file}#{hit.hit.number}"
             curves.append(DecayCurve(task.mode, name, frfs.outputs[task.sensor], amplitude, *table[1:]))
     return curves
-
-
-def _lines(axis: Real, pole: complex, width: float) -> slice:
-    """Lines that the filter about a mode lets pass."""
-    centre = pole.imag / (2 * np.pi)
-    first, stop = np.searchsorted(axis, [centre - CUT * width, centre + CUT * width])
-    return slice(max(int(first), 1), int(stop))
 
 
 def _width(pole: complex, step_hz: float) -> float:
