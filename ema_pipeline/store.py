@@ -123,13 +123,11 @@ class Store:
             ):  # where a file system knows no locks, filelock writes a mark of its own
                 with contextlib.suppress(OSError):  # only a help to whoever finds the folder locked
                     path.write_text(f"{os.getpid()} {platform.node()}", encoding="utf-8")
-            for left_over in self.folder.glob(".*.[0-9]*.tmp"):
-                left_over.unlink(missing_ok=True)
-            self._drop_old_parts()
+            self._tidy()
             try:
                 yield
             finally:
-                self._drop_old_parts()
+                self._tidy()
 
     @contextlib.contextmanager
     def shared(self) -> Iterator[None]:
@@ -294,8 +292,10 @@ class Store:
             ]
             return [self._part_of(link) for link in links if isinstance(link, h5py.ExternalLink)]
 
-    def _drop_old_parts(self) -> None:
-        """Remove the files of results that were replaced, and of those that a killed run did not link any more."""
+    def _tidy(self) -> None:
+        """Remove what killed processes left behind, and the files of results that were replaced."""
+        for left_over in self.folder.glob(".*.[0-9]*.tmp"):
+            left_over.unlink(missing_ok=True)
         folder = self.folder / PARTS_FOLDER
         if not folder.is_dir() or folder.is_symlink():
             return
