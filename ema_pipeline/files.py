@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -80,6 +81,19 @@ def replace_file(path: Path, content: str | bytes) -> None:
     """Write a file in one step: a reader sees the old one or the new one, never half of one."""
     with replacing(path) as scratch:
         scratch.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """A hard link to a file that is never changed in place, or a copy where the file system has none.
+
+    What is there under that name already stays.
+    """
+    try:
+        os.link(source, target)
+    except FileExistsError:
+        return
+    except OSError:
+        shutil.copyfile(source, target)
 
 
 def cannot_write(path: Path | str, error: OSError) -> EmaError:

@@ -10,7 +10,6 @@ from pathlib import Path
 from ema_pipeline.describe import describe
 from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.errors import EmaError, did_you_mean
-from ema_pipeline.observations.loop_forces import effects_of_loops
 from ema_pipeline.pipeline import (
     Keys,
     ShowStage,
@@ -170,6 +169,8 @@ def set_effects(
         run = new_run(store, info, effect_files)
         require_model(run, "add")  # refuses unknown effects and places before anything is written
         if info.kind == "hysteresis" and run.rig is not None:
+            from ema_pipeline.observations.loop_forces import effects_of_loops
+
             effects_of_loops(run.rig, info.effects, run.library)  # refuses what a loop does not show
         before = load_info(store)
         save_info(store, info)

@@ -8,9 +8,10 @@ import importlib
 import json
 import os
 import time
-from collections.abc import Callable, Iterable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -28,6 +29,7 @@ from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.names import check_name
+from ema_pipeline.processes import Send, can_fork, side_by_side
 from ema_pipeline.report.settings import ReportSettings
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.settings import Settings, parse, setting_names
@@ -45,6 +47,7 @@ from ema_pipeline.stages.base import (
     versions,
 )
 from ema_pipeline.store import ALL, Store
+from ema_pipeline.threads import cores, share_cores
 from ema_pipeline.toml_text import parse_toml, read_toml
 
 STAGES = (
@@ -93,6 +96,9 @@ class PipelineSettings(Settings):
     rig: str | None = Field(None, description="rig that this pipeline is made for")
     stages: tuple[str, ...] = Field(STAGES, description="stages to run, in order")
     effect_files: tuple[str, ...] = Field((), description="Python files with effects of the user's own")
+    processes: int | None = Field(
+        None, ge=1, le=64, description="configurations worked on at a time; left out: one per processor"
+    )
     ingest: IngestSettings = Field(IngestSettings(), description="reading raw folders")
     hits: HitSettings = Field(HitSettings(), description="hit finding and quality limits")
     frf: FrfSettings = Field(FrfSettings(), description="windows and estimator")
@@ -370,21 +376,81 @@ def run_stages(run: Run, names: Iterable[str], show: ShowStage | None = None) ->
     EmaError
         With the name of the stage that failed.
     """
-    computed = []
+    computed: list[str] = []
     names = tuple(names)
     keys = Keys(run, names)
-    for name in names:
-        stage = stage_module(name)
-        if name not in STAGES_OF_KIND[run.info.kind] or (stage.NEEDS_RIG and lacks_model(run)):
-            continue
-        for configuration in configurations_of(stage, run):
-            key = keys(name, configuration)
-            if run.store.key(name, configuration) == key and _outputs_present(stage, run):
-                continue
-            label = name if configuration == ALL else f"{name} ({configuration})"
-            _run_one(stage, run, configuration, key, label, show)
-            computed.append(label)
+    there = [stage_module(n) for n in names if n in STAGES_OF_KIND[run.info.kind]]
+    stages = [stage for stage in there if not (stage.NEEDS_RIG and lacks_model(run))]
+    for each, group in groupby(stages, key=lambda stage: stage.PER_CONFIGURATION):
+        chain = list(group)
+        several = each and len(run.info.configurations) > 1 and can_fork()
+        computed += _side_by_side(chain, run, keys, show) if several else _in_turn(chain, run, keys, show)
     return computed
+
+
+def _in_turn(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | None) -> list[str]:
+    """Run the stages that are out of date one after the other."""
+    computed = []
+    for stage in stages:
+        for configuration in configurations_of(stage, run):
+            key = keys(stage.NAME, configuration)
+            if not _up_to_date(stage, run, configuration, key):
+                label = _label(stage, configuration)
+                _run_one(stage, run, configuration, key, label, show)
+                computed.append(label)
+    return computed
+
+
+def _side_by_side(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | None) -> list[str]:
+    """Run the stages that are out of date, each configuration in a process of its own.
+
+    No configuration asks for results of another, so that all are the same as one after the other.
+    """
+    wanted = [(stage, c, keys(stage.NAME, c)) for stage in stages for c in run.info.configurations]
+    todo = [(stage, c, key) for stage, c, key in wanted if not _up_to_date(stage, run, c, key)]
+    names = list(dict.fromkeys(c for _, c, _ in todo))
+    processes = min(stored_settings(run.store, run.info).processes or cores(), len(names))
+    if processes < 2:
+        return _in_turn(stages, run, keys, show)
+
+    def job(configuration: str, send: Send) -> None:
+        share_cores(processes)
+
+        @contextmanager
+        def tell(label: str) -> Iterator[Progress]:
+            send((label, "begins"))
+            yield lambda share, text: send((label, (share, text)))
+            send((label, "ends"))
+
+        for stage, c, key in todo:
+            if c == configuration:
+                _run_one(stage, run, c, key, _label(stage, c), tell if show else None)
+
+    with ExitStack() as open_shows:
+        shown: dict[str, tuple[ExitStack, Progress]] = {}
+
+        def hear(message: tuple[str, object]) -> None:
+            assert show is not None
+            label, what = message
+            if what == "begins":
+                block = open_shows.enter_context(ExitStack())
+                shown[label] = block, block.enter_context(show(label))
+            elif what == "ends":
+                shown[label][0].close()
+            else:
+                shown[label][1](*cast("tuple[float, str]", what))
+
+        with run.store.shared():
+            side_by_side(job, names, processes, hear)
+    return [_label(stage, c) for stage, c, _ in todo]
+
+
+def _label(stage: Stage, configuration: str) -> str:
+    return stage.NAME if configuration == ALL else f"{stage.NAME} ({configuration})"
+
+
+def _up_to_date(stage: Stage, run: Run, configuration: str, key: str) -> bool:
+    return run.store.key(stage.NAME, configuration) == key and _outputs_present(stage, run)
 
 
 def _run_one(

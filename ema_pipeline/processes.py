@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import ctypes
+import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing.connection import Connection, wait
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkProcess
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
@@ -72,3 +79,77 @@ def _remember_parent() -> None:
 def _in_child() -> None:
     if _holders:
         die_with_parent(_parent)
+
+
+def can_fork() -> bool:
+    """True where this process may share its work with copies of itself."""
+    return sys.platform == "linux" and not multiprocessing.current_process().daemon
+
+
+Send = Callable[[Any], None]
+
+
+def side_by_side(
+    job: Callable[[Any, Send], None], items: Sequence[Any], processes: int, hear: Callable[[Any], None]
+) -> None:
+    """Do a job for every item in a forked process each, a few at a time.
+
+    Parameters
+    ----------
+    job : callable
+        Takes an item and a function that sends what can be pickled to `hear`. It goes over by forking, so that it may
+        hold what cannot be pickled.
+    items : sequence
+    processes : int
+        Most that run at a time.
+    hear : callable
+        Is called in this process, with what a job sends.
+
+    Raises
+    ------
+    Exception
+        What the first of the items that failed raised; the others are done to the end.
+    """
+    context = multiprocessing.get_context("fork")
+    left = list(enumerate(items))
+    running: dict[Connection, tuple[int, ForkProcess]] = {}
+    failed: dict[int, Exception] = {}
+    try:
+        while left or running:
+            while left and len(running) < processes:
+                index, item = left.pop(0)
+                mine, theirs = context.Pipe(duplex=False)
+                process = context.Process(target=_do, args=(job, item, theirs), daemon=True)
+                process.start()
+                theirs.close()
+                running[mine] = (index, process)
+            ready = wait(list(running))
+            for connection, (index, process) in list(running.items()):
+                if connection not in ready:
+                    continue
+                try:
+                    kind, content = connection.recv()
+                except EOFError:  # killed, for want of memory most likely
+                    kind, content = "failed", MemoryError(f"a worker ended before its time ({items[index]})")
+                if kind == "told":
+                    hear(content)
+                    continue
+                if kind == "failed":
+                    failed[index] = content
+                process.join()
+                del running[connection]
+    finally:
+        for _, process in running.values():
+            process.kill()
+            process.join()
+    if failed:
+        raise failed[min(failed)]
+
+
+def _do(job: Callable[[Any, Send], None], item: Any, to: Connection) -> None:
+    try:
+        job(item, lambda content: to.send(("told", content)))
+        to.send(("done", None))
+    except Exception as error:
+        error.add_note("In a worker:\n" + traceback.format_exc())  # for the crash report
+        to.send(("failed", error))

@@ -1,17 +1,21 @@
 """The results file ``ema.h5``: one group per stage and configuration, safe against a kill at any moment.
 
 Every change is made to a copy that replaces the file in one step, so that the file on disk is always
-whole: either before the change or after it.
+whole: either before the change or after it. So that the copy stays small, a large result is a file of its own in the
+folder ``stages`` beside it, and the group is a link to that file, which any HDF5 tool follows. Such a file is complete
+before the link is made, and is never changed.
 """
 
 from __future__ import annotations
 
 import contextlib
 import datetime
+import multiprocessing
 import os
 import platform
+import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -21,7 +25,7 @@ from filelock import FileLock, Timeout
 
 from ema_pipeline import __version__, codec
 from ema_pipeline.errors import EmaError
-from ema_pipeline.files import ScratchFile, reason, replacing
+from ema_pipeline.files import ScratchFile, cannot_write, link_or_copy, reason, replacing
 from ema_pipeline.processes import workers_die_with_us
 
 T = TypeVar("T")
@@ -31,7 +35,12 @@ ALL = "all"
 
 LOCK_FILE = ".lock"
 RESULTS_FILE = "ema.h5"
+PARTS_FOLDER = "stages"
 
+LARGE_BYTES = 1_000_000
+"""Size from which a result gets a file of its own: below, copying ``ema.h5`` costs less than the files' clutter."""
+
+_PART = re.compile(re.escape(PARTS_FOLDER) + r"/[^/\\]+\.h5")
 _FORMAT = 1
 _LIBRARY = ("v110", "v110")
 
@@ -73,6 +82,7 @@ class Store:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.path = folder / RESULTS_FILE
+        self._turns: contextlib.AbstractContextManager[object] = contextlib.nullcontext()
 
     @classmethod
     def existing(cls, folder: Path) -> Store:
@@ -113,9 +123,20 @@ class Store:
             ):  # where a file system knows no locks, filelock writes a mark of its own
                 with contextlib.suppress(OSError):  # only a help to whoever finds the folder locked
                     path.write_text(f"{os.getpid()} {platform.node()}", encoding="utf-8")
-            for left_over in self.folder.glob(".*.[0-9]*.tmp"):
-                left_over.unlink(missing_ok=True)
+            self._tidy()
+            try:
+                yield
+            finally:
+                self._tidy()
+
+    @contextlib.contextmanager
+    def shared(self) -> Iterator[None]:
+        """While the block is open, processes forked from this one may save their results, too."""
+        self._turns = multiprocessing.get_context("fork").Lock()
+        try:
             yield
+        finally:
+            self._turns = contextlib.nullcontext()
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[h5py.File]:
@@ -127,19 +148,57 @@ class Store:
             raise self._damaged(error) from None
 
     @contextlib.contextmanager
-    def changing(self) -> Iterator[h5py.File]:
-        """A copy of the HDF5 file to change; it replaces the file when the block ends without an error."""
-        with self._changing() as (file, _):
-            yield file
+    def group(self, stage: str, configuration: str = ALL) -> Iterator[h5py.Group | None]:
+        """What is stored of a stage, open for reading; None where there is nothing.
+
+        Raises
+        ------
+        EmaError
+            If the store is damaged, or if it leads elsewhere than to its own files.
+        """
+        if not self.path.is_file():
+            yield None
+            return
+        with contextlib.ExitStack() as stack:
+            file = stack.enter_context(self.reading())
+            stages = _find(file, f"stages/{stage}")
+            link = None if stages is None else stages.get(configuration, getlink=True)
+            if not isinstance(link, h5py.ExternalLink):
+                yield _find(file, _group(stage, configuration))
+                return
+            part = self._part_of(link)
+            file.close()  # the part is never changed, whatever becomes of the link
+            if (
+                not part.is_file()
+            ):  # left behind when the folder was copied, or deleted because it was damaged
+                yield None
+                return
+            try:
+                yield stack.enter_context(h5py.File(part, "r"))
+            except OSError as error:
+                raise EmaError(f"{part}: is damaged ({reason(error)}); delete it and run again") from None
+
+    def _part_of(self, link: h5py.ExternalLink) -> Path:
+        """The file that a link leads to, if it is one of ours."""
+        part = self.folder / link.filename
+        if (
+            link.path != "/"
+            or not _PART.fullmatch(link.filename)
+            or part.is_symlink()
+            or part.parent.is_symlink()
+        ):
+            raise EmaError(f"{self.path}: leads out of the folder, which ema never writes; do not trust it")
+        return part
 
     @contextlib.contextmanager
-    def _changing(self) -> Iterator[tuple[h5py.File, ScratchFile]]:
-        with replacing(self.path) as scratch:
+    def changing(self) -> Iterator[h5py.File]:
+        """A copy of the HDF5 file to change; it replaces the file when the block ends without an error."""
+        with self._turns, replacing(self.path) as scratch:
             new = not self.path.exists()
             if not new:
                 shutil.copyfile(self.path, scratch)
             with contextlib.closing(ScratchFile(scratch)) as disk, self._open_to_change(disk, new) as file:
-                yield file, disk
+                yield file
             disk.check()
 
     def _open_to_change(self, disk: ScratchFile, new: bool) -> h5py.File:
@@ -161,22 +220,91 @@ class Store:
 
     def key(self, stage: str, configuration: str = ALL) -> str:
         """Key of the stored result, empty where there is none."""
-        if not self.path.is_file():
-            return ""
-        with self.reading() as file:
-            group = _find(file, _group(stage, configuration))
+        with self.group(stage, configuration) as group:
             return "" if group is None else str(codec.read(group, "provenance", Provenance).key)
 
     def save(
         self, stage: str, configuration: str, key: str, settings: str, seconds: float, **results: Any
     ) -> None:
         """Replace a stage's results by new ones in one step."""
-        with self._changing() as (file, disk):
-            watched = {
-                name: _until_full(value, disk) if isinstance(value, Iterator) else value
-                for name, value in results.items()
-            }
-            write_stage(file, stage, configuration, key, settings, seconds, **watched)
+        scratch = self.folder / f".{stage}.{os.getpid()}.tmp"
+        finished = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+        try:
+            with (
+                contextlib.closing(ScratchFile(scratch)) as disk,
+                h5py.File(disk, "w", libver=_LIBRARY) as file,
+            ):
+                codec.write(file, "provenance", Provenance(key, settings, __version__, finished, seconds))
+                for name, value in results.items():
+                    whole = _until_full(value, disk) if isinstance(value, Iterator) else value
+                    codec.write(file, name, whole)
+            disk.check()
+            self._take(stage, configuration, key, scratch)
+        except OSError as error:
+            raise cannot_write(self.path, error) from None
+        finally:
+            with contextlib.suppress(OSError):
+                scratch.unlink(missing_ok=True)
+
+    def _take(self, stage: str, configuration: str, key: str, made: Path) -> None:
+        """Take a stage's results from a complete file: a large one becomes ours as it is."""
+        path = _group(stage, configuration)
+        if made.stat().st_size >= LARGE_BYTES:
+            part = f"{PARTS_FOLDER}/{stage}.{configuration}.{key[:16]}.h5"
+            (self.folder / PARTS_FOLDER).mkdir(exist_ok=True)
+            os.replace(made, self.folder / part)
+            with self.changing() as file:
+                if path in file:
+                    del file[path]
+                file[path] = h5py.ExternalLink(part, "/")
+            return
+        with self.changing() as file, h5py.File(made, "r") as new:
+            if path in file:
+                del file[path]
+            new.copy("/", file, path)
+
+    def copy_from(self, other: Store, stages: Iterable[str], names: Mapping[str, str]) -> None:
+        """Copy what another store has of these stages, under other names of its configurations."""
+        (self.folder / PARTS_FOLDER).mkdir(parents=True, exist_ok=True)
+        with self.changing() as new, other.reading() as old:
+            for path, now in (
+                (_group(stage, a), _group(stage, b)) for stage in stages for a, b in names.items()
+            ):
+                link = old.get(path, getlink=True)
+                if isinstance(link, h5py.ExternalLink):
+                    part = other._part_of(link)
+                    link_or_copy(part, self.folder / PARTS_FOLDER / part.name)
+                    new[now] = link
+                elif link is not None:
+                    old.copy(path, new, now)
+
+    def parts(self) -> list[Path]:
+        """The files of large results that the store refers to."""
+        if not self.path.is_file():
+            return []
+        with self.reading() as file:
+            stages = _find(file, "stages")
+            links = [
+                group.get(name, getlink=True)
+                for stage in (() if stages is None else stages)
+                for group in [codec.member(stages, stage)]
+                for name in group
+            ]
+            return [self._part_of(link) for link in links if isinstance(link, h5py.ExternalLink)]
+
+    def _tidy(self) -> None:
+        """Remove what killed processes left behind, and the files of results that were replaced."""
+        for left_over in self.folder.glob(".*.[0-9]*.tmp"):
+            left_over.unlink(missing_ok=True)
+        folder = self.folder / PARTS_FOLDER
+        if not folder.is_dir() or folder.is_symlink():
+            return
+        try:
+            kept = self.parts()
+        except EmaError:  # damaged: whoever reads it is told
+            return
+        for part in set(folder.glob("*.h5")) - set(kept):
+            part.unlink(missing_ok=True)
 
     def load(self, stage: str, configuration: str, name: str, cls: type[T]) -> T:
         """Load one result of a stage.
@@ -193,10 +321,7 @@ class Store:
 
     def find(self, stage: str, configuration: str, name: str, cls: type[T]) -> T | None:
         """Load one result of a stage, None where there is none."""
-        if not self.path.is_file():
-            return None
-        with self.reading() as file:
-            group = _find(file, _group(stage, configuration))
+        with self.group(stage, configuration) as group:
             if group is None or (name not in group and name not in group.attrs):
                 return None
             try:
@@ -209,30 +334,19 @@ class Store:
 
     def provenance(self) -> dict[tuple[str, str], Provenance]:
         """Provenance of everything in the store, by stage and configuration."""
-        found: dict[tuple[str, str], Provenance] = {}
         with self.reading() as file:
             stages = _find(file, "stages")
-            for stage in () if stages is None else stages:
-                configurations = codec.member(stages, stage)
-                for configuration in configurations:
-                    group = codec.member(configurations, configuration)
+            places = [
+                (stage, name)
+                for stage in (() if stages is None else stages)
+                for name in codec.member(stages, stage)
+            ]
+        found = {}
+        for stage, configuration in places:
+            with self.group(stage, configuration) as group:
+                if group is not None:
                     found[stage, configuration] = codec.read(group, "provenance", Provenance)
         return found
-
-
-def write_stage(
-    file: h5py.File, stage: str, configuration: str, key: str, settings: str, seconds: float, **results: Any
-) -> h5py.Group:
-    """Write a stage's results and provenance into an open file; returns the stage's group."""
-    path = _group(stage, configuration)
-    if path in file:
-        del file[path]
-    group = file.create_group(path)
-    finished = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    codec.write(group, "provenance", Provenance(key, settings, __version__, finished, seconds))
-    for name, value in results.items():
-        codec.write(group, name, value)
-    return group
 
 
 def _group(stage: str, configuration: str) -> str:

@@ -49,7 +49,7 @@ def identified(system: TrueSystem, n_hits: int, references: list[int], **moves: 
     )
     hits = source(records_of(made, dofs, references))
     frfs = estimate_frfs(hits(), FrfSettings())
-    return identify_hits(hits, frfs, FrfSettings(), ModalSettings())
+    return identify_hits(hits, lambda: frfs, FrfSettings(), ModalSettings())
 
 
 def source(records: list) -> Callable[[], Iterator[HitSamples]]:

@@ -15,8 +15,10 @@ import pandas as pd
 import pytest
 from bench import ema, facts_of_series, write_bench
 
+from ema_pipeline.errors import EmaError
 from ema_pipeline.series.database import SeriesDatabase
 from ema_pipeline.series.engine import LOST, in_processes
+from ema_pipeline.series.export import export_series
 from ema_pipeline.series.find import find_tests
 from ema_pipeline.series.one_test import Task
 from ema_pipeline.series.rows import TestRow, failed_row
@@ -266,3 +268,10 @@ def test_own_effects_run_where_they_are_named_and_nowhere_else(
     code, _, err = ema(capsys, *command, "--effect-file", tmp_path / "none.py")
     assert (code, err.count("\n")) == (1, 1)
     assert "no such effect file" in err
+
+
+def test_parquet_without_what_writes_it_is_one_clear_line(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(EmaError, match=r"pip install 'ema-pipeline\[parquet\]'"):
+        export_series(None, tmp_path / "out", parquet=True)
+    assert not (tmp_path / "out").exists()

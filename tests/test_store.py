@@ -289,6 +289,121 @@ def fault(store: Store, good: str) -> str | None:
     return None
 
 
+def large(seed: int) -> np.ndarray:
+    """More than fits into ema.h5 itself."""
+    return np.random.default_rng(seed).normal(size=200_000)
+
+
+def parts(folder: Path) -> list[str]:
+    return sorted(p.name for p in (folder / "stages").glob("*"))
+
+
+def test_a_large_result_is_a_file_of_its_own_that_hdf5_tools_find_in_its_place(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", "default", "0123456789abcdef99", "{}", 0.1, result=large(1))
+    assert parts(tmp_path) == ["frf.default.0123456789abcdef.h5"]
+    assert store.path.stat().st_size < 100_000
+    with h5py.File(store.path) as file:
+        assert_array_equal(file["stages/frf/default/result"][()], large(1))
+    assert_array_equal(store.load("frf", "default", "result", np.ndarray), large(1))
+    assert store.key("frf", "default") == "0123456789abcdef99"
+    assert list(store.provenance()) == [("frf", "default")]
+
+
+def test_saving_one_stage_does_not_touch_the_large_result_of_another(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("ingest", ALL, "a", "{}", 0.1, result=large(1))
+    (before,) = ((p.stat().st_ino, p.stat().st_mtime_ns) for p in (tmp_path / "stages").iterdir())
+    store.save("frf", ALL, "b", "{}", 0.1, result=np.zeros(10))
+    (after,) = ((p.stat().st_ino, p.stat().st_mtime_ns) for p in (tmp_path / "stages").iterdir())
+    assert before == after
+
+
+def test_files_of_replaced_and_of_never_linked_results_are_removed(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "old", "{}", 0.1, result=large(1))
+    store.save("frf", ALL, "new", "{}", 0.1, result=large(2))
+    (tmp_path / "stages" / "modal.all.killed.h5").write_bytes(b"of a run that was killed before the link")
+    with store.lock():
+        assert parts(tmp_path) == ["frf.all.new.h5"]
+        store.save("frf", ALL, "small", "{}", 0.1, result=np.zeros(3))
+    assert parts(tmp_path) == []
+    assert_array_equal(store.load("frf", ALL, "result", np.ndarray), np.zeros(3))
+
+
+def test_a_large_result_that_is_gone_counts_as_not_computed(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key", "{}", 0.1, result=large(1))
+    next((tmp_path / "stages").iterdir()).unlink()
+    assert store.key("frf") == ""
+    assert store.find("frf", ALL, "result", np.ndarray) is None
+    assert store.provenance() == {}
+
+
+def test_damage_of_a_large_result_is_seen_and_said_in_one_line(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key", "{}", 0.1, result=large(1))
+    part = next((tmp_path / "stages").iterdir())
+    content = bytearray(part.read_bytes())
+    content[len(content) // 2] ^= 255
+    part.write_bytes(content)
+    with pytest.raises(EmaError, match=r"frf\.all\.key\.h5: is damaged .*delete it and run again"):
+        store.find("frf", ALL, "result", np.ndarray)
+
+
+@pytest.mark.parametrize("lure", ["path", "group", "symlink"])
+def test_a_link_to_a_file_that_is_no_part_of_the_store_is_refused(tmp_path: Path, lure: str) -> None:
+    store = Store(tmp_path / "out")
+    store.folder.mkdir()
+    store.save("frf", ALL, "key", "{}", 0.1, result=large(1))
+    part = next((store.folder / "stages").iterdir())
+    part.rename(tmp_path / "secret.h5")
+    with h5py.File(store.path, "r+") as file:
+        del file["stages/frf/all"]
+        if lure == "path":
+            file["stages/frf/all"] = h5py.ExternalLink("stages/../../secret.h5", "/")
+        elif lure == "group":
+            file["stages/frf/all"] = h5py.ExternalLink("stages/x.h5", "/elsewhere")
+        else:
+            part.symlink_to(tmp_path / "secret.h5")
+            file["stages/frf/all"] = h5py.ExternalLink(f"stages/{part.name}", "/")
+    with pytest.raises(EmaError, match="leads out of the folder"):
+        store.find("frf", ALL, "result", np.ndarray)
+
+
+def test_a_process_killed_while_it_writes_large_results_leaves_a_whole_store(tmp_path: Path) -> None:
+    Store(tmp_path).save("frf", ALL, "first", "{}", 0.1, result=np.full(200_000, 0.5))
+    code = f"""
+import numpy as np
+from pathlib import Path
+from ema_pipeline.store import Store
+store = Store(Path({str(tmp_path)!r}))
+print("go", flush=True)
+turn = 0
+while True:
+    turn += 1
+    noise = np.random.default_rng(turn).normal(size=200_000)
+    store.save("frf", "all", f"turn {{turn}}", "{{}}", 0.1, result=noise, turn=turn)
+"""
+    for wait in (0.02, 0.05, 0.1, 0.3):
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+        assert process.stdout is not None
+        process.stdout.readline()
+        time.sleep(wait)
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        store = Store(tmp_path)
+        turn = store.find("frf", ALL, "turn", int)
+        if turn is not None:
+            noise = np.random.default_rng(turn).normal(size=200_000)
+            assert_array_equal(store.load("frf", ALL, "result", np.ndarray), noise)
+        assert store.key("frf") == ("first" if turn is None else f"turn {turn}")
+    with Store(tmp_path).lock():
+        assert len(parts(tmp_path)) <= 1
+        assert {p.name for p in tmp_path.iterdir()} == {"ema.h5", "stages", ".lock"}
+
+
 @pytest.mark.parametrize("damaged_bytes", [1, 64, 4096])
 def test_damage_anywhere_in_the_file_is_seen_and_said_in_one_line(tmp_path: Path, damaged_bytes: int) -> None:
     store = Store(tmp_path)

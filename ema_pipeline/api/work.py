@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING
 
 from ema_pipeline.describe import checked_rig, rig_text
 from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.files import link_or_copy
 from ema_pipeline.pipeline import new_run, override, run_stages, stored_settings, with_effect_files
 from ema_pipeline.stages.base import Run, RunInfo
-from ema_pipeline.store import Store
+from ema_pipeline.store import PARTS_FOLDER, Store
 from ema_pipeline.threads import single_blas_thread
 
 if TYPE_CHECKING:
@@ -70,8 +71,10 @@ class Work:
     def copy_of(cls, store: Store, info: RunInfo, effect_files: tuple[str, ...] = ()) -> Work:
         """A copy of a results folder's file."""
         made = cls.new(info)
-        made.store.folder.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(store.path, made.store.path)
+        (made.store.folder / PARTS_FOLDER).mkdir()
+        for part in store.parts():
+            link_or_copy(part, made.store.folder / PARTS_FOLDER / part.name)
         return dataclasses.replace(made, effect_files=effect_files)
 
     def run(self, *stages: str) -> Run:
@@ -147,9 +150,7 @@ class Work:
             *MEASURED,
             *(["ingest"] if info.kind == "continuous" else []),
         )  # whose records are simulated
-        _copy_measured(
-            self.store, made.store, stages, dict(zip(self.info.configurations, names, strict=True))
-        )
+        made.store.copy_from(self.store, stages, dict(zip(self.info.configurations, names, strict=True)))
         made = dataclasses.replace(made, rig=None if named else model, effect_files=files)
         info = with_effect_files(made.store, made.info, files)
         return dataclasses.replace(made, info=info).with_settings(settings)
@@ -170,12 +171,3 @@ def _names_in(rig: Rig, measured: Sequence[str]) -> tuple[str, ...]:
                 "name the configuration in test.toml"
             )
     return tuple(measured)
-
-
-def _copy_measured(source: Store, target: Store, stages: Iterable[str], names: Mapping[str, str]) -> None:
-    """Copy what a model is compared with, under the rig's names of the configurations."""
-    with source.reading() as old, target.changing() as new:
-        for stage in stages:
-            for before, now in names.items():
-                if f"stages/{stage}/{before}" in old:
-                    old.copy(f"stages/{stage}/{before}", new, f"stages/{stage}/{now}")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.expected_gain import Change, ExpectedGain
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
+from ema_pipeline.diagnose.pool import spread
 from ema_pipeline.diagnose.probability import needed
 from ema_pipeline.diagnose.score import Marginal
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -53,11 +54,10 @@ def detection_limits(
         All that compete.
     settings : DiagnoseSettings
     """
-    had, limits = set(fit.model.labels), []
+    had = set(fit.model.labels)
     whole = ExpectedGain(fit.posterior, observations.scatters, Marginal(fit))
-    for hypothesis in hypotheses:
-        if hypothesis.extends:
-            continue
+
+    def least(hypothesis: Hypothesis) -> float | None:
         own = hypothesis.label in had
         model = fit.model if own else fit.model.plus(hypothesis.placed, hypothesis.scales)
         gains = whole
@@ -67,10 +67,12 @@ def detection_limits(
             )
         shown = _Shown.of(observations, fit, model, hypothesis, gains)
         if shown is None:
-            continue
-        least = shown.least(needed(hypothesis, hypotheses, settings, found=0), settings.sigmas)
-        limits += [_under(name, hypothesis, least) for name in hypothesis.names]
-    return tuple(limits)
+            return None
+        return shown.least(needed(hypothesis, hypotheses, settings, found=0), settings.sigmas)
+
+    asked = [h for h in hypotheses if not h.extends]
+    found = zip(asked, spread(least, asked, settings.processes), strict=True)
+    return tuple(_under(name, h, size) for h, size in found if size is not None for name in h.names)
 
 
 def _under(name: Name, hypothesis: Hypothesis, unknown: float) -> DetectionLimit:

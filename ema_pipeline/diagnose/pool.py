@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import TypeVar, cast
 
-from ema_pipeline.threads import single_blas_thread
+from ema_pipeline.processes import can_fork
+from ema_pipeline.threads import cores, single_blas_thread
 
 A = TypeVar("A")
 R = TypeVar("R")
@@ -17,15 +17,14 @@ _job: Callable[..., object] | None = None
 _items: Sequence[object] = ()
 
 
-def spread(job: Callable[[A], R], items: Sequence[A], processes: int) -> Iterator[R]:
+def spread(job: Callable[[A], R], items: Sequence[A], processes: int | None) -> Iterator[R]:
     """``map(job, items)`` over forked processes; in this one where the system cannot fork or it is not worth it.
 
     The job and its items go over by forking, so they may hold what cannot be pickled (effects of a user's own file);
-    results are pickled.
+    results are pickled. None stands for a process per processor.
     """
-    can_fork = sys.platform == "linux" and "fork" in multiprocessing.get_all_start_methods()
-    daemon = multiprocessing.current_process().daemon
-    if processes < 2 or len(items) < 4 or not can_fork or daemon:
+    processes = processes or cores()
+    if processes < 2 or len(items) < 4 or not can_fork():
         with single_blas_thread():
             for item in items:
                 yield job(item)

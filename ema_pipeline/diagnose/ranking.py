@@ -96,7 +96,7 @@ def rank(
     observations: Observations,
     base: Fit,
     hypotheses: Sequence[Hypothesis],
-    processes: int = 1,
+    processes: int | None = 1,
     progress: Progress = lambda share, text: None,
 ) -> Ranking:
     """Fit every hypothesis and rank it.
@@ -108,7 +108,7 @@ def rank(
         The model as it stands, from `fit_base`.
     hypotheses : sequence of Hypothesis
     processes : int
-        Processes that share the fits; the result does not depend on their number.
+        Processes that share the fits, None for one per processor; the result does not depend on their number.
     progress : callable
     """
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
@@ -214,7 +214,7 @@ Found = dict[str, tuple[Hypothesis, Fit]]
 
 
 def _begun_again(
-    observations: Observations, base: Fit, found: Found, processes: int, contenders: int, steps: int
+    observations: Observations, base: Fit, found: Found, processes: int | None, contenders: int, steps: int
 ) -> tuple[Fit, Found]:
     """The base model and the best hypotheses, begun at what the best of all knows of everything else."""
     top = max((f for _, f in found.values()), key=lambda f: f.log_evidence, default=base)
@@ -225,7 +225,7 @@ def _begun_again(
     return base, _bettered(found, contenders, job, processes)
 
 
-def _bettered(found: Found, count: int, job: Callable[[Fit], Posterior], processes: int) -> Found:
+def _bettered(found: Found, count: int, job: Callable[[Fit], Posterior], processes: int | None) -> Found:
     """The hypotheses, the best `count` of them with what `job` makes of their fits."""
     items = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)[:count]
     better = _spread_fits(job, [fit for _, fit in items], processes)
@@ -261,7 +261,7 @@ def _better(observations: Observations, sources: Sequence[Fit], steps: int, fit:
     return best.posterior
 
 
-def _spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes: int) -> list[Fit]:
+def _spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes: int | None) -> list[Fit]:
     """Better fits of the same models; only posteriors go between processes, a user's effects cannot."""
     return [Fit(fit.model, p) for fit, p in zip(fits, spread(job, fits, processes), strict=True)]
 
@@ -285,7 +285,9 @@ def _promising(
     return found
 
 
-def _finals(observations: Observations, base: Fit, found: Found, promising: Found, processes: int) -> Ranking:
+def _finals(
+    observations: Observations, base: Fit, found: Found, promising: Found, processes: int | None
+) -> Ranking:
     """Scatters learned for the base model and the best hypotheses, each from what the others know."""
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     leading = [h.label for h, _ in order[:FINALISTS]]

@@ -52,6 +52,9 @@ class DiagnoseSettings(Settings):
     folds: int = Field(default=4, ge=2, le=20, description="Parts that the modes are held out in, in turn.")
     most_effects: int = Field(default=3, ge=1, le=6, description="Most effects that are added in turn.")
     candidates: int = Field(default=5, ge=1, description="Number of candidates that are reported.")
-    processes: int = Field(
-        default=2, ge=1, le=64, description="Processes that share the hypotheses; 1 for none but this one."
+    processes: int | None = Field(
+        default=None,
+        ge=1,
+        le=64,
+        description="Processes that share the hypotheses; 1 for none but this one; left out: one per processor.",
     )

@@ -28,8 +28,10 @@ def representative_frfs(frfs: FrfSet, count: int = FRFS_SHOWN) -> tuple[tuple[in
     ]
     if len(driving) >= count:
         return tuple(driving[:count])
-    inside = (frfs.frequency_hz >= frfs.band_hz[0]) & (frfs.frequency_hz <= frfs.band_hz[1])
-    level = np.where(measured, np.sqrt(np.mean(np.abs(frfs.frf[..., inside]) ** 2, axis=2)), 0.0)
+    low, high = frfs.band_hz
+    inside = slice(np.searchsorted(frfs.frequency_hz, low), np.searchsorted(frfs.frequency_hz, high, "right"))
+    power = np.array([np.mean(np.abs(row[:, inside]) ** 2, axis=1) for row in frfs.frf])
+    level = np.where(measured, np.sqrt(power), 0.0)
     chosen = list(driving)
     bodies = {frfs.outputs[o].body for o, _ in driving}
     order = [divmod(int(k), len(frfs.inputs)) for k in np.argsort(-np.nan_to_num(level), axis=None)]

@@ -118,9 +118,8 @@ def _residues(frfs: FrfSet, modal: ModalModel, poles: Complex) -> Complex:
     n_out, n_in = len(frfs.outputs), len(frfs.inputs)
     shapes = output_shapes(frfs, modal)
     out = np.zeros((len(poles), n_out, n_in), dtype=np.complex128)
-    accelerance = frfs.accelerance()
     for window in windows_about(poles, frfs.frequency_hz):
-        m = window.modes
+        m, accelerance = window.modes, frfs.accelerance(window.lines)
         omega = 2 * np.pi * frfs.frequency_hz[window.lines]
         for i in range(n_in):
             seen = np.flatnonzero(frfs.hits[:, i] > 0)
@@ -128,7 +127,7 @@ def _residues(frfs: FrfSet, modal: ModalModel, poles: Complex) -> Complex:
                 continue
             shape = shapes[np.ix_(m, seen)]
             rest = frfs.record_s - float(frfs.delay_s[i])
-            parts = participations(omega, accelerance[seen, i][:, window.lines], poles[m], shape, rest)
+            parts = participations(omega, accelerance[seen, i], poles[m], shape, rest)
             out[m[:, None], seen[None], i] = shape * parts[:, None]
     return out
 
@@ -159,10 +158,11 @@ def _of_hit(
     i = [d.point for d in frfs.inputs].index(hit.hit.impact.point)
     places = {d.point: o for o, d in enumerate(frfs.outputs)}
     outputs = [places[c.dof.point] for c in hit.channels]
-    spectra = np.array([np.asarray(rfft(np.asarray(hit.responses[k]))) for k in range(len(outputs))])
-    spectra *= np.array([float(c.dof.sign) for c in hit.channels])[:, None]
     quantity_power = np.array([power[c.quantity] for c in hit.channels])
-    spectra *= (2j * np.pi * axis) ** quantity_power[:, None]
+    spectra = np.empty((len(outputs), len(axis)), dtype=np.complex128)
+    for k, channel in enumerate(hit.channels):
+        factor = float(channel.dof.sign) * (2j * np.pi * axis) ** quantity_power[k]
+        np.multiply(np.asarray(rfft(np.asarray(hit.responses[k]))), factor, out=spectra[k])
     force = np.asarray(rfft(hit.force)) * hit.hit.impact.sign
     start_s = (hit.hit.peak - hit.hit.start) / rate
     curves = []
@@ -173,7 +173,7 @@ def _of_hit(
         first, stop = np.searchsorted(axis, [centre - CUT * width, centre + CUT * width])
         lines = slice(max(int(first), 1), int(stop))
         own = residues[task.mode, outputs, i]
-        weight = _weights(own, frfs.variance[outputs, i][:, lines])
+        weight = _weights(own, frfs.variance[outputs, i, lines])
         u, _ = pole_functions(2 * np.pi * axis[lines], poles, n / rate - start_s)
         mirrored, _ = pole_functions(2 * np.pi * axis[lines], poles.conj(), n / rate - start_s)
         share = residues[:, outputs, i] @ weight
@@ -182,7 +182,7 @@ def _of_hit(
         others = (share @ u + other_share @ mirrored) * force[lines] - mine
         signal = weight @ spectra[:, lines] - others
         band = _Band(axis[lines], lines.start, n, rate, centre, width)
-        scatter = (frfs.variance[outputs, i] * frfs.hits[outputs, i, None])[:, lines]
+        scatter = frfs.variance[outputs, i, lines] * frfs.hits[outputs, i, None]
         scatter *= (2 * np.pi * axis[lines]) ** (2 * quantity_power[:, None])
         noise = band.noise(np.abs(weight) ** 2 @ scatter * np.abs(force[lines]) ** 2, signal - mine)
         table = _read(band, signal, LEFT_OVER * others, noise, start_s, -FILTERED * pole.real)

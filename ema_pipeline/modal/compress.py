@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, synthesis
 from ema_pipeline.modal.noise import Noise, NoiseLaw
+from ema_pipeline.threads import in_order
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -98,18 +99,22 @@ def compress(window: Window) -> Local:
     if not compressible(data):
         return window.near()
     n_rows, n_ref, n_lines = data.frf.shape
-    log_level = np.zeros(n_rows)
-    for block in data.line_blocks():
-        part = window.lines(block.start, block.stop)
-        log_level += np.log(part.noise.at(part.data.frf).variance).sum(axis=(1, 2))
-    level = np.exp(-0.5 * log_level / (n_ref * n_lines))
-    gram = np.zeros((n_rows, n_rows))
-    for block in data.line_blocks():
-        local = window.lines(block.start, block.stop).near()
+
+    def log_variance(lines: slice) -> Real:
+        part = window.lines(lines.start, lines.stop)
+        return np.asarray(np.log(part.noise.at(part.data.frf).variance).sum(axis=(1, 2)))
+
+    blocks = data.line_blocks()
+    level = np.exp(-0.5 * sum(in_order(log_variance, blocks)) / (n_ref * n_lines))
+
+    def products(lines: slice) -> Real:
+        local = window.lines(lines.start, lines.stop).near()
         scaled = (local.data.frf * level[:, None, None]).reshape(n_rows, -1)
-        gram += (scaled @ scaled.conj().T).real
+        return np.asarray((scaled @ scaled.conj().T).real)
+
+    gram = sum(in_order(products, blocks))
     mixer = np.linalg.eigh(gram)[1][:, ::-1][:, :MAX_ROWS].T * level  # (kept, rows)
-    parts = [_mixed(window.lines(block.start, block.stop), mixer) for block in data.line_blocks()]
+    parts = list(in_order(lambda lines: _mixed(window.lines(lines.start, lines.stop), mixer), blocks))
     small = replace(
         data,
         frf=np.concatenate([frf for frf, _ in parts], axis=-1),

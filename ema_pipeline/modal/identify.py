@@ -36,7 +36,7 @@ from ema_pipeline.modal.sweep import (
     whole,
 )
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
-from ema_pipeline.threads import single_blas_thread
+from ema_pipeline.threads import in_order, single_blas_thread
 
 Progress = Callable[[float, str], None]
 Complex = NDArray[np.complex128]
@@ -286,12 +286,16 @@ def _synthesis(window: Window, modes: FittedModes) -> Complex:
     data = window.data
     total = np.empty(data.frf.shape, dtype=np.complex128)
     estimate = Estimate(modes.poles, modes.participation)
-    for rows in data.row_blocks():
+
+    def fill(rows: slice) -> None:
         some = data.rows(rows)
         fitted = synthesis(some, estimate, modes.shapes.T[rows])
         noise = window.noise.rows(rows).at(some.frf)
         fitted += residual_fit(some, noise.weight(some.measured), fitted)
         total[rows] = np.where(some.measured[..., None], fitted, np.nan)
+
+    for _ in in_order(fill, data.row_blocks()):
+        pass
     return np.asarray(total.swapaxes(0, 1) if data.transposed else total)
 
 

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.stats
 from numpy.typing import NDArray
 
+from ema_pipeline.choices import ModeChoice
+from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.modal.chosen import wanted
 from ema_pipeline.modal.data import analysis_band
 from ema_pipeline.modal.drift.align import NOTICED, Alignment, PeakMovement, align
 from ema_pipeline.modal.drift.windows import Hits
 from ema_pipeline.modal.identify import identify
-from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel, Mode
 from ema_pipeline.threads import single_blas_thread
@@ -55,11 +57,11 @@ class HitModes:
 
 def identify_hits(
     hits: Hits,
-    frfs: FrfSet,
+    measured: Callable[[], FrfSet],
     frf_settings: FrfSettings,
     settings: ModalSettings,
     progress: Progress | None = None,
-    wanted: KnownPeaks = NO_PEAKS,
+    included: Sequence[ModeChoice] = (),
 ) -> HitModes:
     """Identify modes from hits whose frequencies may differ from hit to hit.
 
@@ -67,24 +69,29 @@ def identify_hits(
     ----------
     hits : callable
         Gives the accepted hits, as often as it is called.
-    frfs : FrfSet
-        Of these hits, as measured.
+    measured : callable
+        Gives the FRFs of these hits as measured, so that they need not be kept beside the aligned ones.
     frf_settings : FrfSettings
         With which they were estimated.
     settings : ModalSettings
     progress : callable, optional
-    wanted : KnownPeaks, optional
-        As in `identify`.
+    included : sequence of ModeChoice, optional
+        Modes that the user wants, whatever the selection says.
 
     Returns
     -------
     HitModes
         The intervals of frequencies hold their scatter over hits.
     """
+    frfs = measured()
     with single_blas_thread():
         alignment = align(hits, frfs, frf_settings, analysis_band(frfs, settings))
-    modal = identify(alignment.frfs, settings, progress, alignment.known_peaks(), wanted)
-    return HitModes(with_movement(modal, alignment, frfs.response_decay_rad_s), alignment.frfs, alignment)
+        if alignment.shifts is not None:
+            del frfs
+            frfs = estimate_frfs(hits(), frf_settings, alignment.shifts)
+    asked = wanted(included, frfs.response_decay_rad_s)
+    modal = identify(frfs, settings, progress, alignment.known_peaks(), asked)
+    return HitModes(with_movement(modal, alignment, frfs.response_decay_rad_s), frfs, alignment)
 
 
 def with_movement(modal: ModalModel, alignment: Alignment, decay_rad_s: float = 0.0) -> ModalModel:

@@ -16,13 +16,13 @@ Neural Computation 21, 2009.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.data import AT_ONCE
+from ema_pipeline.modal.noise_kernel import quiet_lines, slopes
+from ema_pipeline.threads import over_rows
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -144,87 +144,75 @@ def fit_law(
         True for a roving hammer, where rows are inputs.
     """
     n_rows, n_ref, n_lines = power.shape
+    starts, spacing = _intervals(n_lines)
     hats = _hats(n_lines)
+    n_nodes = len(hats)
+    floor, quiet = np.empty((n_rows, n_ref)), np.empty((n_rows, n_ref))
+    sums = np.empty((4, n_rows, n_ref, n_nodes))
+    group = (n_rows, 1, n_nodes) if inputs_are_rows else (1, n_ref, n_nodes)
     axis = 1 if inputs_are_rows else 0  # the axis that outputs run along
-    at_once = max(1, AT_ONCE // (n_ref * n_lines))
-    blocks = [slice(k, min(k + at_once, n_rows)) for k in range(0, n_rows, at_once)]
-    floor, own_level = np.empty((n_rows, n_ref)), np.empty((n_rows, n_ref))
 
-    def prepared(rows: slice) -> _Block:
-        square = np.abs(response[rows]) ** 2
-        known = measured[rows, :, None] & np.isfinite(power[rows]) & (power[rows] > 0)
-        floor[rows] = FLOOR**2 * np.where(measured[rows], np.mean(square, axis=-1), 1.0)
-        z = np.where(known, np.maximum(np.where(known, power[rows], 1.0), floor[rows, :, None]), 1.0)
-        return _Block(rows, rows if inputs_are_rows else slice(None), known.astype(float), z, square)
+    def begin(rows: slice) -> None:
+        quiet_lines(power[rows], response[rows], measured[rows], FLOOR**2, floor[rows], quiet[rows])
 
-    kept = [prepared(blocks[0])] if len(blocks) == 1 else []
+    with over_rows(n_rows, power.size) as each:
+        each(begin)
+        # start: noise of each FRF at its quiet lines; a small common share
+        b = 1.78 * np.exp(quiet)
+        g, alpha = np.ones(group), np.full(group, 1e-4)
 
-    def each() -> Iterator[_Block]:
-        return iter(kept) if kept else map(prepared, blocks)
+        def derivatives() -> Real:
+            """By the variance, less and more: times |H|², and alone."""
+            full = [np.ascontiguousarray(np.broadcast_to(x, (n_rows, n_ref, n_nodes))) for x in (alpha, g)]
 
-    # start: noise of each FRF at its quiet lines; a small common share
-    for p in each():
-        with np.errstate(divide="ignore", invalid="ignore"):
-            quiet = np.exp(np.sum(p.mask * np.log(p.z), axis=-1) / np.maximum(p.mask.sum(axis=-1), 1)) * 1.78
-        own_level[p.rows] = np.where(quiet > 0, quiet, 1.0)
-    group_shape = (n_rows, 1, len(hats)) if inputs_are_rows else (1, n_ref, len(hats))
-    g, alpha, b = np.ones(group_shape), np.full(group_shape, 1e-4), own_level
+            def work(rows: slice) -> None:
+                a, s = full[0][rows], full[1][rows]
+                known = power[rows], response[rows], measured[rows], floor[rows]
+                slopes(*known, a, s, b[rows], starts, spacing, sums[:, rows])
 
-    def ratios(p: _Block) -> tuple[Real, Real]:
-        """Derivatives of the likelihood by the variance, less and more."""
-        own = b[p.rows, :, None] * (g[p.groups] @ hats)
-        v = (alpha[p.groups] @ hats) * p.square + own + floor[p.rows, :, None]
-        first = p.mask / v
-        return first, first * p.z / v
+            each(work)
+            return sums
 
-    for _ in range(ITERATIONS):
-        less, more = np.zeros(group_shape), np.zeros(group_shape)
-        for p in each():
-            first, second = ratios(p)
-            less[p.groups] += _collect(first * p.square, hats, axis)
-            more[p.groups] += _collect(second * p.square, hats, axis)
-        alpha = alpha * np.sqrt(more / less)
-        less, more = np.zeros(group_shape), np.zeros(group_shape)
-        for p in each():
-            first, second = ratios(p)
-            less[p.groups] += _collect(first * b[p.rows, :, None], hats, axis)
-            more[p.groups] += _collect(second * b[p.rows, :, None], hats, axis)
-        g = g * np.sqrt(more / less)
-        step = np.ones(b.shape)
-        for p in each():
-            first, second = ratios(p)
-            spectrum = g[p.groups] @ hats
+        for _ in range(ITERATIONS):
+            less, more, *_ = derivatives()
+            alpha = alpha * np.sqrt(_total(more, axis) / _total(less, axis))
+            *_, less, more = derivatives()
+            g = g * np.sqrt(_total(b[..., None] * more, axis) / _total(b[..., None] * less, axis))
+            *_, less, more = derivatives()
             with np.errstate(divide="ignore", invalid="ignore"):
-                ratio = np.sum(second * spectrum, axis=-1) / np.sum(first * spectrum, axis=-1)
-            step[p.rows] = np.sqrt(np.where(np.isfinite(ratio), ratio, 1.0))
-        b = b * step
+                ratio = np.sum(more * g, axis=-1) / np.sum(less * g, axis=-1)
+            b = b * np.sqrt(np.where(np.isfinite(ratio), ratio, 1.0))
     return NoiseLaw(alpha, g, b, floor, hats)
 
 
-@dataclass(frozen=True)
-class _Block:
-    """Some rows of the squared errors: where they are known, limited from below, and the FRFs' own power."""
-
-    rows: slice
-    groups: slice
-    mask: Real
-    z: Real
-    square: Real
-
-
-def _collect(values: Real, hats: Real, axis: int) -> Real:
-    """Sum over outputs and, with hat weights, over lines; never 0."""
-    return np.asarray(np.maximum(values.sum(axis=axis, keepdims=True) @ hats.T, 1e-300))
+def _total(values: Real, axis: int) -> Real:
+    """Sum over outputs; never 0."""
+    return np.asarray(np.maximum(values.sum(axis=axis, keepdims=True), 1e-300))
 
 
 def _hats(n_lines: int) -> Real:
     """Piecewise-linear functions that add up to 1, (n_nodes, n_lines)."""
-    n = int(np.clip(n_lines // LINES_PER_NODE, 1, MAX_NODES))
+    n = _n_nodes(n_lines)
     if n == 1:
         return np.ones((1, n_lines))
     nodes = np.linspace(0, n_lines - 1, n)
     x = np.arange(n_lines)
     return np.maximum(0.0, 1.0 - np.abs(x[None] - nodes[:, None]) / (nodes[1] - nodes[0]))
+
+
+def _n_nodes(n_lines: int) -> int:
+    return int(np.clip(n_lines // LINES_PER_NODE, 1, MAX_NODES))
+
+
+def _intervals(n_lines: int) -> tuple[NDArray[np.int64], float]:
+    """First line of every interval between nodes and one past the last line; lines from node to node."""
+    n = _n_nodes(n_lines)
+    if n == 1:
+        return np.array([0, n_lines]), float(n_lines)
+    spacing = (n_lines - 1) / (n - 1)
+    starts = np.ceil(spacing * np.arange(n)).astype(np.int64)
+    starts[-1] = n_lines
+    return starts, spacing
 
 
 def larger(a: Noise, b: Noise) -> Noise:

@@ -21,6 +21,7 @@ from ema_pipeline.modal.noise import Noise, fit_noise, larger
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
 from ema_pipeline.modal.polish import polish
 
+Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
 
 
@@ -112,7 +113,7 @@ def fit_segment(
             if lost.any():
                 estimate, held = _put_back(estimate, before, lost), held | lost
                 continue
-        noise = measured_noise(data, hits, estimate, solution, weight)
+        noise = measured_noise(data, hits, estimate, solution.shapes, weight)
         solution = solve_linear(data, noise.weight(data.measured), estimate)
         fit = SegmentFit(estimate, solution, noise, held)
         drop = judge(data, fit) if len(estimate.poles) else np.zeros(0, dtype=bool)
@@ -139,10 +140,10 @@ def _put_back(estimate: Estimate, before: Estimate, lost: NDArray[np.bool_]) -> 
 
 
 def measured_noise(
-    data: FitData, hits: Noise | None, estimate: Estimate, solution: LinearSolution, weight: Real
+    data: FitData, hits: Noise | None, estimate: Estimate, shapes: Complex, weight: Real
 ) -> Noise:
     """Noise from what the fit leaves over, and from the scatter over hits where that is larger."""
-    modes = synthesis(data, estimate, solution.shapes)
+    modes = synthesis(data, estimate, shapes)
     model = modes + residual_fit(data, weight, modes)
     n_lines = len(data.omega)
     n_ref = data.measured.shape[1]

@@ -22,7 +22,7 @@ from ema_pipeline.modal.credibility import (
 )
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.engines import MODES_PER_PEAK, SPARE_MODES
-from ema_pipeline.modal.fit import Estimate, free_participations, normalised, solve_linear
+from ema_pipeline.modal.fit import Estimate, best_shapes, free_participations, normalised, solve_linear
 from ema_pipeline.modal.missed import Search, missed
 from ema_pipeline.modal.noise import NoiseLaw
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, at_peak
@@ -36,6 +36,7 @@ from ema_pipeline.modal.uncertainty import (
     scores_of_points,
     shape_covariance,
 )
+from ema_pipeline.threads import in_order
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -216,11 +217,12 @@ def _voters(poles: PoleSet) -> Callable[[Estimate], Real]:
 
 def _shapes(window: Window, estimate: Estimate) -> Complex:
     """Shapes that fit best on all lines, (n_rows, n_modes)."""
-    shapes = []
-    for rows in window.data.row_blocks():
+
+    def of_rows(rows: slice) -> Complex:
         some = window.rows(rows).near()
-        shapes.append(solve_linear(some.data, some.noise.weight(some.data.measured), estimate).shapes)
-    return np.concatenate(shapes)
+        return best_shapes(some.data, some.noise.weight(some.data.measured), estimate)
+
+    return np.concatenate(list(in_order(of_rows, window.data.row_blocks())))
 
 
 def _fit_part(
@@ -332,17 +334,18 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand) -> Fitt
     parameters = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
     transposed = window.data.transposed
     if compressible(window.data):
-        made, scores = [], []
-        information = np.zeros_like(parameters)
-        for rows in window.data.row_blocks():
+        first = parameters
+
+        def of_rows(rows: slice) -> tuple[Complex, Real, Real, Real]:
             linear = _linear_fit(window.rows(rows), estimate)
-            made.append(_shapes_and_stds(*linear, parameters))
-            score, more = scores_of_points(transposed, estimate, linear[1].solution)
-            scores.append(score)
-            information += more
-        shapes, stds = np.concatenate([s for s, _ in made]), np.concatenate([s for _, s in made])
+            scores = scores_of_points(transposed, estimate, linear[1].solution)
+            return *_shapes_and_stds(*linear, first), *scores
+
+        each = zip(*in_order(of_rows, window.data.row_blocks()), strict=True)
+        some_shapes, some_stds, scores, information = (list(x) for x in each)
+        shapes, stds = np.concatenate(some_shapes), np.concatenate(some_stds)
         points = np.concatenate(scores) if transposed else np.sum(scores, axis=0)
-        parameters = _widened(parameters, scatter_over_points(points, information))
+        parameters = _widened(parameters, scatter_over_points(points, np.sum(information, axis=0)))
     else:
         scatter = scatter_over_points(*scores_of_points(transposed, estimate, fit.solution))
         parameters = _widened(parameters, scatter)
@@ -376,16 +379,15 @@ def _linear_fit(window: Window, estimate: Estimate) -> tuple[FitData, SegmentFit
     data, noise = local.data, local.noise
     for _ in range(2):
         weight = noise.weight(data.measured)
-        solution = solve_linear(data, weight, estimate)
-        noise = measured_noise(data, local.hits, estimate, solution, weight)
+        shapes = best_shapes(data, weight, estimate)
+        noise = measured_noise(data, local.hits, estimate, shapes, weight)
     solution = solve_linear(data, noise.weight(data.measured), estimate)
     return data, SegmentFit(estimate, solution, noise, np.zeros(len(estimate.poles), dtype=bool))
 
 
 def _shapes_and_stds(data: FitData, fit: SegmentFit, parameters: Real) -> tuple[Complex, Real]:
     """Shapes of some rows and their standard deviations, (n_rows, n_modes)."""
-    weight = fit.noise.weight(data.measured)
-    cov = shape_covariance(data, weight, fit.estimate, fit.solution, fit.noise, parameters)
+    cov = shape_covariance(data, fit.estimate, fit.solution, fit.noise, parameters)
     diagonal = np.einsum("oaa->oa", cov)
     return fit.solution.shapes, np.sqrt(0.5 * (diagonal[:, 0::2] + diagonal[:, 1::2]))
 

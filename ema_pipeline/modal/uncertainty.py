@@ -14,7 +14,6 @@ from ema_pipeline.modal.fit import (
     newton_step,
     parameter_columns,
     solve_scaled,
-    weighted_grams,
 )
 from ema_pipeline.modal.noise import Noise
 from ema_pipeline.modal.windowed import power_of
@@ -67,7 +66,8 @@ def parameter_covariance(
                 continue
             coefficients = z[o, i].copy()
             coefficients[: 2 * m] -= mix[i] @ eliminated[o]
-            a = coefficients.T @ _projected(signal, residual, w) * w  # (n_par, n_lines)
+            seen = coefficients.T @ _parts(_projected(signal, residual, w))
+            a = seen.view(np.complex128) * w  # (n_par, n_lines)
             meat += 0.5 * power_of(a.conj() * np.sqrt(noise.own[o, i]), data)
             size = np.abs(data.frf[o, i])
             phase = np.where(size > 0, data.frf[o, i] / np.maximum(size, 1e-300), 0.0)
@@ -147,19 +147,16 @@ def left_to_go(estimate: Estimate, solution: LinearSolution) -> Real:
 
 
 def shape_covariance(
-    data: FitData,
-    weight: Real,
-    estimate: Estimate,
-    solution: LinearSolution,
-    noise: Noise,
-    parameters: Real,
+    data: FitData, estimate: Estimate, solution: LinearSolution, noise: Noise, parameters: Real
 ) -> Real:
     """Covariance of (Re, Im) of all modes' shape entries of each row, the poles' errors included.
 
     Parameters
     ----------
-    data, weight, estimate, solution, noise
+    data, estimate, noise
         As for `parameter_covariance`; rows are independent of each other.
+    solution : LinearSolution
+        Of a fit weighted by one over the variance of `noise`.
     parameters : ndarray, (n_parameters, n_parameters)
         From `parameter_covariance`.
 
@@ -167,23 +164,28 @@ def shape_covariance(
     -------
     ndarray, (n_rows, 2M, 2M)
     """
-    m = len(estimate.poles)
+    if data.window_rad_s > 0:
+        meat = _meat_of_shapes(data, estimate, noise)
+    else:  # with independent lines and these weights it is the normal matrix
+        meat = 0.5 * solution.normal
+    inverse = np.array([_inverse(normal) for normal in solution.normal])
+    eliminated = _eliminated(estimate, solution)
+    out = inverse @ meat @ inverse
+    out += np.einsum("oap,pq,obq->oab", eliminated, parameters, eliminated, optimize=True)
+    return np.asarray(out)
+
+
+def _meat_of_shapes(data: FitData, estimate: Estimate, noise: Noise) -> Real:
+    """Covariance of the right-hand sides that give the shapes of each row, (n_rows, 2M, 2M)."""
     mix = mixing(estimate.participation)
     columns, _ = real_columns(data.omega, estimate.poles, data.rest_s)
     residual = residual_columns(data.omega)
-    variance = noise.variance
-    out = np.zeros((len(data.frf), 2 * m, 2 * m))
-    for o in range(len(data.frf)):
-        meat = np.zeros((2 * m, 2 * m))
-        for i in range(data.frf.shape[1]):
-            w = weight[o, i]
-            if np.any(w):
-                x = mix[i].T @ _projected(columns, residual, w) * w
-                meat += 0.5 * power_of(x.conj() * np.sqrt(variance[o, i]), data)
-        inverse = _inverse(solution.normal[o])
-        out[o] = inverse @ meat @ inverse
-    eliminated = _eliminated(estimate, solution)
-    out += np.einsum("oap,pq,obq->oab", eliminated, parameters, eliminated, optimize=True)
+    variance, weight = noise.variance, noise.weight(data.measured)
+    out = np.zeros((len(data.frf), len(columns), len(columns)))
+    for o, i in np.ndindex(*data.measured.shape):
+        if np.any(weight[o, i]):
+            x = mix[i].T @ _projected(columns, residual, weight[o, i]) * weight[o, i]
+            out[o] += 0.5 * power_of(x.conj() * np.sqrt(variance[o, i]), data)
     return out
 
 
@@ -197,9 +199,15 @@ def _eliminated(estimate: Estimate, solution: LinearSolution) -> Real:
 
 def _projected(columns: Complex, residual: Complex, weight: Real) -> Complex:
     """Columns with what the residual terms can follow taken off, for one FRF's weights (n_lines,)."""
-    corner, *_ = weighted_grams(residual, weight[None], np.zeros((1, len(weight)), complex))
-    side = (residual.conj() * weight) @ columns.T
-    return np.asarray(columns - np.linalg.lstsq(corner[0], side.real, rcond=None)[0].T @ residual)
+    at, to = _parts(residual), _parts(columns)
+    weighted = at * np.repeat(weight, 2)
+    coefficients = np.linalg.lstsq(weighted @ at.T, weighted @ to.T, rcond=None)[0]
+    return np.asarray((to - coefficients.T @ at).view(np.complex128))
+
+
+def _parts(values: Complex) -> Real:
+    """Real and imaginary parts side by side: products with real matrices then cost half, (n, 2·n_lines)."""
+    return np.ascontiguousarray(values).view(np.float64)
 
 
 def _inverse(matrix: Real) -> Real:

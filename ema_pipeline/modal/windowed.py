@@ -34,7 +34,8 @@ def power_of(factors: Complex, data: FitData) -> Real:
     ndarray, (n, n)
     """
     if data.window_rad_s <= 0:
-        return np.asarray((factors @ factors.conj().T).real)
+        parts = np.ascontiguousarray(factors).view(np.float64)  # real and imaginary parts side by side
+        return np.asarray(parts @ parts.T)
     n_lines = factors.shape[1]
     step = (data.omega[1] - data.omega[0]) / (2 * data.window_rad_s)
     kernel = 1 / (1 + 1j * step * np.arange(n_lines))

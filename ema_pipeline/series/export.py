@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ema_pipeline.errors import EmaError
 from ema_pipeline.files import replacing
 from ema_pipeline.series.database import SeriesDatabase, rows_of
 
@@ -43,8 +45,10 @@ def export_series(database: SeriesDatabase, to: Path, parquet: bool = False) -> 
     Raises
     ------
     EmaError
-        If the folder cannot be written.
+        If the folder cannot be written, or if what writes Parquet is not installed.
     """
+    if parquet and importlib.util.find_spec("pyarrow") is None:
+        raise EmaError("--parquet needs pyarrow; install it with: pip install 'ema-pipeline[parquet]'")
     to.mkdir(parents=True, exist_ok=True)
     tables = {"tests": wide_table(database)} | {name: database.table(name) for name in LONG_TABLES}
     written = []

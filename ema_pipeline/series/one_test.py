@@ -37,7 +37,7 @@ class Task:
     effect_files: tuple[str, ...] = ()
 
 
-SERIES_SETTINGS = ("diagnose.processes=1",)
+SERIES_SETTINGS = ("processes=1", "diagnose.processes=1")
 """Tests are worked on side by side, so that each has one process; no result depends on it."""
 
 

@@ -91,8 +91,10 @@ class StoredRecords(Sequence[Record]):
 @contextlib.contextmanager
 def stored_records(store: Store, configuration: str) -> Iterator[StoredRecords]:
     """The records of one configuration in the store."""
-    with store.reading() as file:
-        yield StoredRecords(file[f"stages/ingest/{configuration}/records"])
+    with store.group("ingest", configuration) as group:
+        if group is None:
+            raise EmaError(f"{store.path}: holds no records of '{configuration}'; run it again")
+        yield StoredRecords(codec.member(group, "records"))
 
 
 def accepted_hits(store: Store, configuration: str, progress: Progress = silent) -> Iterator[HitSamples]:

@@ -35,6 +35,9 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
     frfs = run.store.load("frf", configuration, "frfs", FrfSet)
     modal = run.store.load("modal", configuration, "modal", ModalModel)
+    modal = replace(
+        modal, synthesis=modal.synthesis[..., :0].copy()
+    )  # as large as the FRFs, and not asked for
     settings = cast(LevelSettings, run.settings[NAME])
     modal_settings = cast("ModalStageSettings", run.settings["modal"])
     study = study_levels(

@@ -46,20 +46,26 @@ def _identified(run: Run, configuration: str, progress: Progress) -> ModalModel:
         measured = read_mode_table(Path(run.info.raw), run.require_model(NAME))
         return to_modal_model(measured[configuration])
     settings = cast("ModalStageSettings", run.settings[NAME])
-    frfs = run.store.load("frf", configuration, "frfs", FrfSet)
+
+    def load_frfs() -> FrfSet:
+        return run.store.load("frf", configuration, "frfs", FrfSet)
+
     if settings.method == "circle":
-        return identify_by_circle(frfs, settings.circle)
-    asked = wanted(run.info.choices.of(configuration).included_modes, frfs.response_decay_rad_s)
+        return identify_by_circle(load_frfs(), settings.circle)
+    included = run.info.choices.of(configuration).included_modes
     if run.info.kind == "continuous":
-        modal = identify(frfs, settings.identify, progress, wanted=asked)
+        frfs = load_frfs()
+        modal = identify(
+            frfs, settings.identify, progress, wanted=wanted(included, frfs.response_decay_rad_s)
+        )
         return attach_circles(frfs, modal, settings.circle)
     found = identify_hits(
         lambda: accepted_hits(run.store, configuration),
-        frfs,
+        load_frfs,
         cast(FrfSettings, run.settings["frf"]),
         settings.identify,
         progress,
-        asked,
+        included,
     )
     modal = attach_circles(found.frfs, found.modal, settings.circle)
-    return pooled(modal, found.alignment, frfs.record_s, frfs.response_decay_rad_s)
+    return pooled(modal, found.alignment, found.frfs.record_s, found.frfs.response_decay_rad_s)

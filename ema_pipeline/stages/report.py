@@ -25,16 +25,18 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Write every file of the results folder but the store."""
-    from ema_pipeline.report.html import write_report
-    from ema_pipeline.report.loops import write_loops_summary
-    from ema_pipeline.report.summary_files import write_modes_csv, write_summary
+    from ema_pipeline.report.html import write_report  # drawing libraries are loaded where they are needed
 
     settings = cast(ReportSettings, run.settings[NAME])
     folder = run.store.folder
     results = load_results(run)
     if results.loops is not None:
+        from ema_pipeline.report.loops import write_loops_summary
+
         write_loops_summary(results, results.loops, folder / "summary.json")
     else:
+        from ema_pipeline.report.summary_files import write_modes_csv, write_summary
+
         write_summary(results, folder / "summary.json")
         write_modes_csv(results, folder / "modes.csv")
     write_report(results, folder / "report.html")

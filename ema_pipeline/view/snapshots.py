@@ -6,17 +6,17 @@ snapshot that costs no copy.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 from pathlib import Path
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.store import Store
+from ema_pipeline.files import link_or_copy
+from ema_pipeline.store import PARTS_FOLDER, RESULTS_FILE, Store
 
 FOLDER = ".view-"
 """Begins the name of a server's folder of snapshots; its process number follows."""
-FILES = ("ema.h5", "summary.json", "modes.csv", "report.html")
+FILES = (RESULTS_FILE, "summary.json", "modes.csv", "report.html")
 
 
 class Snapshots:
@@ -49,9 +49,12 @@ class Snapshots:
         self._count += 1
         place = self._room / str(self._count)
         place.mkdir(parents=True)
+        (place / PARTS_FOLDER).mkdir()
+        for part in Store(self._folder).parts():
+            link_or_copy(part, place / PARTS_FOLDER / part.name)
         for name in FILES:
             if (self._folder / name).is_file():
-                _link(self._folder / name, place / name)
+                link_or_copy(self._folder / name, place / name)
         self._kept.append(place)
         for old in self._kept[: -self._most]:
             shutil.rmtree(old, ignore_errors=True)
@@ -69,6 +72,8 @@ class Snapshots:
         if not (place / FILES[0]).is_file():
             raise EmaError(f"{place}: the earlier state is gone; take the change back with 'ema remove'")
         with Store(self._folder).lock():
+            for part in (place / PARTS_FOLDER).iterdir():
+                os.replace(part, self._folder / PARTS_FOLDER / part.name)
             for name in reversed(FILES):  # the store last: until then the folder is in its later state
                 if (place / name).is_file():
                     os.replace(place / name, self._folder / name)
@@ -95,11 +100,3 @@ def _running(process: str) -> bool:
     except OSError:
         return True
     return True
-
-
-def _link(source: Path, target: Path) -> None:
-    """A hard link, or a copy where the file system has none."""
-    with contextlib.suppress(OSError):
-        os.link(source, target)
-        return
-    shutil.copyfile(source, target)

@@ -1,4 +1,4 @@
-"""FRFs of hits whose frequencies have moved, brought to where they belong together."""
+"""What moves from hit to hit, and where every hit has to be read so that all belong together."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.frf.estimate import estimate_frfs
+from ema_pipeline.frf.estimate import Shifts
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import HitSamples
@@ -82,25 +82,27 @@ class PeakMovement:
 
 @dataclass(frozen=True)
 class Alignment:
-    """FRFs brought together, and what had moved.
+    """What had moved, and how hits are brought together.
 
     Attributes
     ----------
-    frfs : FrfSet
-        Of the hits at common frequencies; the measured ones where nothing moves.
     common_spread : float
         Standard deviation over hits of the factor that all frequencies share.
     n_hits : int
     peaks : tuple of PeakMovement
-    aligned : bool
-        True where FRFs were brought together.
+    shifts : callable or None
+        With which FRFs are estimated at common frequencies; None where nothing moves enough to be noticed.
     """
 
-    frfs: FrfSet
     common_spread: float
     n_hits: int
     peaks: tuple[PeakMovement, ...]
-    aligned: bool
+    shifts: Shifts | None = None
+
+    @property
+    def aligned(self) -> bool:
+        """True where hits have to be brought together."""
+        return self.shifts is not None
 
     def known_peaks(self) -> KnownPeaks:
         """Peaks that move, and of which hits on several points show that one mode is there.
@@ -114,10 +116,8 @@ class Alignment:
         return KnownPeaks(poles, REACH * -poles.real + 2 * spread * poles.imag, std)
 
 
-def align(
-    hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float, float], *, move: bool = True
-) -> Alignment:
-    """Estimate what moves from hit to hit, and estimate the FRFs anew without it.
+def align(hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float, float]) -> Alignment:
+    """Estimate what moves from hit to hit.
 
     Parameters
     ----------
@@ -129,10 +129,8 @@ def align(
         With which they were estimated.
     band_hz : tuple of float
         Band in which peaks are looked at.
-    move : bool
-        False to look at the movement only.
     """
-    nothing = Alignment(frfs, 0.0, int(frfs.hits.max(initial=0)), (), aligned=False)
+    nothing = Alignment(0.0, int(frfs.hits.max(initial=0)), ())
     windows = peak_windows(frfs, band_hz)
     if not windows:
         return nothing
@@ -146,17 +144,15 @@ def align(
     if len(keys) < FEWEST_HITS or not peaks:
         return nothing
     moved, looked_at = _movements(peaks, keys)
-    warps = _warps(peaks, looked_at, moved, frfs.frequency_hz) if move else {}
-    if warps is None or not warps:
-        return Alignment(frfs, moved.spread, len(keys), looked_at, aligned=False)
+    warps = _warps(peaks, looked_at, moved, frfs.frequency_hz)
+    if not warps:
+        return Alignment(moved.spread, len(keys), looked_at)
     by_hit = {key.name: warps[k] for k, key in enumerate(keys)}
 
     def shift_of(hit: HitSamples) -> Real:
         return by_hit[hit.hit.file, hit.hit.number]
 
-    return Alignment(
-        estimate_frfs(hits(), settings, shift_of), moved.spread, len(keys), looked_at, aligned=True
-    )
+    return Alignment(moved.spread, len(keys), looked_at, shift_of)
 
 
 def _movements(peaks: list[PeakPoles], keys: tuple[HitKey, ...]) -> tuple[Movement, tuple[PeakMovement, ...]]:

@@ -107,10 +107,17 @@ def _level_steps(sizes: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.where(there, _steps(np.log10(np.where(there, sizes, 1.0)), DECADES, 65534), 65535)
 
 
+_LINES_AT_ONCE = 1024
+"""Lines of all FRFs that are copied at a time."""
+
+
 def packed_cmif(frfs: FrfSet, high_hz: float, most: int = 1500) -> dict[str, list[float]]:
     """The first mode indicator over the frequency; of groups of lines the largest."""
-    lines = (frfs.frequency_hz > 0) & (frfs.frequency_hz <= high_hz)
-    first, frequency = cmif(frfs.accelerance()[..., lines], 1)[0], frfs.frequency_hz[lines]
+    shown = np.flatnonzero((frfs.frequency_hz > 0) & (frfs.frequency_hz <= high_hz))
+    begin, stop = (int(shown[0]), int(shown[-1]) + 1) if shown.size else (0, 0)
+    blocks = [slice(k, min(k + _LINES_AT_ONCE, stop)) for k in range(begin, stop, _LINES_AT_ONCE)]
+    first = np.concatenate([np.zeros(0), *(cmif(frfs.accelerance(lines), 1)[0] for lines in blocks)])
+    frequency = frfs.frequency_hz[shown]
     step = -(-frequency.size // most) or 1
     size = frequency.size // step * step
     return {

@@ -1,0 +1,28 @@
+"""The compiled loop of `fit.weighted_grams`: products of all pairs of columns, line by line."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Real = NDArray[np.float64]
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+def products(re: Real, im: Real, out: Real) -> None:
+    """Re(conj(a) b) for all pairs of columns a and b that is not before it.
+
+    Parameters
+    ----------
+    re, im : ndarray, (n_columns, n_lines)
+        In C order.
+    out : ndarray, (n_columns·(n_columns + 1)/2, n_lines)
+        Made; pairs in the order of ``numpy.triu_indices``.
+    """
+    row = 0
+    for i in range(re.shape[0]):
+        for j in range(i, re.shape[0]):
+            for k in range(re.shape[1]):
+                out[row, k] = re[i, k] * re[j, k] + im[i, k] * im[j, k]
+            row += 1

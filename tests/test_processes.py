@@ -1,0 +1,142 @@
+"""Work shared among processes and threads: same results, nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.processes import Send, side_by_side
+from ema_pipeline.threads import cores, in_order, over_rows, share_cores
+
+
+def test_jobs_are_done_in_processes_of_their_own_and_what_they_tell_is_heard() -> None:
+    heard: list[tuple[str, int, int]] = []
+
+    def job(item: str, send: Send) -> None:
+        for k in range(3):
+            send((item, k, os.getpid()))
+
+    side_by_side(job, ["a", "b", "c"], 2, heard.append)
+    for item in "abc":
+        own = [(k, process) for name, k, process in heard if name == item]
+        assert [k for k, _ in own] == [0, 1, 2]
+        assert os.getpid() not in {process for _, process in own}
+
+
+def test_never_more_processes_run_than_allowed() -> None:
+    running, most = set(), [0]
+
+    def hear(message: tuple[str, str]) -> None:
+        what, item = message
+        (running.add if what == "begins" else running.discard)(item)
+        most[0] = max(most[0], len(running))
+
+    def job(item: str, send: Send) -> None:
+        send(("begins", item))
+        time.sleep(0.05)
+        send(("ends", item))
+
+    side_by_side(job, list("abcdef"), 2, hear)
+    assert most[0] == 2
+
+
+def test_the_first_item_that_fails_is_told_and_the_others_are_done() -> None:
+    done: list[str] = []
+
+    def job(item: str, send: Send) -> None:
+        if item in "bc":
+            raise EmaError(f"{item} is wrong")
+        send(item)
+
+    with pytest.raises(EmaError, match="b is wrong"):
+        side_by_side(job, list("abdc"), 2, done.append)
+    assert sorted(done) == ["a", "d"]
+
+
+def test_a_worker_that_is_killed_is_an_error_and_no_hang() -> None:
+    def job(item: int, send: Send) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    with pytest.raises(MemoryError, match="ended before its time"):
+        side_by_side(job, [1], 2, lambda message: None)
+
+
+def test_an_interruption_ends_the_workers() -> None:
+    workers: list[int] = []
+
+    def job(item: int, send: Send) -> None:
+        send(os.getpid())
+        time.sleep(60)
+
+    def hear(message: int) -> None:
+        workers.append(message)
+        if len(workers) == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        side_by_side(job, [1, 2], 2, hear)
+    assert not any(Path(f"/proc/{worker}").exists() for worker in workers)
+
+
+def test_rows_in_threads_and_in_one_are_the_same() -> None:
+    values = np.random.default_rng(1).normal(size=(37, 5000))
+    sums = []
+    for numbers in (values.size * 100, 0):  # worth a thread, and not
+        out = np.full(len(values), np.nan)
+
+        def work(rows: slice, out: np.ndarray = out) -> None:
+            out[rows] = values[rows].sum(axis=1)
+
+        with over_rows(len(values), numbers) as each:
+            each(work)
+        sums.append(out)
+    assert np.array_equal(*sums)
+
+
+def test_what_threads_call_stays_in_their_thread() -> None:
+    if cores() < 2:
+        pytest.skip("one processor")
+
+    def inner(item: int) -> set[int]:
+        return set(in_order(lambda _: threading.get_ident(), range(8)))
+
+    assert all(len(threads) == 1 for threads in in_order(inner, range(8)))
+
+
+def test_processes_beside_each_other_share_the_processors() -> None:
+    seen: list[int] = []
+
+    def job(item: int, send: Send) -> None:
+        share_cores(2)
+        send(cores())
+
+    side_by_side(job, [1], 2, seen.append)
+    assert seen == [max(1, cores() // 2)]
+
+
+def test_configurations_side_by_side_give_the_digits_of_one_after_the_other(tmp_path: Path) -> None:
+    sample = Path(__file__).parents[1] / "sample_data" / "hidden_effect"
+    tables = []
+    for processes in ("1", "2"):
+        out = tmp_path / processes
+        code = "import sys; from ema_pipeline.cli import main; sys.argv[0] = 'ema'; main()"
+        stages = 'stages=["ingest", "hits", "frf", "modal", "levels", "report"]'
+        command = ["run", str(sample), "--out", str(out), "--set", f"processes={processes}", "--set", stages]
+        done = subprocess.run(
+            [sys.executable, "-c", code, *command], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        for configuration in ("no_ring", "with_ring"):
+            own = [x.split(" (")[0] for x in done.stderr.splitlines() if f"({configuration})" in x]
+            assert own == ["ingest", "hits", "frf", "modal", "levels"]
+        tables.append((out / "modes.csv").read_bytes())
+    assert tables[0] == tables[1]
