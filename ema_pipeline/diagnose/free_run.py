@@ -96,8 +96,8 @@ def _simulated(
     for name, value in unknowns.items():
         if name in problem.unknowns.index:
             x[problem.unknowns.index[name]] = value
-    states = [i for i, n in enumerate(problem.unknowns.names) if n.startswith("state ")]
-    if states and not any(problem.unknowns.names[i] in unknowns for i in states):
+    states = problem.unknowns.names[len(problem.model.unknowns) :]
+    if states and not any(n in unknowns for n in states):
         x = problem.settled(x)
     motions = problem.motions(x)
     if motions is None:

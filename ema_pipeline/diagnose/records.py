@@ -90,10 +90,9 @@ def diagnose_records(
 
 
 def search_pieces(observations: RecordObservations) -> RecordObservations:
-    """The same test by pieces of its records."""
-    records = [d.record for d in observations.data]
+    """The same test by windows of its records, and pieces of those held out."""
     return observations.with_records(
-        thinned(records, SEARCHED),
+        observations.in_windows(SEARCHED),
         thinned(observations.held_out, SEARCHED),
         observations.basis.calibrated(),
         COARSE,

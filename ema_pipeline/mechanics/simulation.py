@@ -35,6 +35,9 @@ frequency; laws with kinks, such as hysteresis, need it too. While hypotheses ar
 MOST_SUBSTEPS = 64
 _PADDING = 400
 """Samples by which a record is continued at both ends before it is interpolated."""
+HYSTERESIS, RELAXATION = 3, 5
+WITH_MEMORY = (HYSTERESIS, RELAXATION)
+"""Kinds of elements, as `coded_law` has them, that have a memory."""
 _NO_LOSS = 1e-6
 """Least σ of a Bouc-Wen law: below it, it is a spring."""
 

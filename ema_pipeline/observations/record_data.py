@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.fft import rfft
+from scipy.fft import irfft, rfft
 
 from ema_pipeline.ingest.driven import DrivenRecord
 from ema_pipeline.mechanics.simulation import between_samples
@@ -25,6 +25,8 @@ _BLOCKS = 4
 """Pieces of a long record that stand for it while hypotheses are compared."""
 _LEAST_BLOCK = 1024
 """Shortest such piece, samples."""
+_LEAST_WINDOW = 64
+"""Shortest window, samples: fewer do not fill the bands of frequency."""
 _GLIDING = ("sweep", "chirp")
 
 
@@ -38,10 +40,16 @@ class RecordData:
         Of a periodic one the mean period.
     noise : ndarray, (n_outputs, BANDS)
         1 σ of a sample of the response within each band, from its scatter over periods; 0 where there is none.
+    within : RecordData, optional
+        The record that this one is a window of: its force between samples is known beyond the ends of the window.
+    at : int
+        First sample of the window there.
     """
 
     record: DrivenRecord
     noise: NDArray[np.float64]
+    within: RecordData | None = None
+    at: int = 0
 
     @classmethod
     def of(cls, record: DrivenRecord) -> RecordData:
@@ -61,6 +69,31 @@ class RecordData:
         band = _bands(record.period)
         power = np.sum(lines**2, axis=1) / (count - 1) / count
         return cls(mean, np.sqrt([[float(np.mean(p[band == b])) for b in range(BANDS)] for p in power]))
+
+    def windows(self, size: int, most: int) -> list[RecordData]:
+        """The record in windows of `size` samples, no more than `most`, evenly spread; each starts from a state of its own.
+
+        The ends of a record that does not repeat are left out: no state is known from what is integrated there.
+        """
+        record, first = self.record, self.compared.start or 0
+        size = min(max(size, _LEAST_WINDOW), (record.n_samples - first) // 2)
+        first += 0 if self.periodic else size // 2
+        count = (record.n_samples - first - (0 if self.periodic else size // 2)) // size
+        chosen = np.unique(np.linspace(0, count - 1, min(max(most, 1), count)).astype(int))
+        found = []
+        for at in (first + chosen * size).tolist():
+            part = slice(at, at + size)
+            window = replace(
+                record,
+                name=f"{record.name} from sample {at}",
+                force=record.force[:, part],
+                responses=record.responses[:, part],
+                first=record.first + at,
+                period=0,
+                transient=0,
+            )
+            found.append(RecordData(window, self.noise, self, at))
+        return found
 
     @property
     def periodic(self) -> bool:
@@ -101,10 +134,52 @@ class RecordData:
     def fine_force(self, substeps: int) -> NDArray[np.float64]:
         """Force at the ends and middles of the steps, and a column of ones, see `between_samples`."""
         known: dict[int, NDArray[np.float64]] = self.__dict__.setdefault("_fine", {})
+        if self.within is not None:
+            whole = self.within.fine_force(substeps)
+            return whole[2 * substeps * self.at :][: 2 * substeps * (self.record.n_samples - 1) + 1]
         if substeps not in known:
             fine = between_samples(self.record.force, 2 * substeps, self.periodic)
             known[substeps] = np.concatenate([fine, np.ones((len(fine), 1))], axis=1)
         return known[substeps]
+
+    def motion(self, slowest_hz: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Displacements and velocities that the sensors suggest, (n_outputs, n_samples) each.
+
+        Parameters
+        ----------
+        slowest_hz : float
+            Frequency below which a structure does not move: what is integrated below it is noise.
+        """
+        if self.within is not None:
+            part = slice(self.at, self.at + self.record.n_samples)
+            x, v = self.within.motion(slowest_hz)
+            return x[:, part], v[:, part]
+        known: dict[float, tuple[NDArray[np.float64], NDArray[np.float64]]] = self.__dict__.setdefault("_motion", {})
+        if slowest_hz not in known:
+            pairs = [
+                _integrated(signal, self.record.sample_rate_hz, slowest_hz, _POWER[c.quantity], self.periodic)
+                for signal, c in zip(self.record.responses, self.record.channels, strict=True)
+            ]
+            known[slowest_hz] = np.array([x for x, _ in pairs]), np.array([v for _, v in pairs])
+        return known[slowest_hz]
+
+
+_POWER = {"displacement": 0, "velocity": 1, "acceleration": 2}
+
+
+def _integrated(
+    signal: NDArray[np.float64], rate: float, slowest_hz: float, power: int, periodic: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Displacement and velocity of a signal that is the derivative of a displacement of order `power`."""
+    count = len(signal)
+    pad = 0 if periodic else count - 1
+    whole = np.pad(signal, pad, mode="reflect", reflect_type="odd") if pad else signal
+    omega = 2j * np.pi * rate * np.fft.rfftfreq(len(whole))
+    spectrum = np.asarray(rfft(whole))
+    seen = np.abs(omega) > 2 * np.pi * slowest_hz
+    factor = np.where(seen, omega, 1.0) ** -power
+    x = np.where(seen | (power == 0), spectrum * factor, 0.0)
+    return tuple(np.asarray(irfft(s, len(whole)))[pad : pad + count] for s in (x, x * omega))  # type: ignore[return-value]
 
 
 def _lines(samples: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -21,7 +21,13 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Damper
 from ema_pipeline.mechanics.modes import eigen_solution
-from ema_pipeline.mechanics.simulation import DrivenSystem, Slopes, driven_system
+from ema_pipeline.mechanics.simulation import (
+    WITH_MEMORY,
+    DrivenSystem,
+    Slopes,
+    coded_law,
+    driven_system,
+)
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.observations.parts import (
     DAMPING,
@@ -288,6 +294,16 @@ class RecordModel:
         m_phi = system.mass @ shapes
         damping = system.damping + (m_phi * (2 * ratio * np.sqrt(np.maximum(values, 0.0)))) @ m_phi.T
         return dataclasses.replace(system, damping=damping, modal_damping_ratio=0.0)
+
+    @cached_property
+    def memories(self) -> tuple[tuple[str, int], ...]:
+        """Name and number of every element that has a memory, among the nonlinear ones."""
+        assembly = self.rig_model.assembly(
+            self.basis.configuration, self._inner(self.start())[self.rig_model.shape_start :]
+        )
+        return tuple(
+            (e.name, j) for j, e in enumerate(assembly.nonlinear) if coded_law(e)[0] in WITH_MEMORY
+        )
 
     def driven(self, x: NDArray[np.float64]) -> DrivenSystem:
         """What is marched at `x`: the forces' columns, then one of their offsets."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Residuals, Unknowns, joined
 from ema_pipeline.ingest.driven import DrivenRecord
+from ema_pipeline.mechanics.simulation import HYSTERESIS, DrivenSystem, Slopes
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, RecordData
 from ema_pipeline.observations.record_model import RecordModel
@@ -26,6 +27,8 @@ _BEGIN_SAMPLES = 50
 """Samples that tell the state at the start of a record which is held out, where the test states no transient."""
 _EDGE = 400
 """Samples behind these that the interpolation of the force sees."""
+_MEMORY = 0.5
+"""1 σ of the memory of an element at the start of a record, as a share of the largest or of a typical one."""
 _ROUNDS = 4
 _LEAST_NOISE = 1e-5
 """Noise, in units of the discrepancy, that nothing falls below."""
@@ -44,21 +47,25 @@ class RecordProblem(EffectProblem):
 
     @cached_property
     def unknowns(self) -> Unknowns:
-        """The model's unknowns, and the state at the start of every record that is not periodic."""
+        """The model's unknowns, and the state at the start of every record that is not periodic.
+
+        States are named after the model: what one model makes of them leads a fit of another one astray.
+        """
+        effects = "".join(f", {e.label}" for e in self.model.rig_model.effects)
         return joined(
             self.model.unknowns,
             *(
-                Unknowns.plain(
-                    [f"state {k + 1} at the start of {d.record.name}" for k in range(self._states)], 1.0
-                )
+                Unknowns.plain([f"{state} at the start of {d.record.name}{effects}" for state in self._states], 1.0)
                 for d in self.observations.data
                 if not d.periodic
             ),
         )
 
-    @property
-    def _states(self) -> int:
-        return len(self.observations.begin_scale)
+    @cached_property
+    def _states(self) -> tuple[str, ...]:
+        """What is unknown at the start of a record: displacements, velocities, memories of elements that have one."""
+        moving = (f"state {k + 1}" for k in range(len(self.observations.begin_scale)))
+        return (*moving, *(f"memory of {name}" for name, _ in self.model.memories))
 
     def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
         """See `EffectProblem`."""
@@ -96,7 +103,7 @@ class RecordProblem(EffectProblem):
             sigma = np.sqrt(variance.total) * heat
             values.append(((data.measured - predicted) / sigma).ravel())
             spread.append(variance)
-            own = 0 if data.periodic else self._states
+            own = 0 if data.periodic else len(self._states)
             if derivatives:
                 rows.append(self._rows(data, motion, gains, place, len(x)) / -sigma[..., None])
             place += own
@@ -113,24 +120,21 @@ class RecordProblem(EffectProblem):
 
     def motions(self, x: NDArray[np.float64], derivatives: bool = False) -> list[Motion] | None:
         """What the model does in every record; None where it grows without bound in one, or has no positive mass."""
-        o, common = self.observations, len(self.model.unknowns)
-        states = self._states
+        common, states = len(self.model.unknowns), len(self._states)
         try:
             here = self.model.driven(x[:common])
             slopes = self.model.slopes(x[:common], here, states) if derivatives else None
         except (EmaError, np.linalg.LinAlgError):  # a step of the search past what can exist
             return None
         found, place = [], common
-        for data in o.data:
+        for data in self.observations.data:
             begin, mine = np.zeros(here.size), slopes
             if not data.periodic:
-                begin[:states] = o.begin_scale * x[place : place + states]
+                begin = self._begin(data, here, x[place : place + states], slopes)
                 place += states
-                if slopes is not None:
-                    slopes.begin[np.arange(states), self.model.marched + np.arange(states)] = o.begin_scale
             elif slopes is not None:
                 mine = slopes.first(self.model.marched)
-            motion = o.motion(data, here, begin, mine)
+            motion = self.observations.motion(data, here, begin, mine)
             if (
                 motion is None
                 or not np.all(np.isfinite(motion.read))
@@ -140,14 +144,36 @@ class RecordProblem(EffectProblem):
             found.append(motion)
         return found
 
+    def _begin(
+        self, data: RecordData, system: DrivenSystem, x: NDArray[np.float64], slopes: Slopes | None
+    ) -> NDArray[np.float64]:
+        """State at the start of a record, (2n + m,), whose unknowns are `x`; its derivatives into `slopes`."""
+        o, moving = self.observations, len(self.observations.begin_scale)
+        begin, marched = np.zeros(system.size), self.model.marched
+        begin[:moving] = o.begin_scale * x[:moving]
+        if data.within is not None:
+            begin[:moving] += o.suggested(data)
+        if slopes is not None:
+            slopes.begin[...] = 0.0
+            slopes.begin[np.arange(moving), marched + np.arange(moving)] = o.begin_scale
+        for k, (_, j) in enumerate(self.model.memories, start=moving):
+            bounded = system.kinds[j] == HYSTERESIS  # its memory is a force, that of others a stretch
+            size = float(system.numbers[j, 1] if bounded else np.abs(system.rows[j]) @ o.begin_scale[: moving // 2])
+            begin[moving + j] = _MEMORY * size * x[k]
+            if slopes is not None:
+                slopes.begin[moving + j, marched + k] = _MEMORY * size
+                if bounded:
+                    slopes.begin[moving + j, :marched] = _MEMORY * x[k] * slopes.numbers[j, 1, :marched]
+        return begin
+
     def settled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """`x` with the states at the start of the records that their first samples alone determine."""
         found, place = x.copy(), len(self.model.unknowns)
         for data in self.observations.data:
             if not data.periodic:
-                part = slice(place, place + self._states)
+                part = slice(place, place + len(self._states))
                 found[part] = self._first_state(data.record, found[: len(self.model.unknowns)])
-                place += self._states
+                place += len(self._states)
         return found
 
     def _first_state(self, record: DrivenRecord, common: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -157,15 +183,18 @@ class RecordProblem(EffectProblem):
         part = replace(record, force=record.force[:, :seen], responses=record.responses[:, :seen])
         short = RecordProblem(self.observations.with_records([part], ()), self.model)
         rms, gains = self.observations.rms, self.model.gains(common)
-        offsets = self.model.response_offsets(common, rms)
-        x = np.concatenate([common, np.zeros(self._states)])
+        offsets, states = self.model.response_offsets(common, rms), len(self._states)
+        x = np.concatenate([common, np.zeros(states)])
+        memory = np.eye(states)[len(self.observations.begin_scale) :] * DISCREPANCY
         for _ in range(_ROUNDS):
             motions = short.motions(x, derivatives=True)
             if motions is None:
-                return np.zeros(self._states)
+                return np.zeros(states)
             gap = (part.responses.T - motions[0].read * gains - offsets)[:count] / rms
             slope = motions[0].change[:count, :, self.model.marched :] * (gains / rms)[:, None]
-            step = np.linalg.lstsq(slope.reshape(-1, self._states), gap.ravel(), rcond=1e-8)[0]
+            matrix = np.concatenate([slope.reshape(-1, states), memory])
+            right = np.concatenate([gap.ravel(), -memory @ x[len(common) :]])
+            step = np.linalg.lstsq(matrix, right, rcond=1e-8)[0]
             x[len(common) :] += step
         return x[len(common) :]
 
@@ -184,7 +213,7 @@ class RecordProblem(EffectProblem):
         found = np.zeros((len(gains), lines.shape[1], count))
         found[:, :, :marched] = lines[:, :, :marched]
         if not data.periodic:
-            found[:, :, place : place + self._states] = lines[:, :, marched:]
+            found[:, :, place : place + len(self._states)] = lines[:, :, marched:]
         read = np.ascontiguousarray((motion.read * gains)[data.compared].T)
         ones = np.ones_like(read) * (DISCREPANCY * self.observations.rms)[:, None]
         found[outputs, :, self.model.gain_columns.start + outputs] = data.lines(read)

@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect
@@ -38,6 +39,14 @@ _WIDE = 10.0
 _MOST_NOISE = 1e3
 _SET_UP = 0.1
 """Mean of a displacement, as a share of its root mean square, from which its zero is arbitrary."""
+_RIGID = 1e-9
+"""Squared frequency, over the highest, below which a mode is a rigid motion."""
+_SLOWEST = 0.5
+"""Frequency, over the lowest natural one, below which integrated accelerations are noise."""
+_NO_ZERO = 1e-6
+"""Prior 1 σ of a zero, in units of the discrepancy, up to which the zero is known."""
+_CYCLES = 4
+"""Cycles in a window: a model off by an eighth in frequency gets out of step by half a cycle."""
 _HEADROOM = 1.3
 """Factor by which effects may raise the highest natural frequency before steps become coarser than meant."""
 
@@ -50,7 +59,7 @@ class RecordObservations:
     rig : Rig
         Without effects.
     configuration : str
-    records : sequence of DrivenRecord
+    records : sequence of DrivenRecord or RecordData
         What the model is fitted to.
     held_out : sequence of DrivenRecord
         What it is judged by.
@@ -75,7 +84,7 @@ class RecordObservations:
         self,
         rig: Rig,
         configuration: str,
-        records: Sequence[DrivenRecord],
+        records: Sequence[DrivenRecord | RecordData],
         held_out: Sequence[DrivenRecord] = (),
         frfs: FrfSet | None = None,
         basis: Basis | None = None,
@@ -86,9 +95,9 @@ class RecordObservations:
         if not records:
             raise EmaError('no record to fit; give at least one use = "fit"')
         self.rig, self.configuration = rig, configuration
-        self.data = tuple(RecordData.of(r) for r in records)
+        self.data = tuple(r if isinstance(r, RecordData) else RecordData.of(r) for r in records)
         self.held_out = tuple(held_out)
-        self.basis = basis or _basis(rig, configuration, records, frfs)
+        self.basis = basis or _basis(rig, configuration, [d.record for d in self.data], frfs)
         self.like, self.modal, self.phase = like, modal, phase
         self.finds_states = (
             False  # True where states at the start are found from the first samples, not fitted
@@ -179,6 +188,36 @@ class RecordObservations:
         return np.asarray(np.maximum(np.std(states[:, : 2 * len(mass)], axis=0), 1e-300))
 
     @cached_property
+    def lowest_hz(self) -> float:
+        """Lowest natural frequency of the linear model, rigid motion aside."""
+        if self.like is not None:
+            return self.like.lowest_hz
+        linear = self.linear_model.linear(self.linear_model.start())
+        squares = scipy.linalg.eigh(linear.stiffness, linear.mass, eigvals_only=True)
+        return float(np.sqrt(np.min(squares[squares > _RIGID * np.max(squares)]))) / (2 * np.pi)
+
+    def suggested(self, data: RecordData) -> NDArray[np.float64]:
+        """State at the start of a record that its sensors suggest, (2n,): 0 for what they do not see."""
+        x, v = data.motion(_SLOWEST * self.lowest_hz)
+        arbitrary = self.basis.zero_std > _NO_ZERO
+        back = np.linalg.pinv(self.basis.rows[1])
+        return np.concatenate([back @ (x[:, 0] - np.where(arbitrary, np.mean(x, axis=1), 0.0)), back @ v[:, 0]])
+
+    def in_windows(self, samples: int) -> list[RecordData]:
+        """All records in windows of a few cycles, no more than so many samples together.
+
+        A simulation that runs through a long record is out of step with the measured motion wherever the model is not
+        yet right, and a fit of it has many local optima. Within a few cycles from a state near the measured one a model cannot get out of step.
+        """
+        sizes = []
+        for data in self.data:
+            x, v = data.motion(_SLOWEST * self.lowest_hz)
+            ratio = np.std(v, axis=1) / np.maximum(np.std(x, axis=1), 1e-300)
+            sizes.append(round(_CYCLES * 2 * np.pi * self.sample_rate_hz / float(np.median(ratio))))
+        share = samples // len(self.data)
+        return [w for d, s in zip(self.data, sizes, strict=True) for w in d.windows(s, share // s)]
+
+    @cached_property
     def slowest_rad_s(self) -> float:
         """Least decay rate of a mode of the linear model, halved."""
         system = self.linear_model.driven(self.linear_model.start())
@@ -203,7 +242,7 @@ class RecordObservations:
 
     def with_records(
         self,
-        records: Sequence[DrivenRecord],
+        records: Sequence[DrivenRecord | RecordData],
         held_out: Sequence[DrivenRecord],
         basis: Basis | None = None,
         phase: float | None = None,
