@@ -103,7 +103,7 @@ def _simulated(
     if motions is None:
         return np.full(one.data[0].record.responses.T.shape, np.nan)
     common = x[: len(problem.model.unknowns)]
-    return motions[0].read * problem.model.gains(common) + problem.model.response_offsets(common, one.rms)
+    return motions[0].read[0] * problem.model.gains(common) + problem.model.response_offsets(common, one.rms)
 
 
 def _errors(one: RecordObservations, runs: Sequence[NDArray[np.float64]]) -> list[RecordError]:

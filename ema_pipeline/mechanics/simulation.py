@@ -255,21 +255,52 @@ def march(
     E. Hairer, S. P. Norsett, G. Wanner, *Solving Ordinary Differential Equations I* (1993), sections II.1 and I.14
     (variational equations).
     """
+    if slopes is not None:
+        slopes = replace(slopes, begin=slopes.begin[None])
+    found = march_windows(system, sample_rate_hz, substeps, force[None], begin[None], slopes)
+    return None if found is None else (found[0][0], found[1][0])
+
+
+def march_windows(
+    system: DrivenSystem,
+    sample_rate_hz: float,
+    substeps: int,
+    force: NDArray[np.float64],
+    begin: NDArray[np.float64],
+    slopes: Slopes | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """`march` under several forces of one length, each from a state of its own.
+
+    Parameters
+    ----------
+    system, sample_rate_hz, substeps
+        As in `march`.
+    force : ndarray, (n_windows, 2·substeps·(n_samples - 1) + 1, n_inputs)
+    begin : ndarray, (n_windows, 2n + m)
+    slopes : Slopes, optional
+        Its derivatives of the first state are (n_windows, 2n + m, p).
+
+    Returns
+    -------
+    states : ndarray, (n_windows, n_samples, 2n + m)
+    derivatives : ndarray, (n_windows, n_samples, 2n + m, p)
+        None where the motion grows without bound in one of them.
+    """
     from ema_pipeline.mechanics import driven  # compiled on first use
 
     step = 1 / (sample_rate_hz * substeps)
-    count = (len(force) - 1) // (2 * substeps) + 1
-    states = np.empty((count, system.size))
+    shape = (len(force), (force.shape[1] - 1) // (2 * substeps) + 1, system.size)
+    states = np.empty(shape)
     fixed = (
         system.stiffness, system.damping, system.inputs, system.push, system.rows, system.kinds,
         system.numbers, force, begin, step, substeps,
     )  # fmt: skip
     if slopes is None:
-        if not driven.march(*fixed, states):
+        if not driven.march_windows(*fixed, states):
             return None
-        return states, np.empty((count, system.size, 0))
-    derivatives = np.empty((count, system.size, slopes.begin.shape[1]))
-    if not driven.march_with_slopes(
+        return states, np.empty((*shape, 0))
+    derivatives = np.empty((*shape, slopes.begin.shape[2]))
+    if not driven.march_windows_with_slopes(
         *fixed, slopes.stiffness, slopes.damping, slopes.inputs, slopes.push, slopes.numbers, slopes.begin,
         states, derivatives,
     ):  # fmt: skip

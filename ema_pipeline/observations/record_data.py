@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,13 +20,8 @@ _LEAST_NOISE = 1e-5
 """Noise, in units of the discrepancy, below which records are not told apart from exact ones."""
 _RESTLESS = 1.5
 """A first period that differs from the mean by this many times what others do holds a transient."""
-_BLOCKS = 4
-"""Pieces of a long record that stand for it while hypotheses are compared."""
-_LEAST_BLOCK = 1024
-"""Shortest such piece, samples."""
 _LEAST_WINDOW = 64
 """Shortest window, samples: fewer do not fill the bands of frequency."""
-_GLIDING = ("sweep", "chirp")
 
 
 @dataclass(frozen=True)
@@ -40,16 +34,16 @@ class RecordData:
         Of a periodic one the mean period.
     noise : ndarray, (n_outputs, BANDS)
         1 σ of a sample of the response within each band, from its scatter over periods; 0 where there is none.
-    within : RecordData, optional
-        The record that this one is a window of: its force between samples is known beyond the ends of the window.
-    at : int
-        First sample of the window there.
+    starts : ndarray of int, (n_windows,)
+        First samples of the windows that are compared: one, of the whole record, unless said otherwise.
+    length : int
+        Samples of a window; 0 for the whole record.
     """
 
     record: DrivenRecord
     noise: NDArray[np.float64]
-    within: RecordData | None = None
-    at: int = 0
+    starts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, dtype=np.int64))
+    length: int = 0
 
     @classmethod
     def of(cls, record: DrivenRecord) -> RecordData:
@@ -70,35 +64,33 @@ class RecordData:
         power = np.sum(lines**2, axis=1) / (count - 1) / count
         return cls(mean, np.sqrt([[float(np.mean(p[band == b])) for b in range(BANDS)] for p in power]))
 
-    def windows(self, size: int, most: int) -> list[RecordData]:
-        """The record in windows of `size` samples, no more than `most`, evenly spread; each starts from a state of its own.
+    def windows(self, length: int, most: int) -> RecordData:
+        """The record in windows, no more than `most`, evenly spread; the response starts from a state of its own in each.
 
         The ends of a record that does not repeat are left out: no state is known from what is integrated there.
         """
-        record, first = self.record, self.compared.start or 0
-        size = min(max(size, _LEAST_WINDOW), (record.n_samples - first) // 2)
-        first += 0 if self.periodic else size // 2
-        count = (record.n_samples - first - (0 if self.periodic else size // 2)) // size
-        chosen = np.unique(np.linspace(0, count - 1, min(max(most, 1), count)).astype(int))
-        found = []
-        for at in (first + chosen * size).tolist():
-            part = slice(at, at + size)
-            window = replace(
-                record,
-                name=f"{record.name} from sample {at}",
-                force=record.force[:, part],
-                responses=record.responses[:, part],
-                first=record.first + at,
-                period=0,
-                transient=0,
-            )
-            found.append(RecordData(window, self.noise, self, at))
-        return found
+        first, last = self.compared.start or 0, self.record.n_samples
+        length = min(max(length, _LEAST_WINDOW), (last - first) // 2)
+        if not self.periodic:
+            first, last = first + length // 2, last - length // 2
+        count = (last - first) // length
+        chosen = np.unique(np.linspace(0, count - 1, min(max(most, 1), count)).astype(np.int64))
+        return replace(self, starts=first + chosen * length, length=length)
+
+    @property
+    def windowed(self) -> bool:
+        """True for a record in windows."""
+        return self.length > 0
 
     @property
     def periodic(self) -> bool:
         """True for a steady response, whose state at the start follows from the force."""
-        return self.record.period > 0
+        return self.record.period > 0 and not self.windowed
+
+    @property
+    def samples(self) -> int:
+        """Of every window."""
+        return self.length or self.record.n_samples
 
     @cached_property
     def rms(self) -> NDArray[np.float64]:
@@ -107,57 +99,60 @@ class RecordData:
 
     @property
     def compared(self) -> slice:
-        """Samples that are compared."""
-        return slice(0 if self.periodic else self.record.transient, None)
+        """Samples of every window that are compared."""
+        return slice(0 if self.windowed or self.periodic else self.record.transient, None)
+
+    @cached_property
+    def responses(self) -> NDArray[np.float64]:
+        """What the sensors read in every window, (n_windows, n_outputs, n_samples), SI."""
+        at = self.starts[:, None] + np.arange(self.samples)
+        return np.ascontiguousarray(self.record.responses[:, at].transpose(1, 0, 2))
 
     @cached_property
     def measured(self) -> NDArray[np.float64]:
-        """Lines of the responses, (n_outputs, n_rows), SI."""
-        return self.lines(self.record.responses[:, self.compared])
+        """Lines of the responses, (n_windows, n_outputs, n_rows), SI."""
+        return self.lines(self.responses[..., self.compared])
 
     def lines(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Lines of signals, (n_outputs, ..., n_samples) to (n_outputs, ..., n_rows), means of displacements included.
+        """Lines of signals, (n_windows, n_outputs, ..., n_samples) to (n_windows, n_outputs, ..., n_rows).
 
-        What other sensors give as a mean is their offset.
+        Means of displacements are included. What other sensors give as a mean is their offset.
         """
         found = _lines(samples)
         for o, channel in enumerate(self.record.channels):
             if channel.quantity != "displacement":
-                found[o, ..., 0] = 0.0
+                found[:, o, ..., 0] = 0.0
         return found
 
     @cached_property
     def band(self) -> NDArray[np.int64]:
         """Band of every row of `measured`, (n_rows,)."""
-        return _bands(self.record.n_samples - (self.compared.start or 0))
+        return _bands(self.samples - (self.compared.start or 0))
 
     def fine_force(self, substeps: int) -> NDArray[np.float64]:
-        """Force at the ends and middles of the steps, and a column of ones, see `between_samples`."""
+        """Force at the ends and middles of the steps, and a column of ones, (n_windows, n_points, n_forces + 1)."""
         known: dict[int, NDArray[np.float64]] = self.__dict__.setdefault("_fine", {})
-        if self.within is not None:
-            whole = self.within.fine_force(substeps)
-            return whole[2 * substeps * self.at :][: 2 * substeps * (self.record.n_samples - 1) + 1]
         if substeps not in known:
-            fine = between_samples(self.record.force, 2 * substeps, self.periodic)
-            known[substeps] = np.concatenate([fine, np.ones((len(fine), 1))], axis=1)
+            fine = between_samples(self.record.force, 2 * substeps, self.record.period > 0)
+            fine = np.concatenate([fine, np.ones((len(fine), 1))], axis=1)
+            if self.windowed:
+                points = 2 * substeps * (self.length - 1) + 1
+                fine = fine[2 * substeps * self.starts[:, None] + np.arange(points)]
+            known[substeps] = np.ascontiguousarray(fine.reshape(len(self.starts), -1, fine.shape[-1]))
         return known[substeps]
 
     def motion(self, slowest_hz: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Displacements and velocities that the sensors suggest, (n_outputs, n_samples) each.
+        """Displacements and velocities that the sensors suggest, (n_outputs, n_samples) each, in the whole record.
 
         Parameters
         ----------
         slowest_hz : float
             Frequency below which a structure does not move: what is integrated below it is noise.
         """
-        if self.within is not None:
-            part = slice(self.at, self.at + self.record.n_samples)
-            x, v = self.within.motion(slowest_hz)
-            return x[:, part], v[:, part]
         known: dict[float, tuple[NDArray[np.float64], NDArray[np.float64]]] = self.__dict__.setdefault("_motion", {})
         if slowest_hz not in known:
             pairs = [
-                _integrated(signal, self.record.sample_rate_hz, slowest_hz, _POWER[c.quantity], self.periodic)
+                _integrated(signal, self.record.sample_rate_hz, slowest_hz, _POWER[c.quantity], self.record.period > 0)
                 for signal, c in zip(self.record.responses, self.record.channels, strict=True)
             ]
             known[slowest_hz] = np.array([x for x, _ in pairs]), np.array([v for _, v in pairs])
@@ -205,34 +200,3 @@ def _steady(responses: NDArray[np.float64], least: int) -> int:
     away = np.sqrt(np.mean((responses - mean) ** 2, axis=(0, 2)))
     return 1 if away[0] > _RESTLESS * float(np.max(away[1:])) else 0
 
-
-def thinned(records: Sequence[DrivenRecord], samples: int) -> list[DrivenRecord]:
-    """Pieces of long records that stand for them; periodic ones and sweeps stay whole.
-
-    Parameters
-    ----------
-    records : sequence of DrivenRecord
-    samples : int
-        Of all pieces together.
-    """
-    long = [r for r in records if not r.period and r.excitation not in _GLIDING]
-    found = [r for r in records if all(r is not other for other in long)]
-    share = samples // max(len(long), 1)
-    for record in long:
-        size = max(share // _BLOCKS, _LEAST_BLOCK)
-        if record.n_samples <= _BLOCKS * size:
-            found.append(record)
-            continue
-        last = record.n_samples - size
-        for k in range(_BLOCKS):
-            start = k * last // (_BLOCKS - 1)
-            found.append(
-                replace(
-                    record,
-                    name=f"{record.name} from sample {start}",
-                    force=record.force[:, start : start + size],
-                    responses=record.responses[:, start : start + size],
-                    first=record.first + start,
-                )
-            )
-    return found

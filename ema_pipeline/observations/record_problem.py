@@ -47,7 +47,7 @@ class RecordProblem(EffectProblem):
 
     @cached_property
     def unknowns(self) -> Unknowns:
-        """The model's unknowns, and the state at the start of every record that is not periodic.
+        """The model's unknowns, and the state at the start of every window, or record, that is not periodic.
 
         States are named after the model: what one model makes of them leads a fit of another one astray.
         """
@@ -55,7 +55,9 @@ class RecordProblem(EffectProblem):
         return joined(
             self.model.unknowns,
             *(
-                Unknowns.plain([f"{state} at the start of {d.record.name}{effects}" for state in self._states], 1.0)
+                Unknowns.plain(
+                    [f"{s} at sample {at} of {d.record.name}{effects}" for at in d.starts for s in self._states], 1.0
+                )
                 for d in self.observations.data
                 if not d.periodic
             ),
@@ -98,16 +100,18 @@ class RecordProblem(EffectProblem):
         for data, motion in zip(self.observations.data, motions, strict=True):
             read = motion.read * gains
             read += self.model.response_offsets(x, self.observations.rms)
-            predicted = data.lines(np.ascontiguousarray(read[data.compared].T))
+            predicted = data.lines(_by_output(read[:, data.compared]))
             variance = self._variance(data, scatters)
             sigma = np.sqrt(variance.total) * heat
             values.append(((data.measured - predicted) / sigma).ravel())
             spread.append(variance)
-            own = 0 if data.periodic else len(self._states)
             if derivatives:
                 rows.append(self._rows(data, motion, gains, place, len(x)) / -sigma[..., None])
-            place += own
-        relative = np.concatenate([v.relative.ravel() for v in spread])
+            place += self._own(data)
+        windows = [len(d.starts) for d in self.observations.data]
+        relative = np.concatenate(
+            [np.tile(v.relative.ravel(), n) for v, n in zip(spread, windows, strict=True)]
+        )
         return Residuals(
             values=np.concatenate(values),
             jacobian=np.concatenate([r.reshape(-1, len(x)) for r in rows])
@@ -128,10 +132,11 @@ class RecordProblem(EffectProblem):
             return None
         found, place = [], common
         for data in self.observations.data:
-            begin, mine = np.zeros(here.size), slopes
+            begin, mine = np.zeros((1, here.size)), slopes
             if not data.periodic:
-                begin = self._begin(data, here, x[place : place + states], slopes)
-                place += states
+                own = self._own(data)
+                begin, mine = self._begin(data, here, x[place : place + own], slopes)
+                place += own
             elif slopes is not None:
                 mine = slopes.first(self.model.marched)
             motion = self.observations.motion(data, here, begin, mine)
@@ -144,59 +149,66 @@ class RecordProblem(EffectProblem):
             found.append(motion)
         return found
 
+    def _own(self, data: RecordData) -> int:
+        """Number of unknowns that a record has for itself."""
+        return 0 if data.periodic else len(self._states) * len(data.starts)
+
     def _begin(
         self, data: RecordData, system: DrivenSystem, x: NDArray[np.float64], slopes: Slopes | None
-    ) -> NDArray[np.float64]:
-        """State at the start of a record, (2n + m,), whose unknowns are `x`; its derivatives into `slopes`."""
-        o, moving = self.observations, len(self.observations.begin_scale)
-        begin, marched = np.zeros(system.size), self.model.marched
-        begin[:moving] = o.begin_scale * x[:moving]
-        if data.within is not None:
-            begin[:moving] += o.suggested(data)
+    ) -> tuple[NDArray[np.float64], Slopes | None]:
+        """States at the start of the windows of a record, (n_windows, 2n + m), whose unknowns are `x`, and slopes with theirs."""
+        o, moving, marched = self.observations, len(self.observations.begin_scale), self.model.marched
+        unknown = x.reshape(len(data.starts), -1)
+        begin = np.zeros((len(data.starts), system.size))
+        begin[:, :moving] = o.suggested(data) + o.begin_scale * unknown[:, :moving]
+        change = np.zeros((*begin.shape, 0 if slopes is None else marched + len(self._states)))
         if slopes is not None:
-            slopes.begin[...] = 0.0
-            slopes.begin[np.arange(moving), marched + np.arange(moving)] = o.begin_scale
+            change[:, np.arange(moving), marched + np.arange(moving)] = o.begin_scale
         for k, (_, j) in enumerate(self.model.memories, start=moving):
-            bounded = system.kinds[j] == HYSTERESIS  # its memory is a force, that of others a stretch
-            size = float(system.numbers[j, 1] if bounded else np.abs(system.rows[j]) @ o.begin_scale[: moving // 2])
-            begin[moving + j] = _MEMORY * size * x[k]
+            force = system.kinds[j] == HYSTERESIS  # what it remembers; others remember a stretch
+            size = system.numbers[j, 1] if force else np.abs(system.rows[j]) @ o.begin_scale[: moving // 2]
+            begin[:, moving + j] = _MEMORY * size * unknown[:, k]
             if slopes is not None:
-                slopes.begin[moving + j, marched + k] = _MEMORY * size
-                if bounded:
-                    slopes.begin[moving + j, :marched] = _MEMORY * x[k] * slopes.numbers[j, 1, :marched]
-        return begin
+                change[:, moving + j, marched + k] = _MEMORY * size
+                if force:
+                    change[:, moving + j, :marched] = _MEMORY * np.outer(unknown[:, k], slopes.numbers[j, 1, :marched])
+        return begin, None if slopes is None else replace(slopes, begin=change)
 
     def settled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """`x` with the states at the start of the records that their first samples alone determine."""
         found, place = x.copy(), len(self.model.unknowns)
         for data in self.observations.data:
             if not data.periodic:
-                part = slice(place, place + len(self._states))
-                found[part] = self._first_state(data.record, found[: len(self.model.unknowns)])
-                place += len(self._states)
+                part = slice(place, place + self._own(data))
+                found[part] = self._first_states(data, found[: len(self.model.unknowns)])
+                place += self._own(data)
         return found
 
-    def _first_state(self, record: DrivenRecord, common: NDArray[np.float64]) -> NDArray[np.float64]:
-        """State at the start of one record, in units of its prior σ, by a few Gauss-Newton steps."""
-        count = min(max(record.transient, _BEGIN_SAMPLES), record.n_samples)
-        seen = count + _EDGE
-        part = replace(record, force=record.force[:, :seen], responses=record.responses[:, :seen])
-        short = RecordProblem(self.observations.with_records([part], ()), self.model)
+    def _first_states(self, data: RecordData, common: NDArray[np.float64]) -> NDArray[np.float64]:
+        """States at the start of a record or of its windows, in units of their prior σ, by a few Gauss-Newton steps."""
+        count = data.samples
+        if not data.windowed:  # the start of the record tells it
+            count = min(max(data.record.transient, _BEGIN_SAMPLES), data.samples)
+            seen = slice(count + _EDGE)
+            part = replace(data.record, force=data.record.force[:, seen], responses=data.record.responses[:, seen])
+            data = RecordData.of(part)
+        short = RecordProblem(self.observations.with_records([data], ()), self.model)
         rms, gains = self.observations.rms, self.model.gains(common)
         offsets, states = self.model.response_offsets(common, rms), len(self._states)
-        x = np.concatenate([common, np.zeros(states)])
+        measured = data.responses.transpose(0, 2, 1)
+        x = np.zeros((len(data.starts), states))
         memory = np.eye(states)[len(self.observations.begin_scale) :] * DISCREPANCY
         for _ in range(_ROUNDS):
-            motions = short.motions(x, derivatives=True)
+            motions = short.motions(np.concatenate([common, x.ravel()]), derivatives=True)
             if motions is None:
-                return np.zeros(states)
-            gap = (part.responses.T - motions[0].read * gains - offsets)[:count] / rms
-            slope = motions[0].change[:count, :, self.model.marched :] * (gains / rms)[:, None]
-            matrix = np.concatenate([slope.reshape(-1, states), memory])
-            right = np.concatenate([gap.ravel(), -memory @ x[len(common) :]])
-            step = np.linalg.lstsq(matrix, right, rcond=1e-8)[0]
-            x[len(common) :] += step
-        return x[len(common) :]
+                return np.zeros(x.size)
+            gap = ((measured - motions[0].read * gains - offsets) / rms)[:, :count]
+            slope = motions[0].change[:, :count, :, self.model.marched :] * (gains / rms)[:, None]
+            for k in range(len(x)):
+                matrix = np.concatenate([slope[k].reshape(-1, states), memory])
+                right = np.concatenate([gap[k].ravel(), -memory @ x[k]])
+                x[k] += np.linalg.lstsq(matrix, right, rcond=1e-8)[0]
+        return x.ravel()
 
     def _rows(
         self,
@@ -206,18 +218,22 @@ class RecordProblem(EffectProblem):
         place: int,
         count: int,
     ) -> NDArray[np.float64]:
-        """Derivatives of a record's lines by all unknowns, (n_outputs, n_rows, n)."""
-        marched, outputs = self.model.marched, np.arange(len(gains))
-        moved = (motion.change * gains[:, None])[data.compared].transpose(1, 2, 0)
-        lines = data.lines(np.ascontiguousarray(moved)).transpose(0, 2, 1)
-        found = np.zeros((len(gains), lines.shape[1], count))
-        found[:, :, :marched] = lines[:, :, :marched]
+        """Derivatives of a record's lines by all unknowns, (n_windows, n_outputs, n_rows, n)."""
+        marched = self.model.marched
+        moved = (motion.change * gains[:, None])[:, data.compared].transpose(0, 2, 3, 1)
+        lines = data.lines(np.ascontiguousarray(moved)).transpose(0, 1, 3, 2)
+        found = np.zeros((*lines.shape[:3], count))
+        found[..., :marched] = lines[..., :marched]
         if not data.periodic:
-            found[:, :, place : place + len(self._states)] = lines[:, :, marched:]
-        read = np.ascontiguousarray((motion.read * gains)[data.compared].T)
+            own = len(self._states)
+            for k in range(len(data.starts)):
+                found[k, :, :, place + k * own : place + (k + 1) * own] = lines[k, :, :, marched:]
+        read = _by_output((motion.read * gains)[:, data.compared])
         ones = np.ones_like(read) * (DISCREPANCY * self.observations.rms)[:, None]
-        found[outputs, :, self.model.gain_columns.start + outputs] = data.lines(read)
-        found[outputs, :, self.model.offset_columns.start + outputs] = data.lines(ones)
+        read, ones = data.lines(read), data.lines(ones)
+        for o in range(len(gains)):
+            found[:, o, :, self.model.gain_columns.start + o] = read[:, o]
+            found[:, o, :, self.model.offset_columns.start + o] = ones[:, o]
         return found
 
     def _variance(self, data: RecordData, scatters: Mapping[str, float]) -> Variance:
@@ -245,17 +261,22 @@ class RecordProblem(EffectProblem):
         for k in range(len(o.basis.outputs)):
             for b in range(BANDS):
                 parts = []
-                for v in spread:
+                for v, data in zip(spread, o.data, strict=True):
                     share = np.zeros(v.share.shape)
                     share[k] = np.where(v.band == b, v.share[k], 0.0)
-                    parts.append(share.ravel())
+                    parts.append(np.tile(share.ravel(), len(data.starts)))
                 found[o.noise_name(k, b)] = np.concatenate(parts)
         return found
 
 
+def _by_output(read: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n_windows, n_samples, n_outputs) to (n_windows, n_outputs, n_samples)."""
+    return np.ascontiguousarray(read.transpose(0, 2, 1))
+
+
 @dataclass(frozen=True)
 class Variance:
-    """Of the lines of one record, each (n_outputs, n_rows): the whole, the learned share, and σ over the stated one."""
+    """Of the lines of every window of a record, each (n_outputs, n_rows): the whole, the learned share, and σ over the stated one."""
 
     total: NDArray[np.float64]
     share: NDArray[np.float64]

@@ -61,7 +61,7 @@ class RecordObservations:
     configuration : str
     records : sequence of DrivenRecord or RecordData
         What the model is fitted to.
-    held_out : sequence of DrivenRecord
+    held_out : sequence of DrivenRecord or RecordData
         What it is judged by.
     frfs : FrfSet
         Of the same test: where the search for the linear values begins.
@@ -85,7 +85,7 @@ class RecordObservations:
         rig: Rig,
         configuration: str,
         records: Sequence[DrivenRecord | RecordData],
-        held_out: Sequence[DrivenRecord] = (),
+        held_out: Sequence[DrivenRecord | RecordData] = (),
         frfs: FrfSet | None = None,
         basis: Basis | None = None,
         like: RecordObservations | None = None,
@@ -174,10 +174,10 @@ class RecordObservations:
         model = self.linear_model
         x = model.start()
         system = model.driven(x)
-        found = self.motion(self.data[0], system, np.zeros(system.size))
+        found = self.motion(self.data[0], system, np.zeros((len(self.data[0].starts), system.size)))
         if found is None:
             raise EmaError(f"rig '{self.rig.name}' without effects grows without bound; check its elements")
-        return found.states, model.linear(x).mass
+        return found.states.reshape(-1, system.size), model.linear(x).mass
 
     @cached_property
     def begin_scale(self) -> NDArray[np.float64]:
@@ -197,25 +197,45 @@ class RecordObservations:
         return float(np.sqrt(np.min(squares[squares > _RIGID * np.max(squares)]))) / (2 * np.pi)
 
     def suggested(self, data: RecordData) -> NDArray[np.float64]:
-        """State at the start of a record that its sensors suggest, (2n,): 0 for what they do not see."""
-        x, v = data.motion(_SLOWEST * self.lowest_hz)
-        arbitrary = self.basis.zero_std > _NO_ZERO
-        back = np.linalg.pinv(self.basis.rows[1])
-        return np.concatenate([back @ (x[:, 0] - np.where(arbitrary, np.mean(x, axis=1), 0.0)), back @ v[:, 0]])
+        """State at the start of every window that the sensors suggest, (n_windows, 2n): 0 for what they do not see.
 
-    def in_windows(self, samples: int) -> list[RecordData]:
-        """All records in windows of a few cycles, no more than so many samples together.
+        Of a whole record it is rest: its ends are no place to integrate.
+        """
+        if not data.windowed:
+            return np.zeros((1, len(self.begin_scale)))
+        known: dict[float, NDArray[np.float64]] = data.__dict__.setdefault("_suggested", {})
+        slowest = _SLOWEST * self.lowest_hz
+        if slowest not in known:
+            x, v = data.motion(slowest)
+            x = x - np.where(self.basis.zero_std > _NO_ZERO, np.mean(x, axis=1), 0.0)[:, None]
+            back = np.linalg.pinv(self.basis.rows[1])
+            known[slowest] = np.concatenate([back @ x[:, data.starts], back @ v[:, data.starts]]).T
+        return known[slowest]
+
+    def in_windows(self, samples: int) -> RecordObservations:
+        """The same test with all records in windows of a few cycles, no more than so many samples of all responses together.
 
         A simulation that runs through a long record is out of step with the measured motion wherever the model is not
-        yet right, and a fit of it has many local optima. Within a few cycles from a state near the measured one a model cannot get out of step.
+        yet right, so that a fit of it has many local optima. Within a few cycles from a state near the measured one no
+        model gets far out of step. Known as multiple shooting.
+
+        References
+        ----------
+        H. G. Bock, Recent advances in parameter identification techniques for O.D.E., *Numerical Treatment of Inverse
+        Problems in Differential and Integral Equations* (1983).
         """
-        sizes = []
-        for data in self.data:
+        held_out = [d if isinstance(d, RecordData) else RecordData.of(d) for d in self.held_out]
+        return self.with_records(self._windows(self.data, samples), self._windows(held_out, samples))
+
+    def _windows(self, records: Sequence[RecordData], samples: int) -> list[RecordData]:
+        found = []
+        share = samples // (max(len(records), 1) * len(self.basis.outputs))
+        for data in records:
             x, v = data.motion(_SLOWEST * self.lowest_hz)
             ratio = np.std(v, axis=1) / np.maximum(np.std(x, axis=1), 1e-300)
-            sizes.append(round(_CYCLES * 2 * np.pi * self.sample_rate_hz / float(np.median(ratio))))
-        share = samples // len(self.data)
-        return [w for d, s in zip(self.data, sizes, strict=True) for w in d.windows(s, share // s)]
+            length = round(_CYCLES * 2 * np.pi * self.sample_rate_hz / max(float(np.median(ratio)), 1e-300))
+            found.append(data.windows(length, share // length))
+        return found
 
     @cached_property
     def slowest_rad_s(self) -> float:
@@ -243,7 +263,7 @@ class RecordObservations:
     def with_records(
         self,
         records: Sequence[DrivenRecord | RecordData],
-        held_out: Sequence[DrivenRecord],
+        held_out: Sequence[DrivenRecord | RecordData],
         basis: Basis | None = None,
         phase: float | None = None,
     ) -> RecordObservations:
