@@ -36,6 +36,8 @@ Schedule = tuple[tuple[float, int], ...]
 
 FINALISTS = 5
 """Hypotheses for which the scatters are learned."""
+_BEATEN = 200.0
+"""Log evidence behind the best hypothesis from which another one cannot catch up: it is not begun again."""
 _SCREENED = 14
 """Generic hypotheses, best first by their score, that are fitted in full."""
 _UNSEEN = 1e6
@@ -269,15 +271,16 @@ def _finals(observations: Observations, base: Fit, found: Found, processes: int)
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     best = [fit for _, fit in order[:FINALISTS]]
     job = partial(_final, observations, (base, *best[:2]))
-    first = _spread_fits(job, [base, *best], processes)
-    leaders = sorted(first[1:], key=lambda f: -f.log_evidence)[:2]
-    job = partial(_final, observations, (first[0], *leaders))
-    second = _spread_fits(job, first, processes)
-    final_base = second[0]
+    near = _spread_fits(job, [base, *_close(best)], processes)
+    far = _spread_fits(partial(_final, observations, ()), best[len(near) - 1 :], processes)
+    leaders = sorted(near[1:], key=lambda f: -f.log_evidence)
+    job = partial(_final, observations, (near[0], *leaders[:2]))
+    final_base, *again = _spread_fits(job, near, processes)
+    finalists = [*again, *far]
     ranked = []
     for i, (hypothesis, fit) in enumerate(order):
         if i < FINALISTS:
-            fit = second[1 + i]
+            fit = finalists[i]
             ranked.append(Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True))
         else:
             ranked.append(Ranked(hypothesis, fit, fit.log_evidence - base.log_evidence, False))
@@ -286,6 +289,11 @@ def _finals(observations: Observations, base: Fit, found: Found, processes: int)
     # An effect that is no finalist was behind at wide scatters; it cannot lead at learned ones.
     rest = [Ranked(r.hypothesis, r.fit, min(r.gain, least), False) for r in ranked[FINALISTS:]]
     return Ranking(final_base, (*finals, *rest))
+
+
+def _close(best: Sequence[Fit]) -> Sequence[Fit]:
+    """Those of the best hypotheses, best first, that are not far behind the first."""
+    return [f for f in best if f.log_evidence >= best[0].log_evidence - _BEATEN]
 
 
 def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:

@@ -25,7 +25,7 @@ from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.fitting import Model, learned, refined
 from ema_pipeline.observations.records import RecordObservations
 
-SEARCHED = 4096
+SEARCHED = 2048
 """Samples of all responses together, in windows, on which hypotheses are compared: enough for evidence by the hundred,
 quick enough for all."""
 _LOST = 3.0

@@ -29,7 +29,7 @@ from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import total_damping
 from ema_pipeline.mechanics.system import LinearSystem
 
-FINE, COARSE = 0.25, 0.5
+FINE, COARSE = 0.25, 0.65
 """Phase, in rad, by which the highest mode may turn in one step. A quarter leaves an error of a hundred thousandth of a
 frequency; laws with kinks, such as hysteresis, need it too. While hypotheses are compared half will do."""
 MOST_SUBSTEPS = 64
@@ -100,30 +100,53 @@ def driven_system(
     EmaError
         For structural damping, which has no time response, and for elements that the loop does not know.
     """
-    system = linear or assembly.system()
-    if np.any(system.structural):
-        raise EmaError(
-            "a loss factor holds at steady state only and has no time response; replace it by a damper"
+    return CodedElements.of(assembly).driven(linear or assembly.system(), in_rows)
+
+
+@dataclass(frozen=True)
+class CodedElements:
+    """Nonlinear elements as the compiled loop takes them.
+
+    Attributes
+    ----------
+    rows : ndarray, (m, n)
+    tangent : ndarray, (m,)
+        Stiffness at rest, which the linear system holds already, N/m.
+    numbers : ndarray, (m, 4)
+    kinds : ndarray of int, (m,)
+    """
+
+    rows: NDArray[np.float64]
+    tangent: NDArray[np.float64]
+    numbers: NDArray[np.float64]
+    kinds: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, assembly: Assembly) -> CodedElements:
+        """Those of an assembly; EmaError for elements that the loop does not know."""
+        elements = assembly.nonlinear
+        coded = [coded_law(e) for e in elements]
+        return cls(
+            np.ascontiguousarray(element_rows(assembly, elements)),
+            np.array([e.tangent_stiffness for e in elements]),
+            np.array([numbers for _, numbers in coded]).reshape(len(elements), 4),
+            np.array([kind for kind, _ in coded], dtype=np.int64),
         )
-    elements = assembly.nonlinear
-    rows = element_rows(assembly, elements)
-    tangent = np.array([e.tangent_stiffness for e in elements])
-    stiffness = system.stiffness - rows.T @ (tangent[:, None] * rows)
-    factor = scipy.linalg.cho_factor(system.mass)
-    coded = [coded_law(e) for e in elements]
 
-    def solved(right: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.ascontiguousarray(scipy.linalg.cho_solve(factor, right, check_finite=False))
-
-    return DrivenSystem(
-        stiffness=solved(stiffness),
-        damping=solved(total_damping(system)),
-        inputs=solved(in_rows.T),
-        push=solved(rows.T),
-        numbers=np.array([numbers for _, numbers in coded]).reshape(len(elements), 4),
-        rows=np.ascontiguousarray(rows),
-        kinds=np.array([kind for kind, _ in coded], dtype=np.int64),
-    )
+    def driven(self, system: LinearSystem, in_rows: NDArray[np.float64]) -> DrivenSystem:
+        """A linear system with these elements, driven along `in_rows`, (n_inputs, n); see `driven_system`."""
+        if np.any(system.structural):
+            raise EmaError(
+                "a loss factor holds at steady state only and has no time response; replace it by a damper"
+            )
+        n, q = len(system.mass), len(in_rows)
+        stiffness = system.stiffness - self.rows.T @ (self.tangent[:, None] * self.rows)
+        solved = np.linalg.solve(
+            system.mass, np.hstack([stiffness, total_damping(system), in_rows.T, self.rows.T])
+        )
+        parts = (solved[:, :n], solved[:, n : 2 * n], solved[:, 2 * n : 2 * n + q], solved[:, 2 * n + q :])
+        stiffness, damping, inputs, push = (np.ascontiguousarray(p) for p in parts)
+        return DrivenSystem(stiffness, damping, inputs, push, self.numbers, self.rows, self.kinds)
 
 
 def coded_law(element: Nonlinear) -> tuple[int, tuple[float, float, float, float]]:

@@ -64,8 +64,8 @@ class RecordData:
         power = np.sum(lines**2, axis=1) / (count - 1) / count
         return cls(mean, np.sqrt([[float(np.mean(p[band == b])) for b in range(BANDS)] for p in power]))
 
-    def windows(self, length: int, most: int) -> RecordData:
-        """The record in windows, no more than `most`, evenly spread; the response starts from a state of its own in each.
+    def windows(self, length: int, samples: int) -> RecordData:
+        """The record in windows, evenly spread, no more than so many samples; each starts from a state of its own.
 
         The ends of a record that does not repeat are left out: no state is known from what is integrated there.
         """
@@ -74,7 +74,7 @@ class RecordData:
         if not self.periodic:
             first, last = first + length // 2, last - length // 2
         count = (last - first) // length
-        chosen = np.unique(np.linspace(0, count - 1, min(max(most, 1), count)).astype(np.int64))
+        chosen = np.unique(np.linspace(0, count - 1, min(max(samples // length, 1), count)).astype(np.int64))
         return replace(self, starts=first + chosen * length, length=length)
 
     @property

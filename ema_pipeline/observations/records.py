@@ -45,6 +45,8 @@ _SLOWEST = 0.5
 """Frequency, over the lowest natural one, below which integrated accelerations are noise."""
 _NO_ZERO = 1e-6
 """Prior 1 σ of a zero, in units of the discrepancy, up to which the zero is known."""
+_LEAST_SAMPLES = 1024
+"""Samples of every response, in windows, that hypotheses are compared on however many responses there are."""
 _CYCLES = 4
 """Cycles in a window: a model off by an eighth in frequency gets out of step by half a cycle."""
 _HEADROOM = 1.3
@@ -213,7 +215,7 @@ class RecordObservations:
         return known[slowest]
 
     def in_windows(self, samples: int) -> RecordObservations:
-        """The same test with all records in windows of a few cycles, no more than so many samples of all responses together.
+        """The same test with all records in windows of a few cycles, about so many samples of all responses together.
 
         A simulation that runs through a long record is out of step with the measured motion wherever the model is not
         yet right, so that a fit of it has many local optima. Within a few cycles from a state near the measured one no
@@ -229,12 +231,12 @@ class RecordObservations:
 
     def _windows(self, records: Sequence[RecordData], samples: int) -> list[RecordData]:
         found = []
-        share = samples // (max(len(records), 1) * len(self.basis.outputs))
+        share = max(samples // len(self.basis.outputs), _LEAST_SAMPLES) // max(len(records), 1)
         for data in records:
             x, v = data.motion(_SLOWEST * self.lowest_hz)
             ratio = np.std(v, axis=1) / np.maximum(np.std(x, axis=1), 1e-300)
             length = round(_CYCLES * 2 * np.pi * self.sample_rate_hz / max(float(np.median(ratio)), 1e-300))
-            found.append(data.windows(length, share // length))
+            found.append(data.windows(length, share))
         return found
 
     @cached_property
