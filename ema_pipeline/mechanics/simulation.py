@@ -29,7 +29,7 @@ from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import total_damping
 from ema_pipeline.mechanics.system import LinearSystem
 
-FINE, COARSE = 0.25, 0.65
+FINE, COARSE = 0.25, 0.5
 """Phase, in rad, by which the highest mode may turn in one step. A quarter leaves an error of a hundred thousandth of a
 frequency; laws with kinks, such as hysteresis, need it too. While hypotheses are compared half will do."""
 MOST_SUBSTEPS = 64
@@ -38,6 +38,8 @@ _PADDING = 400
 HYSTERESIS, RELAXATION = 3, 5
 WITH_MEMORY = (HYSTERESIS, RELAXATION)
 """Kinds of elements, as `coded_law` has them, that have a memory."""
+_VECTOR = 8
+"""Numbers that the compiled loop takes at once: a rest of up to seven takes as long as all the others."""
 _NO_LOSS = 1e-6
 """Least σ of a Bouc-Wen law: below it, it is a spring."""
 
@@ -171,10 +173,10 @@ def coded_law(element: Nonlinear) -> tuple[int, tuple[float, float, float, float
     raise EmaError(f"element '{element.name}' has no law that continuous records can be simulated with")
 
 
-def substeps_for(system: LinearSystem, sample_rate_hz: float, phase: float) -> int:
-    """Steps per sample in which the highest mode turns by no more than `phase`, rad; no fewer than 1/phase."""
+def substeps_for(system: LinearSystem, sample_rate_hz: float, phase: float, headroom: float = 1.0) -> int:
+    """Steps per sample in which `headroom` times the highest mode turns by no more than `phase`, rad, or 1/phase."""
     squares = scipy.linalg.eigh(system.stiffness, system.mass, eigvals_only=True)
-    highest = float(np.sqrt(max(np.max(squares), 0.0)))
+    highest = headroom * float(np.sqrt(max(np.max(squares), 0.0)))
     return int(np.clip(np.ceil(highest / sample_rate_hz / phase), np.ceil(1 / phase), MOST_SUBSTEPS))
 
 
@@ -229,10 +231,14 @@ class Slopes:
         stiffness, damping, inputs, push, numbers = (np.zeros((*a.shape, count)) for a in system.varied)
         return cls(stiffness, damping, inputs, push, numbers, np.zeros((system.size, count)))
 
+    @property
+    def arrays(self) -> tuple[NDArray[np.float64], ...]:
+        """All of them, that of the first state last."""
+        return self.stiffness, self.damping, self.inputs, self.push, self.numbers, self.begin
+
     def first(self, count: int) -> Slopes:
         """The derivatives by the first `count` parameters."""
-        arrays = (self.stiffness, self.damping, self.inputs, self.push, self.numbers, self.begin)
-        return Slopes(*(np.ascontiguousarray(a[..., :count]) for a in arrays))
+        return Slopes(*(np.ascontiguousarray(a[..., :count]) for a in self.arrays))
 
     def set_difference(self, column: int, low: DrivenSystem, high: DrivenSystem, step: float) -> None:
         """Fill in one parameter from the systems `step` apart."""
@@ -322,13 +328,20 @@ def march_windows(
         if not driven.march_windows(*fixed, states):
             return None
         return states, np.empty((*shape, 0))
-    derivatives = np.empty((*shape, slopes.begin.shape[2]))
-    if not driven.march_windows_with_slopes(
-        *fixed, slopes.stiffness, slopes.damping, slopes.inputs, slopes.push, slopes.numbers, slopes.begin,
-        states, derivatives,
-    ):  # fmt: skip
+    count = slopes.begin.shape[-1]
+    wide = [_filled_up(a) for a in slopes.arrays]
+    derivatives = np.empty((*shape, wide[-1].shape[-1]))
+    if not driven.march_windows_with_slopes(*fixed, *wide, states, derivatives):
         return None
-    return states, derivatives
+    return states, derivatives[..., :count]
+
+
+def _filled_up(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Derivatives by so many parameters more, all 0, that the compiled loop takes them in whole vectors."""
+    count = slopes.shape[-1]
+    found = np.zeros((*slopes.shape[:-1], -(-count // _VECTOR) * _VECTOR))
+    found[..., :count] = slopes
+    return found
 
 
 def resolved(
