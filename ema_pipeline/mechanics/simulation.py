@@ -29,9 +29,9 @@ from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import total_damping
 from ema_pipeline.mechanics.system import LinearSystem
 
-FINE, COARSE = 0.25, 0.5
+FINE, COARSE = 0.25, 0.65
 """Phase, in rad, by which the highest mode may turn in one step. A quarter leaves an error of a hundred thousandth of a
-frequency; laws with kinks, such as hysteresis, need it too. While hypotheses are compared half will do."""
+frequency; laws with kinks, such as hysteresis, need it too. While hypotheses are compared less will do."""
 MOST_SUBSTEPS = 64
 _PADDING = 400
 """Samples by which a record is continued at both ends before it is interpolated."""
@@ -173,10 +173,10 @@ def coded_law(element: Nonlinear) -> tuple[int, tuple[float, float, float, float
     raise EmaError(f"element '{element.name}' has no law that continuous records can be simulated with")
 
 
-def substeps_for(system: LinearSystem, sample_rate_hz: float, phase: float, headroom: float = 1.0) -> int:
-    """Steps per sample in which `headroom` times the highest mode turns by no more than `phase`, rad, or 1/phase."""
+def substeps_for(system: LinearSystem, sample_rate_hz: float, phase: float) -> int:
+    """Steps per sample in which the highest mode turns by no more than `phase`, rad; no fewer than 1/phase."""
     squares = scipy.linalg.eigh(system.stiffness, system.mass, eigvals_only=True)
-    highest = headroom * float(np.sqrt(max(np.max(squares), 0.0)))
+    highest = float(np.sqrt(max(np.max(squares), 0.0)))
     return int(np.clip(np.ceil(highest / sample_rate_hz / phase), np.ceil(1 / phase), MOST_SUBSTEPS))
 
 
@@ -329,9 +329,9 @@ def march_windows(
             return None
         return states, np.empty((*shape, 0))
     count = slopes.begin.shape[-1]
-    wide = [_filled_up(a) for a in slopes.arrays]
-    derivatives = np.empty((*shape, wide[-1].shape[-1]))
-    if not driven.march_windows_with_slopes(*fixed, *wide, states, derivatives):
+    k, c, inputs, push, numbers, first = (_filled_up(a) for a in slopes.arrays)
+    derivatives = np.empty((*shape, first.shape[-1]))
+    if not driven.march_windows_with_slopes(*fixed, k, c, inputs, push, numbers, first, states, derivatives):
         return None
     return states, derivatives[..., :count]
 

@@ -149,10 +149,14 @@ class RecordData:
         slowest_hz : float
             Frequency below which a structure does not move: what is integrated below it is noise.
         """
-        known: dict[float, tuple[NDArray[np.float64], NDArray[np.float64]]] = self.__dict__.setdefault("_motion", {})
+        known: dict[float, tuple[NDArray[np.float64], NDArray[np.float64]]] = self.__dict__.setdefault(
+            "_motion", {}
+        )
         if slowest_hz not in known:
             pairs = [
-                _integrated(signal, self.record.sample_rate_hz, slowest_hz, _POWER[c.quantity], self.record.period > 0)
+                _integrated(
+                    signal, self.record.sample_rate_hz, slowest_hz, _POWER[c.quantity], self.record.period > 0
+                )
                 for signal, c in zip(self.record.responses, self.record.channels, strict=True)
             ]
             known[slowest_hz] = np.array([x for x, _ in pairs]), np.array([v for _, v in pairs])
@@ -199,4 +203,3 @@ def _steady(responses: NDArray[np.float64], least: int) -> int:
     mean = responses[:, 1:].mean(axis=1, keepdims=True)
     away = np.sqrt(np.mean((responses - mean) ** 2, axis=(0, 2)))
     return 1 if away[0] > _RESTLESS * float(np.max(away[1:])) else 0
-

@@ -317,9 +317,7 @@ class RecordModel:
         assembly = self.rig_model.assembly(
             self.basis.configuration, self._inner(self.start())[self.rig_model.shape_start :]
         )
-        return tuple(
-            (e.name, j) for j, e in enumerate(assembly.nonlinear) if coded_law(e)[0] in WITH_MEMORY
-        )
+        return tuple((e.name, j) for j, e in enumerate(assembly.nonlinear) if coded_law(e)[0] in WITH_MEMORY)
 
     def driven(self, x: NDArray[np.float64]) -> DrivenSystem:
         """What is marched at `x`: the forces' columns, then one of their offsets."""

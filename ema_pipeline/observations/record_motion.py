@@ -81,9 +81,7 @@ def simulated(
     states, change = found[0][:, kept], found[1][:, kept]
     force = fine[:, :: 2 * substeps][:, kept]
     shape = states.shape[:2]
-    read, slope = sensors.read(
-        system, _joined(states), _joined(force), _joined(change), slopes
-    )
+    read, slope = sensors.read(system, _joined(states), _joined(force), _joined(change), slopes)
     return Motion(states, read.reshape(*shape, -1), slope.reshape(*shape, *slope.shape[1:]))
 
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Residuals, Unknowns, joined
-from ema_pipeline.ingest.driven import DrivenRecord
 from ema_pipeline.mechanics.simulation import HYSTERESIS, DrivenSystem, Slopes
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, RecordData
@@ -56,7 +55,12 @@ class RecordProblem(EffectProblem):
             self.model.unknowns,
             *(
                 Unknowns.plain(
-                    [f"{s} at sample {at} of {d.record.name}{effects}" for at in d.starts for s in self._states], 1.0
+                    [
+                        f"{s} at sample {at} of {d.record.name}{effects}"
+                        for at in d.starts
+                        for s in self._states
+                    ],
+                    1.0,
                 )
                 for d in self.observations.data
                 if not d.periodic
@@ -156,7 +160,7 @@ class RecordProblem(EffectProblem):
     def _begin(
         self, data: RecordData, system: DrivenSystem, x: NDArray[np.float64], slopes: Slopes | None
     ) -> tuple[NDArray[np.float64], Slopes | None]:
-        """States at the start of the windows of a record, (n_windows, 2n + m), whose unknowns are `x`, and slopes with theirs."""
+        """States at the start of a record's windows, (n_windows, 2n + m), of unknowns `x`; slopes with theirs."""
         o, moving, marched = self.observations, len(self.observations.begin_scale), self.model.marched
         unknown = x.reshape(len(data.starts), -1)
         begin = np.zeros((len(data.starts), system.size))
@@ -171,7 +175,9 @@ class RecordProblem(EffectProblem):
             if slopes is not None:
                 change[:, moving + j, marched + k] = _MEMORY * size
                 if force:
-                    change[:, moving + j, :marched] = _MEMORY * np.outer(unknown[:, k], slopes.numbers[j, 1, :marched])
+                    change[:, moving + j, :marched] = _MEMORY * np.outer(
+                        unknown[:, k], slopes.numbers[j, 1, :marched]
+                    )
         return begin, None if slopes is None else replace(slopes, begin=change)
 
     def settled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -190,7 +196,9 @@ class RecordProblem(EffectProblem):
         if not data.windowed:  # the start of the record tells it
             count = min(max(data.record.transient, _BEGIN_SAMPLES), data.samples)
             seen = slice(count + _EDGE)
-            part = replace(data.record, force=data.record.force[:, seen], responses=data.record.responses[:, seen])
+            part = replace(
+                data.record, force=data.record.force[:, seen], responses=data.record.responses[:, seen]
+            )
             data = RecordData.of(part)
         short = RecordProblem(self.observations.with_records([data], ()), self.model)
         rms, gains = self.observations.rms, self.model.gains(common)
@@ -276,7 +284,7 @@ def _by_output(read: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Variance:
-    """Of the lines of every window of a record, each (n_outputs, n_rows): the whole, the learned share, and σ over the stated one."""
+    """Of a window's lines, each (n_outputs, n_rows): the whole, the learned share, and σ over the stated one."""
 
     total: NDArray[np.float64]
     share: NDArray[np.float64]

@@ -142,7 +142,7 @@ class RecordObservations:
     def substeps(self) -> int:
         """Steps per sample."""
         linear = self.linear_model.linear(self.linear_model.start())
-        return substeps_for(linear, self.sample_rate_hz, self.phase, _HEADROOM)
+        return substeps_for(linear, self.sample_rate_hz, self.phase / _HEADROOM)
 
     def scaled(self, placed: PlacedEffect) -> PlacedEffect:
         """An effect with the starts and prior scales of its sizes as these records suggest, if they can."""
