@@ -155,7 +155,7 @@ def _starts(
     measured: MeasuredFrfs,
     residual: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> Iterator[NDArray[np.float64]]:
-    """Starts: the rig's own values, and those that put one of its modes at the measured peak; sizes agree on average."""
+    """Starts: the rig's own values, and those that put a mode at the measured peak; sizes agree on average."""
     plain = model.system(configuration, np.zeros(len(model.unknowns)))
     values = scipy.linalg.eigh(plain.stiffness, plain.mass, eigvals_only=True)
     powers = np.array([_STIFFENED[_kind(model, configuration, n)] for n in names])
