@@ -255,6 +255,8 @@ def run(folder: Path) -> tuple[str, list[tuple[str, float]]]:
         "run",
         str(folder / "raw"),
         *given,
+        "--set",
+        "diagnose.processes=1",
     ]
     done = subprocess.run([*command, "--out", str(folder / "out"), "--quiet"], capture_output=True, text=True)
     if done.returncode:

@@ -96,14 +96,14 @@ def _simulated(
     for name, value in unknowns.items():
         if name in problem.unknowns.index:
             x[problem.unknowns.index[name]] = value
-    states = [i for i, n in enumerate(problem.unknowns.names) if n.startswith("state ")]
-    if states and not any(problem.unknowns.names[i] in unknowns for i in states):
+    states = problem.unknowns.names[len(problem.model.unknowns) :]
+    if states and not any(n in unknowns for n in states):
         x = problem.settled(x)
     motions = problem.motions(x)
     if motions is None:
         return np.full(one.data[0].record.responses.T.shape, np.nan)
     common = x[: len(problem.model.unknowns)]
-    return motions[0].read * problem.model.gains(common) + problem.model.response_offsets(common, one.rms)
+    return motions[0].read[0] * problem.model.gains(common) + problem.model.response_offsets(common, one.rms)
 
 
 def _errors(one: RecordObservations, runs: Sequence[NDArray[np.float64]]) -> list[RecordError]:

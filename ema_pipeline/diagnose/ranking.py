@@ -38,6 +38,8 @@ FINALISTS = 5
 """Hypotheses for which the scatters are learned."""
 _PROMISING = 2
 """Further finalists: what promises most beside learned scatters, which may be far narrower than those begun with."""
+_BEATEN = 200.0
+"""Log evidence behind the best hypothesis from which another one cannot catch up: it is not begun again."""
 _SCREENED = 14
 """Generic hypotheses, best first by their score, that are fitted in full."""
 _UNSEEN = 1e6
@@ -125,7 +127,10 @@ def rank(
     found = _bettered(found, _CONTENDERS, partial(_free, observations), processes)
     base, found = _begun_again(observations, base, found, processes, _CONTENDERS, steps=12)
     progress(0.8, "scatter of parts and channels")
-    return _finals(observations, base, found, _promising(observations, base, hypotheses, models), processes)
+    order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
+    others = [h for h in hypotheses if h.label not in {best.label for best, _ in order[:FINALISTS]}]
+    promising = [] if stuck else _promising(observations, base, others, models)
+    return _finals(observations, base, order, promising, processes)
 
 
 def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) -> list[Hypothesis]:
@@ -268,12 +273,12 @@ def _spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes
 
 def _promising(
     observations: Observations, base: Fit, hypotheses: Sequence[Hypothesis], models: Mapping[str, Model]
-) -> Found:
-    """What promises most on top of the base model with learned scatters, each begun at the size of its score."""
+) -> list[tuple[Hypothesis, Fit]]:
+    """What promises most on top of the base model with learned scatters, begun at the size of its score."""
     settled = learned(observations, base)
-    found: Found = {}
+    found = []
     best = sorted(scores(observations, settled, hypotheses, models), key=lambda s: -s.gain)
-    for score in [s for s in best[:FINALISTS] if s.gain > 0]:
+    for score in [s for s in best[:_PROMISING] if s.gain > 0]:
         model = models[score.hypothesis.label]
         unknowns = model.problem(observations).unknowns
         x = transferred(settled.posterior, unknowns, np.zeros(len(unknowns)))
@@ -281,43 +286,42 @@ def _promising(
         for parameter, size in zip(placed.effect.parameters, score.size, strict=True):
             x[unknowns.index[placed.parameter_name(parameter.name)]] = size
         fit = refined(observations, model, unknowns.clipped(x), settled.posterior.scatters)
-        found[score.hypothesis.label] = (score.hypothesis, fit)
+        found.append((score.hypothesis, fit))
     return found
 
 
 def _finals(
-    observations: Observations, base: Fit, found: Found, promising: Found, processes: int | None
+    observations: Observations,
+    base: Fit,
+    order: Sequence[tuple[Hypothesis, Fit]],
+    promising: Sequence[tuple[Hypothesis, Fit]],
+    processes: int | None,
 ) -> Ranking:
     """Scatters learned for the base model and the best hypotheses, each from what the others know."""
-    order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
-    leading = [h.label for h, _ in order[:FINALISTS]]
-    further = [pair for label, pair in promising.items() if label not in leading][:_PROMISING]
-    taken = [h.label for h, _ in further]
-    order = [
-        *order[:FINALISTS],
-        *further,
-        *(pair for pair in order[FINALISTS:] if pair[0].label not in taken),
+    best, rest = order[:FINALISTS], order[FINALISTS:]
+    near = [pair for pair in best if pair[1].log_evidence >= best[0][1].log_evidence - _BEATEN]
+    far = best[len(near) :]
+    finalists = [*near, *promising]
+    job = partial(_final, observations, (base, *(fit for _, fit in near[:2])))
+    first = _spread_fits(job, [base, *(fit for _, fit in finalists)], processes)
+    beaten = _spread_fits(partial(_final, observations, ()), [fit for _, fit in far], processes)
+    leaders = sorted(first[1:], key=lambda f: -f.log_evidence)
+    job = partial(_final, observations, (first[0], *leaders[:2]))
+    final_base, *again = _spread_fits(job, first, processes)
+    finals = [
+        Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True)
+        for (hypothesis, _), fit in zip((*finalists, *far), (*again, *beaten), strict=True)
     ]
-    count = len(leading) + len(further)
-    best = [fit for _, fit in order[:count]]
-    job = partial(_final, observations, (base, *best[:2]))
-    first = _spread_fits(job, [base, *best], processes)
-    leaders = sorted(first[1:], key=lambda f: -f.log_evidence)[:2]
-    job = partial(_final, observations, (first[0], *leaders))
-    second = _spread_fits(job, first, processes)
-    final_base = second[0]
-    ranked = []
-    for i, (hypothesis, fit) in enumerate(order):
-        if i < count:
-            fit = second[1 + i]
-            ranked.append(Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True))
-        else:
-            ranked.append(Ranked(hypothesis, fit, fit.log_evidence - base.log_evidence, False))
-    finals = sorted(ranked[:count], key=lambda r: -r.gain)
+    finals.sort(key=lambda r: -r.gain)
     least = finals[-1].gain if finals else 0.0
+    taken = {r.hypothesis.label for r in finals}
     # An effect that is no finalist was behind at wide scatters; it cannot lead at learned ones.
-    rest = [Ranked(r.hypothesis, r.fit, min(r.gain, least), False) for r in ranked[count:]]
-    return Ranking(final_base, (*finals, *rest))
+    others = [
+        Ranked(hypothesis, fit, min(fit.log_evidence - base.log_evidence, least), False)
+        for hypothesis, fit in rest
+        if hypothesis.label not in taken
+    ]
+    return Ranking(final_base, (*finals, *others))
 
 
 def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:

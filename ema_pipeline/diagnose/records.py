@@ -1,4 +1,4 @@
-"""Diagnosis by simulation of continuous records: hypotheses, the search on pieces, the ladder on whole records."""
+"""Diagnosis by simulation of continuous records: hypotheses, the search on windows, the ladder on whole records."""
 
 from __future__ import annotations
 
@@ -23,11 +23,13 @@ from ema_pipeline.mechanics.simulation import COARSE, coded_law
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.fitting import Model, learned, refined
-from ema_pipeline.observations.record_data import thinned
 from ema_pipeline.observations.records import RecordObservations
 
-SEARCHED = 4096
-"""Samples, in pieces, on which hypotheses are compared: enough for evidence by the hundred, quick enough for all."""
+SEARCHED = 2048
+"""Samples of all responses together, in windows, on which hypotheses are compared: enough for evidence by the hundred,
+quick enough for all."""
+_LOST = 3.0
+"""Error in whole records, over that in windows, from which a simulation has lost step with the measured motion."""
 _SAME_CHANGE = 1e-5
 """Relative difference of two changes of the linear system below which they are the same physics."""
 _TRIAL = 1e-6
@@ -69,13 +71,13 @@ def diagnose_records(
     Returns
     -------
     Diagnosis
-        Its search used pieces of the records; its ladder holds the whole ones.
+        Its search used windows of the records; its ladder holds the whole ones, where the model can follow them.
     """
     settings = settings or DiagnoseSettings()
-    pieces = search_pieces(observations)
+    windows = in_windows(observations)
     hypotheses = record_hypotheses(observations, library, known)
     found = diagnose(
-        pieces,
+        windows,
         observations.rig,
         library,
         record_model(observations, library, known),
@@ -89,15 +91,10 @@ def diagnose_records(
     return _with_whole(found, ladder)
 
 
-def search_pieces(observations: RecordObservations) -> RecordObservations:
-    """The same test by pieces of its records."""
-    records = [d.record for d in observations.data]
-    return observations.with_records(
-        thinned(records, SEARCHED),
-        thinned(observations.held_out, SEARCHED),
-        observations.basis.calibrated(),
-        COARSE,
-    )
+def in_windows(observations: RecordObservations) -> RecordObservations:
+    """The same test by windows of its records, with coarser steps, and what loose values absorb left out."""
+    windows = observations.in_windows(SEARCHED)
+    return observations.with_records(windows.data, windows.held_out, observations.basis.calibrated(), COARSE)
 
 
 def record_model(
@@ -157,7 +154,22 @@ def _places(observations: RecordObservations) -> tuple[str, ...]:
 
 
 def whole_ladder(observations: RecordObservations, library: Mapping[str, Effect], searched: Ladder) -> Ladder:
-    """The rungs of a ladder that was found on pieces, fitted to whole records.
+    """The rungs of a ladder that was found on windows, fitted to whole records.
+
+    Where motion depends so much on its start that the model loses step in them, the fits to windows stay.
+    """
+    whole = _refitted(observations, library, searched)
+    limit = _LOST * max(searched.rungs[-1].error, 1.0)
+    if whole.rungs[-1].error < limit:
+        return whole
+    windows = observations.in_windows(SEARCHED)
+    rungs = tuple(_with_calibration(windows, library, searched, r) for r in searched.rungs)
+    cycles = "the model is fitted to windows of a few cycles; through whole records it does not stay in step"
+    return dataclasses.replace(searched, rungs=rungs, note="; ".join(n for n in (searched.note, cycles) if n))
+
+
+def _refitted(observations: RecordObservations, library: Mapping[str, Effect], searched: Ladder) -> Ladder:
+    """The rungs fitted to whole records.
 
     The fit takes its reference channels as exact, which costs nothing. Uncertainties are those with all calibrations.
     """
@@ -203,11 +215,11 @@ def records_ladder(
     effects: Sequence[str],
     known: Ladder | None,
 ) -> Ladder:
-    """The ladder of given effects, fitted on pieces where `known` does not hold just these, then on whole records."""
+    """The ladder of given effects, fitted on windows where `known` does not hold just these, then on whole records."""
     rungs = () if known is None else known.rungs
     if known is None or not rungs or rungs[-1].effects != tuple(effects):
         models = [record_model(observations, library, effects[:k]) for k in range(len(effects) + 1)]
-        known = make_ladder(search_pieces(observations), models)
+        known = make_ladder(in_windows(observations), models)
     return whole_ladder(observations, library, known)
 
 

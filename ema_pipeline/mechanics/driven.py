@@ -302,6 +302,49 @@ def march_with_slopes(  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
+def march_windows(stiffness, damping, inputs, push, rows, kinds, numbers, force, begin, step, every, out):  # type: ignore[no-untyped-def]
+    """`march` for every force (n_windows, ...), from `begin` (n_windows, 2n + m) into `out`; False where one fails."""
+    for w in range(len(force)):
+        if not march(
+            stiffness, damping, inputs, push, rows, kinds, numbers, force[w], begin[w], step, every, out[w]
+        ):
+            return False
+    return True
+
+
+@numba.njit(cache=True)
+def march_windows_with_slopes(  # type: ignore[no-untyped-def]
+    stiffness,
+    damping,
+    inputs,
+    push,
+    rows,
+    kinds,
+    numbers,
+    force,
+    begin,
+    step,
+    every,
+    d_stiffness,
+    d_damping,
+    d_inputs,
+    d_push,
+    d_numbers,
+    d_begin,
+    out,
+    d_out,
+):
+    """`march_with_slopes` for every force, as `march_windows` does it."""
+    for w in range(len(force)):
+        if not march_with_slopes(
+            stiffness, damping, inputs, push, rows, kinds, numbers, force[w], begin[w], step, every,
+            d_stiffness, d_damping, d_inputs, d_push, d_numbers, d_begin[w], out[w], d_out[w],
+        ):  # fmt: skip
+            return False
+    return True
+
+
+@numba.njit(cache=True)
 def accelerations(  # type: ignore[no-untyped-def]
     stiffness,
     damping,

@@ -14,14 +14,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.mechanics.simulation import DrivenSystem, Slopes, march
+from ema_pipeline.mechanics.simulation import WITH_MEMORY, DrivenSystem, Slopes, march
 
 _ROUNDS = 12
 """Periods or Newton steps after which the response is left to settle by itself."""
 _CLOSED = 1e-7
 """Gap after one period, over the largest motion, at which the response counts as periodic."""
-WITH_MEMORY = (3, 5)
-"""Kinds of elements, as `simulation.coded_law` has them, that have a memory: hysteresis and relaxation."""
 _STABLE = 1 - 1e-6
 """Largest multiplier of a response that a structure settles to; 1 where a memory never fades."""
 

@@ -29,12 +29,17 @@ from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import total_damping
 from ema_pipeline.mechanics.system import LinearSystem
 
-FINE, COARSE = 0.25, 0.5
+FINE, COARSE = 0.25, 0.65
 """Phase, in rad, by which the highest mode may turn in one step. A quarter leaves an error of a hundred thousandth of a
-frequency; laws with kinks, such as hysteresis, need it too. While hypotheses are compared half will do."""
+frequency; laws with kinks, such as hysteresis, need it too. While hypotheses are compared less will do."""
 MOST_SUBSTEPS = 64
 _PADDING = 400
 """Samples by which a record is continued at both ends before it is interpolated."""
+HYSTERESIS, RELAXATION = 3, 5
+WITH_MEMORY = (HYSTERESIS, RELAXATION)
+"""Kinds of elements, as `coded_law` has them, that have a memory."""
+_VECTOR = 8
+"""Numbers that the compiled loop takes at once: a rest of up to seven takes as long as all the others."""
 _NO_LOSS = 1e-6
 """Least σ of a Bouc-Wen law: below it, it is a spring."""
 
@@ -97,30 +102,53 @@ def driven_system(
     EmaError
         For structural damping, which has no time response, and for elements that the loop does not know.
     """
-    system = linear or assembly.system()
-    if np.any(system.structural):
-        raise EmaError(
-            "a loss factor holds at steady state only and has no time response; replace it by a damper"
+    return CodedElements.of(assembly).driven(linear or assembly.system(), in_rows)
+
+
+@dataclass(frozen=True)
+class CodedElements:
+    """Nonlinear elements as the compiled loop takes them.
+
+    Attributes
+    ----------
+    rows : ndarray, (m, n)
+    tangent : ndarray, (m,)
+        Stiffness at rest, which the linear system holds already, N/m.
+    numbers : ndarray, (m, 4)
+    kinds : ndarray of int, (m,)
+    """
+
+    rows: NDArray[np.float64]
+    tangent: NDArray[np.float64]
+    numbers: NDArray[np.float64]
+    kinds: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, assembly: Assembly) -> CodedElements:
+        """Those of an assembly; EmaError for elements that the loop does not know."""
+        elements = assembly.nonlinear
+        coded = [coded_law(e) for e in elements]
+        return cls(
+            np.ascontiguousarray(element_rows(assembly, elements)),
+            np.array([e.tangent_stiffness for e in elements]),
+            np.array([numbers for _, numbers in coded]).reshape(len(elements), 4),
+            np.array([kind for kind, _ in coded], dtype=np.int64),
         )
-    elements = assembly.nonlinear
-    rows = element_rows(assembly, elements)
-    tangent = np.array([e.tangent_stiffness for e in elements])
-    stiffness = system.stiffness - rows.T @ (tangent[:, None] * rows)
-    factor = scipy.linalg.cho_factor(system.mass)
-    coded = [coded_law(e) for e in elements]
 
-    def solved(right: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.ascontiguousarray(scipy.linalg.cho_solve(factor, right, check_finite=False))
-
-    return DrivenSystem(
-        stiffness=solved(stiffness),
-        damping=solved(total_damping(system)),
-        inputs=solved(in_rows.T),
-        push=solved(rows.T),
-        numbers=np.array([numbers for _, numbers in coded]).reshape(len(elements), 4),
-        rows=np.ascontiguousarray(rows),
-        kinds=np.array([kind for kind, _ in coded], dtype=np.int64),
-    )
+    def driven(self, system: LinearSystem, in_rows: NDArray[np.float64]) -> DrivenSystem:
+        """A linear system with these elements, driven along `in_rows`, (n_inputs, n); see `driven_system`."""
+        if np.any(system.structural):
+            raise EmaError(
+                "a loss factor holds at steady state only and has no time response; replace it by a damper"
+            )
+        n, q = len(system.mass), len(in_rows)
+        stiffness = system.stiffness - self.rows.T @ (self.tangent[:, None] * self.rows)
+        solved = np.linalg.solve(
+            system.mass, np.hstack([stiffness, total_damping(system), in_rows.T, self.rows.T])
+        )
+        parts = (solved[:, :n], solved[:, n : 2 * n], solved[:, 2 * n : 2 * n + q], solved[:, 2 * n + q :])
+        stiffness, damping, inputs, push = (np.ascontiguousarray(p) for p in parts)
+        return DrivenSystem(stiffness, damping, inputs, push, self.numbers, self.rows, self.kinds)
 
 
 def coded_law(element: Nonlinear) -> tuple[int, tuple[float, float, float, float]]:
@@ -203,10 +231,14 @@ class Slopes:
         stiffness, damping, inputs, push, numbers = (np.zeros((*a.shape, count)) for a in system.varied)
         return cls(stiffness, damping, inputs, push, numbers, np.zeros((system.size, count)))
 
+    @property
+    def arrays(self) -> tuple[NDArray[np.float64], ...]:
+        """All of them, that of the first state last."""
+        return self.stiffness, self.damping, self.inputs, self.push, self.numbers, self.begin
+
     def first(self, count: int) -> Slopes:
         """The derivatives by the first `count` parameters."""
-        arrays = (self.stiffness, self.damping, self.inputs, self.push, self.numbers, self.begin)
-        return Slopes(*(np.ascontiguousarray(a[..., :count]) for a in arrays))
+        return Slopes(*(np.ascontiguousarray(a[..., :count]) for a in self.arrays))
 
     def set_difference(self, column: int, low: DrivenSystem, high: DrivenSystem, step: float) -> None:
         """Fill in one parameter from the systems `step` apart."""
@@ -252,26 +284,64 @@ def march(
     E. Hairer, S. P. Norsett, G. Wanner, *Solving Ordinary Differential Equations I* (1993), sections II.1 and I.14
     (variational equations).
     """
+    if slopes is not None:
+        slopes = replace(slopes, begin=slopes.begin[None])
+    found = march_windows(system, sample_rate_hz, substeps, force[None], begin[None], slopes)
+    return None if found is None else (found[0][0], found[1][0])
+
+
+def march_windows(
+    system: DrivenSystem,
+    sample_rate_hz: float,
+    substeps: int,
+    force: NDArray[np.float64],
+    begin: NDArray[np.float64],
+    slopes: Slopes | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """`march` under several forces of one length, each from a state of its own.
+
+    Parameters
+    ----------
+    system, sample_rate_hz, substeps
+        As in `march`.
+    force : ndarray, (n_windows, 2·substeps·(n_samples - 1) + 1, n_inputs)
+    begin : ndarray, (n_windows, 2n + m)
+    slopes : Slopes, optional
+        Its derivatives of the first state are (n_windows, 2n + m, p).
+
+    Returns
+    -------
+    states : ndarray, (n_windows, n_samples, 2n + m)
+    derivatives : ndarray, (n_windows, n_samples, 2n + m, p)
+        None where the motion grows without bound in one of them.
+    """
     from ema_pipeline.mechanics import driven  # compiled on first use
 
     step = 1 / (sample_rate_hz * substeps)
-    count = (len(force) - 1) // (2 * substeps) + 1
-    states = np.empty((count, system.size))
+    shape = (len(force), (force.shape[1] - 1) // (2 * substeps) + 1, system.size)
+    states = np.empty(shape)
     fixed = (
         system.stiffness, system.damping, system.inputs, system.push, system.rows, system.kinds,
         system.numbers, force, begin, step, substeps,
     )  # fmt: skip
     if slopes is None:
-        if not driven.march(*fixed, states):
+        if not driven.march_windows(*fixed, states):
             return None
-        return states, np.empty((count, system.size, 0))
-    derivatives = np.empty((count, system.size, slopes.begin.shape[1]))
-    if not driven.march_with_slopes(
-        *fixed, slopes.stiffness, slopes.damping, slopes.inputs, slopes.push, slopes.numbers, slopes.begin,
-        states, derivatives,
-    ):  # fmt: skip
+        return states, np.empty((*shape, 0))
+    count = slopes.begin.shape[-1]
+    k, c, inputs, push, numbers, first = (_filled_up(a) for a in slopes.arrays)
+    derivatives = np.empty((*shape, first.shape[-1]))
+    if not driven.march_windows_with_slopes(*fixed, k, c, inputs, push, numbers, first, states, derivatives):
         return None
-    return states, derivatives
+    return states, derivatives[..., :count]
+
+
+def _filled_up(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Derivatives by so many parameters more, all 0, that the compiled loop takes them in whole vectors."""
+    count = slopes.shape[-1]
+    found = np.zeros((*slopes.shape[:-1], -(-count // _VECTOR) * _VECTOR))
+    found[..., :count] = slopes
+    return found
 
 
 def resolved(

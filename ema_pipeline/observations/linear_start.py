@@ -155,14 +155,15 @@ def _starts(
     measured: MeasuredFrfs,
     residual: Callable[[NDArray[np.float64]], NDArray[np.float64]],
 ) -> Iterator[NDArray[np.float64]]:
-    """Starts at which one of the model's modes lies at the measured peak, and sizes agree on average."""
+    """Starts: the rig's own values, and those that put a mode at the measured peak; sizes agree on average."""
     plain = model.system(configuration, np.zeros(len(model.unknowns)))
     values = scipy.linalg.eigh(plain.stiffness, plain.mass, eigvals_only=True)
     powers = np.array([_STIFFENED[_kind(model, configuration, n)] for n in names])
     powers[len(names) - bool(damping) :] = 0.0
     sized = np.arange(len(names)) < len(names) - bool(damping)
-    for value in values[values > 1e-9 * np.max(values)]:
-        start = powers * 2 * np.log(measured.peak / np.sqrt(value))
+    peaks = measured.peak / np.sqrt(values[values > 1e-9 * np.max(values)])
+    for factor in (1.0, *peaks.tolist()):
+        start = powers * 2 * np.log(factor)
         if damping:
             start[-1] = np.log(_DAMPING / model.rig.parameters[damping].value)
         seen = measured.weight.ravel() > 0

@@ -21,7 +21,13 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Damper
 from ema_pipeline.mechanics.modes import eigen_solution
-from ema_pipeline.mechanics.simulation import DrivenSystem, Slopes, driven_system
+from ema_pipeline.mechanics.simulation import (
+    WITH_MEMORY,
+    CodedElements,
+    DrivenSystem,
+    Slopes,
+    coded_law,
+)
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.observations.parts import (
     DAMPING,
@@ -46,6 +52,7 @@ _START_RATIO = 0.01
 """Damping ratio of a rig that states no damping at all."""
 _STEP = 1e-4
 """Step of the differences of matrices, in units of the unknowns."""
+_MOST_KNOWN = 32
 _BARELY = 1e-6
 """Size, in units of the prior 1 σ, that stands for an effect of size nought: its elements are there to be changed."""
 
@@ -183,6 +190,7 @@ class RecordModel:
         self.basis = basis
         self.rig_model = RigModel(basis.rig, effects, scales, basis.shared)
         self.offset = len(self.rig_model.unknowns)
+        self._known: dict[bytes, CodedElements] = {}
         self.modes = len(basis.rows[0][0]) if len(basis.rows[0][0]) > 1 and self.rig_model.has_ratio else 0
 
     @property
@@ -280,7 +288,21 @@ class RecordModel:
 
     def linear(self, x: NDArray[np.float64]) -> LinearSystem:
         """Matrices at `x`, the tangents of the elements included, the modes' damping among the dampers."""
-        system = self.rig_model.system(self.basis.configuration, self._inner(x))
+        matrices = self.rig_model.matrices(self.basis.configuration, self._inner(x), derivatives=False)
+        mass, damping, stiffness, structural = matrices.dense
+        system = LinearSystem(
+            dofs=matrices.terms.dofs,
+            mass=mass,
+            stiffness=stiffness,
+            damping=damping + matrices.skew,
+            structural=structural,
+            modal_damping_ratio=matrices.damping_ratio,
+        )
+        if len(mass) == 1:  # the mode of one coordinate needs no eigenvalues
+            critical = 2 * np.sqrt(np.maximum(mass * stiffness, 0.0))
+            return dataclasses.replace(
+                system, damping=system.damping + matrices.damping_ratio * critical, modal_damping_ratio=0.0
+            )
         if not self.modes:
             return system
         values, shapes = eigen_solution(system)
@@ -289,14 +311,31 @@ class RecordModel:
         damping = system.damping + (m_phi * (2 * ratio * np.sqrt(np.maximum(values, 0.0)))) @ m_phi.T
         return dataclasses.replace(system, damping=damping, modal_damping_ratio=0.0)
 
+    @cached_property
+    def memories(self) -> tuple[tuple[str, int], ...]:
+        """Name and number of every element that has a memory, among the nonlinear ones."""
+        assembly = self.rig_model.assembly(
+            self.basis.configuration, self._inner(self.start())[self.rig_model.shape_start :]
+        )
+        return tuple((e.name, j) for j, e in enumerate(assembly.nonlinear) if coded_law(e)[0] in WITH_MEMORY)
+
     def driven(self, x: NDArray[np.float64]) -> DrivenSystem:
         """What is marched at `x`: the forces' columns, then one of their offsets."""
         b = self.basis
-        assembly = self.rig_model.assembly(b.configuration, self._inner(x)[self.rig_model.shape_start :])
         at_start = np.exp(-x[self._parts[2]])
         rows = b.rows[0] * at_start[:, None]
         offset = -(x[self._parts[1]] * b.force_rms) @ rows
-        return driven_system(assembly, np.vstack([rows, offset]), self.linear(x))
+        return self._coded(x).driven(self.linear(x), np.vstack([rows, offset]))
+
+    def _coded(self, x: NDArray[np.float64]) -> CodedElements:
+        """The nonlinear elements, which only some unknowns change; those of the last points are remembered."""
+        shape = self._inner(x)[self.rig_model.shape_start :]
+        key = shape.tobytes()
+        if key not in self._known:
+            if len(self._known) > _MOST_KNOWN:
+                self._known.clear()
+            self._known[key] = CodedElements.of(self.rig_model.assembly(self.basis.configuration, shape))
+        return self._known[key]
 
     def slopes(self, x: NDArray[np.float64], here: DrivenSystem, more: int) -> Slopes:
         """Derivatives of what is marched by all unknowns, and room for `more`.

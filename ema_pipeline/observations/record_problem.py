@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Residuals, Unknowns, joined
-from ema_pipeline.ingest.driven import DrivenRecord
+from ema_pipeline.mechanics.simulation import HYSTERESIS, DrivenSystem, Slopes
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, RecordData
 from ema_pipeline.observations.record_model import RecordModel
@@ -26,6 +26,8 @@ _BEGIN_SAMPLES = 50
 """Samples that tell the state at the start of a record which is held out, where the test states no transient."""
 _EDGE = 400
 """Samples behind these that the interpolation of the force sees."""
+_MEMORY = 0.5
+"""1 σ of the memory of an element at the start of a record, as a share of the largest or of a typical one."""
 _ROUNDS = 4
 _LEAST_NOISE = 1e-5
 """Noise, in units of the discrepancy, that nothing falls below."""
@@ -44,21 +46,32 @@ class RecordProblem(EffectProblem):
 
     @cached_property
     def unknowns(self) -> Unknowns:
-        """The model's unknowns, and the state at the start of every record that is not periodic."""
+        """The model's unknowns, and the state at the start of every window, or record, that is not periodic.
+
+        States are named after the model: what one model makes of them leads a fit of another one astray.
+        """
+        effects = "".join(f", {e.label}" for e in self.model.rig_model.effects)
         return joined(
             self.model.unknowns,
             *(
                 Unknowns.plain(
-                    [f"state {k + 1} at the start of {d.record.name}" for k in range(self._states)], 1.0
+                    [
+                        f"{s} at sample {at} of {d.record.name}{effects}"
+                        for at in d.starts
+                        for s in self._states
+                    ],
+                    1.0,
                 )
                 for d in self.observations.data
                 if not d.periodic
             ),
         )
 
-    @property
-    def _states(self) -> int:
-        return len(self.observations.begin_scale)
+    @cached_property
+    def _states(self) -> tuple[str, ...]:
+        """What is unknown at the start of a record: displacements, velocities, memories of elements that have one."""
+        moving = (f"state {k + 1}" for k in range(len(self.observations.begin_scale)))
+        return (*moving, *(f"memory of {name}" for name, _ in self.model.memories))
 
     def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
         """See `EffectProblem`."""
@@ -91,16 +104,18 @@ class RecordProblem(EffectProblem):
         for data, motion in zip(self.observations.data, motions, strict=True):
             read = motion.read * gains
             read += self.model.response_offsets(x, self.observations.rms)
-            predicted = data.lines(np.ascontiguousarray(read[data.compared].T))
+            predicted = data.lines(_by_output(read[:, data.compared]))
             variance = self._variance(data, scatters)
             sigma = np.sqrt(variance.total) * heat
             values.append(((data.measured - predicted) / sigma).ravel())
             spread.append(variance)
-            own = 0 if data.periodic else self._states
             if derivatives:
                 rows.append(self._rows(data, motion, gains, place, len(x)) / -sigma[..., None])
-            place += own
-        relative = np.concatenate([v.relative.ravel() for v in spread])
+            place += self._own(data)
+        windows = [len(d.starts) for d in self.observations.data]
+        relative = np.concatenate(
+            [np.tile(v.relative.ravel(), n) for v, n in zip(spread, windows, strict=True)]
+        )
         return Residuals(
             values=np.concatenate(values),
             jacobian=np.concatenate([r.reshape(-1, len(x)) for r in rows])
@@ -113,24 +128,22 @@ class RecordProblem(EffectProblem):
 
     def motions(self, x: NDArray[np.float64], derivatives: bool = False) -> list[Motion] | None:
         """What the model does in every record; None where it grows without bound in one, or has no positive mass."""
-        o, common = self.observations, len(self.model.unknowns)
-        states = self._states
+        common, states = len(self.model.unknowns), len(self._states)
         try:
             here = self.model.driven(x[:common])
             slopes = self.model.slopes(x[:common], here, states) if derivatives else None
         except (EmaError, np.linalg.LinAlgError):  # a step of the search past what can exist
             return None
         found, place = [], common
-        for data in o.data:
-            begin, mine = np.zeros(here.size), slopes
+        for data in self.observations.data:
+            begin, mine = np.zeros((1, here.size)), slopes
             if not data.periodic:
-                begin[:states] = o.begin_scale * x[place : place + states]
-                place += states
-                if slopes is not None:
-                    slopes.begin[np.arange(states), self.model.marched + np.arange(states)] = o.begin_scale
+                own = self._own(data)
+                begin, mine = self._begin(data, here, x[place : place + own], slopes)
+                place += own
             elif slopes is not None:
                 mine = slopes.first(self.model.marched)
-            motion = o.motion(data, here, begin, mine)
+            motion = self.observations.motion(data, here, begin, mine)
             if (
                 motion is None
                 or not np.all(np.isfinite(motion.read))
@@ -140,34 +153,70 @@ class RecordProblem(EffectProblem):
             found.append(motion)
         return found
 
+    def _own(self, data: RecordData) -> int:
+        """Number of unknowns that a record has for itself."""
+        return 0 if data.periodic else len(self._states) * len(data.starts)
+
+    def _begin(
+        self, data: RecordData, system: DrivenSystem, x: NDArray[np.float64], slopes: Slopes | None
+    ) -> tuple[NDArray[np.float64], Slopes | None]:
+        """States at the start of a record's windows, (n_windows, 2n + m), of unknowns `x`; slopes with theirs."""
+        o, moving, marched = self.observations, len(self.observations.begin_scale), self.model.marched
+        unknown = x.reshape(len(data.starts), -1)
+        begin = np.zeros((len(data.starts), system.size))
+        begin[:, :moving] = o.suggested(data) + o.begin_scale * unknown[:, :moving]
+        change = np.zeros((*begin.shape, 0 if slopes is None else marched + len(self._states)))
+        if slopes is not None:
+            change[:, np.arange(moving), marched + np.arange(moving)] = o.begin_scale
+        for k, (_, j) in enumerate(self.model.memories, start=moving):
+            force = system.kinds[j] == HYSTERESIS  # what it remembers; others remember a stretch
+            size = system.numbers[j, 1] if force else np.abs(system.rows[j]) @ o.begin_scale[: moving // 2]
+            begin[:, moving + j] = _MEMORY * size * unknown[:, k]
+            if slopes is not None:
+                change[:, moving + j, marched + k] = _MEMORY * size
+                if force:
+                    change[:, moving + j, :marched] = _MEMORY * np.outer(
+                        unknown[:, k], slopes.numbers[j, 1, :marched]
+                    )
+        return begin, None if slopes is None else replace(slopes, begin=change)
+
     def settled(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """`x` with the states at the start of the records that their first samples alone determine."""
         found, place = x.copy(), len(self.model.unknowns)
         for data in self.observations.data:
             if not data.periodic:
-                part = slice(place, place + self._states)
-                found[part] = self._first_state(data.record, found[: len(self.model.unknowns)])
-                place += self._states
+                part = slice(place, place + self._own(data))
+                found[part] = self._first_states(data, found[: len(self.model.unknowns)])
+                place += self._own(data)
         return found
 
-    def _first_state(self, record: DrivenRecord, common: NDArray[np.float64]) -> NDArray[np.float64]:
-        """State at the start of one record, in units of its prior σ, by a few Gauss-Newton steps."""
-        count = min(max(record.transient, _BEGIN_SAMPLES), record.n_samples)
-        seen = count + _EDGE
-        part = replace(record, force=record.force[:, :seen], responses=record.responses[:, :seen])
-        short = RecordProblem(self.observations.with_records([part], ()), self.model)
+    def _first_states(self, data: RecordData, common: NDArray[np.float64]) -> NDArray[np.float64]:
+        """States at the start of a record or of its windows, in units of their prior σ, by a few Gauss-Newton steps."""
+        count = data.samples
+        if not data.windowed:  # the start of the record tells it
+            count = min(max(data.record.transient, _BEGIN_SAMPLES), data.samples)
+            seen = slice(count + _EDGE)
+            part = replace(
+                data.record, force=data.record.force[:, seen], responses=data.record.responses[:, seen]
+            )
+            data = RecordData.of(part)
+        short = RecordProblem(self.observations.with_records([data], ()), self.model)
         rms, gains = self.observations.rms, self.model.gains(common)
-        offsets = self.model.response_offsets(common, rms)
-        x = np.concatenate([common, np.zeros(self._states)])
+        offsets, states = self.model.response_offsets(common, rms), len(self._states)
+        measured = data.responses.transpose(0, 2, 1)
+        x = np.zeros((len(data.starts), states))
+        memory = np.eye(states)[len(self.observations.begin_scale) :] * DISCREPANCY
         for _ in range(_ROUNDS):
-            motions = short.motions(x, derivatives=True)
+            motions = short.motions(np.concatenate([common, x.ravel()]), derivatives=True)
             if motions is None:
-                return np.zeros(self._states)
-            gap = (part.responses.T - motions[0].read * gains - offsets)[:count] / rms
-            slope = motions[0].change[:count, :, self.model.marched :] * (gains / rms)[:, None]
-            step = np.linalg.lstsq(slope.reshape(-1, self._states), gap.ravel(), rcond=1e-8)[0]
-            x[len(common) :] += step
-        return x[len(common) :]
+                return np.zeros(x.size)
+            gap = ((measured - motions[0].read * gains - offsets) / rms)[:, :count]
+            slope = motions[0].change[:, :count, :, self.model.marched :] * (gains / rms)[:, None]
+            for k in range(len(x)):
+                matrix = np.concatenate([slope[k].reshape(-1, states), memory])
+                right = np.concatenate([gap[k].ravel(), -memory @ x[k]])
+                x[k] += np.linalg.lstsq(matrix, right, rcond=1e-8)[0]
+        return x.ravel()
 
     def _rows(
         self,
@@ -177,18 +226,22 @@ class RecordProblem(EffectProblem):
         place: int,
         count: int,
     ) -> NDArray[np.float64]:
-        """Derivatives of a record's lines by all unknowns, (n_outputs, n_rows, n)."""
-        marched, outputs = self.model.marched, np.arange(len(gains))
-        moved = (motion.change * gains[:, None])[data.compared].transpose(1, 2, 0)
-        lines = data.lines(np.ascontiguousarray(moved)).transpose(0, 2, 1)
-        found = np.zeros((len(gains), lines.shape[1], count))
-        found[:, :, :marched] = lines[:, :, :marched]
+        """Derivatives of a record's lines by all unknowns, (n_windows, n_outputs, n_rows, n)."""
+        marched = self.model.marched
+        moved = (motion.change * gains[:, None])[:, data.compared].transpose(0, 2, 3, 1)
+        lines = data.lines(np.ascontiguousarray(moved)).transpose(0, 1, 3, 2)
+        found = np.zeros((*lines.shape[:3], count))
+        found[..., :marched] = lines[..., :marched]
         if not data.periodic:
-            found[:, :, place : place + self._states] = lines[:, :, marched:]
-        read = np.ascontiguousarray((motion.read * gains)[data.compared].T)
+            own = len(self._states)
+            for k in range(len(data.starts)):
+                found[k, :, :, place + k * own : place + (k + 1) * own] = lines[k, :, :, marched:]
+        read = _by_output((motion.read * gains)[:, data.compared])
         ones = np.ones_like(read) * (DISCREPANCY * self.observations.rms)[:, None]
-        found[outputs, :, self.model.gain_columns.start + outputs] = data.lines(read)
-        found[outputs, :, self.model.offset_columns.start + outputs] = data.lines(ones)
+        read, ones = data.lines(read), data.lines(ones)
+        for o in range(len(gains)):
+            found[:, o, :, self.model.gain_columns.start + o] = read[:, o]
+            found[:, o, :, self.model.offset_columns.start + o] = ones[:, o]
         return found
 
     def _variance(self, data: RecordData, scatters: Mapping[str, float]) -> Variance:
@@ -216,17 +269,22 @@ class RecordProblem(EffectProblem):
         for k in range(len(o.basis.outputs)):
             for b in range(BANDS):
                 parts = []
-                for v in spread:
+                for v, data in zip(spread, o.data, strict=True):
                     share = np.zeros(v.share.shape)
                     share[k] = np.where(v.band == b, v.share[k], 0.0)
-                    parts.append(share.ravel())
+                    parts.append(np.tile(share.ravel(), len(data.starts)))
                 found[o.noise_name(k, b)] = np.concatenate(parts)
         return found
 
 
+def _by_output(read: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n_windows, n_samples, n_outputs) to (n_windows, n_outputs, n_samples)."""
+    return np.ascontiguousarray(read.transpose(0, 2, 1))
+
+
 @dataclass(frozen=True)
 class Variance:
-    """Of the lines of one record, each (n_outputs, n_rows): the whole, the learned share, and σ over the stated one."""
+    """Of a window's lines, each (n_outputs, n_rows): the whole, the learned share, and σ over the stated one."""
 
     total: NDArray[np.float64]
     share: NDArray[np.float64]

@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect
@@ -38,6 +39,16 @@ _WIDE = 10.0
 _MOST_NOISE = 1e3
 _SET_UP = 0.1
 """Mean of a displacement, as a share of its root mean square, from which its zero is arbitrary."""
+_RIGID = 1e-9
+"""Squared frequency, over the highest, below which a mode is a rigid motion."""
+_SLOWEST = 0.5
+"""Frequency, over the lowest natural one, below which integrated accelerations are noise."""
+_NO_ZERO = 1e-6
+"""Prior 1 σ of a zero, in units of the discrepancy, up to which the zero is known."""
+_LEAST_SAMPLES = 1024
+"""Samples of every response, in windows, that hypotheses are compared on however many responses there are."""
+_CYCLES = 4
+"""Cycles in a window: a model off by an eighth in frequency gets out of step by half a cycle."""
 _HEADROOM = 1.3
 """Factor by which effects may raise the highest natural frequency before steps become coarser than meant."""
 
@@ -50,9 +61,9 @@ class RecordObservations:
     rig : Rig
         Without effects.
     configuration : str
-    records : sequence of DrivenRecord
+    records : sequence of DrivenRecord or RecordData
         What the model is fitted to.
-    held_out : sequence of DrivenRecord
+    held_out : sequence of DrivenRecord or RecordData
         What it is judged by.
     frfs : FrfSet
         Of the same test: where the search for the linear values begins.
@@ -75,8 +86,8 @@ class RecordObservations:
         self,
         rig: Rig,
         configuration: str,
-        records: Sequence[DrivenRecord],
-        held_out: Sequence[DrivenRecord] = (),
+        records: Sequence[DrivenRecord | RecordData],
+        held_out: Sequence[DrivenRecord | RecordData] = (),
         frfs: FrfSet | None = None,
         basis: Basis | None = None,
         like: RecordObservations | None = None,
@@ -86,9 +97,9 @@ class RecordObservations:
         if not records:
             raise EmaError('no record to fit; give at least one use = "fit"')
         self.rig, self.configuration = rig, configuration
-        self.data = tuple(RecordData.of(r) for r in records)
+        self.data = tuple(r if isinstance(r, RecordData) else RecordData.of(r) for r in records)
         self.held_out = tuple(held_out)
-        self.basis = basis or _basis(rig, configuration, records, frfs)
+        self.basis = basis or _basis(rig, configuration, [d.record for d in self.data], frfs)
         self.like, self.modal, self.phase = like, modal, phase
         self.finds_states = (
             False  # True where states at the start are found from the first samples, not fitted
@@ -165,10 +176,10 @@ class RecordObservations:
         model = self.linear_model
         x = model.start()
         system = model.driven(x)
-        found = self.motion(self.data[0], system, np.zeros(system.size))
+        found = self.motion(self.data[0], system, np.zeros((len(self.data[0].starts), system.size)))
         if found is None:
             raise EmaError(f"rig '{self.rig.name}' without effects grows without bound; check its elements")
-        return found.states, model.linear(x).mass
+        return found.states.reshape(-1, system.size), model.linear(x).mass
 
     @cached_property
     def begin_scale(self) -> NDArray[np.float64]:
@@ -177,6 +188,56 @@ class RecordObservations:
             return self.like.begin_scale
         states, mass = self._linear_motion
         return np.asarray(np.maximum(np.std(states[:, : 2 * len(mass)], axis=0), 1e-300))
+
+    @cached_property
+    def lowest_hz(self) -> float:
+        """Lowest natural frequency of the linear model, rigid motion aside."""
+        if self.like is not None:
+            return self.like.lowest_hz
+        linear = self.linear_model.linear(self.linear_model.start())
+        squares = scipy.linalg.eigh(linear.stiffness, linear.mass, eigvals_only=True)
+        return float(np.sqrt(np.min(squares[squares > _RIGID * np.max(squares)]))) / (2 * np.pi)
+
+    def suggested(self, data: RecordData) -> NDArray[np.float64]:
+        """State at the start of every window that the sensors suggest, (n_windows, 2n): 0 for what they do not see.
+
+        Of a whole record it is rest: its ends are no place to integrate.
+        """
+        if not data.windowed:
+            return np.zeros((1, len(self.begin_scale)))
+        known: dict[float, NDArray[np.float64]] = data.__dict__.setdefault("_suggested", {})
+        slowest = _SLOWEST * self.lowest_hz
+        if slowest not in known:
+            x, v = data.motion(slowest)
+            x = x - np.where(self.basis.zero_std > _NO_ZERO, np.mean(x, axis=1), 0.0)[:, None]
+            back = np.linalg.pinv(self.basis.rows[1])
+            known[slowest] = np.concatenate([back @ x[:, data.starts], back @ v[:, data.starts]]).T
+        return known[slowest]
+
+    def in_windows(self, samples: int) -> RecordObservations:
+        """The same test with all records in windows of a few cycles, about so many samples of all responses together.
+
+        A simulation that runs through a long record is out of step with the measured motion wherever the model is not
+        yet right, so that a fit of it has many local optima. Within a few cycles from a state near the measured one no
+        model gets far out of step. Known as multiple shooting.
+
+        References
+        ----------
+        H. G. Bock, Recent advances in parameter identification techniques for O.D.E., *Numerical Treatment of Inverse
+        Problems in Differential and Integral Equations* (1983).
+        """
+        held_out = [d if isinstance(d, RecordData) else RecordData.of(d) for d in self.held_out]
+        return self.with_records(self._windows(self.data, samples), self._windows(held_out, samples))
+
+    def _windows(self, records: Sequence[RecordData], samples: int) -> list[RecordData]:
+        found = []
+        share = max(samples // len(self.basis.outputs), _LEAST_SAMPLES) // max(len(records), 1)
+        for data in records:
+            x, v = data.motion(_SLOWEST * self.lowest_hz)
+            ratio = np.std(v, axis=1) / np.maximum(np.std(x, axis=1), 1e-300)
+            length = round(_CYCLES * 2 * np.pi * self.sample_rate_hz / max(float(np.median(ratio)), 1e-300))
+            found.append(data.windows(length, share))
+        return found
 
     @cached_property
     def slowest_rad_s(self) -> float:
@@ -203,8 +264,8 @@ class RecordObservations:
 
     def with_records(
         self,
-        records: Sequence[DrivenRecord],
-        held_out: Sequence[DrivenRecord],
+        records: Sequence[DrivenRecord | RecordData],
+        held_out: Sequence[DrivenRecord | RecordData],
         basis: Basis | None = None,
         phase: float | None = None,
     ) -> RecordObservations:
