@@ -14,7 +14,7 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnose.limits import detection_limits
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names, named, sizes_of
-from ema_pipeline.diagnose.probability import needed
+from ema_pipeline.diagnose.probability import against_nothing, needed
 from ema_pipeline.diagnose.score import Score, scores
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.library import parse_effect, shipped_effects
@@ -271,6 +271,16 @@ def test_limits_of_several_names_are_the_same_change() -> None:
     limits = {d.label: d.size for d in detection_limits(observations, base, hypotheses, DiagnoseSettings())}
     assert limits["spring@m2"] == pytest.approx(limits["spring@m2.z"])
     assert all(v > 0 for v in limits.values())
+
+
+@pytest.mark.parametrize("found", [0, 1])
+def test_what_a_claim_needs_leaves_nothing_its_doubt(found: int) -> None:
+    """Where that is more than the least that a claim needs."""
+    hypotheses, settings = list(of_chain().values()), DiagnoseSettings(claim=0.01)
+    for h in hypotheses:
+        gain = needed(h, hypotheses, settings, found)
+        assert against_nothing(h, gain, hypotheses, settings, found) == pytest.approx(1 - settings.doubt)
+        assert against_nothing(h, -1e4, hypotheses, settings, found) == 0.0
 
 
 def test_a_sensor_less_lets_less_be_seen() -> None:

@@ -11,7 +11,7 @@ from ema_pipeline.diagnose.limits import detection_limits
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names
 from ema_pipeline.diagnose.next_test import next_measurement
-from ema_pipeline.diagnose.probability import NOTHING
+from ema_pipeline.diagnose.probability import NOTHING, against_nothing
 from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
@@ -82,7 +82,7 @@ def diagnose(
     in_model = set(found.final.model.labels)
     further = [h for h in hypotheses if h.label not in in_model]
     group = alike(found, settings)
-    candidates = _candidates(found, settings, group)
+    candidates = _candidates(found, settings, group, hypotheses)
     told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.claimed]
     if verdict == "ambiguous":
         names = [j.named.label for j in group]
@@ -113,28 +113,34 @@ def diagnose(
 
 
 def _candidates(
-    found: Selection, settings: DiagnoseSettings, group: Sequence[Judged]
+    found: Selection, settings: DiagnoseSettings, group: Sequence[Judged], hypotheses: Sequence[Hypothesis]
 ) -> tuple[Candidate, ...]:
     """What is claimed, in the order in which it was added, then the best of the rest."""
     last = found.rounds[min(len(found.claimed), len(found.rounds)) - 1] if found.claimed else found.rounds[0]
-    mine = [_candidate(j, found.rounds[k].probabilities, settings, True) for k, j in enumerate(found.claimed)]
+    mine = []
+    for k, j in enumerate(found.claimed):
+        of = found.rounds[k]
+        told = of.probabilities.get(j.named.label, 0.0)
+        if not any(
+            j is one for one in of.judged
+        ):  # it took the place of an earlier claim once others were known
+            told = against_nothing(j.hypothesis, j.gain, hypotheses, settings, k)
+        mine.append(_candidate(j, told, settings, True))
     taken = {c.label for c in mine}
     rest = [j for j in last.judged if j.named.label not in taken]
     rest.sort(key=lambda j: (j not in group, -j.gain))
-    others = [_candidate(j, last.probabilities, settings, False) for j in rest]
+    others = [_candidate(j, last.probabilities.get(j.named.label, 0.0), settings, False) for j in rest]
     return (*mine, *others)[: max(settings.candidates, len(mine) + len(group))]
 
 
-def _candidate(
-    j: Judged, probabilities: Mapping[str, float], settings: DiagnoseSettings, claimed: bool
-) -> Candidate:
+def _candidate(j: Judged, probability: float, settings: DiagnoseSettings, claimed: bool) -> Candidate:
     effect = j.named.name.placed.effect
     why = f"Its signs: {effect.signs}." if claimed or j.claimed else f"Not claimed: {j.doubt}."
     return Candidate(
         effect=effect.id,
         at=j.named.name.placed.place,
         title=effect.title,
-        probability=probabilities.get(j.named.label, 0.0),
+        probability=probability,
         parameters=dict(j.named.sizes),
         error_before=j.base.posterior.error,
         error_after=j.after.posterior.error,

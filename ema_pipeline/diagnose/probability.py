@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import expit
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import named
@@ -56,6 +57,18 @@ def probabilities(
     shares /= np.sum(shares)
     told = {n.label: float(p) for n, p in zip(names, shares, strict=False)}
     return told | {NOTHING: float(shares[-1])}
+
+
+def against_nothing(
+    hypothesis: Hypothesis,
+    gain: float,
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+    found: int,
+) -> float:
+    """Probability of one hypothesis against nothing alone, where no others were weighed beside it."""
+    odds = prior(hypothesis, hypotheses, settings, found) / null_prior(settings, found)
+    return float(expit(gain + np.log(odds)))
 
 
 def needed(
