@@ -278,7 +278,7 @@ def _promising(
     settled = learned(observations, base)
     found = []
     best = sorted(scores(observations, settled, hypotheses, models), key=lambda s: -s.gain)
-    for score in [s for s in best[:_PROMISING] if s.gain > 0]:
+    for score in best[:_PROMISING]:  # what the scatters took up promises little, and gains it back
         model = models[score.hypothesis.label]
         unknowns = model.problem(observations).unknowns
         x = transferred(settled.posterior, unknowns, np.zeros(len(unknowns)))
