@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.pool import spread
 from ema_pipeline.diagnose.score import Score, scores
-from ema_pipeline.inference import Posterior
+from ema_pipeline.inference import Posterior, beyond_scatter
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import (
+    PARTS,
     QUICK,
     Fit,
     Model,
@@ -38,6 +39,8 @@ FINALISTS = 5
 """Hypotheses for which the scatters are learned."""
 _PROMISING = 2
 """Further finalists: what promises most beside learned scatters, which may be far narrower than those begun with."""
+_UNBENT = 3.0
+"""Standard deviations of parts, as the scatter is learned, up to which the base model has not bent them to the data."""
 _BEATEN = 200.0
 """Log evidence behind the best hypothesis from which another one cannot catch up: it is not begun again."""
 _SCREENED = 14
@@ -274,8 +277,13 @@ def _spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes
 def _promising(
     observations: Observations, base: Fit, hypotheses: Sequence[Hypothesis], models: Mapping[str, Model]
 ) -> list[tuple[Hypothesis, Fit]]:
-    """What promises most on top of the base model with learned scatters, begun at the size of its score."""
+    """What promises most on top of the base model with learned scatters, begun at the size of its score.
+
+    None where the base model has bent a part to the data: on top of it everything else promises something.
+    """
     settled = learned(observations, base)
+    if np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT)):
+        return []
     found = []
     best = sorted(scores(observations, settled, hypotheses, models), key=lambda s: -s.gain)
     for score in best[:_PROMISING]:  # what the scatters took up promises little, and gains it back

@@ -34,9 +34,9 @@ class Bounded:
         self.residuals = problem.residuals
 
 
-def beyond_scatter(found: Posterior, bound: Sequence[str]) -> NDArray[np.bool_]:
-    """Mask of the unknowns of some scatters that lie further out than scatter reaches, (n,)."""
-    far = np.abs(found.x) > FURTHEST * found.prior_std
+def beyond_scatter(found: Posterior, bound: Sequence[str], reach: float = FURTHEST) -> NDArray[np.bool_]:
+    """Mask of the unknowns of some scatters that lie further out than `reach` standard deviations, (n,)."""
+    far = np.abs(found.x) > reach * found.prior_std
     return np.asarray(far & _governed_by(found.unknowns.scatter, bound))
 
 
