@@ -341,7 +341,10 @@ def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Post
             observations, fit.model, _on(observations, fit.model, source, fit), scatters, steps=10
         )
         here = refined(observations, fit.model, best.posterior.x, scatters, steps=4)
-        if start.log_evidence > here.log_evidence + _BETTER:
-            again = learned(observations, start)
+        there = max(here, start, key=lambda f: f.log_evidence)
+        # The scatters may have two optima as well, each the best near where it was begun.
+        gained = there.log_evidence - source.posterior.scatter_cost - best.log_evidence
+        if start.log_evidence > here.log_evidence + _BETTER or gained > _BETTER:
+            again = learned(observations, there)
             best = max(best, again, key=lambda f: f.log_evidence)
     return best.posterior
