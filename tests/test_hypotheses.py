@@ -273,6 +273,19 @@ def test_limits_of_several_names_are_the_same_change() -> None:
     assert all(v > 0 for v in limits.values())
 
 
+def test_an_effect_at_a_body_is_not_taken_for_one_at_its_coordinate() -> None:
+    """The unknown of spring@m1 is not that of spring@m1.z, whose name begins alike."""
+    hypotheses = {n.label: h for h in of_chain().values() for n in h.names}
+    at_dof = parse_effect("spring@m2.z", chain())
+    observations = ModeObservations(chain(), [prepare(chain_modes(5, NORMAL)["all"])])
+    model = Model().plus(at_dof, {at_dof.parameter_name("stiffness"): 1e5})
+    base = learned(observations, fit_base(observations, model))
+    body = replace(hypotheses["spring@m2"], names=(hypotheses["spring@m2"].names[0],))
+    assert body.label == "spring@m2"
+    (found,) = scores(observations, base, [body])
+    assert len(found.size) == 1
+
+
 @pytest.mark.parametrize("found", [0, 1])
 def test_what_a_claim_needs_leaves_nothing_its_doubt(found: int) -> None:
     """Where that is more than the least that a claim needs."""

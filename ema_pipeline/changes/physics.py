@@ -19,6 +19,9 @@ from ema_pipeline.stages.modes import measured_modes
 
 Progress = Callable[[float, str], None]
 
+_FURTHER_FINALISTS = 2
+"""Small changes show only beside learned scatters: two tests repeat far better than is stated."""
+
 
 @dataclass(frozen=True)
 class PhysicalChange:
@@ -82,13 +85,17 @@ def _diagnosed(a: Run, b: Run, progress: Progress, repeat: RepeatSettings | None
     from ema_pipeline.threads import single_blas_thread
 
     model = b.require_model("changes")
+    settings = cast(DiagnoseSettings, b.settings["diagnose"])
+    settings = settings.model_copy(
+        update={"further_finalists": max(settings.further_finalists, _FURTHER_FINALISTS)}
+    )
     with single_blas_thread():
         found = diagnose(
             pair_observations(a, b, repeat),
             model,
             b.library,
             known_model(b),
-            cast(DiagnoseSettings, b.settings["diagnose"]),
+            settings,
             progress,
         )
     return replace(found, candidates=tuple(_as_change(c) for c in found.candidates))

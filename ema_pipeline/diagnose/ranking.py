@@ -37,8 +37,6 @@ Schedule = tuple[tuple[float, int], ...]
 
 FINALISTS = 5
 """Hypotheses for which the scatters are learned."""
-_PROMISING = 2
-"""Further finalists: what promises most beside learned scatters, which may be far narrower than those begun with."""
 _UNBENT = 3.0
 """Standard deviations of parts, as the scatter is learned, up to which the base model has not bent them to the data."""
 _BEATEN = 200.0
@@ -103,6 +101,7 @@ def rank(
     hypotheses: Sequence[Hypothesis],
     processes: int | None = 1,
     progress: Progress = lambda share, text: None,
+    further: int = 0,
 ) -> Ranking:
     """Fit every hypothesis and rank it.
 
@@ -115,6 +114,8 @@ def rank(
     processes : int
         Processes that share the fits, None for one per processor; the result does not depend on their number.
     progress : callable
+    further : int
+        Finalists that promise most beside learned scatters, which may be far narrower than those begun with.
     """
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
     promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models)}
@@ -132,7 +133,7 @@ def rank(
     progress(0.8, "scatter of parts and channels")
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     others = [h for h in hypotheses if h.label not in {best.label for best, _ in order[:FINALISTS]}]
-    promising = [] if stuck else _promising(observations, base, others, models)
+    promising = [] if stuck else _promising(observations, base, others, models, further)
     return _finals(observations, base, order, promising, processes)
 
 
@@ -275,18 +276,24 @@ def _spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes
 
 
 def _promising(
-    observations: Observations, base: Fit, hypotheses: Sequence[Hypothesis], models: Mapping[str, Model]
+    observations: Observations,
+    base: Fit,
+    hypotheses: Sequence[Hypothesis],
+    models: Mapping[str, Model],
+    count: int,
 ) -> list[tuple[Hypothesis, Fit]]:
     """What promises most on top of the base model with learned scatters, begun at the size of its score.
 
     None where the base model has bent a part to the data: on top of it everything else promises something.
     """
+    if not count:
+        return []
     settled = learned(observations, base)
     if np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT)):
         return []
     found = []
     best = sorted(scores(observations, settled, hypotheses, models), key=lambda s: -s.gain)
-    for score in best[:_PROMISING]:  # what the scatters took up promises little, and gains it back
+    for score in best[:count]:  # what the scatters took up promises little, and gains it back
         model = models[score.hypothesis.label]
         unknowns = model.problem(observations).unknowns
         x = transferred(settled.posterior, unknowns, np.zeros(len(unknowns)))
@@ -341,10 +348,7 @@ def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Post
             observations, fit.model, _on(observations, fit.model, source, fit), scatters, steps=10
         )
         here = refined(observations, fit.model, best.posterior.x, scatters, steps=4)
-        there = max(here, start, key=lambda f: f.log_evidence)
-        # The scatters may have two optima as well, each the best near where it was begun.
-        gained = there.log_evidence - source.posterior.scatter_cost - best.log_evidence
-        if start.log_evidence > here.log_evidence + _BETTER or gained > _BETTER:
-            again = learned(observations, there)
+        if start.log_evidence > here.log_evidence + _BETTER:
+            again = learned(observations, start)
             best = max(best, again, key=lambda f: f.log_evidence)
     return best.posterior

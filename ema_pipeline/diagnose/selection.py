@@ -108,6 +108,7 @@ def select(
             left,
             settings.processes,
             lambda share, text, low=low: progress(low + share / (settings.most_effects + 1), text),  # type: ignore[misc]
+            settings.further_finalists,
         )
         rounds.append(_round(observations, ranking, left, settings, len(claimed)))
         near = rounds[-1].alike(settings)

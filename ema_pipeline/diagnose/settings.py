@@ -51,6 +51,13 @@ class DiagnoseSettings(Settings):
     )
     folds: int = Field(default=4, ge=2, le=20, description="Parts that the modes are held out in, in turn.")
     most_effects: int = Field(default=3, ge=1, le=6, description="Most effects that are added in turn.")
+    further_finalists: int = Field(
+        default=0,
+        ge=0,
+        le=10,
+        description="Finalists, beside the best by evidence, that promise most beside learned scatters; two tests of "
+        "one rig, which repeat far better than is stated, have 2 in any case.",
+    )
     candidates: int = Field(default=5, ge=1, description="Number of candidates that are reported.")
     processes: int | None = Field(
         default=None,
