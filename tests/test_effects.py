@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ema_pipeline.effects.base import effect_of
 from ema_pipeline.effects.library import (
     effect_ids,
     effect_library,
@@ -301,3 +302,13 @@ def test_broken_effect_file_is_one_clear_line(tmp_path: Path, text: str, message
     assert str(file) in str(caught.value)
     with pytest.raises(EmaError, match="no such effect file"):
         load_effect_file(tmp_path / "none.py")
+
+
+def test_a_parameter_tells_which_effect_it_belongs_to() -> None:
+    """Places have dots as well: one at a body is not one at its coordinate."""
+    rig = planetary()
+    for label in ("spring@sun", "spring@sun.x", "mesh_stiffness_loss@sun-planet1"):
+        placed = parse_effect(label, rig)
+        for parameter in placed.effect.parameters:
+            assert effect_of(placed.parameter_name(parameter.name)) == label
+    assert effect_of("sun_mass") == ""

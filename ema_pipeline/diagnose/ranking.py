@@ -284,7 +284,7 @@ def _promising(
 ) -> list[tuple[Hypothesis, Fit]]:
     """What promises most on top of the base model with learned scatters, begun at the size of its score.
 
-    None where the base model has bent a part to the data: on top of it everything else promises something.
+    Nothing does where the base model has bent a part to the data: on top of it everything would.
     """
     if not count:
         return []

@@ -10,6 +10,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.effects.base import effect_of
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, transferred
 
@@ -58,7 +59,7 @@ def scores(
             continue
         model = models[hypothesis.label] if models else base.model.plus(hypothesis.placed, hypothesis.scales)
         problem = model.problem(observations)
-        names = [n for n in problem.unknowns.names if n.rpartition(".")[0] == hypothesis.label]
+        names = [n for n in problem.unknowns.names if effect_of(n) == hypothesis.label]
         start = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
         at = [problem.unknowns.index[n] for n in names]
         residuals = problem.residuals(
@@ -85,7 +86,7 @@ class Marginal:
         p = base.posterior
         self.residual, jacobian = p.residuals.weighted
         self.weight, self.count = p.residuals.weight, len(self.residual)
-        self.kept = np.array([not without or n.rpartition(".")[0] != without for n in p.unknowns.names], bool)
+        self.kept = np.array([not without or effect_of(n) != without for n in p.unknowns.names], bool)
         self.whitened = (jacobian * p.prior_std)[:, self.kept]
         information = np.eye(self.whitened.shape[1]) + self.whitened.T @ self.whitened
         self.factor = scipy.linalg.cho_factor(information, check_finite=False)

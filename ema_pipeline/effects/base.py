@@ -145,6 +145,14 @@ class Effect:
         return self.edit(assembly, place, self.values(values))
 
 
+def effect_of(parameter: str) -> str:
+    """``id@place`` of a rig's parameter that belongs to an effect, as `PlacedEffect.parameter_name` wrote it; else "".
+
+    Places have dots, too: ``spring@m1`` is another effect than ``spring@m1.x``.
+    """
+    return parameter.rpartition(".")[0]
+
+
 @dataclass(frozen=True)
 class PlacedEffect:
     """An effect at a place, written ``id@place``."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from ema_pipeline.effects.base import PlacedEffect
+from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.effects.library import Library, parse_effect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly
@@ -85,7 +85,7 @@ def _build(
 def _uses(rig: Rig, placed: tuple[PlacedEffect, ...], configuration: str, name: str) -> bool:
     if name in rig.parameters:
         return name in rig.used(configuration)
-    label = name.rpartition(".")[0]
+    label = effect_of(name)
     assembly = rig.assembly(configuration)
     for one in placed:
         fits = one.effect.fits(assembly, one.place)

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.effects.base import PlacedEffect
+from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
 from ema_pipeline.mechanics.laws import Nonlinear, Spring
 from ema_pipeline.mechanics.marching import element_rows
@@ -168,7 +168,7 @@ class AmplitudeProblem:
     @cached_property
     def nonlinear_sizes(self) -> tuple[int, ...]:
         """Positions of the sizes of effects that depend on the amplitude."""
-        names = [n for n in self.sizes if n.rpartition(".")[0] in self._nonlinear]
+        names = [n for n in self.sizes if effect_of(n) in self._nonlinear]
         return tuple(self.unknowns.index[n] for n in names)
 
     def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:

@@ -15,6 +15,7 @@ from ema_pipeline.diagnose.types import (
     EffectSize,
     Ladder,
 )
+from ema_pipeline.effects.base import effect_of
 from ema_pipeline.report.diagnosis import (
     label_words,
     leading,
@@ -205,7 +206,7 @@ def _own_sizes(
             continue
         _, _, place = label.partition("@")
         for name, size in parameters.items():
-            if name.startswith(f"{label}."):
+            if effect_of(name) == label:
                 own[name.removeprefix(f"{label}.")] = size
             elif label == f"out_of_tolerance@{name}":
                 own[place] = size
