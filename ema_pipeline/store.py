@@ -168,9 +168,8 @@ class Store:
                 return
             part = self._part_of(link)
             file.close()  # the part is never changed, whatever becomes of the link
-            if (
-                not part.is_file()
-            ):  # left behind when the folder was copied, or deleted because it was damaged
+            # Left behind when the folder was copied, or deleted because it was damaged.
+            if not part.is_file():
                 yield None
                 return
             try:

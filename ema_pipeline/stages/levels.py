@@ -35,9 +35,8 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
     frfs = run.store.load("frf", configuration, "frfs", FrfSet)
     modal = run.store.load("modal", configuration, "modal", ModalModel)
-    modal = replace(
-        modal, synthesis=modal.synthesis[..., :0].copy()
-    )  # as large as the FRFs, and not asked for
+    # The synthesised FRFs are as large as the measured ones, and not asked for.
+    modal = replace(modal, synthesis=modal.synthesis[..., :0].copy())
     settings = cast(LevelSettings, run.settings[NAME])
     modal_settings = cast("ModalStageSettings", run.settings["modal"])
     study = study_levels(

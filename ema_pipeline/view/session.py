@@ -261,16 +261,14 @@ class Session:
     async def _follow(self, job: Job, told: dict[str, Any]) -> None:
         stage = str(told.get("finished", told.get("stage")))
         if self.preview is None and (stage == "fit" or told.get("finished") == "ladder"):
-            rungs = await asyncio.to_thread(
-                self._rungs
-            )  # known before "fit" begins, be it from the diagnosis
+            # Known before "fit" begins, be it from the diagnosis.
+            rungs = await asyncio.to_thread(self._rungs)
             self.preview = [self._error_before(), *rungs[-1:]] if job.chooses and rungs else rungs
         if "finished" in told:
             job.before = min(job.before + job.share(stage), 1.0)
             job.done = job.before
-            if stage == (
-                "correlate" if self.results.loops is None else "ladder"
-            ):  # all is there but the report
+            # All is there but the report.
+            if stage == ("correlate" if self.results.loops is None else "ladder"):
                 await asyncio.to_thread(self._load_once)
                 job.shown_already = True
         else:
