@@ -262,6 +262,10 @@ def test_server_stopped_amid_a_refit_leaves_the_folder_as_it_was(page: Page, out
     assert page.ask("POST", "/action", json.dumps({"verb": "diagnose"}), **own).status == 202
     time.sleep(1.5)
     assert page.stop() == 0
+    assert page.process.stderr is not None
+    said = page.process.stderr.read()
+    assert said.startswith("ema: interrupted; go on with: ")
+    assert said.rstrip().endswith(f"view {out}")
     assert (out / "ema.h5").read_bytes() == before
     assert not list(out.glob(f"{FOLDER}*"))
 

@@ -52,6 +52,7 @@ def answer_ctrl_c(program: str) -> None:
         timer = threading.Timer(PATIENCE_S, os._exit, (INTERRUPTED,))
         timer.daemon = True
         timer.start()
+        sys.unraisablehook = lambda _: None  # raised in a callback, the interrupt would print a traceback
         raise KeyboardInterrupt
 
     if threading.current_thread() is threading.main_thread():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -225,12 +226,13 @@ def view(
     if _is_raw(out):
         from ema_pipeline.view.hits import serve_hits
 
-        go_on_with(f"run {out}")
+        go_on_with(f"run {shlex.quote(str(out))}")
         serve_hits(out, point or (), hits, poll, port, ready)
         show(f"Next: {program()} run {out}")
         return
     from ema_pipeline.view.server import serve
 
+    go_on_with(f"view {shlex.quote(str(out))}")  # what was changed on the page is kept
     serve(out, effect_file or [], port, ready)
 
 

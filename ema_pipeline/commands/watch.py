@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -46,7 +47,7 @@ def watch(
     if not folder.is_dir():
         raise EmaError(f"{folder}: there is no such folder; give the folder that the analyser writes to")
     session = Session(folder, point or (), hits)
-    go_on_with(f"run {folder}")
+    go_on_with(f"run {shlex.quote(str(folder))}")
     if not json:
         first = f"; strike {session.next_point} first" if session.next_point else ""
         show(f"Watching {folder}, {hits} good hits per point{first}. Stop with Ctrl-C.")
