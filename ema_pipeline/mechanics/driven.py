@@ -1,6 +1,6 @@
 """The compiled loop of `mechanics.simulation`: a structure with nonlinear elements marched under measured forces.
 
-Classical Runge-Kutta steps of fourth order. Derivatives by any number of parameters follow from the variational
+Classical Runge-Kutta steps of fourth order. Derivatives by parameters follow from the variational
 equations, marched by the same steps: they are the exact derivatives of what the loop gives.
 """
 
@@ -14,6 +14,11 @@ POLYNOMIAL, FRICTION, SQUARE_DAMPER, BOUC_WEN, PARTING, MAXWELL = range(6)
 
 NUMBERS = 4
 """Numbers of a law."""
+
+COLUMNS = 8
+"""Derivatives that the loops take at once; a rest takes as long as all of them."""
+FEW = (0,) * COLUMNS
+"""As `known` of a march with just so many: a number that the compiler knows lets it unroll all loops over them."""
 
 _WILD = 1e12
 """Motion, in SI units, that no structure has."""
@@ -182,6 +187,7 @@ def march_with_slopes(  # type: ignore[no-untyped-def]
     d_push,
     d_numbers,
     d_begin,
+    known,
     out,
     d_out,
 ):
@@ -196,21 +202,25 @@ def march_with_slopes(  # type: ignore[no-untyped-def]
     d_push : ndarray, (n, m, p)
     d_numbers : ndarray, (m, 4, p)
     d_begin : ndarray, (2n + m, p)
+    known : tuple of int
+        As many numbers as there are derivatives, or none.
     d_out : ndarray, (n_kept, 2n + m, p)
         Overwritten.
     """
     n, m = stiffness.shape[0], kinds.shape[0]
-    size, ins, p = 2 * n + m, inputs.shape[1], d_begin.shape[1]
+    size, ins, p = 2 * n + m, inputs.shape[1], len(known) if len(known) > 0 else d_begin.shape[1]
     s, at, total, rate = begin.copy(), begin.copy(), np.zeros(size), np.zeros(size)
     t, t_at = d_begin.copy(), d_begin.copy()
     t_total, t_rate = np.zeros((size, p)), np.zeros((size, p))
     g = np.zeros(m)
     t_g, t_d, t_v = np.zeros((m, p)), np.zeros(p), np.zeros(p)
-    moved = np.zeros((n, n), dtype=np.bool_)
+    fed = np.any(d_inputs != 0.0)
+    moved, pushed = np.zeros((n, n), dtype=np.bool_), np.zeros((n, m), dtype=np.bool_)
     for i in range(n):
         for q in range(n):
-            for c in range(p):
-                moved[i, q] |= d_stiffness[i, q, c] != 0.0 or d_damping[i, q, c] != 0.0
+            moved[i, q] = np.any(d_stiffness[i, q] != 0.0) or np.any(d_damping[i, q] != 0.0)
+        for j in range(m):
+            pushed[i, j] = np.any(d_push[i, j] != 0.0)
     out[0], d_out[0] = s, t
     steps = (force.shape[0] - 1) // 2
     for k in range(steps):
@@ -238,23 +248,20 @@ def march_with_slopes(  # type: ignore[no-untyped-def]
                 g[j] = f
                 rate[2 * n + j] = r
                 for c in range(p):
-                    t_z = t_at[2 * n + j, c]
-                    t_g[j, c] = (
-                        fd * t_d[c]
-                        + fv * t_v[c]
-                        + fz * t_z
-                        + fa * d_numbers[j, 0, c]
-                        + fb * d_numbers[j, 1, c]
-                    )
-                    t_rate[2 * n + j, c] = (
-                        rd * t_d[c]
-                        + rv * t_v[c]
-                        + rz * t_z
-                        + ra * d_numbers[j, 0, c]
-                        + rb * d_numbers[j, 1, c]
-                        + rc * d_numbers[j, 2, c]
-                        + re * d_numbers[j, 3, c]
-                    )
+                    t_g[j, c] = fd * t_d[c] + fv * t_v[c] + fa * d_numbers[j, 0, c] + fb * d_numbers[j, 1, c]
+                if kinds[j] == BOUC_WEN or kinds[j] == MAXWELL:  # those with a memory
+                    for c in range(p):
+                        t_z = t_at[2 * n + j, c]
+                        t_g[j, c] += fz * t_z
+                        t_rate[2 * n + j, c] = (
+                            rd * t_d[c]
+                            + rv * t_v[c]
+                            + rz * t_z
+                            + ra * d_numbers[j, 0, c]
+                            + rb * d_numbers[j, 1, c]
+                            + rc * d_numbers[j, 2, c]
+                            + re * d_numbers[j, 3, c]
+                        )
             for i in range(n):
                 total_force = 0.0
                 for c in range(p):
@@ -262,21 +269,27 @@ def march_with_slopes(  # type: ignore[no-untyped-def]
                     t_rate[n + i, c] = 0.0
                 for q in range(ins):
                     total_force += inputs[i, q] * force[half, q]
-                    for c in range(p):
-                        t_rate[n + i, c] += d_inputs[i, q, c] * force[half, q]
+                    if fed:
+                        for c in range(p):
+                            t_rate[n + i, c] += d_inputs[i, q, c] * force[half, q]
                 for q in range(n):
                     by_d, by_v = stiffness[i, q], damping[i, q]
                     x, y = at[q], at[n + q]
                     total_force -= by_d * x + by_v * y
-                    for c in range(p):
-                        t_rate[n + i, c] -= by_d * t_at[q, c] + by_v * t_at[n + q, c]
+                    if by_d != 0.0 or by_v != 0.0:
+                        for c in range(p):
+                            t_rate[n + i, c] -= by_d * t_at[q, c] + by_v * t_at[n + q, c]
                     if moved[i, q]:
                         for c in range(p):
                             t_rate[n + i, c] -= d_stiffness[i, q, c] * x + d_damping[i, q, c] * y
                 for j in range(m):
                     total_force -= push[i, j] * g[j]
-                    for c in range(p):
-                        t_rate[n + i, c] -= push[i, j] * t_g[j, c] + d_push[i, j, c] * g[j]
+                    if push[i, j] != 0.0:
+                        for c in range(p):
+                            t_rate[n + i, c] -= push[i, j] * t_g[j, c]
+                    if pushed[i, j]:
+                        for c in range(p):
+                            t_rate[n + i, c] -= d_push[i, j, c] * g[j]
                 rate[i] = at[n + i]
                 rate[n + i] = total_force
             weight = 1.0 if stage == 0 or stage == 3 else 2.0
@@ -331,6 +344,7 @@ def march_windows_with_slopes(  # type: ignore[no-untyped-def]
     d_push,
     d_numbers,
     d_begin,
+    known,
     out,
     d_out,
 ):
@@ -338,7 +352,7 @@ def march_windows_with_slopes(  # type: ignore[no-untyped-def]
     for w in range(len(force)):
         if not march_with_slopes(
             stiffness, damping, inputs, push, rows, kinds, numbers, force[w], begin[w], step, every,
-            d_stiffness, d_damping, d_inputs, d_push, d_numbers, d_begin[w], out[w], d_out[w],
+            d_stiffness, d_damping, d_inputs, d_push, d_numbers, d_begin[w], known, out[w], d_out[w],
         ):  # fmt: skip
             return False
     return True

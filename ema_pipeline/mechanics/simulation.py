@@ -38,8 +38,6 @@ _PADDING = 400
 HYSTERESIS, RELAXATION = 3, 5
 WITH_MEMORY = (HYSTERESIS, RELAXATION)
 """Kinds of elements, as `coded_law` has them, that have a memory."""
-_VECTOR = 8
-"""Numbers that the compiled loop takes at once: a rest of up to seven takes as long as all the others."""
 _NO_LOSS = 1e-6
 """Least σ of a Bouc-Wen law: below it, it is a spring."""
 
@@ -329,18 +327,19 @@ def march_windows(
             return None
         return states, np.empty((*shape, 0))
     count = slopes.begin.shape[-1]
-    k, c, inputs, push, numbers, first = (_filled_up(a) for a in slopes.arrays)
-    derivatives = np.empty((*shape, first.shape[-1]))
-    if not driven.march_windows_with_slopes(*fixed, k, c, inputs, push, numbers, first, states, derivatives):
+    width = -(-count // driven.COLUMNS) * driven.COLUMNS
+    known = driven.FEW if width == driven.COLUMNS else ()
+    derivatives = np.empty((*shape, width))
+    own = (_filled_up(a, width) for a in slopes.arrays)
+    if not driven.march_windows_with_slopes(*fixed, *own, known, states, derivatives):
         return None
     return states, derivatives[..., :count]
 
 
-def _filled_up(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Derivatives by so many parameters more, all 0, that the compiled loop takes them in whole vectors."""
-    count = slopes.shape[-1]
-    found = np.zeros((*slopes.shape[:-1], -(-count // _VECTOR) * _VECTOR))
-    found[..., :count] = slopes
+def _filled_up(slopes: NDArray[np.float64], width: int) -> NDArray[np.float64]:
+    """Derivatives by `width` parameters, all 0 by those that there are not."""
+    found = np.zeros((*slopes.shape[:-1], width))
+    found[..., : slopes.shape[-1]] = slopes
     return found
 
 
