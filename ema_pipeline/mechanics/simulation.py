@@ -330,8 +330,8 @@ def march_windows(
     width = -(-count // driven.COLUMNS) * driven.COLUMNS
     known = driven.FEW if width == driven.COLUMNS else ()
     derivatives = np.empty((*shape, width))
-    own = (_filled_up(a, width) for a in slopes.arrays)
-    if not driven.march_windows_with_slopes(*fixed, *own, known, states, derivatives):
+    arrays = (*fixed, *(_filled_up(a, width) for a in slopes.arrays), known, states, derivatives)
+    if not driven.march_windows_with_slopes(*arrays):
         return None
     return states, derivatives[..., :count]
 

@@ -20,6 +20,7 @@ from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Damper
+from ema_pipeline.mechanics.driven_slopes import ModalDamping, driven_derivatives, matrix_derivatives
 from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.mechanics.simulation import (
     WITH_MEMORY,
@@ -29,6 +30,7 @@ from ema_pipeline.mechanics.simulation import (
     coded_law,
 )
 from ema_pipeline.mechanics.system import LinearSystem
+from ema_pipeline.mechanics.terms import Matrices
 from ema_pipeline.observations.parts import (
     DAMPING,
     MASS_SCATTER,
@@ -51,7 +53,7 @@ _MODE_STD = 0.3
 _START_RATIO = 0.01
 """Damping ratio of a rig that states no damping at all."""
 _STEP = 1e-4
-"""Step of the differences of matrices, in units of the unknowns."""
+"""Step of the differences of the laws' numbers, in units of the unknowns."""
 _MOST_KNOWN = 32
 _BARELY = 1e-6
 """Size, in units of the prior 1 σ, that stands for an effect of size nought: its elements are there to be changed."""
@@ -289,27 +291,32 @@ class RecordModel:
     def linear(self, x: NDArray[np.float64]) -> LinearSystem:
         """Matrices at `x`, the tangents of the elements included, the modes' damping among the dampers."""
         matrices = self.rig_model.matrices(self.basis.configuration, self._inner(x), derivatives=False)
+        system, ratios = self._system(matrices), self._ratios(x, matrices.damping_ratio)
+        if not np.any(ratios):
+            return system
+        if len(ratios) == 1:  # the mode of one coordinate needs no eigenvalues
+            critical = 2 * np.sqrt(np.maximum(system.mass * system.stiffness, 0.0))
+            return dataclasses.replace(system, damping=system.damping + ratios * critical)
+        values, shapes = eigen_solution(system)
+        m_phi = system.mass @ shapes
+        damping = system.damping + (m_phi * (2 * ratios * np.sqrt(np.maximum(values, 0.0)))) @ m_phi.T
+        return dataclasses.replace(system, damping=damping)
+
+    def _system(self, matrices: Matrices) -> LinearSystem:
+        """The matrices without the modes' damping."""
         mass, damping, stiffness, structural = matrices.dense
-        system = LinearSystem(
+        return LinearSystem(
             dofs=matrices.terms.dofs,
             mass=mass,
             stiffness=stiffness,
             damping=damping + matrices.skew,
             structural=structural,
-            modal_damping_ratio=matrices.damping_ratio,
         )
-        if len(mass) == 1:  # the mode of one coordinate needs no eigenvalues
-            critical = 2 * np.sqrt(np.maximum(mass * stiffness, 0.0))
-            return dataclasses.replace(
-                system, damping=system.damping + matrices.damping_ratio * critical, modal_damping_ratio=0.0
-            )
-        if not self.modes:
-            return system
-        values, shapes = eigen_solution(system)
-        ratio = system.modal_damping_ratio * np.exp(x[self._parts[0]])
-        m_phi = system.mass @ shapes
-        damping = system.damping + (m_phi * (2 * ratio * np.sqrt(np.maximum(values, 0.0)))) @ m_phi.T
-        return dataclasses.replace(system, damping=damping, modal_damping_ratio=0.0)
+
+    def _ratios(self, x: NDArray[np.float64], common: float) -> NDArray[np.float64]:
+        """Damping ratio of every mode beside the dampers, (n,)."""
+        n = len(self.basis.rows[0][0])
+        return np.asarray(common * (np.exp(x[self._parts[0]]) if self.modes else np.ones(n)))
 
     @cached_property
     def memories(self) -> tuple[tuple[str, int], ...]:
@@ -338,29 +345,41 @@ class RecordModel:
         return self._known[key]
 
     def slopes(self, x: NDArray[np.float64], here: DrivenSystem, more: int) -> Slopes:
-        """Derivatives of what is marched by all unknowns, and room for `more`.
-
-        Matrices are differentiated by small differences where they depend on unknowns at all, the motion by the
-        variational equations.
-        """
+        """Derivatives of what is marched by all unknowns, and room for `more`."""
         found = Slopes.none(here, self.marched + more)
-        _, offsets, gains, _, _ = self._parts
-        for i in range(offsets.start):
+        rig, inner = self.rig_model, self._inner(x)
+        matrices = rig.matrices(self.basis.configuration, inner)
+        change = matrix_derivatives(matrices)
+        tangents = np.zeros((len(change), len(here.kinds)))
+        logs = len(change) - (self.offset - rig.shape_start)
+        columns = np.r_[0:logs, rig.shape_start : self.offset]
+        for k, i in enumerate(range(rig.shape_start, self.offset), start=logs):
             low, high, step = self._ends(x, i)
-            found.set_difference(i, low, high, step)
+            found.numbers[..., i] = (high.numbers - low.numbers) / step
+            tangents[k] = (high.tangent - low.tangent) / step
+        system, ratios = self._system(matrices), self._ratios(x, matrices.damping_ratio)
+        modal = ModalDamping.of(system, ratios) if np.any(ratios) else None
+        parts = driven_derivatives(system, here, self._coded(x).tangent, change, tangents, modal)
+        for mine, part in zip(found.arrays, parts, strict=False):
+            mine[..., columns] = np.moveaxis(part, 0, -1)
+        damping, offsets, gains, _, _ = self._parts
+        if modal is not None:
+            if rig.has_ratio:
+                found.damping[..., rig.unknowns.index[DAMPING]] = modal.matrix
+            for mode in range(self.modes):
+                found.damping[..., damping.start + mode] = modal.by_ratio(mode)
         n_in = len(self.basis.inputs)
         for q in range(n_in):
-            own = here.inputs[:, q]
-            size = self.basis.force_rms[q]
+            own, size = here.inputs[:, q], self.basis.force_rms[q]
             found.inputs[:, q, gains.start + q] = -own
             found.inputs[:, n_in, gains.start + q] = own * size * x[offsets.start + q]
             found.inputs[:, n_in, offsets.start + q] = -own * size
         return found
 
-    def _ends(self, x: NDArray[np.float64], i: int) -> tuple[DrivenSystem, DrivenSystem, float]:
-        """Systems at both ends of a small step of one unknown, within its bounds."""
+    def _ends(self, x: NDArray[np.float64], i: int) -> tuple[CodedElements, CodedElements, float]:
+        """Elements at both ends of a small step of one unknown, within its bounds."""
         lower, upper = self.unknowns.lower[i], self.unknowns.upper[i]
         low, high = x.copy(), x.copy()
         low[i] = max(x[i] - _STEP, lower)
         high[i] = min(x[i] + _STEP, upper)
-        return self.driven(low), self.driven(high), float(high[i] - low[i])
+        return self._coded(low), self._coded(high), float(high[i] - low[i])

@@ -121,7 +121,7 @@ class RecordProblem(EffectProblem):
             jacobian=np.concatenate([r.reshape(-1, len(x)) for r in rows])
             if derivatives
             else np.zeros((0, len(x))),
-            share=self._shares(spread, scatters),
+            share=self._shares(spread, scatters) if derivatives else {},
             log_scale=float(np.sum(np.log(relative))),
             relative=relative,
         )
