@@ -199,9 +199,11 @@ def _own_effect(own: OwnRig, random: np.random.Generator) -> tuple[Truth, str]:
     body, _, direction = dof.partition(".")
     stiffness = float(np.exp(np.mean([np.log(s.true) for s in own.springs])))
     if family == "mass":
-        size = _size(random, 0.03 * own.masses[body][1], 0.5 * own.masses[body][1])
+        plane = len(own.directions) > 1
+        most = min(0.5 * own.masses[body][1], 1.0) if plane else 0.5 * own.masses[body][1]
+        size = _size(random, 0.03 * own.masses[body][1], most)  # a sensor has no more than 1 kg
         # A mass goes with its body in every direction.
-        label = f"sensor_mass@{body}" if len(own.directions) > 1 else f"mass@{dof}"
+        label = f"sensor_mass@{body}" if plane else f"mass@{dof}"
         return Truth(label, "mass", size), f"{label}:mass={size}"
     others = [f"{b}.{direction}" for b in own.masses if b != body]
     place = f"{dof}-{random.choice(others)}" if random.random() < 0.4 else dof

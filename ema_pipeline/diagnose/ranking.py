@@ -138,12 +138,14 @@ def rank(
 
 
 def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) -> list[Hypothesis]:
-    """The rig's own hypotheses, and the generic ones that promise most."""
-    generic = sorted(
-        (promise[h.label] for h in hypotheses if h.generic and h.label in promise), key=lambda s: -s.gain
-    )
-    kept = {s.hypothesis.label for s in generic[:_SCREENED]}
-    return [h for h in hypotheses if not h.generic or h.label in kept]
+    """The rig's own hypotheses, and the generic ones that promise most.
+
+    An effect of several sizes (hysteresis) shows its kind at a finite size only, of which a score knows nothing.
+    """
+    scored = [h for h in hypotheses if h.generic and len(h.placed.effect.parameters) == 1]
+    order = sorted((h.label for h in scored if h.label in promise), key=lambda label: -promise[label].gain)
+    out = {h.label for h in scored} - set(order[:_SCREENED])
+    return [h for h in hypotheses if h.label not in out]
 
 
 def _first_fit(
