@@ -12,9 +12,9 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,8 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.harmonic import describing_function
 from ema_pipeline.mechanics.laws import BoucWen, Nonlinear
 
-POLYNOMIAL = 0
-"""Kind of law, see `mechanics.laws.LAWS`, whose averages are known in closed form."""
-OWN_PHASES = 8
-"""Phases of the frequency itself; the describing function of a sign alone is then 3 % off."""
+POLYNOMIAL, FRICTION = 0, 1
+"""Kinds of laws, see `mechanics.laws.LAWS`. The averages of the first are known in closed form."""
 _PRIMES = (11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61)
 _GOLDEN = 0.6180339887498949
 _OFFSET_STEPS = 4
@@ -41,7 +39,6 @@ _DECADES = 6.0
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-Force = Callable[[Real, Real], Real]
 
 
 @dataclass(frozen=True)
@@ -59,13 +56,6 @@ class Motions:
     amplitude: Real
     omega: Real
 
-    @cached_property
-    def _each(self) -> tuple[Real, Real]:
-        """Stretch and rate of each frequency at sets of phases, (n_states, n_frequencies, n_sets)."""
-        phases = _phases(len(self.omega))
-        size = self.amplitude[:, :, None]
-        return size * np.cos(phases), -self.omega[:, None] * size * np.sin(phases)
-
     def mean_force(self, element: Nonlinear, offset: Real) -> Real:
         """Mean force beside the tangent's about an offset (n_states,), N; 0 for an element with memory."""
         if element.law is None:
@@ -74,10 +64,12 @@ class Motions:
         if kind == POLYNOMIAL:
             square = 0.5 * np.sum(self.amplitude**2, axis=1)
             return np.asarray(quadratic * (offset**2 + square) + cubic * offset * (offset**2 + 3 * square))
-        stretch, rate = (each.sum(axis=1) for each in self._each)
-        both = [offset[:, None] + stretch, offset[:, None] - stretch]
-        force = _vectorised(element.law)
-        return np.asarray(0.5 * (force(both[0], rate) + force(both[1], -rate)).mean(axis=1))
+        if kind == FRICTION or element.law[2] == np.inf:  # odd in the rate; teeth that never part
+            return np.zeros(len(offset))
+        from ema_pipeline.mechanics import averages  # compiled on first use
+
+        found = averages.mean_force(*element.law, self.amplitude, _phases(len(self.omega)), offset)
+        return np.asarray(found)
 
     def stiffness(self, element: Nonlinear, offset: Real) -> Complex:
         """Complex stiffness beside the tangent at every frequency, N/m, (n_states, n_frequencies).
@@ -94,16 +86,12 @@ class Motions:
             others = 0.5 * np.sum(each, axis=1, keepdims=True) - 0.5 * each
             about = offset[:, None]
             return (2 * quadratic * about + cubic * (3 * (about**2 + others) + 0.75 * each)).astype(complex)
-        own = 2 * np.pi * (np.arange(OWN_PHASES) + 0.5) / OWN_PHASES
-        stretch, rate = self._each
-        rest = stretch.sum(axis=1, keepdims=True) - stretch + offset[:, None, None]
-        rest_rate = rate.sum(axis=1, keepdims=True) - rate
-        size = self.amplitude[:, :, None, None]
-        x = rest[..., None] + size * np.cos(own)
-        v = rest_rate[..., None] - self.omega[:, None, None] * size * np.sin(own)
-        force = _vectorised(law)(x, v).mean(axis=2)
-        mean = (force @ np.cos(own) - 1j * (force @ np.sin(own))) / OWN_PHASES
-        return np.asarray(2 * mean / np.maximum(self.amplitude, _LEAST))
+        if law[2] == np.inf:  # teeth that never part
+            return np.zeros(self.amplitude.shape, complex)
+        from ema_pipeline.mechanics import averages  # compiled on first use
+
+        phases = _phases(len(self.omega))
+        return np.asarray(averages.stiffness(*law, self.amplitude, self.omega, phases, offset))
 
 
 def settled_offsets(elements: Sequence[Nonlinear], motions: Sequence[Motions], flexibility: Real) -> Real:
@@ -137,6 +125,7 @@ def settled_offsets(elements: Sequence[Nonlinear], motions: Sequence[Motions], f
     return offset
 
 
+@cache
 def _phases(count: int) -> Real:
     """Sets of phases of `count` frequencies, (count, n_sets).
 
@@ -147,16 +136,6 @@ def _phases(count: int) -> Real:
     steps = np.arange(1, count + 1)
     turns = np.outer(steps, np.arange(sets)) / sets + _GOLDEN * steps[:, None] ** 2
     return np.asarray(2 * np.pi * (turns % 1))
-
-
-def _vectorised(law: tuple[int, float, float, float]) -> Force:
-    """Friction or parting, see `mechanics.laws.LAWS`, for arrays of stretches and rates."""
-    kind, a, b, c = law
-    if kind == 1:
-        return lambda x, v: a * np.tanh(v / b)
-    if b == np.inf:
-        return lambda x, v: np.zeros_like(x)
-    return lambda x, v: a * (np.clip(-x - b, 0.0, c) - max(-b, 0.0))
 
 
 def _from_table(element: Nonlinear, amplitude: Real, omega: Real) -> Complex:
