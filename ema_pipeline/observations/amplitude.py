@@ -76,6 +76,10 @@ class AmplitudeObservations:
 
     def folds(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
         """Every force level held out in turn, with the nearest other level beside it that it is compared with."""
+        return self._folds
+
+    @cached_property
+    def _folds(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
         levels = sorted({int(k) for h in self.hits for k in h.level})
         pairs = []
         for k in levels if len(levels) > 2 else []:
