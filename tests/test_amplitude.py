@@ -152,6 +152,20 @@ def test_hits_of_one_level_cannot_be_compared() -> None:
     assert not comparable(hits.only(hits.level == 1))
 
 
+def test_what_a_hit_does_not_tell_of_a_mode_moves_nothing() -> None:
+    (hits,) = synthetic([PolynomialSpring("cubic", {"hub.x": 1.0}, 0.0, 1e11)]).hits
+    on = hits.sheet == 0
+    std = hits.log_frequency_std.copy()
+    std[np.flatnonzero(on)[:2], 1] = np.inf
+    wild = hits.damping.copy()
+    wild[~np.isfinite(std)] = 1e-9  # read from noise
+    holed = replace(hits, log_frequency_std=std, damping=wild)
+    assert np.all(holed.reach(0) <= hits.reach(0) + 1e-12)
+    np.testing.assert_allclose(holed.usual_damping, hits.usual_damping, rtol=0.05)
+    (still,) = synthetic(drift=0.0).hits
+    assert np.all(still.reach(0) < 0.02)
+
+
 def test_hits_without_any_motion_or_with_gaps_are_left_out() -> None:
     (hits,) = synthetic().hits
     motion = hits.motion.copy()

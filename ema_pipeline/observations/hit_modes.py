@@ -128,11 +128,16 @@ class HitData:
 
     @cached_property
     def poles(self) -> Complex:
-        """Of every mode in every hit, 1/s, (h, m); the reference's where a hit tells none."""
+        """Of every mode in every hit, 1/s, (h, m); the reference's where a hit tells none that can be compared."""
+        own = 2 * np.pi * np.exp(self.log_frequency) * (1j - self.damping)
+        return np.asarray(np.where(self.used, own, self._reference_poles))
+
+    @cached_property
+    def _reference_poles(self) -> Complex:
+        """Of the level nearest to the linear structure, 1/s, (m,)."""
         own = self.reference
-        omega = np.where(self._known, self.log_frequency, own.log_frequency[self.modes])
-        decay = np.where(self._known, self.damping, np.exp(own.log_damping[self.modes]))
-        return np.asarray(2 * np.pi * np.exp(omega) * (1j - np.nan_to_num(decay, nan=1e-3)))
+        decay = np.nan_to_num(np.exp(own.log_damping[self.modes]), nan=1e-3)
+        return np.asarray(2 * np.pi * np.exp(own.log_frequency[self.modes]) * (1j - decay))
 
     @cached_property
     def usual_damping(self) -> Real:
@@ -142,7 +147,7 @@ class HitData:
     @cached_property
     def groups(self) -> tuple[Integers, ...]:
         """Modes that move in step, by their place among `modes`, from the lowest up."""
-        pole = np.median(self.poles.real, axis=0) + 1j * np.median(self.poles.imag, axis=0)
+        pole = self._reference_poles
         groups: list[list[int]] = []
         for r in np.argsort(pole.imag):
             last = groups[-1][-1] if groups else None
@@ -157,13 +162,15 @@ class HitData:
 
     def reach(self, sheet: int) -> Real:
         """Largest measured change of each mode's pole between hits of a sheet, in its decay rates, (m,)."""
-        poles = np.where(self.used, self.poles, np.nan)[self.sheet == sheet]
-        known = np.isfinite(poles).any(axis=0)
-        middle = np.nanmedian(np.where(known, poles.real, 0.0), axis=0)
-        centre = middle + 1j * np.nanmedian(np.where(known, poles.imag, 0.0), axis=0)
-        apart = np.nan_to_num(np.abs(poles - centre))
+        on = self.sheet == sheet
+        used, poles = self.used[on], self.poles[on]
+        known = used.any(axis=0)
+        middle = [
+            np.nanmedian(np.where(used | ~known, part, np.nan), axis=0) for part in (poles.real, poles.imag)
+        ]
+        apart = np.where(used, np.abs(poles - (middle[0] + 1j * middle[1])), 0.0)
         usual = np.median(-self.poles.real, axis=0)
-        return np.where(known, apart.max(axis=0, initial=0.0) / usual, 0.0)
+        return np.asarray(apart.max(axis=0, initial=0.0) / usual)
 
     @cached_property
     def weights(self) -> tuple[Real, Complex]:
