@@ -25,10 +25,10 @@ from typing import Any
 import numpy as np
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.pipeline import existing_run
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.html import write_report
 from ema_pipeline.report.results import RunResults
+from ema_pipeline.run.opening import existing_run
 from ema_pipeline.stages.results import load_results
 
 CHANNELS = 100

@@ -26,8 +26,8 @@ from study_own_rigs import draw_rig
 
 from ema_pipeline.changes.compare import Changes, changes_content, compare_runs, open_test
 from ema_pipeline.observations.pair import RepeatSettings
+from ema_pipeline.run.types import Run
 from ema_pipeline.simulate import simulate_campaign
-from ema_pipeline.stages.base import Run
 
 PARTS = 0.03
 """Scatter of springs, 1 σ; masses scatter by half a per cent."""

@@ -9,8 +9,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from ema_pipeline.describe import checked_rig
-from ema_pipeline.pipeline import PipelineSettings
 from ema_pipeline.rigs import model_modes
+from ema_pipeline.run.settings import PipelineSettings
 
 
 def list_model_modes(rig: str, configuration: str | None) -> dict[str, list[dict[str, Any]]]:

@@ -8,20 +8,15 @@ from pathlib import Path
 
 from ema_pipeline.choices import Choices, HitChoice, ModeChoice, split_hit, split_mode
 from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.ingest.chosen import rejected_by_choice
 from ema_pipeline.ingest.records import Hit
+from ema_pipeline.kinds import kind_of, stages_of
 from ema_pipeline.modal.chosen import REACH, nearest_mode, pole_of_chart
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.pipeline import (
-    STAGES_OF_KIND,
-    ShowStage,
-    existing_run,
-    new_run,
-    run_stages,
-    stored_settings,
-)
-from ema_pipeline.stages.base import Run, save_info
-from ema_pipeline.stages.hits import CHOICE
-from ema_pipeline.stages.modes import modes_of_structure
+from ema_pipeline.pipeline import ShowStage, run_stages
+from ema_pipeline.run.measured import modes_of_structure
+from ema_pipeline.run.opening import existing_run, new_run, save_info
+from ema_pipeline.run.types import Run
 from ema_pipeline.store import Store
 
 BEFORE = ("ingest", "diagnose")
@@ -53,8 +48,9 @@ def change_choices(
     """
     effect_files = tuple(effect_files)
     run = existing_run(folder, effect_files)
-    if run.info.kind == "hysteresis":
-        raise EmaError(f"{folder}: a test of force-displacement loops has no hits and no modes to choose")
+    kind = kind_of(run.info)
+    if "modal" not in kind.measures:
+        raise EmaError(f"{folder}: a test of {kind.words} has no hits and no modes to choose")
     store = Store(folder)
     with store.lock():
         before, choices = run.info, change(run)
@@ -71,9 +67,7 @@ def change_choices(
 def stages_after(run: Run) -> tuple[str, ...]:
     """Stages that the folder has and that choices touch."""
     there = {stage for stage, _ in run.store.provenance()} | {"ladder"}
-    wanted = stored_settings(run.store, run.info).stages
-    kind = STAGES_OF_KIND[run.info.kind]
-    return tuple(s for s in wanted if s in there and s in kind and s not in BEFORE)
+    return tuple(s for s in run.settings.stages if s in there & stages_of(run) and s not in BEFORE)
 
 
 def excluding(hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Change:
@@ -139,7 +133,7 @@ def including(hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Change:
                 rest = tuple(x for x in choices.excluded_modes if x is not mine)
                 choices = dataclasses.replace(choices, excluded_modes=rest)
                 continue
-            if run.info.kind == "modes":
+            if "frf" not in kind_of(run.info).measures:
                 raise EmaError(
                     f"{run.store.folder}: a table of modes has no stabilisation chart to take a mode from"
                 )
@@ -189,16 +183,12 @@ def _require_others(run: Run, choices: Choices, choice: HitChoice) -> None:
     left = [
         h
         for h in _hits(run, choice.configuration)
-        if h.impact.point == point and (h.accepted or _by_choice(h)) and (h.file, h.number + 1) not in gone
+        if h.impact.point == point
+        and (h.accepted or rejected_by_choice(h))
+        and (h.file, h.number + 1) not in gone
     ]
     if not left:
         raise EmaError(f"hit '{choice}' is the last good one on {point}; a point needs one")
-
-
-def _by_choice(hit: Hit) -> bool:
-    """True where nothing but the user's choice rejects a hit."""
-    failed = [v for v in hit.verdicts if v.consequence == "reject_hit" and not v.passes]
-    return all(v.check == CHOICE for v in failed)
 
 
 def _hits(run: Run, configuration: str) -> tuple[Hit, ...]:

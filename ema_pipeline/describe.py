@@ -7,20 +7,19 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.effects.isolators import isolators
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.files import read_bounded
 from ema_pipeline.ingest.campaign import Campaign, read_campaign
 from ema_pipeline.ingest.description import TestDescription
+from ema_pipeline.kinds import KINDS
 from ema_pipeline.names import check_name
-from ema_pipeline.pipeline import describe_run, load_pipeline, shipped_pipelines
 from ema_pipeline.rigs import Rig, load_rig, rig_names
-from ema_pipeline.stages.base import RunInfo
+from ema_pipeline.run.opening import describe_run
+from ema_pipeline.run.settings import load_pipeline, shipped_pipelines
+from ema_pipeline.run.types import RunInfo
 from ema_pipeline.toml_text import LARGEST_BYTES, read_toml, read_toml_text
 
 DEFAULT_PIPELINE = "default"
-LOOPS_RIG = "isolator"
-"""Rig of force-displacement loops where none is named."""
 
 
 def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterable[str]) -> RunInfo:
@@ -31,12 +30,13 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
         raise EmaError(
             f"{raw}: holds tests of several kinds ({', '.join(sorted(kinds))}); run their folders one by one"
         )
-    if kinds == {"hysteresis"}:
-        return _describe_loops(campaign, rig, pipeline, overrides)
-    source = rig or _rig_of(campaign)
-    model = None if source is None else checked_rig(source)
-    of_tests = [_configuration(test, model) for test in campaign.tests]
+    kind = KINDS[kinds.pop()]
+    source = rig or _rig_of(campaign) or kind.rig
+    model = checked_rig(source) if source else None
     if model is not None:
+        kind.check_rig(model, source)
+    of_tests = [_configuration(test, model if kind.of_rig else None) for test in campaign.tests]
+    if model is not None and kind.of_rig:
         for test, name in zip(campaign.tests, of_tests, strict=True):
             check_dofs(test, name, model)
     names = tuple(dict.fromkeys(of_tests))
@@ -46,21 +46,7 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
         if len(names) == 1
         else raw.resolve().name
     )
-    return describe_run(kinds.pop(), raw, title, rig_text(source), source or "", names, (), settings)
-
-
-def _describe_loops(
-    campaign: Campaign, rig: str | None, pipeline: str | None, overrides: Iterable[str]
-) -> RunInfo:
-    """Hysteresis tests: the base model is the linear spring of an isolator, which the loops themselves determine."""
-    source = rig or _rig_of(campaign) or LOOPS_RIG
-    model = checked_rig(source)
-    if not any(isolators(model.assembly(name)) for name in model.configurations):
-        raise EmaError(f"{source}: has no isolator that loops could be measured on; leave --rig out")
-    names = tuple(test.configuration or "default" for test in campaign.tests)
-    title = campaign.tests[0].title or campaign.root.resolve().name
-    settings = load_pipeline(pipeline or DEFAULT_PIPELINE, overrides)
-    return describe_run("hysteresis", campaign.root, title, rig_text(source), source, names, (), settings)
+    return describe_run(kind.name, raw, title, rig_text(source), source, names, (), settings)
 
 
 def describe_modes(file: Path, rig: str | None, pipeline: str | None, overrides: Iterable[str]) -> RunInfo:
@@ -98,7 +84,8 @@ def check_dofs(test: TestDescription, configuration: str, rig: Rig) -> None:
                 f"'{dof.point}'{did_you_mean(dof.point, known)}"
             )
 
-    for channel in test.forces if test.kind == "continuous" else ():
+    struck = any(record.impact is not None for record in test.records)
+    for channel in () if struck else test.forces:
         if channel.dof is not None:
             check(channel.dof, f"channel '{channel.name}'")
     for record in test.records:
@@ -120,10 +107,10 @@ def _rig_of(campaign: Campaign) -> str | None:
     return name
 
 
-def rig_text(source: str | None) -> str:
-    """Name of a shipped rig, or the text of the user's file, which then lives on in the store."""
-    if source is None or source in rig_names():
-        return source or ""
+def rig_text(source: str) -> str:
+    """Name of a shipped rig, or the text of the user's file, which then lives on in the store; empty without a rig."""
+    if not source or source in rig_names():
+        return source
     return read_toml_text(Path(source)).rstrip() + "\n"
 
 

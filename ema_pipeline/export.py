@@ -8,9 +8,11 @@ from pathlib import Path
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import replace_file
 from ema_pipeline.fit.types import FitResult
-from ema_pipeline.pipeline import ShowStage, existing_run
+from ema_pipeline.kinds import kind_of
+from ema_pipeline.pipeline import ShowStage
 from ema_pipeline.report.limits import POOR_ERROR
-from ema_pipeline.stages.base import Run
+from ema_pipeline.run.opening import existing_run
+from ema_pipeline.run.types import Run
 from ema_pipeline.store import ALL, Store
 
 
@@ -70,9 +72,10 @@ def write_pages(run: Run, show: ShowStage | None = None) -> Path:
     """
     from ema_pipeline.stages.report import paper
 
-    if run.info.kind == "hysteresis":
+    kind = kind_of(run.info)
+    if "modal" not in kind.measures:
         raise EmaError(
-            f"{run.store.folder}: reports of loops have no PDF; print report.html from the browser"
+            f"{run.store.folder}: reports of {kind.words} have no PDF; print report.html from the browser"
         )
     if show is None:
         return paper(run)
@@ -90,7 +93,7 @@ def export_results(out: Path, folder: Path, effect_files: Iterable[str] = ()) ->
     """
     from ema_pipeline.exchange.tables import shapes_table, write_frf_csv, write_table
     from ema_pipeline.exchange.uff import write_uff
-    from ema_pipeline.stages.modes import measured_frfs, modes_of_structure
+    from ema_pipeline.run.measured import measured_frfs, modes_of_structure
 
     run = existing_run(out, effect_files)
     measured = measured_frfs(run)

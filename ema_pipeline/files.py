@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
 import shutil
@@ -55,6 +56,21 @@ def read_bounded(path: Path, largest_bytes: int) -> bytes:
             return file.read(largest_bytes)
     except OSError as error:
         raise EmaError(f"{path}: cannot be read ({reason(error)}); check the file and its rights") from None
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of a file.
+
+    Raises
+    ------
+    EmaError
+        If it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise EmaError(f"{path}: cannot be read ({error.strerror})") from None
 
 
 @contextmanager

@@ -10,18 +10,19 @@ from pathlib import Path
 from ema_pipeline.describe import describe
 from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.errors import EmaError, did_you_mean
-from ema_pipeline.pipeline import (
-    Keys,
-    ShowStage,
+from ema_pipeline.keys import Keys
+from ema_pipeline.kinds import require_judge, stages_of
+from ema_pipeline.pipeline import ShowStage, run_stages
+from ema_pipeline.run.opening import (
     existing_run,
+    load_info,
     new_run,
-    override,
-    run_stages,
+    save_info,
     stored_settings,
     with_effect_files,
 )
-from ema_pipeline.stages.base import Run, RunInfo, load_info, save_info
-from ema_pipeline.stages.driven import by_records, require_model
+from ema_pipeline.run.settings import override
+from ema_pipeline.run.types import Run, RunInfo
 from ema_pipeline.store import ALL, Store
 
 DescribeSource = Callable[[Path, str | None, str | None, Iterable[str]], RunInfo]
@@ -82,8 +83,8 @@ def run_raw(
         info = _with_decisions_of(store, info)
         save_info(store, info)
         run = new_run(store, info, effect_files)
-        stages = stored_settings(store, info).stages
-        return run, run_stages(run, stages, show)
+        store.keep(stages_of(run))  # an earlier run may have had a model, or been of another kind of test
+        return run, run_stages(run, run.settings.stages, show)
 
 
 def run_on(
@@ -159,7 +160,7 @@ def set_effects(
     """
     effect_files = tuple(effect_files)
     run = existing_run(folder, effect_files)
-    require_model(run, "add")
+    require_judge(run, "add").check_model(run)
     store = Store(folder)
     settings = override(stored_settings(store, run.info), overrides, folder)
     with store.lock():
@@ -167,15 +168,13 @@ def set_effects(
             run.info, effects=change(run.info.effects), pipeline=settings.model_dump_json()
         )
         run = new_run(store, info, effect_files)
-        require_model(run, "add")  # refuses unknown effects and places before anything is written
-        if info.kind == "hysteresis" and run.rig is not None:
-            from ema_pipeline.observations.loop_forces import effects_of_loops
-
-            effects_of_loops(run.rig, info.effects, run.library)  # refuses what a loop does not show
+        judge = require_judge(run, "add")
+        judge.check_model(run)  # before anything is written
         before = load_info(store)
         save_info(store, info)
         try:
-            _take_ladder(run, effect_files)
+            if judge.ladder_of_diagnosis:
+                _take_ladder(run, effect_files)
             run_stages(run, ("ladder",), show)
         except BaseException:  # interrupted, or no such ladder: the model stays as it was
             if before is not None:
@@ -187,12 +186,12 @@ def set_effects(
 def _take_ladder(run: Run, effect_files: tuple[str, ...]) -> None:
     """Take the diagnosis's ladder where it is of just these effects: one model has one error wherever it stands."""
     found = run.store.find("diagnose", ALL, "diagnosis", Diagnosis)
-    if run.info.kind == "hysteresis" or by_records(run) or found is None or not found.ladder.rungs:
+    if found is None or not found.ladder.rungs:
         return
     before = new_run(run.store, dataclasses.replace(run.info, effects=()), effect_files)
     up_to_date = Keys(before, ("diagnose",))("diagnose", ALL) == run.store.key("diagnose", ALL)
     if up_to_date and run.info.effects and found.ladder.rungs[-1].effects == run.info.effects:
-        key, settings = Keys(run, ("ladder",))("ladder", ALL), run.settings["ladder"].model_dump_json()
+        key, settings = Keys(run, ("ladder",))("ladder", ALL), run.settings.ladder.model_dump_json()
         run.store.save("ladder", ALL, key, settings, 0.0, ladder=found.ladder)
 
 

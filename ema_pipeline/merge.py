@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import scipy.stats
@@ -20,17 +19,17 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.files import cannot_write
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.parts import gain_ratios
-from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE, TestDescription
 from ema_pipeline.job import run_raw
 from ema_pipeline.names import check_name
-from ema_pipeline.pipeline import ShowStage, existing_run
+from ema_pipeline.pipeline import ShowStage
+from ema_pipeline.run.measured import measured_frfs, measured_modes
+from ema_pipeline.run.opening import existing_run
+from ema_pipeline.run.records import accepted_hits
+from ema_pipeline.run.types import Run
 from ema_pipeline.significance import holm
-from ema_pipeline.stages.base import Run
-from ema_pipeline.stages.hits import accepted_hits
-from ema_pipeline.stages.modes import measured_frfs, measured_modes
 from ema_pipeline.store import RESULTS_FILE
 
 TOLERANCE = 1e-3
@@ -252,7 +251,7 @@ def _check_one_state(modes: Sequence[CommonMode]) -> None:
 def _frfs_of(run: Run, configuration: str, part: str) -> FrfSet:
     """FRFs of one part of a merged test, of hits as long as those of the others."""
     hits = (h for h in accepted_hits(run.store, configuration) if h.hit.part == part)
-    return estimate_frfs(hits, cast(FrfSettings, run.settings["frf"]))
+    return estimate_frfs(hits, run.settings.frf)
 
 
 def _check_one_rig(parts: Sequence[Part], folder: Path) -> None:

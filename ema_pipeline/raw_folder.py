@@ -13,7 +13,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Hit
-from ema_pipeline.pipeline import load_pipeline, toml_value
+from ema_pipeline.run.settings import load_pipeline, toml_value
 
 if TYPE_CHECKING:
     from ema_pipeline.ingest.description import TestDescription

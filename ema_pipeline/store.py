@@ -15,7 +15,7 @@ import os
 import platform
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -276,6 +276,14 @@ class Store:
                     new[now] = link
                 elif link is not None:
                     old.copy(path, new, now)
+
+    def keep(self, stages: Collection[str]) -> None:
+        """Drop the results of all other stages."""
+        dropped = {stage for stage, _ in self.provenance()} - set(stages)
+        if dropped:
+            with self.changing() as file:
+                for stage in dropped:
+                    del file[f"stages/{stage}"]
 
     def parts(self) -> list[Path]:
         """The files of large results that the store refers to."""

@@ -92,7 +92,7 @@ def test_an_unchanged_rig_is_the_same_with_limits(root: Path, capsys: pytest.Cap
 def test_derivatives_of_the_pair_are_exact(root: Path) -> None:
     """By all unknowns, against differences; the sum of the log scale is that of the joint covariance."""
     from ema_pipeline.effects.library import parse_effect
-    from ema_pipeline.pipeline import existing_run
+    from ema_pipeline.run.opening import existing_run
 
     runs = [existing_run(_results(root, name)) for name in ("before", "after")]
     observations = pair_observations(*runs)
@@ -114,7 +114,7 @@ def test_derivatives_of_the_pair_are_exact(root: Path) -> None:
 
 def test_held_out_pairs_stay_together(root: Path) -> None:
     """What is left out of A is left out of B; nothing is lost."""
-    from ema_pipeline.pipeline import existing_run
+    from ema_pipeline.run.opening import existing_run
 
     observations = pair_observations(*(existing_run(_results(root, n)) for n in ("before", "again")))
     folds = observations.folds()

@@ -30,9 +30,9 @@ from ema_pipeline.levels.settings import LevelSettings
 from ema_pipeline.modal.chosen import EXCLUDED, INCLUDED, wanted
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
-from ema_pipeline.pipeline import existing_run
 from ema_pipeline.report.moved_modes import error_words, moved_table, seen, still
 from ema_pipeline.report.results import RunResults
+from ema_pipeline.run.opening import existing_run
 from ema_pipeline.simulate.campaign import simulate_campaign
 from ema_pipeline.stages.results import load_results
 

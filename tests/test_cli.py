@@ -21,7 +21,7 @@ import pyuff
 from bench import ema, write_bench
 
 from ema_pipeline.loops.simulate import PRINTED, write_sine_tests
-from ema_pipeline.pipeline import existing_run
+from ema_pipeline.run.opening import existing_run
 from ema_pipeline.simulate import simulate_campaign
 
 STAGES = 'stages=["ingest", "hits", "frf", "modal", "ladder", "fit", "correlate", "report"]'

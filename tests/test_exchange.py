@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import pyuff
 
+from ema_pipeline.correlate.types import Pair, Pairing
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.exchange import (
@@ -287,6 +288,14 @@ def test_local_directions_get_a_node_of_their_own() -> None:
     }
 
 
+def test_more_local_directions_than_a_node_has_go_to_another_node() -> None:
+    table = node_table([Dof("planet1", d) for d in ("zeta", "eta", "u", "tilt")])
+    assert table.nodes == {"planet1": 1, "planet1 local": 2, "planet1 local 2": 3}
+    assert table.body["planet1 local 2"] == "planet1"
+    found = [table.dofs[f"planet1.{d}"] for d in ("zeta", "eta", "u", "tilt")]
+    assert found == [(2, 1), (2, 2), (2, 3), (3, 1)]
+
+
 def test_points_keep_the_numbers_in_their_names() -> None:
     table = node_table([Dof.parse("point07.z"), Dof.parse("point12.z")])
     assert table.dofs == {"point07.z": (7, 3), "point12.z": (12, 3)}
@@ -305,6 +314,18 @@ def test_tables_of_modes_and_shapes_come_back_from_csv(tmp_path: Path) -> None:
         shape = next(csv.DictReader(file))
     assert complex(float(shape["sun.x re"]), float(shape["sun.x im"])) == modal.modes[0].shape[0]
     assert shape["sun.y re"] == ""
+
+
+def test_table_of_modes_numbers_the_model_modes_from_1_and_leaves_out_what_has_no_partner() -> None:
+    pair = Pair(
+        measured=1, model=4, measured_frequency_hz=515.0, model_frequency_hz=500.0, mac=0.93, family="planet"
+    )
+    pairing = Pairing((), (pair,), (), (), np.empty((2, 0)))
+    alone, paired = modes_table(modal_model(), "no_ring", pairing)
+    assert (alone["mode"], alone["model_mode"], alone["mac"], alone["family"]) == (1, None, None, None)
+    assert (paired["mode"], paired["model_mode"], paired["mac"], paired["family"]) == (2, 5, 0.93, "planet")
+    assert paired["model_frequency_hz"] == 500.0
+    assert paired["difference_percent"] == pytest.approx(100 * (515.0 - 500.0) / 500.0)
 
 
 def test_no_modes_still_give_a_table_with_its_header(tmp_path: Path) -> None:

@@ -25,8 +25,8 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest import read_description
 from ema_pipeline.ingest.load import load_record
 from ema_pipeline.ingest.readers import read_raw
-from ema_pipeline.pipeline import load_pipeline
 from ema_pipeline.plain_text import printable
+from ema_pipeline.run.settings import load_pipeline
 
 TIMES = int(os.environ.get("EMA_FUZZ", "1"))
 SEED = int(os.environ.get("EMA_FUZZ_SEED", "1"))

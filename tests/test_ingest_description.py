@@ -33,6 +33,18 @@ def test_a_roving_sensor_overrides_its_dof_for_one_record(tmp_path: Path) -> Non
     assert test.dof_of(test.responses[0], test.records[0]) == Dof("root", "y", -1)
 
 
+@pytest.mark.parametrize(("band", "right"), [((0.0, 0.5), True), ((-1.0, 5.0), False), ((5.0, 5.0), False)])
+def test_a_band_may_begin_at_0_and_has_its_lower_end_first(
+    tmp_path: Path, band: tuple[float, float], right: bool
+) -> None:
+    folder = make_test(tmp_path, f"band_hz = [{band[0]}, {band[1]}]\n" + DESCRIPTION)
+    if right:
+        assert read_description(folder).band_hz == band
+        return
+    with pytest.raises(EmaError, match="is no band; give its lower end first"):
+        read_description(folder)
+
+
 def test_a_description_saved_by_a_windows_editor_is_read(tmp_path: Path) -> None:
     folder = make_test(tmp_path)
     text = (folder / "test.toml").read_text()

@@ -17,13 +17,13 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels import LevelSettings, LevelStudy, study_levels
 from ema_pipeline.levels.harmonics import growth, product_of, without, without_products
 from ema_pipeline.levels.linear import structure
+from ema_pipeline.levels.study import with_circles
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel, Mode
-from ema_pipeline.stages.base import Run
-from ema_pipeline.stages.levels import with_circles
-from ema_pipeline.stages.modes import measured_frfs, measured_modes
+from ema_pipeline.run.measured import measured_frfs, measured_modes
+from ema_pipeline.run.types import Run
 
 CASE = replace(LINEAR, noise=1e-3)
 

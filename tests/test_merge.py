@@ -20,9 +20,9 @@ from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.frf.parts import gain_ratios, joined
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.merge import merge
-from ema_pipeline.pipeline import existing_run
+from ema_pipeline.run.measured import measured_frfs, measured_modes
+from ema_pipeline.run.opening import existing_run
 from ema_pipeline.simulate import simulate_campaign
-from ema_pipeline.stages.modes import measured_frfs, measured_modes
 
 BODIES = 6
 STIFFNESS = [5e6 * (1 + 0.1 * k) for k in range(1, BODIES + 1)]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.correlate.measured import MeasuredModes, to_modal_model
 from ema_pipeline.correlate.mode_table import read_mode_table
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
@@ -130,6 +130,14 @@ def test_semicolons_and_a_missing_configuration_are_understood(tmp_path: Path) -
 def test_mistakes_in_a_csv_table_are_one_clear_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(EmaError, match=message):
         read_mode_table(table(tmp_path, text, "modes.csv"))
+
+
+def test_modes_of_a_table_have_the_poles_of_their_frequencies_and_dampings(tmp_path: Path) -> None:
+    modes = to_modal_model(read_mode_table(table(tmp_path, TABLE), load_rig("frame"))["default"]).modes
+    poles = np.array([m.pole for m in modes])
+    np.testing.assert_allclose(np.abs(poles) / (2 * np.pi), [10.0, 30.0], rtol=1e-12)
+    np.testing.assert_allclose(-poles.real / np.abs(poles), [0.004, 0.011], rtol=1e-12)
+    assert np.all(poles.imag > 0)
 
 
 def test_a_table_that_the_program_wrote_is_read_back(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from ema_pipeline.cli import app
 from ema_pipeline.errors import EmaError
-from ema_pipeline.stages.base import load_info, save_info
+from ema_pipeline.run.opening import load_info, save_info
 from ema_pipeline.store import Store
 
 EFFECT = """

@@ -24,10 +24,11 @@ from ema_pipeline.report import plots as report_plots
 from ema_pipeline.report import style, summary, tables, terminal
 from ema_pipeline.report.html import bokeh_script, report_html, write_report
 from ema_pipeline.report.numbers import format_percent, format_value, signed
-from ema_pipeline.report.planetary import gear_layout, missing_words, motions, shape_pair
 from ema_pipeline.report.plots import figure_specs, write_plots
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.run_screen import RunScreen
+from ema_pipeline.report.shapes import missing_words, shape_pair
+from ema_pipeline.rigs import drawing_of
 
 UNIT = re.compile(r", (1|%|°|Hz|N/m|σ|\(?[\w²/]|10[⁰¹²³⁴⁵⁶⁷⁸⁹⁻]+|MN/m|kg)")
 
@@ -238,18 +239,20 @@ def test_plots_of_an_earlier_run_are_removed_but_nothing_else(tmp_path: Path) ->
 # planetary drawing
 
 
-def test_layout_knows_a_planetary_gear_and_nothing_else() -> None:
-    layout = gear_layout(["sun.x", "carrier.x", "ring.x", "planet3.zeta"])
-    assert layout is not None
-    assert [b.name for b in layout.bodies] == ["carrier", "ring", "sun", "planet1", "planet2", "planet3"]
-    assert gear_layout(["point01.z", "sun.x"]) is None
+def test_drawing_knows_a_planetary_gear_and_nothing_else() -> None:
+    drawing = drawing_of(["sun.x", "carrier.x", "ring.x", "planet3.zeta"], complete=False)
+    assert drawing is not None
+    assert [b.name for b in drawing.bodies] == ["carrier", "ring", "sun", "planet1", "planet2", "planet3"]
+    assert drawing_of(["point01.z", "sun.x"], complete=False) is None
 
 
 @pytest.mark.parametrize("planets", [2, 3, 4, 5, 7, 9])
 def test_drawn_planets_touch_neither_each_other_nor_leave_the_ring(planets: int) -> None:
-    layout = gear_layout([f"planet{n}.x" for n in range(1, planets + 1)] + ["sun.x", "carrier.x", "ring.x"])
-    assert layout is not None
-    bodies = {b.name: b for b in layout.bodies}
+    drawing = drawing_of(
+        [f"planet{n}.x" for n in range(1, planets + 1)] + ["sun.x", "carrier.x", "ring.x"], complete=True
+    )
+    assert drawing is not None
+    bodies = {b.name: b for b in drawing.bodies}
     a, b = bodies["planet1"], bodies["planet2"]
     assert math.hypot(a.x - b.x, a.y - b.y) > 2 * a.radius
     assert math.hypot(a.x, a.y) == pytest.approx(1 + a.radius)
@@ -257,10 +260,10 @@ def test_drawn_planets_touch_neither_each_other_nor_leave_the_ring(planets: int)
 
 
 def test_zeta_of_the_second_of_four_planets_is_y() -> None:
-    layout = gear_layout([f"planet{n}.x" for n in range(1, 5)] + ["sun.x", "carrier.x"])
-    assert layout is not None
-    moved = motions(
-        layout, {"planet2.zeta": 1.0, "planet2.eta": 0.0, "planet1.zeta": 0.0, "planet1.eta": 2.0}
+    drawing = drawing_of([f"planet{n}.x" for n in range(1, 5)] + ["sun.x", "carrier.x"], complete=True)
+    assert drawing is not None
+    moved = drawing.motions(
+        {"planet2.zeta": 1.0, "planet2.eta": 0.0, "planet1.zeta": 0.0, "planet1.eta": 2.0}
     )
     assert moved["planet2"].x == pytest.approx(0, abs=1e-12)
     assert moved["planet2"].y == pytest.approx(1)

@@ -19,9 +19,9 @@ from ema_pipeline.mechanics import laws
 from ema_pipeline.mechanics.assembly import Damper, Gyroscopic, Mass, Nonlinear, Spring
 from ema_pipeline.mechanics.modes import complex_modes
 from ema_pipeline.mechanics.nonlinear import force_along
-from ema_pipeline.pipeline import existing_run
 from ema_pipeline.rigs import Rig, load_rig, model_modes
 from ema_pipeline.rigs.element_entries import SECTIONS, Law
+from ema_pipeline.run.opening import existing_run
 from ema_pipeline.stages.results import load_results
 
 DOCS = Path(__file__).parent.parent / "docs"

@@ -18,9 +18,10 @@ from ema_pipeline.mechanics.modes import complex_modes, normal_modes
 from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
-from ema_pipeline.report.planetary import Motion, missing_words, motions, torsional_layout
+from ema_pipeline.report.shapes import missing_words
 from ema_pipeline.reproduce.gearbox import measure
-from ema_pipeline.rigs import load_rig, model_modes
+from ema_pipeline.rigs import drawing_of, load_rig, model_modes
+from ema_pipeline.rigs.drawing import Motion
 from ema_pipeline.rigs.gearbox import default_parameters, gearbox
 from ema_pipeline.rigs.planetary import planetary
 from ema_pipeline.simulate import simulate_campaign
@@ -98,11 +99,11 @@ def test_effects_that_make_sense_find_their_places_on_the_gearbox() -> None:
 
 
 def test_drawn_gearbox_turns_in_a_fixed_ring_and_its_carrier_takes_the_planets_along() -> None:
-    layout = torsional_layout(GEARBOX.assembly("default").dofs)
-    assert layout is not None
-    assert layout.torsional
-    assert [b.name for b in layout.bodies] == ["carrier", "ring", "sun", "planet1", "planet2", "planet3"]
-    moved = motions(layout, {"carrier.u": 0.5, "sun.u": 1.0, "planet1.u": -1.0, "planet2.u": 0.2})
+    drawing = drawing_of(GEARBOX.assembly("default").dofs, complete=True)
+    assert drawing is not None
+    assert drawing.directions == 1
+    assert [b.name for b in drawing.bodies] == ["carrier", "ring", "sun", "planet1", "planet2", "planet3"]
+    moved = drawing.motions({"carrier.u": 0.5, "sun.u": 1.0, "planet1.u": -1.0, "planet2.u": 0.2})
     assert (moved["planet1"].x, moved["planet1"].y, moved["planet1"].u) == (0.0, 0.5, -1.0)
     # Planet 2 of 3 sits at 120°: a carrier that turns takes it along -x and -y.
     assert moved["planet2"].x == pytest.approx(-0.5 * np.sin(2 * np.pi / 3))

@@ -401,7 +401,8 @@ while True:
         assert store.key("frf") == ("first" if turn is None else f"turn {turn}")
     with Store(tmp_path).lock():
         assert len(parts(tmp_path)) <= 1
-        assert {p.name for p in tmp_path.iterdir()} == {"ema.h5", "stages", ".lock"}
+        # "stages" is not there where every process was killed before its first save.
+        assert {p.name for p in tmp_path.iterdir()} - {"stages"} == {"ema.h5", ".lock"}
 
 
 @pytest.mark.parametrize("damaged_bytes", [1, 64, 4096])

@@ -17,7 +17,7 @@ from chain_rig import RIG
 from live_page import Page, opened
 
 from ema_pipeline.job import change_effects, removing, run_raw
-from ema_pipeline.pipeline import existing_run
+from ema_pipeline.run.opening import existing_run
 from ema_pipeline.simulate.campaign import simulate_campaign
 from ema_pipeline.store import Store
 from ema_pipeline.view.snapshots import FOLDER, Snapshots

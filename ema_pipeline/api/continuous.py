@@ -13,7 +13,7 @@ from ema_pipeline.api.display import Report, axes_or_new
 from ema_pipeline.api.frfs import Frfs, frfs_of
 from ema_pipeline.api.work import Settings, Work
 from ema_pipeline.ingest.driven import DrivenRecord
-from ema_pipeline.stages.ingest import driven_records
+from ema_pipeline.run.records import driven_records
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,6 +16,7 @@ from ema_pipeline.diagnose import types as diagnosed
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.types import FitResult, ParameterEstimate
 from ema_pipeline.job import adding, removing
+from ema_pipeline.kinds import kind_of
 from ema_pipeline.store import ALL
 
 if TYPE_CHECKING:
@@ -226,8 +227,9 @@ def fitted(work: Work) -> Fit:
     run = work.run("ladder", "fit", "correlate")
     found = run.store.find("fit", ALL, "fit", FitResult)
     if found is None:
+        what = kind_of(run.info).words
         raise EmaError(
-            "force-displacement loops have no modes to fit; use ema.open(out).add(...) and its ladder"
+            f"a model judged by {what} is not fitted to modes; use ema.open(out).add(...) and its ladder"
         )
     names = run.info.configurations
     return Fit(

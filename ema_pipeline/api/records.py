@@ -17,7 +17,8 @@ from ema_pipeline.api.work import Settings, Work, overrides
 from ema_pipeline.describe import describe
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.records import Hit, Record
-from ema_pipeline.stages.hits import stored_records
+from ema_pipeline.kinds import kind_of
+from ema_pipeline.run.records import stored_records
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -153,12 +154,11 @@ def read(
     True
     """
     info = describe(Path(raw), None, None if pipeline is None else str(pipeline), overrides(settings))
-    if info.kind == "hysteresis":
-        raise EmaError(
-            f"{raw}: holds force-displacement loops, which have no FRFs; use ema.run({str(raw)!r})"
-        )
+    kind = kind_of(info)
+    if "frf" not in kind.measures:
+        raise EmaError(f"{raw}: holds {kind.words}, which have no FRFs; use ema.run({str(raw)!r})")
     work = Work.new(info)
-    if info.kind == "continuous":
+    if "hits" not in kind.measures:
         work.run("ingest")
         return ContinuousTest(info.title, info.configurations, work)
     run = work.run("ingest", "hits")

@@ -19,9 +19,9 @@ from ema_pipeline.api.work import Settings, Work, overrides
 from ema_pipeline.choosing import change_choices, excluding, including
 from ema_pipeline.errors import EmaError
 from ema_pipeline.job import adding, change_effects, removing, run_raw
-from ema_pipeline.pipeline import existing_run
 from ema_pipeline.report.results import RunResults
-from ema_pipeline.stages.base import Run
+from ema_pipeline.run.opening import existing_run
+from ema_pipeline.run.types import Run
 from ema_pipeline.stages.results import load_results
 
 if TYPE_CHECKING:

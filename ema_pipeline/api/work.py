@@ -18,8 +18,11 @@ from typing import TYPE_CHECKING
 from ema_pipeline.describe import checked_rig, rig_text
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.files import link_or_copy
-from ema_pipeline.pipeline import new_run, override, run_stages, stored_settings, with_effect_files
-from ema_pipeline.stages.base import Run, RunInfo
+from ema_pipeline.kinds import kind_of
+from ema_pipeline.pipeline import run_stages
+from ema_pipeline.run.opening import new_run, stored_settings, with_effect_files
+from ema_pipeline.run.settings import override
+from ema_pipeline.run.types import Run, RunInfo
 from ema_pipeline.store import PARTS_FOLDER, Store
 from ema_pipeline.threads import single_blas_thread
 
@@ -28,9 +31,6 @@ if TYPE_CHECKING:
 
 Settings = Mapping[str, object]
 """Settings of a pipeline by their dotted name, e.g. ``{"modal.identify.engine": "lscf"}``."""
-
-MEASURED = ("hits", "frf", "modal", "levels")
-"""Stages that a model is compared with."""
 
 
 def overrides(settings: Settings | None) -> list[str]:
@@ -146,11 +146,8 @@ class Work:
             effects=(),
         )
         made = Work.new(info)
-        stages = (
-            *MEASURED,
-            *(["ingest"] if info.kind == "continuous" else []),
-        )  # whose records are simulated
-        made.store.copy_from(self.store, stages, dict(zip(self.info.configurations, names, strict=True)))
+        measures = kind_of(info).measures
+        made.store.copy_from(self.store, measures, dict(zip(self.info.configurations, names, strict=True)))
         made = dataclasses.replace(made, rig=None if named else model, effect_files=files)
         info = with_effect_files(made.store, made.info, files)
         return dataclasses.replace(made, info=info).with_settings(settings)

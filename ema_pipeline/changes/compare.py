@@ -15,11 +15,13 @@ from ema_pipeline.describe import checked_rig
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import replace_file
 from ema_pipeline.job import run_raw
+from ema_pipeline.kinds import kind_of
 from ema_pipeline.observations.pair import RepeatSettings
-from ema_pipeline.pipeline import ShowStage, existing_run
+from ema_pipeline.pipeline import ShowStage
 from ema_pipeline.report.summary_files import finite
-from ema_pipeline.stages.base import Run
-from ema_pipeline.stages.modes import measured_modes
+from ema_pipeline.run.measured import measured_modes
+from ema_pipeline.run.opening import existing_run
+from ema_pipeline.run.types import Run
 from ema_pipeline.store import RESULTS_FILE
 
 MEASURING = 'stages=["ingest", "hits", "frf", "modal", "levels"]'
@@ -84,8 +86,9 @@ def open_test(
     """
     if (path / RESULTS_FILE).is_file():
         run = existing_run(path, effect_files)
-        if run.info.kind == "hysteresis":
-            raise EmaError(f"{path}: force-displacement loops have no modes; compare hammer tests")
+        kind = kind_of(run.info)
+        if "modal" not in kind.measures:
+            raise EmaError(f"{path}: {kind.words} have no modes; compare hammer tests")
         if rig is not None:
             run = dataclasses.replace(run, built_rig=checked_rig(rig))
     else:

@@ -14,8 +14,8 @@ from ema_pipeline.mechanics.modes import normal_modes
 from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.modal.assurance import mac
 from ema_pipeline.report.summary_files import finite
-from ema_pipeline.stages.base import Run
-from ema_pipeline.stages.modes import measured_modes
+from ema_pipeline.run.measured import measured_modes
+from ema_pipeline.run.types import Run
 from ema_pipeline.stages.results import load_results
 
 

@@ -15,8 +15,8 @@ from ema_pipeline.report.diagnosis_tables import detection_table
 from ema_pipeline.report.pages import page_templates
 from ema_pipeline.report.style import png
 from ema_pipeline.report.tables import Row, Table
-from ema_pipeline.stages.base import Run
-from ema_pipeline.stages.modes import measured_frfs, measured_modes
+from ema_pipeline.run.measured import measured_frfs, measured_modes
+from ema_pipeline.run.types import Run
 
 REPORT = "report.html"
 _ABOVE = 1.15

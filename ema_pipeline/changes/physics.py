@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import cast
 
 from ema_pipeline.correlate.matching import match_modes
-from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Candidate, Diagnosis
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import merged
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.pair import A, B, PairObservations, RepeatSettings
-from ema_pipeline.stages.base import Run
-from ema_pipeline.stages.models import known_model, mode_observations
-from ema_pipeline.stages.modes import measured_modes
+from ema_pipeline.run.measured import measured_modes
+from ema_pipeline.run.models import known_model, mode_observations
+from ema_pipeline.run.types import Run
 
 Progress = Callable[[float, str], None]
 
@@ -85,7 +83,7 @@ def _diagnosed(a: Run, b: Run, progress: Progress, repeat: RepeatSettings | None
     from ema_pipeline.threads import single_blas_thread
 
     model = b.require_model("changes")
-    settings = cast(DiagnoseSettings, b.settings["diagnose"])
+    settings = b.settings.diagnose
     settings = settings.model_copy(
         update={"further_finalists": max(settings.further_finalists, _FURTHER_FINALISTS)}
     )

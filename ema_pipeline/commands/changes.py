@@ -77,7 +77,7 @@ def changes(
 
 def _repeats(texts: list[str]) -> RepeatSettings:
     from ema_pipeline.observations.pair import RepeatSettings
-    from ema_pipeline.pipeline import toml_value
+    from ema_pipeline.run.settings import toml_value
     from ema_pipeline.settings import parse
 
     pairs = [text.partition("=") for text in texts]

@@ -66,10 +66,10 @@ def _require(hits: list[str] | None, modes: list[str] | None) -> None:
 def _change(out: Path, change: Change, effect_files: list[str], quiet: bool, json: bool) -> None:
     """Change the choices, and print modes and errors before and after."""
     from ema_pipeline.choosing import change_choices
-    from ema_pipeline.pipeline import existing_run
     from ema_pipeline.report import terminal
     from ema_pipeline.report.moved_modes import error_words, moved_table, seen, still
     from ema_pipeline.report.summary_files import choices_summary, finite
+    from ema_pipeline.run.opening import existing_run
     from ema_pipeline.stages.results import load_results
 
     before = seen(load_results(existing_run(out, effect_files)))

@@ -15,39 +15,42 @@ from ema_pipeline.commands.screen import program, progress, show, show_json
 
 if TYPE_CHECKING:
     from ema_pipeline.report.results import RunResults
-    from ema_pipeline.stages.base import Run
+    from ema_pipeline.run.types import Run
 
 
 def compare(out: Out, effect_file: EffectFiles = None, json: Json = False) -> None:
     """Show where model and measurement differ, in units of the measurement's uncertainty."""
     from ema_pipeline.job import run_on
+    from ema_pipeline.kinds import require_judge, stages_of
     from ema_pipeline.report import terminal
-    from ema_pipeline.stages.driven import by_records
+    from ema_pipeline.report.simulation import error_lines
+    from ema_pipeline.run.opening import existing_run
     from ema_pipeline.stages.results import load_results
 
     with progress(False) as show_stage:
-        stages = ["correlate", "ladder"] if _of_loops(out) else ["correlate"]
-        run, _ = run_on(out, stages, show=show_stage, effect_files=effect_file or [])
-    if by_records(run):
-        _show_records(run, json)
-        return
-    run.require_model("compare")
-    if run.info.kind == "hysteresis":
+        stage = "correlate" if "correlate" in stages_of(existing_run(out)) else "ladder"
+        run, _ = run_on(out, [stage], show=show_stage, effect_files=effect_file or [])
+    require_judge(run, "compare")
+    results = load_results(run)
+    if results.loops is not None:
+        from ema_pipeline.kinds.loops import own_models
         from ema_pipeline.report.loops import comparison_rows, comparison_screen
-        from ema_pipeline.stages.loop_ladder import loops_of, own_models
 
-        loops, models = loops_of(run), own_models(run)
+        loops, models = results.loops.loops, own_models(run)
         if json:
             show_json({"loops": comparison_rows(loops, models)})
         else:
             show(comparison_screen(loops, models))
-        return
-    results = load_results(run)
-    assert results.comparison is not None  # the stage has just run
-    if json:
-        _show_json(results, "comparison")
+    elif results.comparison is not None:
+        if json:
+            _show_json(results, "comparison")
+        else:
+            show(terminal.comparison_tables(results.comparison))
+    elif json:
+        _show_json(results, "simulation")
     else:
-        show(terminal.comparison_tables(results.comparison))
+        for line in error_lines(results.simulation):
+            show(line)
 
 
 def diagnose(
@@ -62,14 +65,14 @@ def diagnose(
 ) -> None:
     """Say which physical effect the model is missing, how sure that is, and what to measure next."""
     from ema_pipeline.job import adding, change_effects, run_on
+    from ema_pipeline.kinds import require_judge
     from ema_pipeline.report import terminal
     from ema_pipeline.report.cautions import suspicions
-    from ema_pipeline.stages.driven import require_model
     from ema_pipeline.stages.results import load_results
 
     with progress(quiet) as show_stage:
         run, _ = run_on(out, ["diagnose", "report"], set_ or [], show_stage, effect_file or [])
-        require_model(run, "diagnose")
+        require_judge(run, "diagnose").check_model(run)
         results = load_results(run)
         found = results.diagnosis
         assert found is not None  # the stage has just run
@@ -139,28 +142,9 @@ def _change(
 
 def ladder(out: Out, effect_file: EffectFiles = None, json: Json = False) -> None:
     """Show the models so far, each with its error on the data fitted and on data held out."""
-    from ema_pipeline.pipeline import existing_run
+    from ema_pipeline.run.opening import existing_run
 
     _show_ladder(existing_run(out, effect_file or []), json)
-
-
-def _show_records(run: Run, json: bool) -> None:
-    """Free-run errors in every record."""
-    from ema_pipeline.report.simulation import error_lines
-    from ema_pipeline.stages.results import load_results
-
-    results = load_results(run)
-    if json:
-        _show_json(results, "simulation")
-        return
-    for line in error_lines(results.simulation):
-        show(line)
-
-
-def _of_loops(out: Path) -> bool:
-    from ema_pipeline.pipeline import existing_run
-
-    return existing_run(out).info.kind == "hysteresis"
 
 
 def _show_json(results: RunResults, *parts: str) -> None:

@@ -17,9 +17,9 @@ def check(raw: Raw, set_: Overrides = None, json: Json = False) -> None:
 
     The exit code is 1 where a point has no good hit left.
     """
+    from ema_pipeline.ingest.chosen import require_good_hits
     from ema_pipeline.raw_folder import check_raw, check_records
     from ema_pipeline.report import summary_files, terminal
-    from ema_pipeline.stages.hits import require_good_hits
 
     records = check_records(raw, set_ or [])
     if records is not None:

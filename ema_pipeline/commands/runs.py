@@ -16,7 +16,7 @@ from ema_pipeline.commands.options import EffectFiles, Json, Out, Overrides, Qui
 from ema_pipeline.commands.screen import program, progress, show, show_json
 
 if TYPE_CHECKING:
-    from ema_pipeline.stages.base import Run
+    from ema_pipeline.run.types import Run
 
 
 def run(
@@ -73,7 +73,7 @@ def _show_summary(done: Run) -> None:
 
     results, folder = load_results(done), done.store.folder
     report = f"Report: {folder / 'report.html'}"
-    if done.info.kind == "hysteresis":
+    if results.loops is not None:
         from ema_pipeline.report.loops import run_screen
         from ema_pipeline.stages.results import isolators
 

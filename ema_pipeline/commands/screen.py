@@ -18,7 +18,7 @@ from ema_pipeline.plain_text import printable
 
 if TYPE_CHECKING:
     from ema_pipeline.pipeline import ShowStage
-    from ema_pipeline.stages.base import Progress
+    from ema_pipeline.run.types import Progress
 
 
 def show(what: Any) -> None:

@@ -58,12 +58,11 @@ class ExpectedGain:
     def __init__(self, fit: Posterior, scatters: Mapping[str, Scatter], marginal: Marginal) -> None:
         self.marginal = marginal
         learned = [s for n, s in scatters.items() if s.spread and n in fit.scatters]
-        values, jacobian = fit.residuals.weighted
         self._governed = [fit.unknowns.governed(s.name)[marginal.kept] for s in learned]
         self._shares = np.zeros((marginal.count, len(learned)))
         for k, s in enumerate(learned):
             self._shares[:, k] = fit.residuals.share.get(s.name, 0.0)
-        self._square = values**2 + np.einsum("ij,jk,ik->i", jacobian, fit.covariance, jacobian)
+        self._square = fit.expected_squares()
         of_residuals = np.sum(self._shares, axis=0)
         self._values = np.array([determined(fit, s.name) for s in learned]) - of_residuals
         now = np.array([np.log(fit.scatters[s.name]) for s in learned])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -76,3 +77,20 @@ def merged(one: ChannelQuality | None, other: ChannelQuality) -> ChannelQuality:
         max(one.calibration_std, other.calibration_std),
         max(one.transverse, other.transverse),
     )
+
+
+def uncertainty_of_dofs(
+    measured: Iterable[tuple[FrfSet | None, Iterable[Dof]]],
+) -> dict[str, ChannelQuality]:
+    """Uncertainty of every DOF of several configurations, by point.
+
+    Parameters
+    ----------
+    measured : iterable of (FrfSet or None, iterable of Dof)
+        FRFs of each configuration, or None for a table of modes, with the DOFs that were measured.
+    """
+    found: dict[str, ChannelQuality] = {}
+    for frfs, dofs in measured:
+        for dof in dofs:
+            found[dof.point] = merged(found.get(dof.point), channel_uncertainty(frfs, dof))
+    return found

@@ -86,6 +86,17 @@ class Posterior:
         count = len(self.residuals.values) - self.residuals.projected
         return float(np.sqrt(squares / max(count, 1)))
 
+    def expected_squares(self, rows: NDArray[np.bool_] | slice = slice(None)) -> NDArray[np.float64]:
+        """Expected squares of the weighted residuals while the unknowns are as uncertain as they are, (m,).
+
+        Parameters
+        ----------
+        rows : ndarray of bool or slice, optional
+            Residuals that are asked for.
+        """
+        values, jacobian = (a[rows] for a in self.residuals.weighted)
+        return np.asarray(values**2 + np.einsum("ij,ij->i", jacobian @ self.covariance, jacobian))
+
     def of_sums(
         self, terms: Sequence[Mapping[str, float]]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

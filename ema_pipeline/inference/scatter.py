@@ -139,11 +139,8 @@ def _of_residuals(found: Posterior, name: str, now: float) -> tuple[float, int]:
     if share is None or not np.any(share > 0):
         return 0.0, 0
     rows = share > 0
-    values, jacobian = (a[rows] for a in found.residuals.weighted)
-    uncertain = np.einsum("ij,jk,ik->i", jacobian, found.covariance, jacobian)
-    square = values**2 + uncertain
     part = share[rows]
-    return float(now**2 * np.sum(part * square + 1.0 - part)), int(np.sum(rows))
+    return float(now**2 * np.sum(part * found.expected_squares(rows) + 1.0 - part)), int(np.sum(rows))
 
 
 def _mode_of_log(squares: float, count: int, now: float, scatter: Scatter) -> float:
@@ -168,10 +165,7 @@ def _of_residuals_at_once(found: Posterior, scatter: Scatter) -> float:
     if share is None:
         return now
     rows = share > 0  # the others do not depend on it
-    values, jacobian = found.residuals.weighted
-    share, jacobian = share[rows], jacobian[rows]
-    uncertain = np.einsum("ij,ij->i", jacobian @ found.covariance, jacobian)
-    square = values[rows] ** 2 + uncertain
+    share, square = share[rows], found.expected_squares(rows)
     log, weight = 0.0, scatter.spread**-2.0
     for _ in range(_NEWTON_STEPS):
         t = np.exp(2 * log)

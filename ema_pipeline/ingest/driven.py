@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -280,3 +280,20 @@ def _check_period(force: NDArray[np.float64], period: int, where: str) -> None:
             f"{where}: period_samples = {period} does not fit: the force differs by {share:.0%} from one period to "
             "the next; correct it, or remove it where the force does not repeat"
         )
+
+
+def check_same_sensors(records: Sequence[DrivenRecord]) -> None:
+    """Make sure that the sensors of all records sit where those of the first do, as one simulation needs it.
+
+    Raises
+    ------
+    EmaError
+        Names the record whose sensors sit elsewhere.
+    """
+    first = records[0]
+    for r in records:
+        if [c.dof.point for c in r.channels] != [c.dof.point for c in first.channels]:
+            raise EmaError(
+                f"record '{r.name}': its sensors sit elsewhere than those of '{first.name}'; records of one "
+                "simulation need the same sensors, put it into a test of its own"
+            )

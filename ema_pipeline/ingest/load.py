@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from ema_pipeline.ingest.description import ChannelDescription, RecordDescriptio
 from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers import read_raw
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord, Samples, split_unit
-from ema_pipeline.ingest.records import ANY_BAND_HZ, Record, ResponseChannel
+from ema_pipeline.ingest.records import ANY_BAND_HZ, Record, ResponseChannel, Transducer
 from ema_pipeline.ingest.swap import find_swap
 from ema_pipeline.lazy_samples import LazySamples
 from ema_pipeline.units import Unit, find_unit
@@ -366,3 +366,22 @@ def _full_scale(channel: ChannelDescription) -> float:
     if channel.sensitivity_mv is None:
         return float("inf")
     return channel.full_scale_v * 1000.0 / channel.sensitivity_mv * unit.scale
+
+
+def transducers_of(tests: Iterable[TestDescription]) -> tuple[Transducer, ...]:
+    """The sensors that tests state, each once."""
+    found = (_transducer(channel) for test in tests for channel in test.channels)
+    return tuple({repr(x): x for x in found}.values())  # by their text: not-a-numbers are never equal
+
+
+def _transducer(channel: ChannelDescription) -> Transducer:
+    return Transducer(
+        channel.name,
+        channel.quantity,
+        channel.unit,
+        "" if channel.dof is None else str(channel.dof),
+        float("nan") if channel.sensitivity_mv is None else channel.sensitivity_mv,
+        channel.sensor_mass_kg,
+        channel.calibration_std,
+        channel.transverse,
+    )

@@ -19,6 +19,7 @@ from ema_pipeline.modal.settings import ModalSettings
 if TYPE_CHECKING:
     from ema_pipeline.ingest.records import HitSamples
     from ema_pipeline.levels.single import HitPoles
+    from ema_pipeline.modal.circle.settings import CircleSettings
     from ema_pipeline.modal.types import ModalModel
 
 Progress = Callable[[float, str], None]
@@ -133,6 +134,19 @@ def study_levels(
         levels, frfs.inputs, modes, curves, verdicts, depends, p_value, "", linear, products, hit_modes
     )
     return replace(study, summary=several_levels(study, modal, settings))
+
+
+def with_circles(study: LevelStudy, settings: CircleSettings) -> LevelStudy:
+    """The study with circle fits beside the modes of the level that stands for the linear structure."""
+    from ema_pipeline.modal.circle import attach_circles
+
+    if study.linear_level is None:
+        return study
+    levels = list(study.levels)
+    level = levels[study.linear_level]
+    if level.modal is not None:
+        levels[study.linear_level] = replace(level, modal=attach_circles(level.frfs, level.modal, settings))
+    return replace(study, levels=tuple(levels))
 
 
 def _level(

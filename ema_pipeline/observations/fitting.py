@@ -9,11 +9,13 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.effects.base import PlacedEffect
+from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.effects.library import depends_on_level, parse_effect
 from ema_pipeline.inference import Bounded, Posterior, Unknowns, anneal, beyond_scatter, descend, learn
 from ema_pipeline.inference.maximise import ANNEALING
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.parts import MASS_SCATTER, PART_SCATTER
+from ema_pipeline.rigs.types import Rig
 
 PARTS = (PART_SCATTER, MASS_SCATTER)
 """Scatters of what the model is made of. A channel may be off by any factor, the model is none the worse for it."""
@@ -57,6 +59,38 @@ class Model:
         if not self._known or self._known[0][0] is not observations:
             self._known[:] = [(observations, observations.problem(self.effects, self.scales))]
         return self._known[0][1]
+
+
+def model_with(
+    labels: Sequence[str],
+    rig: Rig,
+    library: Mapping[str, Effect],
+    model: Model | None = None,
+    with_hits: bool = False,
+) -> Model:
+    """A model with effects ``id@place`` added.
+
+    Parameters
+    ----------
+    labels : sequence of str
+    rig : Rig
+        With the effects that `model` has.
+    library : mapping of str to Effect
+    model : Model, optional
+        What the effects are added to; the base model where left out.
+    with_hits : bool
+        False leaves out effects that depend on the force level: modes of one level do not show them.
+    """
+    model = model or Model()
+    for label in labels:
+        if not with_hits and depends_on_level(label, library):
+            continue
+        placed = parse_effect(label, rig, library=library)
+        assemblies = (rig.assembly(c) for c in rig.configurations)
+        host = next((a for a in assemblies if placed.effect.fits(a, placed.place)), None)
+        scales = {} if host is None else placed.effect.scales(host, placed.place)
+        model = model.plus(placed, {placed.parameter_name(k): v for k, v in scales.items()})
+    return model
 
 
 @dataclass(frozen=True)

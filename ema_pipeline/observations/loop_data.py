@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.loops.types import Loop
 from ema_pipeline.mechanics.fourier import fourier
 from ema_pipeline.observations.typical import Typical
@@ -137,6 +138,21 @@ def groups(values: Sequence[float], tolerance: float) -> NDArray[np.int64]:
         labels[at] = labels[before] + int(new)
         start = values[at] if new else start
     return labels
+
+
+def have_own_scales(loops: Sequence[Loop], settings: LoopSettings, several_settings: bool) -> bool:
+    """Whether each loop has a force scale of its own.
+
+    Parameters
+    ----------
+    loops : sequence of Loop
+    settings : LoopSettings
+    several_settings : bool
+        True where the test states that its loops are of several settings of one device.
+    """
+    if len(loops) < 2 or settings.own_scales != "auto":
+        return len(loops) > 1 and settings.own_scales == "yes"
+    return several_settings or settings_differ(loops, settings.significance)
 
 
 def settings_differ(loops: Sequence[Loop], significance: float = 2.0) -> bool:

@@ -12,8 +12,8 @@ from ema_pipeline.diagnose.types import Diagnosis, Rung
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.culprit import CulpritDrawing, culprit_drawing
 from ema_pipeline.report.numbers import plain
-from ema_pipeline.report.planetary import layout_of
 from ema_pipeline.report.results import RunResults
+from ema_pipeline.report.shapes import drawing_for
 
 _OTHERS = 3
 """Less likely explanations that are named."""
@@ -160,7 +160,7 @@ def _against(found: Diagnosis) -> tuple[str, ...]:
 def _drawing(results: RunResults) -> CulpritDrawing | None:
     """The rig with the places of what is named or added; of the configuration with most bodies."""
     places = _places(results)
-    drawings = [culprit_drawing(layout_of(c), places) for c in results.configurations]
+    drawings = [culprit_drawing(drawing_for(c), places) for c in results.configurations]
     known = [d for d in drawings if d is not None]
     return max(known, key=lambda d: len(d.bodies), default=None)
 

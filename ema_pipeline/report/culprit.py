@@ -6,11 +6,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ema_pipeline.report.moving_gear import UNITS, outline_path
-from ema_pipeline.report.planetary import FILLS, GearBody, GearLayout
+from ema_pipeline.report.moving_shapes import UNITS, outline_path
+from ema_pipeline.rigs.drawing import Body, Drawing
 
 _LARGEST_GAP = 0.35
-"""Bodies whose outlines are nearer than this mesh with each other; in radii of the sun."""
+"""Bodies whose outlines are nearer than this mesh with each other; in units of the drawing."""
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,7 @@ class DrawnBody:
     path: str
     x: float
     y: float
+    form: str
     fill: str
     named: bool
 
@@ -35,18 +36,18 @@ class CulpritDrawing:
     words: str
 
 
-def culprit_drawing(layout: GearLayout | None, places: Sequence[str]) -> CulpritDrawing | None:
-    """Where effects sit on a planetary gear; None where the rig is no such gear or no body is named.
+def culprit_drawing(drawing: Drawing | None, places: Sequence[str]) -> CulpritDrawing | None:
+    """Where effects sit on the rig; None where the rig has no drawing or no body is named.
 
     Parameters
     ----------
-    layout : GearLayout or None
+    drawing : Drawing or None
     places : sequence of str
         Of effects, e.g. ``"sun-planet1"``, ``"carrier"``, ``"planet2.x"``.
     """
-    if layout is None:
+    if drawing is None:
         return None
-    by_name = {b.name: b for b in layout.bodies}
+    by_name = {b.name: b for b in drawing.bodies}
     groups = [[p.partition(".")[0] for p in place.split("-")] for place in places]
     named = {name for group in groups for name in group if name in by_name}
     if not named:
@@ -58,17 +59,15 @@ def culprit_drawing(layout: GearLayout | None, places: Sequence[str]) -> Culprit
             if meeting is not None:
                 marks.append((_n(meeting[0]), _n(-meeting[1])))
     bodies = tuple(
-        DrawnBody(
-            b.name, outline_path(b), _n(b.x), _n(-b.y), FILLS[b.name.rstrip("0123456789")], b.name in named
-        )
-        for b in layout.bodies
+        DrawnBody(b.name, outline_path(b), _n(b.x), _n(-b.y), b.form, b.fill, b.name in named)
+        for b in drawing.bodies
     )
-    reach = 1.08 * layout.reach * UNITS
+    reach = 1.08 * drawing.reach * UNITS
     box = " ".join(f"{v:.0f}" for v in (-reach, -reach, 2 * reach, 2 * reach))
     return CulpritDrawing(box, bodies, tuple(marks), f"Rig with {', '.join(places)} marked")
 
 
-def _meeting(a: GearBody, b: GearBody) -> tuple[float, float] | None:
+def _meeting(a: Body, b: Body) -> tuple[float, float] | None:
     """Where two bodies mesh, None where they do not."""
     outer, inner = (a, b) if a.radius >= b.radius else (b, a)
     distance = math.hypot(inner.x - outer.x, inner.y - outer.y)

@@ -18,7 +18,7 @@ from ema_pipeline.report.band import band_of
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.loops import loops_context
 from ema_pipeline.report.moved_modes import Seen, error_words, moved_table, still
-from ema_pipeline.report.moving_gear import fill_of, moving_gears
+from ema_pipeline.report.moving_shapes import moving_shapes
 from ema_pipeline.report.numbers import format_percent, format_value, plain, signed, slug, words
 from ema_pipeline.report.pages import page_templates
 from ema_pipeline.report.results import ConfigurationResults, RunResults
@@ -172,7 +172,6 @@ def page_context(
         "differences": tables.differences_table(compared) if compared else None,
         "worst_dofs": tables.worst_dofs_table(compared) if compared and compared.dofs else None,
         "worst_bands": tables.worst_bands_table(compared) if compared and compared.bands else None,
-        "fill_of": fill_of,
         "loops": None if results.loops is None else loops_context(results, results.loops),
         "simulation": simulation_context(results),
         "choices": _choices(results),
@@ -307,7 +306,7 @@ def _configuration(results: RunResults, c: ConfigurationResults) -> dict[str, An
         "modes": tables.modes_table(c.modal) if c.modal else None,
         "pairs": tables.pairs_table(c.pairing, c.modal) if c.pairing and c.modal else None,
         "unpaired": tables.unpaired_table(c.pairing) if c.pairing else None,
-        "gears": moving_gears(c),
+        "moving_shapes": moving_shapes(c),
         "hit_count": len(hits),
         "used": sum(h.accepted for h in hits),
         "hit_rows": _hit_rows(results, c),

@@ -29,8 +29,8 @@ from ema_pipeline.report.figures import (
 )
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.numbers import slug
-from ema_pipeline.report.planetary import layout_of
 from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.report.shapes import drawing_for
 
 LEVEL_SHEETS = 8
 """Modes that move with the force and get a sheet of their own."""
@@ -150,11 +150,11 @@ def _diagnosed(results: RunResults) -> Iterator[FigureSpec]:
             "diagnosis_where",
             "diagnosis",
             "",
-            "Where the model fails: the largest difference of every mode, and of the shapes on the gear set",
+            "Where the model fails: the largest difference of every mode, and of the shapes on the rig's drawing",
             partial(
                 diagnosis.where_it_fails,
                 results.comparison,
-                [layout_of(c) for c in results.configurations],
+                [drawing_for(c) for c in results.configurations],
                 {c.name: c.pairing.unpaired_measured for c in results.configurations if c.pairing},
                 results.comparison_after,
             ),
@@ -299,17 +299,17 @@ def _levels(configuration: ConfigurationResults, modal: ModalModel, stem: str) -
 def _shapes(configuration: ConfigurationResults, stem: str) -> Iterator[FigureSpec]:
     modal = configuration.modal
     assert modal is not None
-    layout = layout_of(configuration)
-    size = shapes.GEAR_MODES_PER_SHEET if layout else shapes.STEM_MODES_PER_SHEET
+    drawing = drawing_for(configuration)
+    size = shapes.DRAWN_MODES_PER_SHEET if drawing else shapes.STEM_MODES_PER_SHEET
     for n, chunk in enumerate(_chunks(len(modal.modes), size), start=1):
         caption = f"Shapes of modes {chunk[0] + 1} to {chunk[-1] + 1}"
-        if layout is not None:
+        if drawing is not None:
             yield FigureSpec(
                 f"{stem}_shapes_{n}",
                 "shapes",
                 configuration.name,
-                caption + " as a moved gear set",
-                partial(shapes.gear_shapes, configuration, layout, chunk),
+                caption + " on the moved rig",
+                partial(shapes.drawn_shapes, configuration, drawing, chunk),
             )
         else:
             yield FigureSpec(
@@ -366,7 +366,7 @@ def _fitted(results: RunResults) -> Iterator[FigureSpec]:
             "Frequency, damping and shape differences per mode, in σ",
             partial(comparison.mode_differences, compared.modes),
         )
-    layouts = {c.name: layout_of(c) for c in results.configurations}
+    drawings = {c.name: drawing_for(c) for c in results.configurations}
     for name in dict.fromkeys(d.configuration for d in compared.dofs):
         mine = [d for d in compared.dofs if d.configuration == name]
         yield FigureSpec(
@@ -374,7 +374,7 @@ def _fitted(results: RunResults) -> Iterator[FigureSpec]:
             "comparison",
             name,
             f"{name}: shape difference per DOF, in σ",
-            partial(comparison.dof_differences, mine, layouts.get(name)),
+            partial(comparison.dof_differences, mine, drawings.get(name)),
         )
     for name in dict.fromkeys(b.configuration for b in compared.bands):
         yield FigureSpec(

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.rigs.base import ParametricRig, RigKind, model_modes
+from ema_pipeline.rigs.drawing import Drawing
 from ema_pipeline.rigs.files import read_rig_file
 from ema_pipeline.rigs.types import ModelMode, Parameter, Rig
 
@@ -18,6 +20,7 @@ __all__ = [
     "ParametricRig",
     "Rig",
     "RigKind",
+    "drawing_of",
     "load_rig",
     "model_modes",
     "rig_kinds",
@@ -39,6 +42,20 @@ def rig_kinds() -> dict[str, RigKind]:
 def rig_names() -> tuple[str, ...]:
     """Names of the shipped rigs."""
     return tuple(sorted(rig_kinds()))
+
+
+def drawing_of(points: Sequence[str], complete: bool) -> Drawing | None:
+    """How the rig with these DOFs is drawn; None where no shipped rig knows them, or it has no drawing.
+
+    Parameters
+    ----------
+    points : sequence of str
+        DOFs without sign, e.g. ``"sun.x"``.
+    complete : bool
+        True where they are all coordinates of a model, not only what was measured.
+    """
+    found = (kind.drawing(points, complete) for kind in rig_kinds().values())
+    return next((drawing for drawing in found if drawing is not None), None)
 
 
 def load_rig(name_or_path: str | Path) -> Rig:

@@ -13,6 +13,7 @@ from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.modes import complex_modes, damping_ratios, normal_modes
 from ema_pipeline.mechanics.system import LinearSystem
+from ema_pipeline.rigs.drawing import Draw, no_drawing
 from ema_pipeline.rigs.types import MODAL_DAMPING_SCATTER, ModelMode, Parameter, Rig
 
 Build = Callable[[str, Mapping[str, float]], Assembly]
@@ -178,6 +179,8 @@ class RigKind:
         ``parameters(geometry) -> dict`` of the default parameters.
     extra : callable
         ``extra(name, geometry)``: a parameter that a file may add to the defaults, or None.
+    drawing : callable
+        ``drawing(points, complete)``: how the rig is drawn, see `drawing.Draw`.
     """
 
     name: str
@@ -186,3 +189,4 @@ class RigKind:
     geometry: Mapping[str, int]
     parameters: Callable[[Mapping[str, int]], dict[str, Parameter]]
     extra: Callable[[str, Mapping[str, int]], Parameter | None] = no_extra
+    drawing: Draw = no_drawing

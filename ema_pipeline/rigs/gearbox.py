@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Mass, Row, Spring
 from ema_pipeline.mechanics.system import LinearSystem
+from ema_pipeline.rigs import gear_set
 from ema_pipeline.rigs.base import Families, ParametricRig, RigKind, check_count
 from ema_pipeline.rigs.types import Parameter
 
@@ -134,4 +135,5 @@ RIG = RigKind(
     geometry={"planets": 3},
     parameters=default_parameters,
     extra=extra_parameter,
+    drawing=gear_set.torsional,
 )

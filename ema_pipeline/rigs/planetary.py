@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Mass, Row, Spring
 from ema_pipeline.mechanics.system import LinearSystem
+from ema_pipeline.rigs import gear_set
 from ema_pipeline.rigs.base import Families, ParametricRig, RigKind, check_count
 from ema_pipeline.rigs.types import Parameter
 
@@ -314,4 +315,5 @@ RIG = RigKind(
     geometry={"planets": 2},
     parameters=_defaults,
     extra=_extra,
+    drawing=gear_set.in_plane,
 )

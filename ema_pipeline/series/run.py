@@ -12,14 +12,15 @@ from pathlib import Path
 from ema_pipeline.describe import DEFAULT_PIPELINE, checked_rig, rig_text
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.errors import EmaError
-from ema_pipeline.pipeline import load_pipeline
+from ema_pipeline.files import file_hash
+from ema_pipeline.keys import code_fingerprint
 from ema_pipeline.processes import peak_memory_mb
+from ema_pipeline.run.settings import load_pipeline
 from ema_pipeline.series.database import SeriesDatabase
 from ema_pipeline.series.engine import Work, in_processes, on_cluster
 from ema_pipeline.series.find import FoundTest, find_tests, raw_fingerprint
 from ema_pipeline.series.one_test import Task, run_task
 from ema_pipeline.series.rows import TestRow
-from ema_pipeline.stages.base import code_fingerprint, file_hash
 from ema_pipeline.store import RESULTS_FILE, Store
 
 TESTS_FOLDER = "tests"
@@ -144,7 +145,9 @@ def _made_of(
         effect_library(effect_files, model)
     effects = [file_hash(Path(file)) for file in effect_files]
     settings = load_pipeline(pipeline or DEFAULT_PIPELINE, overrides).model_dump_json()
-    return json.dumps([code_fingerprint(), rig_text(rig), pipeline, list(overrides), settings, *effects])
+    return json.dumps(
+        [code_fingerprint(), rig_text(rig or ""), pipeline, list(overrides), settings, *effects]
+    )
 
 
 def _absolute(name_or_path: str | None) -> str | None:

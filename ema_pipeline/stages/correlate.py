@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
-from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.fit.types import FitResult
-from ema_pipeline.rigs.types import Rig
-from ema_pipeline.stages import driven
-from ema_pipeline.stages.base import Progress, Run
-from ema_pipeline.stages.modes import measured_frfs, measured_modes
+from ema_pipeline.run.measured import measured_frfs
+from ema_pipeline.run.types import Progress, Run
 from ema_pipeline.store import ALL
 from ema_pipeline.verdict import Verdict
 
 if TYPE_CHECKING:
     from ema_pipeline.fit.parameters import FittedModes
-    from ema_pipeline.pipeline import CorrelateSettings
 
 NAME = "correlate"
 NEEDS = ("frf", "modal", "fit")
@@ -32,11 +28,9 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Pair the modes at the fitted parameters, then compare modes, shapes and FRFs; so for the base model's modes."""
-    if driven.by_records(run) or run.rig is None:
-        return {}
     from ema_pipeline.fit.parameters import restored
     from ema_pipeline.observations.fitting import Model
-    from ema_pipeline.stages.models import base_unknowns, known_model, mode_observations
+    from ema_pipeline.run.models import base_unknowns, correlate, known_model, mode_observations
 
     fit, observations = run.store.load("fit", ALL, "fit", FitResult), mode_observations(run)
     fitted = restored(observations, known_model(run), fit)
@@ -55,21 +49,3 @@ def _suspected(run: Run, fitted: FittedModes) -> tuple[Verdict, ...]:
     model, frfs = run.require_model(NAME), measured_frfs(run)
     systems = {name: (model.system(name), fitted.system(name)) for name in frfs}
     return suspected_sensitivities(frfs, systems)
-
-
-def correlate(
-    run: Run, rig: Rig, fitted: FittedModes, with_frfs: bool = True
-) -> tuple[dict[str, Pairing], Comparison]:
-    """Pair the measured modes with those of a fitted model, and compare the two."""
-    from ema_pipeline.correlate.pairing import pair_system
-    from ema_pipeline.fit.comparison import compare
-
-    settings = cast("CorrelateSettings", run.settings[NAME])
-    measured = measured_modes(run)
-    pairings = {
-        name: pair_system(rig, fitted.system(name), modes, settings.pairing)
-        for name, modes in measured.items()
-    }
-    return pairings, compare(
-        fitted, measured, measured_frfs(run) if with_frfs else None, pairings, settings.compare
-    )

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import cast
 
 from ema_pipeline.diagnose.types import Ladder
-from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.types import FitResult, ParameterEstimate
-from ema_pipeline.stages import driven
-from ema_pipeline.stages.base import Progress, Run
-from ema_pipeline.stages.modes import measured_modes, modes_key
+from ema_pipeline.run.measured import measured_modes, modes_key
+from ema_pipeline.run.types import Progress, Run
 from ema_pipeline.store import ALL
 
 NAME = "fit"
@@ -27,15 +24,10 @@ def inputs(run: Run, configuration: str) -> str:
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
-    """Fit all parameters to all configurations at once, and the base model beside the one with added effects.
-
-    Where records are simulated, the diagnosis and the ladder hold the fitted values.
-    """
-    if driven.by_records(run) or run.rig is None:
-        return {}
+    """Fit all parameters to all configurations at once, and the base model beside the one with added effects."""
     from ema_pipeline.fit.parameters import deviations_of, fit_modes, fit_result
     from ema_pipeline.observations.fitting import Model
-    from ema_pipeline.stages.models import (
+    from ema_pipeline.run.models import (
         diagnosed_scatters,
         earlier_unknowns,
         known_model,
@@ -44,7 +36,6 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     )
     from ema_pipeline.threads import single_blas_thread
 
-    settings = cast(FitSettings, run.settings[NAME])
     rig = run.require_model(NAME)
     with single_blas_thread():
         observations, model, told = mode_observations(run), known_model(run), diagnosed_scatters(run)
@@ -58,7 +49,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
         if model.effects:
             base = fit_modes(observations, Model(), fitted.posterior.scatters, begun(()))
         progress(0.6, "error function")
-        found = fit_result(fitted, rig, measured_modes(run), settings)
+        found = fit_result(fitted, rig, measured_modes(run), run.settings.fit)
     return {
         "fit": found if ladder is None else _with_sizes(found, ladder),
         "base_unknowns": base.fit.unknowns,

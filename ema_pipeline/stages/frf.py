@@ -1,13 +1,9 @@
-"""Hits, or records of continuous excitation → FRFs and coherence."""
+"""What was recorded → FRFs and coherence."""
 
 from __future__ import annotations
 
-from typing import cast
-
-from ema_pipeline.frf.settings import FrfSettings
-from ema_pipeline.stages.base import Progress, Run
-from ema_pipeline.stages.hits import accepted_hits
-from ema_pipeline.stages.ingest import driven_records
+from ema_pipeline.kinds import kind_of
+from ema_pipeline.run.types import Progress, Run
 
 NAME = "frf"
 NEEDS = ("ingest", "hits")
@@ -22,11 +18,4 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Average the accepted hits of every impact point, or the blocks of continuous records."""
-    from ema_pipeline.frf.estimate import estimate_frfs
-
-    settings = cast(FrfSettings, run.settings[NAME])
-    if run.info.kind == "continuous":
-        from ema_pipeline.frf.driven import estimate_driven_frfs
-
-        return {"frfs": estimate_driven_frfs(driven_records(run.store, configuration), settings)}
-    return {"frfs": estimate_frfs(accepted_hits(run.store, configuration, progress), settings)}
+    return {"frfs": kind_of(run.info).frfs(run, configuration, progress)}

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-from typing import cast
 
-from ema_pipeline.loops.settings import LoopSettings
-from ema_pipeline.stages.base import Progress, Run
-from ema_pipeline.stages.ingest import file_hashes, test_of
+from ema_pipeline.run.sources import file_hashes, test_of
+from ema_pipeline.run.types import Progress, Run
 
 NAME = "loops"
 NEEDS: tuple[str, ...] = ()
@@ -25,5 +23,5 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     from ema_pipeline.fit.isolator import analyse_loops
 
     test = test_of(run, configuration)
-    result = analyse_loops(test, cast(LoopSettings, run.settings[NAME]), progress)
+    result = analyse_loops(test, run.settings.loops, progress)
     return {"sources": file_hashes(test), "isolator": result}

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import cast
 
-from ema_pipeline.report.settings import ReportSettings
-from ema_pipeline.stages.base import Progress, Run, silent
+from ema_pipeline.run.types import Progress, Run, silent
 from ema_pipeline.stages.results import load_results
 
 NAME = "report"
@@ -27,7 +25,6 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Write every file of the results folder but the store."""
     from ema_pipeline.report.html import write_report  # drawing libraries are loaded where they are needed
 
-    settings = cast(ReportSettings, run.settings[NAME])
     folder = run.store.folder
     results = load_results(run)
     if results.loops is not None:
@@ -40,7 +37,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
         write_summary(results, folder / "summary.json")
         write_modes_csv(results, folder / "modes.csv")
     write_report(results, folder / "report.html")
-    if settings.plots:
+    if run.settings.report.plots:
         draw(run, progress)
     return {"files": OUTPUTS}
 

@@ -13,16 +13,17 @@ from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit, Transducer
+from ema_pipeline.kinds import kind_of
+from ema_pipeline.kinds.loops import loops_of, models_of
 from ema_pipeline.levels.linear import structure, structure_frfs
 from ema_pipeline.levels.sentences import flagged
 from ema_pipeline.loops.types import IsolatorResult
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report.results import ConfigurationResults, LoopResults, RunResults
-from ema_pipeline.stages.base import Run
-from ema_pipeline.stages.loop_ladder import loops_of, models_of
-from ema_pipeline.stages.models import diagnosed_choices
-from ema_pipeline.stages.modes import level_study
+from ema_pipeline.run.measured import level_study
+from ema_pipeline.run.models import diagnosed_choices, diagnosis_is_of_other_data
+from ema_pipeline.run.types import Run
 from ema_pipeline.store import ALL
 from ema_pipeline.verdict import Verdict
 
@@ -32,7 +33,7 @@ def load_results(run: Run) -> RunResults:
     fit = run.store.find("fit", ALL, "fit", FitResult)
     values = fitted_values(fit)
     configurations = []
-    loops = run.info.kind == "hysteresis"
+    kind = kind_of(run.info)
     for name in run.info.configurations:
         modal, levels = run.store.find("modal", name, "modal", ModalModel), level_study(run, name)
         frfs = run.store.find("frf", name, "frfs", FrfSet)
@@ -43,7 +44,7 @@ def load_results(run: Run) -> RunResults:
                 frfs=None if frfs is None else structure_frfs(frfs, levels),
                 modal=modal if modal is None or levels is None else flagged(structure(modal, levels), levels),
                 pairing=run.store.find("correlate", ALL, f"pairing {name}", Pairing),
-                system=None if run.model is None or loops else _system(run, name, values),
+                system=None if run.model is None or not kind.of_rig else _system(run, name, values),
                 transducers=run.store.find("ingest", name, "transducers", tuple[Transducer, ...]) or (),
                 base_system=run.store.find("fit", ALL, f"base system {name}", LinearSystem),
                 like_parts=tuple(
@@ -70,7 +71,7 @@ def load_results(run: Run) -> RunResults:
         ladder=_own_ladder(run),
         simulation=_of_records(run, "simulation", RecordError),
         hysteresis=_of_records(run, "hysteresis", HysteresisLoop),
-        loops=_loops(run) if loops else None,
+        loops=_loops(run),
         sensitivities=run.store.find("correlate", ALL, "sensitivities", tuple[Verdict, ...]) or (),
         deviations=tuple(
             run.store.find(stage, ALL, name, dict[str, float]) or {}
@@ -86,29 +87,24 @@ def load_results(run: Run) -> RunResults:
         diagnosed_choices=diagnosed_choices(run),
         folder=str(run.store.folder),
         provenance=provenance(run),
-        settings={name: _flat(json.loads(s.model_dump_json())) for name, s in run.settings.items()},
+        settings={
+            name: _flat(json.loads(s.model_dump_json())) for name, s in run.settings.by_stage().items()
+        },
     )
-
-
-FOR_A_TABLE = (
-    "Give the table the shapes at further places around the place named and the standard deviations of its numbers; "
-    "whether the missing effect depends on amplitude only hits at several force levels can tell."
-)
-"""What to measure next where a table of modes leaves a model unexplained: nobody can strike a table."""
 
 
 def _diagnosis(run: Run) -> Diagnosis | None:
     """The diagnosis, with advice that its kind of data can follow."""
     found = run.store.find("diagnose", ALL, "diagnosis", Diagnosis)
-    if found is None or run.info.kind != "modes" or found.verdict != "unknown_effect":
+    advice = kind_of(run.info).next_measurement
+    if found is None or not advice or found.verdict != "unknown_effect":
         return found
-    return replace(found, next_measurement=FOR_A_TABLE)
+    return replace(found, next_measurement=advice)
 
 
 def _own_ladder(run: Run) -> Ladder | None:
     """The ladder of added effects; that of the base model alone only while the diagnosis is of other data."""
-    bare = not run.info.effects and run.info.kind != "hysteresis"
-    if bare and diagnosed_choices(run) == run.info.choices:
+    if not run.info.effects and not diagnosis_is_of_other_data(run):
         return None
     return run.store.find("ladder", ALL, "ladder", Ladder)
 
@@ -118,8 +114,6 @@ R = TypeVar("R", RecordError, HysteresisLoop)
 
 def _of_records(run: Run, name: str, kind: type[R]) -> tuple[R, ...]:
     """What simulated records give of the model that the user made, or else of the one that the diagnosis proposes."""
-    if run.info.kind != "continuous":
-        return ()
     stages = ("ladder", "diagnose") if run.info.effects else ("diagnose",)
     for stage in stages:
         found = run.store.find(stage, ALL, name, tuple[kind, ...])  # type: ignore[valid-type]
@@ -129,7 +123,7 @@ def _of_records(run: Run, name: str, kind: type[R]) -> tuple[R, ...]:
 
 
 def _loops(run: Run) -> LoopResults | None:
-    """Loops of all configurations; None before they were identified."""
+    """Loops of all configurations; None in tests of another kind and before they were identified."""
     if not all(run.store.key("loops", name) for name in run.info.configurations):
         return None
     return LoopResults(isolators(run), loops_of(run), models_of(run))
@@ -164,8 +158,8 @@ def provenance(run: Run) -> dict[str, str]:
         label = stage if configuration == ALL else f"{stage} ({configuration})"
         facts[f"stage {label}"] = f"{p.finished}, {p.seconds:.2f} s, key {p.key[:12]}"
     for configuration in run.info.configurations:
-        stage = "loops" if run.info.kind == "hysteresis" else "ingest"
-        sources = run.store.find(stage, configuration, "sources", dict[str, str]) or {}
+        first = kind_of(run.info).measures[0]
+        sources = run.store.find(first, configuration, "sources", dict[str, str]) or {}
         for file, digest in sources.items():
             facts[f"SHA-256 of {configuration}/{file}"] = digest
     return facts

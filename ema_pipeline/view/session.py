@@ -18,17 +18,17 @@ from typing import Any
 
 from ema_pipeline.choices import options_between
 from ema_pipeline.errors import EmaError
-from ema_pipeline.pipeline import existing_run
 from ema_pipeline.report.moved_modes import Seen, error_words, seen
 from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.results import RunResults
-from ema_pipeline.stages.base import Run
-from ema_pipeline.stages.modes import modes_key
+from ema_pipeline.run.measured import modes_key
+from ema_pipeline.run.opening import existing_run
+from ema_pipeline.run.types import Run
 from ema_pipeline.stages.results import load_results
 from ema_pipeline.view.serving import Listeners
 from ema_pipeline.view.snapshots import Snapshots
 
-PARTS = ("band", "candidates", "loop_model", "model_details", "choices", "mode_rows", "gears")
+PARTS = ("band", "candidates", "loop_model", "model_details", "choices", "mode_rows", "moving_shapes")
 """Parts of the page that change with the model, by the names of their templates."""
 
 _LOOK_S = 1.0

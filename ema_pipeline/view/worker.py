@@ -17,7 +17,7 @@ from typing import Any
 from ema_pipeline.errors import EmaError
 from ema_pipeline.pipeline import ShowStage
 from ema_pipeline.processes import die_with_parent
-from ema_pipeline.stages.base import Progress
+from ema_pipeline.run.types import Progress
 
 VERBS = ("add", "remove", "diagnose", "exclude_hit", "exclude_mode", "include_hit", "include_mode")
 """What the page can ask for; the part after the underscore is the option of that verb on the command line."""
@@ -72,7 +72,8 @@ def main() -> None:
     from ema_pipeline.crash import write_crash_report
     from ema_pipeline.diagnose import diagnosis, rungs  # noqa: F401
     from ema_pipeline.report import html  # noqa: F401
-    from ema_pipeline.stages import correlate, fit, ladder, models, report  # noqa: F401
+    from ema_pipeline.run import models  # noqa: F401
+    from ema_pipeline.stages import correlate, fit, ladder, report  # noqa: F401
 
     die_with_parent(os.getppid())
     folder, effect_files = Path(sys.argv[1]), tuple(sys.argv[2:])

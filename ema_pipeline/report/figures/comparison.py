@@ -14,8 +14,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
 from ema_pipeline.correlate.types import BandDifference, DofDifference, ModeDifference
-from ema_pipeline.report.figures.shapes import draw_gear
-from ema_pipeline.report.planetary import GearLayout, Motion, body_of
+from ema_pipeline.report.figures.shapes import draw_rig
+from ema_pipeline.report.shapes import body_of
 from ema_pipeline.report.style import (
     BLUE,
     GREEN,
@@ -25,6 +25,7 @@ from ema_pipeline.report.style import (
     new_figure,
     styled,
 )
+from ema_pipeline.rigs.drawing import Drawing
 
 FRF_ROWS = 40
 LEVELS = (0, 1, 2, 3, 5, 10, 20, 50)
@@ -86,11 +87,11 @@ def mode_differences(modes: Sequence[ModeDifference]) -> Figure:
 
 
 @styled
-def dof_differences(dofs: Sequence[DofDifference], layout: GearLayout | None = None) -> Figure:
-    """Shape difference per DOF in units of its uncertainty; on the gear set too where there is one."""
+def dof_differences(dofs: Sequence[DofDifference], drawing: Drawing | None = None) -> Figure:
+    """Shape difference per DOF in units of its uncertainty; on the rig's drawing too where it has one."""
     shown = sorted(dofs, key=lambda d: -np.nan_to_num(d.z))[:FRF_ROWS]
     keep = [d for d in dofs if d in shown]
-    share = 0.58 if layout else 1.0
+    share = 0.58 if drawing else 1.0
     figure = new_figure(max(0.95 + 0.155 * len(keep), 2.9))
     width, height = figure.get_size_inches()
     left = 1.35
@@ -110,24 +111,21 @@ def dof_differences(dofs: Sequence[DofDifference], layout: GearLayout | None = N
     ax.set_xlabel("shape difference / σ, root mean square, 1")
     ax.grid(False, axis="y")
     ax.set_title("Per DOF" + (f" (worst {len(keep)} of {len(dofs)})" if len(keep) < len(dofs) else ""))
-    if layout is not None:
-        gear = figure.add_axes((share + 0.01, 0.24, 0.97 - share, 0.68))
+    if drawing is not None:
+        rig = figure.add_axes((share + 0.01, 0.24, 0.97 - share, 0.68))
         worst = worst_per_body(dofs)
         norm, colours = severity()
         fills = {
             b.name: to_hex(colours(norm(worst[b.name]))) if b.name in worst else "#ffffff"
-            for b in layout.bodies
+            for b in drawing.bodies
         }
-        still = {b.name: Motion(0, 0, 0, ("x", "y", "u")) for b in layout.bodies}
-        draw_gear(gear, layout, still, 0.0, fills)
-        gear.set_title("Largest per body (white: not measured)")
-        for b in layout.bodies:
+        draw_rig(rig, drawing, drawing.at_rest(), 0.0, fills)
+        rig.set_title("Largest per body (white: not measured)")
+        for b in drawing.bodies:
             if b.name not in worst:
                 continue
-            x, y = {"carrier": (0.71 * b.radius, 0.71 * b.radius), "ring": (0.0, b.radius + 0.18)}.get(
-                b.name, (b.x, b.y)
-            )
-            gear.text(
+            x, y = b.label_at
+            rig.text(
                 x,
                 y,
                 f"{worst[b.name]:.1f}",

@@ -21,9 +21,8 @@ from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import Diagnosis, Ladder, Rung
 from ema_pipeline.report.diagnosis import NOTHING, label_words, rung_words
 from ema_pipeline.report.figures.comparison import severity, worst_per_body
-from ema_pipeline.report.figures.shapes import draw_gear
+from ema_pipeline.report.figures.shapes import draw_rig
 from ema_pipeline.report.numbers import plain
-from ema_pipeline.report.planetary import GearLayout, Motion
 from ema_pipeline.report.style import (
     BLACK,
     BLUE,
@@ -36,6 +35,7 @@ from ema_pipeline.report.style import (
     note,
     styled,
 )
+from ema_pipeline.rigs.drawing import Drawing
 
 HALF_IN = 3.55
 """Width of figures that stand side by side."""
@@ -170,27 +170,27 @@ def _rung_label(before: tuple[str, ...], rung: Rung, width: int) -> str:
 @styled
 def where_it_fails(
     before: Comparison,
-    layouts: Sequence[GearLayout | None],
+    drawings: Sequence[Drawing | None],
     lone: Mapping[str, Sequence[Unpaired]],
     after: Comparison | None = None,
 ) -> Figure:
-    """The largest difference of every mode, and the shape's misfit on a drawing of the gear set.
+    """The largest difference of every mode, and the shape's misfit on the rig's drawing.
 
     Parameters
     ----------
     before : Comparison
         Of the model that was diagnosed.
-    layouts : sequence of GearLayout or None
-        One per configuration; the one with most bodies is drawn, and no gear where there is none.
+    drawings : sequence of Drawing or None
+        One per configuration; the one with most bodies is drawn, if there is one.
     lone : mapping of configuration to Unpaired
         Measured modes without a partner in the model: bars to the top.
     after : Comparison or None
         Of the model with what was found; drawn as hollow diamonds.
     """
-    layout = max((g for g in layouts if g is not None), key=lambda g: len(g.bodies), default=None)
+    drawing = max((d for d in drawings if d is not None), key=lambda d: len(d.bodies), default=None)
     figure = new_figure(2.35)
     width, height = figure.get_size_inches()
-    right = 2.35 if layout is not None and before.dofs else 0.1
+    right = 2.35 if drawing is not None and before.dofs else 0.1
     ax = figure.add_axes(
         (0.55 / width, 0.62 / height, (width - 0.55 - right) / width, (height - 1.08) / height)
     )
@@ -212,9 +212,9 @@ def where_it_fails(
         handletextpad=0.4,
         fontsize=6.2,
     )
-    if layout is not None and before.dofs:
-        gear = figure.add_axes(((width - right + 0.1) / width, 0.03, (right - 0.1) / width, 0.87))
-        _gear_misfit(gear, layout, worst_per_body(before.dofs))
+    if drawing is not None and before.dofs:
+        rig = figure.add_axes(((width - right + 0.1) / width, 0.03, (right - 0.1) / width, 0.87))
+        _body_misfit(rig, drawing, worst_per_body(before.dofs))
     return figure
 
 
@@ -274,19 +274,17 @@ def _mode_bars(ax: Axes, bars: Sequence[_Bar], after: Mapping[tuple[str, int], f
     ax.set_ylabel("largest |difference|/σ, 1")
 
 
-def _gear_misfit(ax: Axes, layout: GearLayout, worst: Mapping[str, float]) -> None:
+def _body_misfit(ax: Axes, drawing: Drawing, worst: Mapping[str, float]) -> None:
     norm, colours = severity()
     fills = {
-        b.name: to_hex(colours(norm(worst[b.name]))) if b.name in worst else "#ffffff" for b in layout.bodies
+        b.name: to_hex(colours(norm(worst[b.name]))) if b.name in worst else "#ffffff" for b in drawing.bodies
     }
-    still = {b.name: Motion(0, 0, 0, ("x", "y", "u")) for b in layout.bodies}
-    draw_gear(ax, layout, still, 0.0, fills)
+    draw_rig(ax, drawing, drawing.at_rest(), 0.0, fills)
     top = max([5.0, *worst.values()])
-    for b in layout.bodies:
+    for b in drawing.bodies:
         if b.name not in worst:
             continue
-        diagonal = 0.71 * b.radius
-        x, y = {"carrier": (diagonal, diagonal), "ring": (0.0, b.radius + 0.18)}.get(b.name, (b.x, b.y))
+        x, y = b.label_at
         z = worst[b.name]
         ax.plot(x, y, "o", ms=11 + 13 * min(z / top, 1.0), mfc=fills[b.name], mec=BLACK, mew=0.7, zorder=6)
         ax.text(

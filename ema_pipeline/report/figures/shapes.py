@@ -1,4 +1,4 @@
-"""Mode shapes: a planetary gear in its plane, or stems over the DOFs of any other structure."""
+"""Mode shapes: the rig's drawing moved, or stems over the DOFs of a rig without one."""
 
 from __future__ import annotations
 
@@ -11,28 +11,21 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from matplotlib.transforms import Affine2D
 
-from ema_pipeline.report.planetary import (
-    FILLS,
-    GearLayout,
-    Motion,
-    displaced,
-    drawing_scale,
-    missing_words,
-    motions,
-    outline,
-    shape_pair,
-)
 from ema_pipeline.report.results import ConfigurationResults
+from ema_pipeline.report.shapes import missing_words, shape_pair
 from ema_pipeline.report.style import GREY, MEASURED, MODEL, margins, new_figure, note, styled
+from ema_pipeline.rigs.drawing import Drawing, Motion
 
-GEAR_MODES_PER_SHEET = 4
+DRAWN_MODES_PER_SHEET = 4
 STEM_MODES_PER_SHEET = 4
 _DOF_LABELS_UP_TO = 34
+_ARMS = "#d9a878"
+"""Colour of a body with arms, which is drawn as lines."""
 
 
 @styled
-def gear_shapes(configuration: ConfigurationResults, layout: GearLayout, indices: Sequence[int]) -> Figure:
-    """Measured shapes of up to four modes as a moved gear set, each with the model's shape beside it."""
+def drawn_shapes(configuration: ConfigurationResults, drawing: Drawing, indices: Sequence[int]) -> Figure:
+    """Measured shapes of up to four modes on the moved drawing of the rig, each with the model's shape beside it."""
     modal = configuration.modal
     assert modal is not None
     rows = -(-len(indices) // 2)
@@ -46,16 +39,16 @@ def gear_shapes(configuration: ConfigurationResults, layout: GearLayout, indices
         mode = modal.modes[index]
         left = figure.add_subplot(grid[k // 2, 2 * (k % 2)])
         right = figure.add_subplot(grid[k // 2, 2 * (k % 2) + 1])
-        moved = motions(layout, pair.measured)
+        moved = drawing.motions(pair.measured)
         lacks = missing_words(moved)
-        scale = drawing_scale(layout, moved)
-        draw_gear(left, layout, moved, scale)
+        scale = drawing.scale(moved)
+        draw_rig(left, drawing, moved, scale)
         left.set_title(f"mode {index + 1}: {mode.frequency_hz:.5g} Hz\nmeasured", fontsize=7.2)
         if pair.model is None:
             empty(right)
             note(right, "no model shape", fontsize=7)
             continue
-        draw_gear(right, layout, motions(layout, pair.model), scale)
+        draw_rig(right, drawing, drawing.motions(pair.model), scale)
         mix = " (mixture of its group)" if pair.combined else ""
         right.set_title(
             f"model: {pair.model_frequency_hz:.5g} Hz\n{mix.strip() or 'same scale'}", fontsize=7.2
@@ -79,45 +72,32 @@ def empty(ax: Axes) -> None:
     ax.set_axis_off()
 
 
-def draw_gear(
-    ax: Axes, layout: GearLayout, moved: dict[str, Motion], scale: float, fills: dict[str, str] | None = None
+def draw_rig(
+    ax: Axes, drawing: Drawing, moved: dict[str, Motion], scale: float, fills: dict[str, str] | None = None
 ) -> None:
-    """Draw the gear set at rest (dashed) and moved (solid); bodies with missing DOFs are drawn pale."""
+    """Draw the rig at rest (dashed) and moved (solid); bodies with missing DOFs are drawn pale."""
     empty(ax)
-    reach = 1.12 * layout.reach
+    reach = 1.12 * drawing.reach
     ax.set_xlim(-reach, reach)
     ax.set_ylim(-reach, reach)
-    planets = [b for b in layout.bodies if b.name.startswith("planet")]
-    for body in layout.bodies:
-        x, y, turn = displaced(body, moved[body.name], scale)
+    for body in drawing.bodies:
+        x, y, turn = body.displaced(moved[body.name], scale)
         place = Affine2D().rotate(turn).translate(x, y) + ax.transData
         rest = Affine2D().translate(body.x, body.y) + ax.transData
-        kind = body.name.rstrip("0123456789")
-        fill = (fills or {}).get(body.name, FILLS[kind])
-        everything = 1 if layout.torsional else 3
-        unknown = len(moved[body.name].missing) == everything and fills is None
-        if kind == "carrier":
-            circle = outline(body)
+        fill = (fills or {}).get(body.name, body.fill)
+        unknown = len(moved[body.name].missing) == drawing.directions and fills is None
+        if body.form == "arms":
+            circle, color = body.outline(), _ARMS if fills is None else fill
             ax.add_artist(Polygon(circle, fill=False, ec="#a0a0a0", lw=0.5, ls=(0, (3, 2)), transform=rest))
-            ax.add_artist(
-                Polygon(circle, fill=False, ec="#d9a878" if fills is None else fill, lw=3.2, transform=place)
-            )
-            for planet in planets:
-                ax.add_artist(
-                    Line2D(
-                        [0, planet.x],
-                        [0, planet.y],
-                        color="#d9a878" if fills is None else fill,
-                        lw=3.2,
-                        transform=place,
-                    )
-                )
+            ax.add_artist(Polygon(circle, fill=False, ec=color, lw=3.2, transform=place))
+            for x, y in body.arms:
+                ax.add_artist(Line2D([0, x], [0, y], color=color, lw=3.2, transform=place))
             continue
-        teeth = outline(body)
+        teeth = body.outline()
         ax.add_artist(
             Polygon(teeth, fill=False, ec="#8a8a8a", lw=0.5, ls=(0, (3, 2)), transform=rest, zorder=1.5)
         )
-        if kind == "ring":
+        if body.form == "ring":
             angle = np.linspace(0, 2 * np.pi, 121)
             outer = (body.radius + 0.35) * np.column_stack([np.cos(angle), np.sin(angle)])
             ax.add_artist(
@@ -139,8 +119,9 @@ def draw_gear(
             ax.plot(x, y, "o", color="#333333", ms=1.8, zorder=4)
         if "u" in moved[body.name].missing:
             continue  # a spoke would claim that the body does not turn
-        inner = 0.0 if kind != "ring" else body.radius + 0.05
-        end = body.radius * 0.9 if kind != "ring" else body.radius + 0.33
+        ring = body.form == "ring"
+        inner = body.radius + 0.05 if ring else 0.0
+        end = body.radius + 0.33 if ring else body.radius * 0.9
         ax.add_artist(Line2D([inner, end], [0, 0], color=MODEL, lw=1.4, transform=place, zorder=4))
         ax.add_artist(
             Line2D([inner, end], [0, 0], color="#8a8a8a", lw=0.6, ls=(0, (3, 2)), transform=rest, zorder=3)

@@ -25,8 +25,8 @@ from ema_pipeline.report.interactive.loops import loop_model_names, loops_data, 
 from ema_pipeline.report.interactive.packing import POINTS, packed_cmif, packed_frfs
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.numbers import format_percent, format_value, plain, words
-from ema_pipeline.report.planetary import shape_pair
 from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.report.shapes import shape_pair
 
 CIRCLES = 4
 """Nyquist circles of a mode that are shown."""

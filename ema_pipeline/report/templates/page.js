@@ -182,9 +182,9 @@ var EmaPage = (function () {
       b.setAttribute("aria-pressed", String(mine));
       b.closest("tr").classList.toggle("chosen", mine);
     });
-    document.querySelectorAll(".gear-set").forEach(function (s) {
+    document.querySelectorAll(".shape-set").forEach(function (s) {
       s.hidden = s.dataset.configuration !== configuration;
-      s.querySelectorAll("figure.gear").forEach(function (f) { f.hidden = Number(f.dataset.mode) !== index; });
+      s.querySelectorAll("figure.shape").forEach(function (f) { f.hidden = Number(f.dataset.mode) !== index; });
     });
     var mode = currentMode();
     if (byId("mode-title")) { byId("mode-title").textContent = configuration + ", " + mode.title; }
@@ -192,7 +192,7 @@ var EmaPage = (function () {
     circleText();
     refill(["nyquist", "stab", "shape"]);
     markMode();
-    drawGears();
+    drawShapes();
   }
   function circleText() {
     var mode = currentMode(), place = byId("nyquist-text");
@@ -201,9 +201,9 @@ var EmaPage = (function () {
 
   /* Shapes in motion. */
   var phase = 0, last = null;
-  function drawGears() {
+  function drawShapes() {
     var c = Math.cos(phase), s = Math.sin(phase);
-    document.querySelectorAll(".gear-set:not([hidden]) figure.gear:not([hidden]) svg[data-motion]").forEach(function (svg) {
+    document.querySelectorAll(".shape-set:not([hidden]) figure.shape:not([hidden]) svg[data-motion]").forEach(function (svg) {
       var bodies = svg.querySelectorAll("g.body");
       JSON.parse(svg.dataset.motion).forEach(function (m, i) {
         var x = m[0] + m[2] * c - m[3] * s, y = m[1] + m[4] * c - m[5] * s, r = m[6] * c - m[7] * s;
@@ -214,7 +214,7 @@ var EmaPage = (function () {
   function step(now) {
     if (!playing) { last = null; return; }
     if (last !== null) { phase = (phase + (now - last) / 1600 * 2 * Math.PI) % (2 * Math.PI); }
-    last = now; drawGears(); window.requestAnimationFrame(step);
+    last = now; drawShapes(); window.requestAnimationFrame(step);
   }
   function play(wanted) {
     if (wanted && !playing) { window.requestAnimationFrame(step); }

@@ -1,4 +1,4 @@
-"""Moving planetary gears for the HTML report: inline SVG whose bodies a few lines of script set in motion."""
+"""Moving shapes for the HTML report: inline SVG whose bodies a few lines of script set in motion."""
 
 from __future__ import annotations
 
@@ -8,41 +8,36 @@ from dataclasses import dataclass
 import numpy as np
 
 from ema_pipeline.report.numbers import format_percent, format_value, slug
-from ema_pipeline.report.planetary import (
-    FILLS,
-    GearBody,
-    GearLayout,
-    Motion,
-    displaced,
-    drawing_scale,
-    layout_of,
-    missing_words,
-    motions,
-    outline,
-    shape_pair,
-)
 from ema_pipeline.report.results import ConfigurationResults
+from ema_pipeline.report.shapes import drawing_for, missing_words, shape_pair
+from ema_pipeline.rigs.drawing import Body, Drawing, Motion
 
 UNITS = 100.0
-"""Drawing units per radius of the sun."""
+"""Units of the page per unit of a drawing."""
 
 _SCALE_SHARE = 0.14
 
 
 @dataclass(frozen=True)
 class MovingBody:
-    """One body: which outline, its place at phase 0 and at rest, whether its turn is known, length of its spoke."""
+    """One body: which outline, its place at phase 0 and at rest, whether its turn is known, length of its spoke.
 
-    kind: str
+    `rim` is the outer radius of a ring, `arms` the ends of a body's arms.
+    """
+
+    form: str
+    fill: str
     outline_id: str
     transform: str
     rest: str
     turns: bool
     spoke: float
+    rim: float
+    arms: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
-class MovingGear:
+class MovingShape:
     """One drawing; `motion` is JSON, per body [cx, cy, Re x, Im x, Re y, Im y, Re φ, Im φ], φ in degrees."""
 
     label: str
@@ -56,41 +51,39 @@ class MovingMode:
 
     title: str
     damping: str
-    drawings: tuple[MovingGear, ...]
+    drawings: tuple[MovingShape, ...]
     remark: str
 
 
 @dataclass(frozen=True)
-class MovingGears:
+class MovingShapes:
     """All modes of a configuration, with the outlines (id → SVG path) that their drawings share."""
 
     outlines: dict[str, str]
     view_box: str
-    ring_radius: float
-    spokes: tuple[tuple[float, float], ...]
     modes: tuple[MovingMode, ...]
     missing: str
 
 
-def moving_gears(configuration: ConfigurationResults) -> MovingGears | None:
-    """Drawings of all modes; None where the structure is no planetary gear or no mode was found."""
-    layout = layout_of(configuration)
+def moving_shapes(configuration: ConfigurationResults) -> MovingShapes | None:
+    """Drawings of all modes; None where the rig has no drawing or no mode was found."""
+    drawing = drawing_for(configuration)
     modal = configuration.modal
-    if layout is None or modal is None or not modal.modes:
+    if drawing is None or modal is None or not modal.modes:
         return None
     stem = slug(configuration.name)
-    outlines = {f"{stem}-{kind}": outline_path(body) for kind, body in _kinds(layout).items()}
+    outlines = {f"{stem}-{body.like}": outline_path(body) for body in drawing.bodies}
     modes, lacks = [], ""
     for index, mode in enumerate(modal.modes):
         pair = shape_pair(configuration, index)
-        moved = motions(layout, pair.measured)
+        moved = drawing.motions(pair.measured)
         lacks = missing_words(moved)
-        scale = drawing_scale(layout, moved, _SCALE_SHARE)
-        drawings = [_drawing(stem, layout, moved, scale, f"Measured shape of mode {index + 1}")]
+        scale = drawing.scale(moved, _SCALE_SHARE)
+        drawings = [_drawn(stem, drawing, moved, scale, f"Measured shape of mode {index + 1}")]
         remark = "no model partner"
         if pair.model is not None:
-            theirs = motions(layout, pair.model)
-            drawings.append(_drawing(stem, layout, theirs, scale, f"Model shape beside mode {index + 1}"))
+            theirs = drawing.motions(pair.model)
+            drawings.append(_drawn(stem, drawing, theirs, scale, f"Model shape beside mode {index + 1}"))
             remark = f"model {pair.model_frequency_hz:.5g} Hz" + (
                 ", mixture of its close group" if pair.combined else ""
             )
@@ -102,52 +95,40 @@ def moving_gears(configuration: ConfigurationResults) -> MovingGears | None:
                 remark,
             )
         )
-    reach = 1.12 * layout.reach * UNITS
-    ring = next((b.radius for b in layout.bodies if b.name == "ring"), 0.0)
-    planets = tuple((_n(b.x), _n(b.y)) for b in layout.bodies if b.name.startswith("planet"))
+    reach = 1.12 * drawing.reach * UNITS
     box = " ".join(f"{v:.0f}" for v in (-reach, -reach, 2 * reach, 2 * reach))
-    return MovingGears(outlines, box, _n(ring + 0.35) if ring else 0.0, planets, tuple(modes), lacks)
+    return MovingShapes(outlines, box, tuple(modes), lacks)
 
 
-def fill_of(kind: str) -> str:
-    """Fill colour of a kind of body, the same as in the figures."""
-    return FILLS[kind]
-
-
-def _kinds(layout: GearLayout) -> dict[str, GearBody]:
-    return {_kind(b): b for b in layout.bodies}
-
-
-def _kind(body: GearBody) -> str:
-    return body.name.rstrip("0123456789")
-
-
-def _drawing(stem: str, layout: GearLayout, moved: dict[str, Motion], scale: float, label: str) -> MovingGear:
+def _drawn(stem: str, drawing: Drawing, moved: dict[str, Motion], scale: float, label: str) -> MovingShape:
     bodies, numbers = [], []
-    for body in layout.bodies:
+    for body in drawing.bodies:
         motion = moved[body.name]
-        x, y, turn = displaced(body, motion, scale)
+        x, y, turn = body.displaced(motion, scale)
         place = f"translate({_n(x):g} {_n(y):g}) rotate({np.rad2deg(turn):.2f})"
         bodies.append(
             MovingBody(
-                _kind(body),
-                f"{stem}-{_kind(body)}",
+                body.form,
+                body.fill,
+                f"{stem}-{body.like}",
                 place,
                 f"translate({_n(body.x):g} {_n(body.y):g})",
                 "u" not in motion.missing,
                 _n(0.85 * body.radius),
+                _n(body.radius + 0.35),
+                tuple((_n(x), _n(y)) for x, y in body.arms),
             )
         )
         u = complex(motion.u) * scale / body.radius * 180 / np.pi
         mx, my = complex(motion.x) * scale * UNITS, complex(motion.y) * scale * UNITS
         row = (body.x * UNITS, body.y * UNITS, mx.real, mx.imag, my.real, my.imag, u.real, u.imag)
         numbers.append([round(float(v), 2) for v in row])
-    return MovingGear(label, tuple(bodies), json.dumps(numbers, separators=(",", ":")))
+    return MovingShape(label, tuple(bodies), json.dumps(numbers, separators=(",", ":")))
 
 
-def outline_path(body: GearBody) -> str:
+def outline_path(body: Body) -> str:
     """Outline of a body about its own centre, as an SVG path."""
-    points = outline(body, samples=4 if body.teeth else 1) * UNITS
+    points = body.outline(samples=4 if body.teeth else 1) * UNITS
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in points[:-1]) + "Z"
 
 

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.choices import NO_CHOICES, Choices
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
-from ema_pipeline.effects.library import depends_on_level, parse_effect
 from ema_pipeline.errors import EmaError
-from ema_pipeline.fit.settings import FitSettings
-from ema_pipeline.frf.channels import ChannelQuality, channel_uncertainty, merged
-from ema_pipeline.observations.fitting import Model
+from ema_pipeline.frf.channels import uncertainty_of_dofs
+from ema_pipeline.observations.fitting import Model, model_with
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs.types import Rig
-from ema_pipeline.stages.base import Run
-from ema_pipeline.stages.modes import measured_frfs, measured_modes, modes_key
+from ema_pipeline.run.measured import (
+    level_studies,
+    measured_frfs,
+    measured_modes,
+    modes_key,
+    modes_of_structure,
+)
+from ema_pipeline.run.types import Run
 from ema_pipeline.store import ALL
+
+if TYPE_CHECKING:
+    from ema_pipeline.correlate.types import Comparison, Pairing
+    from ema_pipeline.fit.parameters import FittedModes
+    from ema_pipeline.observations.amplitude import AmplitudeObservations
 
 
 def mode_observations(run: Run) -> ModeObservations:
@@ -37,56 +46,48 @@ def mode_observations(run: Run) -> ModeObservations:
 
 
 def _mode_observations(run: Run, rig: Rig) -> ModeObservations:
-    settings = cast(FitSettings, run.settings["fit"])
-    measured = measured_modes(run)
-    frfs = measured_frfs(run)
-    channels: dict[str, ChannelQuality] = {}
-    for name, modes in measured.items():
-        for dof in modes.dofs:
-            quality = channel_uncertainty(frfs.get(name), dof)
-            channels[dof.point] = merged(channels.get(dof.point), quality)
-    return ModeObservations(rig, [prepare(m, settings) for m in measured.values()], channels)
+    measured, frfs = measured_modes(run), measured_frfs(run)
+    channels = uncertainty_of_dofs((frfs.get(name), modes.dofs) for name, modes in measured.items())
+    return ModeObservations(rig, [prepare(m, run.settings.fit) for m in measured.values()], channels)
 
 
-def model_with(
-    run: Run, rig: Rig, labels: Sequence[str], model: Model | None = None, with_hits: bool = False
-) -> Model:
-    """A model with effects ``id@place`` added.
+def amplitude_observations(run: Run) -> AmplitudeObservations | None:
+    """Modes and hits of all configurations; None where none was struck at several levels."""
+    from ema_pipeline.observations.amplitude import AmplitudeObservations
+    from ema_pipeline.observations.hit_modes import prepare_hits
 
-    Parameters
-    ----------
-    run : Run
-        Holds the user's own effects.
-    rig : Rig
-        With the effects that `model` has.
-    labels : sequence of str
-    model : Model, optional
-        What the effects are added to; the base model where left out.
-    with_hits : bool
-        False leaves out effects that depend on the force level: modes of one level do not show them.
-    """
-    model = model or Model()
-    for label in labels:
-        if not with_hits and depends_on_level(label, run.library):
+    hits = []
+    for name, study in level_studies(run).items():
+        if study.hit_modes is None:
             continue
-        placed = parse_effect(label, rig, library=run.library)
-        scales: dict[str, float] = {}
-        for configuration in rig.configurations:
-            assembly = rig.assembly(configuration)
-            if placed.effect.fits(assembly, placed.place):
-                scales = {
-                    placed.parameter_name(k): v
-                    for k, v in placed.effect.scales(assembly, placed.place).items()
-                }
-                break
-        model = model.plus(placed, scales)
-    return model
+        modal = modes_of_structure(run, name)
+        data = prepare_hits(name, study.hit_modes, modal, [level.force_n for level in study.levels])
+        if data is not None:
+            hits.append(data)
+    return AmplitudeObservations(mode_observations(run), hits) if hits else None
 
 
 def known_model(run: Run, with_hits: bool = False) -> Model:
     """The model with the effects that the user added, see `model_with`."""
     assert run.model is not None
-    return model_with(run, run.model, run.info.effects, with_hits=with_hits)
+    return model_with(run.info.effects, run.model, run.library, with_hits=with_hits)
+
+
+def correlate(
+    run: Run, rig: Rig, fitted: FittedModes, with_frfs: bool = True
+) -> tuple[dict[str, Pairing], Comparison]:
+    """Pair the measured modes with those of a fitted model, and compare the two."""
+    from ema_pipeline.correlate.pairing import pair_system
+    from ema_pipeline.fit.comparison import compare
+
+    settings, measured = run.settings.correlate, measured_modes(run)
+    pairings = {
+        name: pair_system(rig, fitted.system(name), modes, settings.pairing)
+        for name, modes in measured.items()
+    }
+    return pairings, compare(
+        fitted, measured, measured_frfs(run) if with_frfs else None, pairings, settings.compare
+    )
 
 
 def diagnosed_scatters(run: Run) -> dict[str, float]:
@@ -100,6 +101,11 @@ def diagnosed_choices(run: Run) -> Choices:
     if not run.store.key("diagnose", ALL):
         return run.info.choices
     return run.store.find("diagnose", ALL, "choices", Choices) or NO_CHOICES
+
+
+def diagnosis_is_of_other_data(run: Run) -> bool:
+    """True where hits or modes were excluded or included since the diagnosis."""
+    return diagnosed_choices(run) != run.info.choices
 
 
 def rung_unknowns(ladder: Ladder | None, effects: Sequence[str]) -> dict[str, float]:

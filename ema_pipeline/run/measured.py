@@ -7,7 +7,7 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels.linear import structure, structure_frfs
 from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.stages.base import Run
+from ema_pipeline.run.types import Run
 
 
 def modes_of_structure(run: Run, configuration: str) -> ModalModel:
@@ -46,3 +46,9 @@ def measured_frfs(run: Run) -> dict[str, FrfSet]:
 def level_study(run: Run, configuration: str) -> LevelStudy | None:
     """What moves with the force of the hits; None where that was not looked at."""
     return run.store.find("levels", configuration, "study", LevelStudy)
+
+
+def level_studies(run: Run) -> dict[str, LevelStudy]:
+    """The studies of all configurations that have one; none for a table of modes."""
+    found = {name: level_study(run, name) for name in run.info.configurations}
+    return {name: study for name, study in found.items() if study is not None}

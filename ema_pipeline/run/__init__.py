@@ -1,0 +1,1 @@
+"""A run: its description and settings, its model, and what was measured."""
