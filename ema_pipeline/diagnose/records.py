@@ -45,6 +45,9 @@ _GENERIC = (
     "damper",
 )
 """Effects that are sought at every DOF and between any two bodies; what is simplest to say comes first."""
+_OUT_OF_STEP = (
+    "the model is fitted to windows of a few cycles; through whole records it does not stay in step"
+)
 
 
 def diagnose_records(
@@ -164,8 +167,8 @@ def whole_ladder(observations: RecordObservations, library: Mapping[str, Effect]
         return whole
     windows = observations.in_windows(SEARCHED)
     rungs = tuple(_with_calibration(windows, library, searched, r) for r in searched.rungs)
-    cycles = "the model is fitted to windows of a few cycles; through whole records it does not stay in step"
-    return dataclasses.replace(searched, rungs=rungs, note="; ".join(n for n in (searched.note, cycles) if n))
+    notes = [n for n in searched.note.split("; ") if n and n != _OUT_OF_STEP]
+    return dataclasses.replace(searched, rungs=rungs, note="; ".join([*notes, _OUT_OF_STEP]))
 
 
 def _refitted(observations: RecordObservations, library: Mapping[str, Effect], searched: Ladder) -> Ladder:
