@@ -29,7 +29,7 @@ from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.names import check_name
-from ema_pipeline.processes import Send, can_fork, side_by_side
+from ema_pipeline.processes import Send, can_fork, release_memory, side_by_side
 from ema_pipeline.report.settings import ReportSettings
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.settings import Settings, parse, setting_names
@@ -383,8 +383,8 @@ def run_stages(run: Run, names: Iterable[str], show: ShowStage | None = None) ->
     stages = [stage for stage in there if not (stage.NEEDS_RIG and lacks_model(run))]
     for each, group in groupby(stages, key=lambda stage: stage.PER_CONFIGURATION):
         chain = list(group)
-        several = each and len(run.info.configurations) > 1 and can_fork()
-        computed += _side_by_side(chain, run, keys, show) if several else _in_turn(chain, run, keys, show)
+        apart = each and can_fork() and stored_settings(run.store, run.info).processes != 1
+        computed += _side_by_side(chain, run, keys, show) if apart else _in_turn(chain, run, keys, show)
     return computed
 
 
@@ -404,14 +404,13 @@ def _in_turn(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | None) 
 def _side_by_side(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | None) -> list[str]:
     """Run the stages that are out of date, each configuration in a process of its own.
 
-    No configuration asks for results of another, so that all are the same as one after the other.
+    No configuration asks for results of another, so that all are the same as one after the other. One alone has its own
+    process, too: what its stages needed does not burden those that follow.
     """
     wanted = [(stage, c, keys(stage.NAME, c)) for stage in stages for c in run.info.configurations]
     todo = [(stage, c, key) for stage, c, key in wanted if not _up_to_date(stage, run, c, key)]
     names = list(dict.fromkeys(c for _, c, _ in todo))
     processes = min(stored_settings(run.store, run.info).processes or cores(), len(names))
-    if processes < 2:
-        return _in_turn(stages, run, keys, show)
 
     def job(configuration: str, send: Send) -> None:
         share_cores(processes)
@@ -440,7 +439,7 @@ def _side_by_side(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | N
             else:
                 shown[label][1](*cast("tuple[float, str]", what))
 
-        with run.store.shared():
+        with run.store.shared():  # nothing is started where nothing is out of date
             side_by_side(job, names, processes, hear)
     return [_label(stage, c) for stage, c, _ in todo]
 
@@ -458,14 +457,18 @@ def _run_one(
 ) -> None:
     start = time.perf_counter()
     settings = run.settings[stage.NAME].model_dump_json()
-    if show is None:
-        results = stage.work(run, configuration, silent)
-        run.store.save(stage.NAME, configuration, key, settings, time.perf_counter() - start, **results)
-        return
-    with show(label) as progress:
+
+    def work(progress: Progress) -> None:
         results = stage.work(run, configuration, progress)
         run.store.save(stage.NAME, configuration, key, settings, time.perf_counter() - start, **results)
-        progress(1.0, "")
+
+    if show is None:
+        work(silent)
+    else:
+        with show(label) as progress:
+            work(progress)
+            progress(1.0, "")
+    release_memory()
 
 
 def _outputs_present(stage: Stage, run: Run) -> bool:
