@@ -34,7 +34,7 @@ MAX_ORDERS = 30
 
 
 def poles_of_all_orders(
-    data: FitData, variance: NDArray[np.float64], n_peaks: int, settings: ModalSettings
+    data: FitData, noise: NDArray[np.float64], n_peaks: int, settings: ModalSettings
 ) -> PoleSet:
     """Poles of all orders in one sub-band with the engine of the settings.
 
@@ -42,8 +42,8 @@ def poles_of_all_orders(
     ----------
     data : FitData
         Lines of the sub-band.
-    variance : ndarray, (n_rows, n_references, n_lines)
-        Of the FRFs: rows are scaled to equal noise.
+    noise : ndarray, (n_rows, n_references)
+        Mean logarithm of the variance of every FRF: rows are scaled to equal noise.
     n_peaks : int
         Peaks seen, which sets the highest order unless the settings do.
     settings : ModalSettings
@@ -56,8 +56,8 @@ def poles_of_all_orders(
     n_lines = len(data.omega)
     modes = MODES_PER_PEAK * n_peaks + SPARE_MODES
     rows, refs = complete_block(data.measured)
-    frf = data.frf[np.ix_(rows, refs)]
-    row_scale = np.exp(0.5 * np.log(np.maximum(variance[np.ix_(rows, refs)], 1e-300)).mean(axis=(1, 2)))
+    row_scale = np.exp(0.5 * noise[np.ix_(rows, refs)].mean(axis=1))
+    frf = data.frf if data.measured.all() else data.frf[np.ix_(rows, refs)]
     scaled = frf / row_scale[:, None, None]
     back = np.eye(len(refs))
     if settings.engine == "plscf":
