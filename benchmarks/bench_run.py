@@ -136,7 +136,17 @@ def inside(arguments: list[str]) -> None:
 
 
 def _processor_s() -> float:
-    return sum(os.times()[:4])
+    """Processor time of this process, of those that descend from it, and of those that have ended."""
+    return sum(map(_used_s, family(os.getpid())))
+
+
+def _used_s(process: int) -> float:
+    """Processor time of a process and of its children that have ended."""
+    try:
+        text = Path(f"/proc/{process}/stat").read_text()
+    except OSError:
+        return 0.0
+    return sum(map(int, text.rpartition(")")[2].split()[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 def measured(raw: Path, rig: str, out: Path, overrides: list[str]) -> list[dict[str, float]]:

@@ -137,6 +137,10 @@ class LeftOut:
     reason: str
 
 
+NO_SYNTHESIS = np.zeros((0, 0, 0), dtype=np.complex128)
+"""In place of a synthesis that was not loaded: it is as large as the FRFs."""
+
+
 @dataclass(frozen=True)
 class ModalModel:
     """Everything identified from one configuration's FRFs.

@@ -27,7 +27,7 @@ NEEDS_RIG = False
 
 def inputs(run: Run, configuration: str) -> str:
     """Hashes of the description and of every record file."""
-    return json.dumps(file_hashes(*tests_of(run, configuration)))
+    return json.dumps(_hashes(run, configuration))
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
@@ -36,7 +36,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     test = tests[0]
     limits = cast(ReadLimits, run.settings[NAME])
     common: dict[str, object] = {
-        "sources": file_hashes(*tests),
+        "sources": _hashes(run, configuration),
         "title": test.title,
         "transducers": tuple({repr(x): x for t in tests for x in map(_transducer, t.channels)}.values()),
     }
@@ -70,6 +70,14 @@ def _with_progress(records: Iterator[R], count: int, progress: Progress) -> Iter
     for index, record in enumerate(records):
         progress(index / count, record.file)
         yield record
+
+
+def _hashes(run: Run, configuration: str) -> dict[str, str]:
+    """As `file_hashes`; every file is read for them once in a run."""
+    at = ("file hashes", configuration)
+    if at not in run.memory:
+        run.memory[at] = file_hashes(*tests_of(run, configuration))
+    return dict(run.memory[at])
 
 
 def file_hashes(*tests: TestDescription) -> dict[str, str]:

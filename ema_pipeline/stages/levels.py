@@ -9,10 +9,9 @@ from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels.settings import LevelSettings
 from ema_pipeline.levels.types import LevelStudy
-from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.stages.base import Progress, Run
 from ema_pipeline.stages.hits import accepted_hits
-from ema_pipeline.stages.modes import level_study
+from ema_pipeline.stages.modes import level_study, modes_alone
 
 if TYPE_CHECKING:
     from ema_pipeline.modal.circle.settings import CircleSettings
@@ -34,9 +33,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     from ema_pipeline.levels import study_levels
 
     frfs = run.store.load("frf", configuration, "frfs", FrfSet)
-    modal = run.store.load("modal", configuration, "modal", ModalModel)
-    # The synthesised FRFs are as large as the measured ones, and not asked for.
-    modal = replace(modal, synthesis=modal.synthesis[..., :0].copy())
+    modal = modes_alone(run, configuration)
     settings = cast(LevelSettings, run.settings[NAME])
     modal_settings = cast("ModalStageSettings", run.settings["modal"])
     study = study_levels(

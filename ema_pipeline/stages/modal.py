@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, cast
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.stages.base import Progress, Run, file_hash
+from ema_pipeline.stages.frf import without_coherence
 from ema_pipeline.stages.hits import accepted_hits
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def _identified(run: Run, configuration: str, progress: Progress) -> ModalModel:
     settings = cast("ModalStageSettings", run.settings[NAME])
 
     def load_frfs() -> FrfSet:
-        return run.store.load("frf", configuration, "frfs", FrfSet)
+        return without_coherence(run.store, configuration)
 
     if settings.method == "circle":
         return identify_by_circle(load_frfs(), settings.circle)

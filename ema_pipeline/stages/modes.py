@@ -6,7 +6,7 @@ from ema_pipeline.correlate.measured import MeasuredModes, from_modal_model
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels.linear import structure, structure_frfs
 from ema_pipeline.levels.types import LevelStudy
-from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.modal.types import NO_SYNTHESIS, ModalModel
 from ema_pipeline.stages.base import Run
 
 
@@ -15,8 +15,12 @@ def modes_of_structure(run: Run, configuration: str) -> ModalModel:
 
     Those of all hits, or those of one force level where the answer depends on the level.
     """
-    modal = run.store.load("modal", configuration, "modal", ModalModel)
-    return structure(modal, level_study(run, configuration))
+    return structure(modes_alone(run, configuration), level_study(run, configuration))
+
+
+def modes_alone(run: Run, configuration: str) -> ModalModel:
+    """The modes of a configuration without the FRFs that they give."""
+    return run.store.load("modal", configuration, "modal", ModalModel, {"synthesis": NO_SYNTHESIS})
 
 
 def measured_modes(run: Run) -> dict[str, MeasuredModes]:

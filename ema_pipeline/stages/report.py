@@ -29,7 +29,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
     settings = cast(ReportSettings, run.settings[NAME])
     folder = run.store.folder
-    results = load_results(run)
+    results = load_results(run, synthesis=False)
     if results.loops is not None:
         from ema_pipeline.report.loops import write_loops_summary
 
