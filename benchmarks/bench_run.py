@@ -106,7 +106,8 @@ def inside(arguments: list[str]) -> None:
 
     def look() -> None:
         while not stop.wait(LOOK_EVERY_S):
-            peak[0] = max(peak[0], sum(map(resident_mb, family(me))))
+            now = sum(map(resident_mb, family(me)))
+            peak[0] = max(peak[0], now)  # looked up afterwards: a stage may have begun since
 
     threading.Thread(target=look, daemon=True).start()
 

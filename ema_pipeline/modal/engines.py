@@ -58,16 +58,16 @@ def poles_of_all_orders(
     rows, refs = complete_block(data.measured)
     row_scale = np.exp(0.5 * noise[np.ix_(rows, refs)].mean(axis=1))
     frf = data.frf if data.measured.all() else data.frf[np.ix_(rows, refs)]
-    scaled = frf / row_scale[:, None, None]
     back = np.eye(len(refs))
     if settings.engine == "plscf":
         if len(refs) > MAX_REFERENCES:
-            back = _strongest(scaled, MAX_REFERENCES)
-            scaled = np.einsum("oil,ik->okl", scaled, back)
-        n_ref = scaled.shape[1]
+            back = _strongest(frf / row_scale[:, None, None], MAX_REFERENCES)
+            frf = np.einsum("oil,ik->okl", frf, back)
+        n_ref = frf.shape[1]
         orders = _orders(settings, int(np.ceil(2 * modes / np.sqrt(n_ref))), n_lines, max(2, 4 // n_ref), 1)
-        found = polyreference_poles(data.omega, scaled, np.ones(n_lines), orders)
+        found = polyreference_poles(data.omega, frf, np.ones(n_lines), orders, row_scale)
     else:
+        scaled = frf / row_scale[:, None, None]
         orders = _orders(settings, 2 * modes, n_lines, 4, 2)
         flat = scaled.reshape(-1, n_lines)
         if settings.engine == "lscf":

@@ -112,6 +112,7 @@ def _identify(
     if len(bands) > 1:
         tell(0.4, f"first fit of {len(sure.poles)} candidates")
         sure = first_guess(window, bands, sure, iterations)
+    release_memory()
     tell(0.6, f"refining {len(sure.poles)} modes, trying {len(weak.poles)} more")
 
     def search(window: FitData, known: Noise) -> Estimate:
@@ -287,10 +288,10 @@ def _chart(charts: list[PoleSet], poles: Complex, decay: float) -> tuple[Stabili
     ), share
 
 
-def _synthesis(window: Window, modes: FittedModes) -> Complex:
+def _synthesis(window: Window, modes: FittedModes) -> NDArray[np.complex64]:
     """Accelerance of the modes and residual terms, in the order (outputs, inputs); NaN where not measured."""
     data = window.data
-    total = np.empty(data.frf.shape, dtype=np.complex128)
+    total = np.empty(data.frf.shape, dtype=np.complex64)
     estimate = Estimate(modes.poles, modes.participation)
 
     def fill(rows: slice) -> None:

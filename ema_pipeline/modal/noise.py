@@ -84,6 +84,13 @@ def second_difference_power(frf: Complex) -> Real:
     return np.asarray(np.median(difference, axis=-1) / np.log(2.0))
 
 
+def squared(values: Complex) -> Real:
+    """|values|², of the same shape."""
+    power = np.asarray(np.square(values.real))
+    power += np.square(values.imag)
+    return power
+
+
 @dataclass(frozen=True)
 class NoiseLaw:
     """The noise model by its parameters: evaluated where it is needed, it takes no memory.
@@ -105,8 +112,11 @@ class NoiseLaw:
 
     def at(self, response: Complex) -> Noise:
         """Noise of FRFs (n_rows, n_references, n_lines)."""
-        own = self.level[..., None] * (self.shape @ self.hats) + self.floor[..., None]
-        return Noise((self.common @ self.hats) * np.abs(response) ** 2, own)
+        own = self.level[..., None] * (self.shape @ self.hats)
+        own += self.floor[..., None]
+        common = squared(response)
+        common *= self.common @ self.hats
+        return Noise(common, own)
 
     def lines(self, first: int, stop: int) -> NoiseLaw:
         """The same on lines ``first:stop``."""
@@ -225,5 +235,5 @@ def _intervals(n_lines: int) -> tuple[NDArray[np.int64], float]:
 
 def larger(a: Noise, b: Noise) -> Noise:
     """Line by line the noise with the larger variance."""
-    pick = a.variance >= b.variance
+    pick = np.asarray(a.variance >= b.variance)
     return Noise(np.where(pick, a.common, b.common), np.where(pick, a.own, b.own))
