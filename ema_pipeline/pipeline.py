@@ -29,7 +29,7 @@ from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.names import check_name
-from ema_pipeline.processes import Send, can_fork, release_memory, side_by_side
+from ema_pipeline.processes import Send, can_fork, one_store_of_memory, release_memory, side_by_side
 from ema_pipeline.report.settings import ReportSettings
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.settings import Settings, parse, setting_names
@@ -414,6 +414,7 @@ def _side_by_side(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | N
 
     def job(configuration: str, send: Send) -> None:
         share_cores(processes)
+        one_store_of_memory()
 
         @contextmanager
         def tell(label: str) -> Iterator[Progress]:

@@ -156,7 +156,7 @@ def frf_overview(frfs: FrfSet, modal: ModalModel | None) -> Figure:
     return figure
 
 
-def phase_deg(frf: NDArray[np.complex128]) -> NDArray[np.float64]:
+def phase_deg(frf: NDArray[np.complex128] | NDArray[np.complex64]) -> NDArray[np.float64]:
     """Phase in degrees, NaN after each wrap so that no vertical line is drawn there."""
     phase = np.rad2deg(np.angle(frf))
     wraps = np.flatnonzero(np.abs(np.diff(phase)) > 180) + 1
