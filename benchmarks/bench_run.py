@@ -101,19 +101,21 @@ def inside(arguments: list[str]) -> None:
     started, used = time.perf_counter(), _processor_s()
     from ema_pipeline import job
 
-    peak, stop = [0.0], threading.Event()
+    peak, begun, stop = [0.0], [0], threading.Event()
     me = os.getpid()
 
     def look() -> None:
         while not stop.wait(LOOK_EVERY_S):
-            now = sum(map(resident_mb, family(me)))
-            peak[0] = max(peak[0], now)  # looked up afterwards: a stage may have begun since
+            during, now = begun[0], sum(map(resident_mb, family(me)))
+            if during == begun[0]:  # else another stage has begun meanwhile
+                peak[0] = max(peak[0], now)
 
     threading.Thread(target=look, daemon=True).start()
 
     @contextmanager
     def show(label: str) -> Iterator[object]:
         wall, cpu = time.perf_counter(), _processor_s()
+        begun[0] += 1
         peak[0] = 0.0
         yield lambda fraction, text: None
         row = {
