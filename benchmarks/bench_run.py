@@ -101,18 +101,21 @@ def inside(arguments: list[str]) -> None:
     started, used = time.perf_counter(), _processor_s()
     from ema_pipeline import job
 
-    peak, stop = [0.0], threading.Event()
+    peak, begun, stop = [0.0], [0], threading.Event()
     me = os.getpid()
 
     def look() -> None:
         while not stop.wait(LOOK_EVERY_S):
-            peak[0] = max(peak[0], sum(map(resident_mb, family(me))))
+            during, now = begun[0], sum(map(resident_mb, family(me)))
+            if during == begun[0]:  # else another stage has begun meanwhile
+                peak[0] = max(peak[0], now)
 
     threading.Thread(target=look, daemon=True).start()
 
     @contextmanager
     def show(label: str) -> Iterator[object]:
         wall, cpu = time.perf_counter(), _processor_s()
+        begun[0] += 1
         peak[0] = 0.0
         yield lambda fraction, text: None
         row = {
@@ -136,7 +139,17 @@ def inside(arguments: list[str]) -> None:
 
 
 def _processor_s() -> float:
-    return sum(os.times()[:4])
+    """Processor time of this process, of those that descend from it, and of those that have ended."""
+    return sum(map(_used_s, family(os.getpid())))
+
+
+def _used_s(process: int) -> float:
+    """Processor time of a process and of its children that have ended."""
+    try:
+        text = Path(f"/proc/{process}/stat").read_text()
+    except OSError:
+        return 0.0
+    return sum(map(int, text.rpartition(")")[2].split()[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 def measured(raw: Path, rig: str, out: Path, overrides: list[str]) -> list[dict[str, float]]:

@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import types
 import typing
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -32,11 +32,15 @@ from ema_pipeline.lazy_samples import LazySamples
 
 T = TypeVar("T")
 
+_ALL: Mapping[str, Any] = types.MappingProxyType({})
 _SCALARS = (bool, int, float, complex, str)
 _NONE = "__none__"
 _COMPRESS_FROM_BYTES = 16_384
 _ROW_CHUNK = 65_536
-"""Samples of a row that are checked together, 0.5 MB: a hit is cut out without reading the whole row."""
+"""Numbers of a row that are checked together, 0.5 or 1 MB: a part of it is read without reading the whole row."""
+
+_PROBES = 1_000
+"""Numbers of an array that are looked at to see whether it is worth compressing."""
 
 _SMALL_BYTES, _BEST_PACKING = 64_000_000, 300
 """Even zeros are packed no better than 1:300 by the filter that is used here."""
@@ -64,10 +68,12 @@ def write(parent: h5py.Group, name: str, value: Any) -> None:
     elif isinstance(value, np.ndarray):
         _write_array(parent, name, value)
     elif isinstance(value, LazySamples):
-        # Not compressed: measured samples gain a twentieth and would take ten times as long to read.
-        chunk = (1, min(_ROW_CHUNK, value.shape[1]))
         dataset = parent.create_dataset(
-            name, shape=value.shape, dtype=np.float64, chunks=chunk, fletcher32=True
+            name,
+            shape=value.shape,
+            dtype=np.float64,
+            chunks=(1, _share(value.shape[1], _ROW_CHUNK)),
+            fletcher32=True,
         )
         for row in range(len(value)):
             dataset[row] = value[row]
@@ -89,8 +95,16 @@ def write(parent: h5py.Group, name: str, value: Any) -> None:
         raise TypeError(f"cannot store {type(value).__name__} as '{name}'")
 
 
-def read(parent: h5py.Group, name: str, annotation: Any) -> Any:
+def read(parent: h5py.Group, name: str, annotation: Any, left_out: Mapping[str, Any] | None = None) -> Any:
     """Read member `name` of `parent` as the annotated type.
+
+    Parameters
+    ----------
+    parent : h5py.Group
+    name : str
+    annotation : type
+    left_out : mapping of str, optional
+        Fields of a dataclass that are not read, with what stands in their place.
 
     Raises
     ------
@@ -102,7 +116,7 @@ def read(parent: h5py.Group, name: str, annotation: Any) -> Any:
         If it is not what `write` has written.
     """
     try:
-        return _read(parent, name, annotation)
+        return _read(parent, name, annotation, left_out or {})
     except (EmaError, MissingError, DamagedError):
         raise
     except Exception as error:  # h5py and the types to be made raise anything on damaged content
@@ -110,7 +124,7 @@ def read(parent: h5py.Group, name: str, annotation: Any) -> Any:
         raise DamagedError(f"'{where}': {reason(error)}") from error
 
 
-def _read(parent: h5py.Group, name: str, annotation: Any) -> Any:
+def _read(parent: h5py.Group, name: str, annotation: Any, left_out: Mapping[str, Any] = _ALL) -> Any:
     annotation, optional = _strip_optional(annotation)
     if name in parent.attrs:
         raw = parent.attrs[name]
@@ -118,7 +132,7 @@ def _read(parent: h5py.Group, name: str, annotation: Any) -> Any:
     node = member(parent, name)
     origin = typing.get_origin(annotation)
     if isinstance(annotation, type) and dataclasses.is_dataclass(annotation):
-        return _read_dataclass(node, annotation)
+        return _read_dataclass(node, annotation, left_out)
     if origin is tuple:
         return _read_tuple(node, typing.get_args(annotation))
     if origin is dict:
@@ -177,15 +191,39 @@ def _write_array(parent: h5py.Group, name: str, value: np.ndarray[Any, Any]) -> 
     ):  # nothing that a checksum could guard, or stored with its description
         parent.create_dataset(name, data=value)
         return
-    large = value.nbytes >= _COMPRESS_FROM_BYTES
-    parent.create_dataset(
-        name,
-        data=value,
-        chunks=True if large else value.shape,
-        compression="lzf" if large else None,
-        shuffle=large,
-        fletcher32=True,
-    )
+    if value.nbytes < _COMPRESS_FROM_BYTES:
+        parent.create_dataset(name, data=value, chunks=value.shape, fletcher32=True)
+    elif _is_measured(value):
+        parent.create_dataset(name, data=value, chunks=_rows(value.shape), fletcher32=True)
+    else:
+        parent.create_dataset(name, data=value, chunks=True, compression="lzf", shuffle=True, fletcher32=True)
+
+
+def _is_measured(value: np.ndarray[Any, Any]) -> bool:
+    """True for numbers that are not worth compressing.
+
+    Measured ones gain a twentieth to a tenth and take ten times as long to write and to read; arrays that are mostly
+    empty gain all of it.
+    """
+    if value.dtype.kind not in "fc":
+        return False
+    some = value.reshape(-1)[:: max(1, value.size // _PROBES)]
+    return bool(np.mean(np.isfinite(some) & (some != 0)) > 0.5)
+
+
+def _rows(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """Chunks of a long row each, of a part of it, or of several short ones."""
+    chunk: list[int] = []
+    most = _ROW_CHUNK
+    for size in reversed(shape):
+        chunk.insert(0, _share(size, most))
+        most = max(1, most // chunk[0])
+    return tuple(chunk)
+
+
+def _share(size: int, most: int) -> int:
+    """Length of equal parts of at most `most` each: what is left over in the last one would be stored, too."""
+    return -(-size // -(-size // most))
 
 
 def _write_tuple(parent: h5py.Group, name: str, value: tuple[Any, ...]) -> None:
@@ -245,9 +283,10 @@ def _resolved_hints(cls: Any) -> dict[str, Any]:
     return typing.get_type_hints(cls)
 
 
-def _read_dataclass(node: h5py.Group, cls: type[T]) -> T:
+def _read_dataclass(node: h5py.Group, cls: type[T], left_out: Mapping[str, Any]) -> T:
     hints = _hints(cls)
-    return cls(**{f.name: _read(node, f.name, hints[f.name]) for f in dataclasses.fields(cast(Any, cls))})
+    read = [f.name for f in dataclasses.fields(cast(Any, cls)) if f.name not in left_out]
+    return cls(**{name: _read(node, name, hints[name]) for name in read}, **left_out)
 
 
 def _read_tuple(node: h5py.Group | h5py.Dataset, args: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -256,9 +295,10 @@ def _read_tuple(node: h5py.Group | h5py.Dataset, args: tuple[Any, ...]) -> tuple
         if node.dtype.names is not None and dataclasses.is_dataclass(args[0]):
             row = cast(Any, args[0])
             hints = _hints(row)
-            columns = {n: node.fields(n)[()] for n in node.dtype.names}
+            table, names = node[()], node.dtype.names
+            columns = [[_scalar(raw, hints[n]) for raw in table[n].tolist()] for n in names]
             return tuple(
-                row(**{n: _scalar(columns[n][i], hints[n]) for n in columns}) for i in range(len(node))
+                row(**dict(zip(names, values, strict=True))) for values in zip(*columns, strict=True)
             )
         return tuple(_scalar(v, args[0] if variadic else args[i]) for i, v in enumerate(node[()]))
     size = len(node) + len(node.attrs)

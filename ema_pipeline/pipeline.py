@@ -10,7 +10,7 @@ from typing import cast
 
 from ema_pipeline.keys import Keys
 from ema_pipeline.kinds import stages_of
-from ema_pipeline.processes import Send, can_fork, side_by_side
+from ema_pipeline.processes import Send, can_fork, one_store_of_memory, release_memory, side_by_side
 from ema_pipeline.run.types import Progress, Run, silent
 from ema_pipeline.stages.base import Stage, configurations_of, stage_module
 from ema_pipeline.store import ALL
@@ -40,8 +40,8 @@ def run_stages(run: Run, names: Iterable[str], show: ShowStage | None = None) ->
     stages = [stage_module(name) for name in names if name in there]
     for each, group in groupby(stages, key=lambda stage: stage.PER_CONFIGURATION):
         chain = list(group)
-        several = each and len(run.info.configurations) > 1 and can_fork()
-        computed += _side_by_side(chain, run, keys, show) if several else _in_turn(chain, run, keys, show)
+        apart = each and can_fork() and run.settings.processes != 1
+        computed += _side_by_side(chain, run, keys, show) if apart else _in_turn(chain, run, keys, show)
     return computed
 
 
@@ -61,17 +61,17 @@ def _in_turn(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | None) 
 def _side_by_side(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | None) -> list[str]:
     """Run the stages that are out of date, each configuration in a process of its own.
 
-    No configuration asks for results of another, so that all are the same as one after the other.
+    No configuration asks for results of another, so that all are the same as one after the other. One alone has its own
+    process, too: what its stages needed does not burden those that follow.
     """
     wanted = [(stage, c, keys(stage.NAME, c)) for stage in stages for c in run.info.configurations]
     todo = [(stage, c, key) for stage, c, key in wanted if not _up_to_date(stage, run, c, key)]
     names = list(dict.fromkeys(c for _, c, _ in todo))
     processes = min(run.settings.processes or cores(), len(names))
-    if processes < 2:
-        return _in_turn(stages, run, keys, show)
 
     def job(configuration: str, send: Send) -> None:
         share_cores(processes)
+        one_store_of_memory()
 
         @contextmanager
         def tell(label: str) -> Iterator[Progress]:
@@ -97,7 +97,7 @@ def _side_by_side(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | N
             else:
                 shown[label][1](*cast("tuple[float, str]", what))
 
-        with run.store.shared():
+        with run.store.shared():  # nothing is started where nothing is out of date
             side_by_side(job, names, processes, hear)
     return [_label(stage, c) for stage, c, _ in todo]
 
@@ -115,14 +115,18 @@ def _run_one(
 ) -> None:
     start = time.perf_counter()
     settings = run.settings.of(stage.NAME).model_dump_json()
-    if show is None:
-        results = stage.work(run, configuration, silent)
-        run.store.save(stage.NAME, configuration, key, settings, time.perf_counter() - start, **results)
-        return
-    with show(label) as progress:
+
+    def work(progress: Progress) -> None:
         results = stage.work(run, configuration, progress)
         run.store.save(stage.NAME, configuration, key, settings, time.perf_counter() - start, **results)
-        progress(1.0, "")
+
+    if show is None:
+        work(silent)
+    else:
+        with show(label) as progress:
+            work(progress)
+            progress(1.0, "")
+    release_memory()
 
 
 def _outputs_present(stage: Stage, run: Run) -> bool:

@@ -313,26 +313,40 @@ class Store:
         for part in set(folder.glob("*.h5")) - set(kept):
             part.unlink(missing_ok=True)
 
-    def load(self, stage: str, configuration: str, name: str, cls: type[T]) -> T:
-        """Load one result of a stage.
+    def load(
+        self,
+        stage: str,
+        configuration: str,
+        name: str,
+        cls: type[T],
+        left_out: Mapping[str, Any] | None = None,
+    ) -> T:
+        """Load one result of a stage; `left_out` as in `codec.read`.
 
         Raises
         ------
         EmaError
             If the stage has not been run.
         """
-        result = self.find(stage, configuration, name, cls)
+        result = self.find(stage, configuration, name, cls, left_out)
         if result is None:
             raise EmaError(f"{self.path}: holds no result of stage '{stage}' ({configuration}); run it first")
         return result
 
-    def find(self, stage: str, configuration: str, name: str, cls: type[T]) -> T | None:
-        """Load one result of a stage, None where there is none."""
+    def find(
+        self,
+        stage: str,
+        configuration: str,
+        name: str,
+        cls: type[T],
+        left_out: Mapping[str, Any] | None = None,
+    ) -> T | None:
+        """Load one result of a stage, None where there is none; `left_out` as in `codec.read`."""
         with self.group(stage, configuration) as group:
             if group is None or (name not in group and name not in group.attrs):
                 return None
             try:
-                result: T = codec.read(group, name, cls)
+                result: T = codec.read(group, name, cls, left_out)
             except codec.MissingError:
                 raise EmaError(
                     f"{self.path}: stage '{stage}' was written by another version of ema; run it again"

@@ -85,7 +85,7 @@ def test_fit_and_comparison_take_the_modes_and_frfs_of_that_level(
     study, modal, frfs = hardening
     held: dict[str, Any] = {"modal": modal, "frfs": frfs, "study": with_circles(study, CircleSettings())}
 
-    def held_result(stage: str, configuration: str, name: str, cls: type) -> object:
+    def held_result(stage: str, configuration: str, name: str, cls: type, left_out: object = None) -> object:
         return held[name]
 
     store = SimpleNamespace(find=held_result, load=held_result, key=lambda stage, configuration: "")

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from simulate_modal import TrueSystem, random_system
 
-from ema_pipeline.modal.basis import pole_functions
+from ema_pipeline.modal.basis import pole_functions, real_columns, residual_columns
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.engines import complete_block
-from ema_pipeline.modal.fit import Estimate, moved, newton_step, solve_linear
+from ema_pipeline.modal.fit import Estimate, moved, newton_step, shapes_by_lines, solve_linear
 from ema_pipeline.modal.lscf import common_denominator_poles
+from ema_pipeline.modal.noise_kernel import slopes
 from ema_pipeline.modal.normal_equations import fractions, normal_equations, numerator
 from ema_pipeline.modal.plscf import polyreference_poles
 from ema_pipeline.modal.poles import PoleSet
@@ -152,6 +153,76 @@ def test_derivative_of_the_basis_equals_its_difference_quotient(rest_s: float) -
     for step in (1e-5, 1e-5j):
         u2, _ = pole_functions(omega, s + step, rest_s)
         assert np.allclose((u2 - u1) / step, d, rtol=1e-4)
+
+
+@pytest.mark.parametrize("rest_s", [np.inf, 0.8])
+def test_columns_of_a_residue_add_up_to_the_pole_and_its_conjugate(rest_s: float) -> None:
+    omega, residue = np.linspace(100, 200, 11), 0.3 - 0.7j
+    s = np.array([-2 + 150j, -30 + 199j])
+    columns, derivatives = real_columns(omega, s, rest_s)
+    for r in range(2):
+        for made, k in ((columns, 0), (derivatives, 1)):
+            own, mirrored = (pole_functions(omega, p, rest_s)[k][r] for p in (s, s.conj()))
+            whole = residue.real * made[2 * r] + residue.imag * made[2 * r + 1]
+            assert np.allclose(whole, residue * own + residue.conjugate() * mirrored, rtol=1e-12)
+
+
+def test_shapes_made_some_lines_at_a_time_are_those_of_all_lines_at_once() -> None:
+    rng = np.random.default_rng(3)
+    omega, shape = np.linspace(100, 200, 700), (5, 2, 700)
+    frf = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+    weight = rng.uniform(0.5, 2, size=shape)
+    data = FitData(omega, frf, np.ones(shape), np.ones((5, 2), dtype=bool), 3.0, False)
+    poles = np.array([-1 + 120j, -2 + 180j])
+    estimate = Estimate(poles, np.array([[1, 0.5j], [0.2, 1]]))
+    blocks = [slice(k, min(k + 90, 700)) for k in range(0, 700, 90)]
+    found = shapes_by_lines(data, lambda lines: (frf[..., lines], weight[..., lines]), blocks, estimate)
+    # the same by plain least squares of every row, residual terms of every FRF beside the shapes
+    columns, residual = real_columns(omega, poles, 3.0)[0], residual_columns(omega)
+    for o in range(5):
+        rows, right = [], []
+        for i in range(2):
+            part = estimate.participation[:, i, None]
+            turned = np.empty_like(columns)
+            turned[0::2] = part.real * columns[0::2] + part.imag * columns[1::2]
+            turned[1::2] = part.real * columns[1::2] - part.imag * columns[0::2]
+            own = [residual if k == i else np.zeros_like(residual) for k in range(2)]
+            size = np.sqrt(weight[o, i])
+            rows.append(np.concatenate([turned, *own]) * size)
+            right.append(frf[o, i] * size)
+        a, b = np.concatenate(rows, axis=1), np.concatenate(right)
+        plain = np.linalg.lstsq(np.concatenate([a.real, a.imag], axis=1).T, np.concatenate([b.real, b.imag]))[
+            0
+        ]
+        assert np.allclose(found[o], plain[:4:2] + 1j * plain[1:4:2], rtol=1e-6)
+
+
+def test_slopes_of_the_noise_law_equal_sums_over_lines() -> None:
+    rng = np.random.default_rng(4)
+    rows, refs, lines, nodes = 3, 2, 130, 4
+    starts = np.ceil((lines - 1) / (nodes - 1) * np.arange(nodes)).astype(np.int64)
+    starts[-1] = lines
+    hats = np.maximum(
+        0, 1 - np.abs(np.arange(lines) / ((lines - 1) / (nodes - 1)) - np.arange(nodes)[:, None])
+    )
+    power = rng.exponential(size=(rows, refs, lines))
+    power[0, 0, ::7], power[1, 1, 3] = np.nan, 0.0
+    response = (rng.normal(size=(rows, lines, refs)) + 1j * rng.normal(size=(rows, lines, refs))).swapaxes(
+        1, 2
+    )
+    measured = np.array([[True, True], [True, True], [True, False]])
+    floor, level = np.full((rows, refs), 1e-3), rng.uniform(0.5, 1, size=(rows, refs))
+    alpha, shape = rng.uniform(0.5, 2, size=(2, rows, refs, nodes))
+    variance = (alpha @ hats) * np.abs(response) ** 2 + level[..., None] * (shape @ hats) + floor[..., None]
+    known = measured[..., None] & (power > 0)
+    less = np.where(known, 1 / variance, 0.0)
+    more = np.where(known, np.maximum(power, floor[..., None]) / variance**2, 0.0)
+    for common, by in ((True, np.abs(response) ** 2), (False, 1.0)):
+        out = np.empty((2, rows, refs, nodes))
+        spacing = (lines - 1) / (nodes - 1)
+        slopes(power, response, measured, floor, alpha, shape, level, starts, spacing, common, out)
+        assert np.allclose(out[0], (less * by) @ hats.T, rtol=1e-10)
+        assert np.allclose(out[1], (more * by) @ hats.T, rtol=1e-10)
 
 
 def test_basis_of_a_cut_record_equals_the_transform_of_the_cut_decay() -> None:

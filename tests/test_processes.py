@@ -13,8 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ema_pipeline import pipeline
 from ema_pipeline.errors import EmaError
 from ema_pipeline.processes import Send, side_by_side
+from ema_pipeline.stages.base import Progress, Run, save_info
+from ema_pipeline.store import Store
 from ema_pipeline.threads import cores, in_order, over_rows, share_cores
 
 
@@ -121,6 +124,29 @@ def test_processes_beside_each_other_share_the_processors() -> None:
 
     side_by_side(job, [1], 2, seen.append)
     assert seen == [max(1, cores() // 2)]
+
+
+@pytest.mark.parametrize(("processes", "apart"), [(None, True), (1, False)])
+def test_one_configuration_alone_has_a_process_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, processes: int | None, apart: bool
+) -> None:
+    class Stage:
+        NAME, NEEDS, PER_CONFIGURATION, NEEDS_RIG = "ingest", (), True, False
+
+        def inputs(self, run: Run, configuration: str) -> str:
+            return ""
+
+        def work(self, run: Run, configuration: str, progress: Progress) -> dict[str, object]:
+            return {"process": os.getpid()}
+
+    monkeypatch.setattr(pipeline, "stage_module", lambda name: Stage())
+    settings = pipeline.PipelineSettings(processes=processes)
+    info = pipeline.describe_run("hammer", tmp_path, "", "", "", ("default",), (), settings)
+    store = Store(tmp_path)
+    save_info(store, info)
+    with store.lock():
+        assert pipeline.run_stages(pipeline.new_run(store, info), ["ingest"]) == ["ingest (default)"]
+    assert (store.load("ingest", "default", "process", int) != os.getpid()) == apart
 
 
 def test_configurations_side_by_side_give_the_digits_of_one_after_the_other(tmp_path: Path) -> None:

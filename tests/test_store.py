@@ -493,3 +493,31 @@ def test_an_array_that_states_more_than_is_stored_is_damage(tmp_path: Path) -> N
         file["stages/frf/all"].create_dataset("result", (1_000_000_000_000,), "f8", chunks=(1024,))
     with pytest.raises(EmaError, match="states 8000000000000 bytes where 0 are stored"):
         store.find("frf", ALL, "result", np.ndarray)
+
+
+def test_measured_numbers_are_stored_as_they_are_and_empty_ones_packed(tmp_path: Path) -> None:
+    """Packing gains a tenth of measured numbers, at ten times the time; of what is mostly empty it gains all."""
+    measured = np.random.default_rng(1).normal(size=(3, 2, 65_537)) + 0j
+    empty = np.full(measured.shape, np.nan)
+    empty[0, 0] = 1.0
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        for name, value in (("measured", measured), ("empty", empty), ("short", np.ones((50_000, 3)))):
+            codec.write(file, name, value)
+            assert_array_equal(codec.read(file, name, np.ndarray), value)
+            assert file[name].fletcher32
+            assert file[name].id.get_storage_size() < 1.01 * value.nbytes + 4 * file[name].id.get_num_chunks()
+        assert file["measured"].compression is None
+        assert file["measured"].chunks[:2] == (1, 1)  # one FRF is read without the others
+        assert file["empty"].id.get_storage_size() < empty.nbytes / 20
+        assert file["short"].id.get_num_chunks() < 10
+
+
+def test_what_is_left_out_is_not_read(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key", "{}", 0.1, result=example())
+    found = store.load("frf", ALL, "result", Everything, {"array": np.zeros(0)})
+    assert found.array.size == 0
+    assert_array_equal(found.masks, example().masks)
+    with h5py.File(store.path, "r+") as file:
+        del file["stages/frf/all/result/array"]  # so it cannot have been read
+    assert store.load("frf", ALL, "result", Everything, {"array": np.zeros(0)}).text == example().text

@@ -71,7 +71,7 @@ def run(
 def _show_summary(done: Run) -> None:
     from ema_pipeline.stages.results import load_results
 
-    results, folder = load_results(done), done.store.folder
+    results, folder = load_results(done, synthesis=False), done.store.folder
     report = f"Report: {folder / 'report.html'}"
     if results.loops is not None:
         from ema_pipeline.report.loops import run_screen
@@ -93,7 +93,7 @@ def _content(done: Run) -> Any:
     from ema_pipeline.report.summary_files import finite, summary
     from ema_pipeline.stages.results import load_results
 
-    return finite(summary(load_results(done)))
+    return finite(summary(load_results(done, synthesis=False)))
 
 
 def stage_command(name: str) -> Callable[..., None]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.modal.assurance import mpc
-from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
+from ema_pipeline.modal.types import NO_SYNTHESIS, ModalModel, Mode, StabilisationChart
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def to_modal_model(measured: MeasuredModes) -> ModalModel:
         scaling_note="" if measured.scaled else "the table of modes does not say that its shapes are scaled",
         references=measured.references,
         frequency_hz=empty,
-        synthesis=np.zeros((0, 0, 0), complex),
+        synthesis=NO_SYNTHESIS,
         outputs=(),
         inputs=(),
         chart=nothing,

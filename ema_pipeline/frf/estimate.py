@@ -269,6 +269,7 @@ def _finish(total: _Total, first: HitSamples, settings: FrfSettings, pool: Threa
                 hits[o, i] += sheet.hits
                 # Outputs share the force sum of their sheet until a second sheet adds its own.
                 force[o, i] = force[o, i] + sheet.force if (o, i) in force else sheet.force
+            del sheet  # as large as its part of the FRFs
     variance = np.empty(shape)
 
     def finish(output: int) -> None:

@@ -14,6 +14,11 @@ from ema_pipeline.verdict import Verdict
 ALL_LINES = slice(None)
 
 
+def unknown(shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """NaN of any shape, that takes no memory."""
+    return np.broadcast_to(np.nan, shape)
+
+
 @dataclass(frozen=True)
 class FrfSet:
     """Frequency response functions of one configuration.

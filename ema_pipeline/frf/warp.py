@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse
+import scipy.special
 from numpy.typing import NDArray
 from scipy.fft import rfft
 
@@ -57,7 +58,9 @@ class WarpedTransform:
                 (values.ravel()[chosen], (rows[chosen], folded.ravel()[chosen])), shape=size
             )
 
-        self._direct, self._mirrored = matrix(~mirrored), matrix(mirrored)
+        self._direct, edges = matrix(~mirrored), matrix(mirrored)
+        self._at_edges = np.flatnonzero(np.diff(edges.indptr))
+        self._mirrored = edges[self._at_edges]
         time = np.arange(n_samples) - n_samples // 2
         self._taper = 1.0 / _kernel_transform(time / self._long)
         self._turn = np.exp(-1j * np.pi * place / self._long * 2 * (n_samples // 2))
@@ -70,8 +73,10 @@ class WarpedTransform:
         padded[:, : self._n - half] = flat[:, half:]
         if half:
             padded[:, -half:] = flat[:, :half]
-        spectrum = np.asarray(rfft(padded, axis=-1)).T
-        moved = self._direct @ spectrum + self._mirrored @ spectrum.conj()
+        # real and imaginary parts side by side, as the matrices are real
+        spectrum = np.ascontiguousarray(np.asarray(rfft(padded, axis=-1)).T).view(np.float64)
+        moved = (self._direct @ spectrum).view(np.complex128)
+        moved[self._at_edges] += (self._mirrored @ spectrum).view(np.complex128).conj()
         out = (moved.T * self._turn).reshape(*samples.shape[:-1], len(self._turn))
         return np.asarray(out)
 
@@ -79,7 +84,7 @@ class WarpedTransform:
 def _kernel(distance: Real) -> Real:
     """Kaiser-Bessel kernel over lines of the longer transform."""
     inside = np.maximum(1.0 - (2.0 * distance / TAPS) ** 2, 0.0)
-    return np.asarray(np.where(np.abs(distance) <= TAPS / 2, np.i0(SHAPE * np.sqrt(inside)), 0.0))
+    return np.asarray(np.where(np.abs(distance) <= TAPS / 2, scipy.special.i0(SHAPE * np.sqrt(inside)), 0.0))
 
 
 def _kernel_transform(time: Real) -> Real:

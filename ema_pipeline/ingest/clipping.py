@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.ingest.pulse import noise_of
-
 MINIMUM_FLAT = 3
 """A top of fewer samples may be flat by chance."""
 
@@ -14,7 +12,7 @@ SIGNIFICANT = 30
 """Excursions of fewer noise deviations have no top to speak of."""
 
 
-def flat_top_share(samples: NDArray[np.float64]) -> float:
+def flat_top_share(samples: NDArray[np.float64], noise: float) -> float:
     """How flat the highest or lowest tops are: 0.5 for smooth peaks, 1 for clipped ones, 0 if undecidable.
 
     Near any smooth peak the signal is a parabola, so that it stays within ε of its top for a time that
@@ -26,6 +24,8 @@ def flat_top_share(samples: NDArray[np.float64]) -> float:
     Parameters
     ----------
     samples : ndarray, (n_samples,)
+    noise : float
+        Standard deviation of the channel's noise, see `pulse.noise_of`.
 
     Returns
     -------
@@ -34,7 +34,6 @@ def flat_top_share(samples: NDArray[np.float64]) -> float:
         (where at least three samples lie there), and the same for sample counts over all lobes (where they
         are too many to be chance).
     """
-    noise = noise_of(samples)
     middle = float(np.median(samples))
     return max(_side(samples - middle, noise), _side(middle - samples, noise))
 

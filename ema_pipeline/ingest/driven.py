@@ -15,6 +15,7 @@ from ema_pipeline.ingest.description import ChannelDescription, RecordDescriptio
 from ema_pipeline.ingest.driven_entries import record_name
 from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.load import RATE_TOLERANCE, ScaledChannels, load_channels
+from ema_pipeline.ingest.pulse import noise_of
 from ema_pipeline.ingest.records import ResponseChannel
 
 FIT, HELD_OUT = "fit", "held_out"
@@ -241,7 +242,7 @@ def _check_channel(
             f"{where}: reaches its full scale of {full_scale:.4g} at sample {int(np.argmax(np.abs(samples)))}, so it "
             "is clipped; record again with a larger range"
         )
-    if flat_top_share(samples) > CLIPPED_SHARE or _at_limits(samples) >= AT_LIMIT:
+    if flat_top_share(samples, noise_of(samples)) > CLIPPED_SHARE or _at_limits(samples) >= AT_LIMIT:
         raise EmaError(
             f"{where}: is clipped at {top:.4g}: its tops are flat; record again with a larger range"
         )

@@ -22,6 +22,10 @@ DEEP = 0.04
 """Depth of a valley that only a shoulder can make, whose own height is then looked at."""
 
 
+NOISE_BLOCK = 64
+"""Samples of a stretch that may be the quietest."""
+
+
 RESOLVED = 8.0
 """Width of a pulse, samples, from which on a shoulder is more than the filter's ringing."""
 
@@ -71,7 +75,7 @@ class SecondImpact:
     delay_s: float
 
 
-def noise_of(samples: NDArray[np.float64], block: int = 64) -> float:
+def noise_of(samples: NDArray[np.float64], step: float | None = None) -> float:
     """Standard deviation of a channel's broadband noise, from its quietest stretches.
 
     Second differences take offset, drift and slow vibration away; the tenth percentile over blocks takes
@@ -80,18 +84,18 @@ def noise_of(samples: NDArray[np.float64], block: int = 64) -> float:
     Parameters
     ----------
     samples : ndarray, (n_samples,)
-    block : int
-        Samples per block.
+    step : float, optional
+        The converter's step, where it is known already.
     """
     if samples.size < 4:
         return 0.0
     bend = np.diff(samples, 2)
-    if bend.size >= 4 * block:
-        blocks = bend[: bend.size // block * block].reshape(-1, block)
+    if bend.size >= 4 * NOISE_BLOCK:
+        blocks = bend[: bend.size // NOISE_BLOCK * NOISE_BLOCK].reshape(-1, NOISE_BLOCK)
         level = float(np.percentile(np.sqrt(np.mean(blocks**2, axis=1)), 10))
     else:
         level = float(1.4826 * np.median(np.abs(bend)))
-    return max(level / np.sqrt(6.0), step_of(samples) / np.sqrt(12.0))
+    return max(level / np.sqrt(6.0), (step_of(samples) if step is None else step) / np.sqrt(12.0))
 
 
 def step_of(samples: NDArray[np.float64]) -> float:

@@ -16,6 +16,7 @@ from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.hits import align_hits, find_hits, trim_hits
 from ema_pipeline.ingest.pulse import Pulse, find_pulse, find_second_impact, noise_of, step_of
 from ema_pipeline.ingest.records import Hit, Record, ResponseChannel
+from ema_pipeline.threads import in_order
 from ema_pipeline.verdict import Consequence, Verdict, judged
 
 DOUBLE_HIT = "ISO 7626-5, avoidance of double impacts"
@@ -155,22 +156,26 @@ def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> 
     settings = settings or HitSettings()
     force = record.force[hit.start : hit.stop]
     pulse = find_pulse(force, hit.peak - hit.start)
-    rate, name = record.sample_rate_hz, record.force_name
+    rate, name, noise = record.sample_rate_hz, record.force_name, noise_of(force)
     verdicts = [
         *hit.verdicts,
         _double_hit(force, pulse, rate, settings),
         _overload(force, record.force_full_scale, name, "reject_hit", pulse.peak, rate, settings),
-        _flat_top(force, record.force_full_scale, name, "reject_hit"),
-        _force_level(force, pulse, name, settings),
+        _flat_top(force, record.force_full_scale, name, "reject_hit", noise),
+        _force_level(pulse, noise, name, settings),
         _force_spectrum(force, pulse, rate, name, settings),
     ]
     if record.force_calibrated:
         verdicts.append(_force_peak(hit.peak_force, name))
     # Before the first hit of a record the structure is at rest: what is there is noise and hum.
     rest = pulse.start if hit.start == 0 and hit.number == 0 else 0
-    for row, channel in enumerate(record.channels):
+
+    def check(row: int) -> list[Verdict]:
         samples = record.responses[row, hit.start : hit.stop]
-        verdicts += _check_response(channel, samples, pulse, rest, rate, settings)
+        return _check_response(record.channels[row], samples, pulse, rest, rate, settings)
+
+    for found in in_order(check, range(len(record.channels))):
+        verdicts += found
     return replace(hit, verdicts=tuple(verdicts))
 
 
@@ -226,17 +231,16 @@ def _overload(
 
 
 def _flat_top(
-    samples: NDArray[np.float64], full_scale: float, name: str, consequence: Consequence
+    samples: NDArray[np.float64], full_scale: float, name: str, consequence: Consequence, noise: float
 ) -> Verdict:
-    share = flat_top_share(samples)
+    share = flat_top_share(samples, noise)
     far_below = float(max(samples.max(), -samples.min())) < FAR_BELOW_SCALE * full_scale
     passes = share < FLAT_TOP_LIMIT or (np.isfinite(full_scale) and far_below)
     fault = f"{name} is clipped: its tops are flat; use a lower gain or hit softer"
     return judged("clipping", share, FLAT_TOP_LIMIT, passes, OVERLOAD, consequence, fault, channel=name)
 
 
-def _force_level(force: NDArray[np.float64], pulse: Pulse, name: str, settings: HitSettings) -> Verdict:
-    noise = noise_of(force)
+def _force_level(pulse: Pulse, noise: float, name: str, settings: HitSettings) -> Verdict:
     ratio = min(pulse.height / noise, 1e12) if noise > 0 else 1e12
     passes = ratio >= settings.trigger_noise
     fault = f"{name} does not stand out of its noise: {ratio:.1f} times"
@@ -275,25 +279,28 @@ def _check_response(
     rate: float,
     settings: HitSettings,
 ) -> list[Verdict]:
-    dead = _dead_channel(channel.name, samples, pulse, rest, rate)
+    step = step_of(samples)
+    dead = _dead_channel(channel.name, samples, step, pulse, rest, rate)
     if not dead.passes:
         return [dead]
+    noise = noise_of(samples, step)
     return [
         dead,
         _overload(samples, channel.full_scale, channel.name, "reject_channel", pulse.peak, rate, settings),
-        _flat_top(samples, channel.full_scale, channel.name, "reject_channel"),
-        _decay(channel.name, samples, pulse, rest, settings),
+        _flat_top(samples, channel.full_scale, channel.name, "reject_channel", noise),
+        _decay(channel.name, samples, pulse, rest, noise, settings),
     ]
 
 
-def _dead_channel(name: str, samples: NDArray[np.float64], pulse: Pulse, rest: int, rate: float) -> Verdict:
+def _dead_channel(
+    name: str, samples: NDArray[np.float64], step: float, pulse: Pulse, rest: int, rate: float
+) -> Verdict:
     """A channel that carries a constant, a flickering last bit, or nothing but mains hum.
 
     A working sensor at a node shows its own broadband noise instead, many steps of the converter high; it is
     not dead, however silent. The value is the number of converter steps that the channel spans, which
     for a dead one is at most one.
     """
-    step = step_of(samples)
     spans = float(np.ptp(samples) / step) if step > 0 else 0.0
     silent = spans > 1.5 and not _answers(samples, pulse, rest)
     hum = _hum_share(samples, rate) if silent else 0.0
@@ -357,7 +364,7 @@ def _answers(samples: NDArray[np.float64], pulse: Pulse, rest: int) -> bool:
 
 
 def _decay(
-    name: str, samples: NDArray[np.float64], pulse: Pulse, rest: int, settings: HitSettings
+    name: str, samples: NDArray[np.float64], pulse: Pulse, rest: int, noise: float, settings: HitSettings
 ) -> Verdict:
     """Response at the end of the record over its largest, noise and hum taken off.
 
@@ -365,7 +372,7 @@ def _decay(
     of a recording, its broadband noise) is no response. A channel that shows nothing but noise has decayed.
     """
     length = max(samples.size // 20, 8)
-    quiet = float(np.std(samples[:rest])) if rest >= 32 else noise_of(samples)
+    quiet = float(np.std(samples[:rest])) if rest >= 32 else noise
     blocks = samples[samples.size % length :].reshape(-1, length)
     blocks = blocks[max(0, (pulse.start - samples.size % length) // length) :]
     # Offset from the end: an AC-coupled or drifting channel is centred where it matters.

@@ -223,7 +223,8 @@ class HitSamples:
 
 def cut_hit(record: Record, hit: Hit) -> HitSamples:
     """Cut a hit out of its record and leave out the channels that its verdicts reject."""
-    keep = [i for i, c in enumerate(record.channels) if c.name not in hit.rejected_channels]
+    rejected = hit.rejected_channels
+    keep = [i for i, c in enumerate(record.channels) if c.name not in rejected]
     return HitSamples(
         hit=hit,
         sample_rate_hz=record.sample_rate_hz,

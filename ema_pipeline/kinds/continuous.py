@@ -13,6 +13,7 @@ from ema_pipeline.kinds import by_modes
 from ema_pipeline.kinds.base import Judge, Kind, Results
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.rigs.types import Rig
+from ema_pipeline.run.measured import without_coherence
 from ema_pipeline.run.records import DRIVEN, driven_records, shown
 from ema_pipeline.run.sources import tests_of
 from ema_pipeline.run.types import Progress, Run
@@ -42,7 +43,7 @@ def _modes(run: Run, configuration: str, progress: Progress) -> ModalModel:
     from ema_pipeline.modal.circle import attach_circles, identify_by_circle
     from ema_pipeline.modal.identify import identify
 
-    settings, frfs = run.settings.modal, run.store.load("frf", configuration, "frfs", FrfSet)
+    settings, frfs = run.settings.modal, without_coherence(run, configuration)
     if settings.method == "circle":
         return identify_by_circle(frfs, settings.circle)
     included = wanted(run.info.choices.of(configuration).included_modes, frfs.response_decay_rad_s)

@@ -6,6 +6,7 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.kinds import by_modes
 from ema_pipeline.kinds.base import Kind, Results
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.run.measured import without_coherence
 from ema_pipeline.run.records import accepted_hits, shown
 from ema_pipeline.run.sources import tests_of
 from ema_pipeline.run.types import Progress, Run
@@ -33,7 +34,7 @@ def _modes(run: Run, configuration: str, progress: Progress) -> ModalModel:
     settings = run.settings.modal
 
     def load_frfs() -> FrfSet:
-        return run.store.load("frf", configuration, "frfs", FrfSet)
+        return without_coherence(run, configuration)
 
     if settings.method == "circle":
         return identify_by_circle(load_frfs(), settings.circle)

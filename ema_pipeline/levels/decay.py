@@ -70,6 +70,9 @@ FILTERED = 0.05
 
 HITS_PER_MODE = 2
 
+DERIVATIVES = {"acceleration": 0, "velocity": 1, "displacement": 2}
+"""How often a quantity is to be differentiated for an acceleration."""
+
 MOST_MODES = 24
 """Modes analysed, those with the largest response first."""
 
@@ -154,36 +157,30 @@ def _of_hit(
     """The curves of some modes after one hit."""
     n, rate = hit.force.size, hit.sample_rate_hz
     axis = np.asarray(np.fft.rfftfreq(n, 1 / rate))
-    power = {"acceleration": 0, "velocity": 1, "displacement": 2}
     i = [d.point for d in frfs.inputs].index(hit.hit.impact.point)
     places = {d.point: o for o, d in enumerate(frfs.outputs)}
     outputs = [places[c.dof.point] for c in hit.channels]
-    quantity_power = np.array([power[c.quantity] for c in hit.channels])
-    spectra = np.empty((len(outputs), len(axis)), dtype=np.complex128)
-    for k, channel in enumerate(hit.channels):
-        factor = float(channel.dof.sign) * (2j * np.pi * axis) ** quantity_power[k]
-        np.multiply(np.asarray(rfft(np.asarray(hit.responses[k]))), factor, out=spectra[k])
+    derivatives = np.array([DERIVATIVES[c.quantity] for c in hit.channels])
+    bands = [_band(complex(poles[task.mode]), axis, n, rate) for task in tasks]
+    weights = [
+        _weights(residues[task.mode, outputs, i], frfs.variance[outputs, i, band.lines])
+        for task, band in zip(tasks, bands, strict=True)
+    ]
+    combined = _combined(hit, bands, weights)
     force = np.asarray(rfft(hit.force)) * hit.hit.impact.sign
     start_s = (hit.hit.peak - hit.hit.start) / rate
     curves = []
-    for task in tasks:
-        pole = complex(poles[task.mode])
-        width = _width(pole, float(axis[1]))
-        centre = pole.imag / (2 * np.pi)
-        first, stop = np.searchsorted(axis, [centre - CUT * width, centre + CUT * width])
-        lines = slice(max(int(first), 1), int(stop))
-        own = residues[task.mode, outputs, i]
-        weight = _weights(own, frfs.variance[outputs, i, lines])
-        u, _ = pole_functions(2 * np.pi * axis[lines], poles, n / rate - start_s)
-        mirrored, _ = pole_functions(2 * np.pi * axis[lines], poles.conj(), n / rate - start_s)
+    for task, band, weight, measured in zip(tasks, bands, weights, combined, strict=True):
+        pole, lines, omega = complex(poles[task.mode]), band.lines, 2 * np.pi * band.axis
+        u, _ = pole_functions(omega, poles, n / rate - start_s)
+        mirrored, _ = pole_functions(omega, poles.conj(), n / rate - start_s)
         share = residues[:, outputs, i] @ weight
         other_share = residues[:, outputs, i].conj() @ weight
         mine = u[task.mode] * force[lines]
         others = (share @ u + other_share @ mirrored) * force[lines] - mine
-        signal = weight @ spectra[:, lines] - others
-        band = _Band(axis[lines], lines.start, n, rate, centre, width)
+        signal = measured - others
         scatter = frfs.variance[outputs, i, lines] * frfs.hits[outputs, i, None]
-        scatter *= (2 * np.pi * axis[lines]) ** (2 * quantity_power[:, None])
+        scatter *= omega ** (2 * derivatives[:, None])
         noise = band.noise(np.abs(weight) ** 2 @ scatter * np.abs(force[lines]) ** 2, signal - mine)
         table = _read(band, signal, LEFT_OVER * others, noise, start_s, -FILTERED * pole.real)
         if table is not None:
@@ -192,6 +189,27 @@ def _of_hit(
             name = f"{hit.hit.file}#{hit.hit.number}"
             curves.append(DecayCurve(task.mode, name, frfs.outputs[task.sensor], amplitude, *table[1:]))
     return curves
+
+
+def _combined(hit: HitSamples, bands: list[_Band], weights: list[Complex]) -> list[Complex]:
+    """Accelerations of all sensors with the weights of every band, (n_lines,) each; one spectrum is kept at a time."""
+    out = [np.zeros(len(band.axis), dtype=np.complex128) for band in bands]
+    for k, channel in enumerate(hit.channels):
+        spectrum = np.asarray(rfft(np.asarray(hit.responses[k])))
+        for band, weight, total in zip(bands, weights, out, strict=True):
+            part = weight[k] * channel.dof.sign * spectrum[band.lines]
+            for _ in range(DERIVATIVES[channel.quantity]):
+                part *= 2j * np.pi * band.axis
+            total += part
+    return out
+
+
+def _band(pole: complex, axis: Real, n: int, rate: float) -> _Band:
+    """The lines and the filter about one mode."""
+    width, centre = _width(pole, float(axis[1])), pole.imag / (2 * np.pi)
+    first, stop = np.searchsorted(axis, [centre - CUT * width, centre + CUT * width])
+    first = max(int(first), 1)
+    return _Band(axis[first : int(stop)], first, n, rate, centre, width)
 
 
 def _width(pole: complex, step_hz: float) -> float:
@@ -218,6 +236,11 @@ class _Band:
     rate_hz: float
     centre: float
     width: float
+
+    @property
+    def lines(self) -> slice:
+        """Numbers of the lines."""
+        return slice(self.first, self.first + len(self.axis))
 
     @property
     def gain(self) -> Real:

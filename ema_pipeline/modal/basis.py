@@ -14,6 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.modal.basis_kernel import columns_of_poles
+
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
 
@@ -39,8 +41,7 @@ def pole_functions(omega: Real, poles: Complex, rest_s: float) -> tuple[Complex,
     if not np.isfinite(rest_s):
         return inverse, inverse**2
     # as a product, because an exponential of every line and pole costs ten times as much
-    left = np.exp(np.minimum(poles.real * rest_s, 30.0) + 1j * poles.imag * rest_s)
-    tail = left[:, None] * np.exp(-1j * omega * rest_s)
+    tail = _left(poles, rest_s)[:, None] * np.exp(-1j * omega * rest_s)
     u = (1.0 - tail) * inverse
     return u, u * inverse - rest_s * tail * inverse
 
@@ -54,12 +55,19 @@ def real_columns(omega: Real, poles: Complex, rest_s: float) -> tuple[Complex, C
         Rows 2r and 2r+1 belong to the real and imaginary part of mode r: Q gives Re Q times row 2r plus
         Im Q times row 2r+1.
     """
-    u, du = pole_functions(omega, poles, rest_s)
-    uc, duc = pole_functions(omega, poles.conj(), rest_s)
-    shape = (2 * len(poles), len(omega))
-    columns = np.stack([u + uc, 1j * (u - uc)], axis=1).reshape(shape)
-    derivatives = np.stack([du + duc, 1j * (du - duc)], axis=1).reshape(shape)
+    columns, derivatives = np.empty((2, 2 * len(poles), len(omega)), dtype=np.complex128)
+    if np.isfinite(rest_s):
+        left, turn = _left(poles, rest_s), np.exp(-1j * omega * rest_s)
+    else:
+        rest_s, left, turn = 0.0, np.zeros_like(poles), np.zeros(len(omega), dtype=np.complex128)
+    flat = np.ascontiguousarray(omega), np.ascontiguousarray(poles)
+    columns_of_poles(*flat, rest_s, left, turn, columns, derivatives)
     return columns, derivatives
+
+
+def _left(poles: Complex, rest_s: float) -> Complex:
+    """exp(s·rest), bounded for poles that grow."""
+    return np.asarray(np.exp(np.minimum(poles.real * rest_s, 30.0) + 1j * poles.imag * rest_s))
 
 
 EDGE = 0.12

@@ -34,7 +34,7 @@ MAX_ORDERS = 30
 
 
 def poles_of_all_orders(
-    data: FitData, variance: NDArray[np.float64], n_peaks: int, settings: ModalSettings
+    data: FitData, noise: NDArray[np.float64], n_peaks: int, settings: ModalSettings
 ) -> PoleSet:
     """Poles of all orders in one sub-band with the engine of the settings.
 
@@ -42,8 +42,8 @@ def poles_of_all_orders(
     ----------
     data : FitData
         Lines of the sub-band.
-    variance : ndarray, (n_rows, n_references, n_lines)
-        Of the FRFs: rows are scaled to equal noise.
+    noise : ndarray, (n_rows, n_references)
+        Mean logarithm of the variance of every FRF: rows are scaled to equal noise.
     n_peaks : int
         Peaks seen, which sets the highest order unless the settings do.
     settings : ModalSettings
@@ -56,18 +56,18 @@ def poles_of_all_orders(
     n_lines = len(data.omega)
     modes = MODES_PER_PEAK * n_peaks + SPARE_MODES
     rows, refs = complete_block(data.measured)
-    frf = data.frf[np.ix_(rows, refs)]
-    row_scale = np.exp(0.5 * np.log(np.maximum(variance[np.ix_(rows, refs)], 1e-300)).mean(axis=(1, 2)))
-    scaled = frf / row_scale[:, None, None]
+    row_scale = np.exp(0.5 * noise[np.ix_(rows, refs)].mean(axis=1))
+    frf = data.frf if data.measured.all() else data.frf[np.ix_(rows, refs)]
     back = np.eye(len(refs))
     if settings.engine == "plscf":
         if len(refs) > MAX_REFERENCES:
-            back = _strongest(scaled, MAX_REFERENCES)
-            scaled = np.einsum("oil,ik->okl", scaled, back)
-        n_ref = scaled.shape[1]
+            back = _strongest(frf / row_scale[:, None, None], MAX_REFERENCES)
+            frf = np.einsum("oil,ik->okl", frf, back)
+        n_ref = frf.shape[1]
         orders = _orders(settings, int(np.ceil(2 * modes / np.sqrt(n_ref))), n_lines, max(2, 4 // n_ref), 1)
-        found = polyreference_poles(data.omega, scaled, np.ones(n_lines), orders)
+        found = polyreference_poles(data.omega, frf, np.ones(n_lines), orders, row_scale)
     else:
+        scaled = frf / row_scale[:, None, None]
         orders = _orders(settings, 2 * modes, n_lines, 4, 2)
         flat = scaled.reshape(-1, n_lines)
         if settings.engine == "lscf":

@@ -17,6 +17,7 @@ Inverse Problems 19, 2003.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,9 +26,12 @@ from numpy.typing import NDArray
 from ema_pipeline.modal.basis import real_columns, residual_columns
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.gram_kernel import products
+from ema_pipeline.threads import in_order
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
+Known = Callable[[slice], tuple[Complex, Real]]
+"""Data and weights of some lines, (n_rows, n_references, n_some) each."""
 
 LINES_AT_ONCE = 128
 """Block of lines in a Gram matrix, at least."""
@@ -35,7 +39,7 @@ LINES_AT_ONCE = 128
 PRODUCTS_AT_ONCE = 1 << 16
 """Products of columns kept at a time, 0.5 MB."""
 
-COLUMNS_AT_ONCE = 4096
+COLUMNS_AT_ONCE = 2048
 """Lines for which the functions of frequency are made at a time: of many modes they outgrow the FRFs."""
 
 RIDGE = 1e-12
@@ -139,10 +143,10 @@ def weighted_grams(columns: Complex, weight: Real, data: Complex) -> tuple[Real,
         of_pairs = np.empty((len(upper[0]), re.shape[1]))
         products(re, im, of_pairs)
         packed += weight[:, block] @ of_pairs.T
-        weighted = weight[:, block] * data[:, block]
-        moment += weighted.real @ re.T
-        moment += weighted.imag @ im.T
-        power += np.sum(weighted.real * data[:, block].real + weighted.imag * data[:, block].imag, axis=1)
+        known = np.ascontiguousarray(data[:, block])
+        weighted = _parts(weight[:, block] * known)
+        moment += weighted @ _parts(columns[:, block]).T
+        power += np.einsum("fl,fl->f", weighted, _parts(known))
     gram = np.empty((len(weight), n, n))
     gram[:, upper[0], upper[1]] = packed
     gram[:, upper[1], upper[0]] = packed
@@ -160,7 +164,8 @@ def solve_linear(data: FitData, weight: Real, estimate: Estimate) -> LinearSolut
     estimate : Estimate
     """
     m, each = len(estimate.poles), data.frf.shape[:2]
-    gram, moment, power = _normal_equations(data, weight, estimate, slopes=True)
+    known, blocks = _known(data, weight), _blocks(len(data.omega))
+    gram, moment, power = _normal_equations(data, known, blocks, estimate, slopes=True)
     gram, moment = gram.reshape(*each, 4 * m, 4 * m), moment.reshape(*each, 4 * m)
     normal, right, solved = _solved(gram[:, :, : 2 * m, : 2 * m], moment[:, :, : 2 * m], estimate)
     cost = float(power.sum() - np.einsum("oa,oa->", right, solved))
@@ -169,30 +174,49 @@ def solve_linear(data: FitData, weight: Real, estimate: Estimate) -> LinearSolut
 
 def best_shapes(data: FitData, weight: Real, estimate: Estimate) -> Complex:
     """The shapes of `solve_linear` alone, (n_rows, n_modes), at a third of its cost."""
+    return shapes_by_lines(data, _known(data, weight), _blocks(len(data.omega)), estimate)
+
+
+def shapes_by_lines(data: FitData, known: Known, blocks: list[slice], estimate: Estimate) -> Complex:
+    """The same of many rows, whose data and weights are made some lines at a time.
+
+    Parameters
+    ----------
+    data : FitData
+    known : callable
+        Gives data and weights, (n_rows, n_references, n_some) each, of some lines.
+    blocks : list of slice
+        All lines, in order.
+    estimate : Estimate
+    """
     m, each = len(estimate.poles), data.frf.shape[:2]
-    gram, moment, _ = _normal_equations(data, weight, estimate, slopes=False)
+    gram, moment, _ = _normal_equations(data, known, blocks, estimate, slopes=False)
     gram, moment = gram.reshape(*each, 2 * m, 2 * m), moment.reshape(*each, 2 * m)
     solved = _solved(gram, moment, estimate)[2]
     return np.asarray(solved[:, 0::2] + 1j * solved[:, 1::2])
 
 
 def _normal_equations(
-    data: FitData, weight: Real, estimate: Estimate, *, slopes: bool
+    data: FitData, known: Known, blocks: list[slice], estimate: Estimate, *, slopes: bool
 ) -> tuple[Real, Real, Real]:
     """Of every FRF by itself, for the columns of the modes and, with `slopes`, their derivatives by the poles."""
-    n_rows, n_ref, n_lines = data.frf.shape
+    n_rows, n_ref, _ = data.frf.shape
     residual = residual_columns(data.omega)
     n_modes, n_frfs = len(estimate.poles) * (4 if slopes else 2), n_rows * n_ref
     n_columns = n_modes + len(residual)
     gram, moment = np.zeros((n_frfs, n_columns, n_columns)), np.zeros((n_frfs, n_columns))
     power = np.zeros(n_frfs)
-    for block in _blocks(n_lines):
+
+    def of_lines(block: slice) -> tuple[Real, Real, Real]:
         columns, derivatives = real_columns(data.omega[block], estimate.poles, data.rest_s)
-        some = weighted_grams(
+        frf, weight = known(block)
+        return weighted_grams(
             np.concatenate([columns, *([derivatives] if slopes else []), residual[:, block]]),
-            weight[..., block].reshape(n_frfs, -1),
-            data.frf[..., block].reshape(n_frfs, -1),
+            weight.reshape(n_frfs, -1),
+            frf.reshape(n_frfs, -1),
         )
+
+    for some in in_order(of_lines, blocks):
         gram, moment, power = gram + some[0], moment + some[1], power + some[2]
     return _project_out(gram, moment, power, n_modes)
 
@@ -302,12 +326,26 @@ def moved(estimate: Estimate, change: Real) -> Estimate:
 
 def synthesis(data: FitData, estimate: Estimate, shapes: Complex) -> Complex:
     """What the modes alone add to the FRFs, (n_rows, n_references, n_lines)."""
-    residues = shapes[:, None, :] * estimate.participation.T[None]
+    residues = _parts(shapes[:, None, :] * estimate.participation.T[None])
     out = np.empty(data.frf.shape, dtype=np.complex128)
     for block in _blocks(len(data.omega)):
         columns, _ = real_columns(data.omega[block], estimate.poles, data.rest_s)
-        out[..., block] = residues.real @ columns[0::2] + residues.imag @ columns[1::2]
+        out[..., block] = _summed(residues, columns)
     return out
+
+
+def _parts(values: Complex) -> Real:
+    """Real and imaginary parts side by side, (..., 2·n): products with real matrices then cost half."""
+    return np.ascontiguousarray(values).view(np.float64)
+
+
+def _summed(coefficients: Real, columns: Complex) -> Complex:
+    """Sums of columns with real coefficients, (..., n_columns) to (..., n_lines)."""
+    return np.asarray((coefficients @ _parts(columns)).view(np.complex128))
+
+
+def _known(data: FitData, weight: Real) -> Known:
+    return lambda lines: (data.frf[..., lines], weight[..., lines])
 
 
 def _blocks(n_lines: int) -> list[slice]:
@@ -322,4 +360,4 @@ def residual_fit(data: FitData, weight: Real, modes: Complex) -> Complex:
         columns, weight.reshape(-1, n_lines), (data.frf - modes).reshape(-1, n_lines)
     )
     coefficients = solve_scaled(gram, moment[..., None])[..., 0]
-    return np.asarray((coefficients @ columns).reshape(data.frf.shape))
+    return _summed(coefficients, columns).reshape(data.frf.shape)

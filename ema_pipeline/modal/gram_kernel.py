@@ -9,7 +9,12 @@ from numpy.typing import NDArray
 Real = NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+@numba.njit(
+    "void(float64[:, ::1], float64[:, ::1], float64[:, ::1])",
+    cache=True,
+    nogil=True,
+    fastmath={"reassoc", "contract", "nsz"},
+)
 def products(re: Real, im: Real, out: Real) -> None:
     """Re(conj(a) b) for all pairs of columns a and b that is not before it.
 

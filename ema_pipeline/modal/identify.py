@@ -36,6 +36,7 @@ from ema_pipeline.modal.sweep import (
     whole,
 )
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
+from ema_pipeline.processes import release_memory
 from ema_pipeline.threads import in_order, single_blas_thread
 
 Progress = Callable[[float, str], None]
@@ -98,22 +99,28 @@ def _identify(
     bands = split(data.omega, indicator(data, level))
     iterations = POLISH_ITERATIONS if settings.polish else 0
 
+    def chart_of(part: SubBand) -> PoleSet:
+        return _chart_of(window.lines(part.first, part.stop), part, settings)
+
     charts: list[PoleSet] = []
-    for k, part in enumerate(bands):
-        tell(0.1 + 0.3 * k / len(bands), f"poles of sub-band {k + 1} of {len(bands)}")
-        charts.append(_chart_of(window.lines(part.first, part.stop), part, settings))
+    for chart in in_order(chart_of, bands):
+        charts.append(chart)
+        tell(0.1 + 0.3 * len(charts) / len(bands), f"poles of sub-band {len(charts)} of {len(bands)}")
+    release_memory()
     found = candidates(charts, bands, data.measured.shape[1])
     sure, weak = seeded(found.sure, found.weak, peaks, data)
     if len(bands) > 1:
         tell(0.4, f"first fit of {len(sure.poles)} candidates")
         sure = first_guess(window, bands, sure, iterations)
+    release_memory()
     tell(0.6, f"refining {len(sure.poles)} modes, trying {len(weak.poles)} more")
 
     def search(window: FitData, known: Noise) -> Estimate:
-        return tracked(poles_of_all_orders(window, known.variance, 2, settings))
+        return tracked(poles_of_all_orders(window, known.mean_log(), 2, settings))
 
     plain = plain_peaks(frfs, band)
     modes = refined(window, bands, charts, sure, weak, search, iterations, peaks, plain, wanted)
+    release_memory()
     tell(0.9, "shapes and synthesis")
     cores = [chart.take(between(chart.pole, b.low, b.high)) for chart, b in zip(charts, bands, strict=True)]
     return _model(frfs, settings, band, window, modes, cores, peaks, plain.joined(wanted))
@@ -281,10 +288,10 @@ def _chart(charts: list[PoleSet], poles: Complex, decay: float) -> tuple[Stabili
     ), share
 
 
-def _synthesis(window: Window, modes: FittedModes) -> Complex:
+def _synthesis(window: Window, modes: FittedModes) -> NDArray[np.complex64]:
     """Accelerance of the modes and residual terms, in the order (outputs, inputs); NaN where not measured."""
     data = window.data
-    total = np.empty(data.frf.shape, dtype=np.complex128)
+    total = np.empty(data.frf.shape, dtype=np.complex64)
     estimate = Estimate(modes.poles, modes.participation)
 
     def fill(rows: slice) -> None:
@@ -301,8 +308,9 @@ def _synthesis(window: Window, modes: FittedModes) -> Complex:
 
 def _chart_of(window: Window, part: SubBand, settings: ModalSettings) -> PoleSet:
     """Poles of all orders of a sub-band, from all rows: a few combinations of them lose weak modes."""
-    variance = window.noise.at(window.data.frf).variance
-    return poles_of_all_orders(window.data, variance, part.n_peaks, settings)
+    data = window.data
+    noise = [window.noise.rows(rows).at(data.frf[rows]).mean_log() for rows in data.row_blocks()]
+    return poles_of_all_orders(data, np.concatenate(noise), part.n_peaks, settings)
 
 
 def _notes(data: FitData, scaling: str) -> tuple[str, ...]:

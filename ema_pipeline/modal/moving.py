@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.choices import ModeChoice
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
-from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.frf.types import FrfSet, unknown
 from ema_pipeline.modal.chosen import wanted
 from ema_pipeline.modal.data import analysis_band
 from ema_pipeline.modal.drift.align import NOTICED, Alignment, PeakMovement, align
@@ -20,6 +20,7 @@ from ema_pipeline.modal.drift.windows import Hits
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel, Mode
+from ema_pipeline.processes import release_memory
 from ema_pipeline.threads import single_blas_thread
 
 Progress = Callable[[float, str], None]
@@ -89,6 +90,8 @@ def identify_hits(
         if alignment.shifts is not None:
             del frfs
             frfs = estimate_frfs(hits(), frf_settings, alignment.shifts)
+            frfs = replace(frfs, coherence=unknown(frfs.frf.shape))  # not asked for
+    release_memory()
     asked = wanted(included, frfs.response_decay_rad_s)
     modal = identify(frfs, settings, progress, alignment.known_peaks(), asked)
     return HitModes(with_movement(modal, alignment, frfs.response_decay_rad_s), frfs, alignment)

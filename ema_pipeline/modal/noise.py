@@ -61,7 +61,15 @@ class Noise:
 
     def weight(self, measured: NDArray[np.bool_]) -> Real:
         """One over variance; 0 where not measured."""
-        return np.where(measured[..., None], 1.0 / np.where(self.variance > 0, self.variance, 1.0), 0.0)
+        variance = self.variance
+        variance[~(variance > 0)] = 1.0
+        np.divide(1.0, variance, out=variance)
+        variance[~measured] = 0.0
+        return variance
+
+    def mean_log(self) -> Real:
+        """Mean logarithm of the variance of every FRF over its lines, (n_rows, n_references)."""
+        return np.asarray(np.log(np.maximum(self.variance, 1e-300)).mean(axis=-1))
 
 
 def second_difference_power(frf: Complex) -> Real:
@@ -74,6 +82,13 @@ def second_difference_power(frf: Complex) -> Real:
     """
     difference = np.abs(np.diff(frf, n=2, axis=-1)) ** 2 / 6.0
     return np.asarray(np.median(difference, axis=-1) / np.log(2.0))
+
+
+def squared(values: Complex) -> Real:
+    """|values|², of the same shape."""
+    power = np.asarray(np.square(values.real))
+    power += np.square(values.imag)
+    return power
 
 
 @dataclass(frozen=True)
@@ -97,8 +112,11 @@ class NoiseLaw:
 
     def at(self, response: Complex) -> Noise:
         """Noise of FRFs (n_rows, n_references, n_lines)."""
-        own = self.level[..., None] * (self.shape @ self.hats) + self.floor[..., None]
-        return Noise((self.common @ self.hats) * np.abs(response) ** 2, own)
+        own = self.level[..., None] * (self.shape @ self.hats)
+        own += self.floor[..., None]
+        common = squared(response)
+        common *= self.common @ self.hats
+        return Noise(common, own)
 
     def lines(self, first: int, stop: int) -> NoiseLaw:
         """The same on lines ``first:stop``."""
@@ -148,7 +166,7 @@ def fit_law(
     hats = _hats(n_lines)
     n_nodes = len(hats)
     floor, quiet = np.empty((n_rows, n_ref)), np.empty((n_rows, n_ref))
-    sums = np.empty((4, n_rows, n_ref, n_nodes))
+    sums = np.empty((2, n_rows, n_ref, n_nodes))
     group = (n_rows, 1, n_nodes) if inputs_are_rows else (1, n_ref, n_nodes)
     axis = 1 if inputs_are_rows else 0  # the axis that outputs run along
 
@@ -161,24 +179,24 @@ def fit_law(
         b = 1.78 * np.exp(quiet)
         g, alpha = np.ones(group), np.full(group, 1e-4)
 
-        def derivatives() -> Real:
-            """By the variance, less and more: times |H|², and alone."""
+        def derivatives(*, common: bool) -> Real:
+            """Of the likelihood by one share of the variance, less and more."""
             full = [np.ascontiguousarray(np.broadcast_to(x, (n_rows, n_ref, n_nodes))) for x in (alpha, g)]
 
             def work(rows: slice) -> None:
                 a, s = full[0][rows], full[1][rows]
                 known = power[rows], response[rows], measured[rows], floor[rows]
-                slopes(*known, a, s, b[rows], starts, spacing, sums[:, rows])
+                slopes(*known, a, s, b[rows], starts, spacing, common, sums[:, rows])
 
             each(work)
             return sums
 
         for _ in range(ITERATIONS):
-            less, more, *_ = derivatives()
+            less, more = derivatives(common=True)
             alpha = alpha * np.sqrt(_total(more, axis) / _total(less, axis))
-            *_, less, more = derivatives()
+            less, more = derivatives(common=False)
             g = g * np.sqrt(_total(b[..., None] * more, axis) / _total(b[..., None] * less, axis))
-            *_, less, more = derivatives()
+            less, more = derivatives(common=False)
             with np.errstate(divide="ignore", invalid="ignore"):
                 ratio = np.sum(more * g, axis=-1) / np.sum(less * g, axis=-1)
             b = b * np.sqrt(np.where(np.isfinite(ratio), ratio, 1.0))
@@ -217,5 +235,5 @@ def _intervals(n_lines: int) -> tuple[NDArray[np.int64], float]:
 
 def larger(a: Noise, b: Noise) -> Noise:
     """Line by line the noise with the larger variance."""
-    pick = a.variance >= b.variance
+    pick = np.asarray(a.variance >= b.variance)
     return Noise(np.where(pick, a.common, b.common), np.where(pick, a.own, b.own))

@@ -6,6 +6,8 @@ variance of a line is made where it is used: nothing as large as the FRFs is kep
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +15,34 @@ from numpy.typing import NDArray
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
 
-_loop = numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"}, error_model="numpy")
-"""Compiled to vector instructions: with Python's rules a division by zero would have to be looked for."""
+_REAL, _FLAG = numba.float64, numba.boolean
 
 
-@_loop
+def _read(kind: numba.types.Type, dimensions: int) -> numba.types.Array:
+    return numba.types.Array(kind, dimensions, "A", readonly=True)
+
+
+def _made(dimensions: int) -> numba.types.Array:
+    return numba.types.Array(_REAL, dimensions, "A")
+
+
+_DATA = (_read(_REAL, 3), _read(numba.complex128, 3), _read(_FLAG, 2))
+"""Squared errors, FRFs, and which were measured. One type for arrays of any order in memory: each further one would be
+compiled by itself, for a second or two."""
+
+
+def _loop(*arguments: numba.types.Type) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Compiled to vector instructions: with Python's rules a division by zero would have to be looked for."""
+    return numba.njit(
+        numba.void(*arguments),
+        cache=True,
+        nogil=True,
+        fastmath={"reassoc", "contract", "nsz"},
+        error_model="numpy",
+    )
+
+
+@_loop(*_DATA, _REAL, _made(2), _made(2))
 def quiet_lines(
     power: Real, response: Complex, measured: NDArray[np.bool_], least: float, floor: Real, quiet: Real
 ) -> None:
@@ -53,7 +78,10 @@ def quiet_lines(
                 quiet[o, i] = total / known
 
 
-@_loop
+@_loop(
+    *_DATA, _read(_REAL, 2), _read(_REAL, 3), _read(_REAL, 3), _read(_REAL, 2),
+    _read(numba.int64, 1), _REAL, _FLAG, _made(4),
+)  # fmt: skip
 def slopes(
     power: Real,
     response: Complex,
@@ -64,6 +92,7 @@ def slopes(
     level: Real,
     starts: NDArray[np.int64],
     spacing: float,
+    common: bool,
     out: Real,
 ) -> None:
     """Derivatives of the likelihood by the variance, less and more, summed over lines against the hats.
@@ -80,8 +109,10 @@ def slopes(
         First line of every interval between nodes, and one past the last line.
     spacing : float
         Lines between nodes.
-    out : ndarray, (4, n_rows, n_references, n_nodes)
-        Made: less and more times |H|², then less and more alone.
+    common : bool
+        True for the derivatives by the common share, times |H|²; False for those by the own share.
+    out : ndarray, (2, n_rows, n_references, n_nodes)
+        Made: less and more.
     """
     out[:] = 0.0
     n_nodes, step = alpha.shape[2], 1.0 / spacing
@@ -90,35 +121,43 @@ def slopes(
             if not measured[o, i]:
                 continue
             least = floor[o, i]
+            # side by side in memory, so that several lines are taken at once
+            errors, row = np.ascontiguousarray(power[o, i]), np.ascontiguousarray(response[o, i])
             for j in range(starts.size - 1):
-                lines = slice(starts[j], starts[j + 1])
-                # side by side in memory, so that several lines are taken at once
-                z = np.ascontiguousarray(power[o, i, lines])
-                h = np.ascontiguousarray(response[o, i, lines])
-                after = min(j + 1, n_nodes - 1)
-                a, da = alpha[o, i, j], alpha[o, i, after] - alpha[o, i, j]
-                s = level[o, i] * shape[o, i, j] + least
-                ds = level[o, i] * (shape[o, i, after] - shape[o, i, j])
-                begin = starts[j] / spacing - j
-                p0, p1, q0, q1, l0, l1, m0, m1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-                for k in range(z.size):
-                    t = begin + k * step
-                    square = h[k].real ** 2 + h[k].imag ** 2
-                    less = 1.0 / ((a + t * da) * square + (s + t * ds))
-                    more = less * less * max(z[k], least)
-                    known = (z[k] > 0.0) & (z[k] < np.inf)
-                    less = less if known else 0.0
-                    more = more if known else 0.0
-                    l0 += less
-                    l1 += less * t
-                    m0 += more
-                    m1 += more * t
-                    p0 += less * square
-                    p1 += less * square * t
-                    q0 += more * square
-                    q1 += more * square * t
-                for row, (near, far) in enumerate(((p0, p1), (q0, q1), (l0, l1), (m0, m1))):
-                    out[row, o, i, j] += near
+                z, h = errors[starts[j] : starts[j + 1]], row[starts[j] : starts[j + 1]]
+                after, begin = min(j + 1, n_nodes - 1), starts[j] * step - j
+                da = (alpha[o, i, after] - alpha[o, i, j]) * step
+                ds = level[o, i] * (shape[o, i, after] - shape[o, i, j]) * step
+                a = alpha[o, i, j] + begin * spacing * da
+                s = level[o, i] * shape[o, i, j] + least + begin * spacing * ds
+                l0, l1, m0, m1 = 0.0, 0.0, 0.0, 0.0
+                if common:
+                    for k in range(z.size):
+                        square = h[k].real ** 2 + h[k].imag ** 2
+                        less = 1.0 / ((a + k * da) * square + (s + k * ds))
+                        more = less * less * max(z[k], least)
+                        known = (z[k] > 0.0) & (z[k] < np.inf)
+                        less = less * square if known else 0.0
+                        more = more * square if known else 0.0
+                        l0 += less
+                        l1 += less * k
+                        m0 += more
+                        m1 += more * k
+                else:
+                    for k in range(z.size):
+                        square = h[k].real ** 2 + h[k].imag ** 2
+                        less = 1.0 / ((a + k * da) * square + (s + k * ds))
+                        more = less * less * max(z[k], least)
+                        known = (z[k] > 0.0) & (z[k] < np.inf)
+                        less = less if known else 0.0
+                        more = more if known else 0.0
+                        l0 += less
+                        l1 += less * k
+                        m0 += more
+                        m1 += more * k
+                for part, (all_, moment) in enumerate(((l0, l1), (m0, m1))):
+                    far = begin * all_ + step * moment
+                    out[part, o, i, j] += all_
                     if n_nodes > 1:
-                        out[row, o, i, j] -= far
-                        out[row, o, i, j + 1] += far
+                        out[part, o, i, j] -= far
+                        out[part, o, i, j + 1] += far

@@ -70,7 +70,12 @@ class NormalEquations:
 
 
 def normal_equations(
-    frf: NDArray[np.complex128], weight: Real, order: int, first_line: int, n_grid: int
+    frf: NDArray[np.complex128],
+    weight: Real,
+    order: int,
+    first_line: int,
+    n_grid: int,
+    row_scale: Real | None = None,
 ) -> NormalEquations:
     """Normal equations of the highest order.
 
@@ -82,6 +87,8 @@ def normal_equations(
         Squared weight of the lines.
     order : int
     first_line, n_grid : int
+    row_scale : ndarray, (n_rows,), optional
+        By which each row is divided, a few at a time: no scaled copy of all is made.
     """
     n_rows, n_ref, n_lines = frf.shape
     lines = slice(first_line, first_line + n_lines)
@@ -91,6 +98,8 @@ def normal_equations(
     products = np.zeros((n_ref, n_ref, n_grid + 1), dtype=np.complex128)
     for start in range(0, n_rows, at_once):
         block = frf[start : start + at_once]
+        if row_scale is not None:
+            block = block / row_scale[start : start + at_once, None, None]
         weighted = padded[: len(block)]
         np.multiply(block, weight, out=weighted[..., lines])
         cross[..., start : start + at_once] = _lags(weighted, order)[..., ::-1].transpose(2, 1, 0)

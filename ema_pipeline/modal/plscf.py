@@ -29,6 +29,7 @@ def polyreference_poles(
     frf: NDArray[np.complex128],
     weight: NDArray[np.float64],
     orders: list[int],
+    row_scale: NDArray[np.float64] | None = None,
 ) -> PoleSet:
     """Poles of all orders; the band is mapped onto the half circle.
 
@@ -37,11 +38,12 @@ def polyreference_poles(
     omega : ndarray, (n_lines,)
         rad/s, equally spaced.
     frf : complex ndarray, (n_rows, n_references, n_lines)
-        Scaled so that the noise of all rows is alike.
+        Noise of all rows alike, once divided by `row_scale`.
     weight : ndarray, (n_lines,)
         Squared weight of each line.
     orders : list of int
         Polynomial orders.
+    row_scale : ndarray, (n_rows,), optional
 
     Returns
     -------
@@ -49,7 +51,7 @@ def polyreference_poles(
         Stable poles inside the band.
     """
     orders = sorted(orders)
-    equations = normal_equations(frf, weight, orders[-1], 0, len(omega) - 1)
+    equations = normal_equations(frf, weight, orders[-1], 0, len(omega) - 1, row_scale)
     parts = [_poles_of(fraction, equations, omega) for fraction in fractions(equations, orders)]
     return PoleSet(
         order=np.concatenate([np.full(len(p), n) for n, (p, _, _) in zip(orders, parts, strict=True)]),

@@ -17,7 +17,7 @@ from ema_pipeline.modal.fit import (
     solve_linear,
     synthesis,
 )
-from ema_pipeline.modal.noise import Noise, fit_noise, larger
+from ema_pipeline.modal.noise import Noise, fit_law, larger, squared
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
 from ema_pipeline.modal.polish import polish
 
@@ -143,13 +143,17 @@ def measured_noise(
     data: FitData, hits: Noise | None, estimate: Estimate, shapes: Complex, weight: Real
 ) -> Noise:
     """Noise from what the fit leaves over, and from the scatter over hits where that is larger."""
-    modes = synthesis(data, estimate, shapes)
-    model = modes + residual_fit(data, weight, modes)
+    model = synthesis(data, estimate, shapes)
+    model += residual_fit(data, weight, model)
     n_lines = len(data.omega)
     n_ref = data.measured.shape[1]
     # the fit follows the noise a little: one shape entry per row and mode, and the residual terms
     linear = 2.0 * len(estimate.poles) / max(n_ref, 1) + 8.0
     share = max(1.0 - linear / (2.0 * n_lines), 0.3)
-    left = np.abs(data.frf - model) ** 2 / share
-    found = fit_noise(left, model, data.measured, inputs_are_rows=data.transposed)
+    left = squared(data.frf - model)
+    left /= share
+    law = fit_law(left, model, data.measured, inputs_are_rows=data.transposed)
+    del left  # as large as what follows
+    found = law.at(model)
+    del model
     return found if hits is None else larger(found, hits)

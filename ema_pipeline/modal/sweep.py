@@ -22,7 +22,14 @@ from ema_pipeline.modal.credibility import (
 )
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.engines import MODES_PER_PEAK, SPARE_MODES
-from ema_pipeline.modal.fit import Estimate, best_shapes, free_participations, normalised, solve_linear
+from ema_pipeline.modal.fit import (
+    Estimate,
+    best_shapes,
+    free_participations,
+    normalised,
+    shapes_by_lines,
+    solve_linear,
+)
 from ema_pipeline.modal.missed import Search, missed
 from ema_pipeline.modal.noise import NoiseLaw
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, at_peak
@@ -218,11 +225,11 @@ def _voters(poles: PoleSet) -> Callable[[Estimate], Real]:
 def _shapes(window: Window, estimate: Estimate) -> Complex:
     """Shapes that fit best on all lines, (n_rows, n_modes)."""
 
-    def of_rows(rows: slice) -> Complex:
-        some = window.rows(rows).near()
-        return best_shapes(some.data, some.noise.weight(some.data.measured), estimate)
+    def known(lines: slice) -> tuple[Complex, Real]:
+        some = window.lines(lines.start, lines.stop).near()
+        return some.data.frf, some.noise.weight(some.data.measured)
 
-    return np.concatenate(list(in_order(of_rows, window.data.row_blocks())))
+    return shapes_by_lines(window.data, known, window.data.line_blocks(), estimate)
 
 
 def _fit_part(

@@ -137,6 +137,10 @@ class LeftOut:
     reason: str
 
 
+NO_SYNTHESIS = np.zeros((0, 0, 0), dtype=np.complex64)
+"""In place of a synthesis that was not loaded: it is as large as the FRFs."""
+
+
 @dataclass(frozen=True)
 class ModalModel:
     """Everything identified from one configuration's FRFs.
@@ -158,7 +162,7 @@ class ModalModel:
     frequency_hz : ndarray, (n_lines,)
         Lines of the band analysed.
     synthesis : complex ndarray, (n_outputs, n_inputs, n_lines)
-        Accelerance that the modes and residuals give at these lines.
+        Accelerance that the modes and residuals give at these lines, in single precision: it is there to be looked at.
     outputs, inputs : tuple of Dof
         DOFs of `synthesis`.
     chart : StabilisationChart
@@ -175,7 +179,7 @@ class ModalModel:
     scaling_note: str
     references: tuple[Dof, ...]
     frequency_hz: NDArray[np.float64]
-    synthesis: NDArray[np.complex128]
+    synthesis: NDArray[np.complex64]
     outputs: tuple[Dof, ...]
     inputs: tuple[Dof, ...]
     chart: StabilisationChart

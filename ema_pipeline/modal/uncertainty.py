@@ -17,6 +17,7 @@ from ema_pipeline.modal.fit import (
 )
 from ema_pipeline.modal.noise import Noise
 from ema_pipeline.modal.windowed import power_of
+from ema_pipeline.threads import in_order
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -53,13 +54,13 @@ def parameter_covariance(
     residual = residual_columns(data.omega)
     n_rows, n_ref, n_lines = data.frf.shape
     n_par = z.shape[-1]
-    meat = np.zeros((n_par, n_par))
     # what all outputs share adds up over the outputs of one input before it is squared
     together = [[(o, i) for i in range(n_ref)] for o in range(n_rows)]
     if not data.transposed:
         together = [list(group) for group in zip(*together, strict=True)]
-    for group in together:
-        coherent = np.zeros((n_par, n_lines), dtype=np.complex128)
+
+    def meat_of(group: list[tuple[int, int]]) -> Real:
+        meat, coherent = np.zeros((n_par, n_par)), np.zeros((n_par, n_lines), dtype=np.complex128)
         for o, i in group:
             w = weight[o, i]
             if not np.any(w):
@@ -72,7 +73,9 @@ def parameter_covariance(
             size = np.abs(data.frf[o, i])
             phase = np.where(size > 0, data.frf[o, i] / np.maximum(size, 1e-300), 0.0)
             coherent += a.conj() * (np.sqrt(noise.common[o, i]) * phase)
-        meat += 0.5 * power_of(coherent, data)
+        return meat + 0.5 * power_of(coherent, data)
+
+    meat = sum(in_order(meat_of, together))
     parameters = inverse @ meat @ inverse
     return np.asarray(0.5 * (parameters + parameters.T))
 

@@ -6,18 +6,20 @@ import json
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from ema_pipeline.files import replace_file
 from ema_pipeline.loops.summary import summary, terminal_lines
 from ema_pipeline.loops.types import Estimate, IsolatorResult, Loop, LoopModel
-from ema_pipeline.report import diagnosis, style, summary_files
+from ema_pipeline.report import diagnosis, summary_files
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.results import LoopResults, RunResults
 from ema_pipeline.report.tables import Row, Table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def write_loops_summary(results: RunResults, found: LoopResults, path: Path) -> None:
@@ -222,6 +224,8 @@ def _unit(unit: str) -> str:
 
 def write_loops_plots(results: RunResults, found: LoopResults, folder: Path) -> None:
     """Write every figure as PNG and SVG into `folder`."""
+    from ema_pipeline.report import style  # loads the drawing library, which the page does without
+
     folder.mkdir(exist_ok=True)
     for name, figure in _figures(results, found).items():
         replace_file(folder / f"{name}.png", style.png(figure))

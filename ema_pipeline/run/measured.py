@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+
 from ema_pipeline.correlate.measured import MeasuredModes, from_modal_model
-from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.frf.types import FrfSet, unknown
 from ema_pipeline.levels.linear import structure, structure_frfs
 from ema_pipeline.levels.types import LevelStudy
-from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.modal.types import NO_SYNTHESIS, ModalModel
 from ema_pipeline.run.types import Run
 
 
@@ -15,8 +19,12 @@ def modes_of_structure(run: Run, configuration: str) -> ModalModel:
 
     Those of all hits, or those of one force level where the answer depends on the level.
     """
-    modal = run.store.load("modal", configuration, "modal", ModalModel)
-    return structure(modal, level_study(run, configuration))
+    return structure(modes_alone(run, configuration), level_study(run, configuration))
+
+
+def modes_alone(run: Run, configuration: str) -> ModalModel:
+    """The modes of a configuration without the FRFs that they give."""
+    return run.store.load("modal", configuration, "modal", ModalModel, {"synthesis": NO_SYNTHESIS})
 
 
 def measured_modes(run: Run) -> dict[str, MeasuredModes]:
@@ -41,6 +49,12 @@ def measured_frfs(run: Run) -> dict[str, FrfSet]:
     return {
         name: structure_frfs(frfs, level_study(run, name)) for name, frfs in found.items() if frfs is not None
     }
+
+
+def without_coherence(run: Run, configuration: str) -> FrfSet:
+    """The FRFs of a configuration, with NaN in place of their coherence, which would take half as much memory."""
+    frfs = run.store.load("frf", configuration, "frfs", FrfSet, {"coherence": np.zeros(0)})
+    return replace(frfs, coherence=unknown(frfs.frf.shape))
 
 
 def level_study(run: Run, configuration: str) -> LevelStudy | None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.run.measured import modes_alone
 from ema_pipeline.run.records import accepted_hits
 from ema_pipeline.run.types import Progress, Run
 
@@ -25,9 +23,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     from ema_pipeline.levels.study import study_levels, with_circles
 
     frfs = run.store.load("frf", configuration, "frfs", FrfSet)
-    modal = run.store.load("modal", configuration, "modal", ModalModel)
-    # The synthesised FRFs are as large as the measured ones, and not asked for.
-    modal = replace(modal, synthesis=modal.synthesis[..., :0].copy())
+    modal = modes_alone(run, configuration)
     study = study_levels(
         lambda: accepted_hits(run.store, configuration),
         frfs,

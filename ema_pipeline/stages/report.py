@@ -26,7 +26,7 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     from ema_pipeline.report.html import write_report  # drawing libraries are loaded where they are needed
 
     folder = run.store.folder
-    results = load_results(run)
+    results = load_results(run, synthesis=False)
     if results.loops is not None:
         from ema_pipeline.report.loops import write_loops_summary
 

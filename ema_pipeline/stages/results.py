@@ -19,7 +19,7 @@ from ema_pipeline.levels.linear import structure, structure_frfs
 from ema_pipeline.levels.sentences import flagged
 from ema_pipeline.loops.types import IsolatorResult
 from ema_pipeline.mechanics.system import LinearSystem
-from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.modal.types import NO_SYNTHESIS, ModalModel
 from ema_pipeline.report.results import ConfigurationResults, LoopResults, RunResults
 from ema_pipeline.run.measured import level_study
 from ema_pipeline.run.models import diagnosed_choices, diagnosis_is_of_other_data
@@ -28,14 +28,19 @@ from ema_pipeline.store import ALL
 from ema_pipeline.verdict import Verdict
 
 
-def load_results(run: Run) -> RunResults:
-    """Everything that has been computed so far; what is missing is None or empty."""
+def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
+    """Everything that has been computed so far; what is missing is None or empty.
+
+    Without `synthesis` the FRFs that the modes give, which only figures for print show, stay where they are.
+    """
+    left_out = {} if synthesis else {"synthesis": NO_SYNTHESIS}
     fit = run.store.find("fit", ALL, "fit", FitResult)
     values = fitted_values(fit)
     configurations = []
     kind = kind_of(run.info)
     for name in run.info.configurations:
-        modal, levels = run.store.find("modal", name, "modal", ModalModel), level_study(run, name)
+        modal = run.store.find("modal", name, "modal", ModalModel, left_out)
+        levels = level_study(run, name)
         frfs = run.store.find("frf", name, "frfs", FrfSet)
         configurations.append(
             ConfigurationResults(

@@ -192,7 +192,7 @@ def _assemble(
                 flags=_remarks(targets, index),
             )
         )
-    synthesis = np.full((*measured.shape, f.size), np.nan, dtype=complex)
+    synthesis = np.full((*measured.shape, f.size), np.nan, dtype=np.complex64)
     synthesis[data.output, data.input] = total * 2j * np.pi * f
     note = "" if scaled else "no driving point" if frfs.force_calibrated else "the hammer is not calibrated"
     none = np.empty(0)

@@ -15,6 +15,7 @@ from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.frf.windows import Windows
 from ema_pipeline.ingest.records import HitSamples
+from ema_pipeline.threads import in_order
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -156,29 +157,45 @@ def spectra_of_hits(
     spectra : list of complex ndarray, (n_hits, n_outputs, n_lines)
         Per window, as accelerance; NaN where a channel was left out.
     """
-    keys, parts = [], []
+    keys: list[HitKey] = []
+    stacked: list[list[Complex]] = [[] for _ in windows]
     place = {d.point: k for k, d in enumerate(frfs.outputs)}
     for hit in hits():
         keys.append(
             HitKey(hit.hit.file, hit.hit.number, hit.hit.impact.point, float(abs(hit.hit.peak_force)))
         )
-        frf = _one_hit(hit, frfs, settings, place)
-        parts.append([frf[np.ix_(w.outputs, np.arange(w.lines.start, w.lines.stop))] for w in windows])
-    stacked = [np.array([p[k] for p in parts]) for k in range(len(windows))]
+        for found, part in zip(stacked, _one_hit(hit, settings, place, windows), strict=True):
+            found.append(part)
+    spectra = [np.array(found) for found in stacked]
     power = {"acceleration": 0, "velocity": 1, "displacement": 2}
-    for window, values in zip(windows, stacked, strict=True):
+    for window, values in zip(windows, spectra, strict=True):
         jw = 2j * np.pi * frfs.frequency_hz[window.lines]
         values *= np.array([jw ** power[frfs.quantities[o]] for o in window.outputs])
-    return tuple(keys), stacked
+    return tuple(keys), spectra
 
 
-def _one_hit(hit: HitSamples, frfs: FrfSet, settings: FrfSettings, place: dict[str, int]) -> Complex:
-    """Response over force of one hit, (n_outputs, n_lines); NaN where a channel was left out."""
+def _one_hit(
+    hit: HitSamples, settings: FrfSettings, place: dict[str, int], windows: tuple[PeakWindow, ...]
+) -> list[Complex]:
+    """Response over force of one hit, (n_outputs, n_lines) per window; NaN where a channel was left out."""
     prepared = Windows(hit, settings)
     force = np.asarray(rfft(prepared.force(hit.force))) * hit.hit.impact.sign
     safe = np.where(np.abs(force) > 0, force, 1.0)
-    out = np.full((len(frfs.outputs), len(force)), np.nan, dtype=np.complex128)
-    for row, channel in enumerate(hit.channels):
+    out = [np.full((len(w.outputs), w.lines.stop - w.lines.start), np.nan, dtype=complex) for w in windows]
+    seen = [dict(zip(w.outputs.tolist(), range(len(w.outputs)), strict=True)) for w in windows]
+
+    def read(row: int) -> None:
+        channel = hit.channels[row]
+        output = place[channel.dof.point]
+        wanted = [k for k, rows in enumerate(seen) if output in rows]
+        if not wanted:
+            return
         samples = prepared.responses(np.asarray(hit.responses[row : row + 1]))[0]
-        out[place[channel.dof.point]] = channel.dof.sign * np.asarray(rfft(samples)) / safe
+        spectrum = channel.dof.sign * np.asarray(rfft(samples))
+        for k in wanted:
+            lines = windows[k].lines
+            out[k][seen[k][output]] = spectrum[lines] / safe[lines]
+
+    for _ in in_order(read, range(len(hit.channels))):
+        pass
     return out

@@ -156,7 +156,7 @@ def frf_overview(frfs: FrfSet, modal: ModalModel | None) -> Figure:
     return figure
 
 
-def phase_deg(frf: NDArray[np.complex128]) -> NDArray[np.float64]:
+def phase_deg(frf: NDArray[np.complex128] | NDArray[np.complex64]) -> NDArray[np.float64]:
     """Phase in degrees, NaN after each wrap so that no vertical line is drawn there."""
     phase = np.rad2deg(np.angle(frf))
     wraps = np.flatnonzero(np.abs(np.diff(phase)) > 180) + 1
@@ -164,7 +164,7 @@ def phase_deg(frf: NDArray[np.complex128]) -> NDArray[np.float64]:
     return np.asarray(phase)
 
 
-def _synthesis_of(modal: ModalModel, frfs: FrfSet, o: int, i: int) -> NDArray[np.complex128] | None:
+def _synthesis_of(modal: ModalModel, frfs: FrfSet, o: int, i: int) -> NDArray[np.complex64] | None:
     outputs = [d.point for d in modal.outputs]
     inputs = [d.point for d in modal.inputs]
     out, inp = frfs.outputs[o].point, frfs.inputs[i].point
