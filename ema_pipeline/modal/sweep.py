@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.modal.all_rows import linear_fit, placed
 from ema_pipeline.modal.bands import SubBand
 from ema_pipeline.modal.compress import Local, Window, compress, compressible
 from ema_pipeline.modal.credibility import (
@@ -22,15 +23,24 @@ from ema_pipeline.modal.credibility import (
 )
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.engines import MODES_PER_PEAK, SPARE_MODES
-from ema_pipeline.modal.fit import Estimate, best_shapes, free_participations, normalised, solve_linear
+from ema_pipeline.modal.fit import (
+    Estimate,
+    Step,
+    best_shapes,
+    free_participations,
+    newton_step,
+    normalised,
+    solve_linear,
+)
 from ema_pipeline.modal.missed import Search, missed
 from ema_pipeline.modal.noise import NoiseLaw
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, at_peak
 from ema_pipeline.modal.poles import PoleSet
-from ema_pipeline.modal.segment import SegmentFit, fit_segment, measured_noise
+from ema_pipeline.modal.segment import SegmentFit, fit_segment
 from ema_pipeline.modal.selection import link, votes
 from ema_pipeline.modal.uncertainty import (
     left_to_go,
+    of_all_rows,
     parameter_covariance,
     scatter_over_points,
     scores_of_points,
@@ -193,7 +203,7 @@ def refined(
         fit = _with_peaks(few, fit, seen.absent(fit.estimate), _voters(chart), iterations, peaks)
         fit = _with_wanted(few, fit, asked.absent(fit.estimate), iterations, peaks)
         if len(fit.estimate.poles):
-            parts.append(_final(lines, few.data, fit, part))
+            parts.append(_final(lines, few.data, fit, part, iterations))
     n_rows, n_ref = data.measured.shape
     empty = FittedModes(
         np.zeros(0, complex),
@@ -327,32 +337,44 @@ def _holds(larger: Estimate, smaller: Estimate) -> bool:
     return bool(np.all(distance < 2 * -smaller.poles.real))
 
 
-def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand) -> FittedModes:
+def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand, iterations: int) -> FittedModes:
     """Modes of a sub-band's core with their uncertainties, and with shapes at all rows."""
-    estimate = fit.estimate
+    core = np.flatnonzero(between(fit.estimate.poles, part.low, part.high))
     weight = fit.noise.weight(few.measured)
-    parameters = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
     transposed = window.data.transposed
     if compressible(window.data):
-        first = parameters
+        all_rows = placed(window, fit, iterations)
+        estimate, held = all_rows.estimate, all_rows.held
+        solution = solve_linear(few, weight, estimate)
+        first = of_all_rows(
+            parameter_covariance(few, weight, estimate, solution, fit.noise),
+            newton_step(estimate, solution).information,
+            all_rows.information,
+        )
 
         def of_rows(rows: slice) -> tuple[Complex, Real, Real, Real]:
-            linear = _linear_fit(window.rows(rows), estimate)
+            linear = linear_fit(window.rows(rows), estimate)
             scores = scores_of_points(transposed, estimate, linear[1].solution)
             return *_shapes_and_stds(*linear, first), *scores
 
         each = zip(*in_order(of_rows, window.data.row_blocks()), strict=True)
-        some_shapes, some_stds, scores, information = (list(x) for x in each)
+        some_shapes, some_stds, some_scores, some_information = (list(x) for x in each)
         shapes, stds = np.concatenate(some_shapes), np.concatenate(some_stds)
-        points = np.concatenate(scores) if transposed else np.sum(scores, axis=0)
-        parameters = _widened(parameters, scatter_over_points(points, np.sum(information, axis=0)))
+        scores = np.concatenate(some_scores) if transposed else np.sum(some_scores, axis=0)
+        information = np.sum(some_information, axis=0)
+        parameters = _widened(first, scatter_over_points(scores, information))
     else:
-        scatter = scatter_over_points(*scores_of_points(transposed, estimate, fit.solution))
-        parameters = _widened(parameters, scatter)
+        estimate, held = fit.estimate, fit.held
+        scores, information = scores_of_points(transposed, estimate, fit.solution)
+        parameters = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
+        parameters = _widened(parameters, scatter_over_points(scores, information))
         shapes, stds = _shapes_and_stds(few, fit, parameters)
-    core = np.flatnonzero(between(estimate.poles, part.low, part.high))
     pole_cov = np.array([parameters[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] for r in core]).reshape(-1, 2, 2)
-    rest = left_to_go(estimate, fit.solution)[core]
+    m = len(estimate.poles)
+    rest = left_to_go(Step(information, scores.sum(axis=0)))[: 2 * m].reshape(-1, 2)
+    # a held pole is as far from its place as the fit that drove it away would have it
+    driven = left_to_go(newton_step(fit.estimate, fit.solution))[: 2 * m].reshape(-1, 2)
+    rest = np.where(held[:, None], driven, rest)[core]
     far = np.einsum("ra,rab,rb->r", rest, np.linalg.pinv(pole_cov), rest)
     return FittedModes(
         poles=estimate.poles[core],
@@ -361,7 +383,7 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand) -> Fitt
         shape_stds=stds.T[core],
         participation=estimate.participation[core],
         participation_stds=_participation_stds(estimate, parameters)[core],
-        held=fit.held[core],
+        held=held[core],
         restless=far > AT_REST,
     )
 
@@ -371,18 +393,6 @@ def _widened(covariance: Real, scatter: Real) -> Real:
     own = np.diag(covariance)
     factor = np.sqrt(np.maximum(np.diag(scatter) / np.where(own > 0, own, np.inf), 1.0))
     return np.asarray(covariance * factor[:, None] * factor)
-
-
-def _linear_fit(window: Window, estimate: Estimate) -> tuple[FitData, SegmentFit]:
-    """Shapes of some rows for poles that are known, at the noise that they leave over."""
-    local = window.near()
-    data, noise = local.data, local.noise
-    for _ in range(2):
-        weight = noise.weight(data.measured)
-        shapes = best_shapes(data, weight, estimate)
-        noise = measured_noise(data, local.hits, estimate, shapes, weight)
-    solution = solve_linear(data, noise.weight(data.measured), estimate)
-    return data, SegmentFit(estimate, solution, noise, np.zeros(len(estimate.poles), dtype=bool))
 
 
 def _shapes_and_stds(data: FitData, fit: SegmentFit, parameters: Real) -> tuple[Complex, Real]:

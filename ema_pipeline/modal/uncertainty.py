@@ -10,6 +10,7 @@ from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import (
     Estimate,
     LinearSolution,
+    Step,
     mixing,
     newton_step,
     parameter_columns,
@@ -136,14 +137,28 @@ def scatter_over_points(scores: Real, information: Real) -> Real:
     return np.asarray(inverse @ (off.T @ off) @ inverse * n / (n - 1))
 
 
-def left_to_go(estimate: Estimate, solution: LinearSolution) -> Real:
-    """Step (Re s, Im s) that each pole would still take to the best fit, (n_modes, 2).
+def of_all_rows(covariance: Real, information: Real, everything: Real) -> Real:
+    """Covariance from combinations of rows, with each variance as much smaller as all rows know more.
+
+    Parameters
+    ----------
+    covariance, information : ndarray, (n_parameters, n_parameters)
+        Of the combinations.
+    everything : ndarray, (n_parameters, n_parameters)
+        Information of all rows.
+    """
+    ratio = np.diag(_inverse(everything)) / np.diag(_inverse(information))
+    factor = np.sqrt(np.maximum(ratio, 0.0))
+    return np.asarray(covariance * factor[:, None] * factor)
+
+
+def left_to_go(step: Step) -> Real:
+    """Step that each parameter would still take to the best fit, (n_parameters,).
 
     About nothing after a polish that has converged; for poles that are not polished, or not placed by it, the
     size of their bias.
     """
-    step = newton_step(estimate, solution)
-    return (_inverse(step.information) @ step.gradient)[: 2 * len(estimate.poles)].reshape(-1, 2)
+    return np.asarray(_inverse(step.information) @ step.gradient)
 
 
 def shape_covariance(
