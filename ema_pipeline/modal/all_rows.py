@@ -1,8 +1,9 @@
-"""Poles placed by all rows, each by its own noise.
+"""Poles placed by all struck points, each by its own noise.
 
-Combinations of rows find the modes at a fraction of the work. They weigh a row alike at all lines, and mix rows that
-one mode model describes well with others that it does not: points struck harder, or near a node. Where rows differ in
-this, poles from combinations scatter by several times what those of all rows do.
+With a roving hammer rows are points, and no two points were struck alike. Combinations of rows find the modes at a
+fraction of the work, but they weigh a row alike at all lines, and mix points that one mode model describes well with
+others that it does not: struck harder, at another time, or near a node. Poles from combinations then scatter by several
+times what those of all rows do. Many sensors of the same hits do not differ in this.
 """
 
 from __future__ import annotations
@@ -30,24 +31,6 @@ FARTHEST = 1.0
 
 
 @dataclass(frozen=True)
-class Placed:
-    """Modes where all rows want them.
-
-    Attributes
-    ----------
-    estimate : Estimate
-    held : ndarray of bool, (n_modes,)
-        Modes that stay where combinations of rows have them: held there before, or driven away by the rows.
-    information : ndarray, (n_parameters, n_parameters)
-        Of all rows, shapes eliminated.
-    """
-
-    estimate: Estimate
-    held: NDArray[np.bool_]
-    information: Real
-
-
-@dataclass(frozen=True)
 class _Sums:
     """What all blocks of rows add up to: weighted sum of squares and normal equations."""
 
@@ -55,7 +38,7 @@ class _Sums:
     step: Step
 
 
-def placed(window: Window, fit: SegmentFit, iterations: int) -> Placed:
+def placed(window: Window, fit: SegmentFit, iterations: int) -> tuple[Estimate, NDArray[np.bool_]]:
     """Modes of combinations of rows, placed where all rows want them.
 
     Parameters
@@ -65,8 +48,16 @@ def placed(window: Window, fit: SegmentFit, iterations: int) -> Placed:
         Of the combinations.
     iterations : int
         Of the descent at most; 0 keeps the poles where they are.
+
+    Returns
+    -------
+    Estimate
+    held : ndarray of bool, (n_modes,)
+        Modes that stay where `fit` has them: held there before, or driven away by the rows.
     """
     start, held = fit.estimate, fit.held
+    if not iterations:
+        return start, held
     blocks = window.data.row_blocks()
 
     def weight_of(rows: slice) -> Real:
@@ -84,11 +75,11 @@ def placed(window: Window, fit: SegmentFit, iterations: int) -> Placed:
         return _added(list(in_order(of_rows, list(zip(blocks, weights, strict=True)))))
 
     while True:
-        estimate, found = descend(start, sums, lambda _, found: found.step, iterations, held, ENOUGH)
+        estimate = descend(start, sums, lambda _, found: found.step, iterations, held, ENOUGH)[0]
         far = np.abs(estimate.poles - start.poles) > FARTHEST * -start.poles.real
         lost = (far | (impossible(window.data, estimate) & ~impossible(window.data, start))) & ~held
         if not lost.any():
-            return Placed(estimate, held, found.step.information)
+            return estimate, held
         start, held = put_back(estimate, start, lost), held | lost
 
 

@@ -30,7 +30,6 @@ from ema_pipeline.modal.fit import (
     free_participations,
     newton_step,
     normalised,
-    solve_linear,
 )
 from ema_pipeline.modal.missed import Search, missed
 from ema_pipeline.modal.noise import NoiseLaw
@@ -40,8 +39,9 @@ from ema_pipeline.modal.segment import SegmentFit, fit_segment
 from ema_pipeline.modal.selection import link, votes
 from ema_pipeline.modal.uncertainty import (
     left_to_go,
-    of_all_rows,
     parameter_covariance,
+    sandwich,
+    scatter_of_scores,
     scatter_over_points,
     scores_of_points,
     shape_covariance,
@@ -342,15 +342,23 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand, iterati
     core = np.flatnonzero(between(fit.estimate.poles, part.low, part.high))
     weight = fit.noise.weight(few.measured)
     transposed = window.data.transposed
-    if compressible(window.data):
-        all_rows = placed(window, fit, iterations)
-        estimate, held = all_rows.estimate, all_rows.held
-        solution = solve_linear(few, weight, estimate)
-        first = of_all_rows(
-            parameter_covariance(few, weight, estimate, solution, fit.noise),
-            newton_step(estimate, solution).information,
-            all_rows.information,
+    estimate, held = fit.estimate, fit.held
+    step = newton_step(estimate, fit.solution)
+    if compressible(window.data) and transposed:
+        estimate, held = placed(window, fit, iterations)
+        blocks = window.data.row_blocks()
+        linear = list(in_order(lambda rows: linear_fit(window.rows(rows), estimate), blocks))
+        scores, parts = zip(
+            *(scores_of_points(True, estimate, one.solution) for _, one in linear), strict=True
         )
+        points, information = np.concatenate(scores), np.sum(parts, axis=0)
+        first = sandwich(np.sum([_noise_of(*one) for one in linear], axis=0), information)
+        parameters = _widened(first, scatter_over_points(points, information))
+        some = [_shapes_and_stds(*one, first) for one in linear]
+        shapes, stds = (np.concatenate(x) for x in zip(*some, strict=True))
+        step = Step(information, points.sum(axis=0))
+    elif compressible(window.data):
+        first = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
 
         def of_rows(rows: slice) -> tuple[Complex, Real, Real, Real]:
             linear = linear_fit(window.rows(rows), estimate)
@@ -360,20 +368,19 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand, iterati
         each = zip(*in_order(of_rows, window.data.row_blocks()), strict=True)
         some_shapes, some_stds, some_scores, some_information = (list(x) for x in each)
         shapes, stds = np.concatenate(some_shapes), np.concatenate(some_stds)
-        scores = np.concatenate(some_scores) if transposed else np.sum(some_scores, axis=0)
-        information = np.sum(some_information, axis=0)
-        parameters = _widened(first, scatter_over_points(scores, information))
+        scatter = scatter_over_points(np.sum(some_scores, axis=0), np.sum(some_information, axis=0))
+        parameters = _widened(first, scatter)
     else:
-        estimate, held = fit.estimate, fit.held
-        scores, information = scores_of_points(transposed, estimate, fit.solution)
+        scatter = scatter_over_points(*scores_of_points(transposed, estimate, fit.solution))
         parameters = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
-        parameters = _widened(parameters, scatter_over_points(scores, information))
+        parameters = _widened(parameters, scatter)
         shapes, stds = _shapes_and_stds(few, fit, parameters)
     pole_cov = np.array([parameters[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] for r in core]).reshape(-1, 2, 2)
     m = len(estimate.poles)
-    rest = left_to_go(Step(information, scores.sum(axis=0)))[: 2 * m].reshape(-1, 2)
     # a held pole is as far from its place as the fit that drove it away would have it
-    driven = left_to_go(newton_step(fit.estimate, fit.solution))[: 2 * m].reshape(-1, 2)
+    driven, rest = (
+        left_to_go(x)[: 2 * m].reshape(-1, 2) for x in (newton_step(fit.estimate, fit.solution), step)
+    )
     rest = np.where(held[:, None], driven, rest)[core]
     far = np.einsum("ra,rab,rb->r", rest, np.linalg.pinv(pole_cov), rest)
     return FittedModes(
@@ -386,6 +393,11 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand, iterati
         held=held[core],
         restless=far > AT_REST,
     )
+
+
+def _noise_of(data: FitData, fit: SegmentFit) -> Real:
+    """What noise makes of the gradient of some rows."""
+    return scatter_of_scores(data, fit.noise.weight(data.measured), fit.estimate, fit.solution, fit.noise)
 
 
 def _widened(covariance: Real, scatter: Real) -> Real:

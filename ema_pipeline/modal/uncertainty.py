@@ -45,8 +45,25 @@ def parameter_covariance(
     ndarray, (n_parameters, n_parameters)
         In the order of `fit.parameter_columns`.
     """
+    meat = scatter_of_scores(data, weight, estimate, solution, noise)
+    return sandwich(meat, newton_step(estimate, solution).information)
+
+
+def sandwich(scatter: Real, information: Real) -> Real:
+    """Covariance of parameters from that of their gradient and from the information of the fit."""
+    inverse = _inverse(information)
+    parameters = inverse @ scatter @ inverse
+    return np.asarray(0.5 * (parameters + parameters.T))
+
+
+def scatter_of_scores(
+    data: FitData, weight: Real, estimate: Estimate, solution: LinearSolution, noise: Noise
+) -> Real:
+    """Covariance of the gradient by noise, (n_parameters, n_parameters); arguments as of `parameter_covariance`.
+
+    With a roving hammer it adds up over rows.
+    """
     m = len(estimate.poles)
-    inverse = _inverse(newton_step(estimate, solution).information)
     mix = mixing(estimate.participation)
     z = parameter_columns(estimate, solution.shapes)
     eliminated = _eliminated(estimate, solution)
@@ -74,8 +91,7 @@ def parameter_covariance(
             phase = np.where(size > 0, data.frf[o, i] / np.maximum(size, 1e-300), 0.0)
             coherent += a.conj() * (np.sqrt(noise.common[o, i]) * phase)
         meat += 0.5 * power_of(coherent, data)
-    parameters = inverse @ meat @ inverse
-    return np.asarray(0.5 * (parameters + parameters.T))
+    return meat
 
 
 FEWEST_GROUPS = 5
@@ -135,21 +151,6 @@ def scatter_over_points(scores: Real, information: Real) -> Real:
     off = scores - scores.mean(axis=0)
     inverse = _inverse(information)
     return np.asarray(inverse @ (off.T @ off) @ inverse * n / (n - 1))
-
-
-def of_all_rows(covariance: Real, information: Real, everything: Real) -> Real:
-    """Covariance from combinations of rows, with each variance as much smaller as all rows know more.
-
-    Parameters
-    ----------
-    covariance, information : ndarray, (n_parameters, n_parameters)
-        Of the combinations.
-    everything : ndarray, (n_parameters, n_parameters)
-        Information of all rows.
-    """
-    ratio = np.diag(_inverse(everything)) / np.diag(_inverse(information))
-    factor = np.sqrt(np.maximum(ratio, 0.0))
-    return np.asarray(covariance * factor[:, None] * factor)
 
 
 def left_to_go(step: Step) -> Real:
