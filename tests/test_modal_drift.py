@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from simulate_modal import TrueSystem, random_system, records_of, simulate_hits
+from simulate_modal import TrueSystem, frf_set, random_system, records_of, simulate_hits
 
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
@@ -16,6 +17,7 @@ from ema_pipeline.ingest.records import HitSamples, cut_hit
 from ema_pipeline.modal.drift.shifts import movement
 from ema_pipeline.modal.earned import has_peak
 from ema_pipeline.modal.fit import Estimate
+from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.left_out import left_out, sentences
 from ema_pipeline.modal.moving import HitModes, identify_hits
 from ema_pipeline.modal.peaks import KnownPeaks
@@ -123,6 +125,27 @@ def test_hits_that_do_not_move_are_left_as_they_are() -> None:
     found = identified(SYSTEM, 3, [0, 3])
     assert not found.alignment.aligned
     assert not any("moves" in flag for mode in found.modal.modes for flag in mode.flags)
+
+
+def test_points_at_which_modes_have_moved_do_not_take_the_others_with_them() -> None:
+    rng = np.random.default_rng(3)
+    points, outputs = list(range(40)), [0, 1, 2]
+    system = random_system(
+        rng, n_modes=5, n_dofs=40, low_hz=60, high_hz=340, min_spacing=0.05, damping=(0.003, 0.01)
+    )
+    f = np.arange(1, 3201) * 0.125
+    frf = np.empty((3, 40, len(f)), dtype=complex)
+    for i in points:  # every fourth was struck while the modes were elsewhere, each by 0.2 %
+        moved = 1 + (2e-3 if i % 4 == 0 else 1e-5) * rng.standard_normal(5)
+        there = replace(system, frequency_hz=system.frequency_hz * moved)
+        frf[:, i] = there.accelerance(f, outputs, [i])[:, 0]
+    noise = rng.standard_normal(frf.shape) + 1j * rng.standard_normal(frf.shape)
+    frf += 1e-3 * np.median(np.abs(frf)) * noise
+    model = identify(frf_set(f, frf, outputs, points), ModalSettings())
+    for true, zeta in zip(system.frequency_hz, system.damping_ratio, strict=True):
+        mode = min(model.modes, key=lambda m, true=true: abs(m.frequency_hz - true))
+        assert mode.frequency_hz == pytest.approx(true, rel=6e-5)
+        assert mode.damping_ratio == pytest.approx(zeta, rel=3e-3)
 
 
 def test_estimates_that_disagree_widen_the_interval_and_two_of_them_move_the_value() -> None:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from typing import Protocol, TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,6 +32,85 @@ CONVERGED = 1e-3
 hundredths of their standard deviation."""
 
 
+class Cost(Protocol):
+    """A linear solution."""
+
+    @property
+    def cost(self) -> float:
+        """Weighted sum of squares of the residual."""
+
+
+S = TypeVar("S", bound=Cost)
+
+
+def descend(
+    start: Estimate,
+    solve: Callable[[Estimate], S],
+    slope: Callable[[Estimate, S], Step],
+    iterations: int,
+    held: NDArray[np.bool_] | None = None,
+    enough: float = CONVERGED,
+) -> tuple[Estimate, S]:
+    """Levenberg–Marquardt on poles and participations.
+
+    Parameters
+    ----------
+    start : Estimate
+    solve : callable
+        Best linear solution of an estimate, with its cost.
+    slope : callable
+        Normal equations of the nonlinear parameters at an estimate and its solution.
+    iterations : int
+    held : ndarray of bool, (n_modes,), optional
+        Modes whose poles and participations stay as they are.
+    enough : float
+        Gain of a step below which the descent ends.
+
+    Returns
+    -------
+    Estimate, S
+        The best found; the start where no step improves it.
+    """
+    estimate = Estimate(start.poles, normalised(start.participation))
+    solution = solve(estimate)
+    damping = 1e-3
+    for _ in range(iterations):
+        step = slope(estimate, solution)
+        if held is not None:
+            step = _without(step, estimate, held)
+        diagonal = np.diag(step.information).copy()
+        diagonal = np.where(diagonal > 0, diagonal, 1.0)
+        scale = 1 / np.sqrt(diagonal)
+        accepted = False
+        change = np.zeros(len(diagonal))
+        for _ in range(6):
+            scaled = step.information * scale[:, None] * scale[None]
+            scaled[np.diag_indices_from(scaled)] += damping
+            try:
+                change = scale * np.linalg.lstsq(scaled, scale * step.gradient, rcond=1e-13)[0]
+                change = _limited(estimate, change)
+                trial = moved(estimate, change)
+                trial_solution = solve(trial)
+            except np.linalg.LinAlgError:  # a step too far: a shorter one may do
+                trial_solution = solution
+            if trial_solution.cost < solution.cost:
+                accepted = True
+                break
+            damping = max(10 * damping, 1e-6)
+        if not accepted:
+            break
+        gain = solution.cost - trial_solution.cost
+        estimate, solution = trial, trial_solution
+        damping *= 0.1
+        if gain < enough:
+            break
+        pivoted = normalised(estimate.participation)
+        if np.max(np.abs(estimate.participation)) > 1.5:
+            estimate = Estimate(estimate.poles, pivoted)
+            solution = solve(estimate)
+    return estimate, solution
+
+
 def polish(
     data: FitData,
     weight: Real,
@@ -35,7 +118,7 @@ def polish(
     iterations: int = MAX_ITERATIONS,
     held: NDArray[np.bool_] | None = None,
 ) -> tuple[Estimate, LinearSolution]:
-    """Levenberg–Marquardt on poles and participations, shapes and residual terms eliminated.
+    """Descend on poles and participations, shapes and residual terms eliminated.
 
     Parameters
     ----------
@@ -52,44 +135,7 @@ def polish(
     Estimate, LinearSolution
         The best found; the start where no step improves it.
     """
-    estimate = Estimate(start.poles, normalised(start.participation))
-    solution = solve_linear(data, weight, estimate)
-    damping = 1e-3
-    for _ in range(iterations):
-        step = newton_step(estimate, solution)
-        if held is not None:
-            step = _without(step, estimate, held)
-        diagonal = np.diag(step.information).copy()
-        diagonal = np.where(diagonal > 0, diagonal, 1.0)
-        scale = 1 / np.sqrt(diagonal)
-        accepted = False
-        change = np.zeros(len(diagonal))
-        for _ in range(6):
-            scaled = step.information * scale[:, None] * scale[None]
-            scaled[np.diag_indices_from(scaled)] += damping
-            try:
-                change = scale * np.linalg.lstsq(scaled, scale * step.gradient, rcond=1e-13)[0]
-                change = _limited(estimate, change)
-                trial = moved(estimate, change)
-                trial_solution = solve_linear(data, weight, trial)
-            except np.linalg.LinAlgError:  # a step too far: a shorter one may do
-                trial_solution = solution
-            if trial_solution.cost < solution.cost:
-                accepted = True
-                break
-            damping = max(10 * damping, 1e-6)
-        if not accepted:
-            break
-        gain = solution.cost - trial_solution.cost
-        estimate, solution = trial, trial_solution
-        damping *= 0.1
-        if gain < CONVERGED:
-            break
-        pivoted = normalised(estimate.participation)
-        if np.max(np.abs(estimate.participation)) > 1.5:
-            estimate = Estimate(estimate.poles, pivoted)
-            solution = solve_linear(data, weight, estimate)
-    return estimate, solution
+    return descend(start, partial(solve_linear, data, weight), newton_step, iterations, held)
 
 
 def _without(step: Step, estimate: Estimate, held: NDArray[np.bool_]) -> Step:

@@ -104,14 +104,14 @@ def fit_segment(
         if (strayed & ~held).any():
             strayed &= ~held
             before = Estimate(np.where(strayed, places, before.poles), before.participation)
-            estimate, held = _put_back(estimate, before, strayed), held | strayed
+            estimate, held = put_back(estimate, before, strayed), held | strayed
             continue
         lost = impossible(data, estimate) & ~impossible(data, before)
         if evident is not None and lost.any():
-            back = _put_back(estimate, before, lost)
+            back = put_back(estimate, before, lost)
             lost &= evident(data, back, solve_linear(data, weight, back))
             if lost.any():
-                estimate, held = _put_back(estimate, before, lost), held | lost
+                estimate, held = put_back(estimate, before, lost), held | lost
                 continue
         noise = measured_noise(data, hits, estimate, solution.shapes, weight)
         solution = solve_linear(data, noise.weight(data.measured), estimate)
@@ -133,7 +133,7 @@ def impossible(data: FitData, estimate: Estimate) -> NDArray[np.bool_]:
     return np.asarray((poles.real >= 0) | (zeta > MAX_DAMPING_RATIO) | outside)
 
 
-def _put_back(estimate: Estimate, before: Estimate, lost: NDArray[np.bool_]) -> Estimate:
+def put_back(estimate: Estimate, before: Estimate, lost: NDArray[np.bool_]) -> Estimate:
     """The modes as polished, but the lost ones as they were before."""
     participation = np.where(lost[:, None], before.participation, estimate.participation)
     return Estimate(np.where(lost, before.poles, estimate.poles), normalised(participation))

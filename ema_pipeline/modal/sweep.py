@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.modal.all_rows import linear_fit, placed
 from ema_pipeline.modal.bands import SubBand
 from ema_pipeline.modal.compress import Local, Window, compress, compressible
 from ema_pipeline.modal.credibility import (
@@ -24,21 +25,24 @@ from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.engines import MODES_PER_PEAK, SPARE_MODES
 from ema_pipeline.modal.fit import (
     Estimate,
+    Step,
     best_shapes,
     free_participations,
+    newton_step,
     normalised,
     shapes_by_lines,
-    solve_linear,
 )
 from ema_pipeline.modal.missed import Search, missed
 from ema_pipeline.modal.noise import NoiseLaw
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, at_peak
 from ema_pipeline.modal.poles import PoleSet
-from ema_pipeline.modal.segment import SegmentFit, fit_segment, measured_noise
+from ema_pipeline.modal.segment import SegmentFit, fit_segment
 from ema_pipeline.modal.selection import link, votes
 from ema_pipeline.modal.uncertainty import (
     left_to_go,
     parameter_covariance,
+    sandwich,
+    scatter_of_scores,
     scatter_over_points,
     scores_of_points,
     shape_covariance,
@@ -200,7 +204,7 @@ def refined(
         fit = _with_peaks(few, fit, seen.absent(fit.estimate), _voters(chart), iterations, peaks)
         fit = _with_wanted(few, fit, asked.absent(fit.estimate), iterations, peaks)
         if len(fit.estimate.poles):
-            parts.append(_final(lines, few.data, fit, part))
+            parts.append(_final(lines, few.data, fit, part, iterations))
     n_rows, n_ref = data.measured.shape
     empty = FittedModes(
         np.zeros(0, complex),
@@ -334,32 +338,51 @@ def _holds(larger: Estimate, smaller: Estimate) -> bool:
     return bool(np.all(distance < 2 * -smaller.poles.real))
 
 
-def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand) -> FittedModes:
+def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand, iterations: int) -> FittedModes:
     """Modes of a sub-band's core with their uncertainties, and with shapes at all rows."""
-    estimate = fit.estimate
+    core = np.flatnonzero(between(fit.estimate.poles, part.low, part.high))
     weight = fit.noise.weight(few.measured)
-    parameters = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
     transposed = window.data.transposed
-    if compressible(window.data):
-        first = parameters
+    estimate, held = fit.estimate, fit.held
+    step = newton_step(estimate, fit.solution)
+    if compressible(window.data) and transposed:
+        estimate, held = placed(window, fit, iterations)
+        blocks = window.data.row_blocks()
+        linear = list(in_order(lambda rows: linear_fit(window.rows(rows), estimate), blocks))
+        scores, parts = zip(
+            *(scores_of_points(True, estimate, one.solution) for _, one in linear), strict=True
+        )
+        points, information = np.concatenate(scores), np.sum(parts, axis=0)
+        first = sandwich(np.sum([_noise_of(*one) for one in linear], axis=0), information)
+        parameters = _widened(first, scatter_over_points(points, information))
+        some = [_shapes_and_stds(*one, first) for one in linear]
+        shapes, stds = (np.concatenate(x) for x in zip(*some, strict=True))
+        step = Step(information, points.sum(axis=0))
+    elif compressible(window.data):
+        first = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
 
         def of_rows(rows: slice) -> tuple[Complex, Real, Real, Real]:
-            linear = _linear_fit(window.rows(rows), estimate)
+            linear = linear_fit(window.rows(rows), estimate)
             scores = scores_of_points(transposed, estimate, linear[1].solution)
             return *_shapes_and_stds(*linear, first), *scores
 
         each = zip(*in_order(of_rows, window.data.row_blocks()), strict=True)
-        some_shapes, some_stds, scores, information = (list(x) for x in each)
+        some_shapes, some_stds, some_scores, some_information = (list(x) for x in each)
         shapes, stds = np.concatenate(some_shapes), np.concatenate(some_stds)
-        points = np.concatenate(scores) if transposed else np.sum(scores, axis=0)
-        parameters = _widened(parameters, scatter_over_points(points, np.sum(information, axis=0)))
+        scatter = scatter_over_points(np.sum(some_scores, axis=0), np.sum(some_information, axis=0))
+        parameters = _widened(first, scatter)
     else:
         scatter = scatter_over_points(*scores_of_points(transposed, estimate, fit.solution))
+        parameters = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
         parameters = _widened(parameters, scatter)
         shapes, stds = _shapes_and_stds(few, fit, parameters)
-    core = np.flatnonzero(between(estimate.poles, part.low, part.high))
     pole_cov = np.array([parameters[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] for r in core]).reshape(-1, 2, 2)
-    rest = left_to_go(estimate, fit.solution)[core]
+    m = len(estimate.poles)
+    # a held pole is as far from its place as the fit that drove it away would have it
+    driven, rest = (
+        left_to_go(x)[: 2 * m].reshape(-1, 2) for x in (newton_step(fit.estimate, fit.solution), step)
+    )
+    rest = np.where(held[:, None], driven, rest)[core]
     far = np.einsum("ra,rab,rb->r", rest, np.linalg.pinv(pole_cov), rest)
     return FittedModes(
         poles=estimate.poles[core],
@@ -368,9 +391,14 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand) -> Fitt
         shape_stds=stds.T[core],
         participation=estimate.participation[core],
         participation_stds=_participation_stds(estimate, parameters)[core],
-        held=fit.held[core],
+        held=held[core],
         restless=far > AT_REST,
     )
+
+
+def _noise_of(data: FitData, fit: SegmentFit) -> Real:
+    """What noise makes of the gradient of some rows."""
+    return scatter_of_scores(data, fit.noise.weight(data.measured), fit.estimate, fit.solution, fit.noise)
 
 
 def _widened(covariance: Real, scatter: Real) -> Real:
@@ -378,18 +406,6 @@ def _widened(covariance: Real, scatter: Real) -> Real:
     own = np.diag(covariance)
     factor = np.sqrt(np.maximum(np.diag(scatter) / np.where(own > 0, own, np.inf), 1.0))
     return np.asarray(covariance * factor[:, None] * factor)
-
-
-def _linear_fit(window: Window, estimate: Estimate) -> tuple[FitData, SegmentFit]:
-    """Shapes of some rows for poles that are known, at the noise that they leave over."""
-    local = window.near()
-    data, noise = local.data, local.noise
-    for _ in range(2):
-        weight = noise.weight(data.measured)
-        shapes = best_shapes(data, weight, estimate)
-        noise = measured_noise(data, local.hits, estimate, shapes, weight)
-    solution = solve_linear(data, noise.weight(data.measured), estimate)
-    return data, SegmentFit(estimate, solution, noise, np.zeros(len(estimate.poles), dtype=bool))
 
 
 def _shapes_and_stds(data: FitData, fit: SegmentFit, parameters: Real) -> tuple[Complex, Real]:

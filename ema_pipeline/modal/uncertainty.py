@@ -10,6 +10,7 @@ from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import (
     Estimate,
     LinearSolution,
+    Step,
     mixing,
     newton_step,
     parameter_columns,
@@ -45,8 +46,25 @@ def parameter_covariance(
     ndarray, (n_parameters, n_parameters)
         In the order of `fit.parameter_columns`.
     """
+    meat = scatter_of_scores(data, weight, estimate, solution, noise)
+    return sandwich(meat, newton_step(estimate, solution).information)
+
+
+def sandwich(scatter: Real, information: Real) -> Real:
+    """Covariance of parameters from that of their gradient and from the information of the fit."""
+    inverse = _inverse(information)
+    parameters = inverse @ scatter @ inverse
+    return np.asarray(0.5 * (parameters + parameters.T))
+
+
+def scatter_of_scores(
+    data: FitData, weight: Real, estimate: Estimate, solution: LinearSolution, noise: Noise
+) -> Real:
+    """Covariance of the gradient by noise, (n_parameters, n_parameters); arguments as of `parameter_covariance`.
+
+    With a roving hammer it adds up over rows.
+    """
     m = len(estimate.poles)
-    inverse = _inverse(newton_step(estimate, solution).information)
     mix = mixing(estimate.participation)
     z = parameter_columns(estimate, solution.shapes)
     eliminated = _eliminated(estimate, solution)
@@ -75,9 +93,7 @@ def parameter_covariance(
             coherent += a.conj() * (np.sqrt(noise.common[o, i]) * phase)
         return meat + 0.5 * power_of(coherent, data)
 
-    meat = sum(in_order(meat_of, together))
-    parameters = inverse @ meat @ inverse
-    return np.asarray(0.5 * (parameters + parameters.T))
+    return np.asarray(sum(in_order(meat_of, together)))
 
 
 FEWEST_GROUPS = 5
@@ -139,14 +155,13 @@ def scatter_over_points(scores: Real, information: Real) -> Real:
     return np.asarray(inverse @ (off.T @ off) @ inverse * n / (n - 1))
 
 
-def left_to_go(estimate: Estimate, solution: LinearSolution) -> Real:
-    """Step (Re s, Im s) that each pole would still take to the best fit, (n_modes, 2).
+def left_to_go(step: Step) -> Real:
+    """Step that each parameter would still take to the best fit, (n_parameters,).
 
     About nothing after a polish that has converged; for poles that are not polished, or not placed by it, the
     size of their bias.
     """
-    step = newton_step(estimate, solution)
-    return (_inverse(step.information) @ step.gradient)[: 2 * len(estimate.poles)].reshape(-1, 2)
+    return np.asarray(_inverse(step.information) @ step.gradient)
 
 
 def shape_covariance(
