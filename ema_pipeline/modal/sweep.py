@@ -26,7 +26,6 @@ from ema_pipeline.modal.engines import MODES_PER_PEAK, SPARE_MODES
 from ema_pipeline.modal.fit import (
     Estimate,
     Step,
-    best_shapes,
     free_participations,
     newton_step,
     normalised,
