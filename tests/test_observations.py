@@ -44,6 +44,31 @@ def chain_observations(seed: int = 0, lab=GOOD) -> ModeObservations:
     return observed(chain(), chain_modes(seed, lab))
 
 
+def test_a_mode_with_a_mix_of_close_shapes_is_a_double_and_one_with_a_shape_of_its_own_is_not() -> None:
+    random = np.random.default_rng(0)
+    shapes = random.standard_normal((5, 8))
+    shapes[2] = 0.6 * shapes[0] - 0.8 * shapes[1] + 0.05 * random.standard_normal(8)
+    shapes[4] = shapes[3]  # far away, a shape may come again
+    frequency = np.array([100.0, 100.3, 100.01, 150.0, 170.0])
+    measured = MeasuredModes(
+        "test", frequency, 1e-4 * frequency, np.full(5, 0.005), np.full(5, 1e-4), shapes.astype(complex),
+        np.full((5, 8), 1e-2), tuple(Dof.parse(f"m{k}.x") for k in range(8)), band_hz=(50.0, 200.0),
+    )  # fmt: skip
+    assert prepare(measured).double.tolist() == [
+        True,
+        True,
+        True,
+        False,
+        False,
+    ]  # any two of the three make the other
+    apart = replace(measured, frequency_hz=np.array([100.0, 100.3, 103.0, 150.0, 170.0]))
+    assert not np.any(prepare(apart).double)
+    few = replace(
+        measured, shapes=measured.shapes[:, :3], shape_std=np.full((5, 3), 1e-2), dofs=measured.dofs[:3]
+    )
+    assert not np.any(prepare(few).double)  # three sensors cannot tell three shapes apart
+
+
 # --- families and parts -----------------------------------------------------------------------------------
 
 

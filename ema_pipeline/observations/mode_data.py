@@ -13,6 +13,9 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.settings import AssumedSettings
 from ema_pipeline.dof import Dof
 
+_DOUBLE = 0.9
+"""Share of a shape's squares that shapes of modes within a half-width explain, from which it is no mode of its own."""
+
 
 @dataclass(frozen=True)
 class ModeData:
@@ -60,6 +63,26 @@ class ModeData:
     def squares(self) -> NDArray[np.float64]:
         """Sum of squares of every shape, (m,)."""
         return np.asarray(np.sum(self.known_shapes**2, axis=1))
+
+    @cached_property
+    def double(self) -> NDArray[np.bool_]:
+        """Mask of modes whose shape is a mix of those of modes within a half-width, (m,).
+
+        Drift and hits off their mark split close modes into more than there are. What a structure adds has a shape that
+        the others have not.
+        """
+        found = np.zeros(len(self), bool)
+        width = np.nan_to_num(np.exp(self.log_damping))
+        for i in range(len(self)):
+            near = np.abs(self.log_frequency - self.log_frequency[i]) < np.maximum(width, width[i])
+            near[i] = False
+            on = (self.seen[i] > 0) & np.all(self.seen[near] > 0, axis=0)
+            if not np.any(near) or np.sum(on) < np.sum(near) + 2:
+                continue
+            others, own = self.shapes[near][:, on].T, self.shapes[i, on]
+            left = own - others @ np.linalg.lstsq(others, own, rcond=None)[0]
+            found[i] = left @ left < (1 - _DOUBLE) * (own @ own)
+        return found
 
     def only(self, keep: NDArray[np.bool_]) -> ModeData:
         """The modes of a mask, (m,)."""

@@ -260,7 +260,7 @@ class Comparison:
             match=match,
             log_scale=self._usual(alone) if len(alone) else 0.0,
             penalty=UNEXPLAINED * len(alone) + UNSEEN * self._unseen(solution, to),
-            unexplained=len(alone),
+            unexplained=int(np.sum(~self.data.double[alone])),
             projected=len(on) if self.data.shapes.shape[1] else 0,
         )
 
