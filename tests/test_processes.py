@@ -13,10 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ema_pipeline import pipeline
+from ema_pipeline import keys, pipeline
 from ema_pipeline.errors import EmaError
 from ema_pipeline.processes import Send, side_by_side
-from ema_pipeline.stages.base import Progress, Run, save_info
+from ema_pipeline.run.opening import describe_run, new_run, save_info
+from ema_pipeline.run.settings import PipelineSettings
+from ema_pipeline.run.types import Progress, Run
 from ema_pipeline.store import Store
 from ema_pipeline.threads import cores, in_order, over_rows, share_cores
 
@@ -140,12 +142,13 @@ def test_one_configuration_alone_has_a_process_of_its_own(
             return {"process": os.getpid()}
 
     monkeypatch.setattr(pipeline, "stage_module", lambda name: Stage())
-    settings = pipeline.PipelineSettings(processes=processes)
-    info = pipeline.describe_run("hammer", tmp_path, "", "", "", ("default",), (), settings)
+    monkeypatch.setattr(keys, "stage_module", lambda name: Stage())
+    settings = PipelineSettings(processes=processes)
+    info = describe_run("hammer", tmp_path, "", "", "", ("default",), (), settings)
     store = Store(tmp_path)
     save_info(store, info)
     with store.lock():
-        assert pipeline.run_stages(pipeline.new_run(store, info), ["ingest"]) == ["ingest (default)"]
+        assert pipeline.run_stages(new_run(store, info), ["ingest"]) == ["ingest (default)"]
     assert (store.load("ingest", "default", "process", int) != os.getpid()) == apart
 
 
