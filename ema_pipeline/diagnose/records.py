@@ -167,8 +167,10 @@ def whole_ladder(observations: RecordObservations, library: Mapping[str, Effect]
         return whole
     windows = observations.in_windows(SEARCHED)
     rungs = tuple(_with_calibration(windows, library, searched, r) for r in searched.rungs)
-    notes = [n for n in searched.note.split("; ") if n and n != _OUT_OF_STEP]
-    return dataclasses.replace(searched, rungs=rungs, note="; ".join([*notes, _OUT_OF_STEP]))
+    told = searched.note  # of a diagnosis, whose ladder may have come this way before
+    if _OUT_OF_STEP not in told:
+        told = f"{told}; {_OUT_OF_STEP}" if told else _OUT_OF_STEP
+    return dataclasses.replace(searched, rungs=rungs, note=told)
 
 
 def _refitted(observations: RecordObservations, library: Mapping[str, Effect], searched: Ladder) -> Ladder:

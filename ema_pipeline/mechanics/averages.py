@@ -5,8 +5,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-_FRICTION = 1
-"""Kind of law, see `mechanics.laws.LAWS`; the other one that comes here parts."""
+from ema_pipeline.mechanics.laws import FRICTION, LAWS, PARTING
+
+_parting = numba.njit(LAWS[PARTING], inline="always")
 OWN_PHASES = 8
 """Phases of the frequency itself; the describing function of a sign alone is then 3 % off."""
 _SATURATED = 20.0
@@ -15,13 +16,13 @@ _SATURATED = 20.0
 
 @numba.njit(inline="always")
 def _force(kind, a, b, c, x, v):  # type: ignore[no-untyped-def]
-    """Friction or parting at stretch `x` and rate `v`."""
-    if kind == _FRICTION:
+    """Friction or parting at stretch `x` and rate `v`; the derivative in the law of friction costs as much again."""
+    if kind == FRICTION:
         u = v / b
         if abs(u) > _SATURATED:
             return a if u > 0.0 else -a
         return a * np.tanh(u)
-    return a * (min(max(-x - b, 0.0), c) - max(-b, 0.0))
+    return _parting(x, v, a, b, c)[0]
 
 
 @numba.njit(cache=True)
@@ -61,7 +62,7 @@ def stiffness(kind, a, b, c, amplitude, omega, phases, offset):  # type: ignore[
             for p in range(sets):
                 stretch[p] += size * cos[k, p]
                 rate[p] -= omega[k] * size * sin[k, p]
-        if kind != _FRICTION and b >= 0.0 and reach - offset[s] <= b:
+        if kind == PARTING and b >= 0.0 and reach - offset[s] <= b:
             continue  # the teeth do not part
         for k in range(count):
             size = amplitude[s, k]
@@ -82,8 +83,8 @@ def stiffness(kind, a, b, c, amplitude, omega, phases, offset):  # type: ignore[
 
 
 @numba.njit(cache=True)
-def mean_force(kind, a, b, c, amplitude, phases, offset):  # type: ignore[no-untyped-def]
-    """Mean force of a law that parts, N, (n_states,); friction has none. Arguments as of `stiffness`."""
+def mean_force(a, b, c, amplitude, phases, offset):  # type: ignore[no-untyped-def]
+    """Mean force of teeth that part, N, (n_states,). Arguments as of `stiffness`."""
     states, count = amplitude.shape
     sets = phases.shape[1]
     cos = np.cos(phases)
@@ -96,7 +97,7 @@ def mean_force(kind, a, b, c, amplitude, phases, offset):  # type: ignore[no-unt
                 stretch[p] += amplitude[s, k] * cos[k, p]
         total = 0.0
         for p in range(sets):  # every set of phases and its opposite
-            total += _force(kind, a, b, c, offset[s] + stretch[p], 0.0)
-            total += _force(kind, a, b, c, offset[s] - stretch[p], 0.0)
+            total += _parting(offset[s] + stretch[p], 0.0, a, b, c)[0]
+            total += _parting(offset[s] - stretch[p], 0.0, a, b, c)[0]
         result[s] = total / (2 * sets)
     return result

@@ -21,10 +21,8 @@ from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.harmonic import describing_function
-from ema_pipeline.mechanics.laws import BoucWen, Nonlinear
+from ema_pipeline.mechanics.laws import FRICTION, POLYNOMIAL, BoucWen, Nonlinear
 
-POLYNOMIAL, FRICTION = 0, 1
-"""Kinds of laws, see `mechanics.laws.LAWS`. The averages of the first are known in closed form."""
 _PRIMES = (11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61)
 _GOLDEN = 0.6180339887498949
 _OFFSET_STEPS = 4
@@ -64,11 +62,11 @@ class Motions:
         if kind == POLYNOMIAL:
             square = 0.5 * np.sum(self.amplitude**2, axis=1)
             return np.asarray(quadratic * (offset**2 + square) + cubic * offset * (offset**2 + 3 * square))
-        if kind == FRICTION or element.law[2] == np.inf:  # odd in the rate; teeth that never part
+        if kind == FRICTION:  # odd in the rate
             return np.zeros(len(offset))
         from ema_pipeline.mechanics import averages  # compiled on first use
 
-        found = averages.mean_force(*element.law, self.amplitude, _phases(len(self.omega)), offset)
+        found = averages.mean_force(*element.law[1:], self.amplitude, _phases(len(self.omega)), offset)
         return np.asarray(found)
 
     def stiffness(self, element: Nonlinear, offset: Real) -> Complex:
@@ -86,8 +84,6 @@ class Motions:
             others = 0.5 * np.sum(each, axis=1, keepdims=True) - 0.5 * each
             about = offset[:, None]
             return (2 * quadratic * about + cubic * (3 * (about**2 + others) + 0.75 * each)).astype(complex)
-        if law[2] == np.inf:  # teeth that never part
-            return np.zeros(self.amplitude.shape, complex)
         from ema_pipeline.mechanics import averages  # compiled on first use
 
         phases = _phases(len(self.omega))

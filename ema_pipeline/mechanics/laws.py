@@ -122,7 +122,8 @@ def parting(stretch: float, rate: float, k: float, preload: float, gap: float) -
 
 
 LAWS = (polynomial, friction, parting)
-"""Laws without memory, which `mechanics.batch` compiles."""
+"""Laws without memory, which `mechanics.batch` and `mechanics.equivalent` compile."""
+POLYNOMIAL, FRICTION, PARTING = range(len(LAWS))
 
 
 @dataclass(frozen=True)

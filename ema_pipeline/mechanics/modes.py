@@ -82,9 +82,14 @@ def total_damping(system: LinearSystem) -> NDArray[np.float64]:
     """Viscous matrix with the modal damping ratio turned into its matrix MΦ·diag(2ζω)·ΦᵀM, (n, n)."""
     if system.modal_damping_ratio == 0.0:
         return system.damping
+    return system.damping + modal_damping(system, system.modal_damping_ratio)
+
+
+def modal_damping(system: LinearSystem, ratio: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    """Viscous matrix of damping ratios of the modes, one for all or (n,), MΦ·diag(2ζω)·ΦᵀM, (n, n)."""
     values, shapes = eigen_solution(system)
     m_phi = system.mass @ shapes
-    return np.asarray(system.damping + (m_phi * (2 * system.modal_damping_ratio * np.sqrt(values))) @ m_phi.T)
+    return np.asarray((m_phi * (2 * ratio * np.sqrt(np.maximum(values, 0.0)))) @ m_phi.T)
 
 
 @dataclass(frozen=True)

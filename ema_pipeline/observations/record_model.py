@@ -21,7 +21,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Damper
 from ema_pipeline.mechanics.driven_slopes import ModalDamping, driven_derivatives, matrix_derivatives
-from ema_pipeline.mechanics.modes import eigen_solution
+from ema_pipeline.mechanics.modes import modal_damping
 from ema_pipeline.mechanics.simulation import (
     WITH_MEMORY,
     CodedElements,
@@ -297,10 +297,7 @@ class RecordModel:
         if len(ratios) == 1:  # the mode of one coordinate needs no eigenvalues
             critical = 2 * np.sqrt(np.maximum(system.mass * system.stiffness, 0.0))
             return dataclasses.replace(system, damping=system.damping + ratios * critical)
-        values, shapes = eigen_solution(system)
-        m_phi = system.mass @ shapes
-        damping = system.damping + (m_phi * (2 * ratios * np.sqrt(np.maximum(values, 0.0)))) @ m_phi.T
-        return dataclasses.replace(system, damping=damping)
+        return dataclasses.replace(system, damping=system.damping + modal_damping(system, ratios))
 
     def _system(self, matrices: Matrices) -> LinearSystem:
         """The matrices without the modes' damping."""
