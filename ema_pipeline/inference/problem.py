@@ -31,7 +31,7 @@ class Residuals:
     penalty : float
         Further cost, in units of the log posterior: measured modes that the model does not explain.
     unexplained : int
-        Number of measured modes among them.
+        Number of measured modes among them, doubles of others left out.
     projected : int
         Number of values that were spent on factors of no interest (one per shape).
     relative : ndarray, (m,), optional

@@ -131,7 +131,7 @@ def _tiles(results: RunResults) -> tuple[Tile, ...]:
             Tile(
                 "modes explained", f"{total - first.unexplained} of {total}",
                 f"{total - last.unexplained} of {total}" if more else "",
-                "measured modes with a counterpart in the model",
+                "measured modes with a counterpart in the model, and doubles of such",
             )
         )  # fmt: skip
     return tuple(tiles)

@@ -88,7 +88,7 @@ def rung_words(before: Sequence[str], effects: Sequence[str]) -> str:
 
 
 def unexplained_words(ladder: Ladder) -> str:
-    """Measured modes without a counterpart, before and after; empty where there are none."""
+    """Measured modes without a counterpart that are no doubles, before and after; empty where there are none."""
     if not ladder.rungs or not any(r.unexplained for r in ladder.rungs):
         return ""
     first, last = ladder.rungs[0].unexplained, ladder.rungs[-1].unexplained
