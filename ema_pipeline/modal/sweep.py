@@ -343,7 +343,7 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand, iterati
     weight = fit.noise.weight(few.measured)
     transposed = window.data.transposed
     estimate, held = fit.estimate, fit.held
-    step = newton_step(estimate, fit.solution)
+    step = found = newton_step(estimate, fit.solution)
     if compressible(window.data) and transposed:
         estimate, held = placed(window, fit, iterations)
         blocks = window.data.row_blocks()
@@ -378,9 +378,7 @@ def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand, iterati
     pole_cov = np.array([parameters[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] for r in core]).reshape(-1, 2, 2)
     m = len(estimate.poles)
     # a held pole is as far from its place as the fit that drove it away would have it
-    driven, rest = (
-        left_to_go(x)[: 2 * m].reshape(-1, 2) for x in (newton_step(fit.estimate, fit.solution), step)
-    )
+    driven, rest = (left_to_go(x)[: 2 * m].reshape(-1, 2) for x in (found, step))
     rest = np.where(held[:, None], driven, rest)[core]
     far = np.einsum("ra,rab,rb->r", rest, np.linalg.pinv(pole_cov), rest)
     return FittedModes(
