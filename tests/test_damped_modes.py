@@ -10,6 +10,7 @@ from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.mechanics.damped_modes import DampedModes
 from ema_pipeline.mechanics.modes import complex_modes
 from ema_pipeline.observations.rig_model import RigModel
+from ema_pipeline.rigs.planetary import planetary
 
 
 @pytest.mark.parametrize(("coefficient", "close"), [(5.0, 1e-8), (50.0, 1e-6), (150.0, 1e-4), (800.0, 1e-9)])
@@ -50,3 +51,20 @@ def test_a_damped_rigid_body_leaves_the_modes_above_it_as_they_are() -> None:
     exact = np.linalg.eigvals(first_order)
     exact = exact[exact.imag > 1]
     np.testing.assert_allclose(found.frequency_hz[1:], np.sort(np.abs(exact)) / (2 * np.pi), rtol=1e-4)
+
+
+@pytest.mark.parametrize("coefficient", [5.0, 60.0])
+def test_gyroscopic_coupling_parts_pairs_as_the_first_order_system_does(coefficient: float) -> None:
+    rig = planetary()
+    model = RigModel(rig, [parse_effect("gyroscopic@carrier", rig)])
+    x = model.start({"gyroscopic@carrier.coefficient": coefficient})
+    bare = RigModel(rig).modes("with_ring", RigModel(rig).start())[1]
+    _, solution = model.modes("with_ring", x)
+    assert solution is not None
+    assert bare is not None
+    exact = complex_modes(model.system("with_ring", x))
+    band = exact.frequency_hz > 10
+    np.testing.assert_allclose(
+        np.sort(solution.frequency_hz[solution.frequency_hz > 10]), np.sort(exact.frequency_hz[band]), rtol=1e-6
+    )
+    assert np.max(np.abs(solution.frequency_hz / bare.frequency_hz - 1)) > 1e-4 * coefficient / 5

@@ -186,26 +186,29 @@ def test_an_effect_of_no_size_leaves_the_system_as_it_is() -> None:
 # --- residuals --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("labels", [(), ("spring@m2.z",), ("mass@m4.z", "damper@m1-m3")])
+@pytest.mark.parametrize(
+    "labels", [(), ("spring@m2.z",), ("mass@m4.z", "damper@m1-m3"), ("damper@m2.z",), ("damper@m1-m4",)]
+)
 def test_derivatives_of_the_residuals_are_those_of_differences(labels: tuple[str, ...]) -> None:
     observations = chain_observations(1)
     problem = observations.problem([parse_effect(x, observations.rig) for x in labels], {})
     scatters = {n: s.default for n, s in observations.scatters.items()}
-    x = problem.start() + 0.02 * np.random.default_rng(1).normal(size=len(problem.unknowns))
+    strong = {n: 300.0 for n in problem.sizes if "damper" in n}
+    x = problem.start(strong) + 0.02 * np.random.default_rng(1).normal(size=len(problem.unknowns))
     here = problem.residuals(x, scatters)
     for i, name in enumerate(problem.unknowns.names):
         h = np.zeros(len(x))
         h[i] = 1e-6
         low, high = (problem.residuals(x + s * h, scatters, matching=here.matching) for s in (-1, 1))
         change = (high.stated - low.stated) / 2e-6
-        # Where damping couples modes, that it turns their shapes is left out of the derivatives.
-        close = max(0.5, 1e-2 * np.max(np.abs(change))) if any("damper" in x for x in labels) else 2e-3
+        # Where damping hardly turns a shape, that it does is left out of the derivatives.
+        close = max(0.05, 3e-3 * np.max(np.abs(change))) if any("damper" in x for x in labels) else 2e-3
         slope = here.jacobian[:, i]
-        np.testing.assert_allclose(slope, change, atol=max(close, 2e-3), err_msg=name)
+        np.testing.assert_allclose(slope, change, atol=close, err_msg=name)
         values, jacobian = here.weighted
         gradient = float(jacobian[:, i] @ values)
         fall = (high.cost - low.cost) / 2e-6
-        assert gradient == pytest.approx(fall, rel=1e-3, abs=20 * max(close, 2e-3)), name
+        assert gradient == pytest.approx(fall, rel=1e-3, abs=20 * close), name
 
 
 def test_derivatives_of_the_residuals_hold_for_two_configurations_with_transverse_sensors() -> None:

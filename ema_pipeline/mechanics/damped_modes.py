@@ -7,7 +7,7 @@ References
 ----------
 T. K. Caughey, M. E. J. O'Kelly, Classical normal modes in damped linear dynamic systems, J. Appl. Mech. 32 (1965)
 583-588. S. Adhikari, Rates of change of eigenvalues and eigenvectors in damped dynamic system, AIAA Journal 37 (1999)
-1452-1458.
+1452-1458. R. B. Nelson, Simplified calculation of eigenvector derivatives, AIAA Journal 14 (1976) 1201-1205.
 """
 
 from __future__ import annotations
@@ -27,6 +27,10 @@ _WEAK = 0.15
 """Share of another mode in a shape up to which eliminating the others one by one is exact enough."""
 _ROUNDING = 1e-9
 """Coupling, over ω², that is no more than rounding: modes of one frequency are not mixed by it."""
+_TURNS = 0.01
+"""Share of another mode in a shape from which derivatives follow the damped shape."""
+_CLOSE = 2e-5
+"""Dynamic stiffness of another mode, over ω², below which the rotation of two shapes is no longer linear."""
 _ITERATIONS = 4
 _OSCILLATES = 0.1
 """Share of a pole that is imaginary, below which a mode counts as one that does not oscillate."""
@@ -78,7 +82,7 @@ class DampedModes:
         shapes : ndarray, (n, n)
             Mass-normalised.
         damping, structural : ndarray, (n, n)
-            In modal coordinates, the damping ratio that all modes share included.
+            In modal coordinates, the damping ratio that all modes share and gyroscopic coupling included.
         """
         omega = np.sqrt(values)
         coupled = np.hypot(omega[None, :] * damping, structural)
@@ -102,6 +106,10 @@ class DampedModes:
         weights[:, still] = np.eye(len(values))[:, still]
         return cls(poles, shapes @ weights, weights)
 
+    def turned(self, r: int) -> bool:
+        """True for a mode whose shape damping turns so far that derivatives have to follow it."""
+        return bool(np.sum(np.abs(self.shares[:, r]) > _TURNS) > 1)
+
     def derivatives(
         self,
         matrices: Matrices,
@@ -111,6 +119,8 @@ class DampedModes:
         omega: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Derivatives of ln f and of the damping ratio by all unknowns but the common ratio, two of (n_unknowns, m).
+
+        Of modes whose shapes are nearly the undamped ones, with symmetric matrices.
 
         Parameters
         ----------
@@ -146,10 +156,76 @@ class DampedModes:
         mass, damping = matrices.dense[MASS], matrices.dense[DAMPING_MATRIX]
         slope = np.sum(shape * ((2 * mass) @ shape), axis=0) * pole
         slope += np.sum(shape * (damping @ shape), axis=0) + common
-        moved = -change / slope / pole
-        ratio = -np.real(pole) / np.abs(pole)
-        # λ = |λ|(-ζ + i√(1 - ζ²)): the real part of d ln λ is d ln|λ|, the imaginary one turns the pole by dζ
-        return np.real(moved), np.imag(moved) * np.sqrt(np.maximum(1 - ratio**2, 0.0))
+        return _of_pole(pole, -change / slope)
+
+    def derivatives_of(
+        self,
+        r: int,
+        matrices: Matrices,
+        shapes: NDArray[np.float64],
+        omega: NDArray[np.float64],
+        log_frequency: NDArray[np.float64],
+        turning: NDArray[np.float64],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.complex128]]:
+        """Derivatives of one mode's ln f, damping ratio and shape by all unknowns and, last, by ln of the common ratio.
+
+        With P(λ)q = 0 in coordinates of the undamped modes, P·dq + P'q·dλ = -dP·q is solved for dλ and dq; the own
+        share in q stays 1. Holds for any damping and for gyroscopic coupling.
+
+        Parameters
+        ----------
+        r : int
+            Index of the mode.
+        matrices : Matrices
+        shapes : ndarray, (n, n)
+            Mass-normalised, undamped.
+        omega : ndarray, (n,)
+            rad/s.
+        log_frequency : ndarray, (n_unknowns, n)
+            Derivatives of ln ω.
+        turning : ndarray, (n_unknowns, n, n)
+            Shares of all undamped shapes in the derivatives of each.
+
+        Returns
+        -------
+        log_frequency, damping_ratio : ndarray, (n_unknowns + 1,)
+        shape : complex ndarray, (n, n_unknowns + 1)
+        """
+        pole, share, shape, terms = self.poles[r], self.shares[:, r], self.shapes[:, r], matrices.terms
+        power = {MASS: pole**2, DAMPING_MATRIX: pole, STIFFNESS: 1.0, STRUCTURAL: 1j}
+        logs, n = terms.log.shape[1], len(share)
+        common = 2 * matrices.damping_ratio * omega
+        force = np.zeros((len(turning) + 1, n), complex)
+        for kind, (on, rows) in terms.by_kind.items():
+            pushed = power[kind] * matrices.coefficient[on] * (rows @ shape)
+            force[:logs] += terms.log[on].T @ (pushed[:, None] * (rows @ shapes))
+        for j, kinds in enumerate(matrices.by_shape):
+            total = pole * (matrices.skew_by_shape[j] @ shape)
+            total += sum(factor * (kinds[kind] @ shape) for kind, factor in power.items())
+            force[logs + j] = total @ shapes
+        # The damping that all modes share goes with the undamped frequencies and turns with the undamped shapes.
+        turns = np.einsum("jts,t->js", turning, common * share) + common * (turning @ share)
+        force[:-1] += pole * (log_frequency * (common * share) - turns)
+        force[-1] = pole * common * share
+        _, damping, stiffness, structural = (shapes.T @ dense @ shapes for dense in matrices.dense)
+        damping = damping + shapes.T @ matrices.skew @ shapes + np.diag(common)
+        whole = pole**2 * np.eye(n) + pole * damping + stiffness + 1j * structural
+        own = np.diag(whole) + 1e-30
+        whole[np.diag_indices(n)] = own + (_CLOSE * np.abs(pole) ** 2) ** 2 / np.conj(own)
+        whole[:, r] = 2 * pole * share + damping @ share
+        found = np.linalg.solve(whole, -force.T)
+        moved = found[r].copy()
+        found[r] = 0.0
+        return *_of_pole(pole, moved), shapes @ found
+
+
+def _of_pole(
+    pole: NDArray[np.complex128], moved: NDArray[np.complex128]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Derivatives of ln f and of the damping ratio from those of a pole."""
+    ratio, turned = -np.real(pole) / np.abs(pole), moved / pole
+    # λ = |λ|(-ζ + i√(1 - ζ²)): the real part of d ln λ is d ln|λ|, the imaginary one turns the pole by dζ
+    return np.real(turned), np.imag(turned) * np.sqrt(np.maximum(1 - ratio**2, 0.0))
 
 
 def _eliminated(
@@ -161,11 +237,15 @@ def _eliminated(
     np.fill_diagonal(mixed, False)
     stiff = values + 1j * lag
     pole = -0.5 * own + 1j * np.sqrt(np.maximum(stiff - 0.25 * own**2, 1e-12) + 0j)
+    aside, behind = damping - np.diag(own), structural - np.diag(lag)
+    share = np.zeros_like(aside, complex)
     for _ in range(_ITERATIONS):
         across = damping * pole[None, :] + 1j * structural
+        across = across + (aside @ share) * pole[None, :] + 1j * (behind @ share)  # what the others do to each other
+        back = damping.T * pole[None, :] + 1j * structural  # gyroscopic coupling has the other sign
         others = pole[None, :] ** 2 + pole[None, :] * own[:, None] + stiff[:, None]
         share = np.where(mixed, -across / np.where(mixed, others, 1.0), 0.0)
-        pull = np.sum(across * share, axis=0)  # nothing from the mode itself, whose share is 0 here
+        pull = np.sum(back * share, axis=0)  # nothing from the mode itself, whose share is 0 here
         pole = -0.5 * own + 1j * np.sqrt(stiff + pull - 0.25 * own**2 + 0j)
     np.fill_diagonal(share, 1.0)
     return pole, share
@@ -174,7 +254,7 @@ def _eliminated(
 def _exact(
     values: NDArray[np.float64], damping: NDArray[np.float64], structural: NDArray[np.float64]
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]] | None:
-    """The same from the eigenvalues of the first-order system; None where a mode does not oscillate."""
+    """The same from the eigenvalues of the first-order system; None where they cannot be told apart by shape."""
     n = len(values)
     scale = float(np.sqrt(np.max(values)))
     first = np.zeros((2 * n, 2 * n), complex)
@@ -186,13 +266,15 @@ def _exact(
     except (np.linalg.LinAlgError, ValueError):
         return None
     up = np.flatnonzero(np.imag(found) > 1e-9)
-    if len(up) != n:
+    if len(up) > n:
         return None
     weights = vectors[:n, up]
     weights = weights / np.max(np.abs(weights), axis=0)
-    own = scipy.optimize.linear_sum_assignment(-(np.abs(weights) ** 2))[1]
-    weights = weights[:, own]
-    diagonal = np.diag(weights)
-    if np.any(np.abs(diagonal) < 1e-3):
+    mode, column = scipy.optimize.linear_sum_assignment(-(np.abs(weights) ** 2))
+    weights = weights[:, column]
+    own = weights[mode, np.arange(len(mode))]
+    if np.any(np.abs(own) < 1e-3):
         return None
-    return found[up][own] * scale, weights / diagonal
+    poles, shares = np.full(n, -scale, complex), np.eye(n, dtype=complex)  # where nothing is found: no oscillation
+    poles[mode], shares[:, mode] = found[up][column] * scale, weights / own
+    return poles, shares

@@ -9,6 +9,7 @@ derivative of a shape is expanded over all shapes.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import scipy.linalg
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 
 from ema_pipeline.mechanics.damped_modes import DampedModes
 from ema_pipeline.mechanics.terms import DAMPING_MATRIX, MASS, STIFFNESS, STRUCTURAL, Matrices
+
+T = TypeVar("T", np.float64, np.complex128)
 
 _CLOSE = 1e-4
 """Relative distance of eigenvalues below which the rotation of their shapes into each other is no longer linear."""
@@ -38,7 +41,7 @@ class EigenSolution:
         Mass-normalised columns.
     frequency_hz, damping_ratio : ndarray, (n,)
     damped : DampedModes, optional
-        Where damping couples the modes; frequencies and damping ratios are then theirs.
+        Where damping or gyroscopic coupling couples the modes; frequencies and damping ratios are then theirs.
     """
 
     eigenvalues: NDArray[np.float64]
@@ -64,6 +67,7 @@ class EigenSolution:
         values = np.maximum(values, 1.0)  # rigid bodies: far under any band
         omega = np.sqrt(values)
         ratio = np.full(len(values), damping_ratio)
+        damping = damping + skew
         coupling, lag = np.any(damping), np.any(structural)
         modal = shapes.T @ damping @ shapes if coupling else np.zeros_like(shapes)
         modal_lag = shapes.T @ structural @ shapes if lag else np.zeros_like(shapes)
@@ -106,11 +110,12 @@ class ModeDerivatives:
     log_frequency : ndarray, (m, n)
     damping_ratio : ndarray, (m, n)
     shapes : ndarray, (n_dofs, m, n)
+        Complex where the modes are damped ones.
     """
 
     log_frequency: NDArray[np.float64]
     damping_ratio: NDArray[np.float64]
-    shapes: NDArray[np.float64]
+    shapes: NDArray[np.float64] | NDArray[np.complex128]
 
     @classmethod
     def of(
@@ -127,23 +132,10 @@ class ModeDerivatives:
         has_ratio : bool
             True where the logarithm of the common damping ratio is an unknown.
         """
-        stiffness, mass = (
-            _forms(matrices, solution, modes, STIFFNESS),
-            _forms(matrices, solution, modes, MASS),
-        )
-        values = solution.eigenvalues[modes]
-        apart = values[None, :] - solution.eigenvalues[:, None]
-        nearness = apart / (apart**2 + (_CLOSE * values[None, :]) ** 2)
-        weight = (stiffness - values * mass) * nearness
-        here = np.arange(len(modes))
-        own = stiffness[:, modes, here] - values * mass[:, modes, here]
-        weight[:, modes, here] = -0.5 * mass[:, modes, here]
-        log_frequency = own / (2 * values)
-        if solution.damped is None:
-            ratio = _damping(matrices, solution, modes, log_frequency, weight)
-        else:
-            omega = np.sqrt(solution.eigenvalues)
-            log_frequency, ratio = solution.damped.derivatives(matrices, modes, log_frequency, weight, omega)
+        if solution.damped is not None:
+            return cls._damped(matrices, solution, solution.damped, modes, has_ratio)
+        log_frequency, weight = _undamped(matrices, solution, modes)
+        ratio = _damping(matrices, solution, modes, log_frequency, weight)
         if has_ratio:
             at = matrices.terms.log.shape[1]
             log_frequency = _inserted(log_frequency, at, 0.0)
@@ -151,10 +143,52 @@ class ModeDerivatives:
             weight = _inserted(weight, at, 0.0)
         return cls(log_frequency.T, ratio.T, (solution.shapes @ weight).transpose(1, 2, 0))
 
+    @classmethod
+    def _damped(
+        cls,
+        matrices: Matrices,
+        solution: EigenSolution,
+        damped: DampedModes,
+        modes: NDArray[np.int64],
+        has_ratio: bool,
+    ) -> ModeDerivatives:
+        omega, phi = np.sqrt(solution.eigenvalues), solution.shapes
+        bare, weight = _undamped(matrices, solution, np.arange(len(omega)))
+        log_frequency, ratio = damped.derivatives(matrices, modes, bare[:, modes], weight[:, :, modes], omega)
+        shapes = (phi @ weight[:, :, modes]).astype(complex)
+        at = matrices.terms.log.shape[1]
+        if has_ratio:
+            log_frequency = _inserted(log_frequency, at, 0.0)
+            ratio = _inserted(ratio, at, matrices.damping_ratio)
+            shapes = _inserted(shapes, at, 0.0)
+        gyroscopic = bool(np.any(matrices.skew) or np.any(matrices.skew_by_shape))
+        order = [*range(at), *([len(weight)] if has_ratio else []), *range(at, len(weight))]
+        for k, r in enumerate(modes.tolist()):
+            if gyroscopic or damped.turned(r):
+                own = damped.derivatives_of(r, matrices, phi, omega, bare, weight)
+                log_frequency[:, k], ratio[:, k] = own[0][order], own[1][order]
+                shapes[:, :, k] = own[2].T[order]
+        return cls(log_frequency.T, ratio.T, shapes.transpose(1, 2, 0))
 
-def _inserted(array: NDArray[np.float64], at: int, value: float) -> NDArray[np.float64]:
+
+def _undamped(
+    matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Derivatives of ln f of undamped modes, (n_unknowns, m), and of their shapes, as shares of all, (n_unknowns, n, m)."""
+    stiffness, mass = (_forms(matrices, solution, modes, kind) for kind in (STIFFNESS, MASS))
+    values = solution.eigenvalues[modes]
+    apart = values[None, :] - solution.eigenvalues[:, None]
+    nearness = apart / (apart**2 + (_CLOSE * values[None, :]) ** 2)
+    weight = (stiffness - values * mass) * nearness
+    here = np.arange(len(modes))
+    own = stiffness[:, modes, here] - values * mass[:, modes, here]
+    weight[:, modes, here] = -0.5 * mass[:, modes, here]
+    return own / (2 * values), weight
+
+
+def _inserted(array: NDArray[T], at: int, value: float) -> NDArray[T]:
     """`numpy.insert` of one row, which is many times slower."""
-    return np.concatenate([array[:at], np.full((1, *array.shape[1:]), value), array[at:]])
+    return np.concatenate([array[:at], np.full((1, *array.shape[1:]), value, array.dtype), array[at:]])
 
 
 def _forms(

@@ -269,8 +269,7 @@ class Comparison:
         width = self.reading.shape[1]
         if solution.damped is None:
             return np.asarray(self.reading @ solution.shapes[:width])
-        read = self.reading @ solution.damped.shapes[:width]
-        return np.asarray(np.real(read * np.exp(-0.5j * np.angle(np.sum(read**2, axis=0)))))
+        return _turned(self.reading @ solution.damped.shapes[:width])
 
     def matched(self, solution: EigenSolution, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
         """Index of the model mode of every measured one, -1 for none, (m,)."""
@@ -380,7 +379,7 @@ class Comparison:
         scale = np.sum(weighted * y, axis=1) / squared
         slope = None
         if slopes is not None:
-            dp = self._shape_slopes(slopes.shapes, solution.shapes[:, to], p)
+            dp = self._shape_slopes(slopes.shapes, solution, to)
             towards = weight * (y - 2 * scale[:, None] * p) / squared[:, None]
             factor = towards[:, None, :] @ dp
             slope = (scale[:, None, None] * dp + p[:, :, None] * factor)[seen]
@@ -401,17 +400,35 @@ class Comparison:
         return int(np.count_nonzero(inside))
 
     def _shape_slopes(
-        self, by_model: NDArray[np.float64], shapes: NDArray[np.float64], predicted: NDArray[np.float64]
+        self,
+        by_model: NDArray[np.float64] | NDArray[np.complex128],
+        solution: EigenSolution,
+        to: NDArray[np.int64],
     ) -> NDArray[np.float64]:
         """Derivatives of what the sensors read of some shapes by all unknowns, (k, s, n)."""
         width, s = self.reading.shape[1], self.sensing
+        shapes = (solution.shapes if solution.damped is None else solution.damped.shapes)[:width, to]
+        predicted = (self.reading @ shapes).T
         k, count = predicted.shape
-        slope = np.zeros((k, count, len(self.x)))
+        slope = np.zeros((k, count, len(self.x)), predicted.dtype)
         read = self.reading @ by_model[:width].reshape(width, k * by_model.shape[2])
         slope[:, :, : by_model.shape[2]] = read.reshape(count, k, by_model.shape[2]).transpose(1, 0, 2)
         has = np.flatnonzero(s.gain >= 0)
         slope[:, has, s.gain[has]] += predicted[:, has]
         for across, unknown in zip(s.across, s.transverse, strict=True):
             has = np.flatnonzero(unknown >= 0)
-            slope[:, has, unknown[has]] += (self.gain[:, None] * (across @ shapes[:width])).T[:, has]
-        return slope
+            slope[:, has, unknown[has]] += (self.gain[:, None] * (across @ shapes)).T[:, has]
+        return slope if solution.damped is None else _turned_slopes(predicted, slope)
+
+
+def _turned(read: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Complex shapes, (s, k), turned as measured ones are, and made real."""
+    return np.asarray(np.real(read * np.exp(-0.5j * np.angle(np.sum(read**2, axis=0)))))
+
+
+def _turned_slopes(read: NDArray[np.complex128], slope: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Derivatives of `_turned` shapes from those (k, s, n) of the complex ones (k, s), which turn the angle, too."""
+    square = np.sum(read**2, axis=1)
+    back = np.exp(-0.5j * np.angle(square))[:, None]
+    angle = np.imag(np.einsum("ks,ksn->kn", read, slope) / square[:, None])
+    return np.asarray(np.real(back[..., None] * slope) + np.imag(back * read)[..., None] * angle[:, None, :])
