@@ -146,6 +146,33 @@ def test_every_level_is_held_out_once_beside_another() -> None:
         assert not out.modes.data
 
 
+def test_a_mode_that_moves_is_not_spared_by_leaving_it_without_a_partner() -> None:
+    """A model that pairs no mode would otherwise explain that all of them move."""
+    observations = synthetic([PolynomialSpring("cubic", {"hub.x": 1.0}, cubic=1e11)])
+    problem = AmplitudeProblem(observations, [], {})
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    x = problem.start()
+    paired = problem.residuals(x, scatters, derivatives=False)
+    nobody = np.full(len(observations.hits[0].reference), -1)
+    modes, hits = paired.matching  # type: ignore[misc]
+    alone = problem.residuals(x, scatters, matching=(modes, tuple(nobody for _ in hits)), derivatives=False)
+    assert alone.cost == pytest.approx(paired.cost, rel=1e-9)
+
+
+def test_poles_that_move_far_are_read_less_well_than_near_ones() -> None:
+    """σ grows with the square of the distance at first: a tenth of a width is read as if nothing were left out."""
+    hits = synthetic().hits[0]
+    moved = hits.log_frequency.copy()
+    hard = hits.level == hits.level.max()
+    assert np.max(hits.linearised_std) < 1e-3
+    for far, least, most in ((0.1, 0.005, 0.012), (1.0, 0.3, 0.4), (4.0, 1.5, 2.0)):
+        there = replace(hits, log_frequency=moved + np.where(hard[:, None], far * RATIO, 0.0))
+        std = there.linearised_std[hard]
+        assert np.all((std > least) & (std < most)), far
+        assert np.max(there.linearised_std[hits.level == 0]) < 1e-3
+        assert there.moves[0] == pytest.approx(far, rel=0.1)
+
+
 def test_hits_of_one_level_cannot_be_compared() -> None:
     (hits,) = synthetic().hits
     assert comparable(hits)

@@ -65,6 +65,8 @@ def test_gyroscopic_coupling_parts_pairs_as_the_first_order_system_does(coeffici
     exact = complex_modes(model.system("with_ring", x))
     band = exact.frequency_hz > 10
     np.testing.assert_allclose(
-        np.sort(solution.frequency_hz[solution.frequency_hz > 10]), np.sort(exact.frequency_hz[band]), rtol=1e-6
+        np.sort(solution.frequency_hz[solution.frequency_hz > 10]),
+        np.sort(exact.frequency_hz[band]),
+        rtol=1e-6,
     )
     assert np.max(np.abs(solution.frequency_hz / bare.frequency_hz - 1)) > 1e-4 * coefficient / 5

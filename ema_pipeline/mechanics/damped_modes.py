@@ -214,9 +214,9 @@ class DampedModes:
         whole[np.diag_indices(n)] = own + (_CLOSE * np.abs(pole) ** 2) ** 2 / np.conj(own)
         whole[:, r] = 2 * pole * share + damping @ share
         found = np.linalg.solve(whole, -force.T)
-        moved = found[r].copy()
+        frequency, ratio = _of_pole(pole, found[r].copy())
         found[r] = 0.0
-        return *_of_pole(pole, moved), shapes @ found
+        return frequency, ratio, np.asarray(shapes @ found, complex)
 
 
 def _of_pole(
@@ -241,7 +241,9 @@ def _eliminated(
     share = np.zeros_like(aside, complex)
     for _ in range(_ITERATIONS):
         across = damping * pole[None, :] + 1j * structural
-        across = across + (aside @ share) * pole[None, :] + 1j * (behind @ share)  # what the others do to each other
+        across = (
+            across + (aside @ share) * pole[None, :] + 1j * (behind @ share)
+        )  # what the others do to each other
         back = damping.T * pole[None, :] + 1j * structural  # gyroscopic coupling has the other sign
         others = pole[None, :] ** 2 + pole[None, :] * own[:, None] + stiff[:, None]
         share = np.where(mixed, -across / np.where(mixed, others, 1.0), 0.0)
@@ -275,6 +277,9 @@ def _exact(
     own = weights[mode, np.arange(len(mode))]
     if np.any(np.abs(own) < 1e-3):
         return None
-    poles, shares = np.full(n, -scale, complex), np.eye(n, dtype=complex)  # where nothing is found: no oscillation
+    poles, shares = (
+        np.full(n, -scale, complex),
+        np.eye(n, dtype=complex),
+    )  # where nothing is found: no oscillation
     poles[mode], shares[:, mode] = found[up][column] * scale, weights / own
     return poles, shares

@@ -174,7 +174,7 @@ class ModeDerivatives:
 def _undamped(
     matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Derivatives of ln f of undamped modes, (n_unknowns, m), and of their shapes, as shares of all, (n_unknowns, n, m)."""
+    """Derivatives of ln f of undamped modes, (n_unknowns, m), and of shapes as shares of all, (n_unknowns, n, m)."""
     stiffness, mass = (_forms(matrices, solution, modes, kind) for kind in (STIFFNESS, MASS))
     values = solution.eigenvalues[modes]
     apart = values[None, :] - solution.eigenvalues[:, None]

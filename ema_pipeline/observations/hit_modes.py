@@ -46,6 +46,9 @@ _RIGID = 0.02
 _SETTLING_STEPS = 3
 _MOST_GIVEN = 5.0
 """Change of a stretch by its own force that is not worth a further step, most steps, and largest change allowed."""
+_FAR, _FAR_STD = 0.5, 0.5
+"""Distance of a pole from that of the softest hits, in decay rates, at which half of the relative error is reached that
+a shift read from a decay has against one of first order; and that error of far ones, 1 σ."""
 _HEARD = 0.1
 """Motion of a mode over that of the largest that moves in step with it, below which a hit does not tell its pole."""
 _FINE = 400
@@ -171,6 +174,36 @@ class HitData:
         apart = np.where(used, np.abs(poles - (middle[0] + 1j * middle[1])), 0.0)
         usual = np.median(-self.poles.real, axis=0)
         return np.asarray(apart.max(axis=0, initial=0.0) / usual)
+
+    @cached_property
+    def _moved(self) -> Real:
+        """Distance of every pole from that of the softest hits of its sheet, in decay rates, (h, m)."""
+        usual, apart = np.median(-self.poles.real, axis=0), np.zeros(self.poles.shape)
+        for sheet in np.unique(self.sheet):
+            on = np.flatnonzero(self.sheet == sheet)
+            for r in range(len(self.modes)):
+                heard = on[self.used[on, r]]
+                if len(heard):
+                    softest = heard[self.level[heard] == self.level[heard].min()]
+                    apart[heard, r] = np.abs(self.poles[heard, r] - self.poles[softest, r].mean()) / usual[r]
+        return apart
+
+    @property
+    def linearised_std(self) -> Real:
+        """1 σ of what a fit of one pole reads of a decay that is no small change, in decay rates, (h, m).
+
+        The pole moves while it is read: by half a width and more, what is read is no mean of the momentary pole.
+        """
+        return np.asarray(_FAR_STD * self._moved**2 / (self._moved + _FAR))
+
+    @property
+    def moves(self) -> tuple[float, float]:
+        """Mean distance of poles from those of the softest hits, in decay rates, each by its square over its variance;
+        and the sum of these weights."""
+        noise = np.hypot(self.log_frequency_std / self.usual_damping, self.damping_std / self.usual_damping)
+        weight = np.where(self.used, (self._moved / np.where(self.used, noise, 1.0)) ** 2, 0.0)
+        total = float(weight.sum())
+        return float((weight * self._moved).sum() / total) if total else 0.0, total
 
     @cached_property
     def weights(self) -> tuple[Real, Complex]:
