@@ -87,7 +87,13 @@ class Motions:
         from ema_pipeline.mechanics import averages  # compiled on first use
 
         phases = _phases(len(self.omega))
-        return np.asarray(averages.stiffness(*law, self.amplitude, self.omega, phases, offset))
+        if kind == FRICTION:
+            limit, velocity = law[1:3]
+            return np.asarray(1j * limit * averages.friction(velocity, self.amplitude, self.omega, phases))
+        k, preload, gap = law[1:]
+        if preload == np.inf:
+            return np.zeros(self.amplitude.shape, complex)
+        return np.asarray(k * averages.parting(preload, gap, self.amplitude, phases, offset), complex)
 
 
 def settled_offsets(elements: Sequence[Nonlinear], motions: Sequence[Motions], flexibility: Real) -> Real:

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
+import scipy.sparse
 from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect, effect_of
@@ -408,6 +409,6 @@ def _without_mean(
     """Whitened rows less their weighted mean in every group."""
     norm = np.bincount(group, weight**2)
     flat = rows.reshape(len(rows), -1)
-    total = np.zeros((len(norm), flat.shape[1]))
-    np.add.at(total, group, flat * weight[:, None])
+    summed = scipy.sparse.csr_array((weight, (group, np.arange(len(rows)))), shape=(len(norm), len(rows)))
+    total = np.asarray(summed.dot(flat))
     return np.asarray((flat - weight[:, None] * (total / norm[:, None])[group]).reshape(rows.shape))
