@@ -246,3 +246,25 @@ def test_equal_frequencies_have_finite_derivatives() -> None:
     assert np.all(np.isfinite(slope.shapes))
     assert np.all(np.isfinite(slope.log_frequency))
     assert np.max(np.abs(slope.log_frequency)) < 1.0
+
+
+def test_gyroscopic_coupling_of_no_size_has_the_derivatives_of_a_small_one() -> None:
+    rig = planetary()
+    model = RigModel(rig, [placed(rig, "gyroscopic@carrier")])
+    x = point(model, 3)
+    i = model.unknowns.index["gyroscopic@carrier.coefficient"]
+    x[i] = 0.0
+    before = solved(model, "with_ring", x)
+    modes = np.flatnonzero((before.frequency_hz > 20) & (before.frequency_hz < 300))
+    _, slope = derivatives(model, "with_ring", x, modes)
+    ends = [solved(model, "with_ring", x + h * np.eye(len(x))[i]) for h in (-0.02, 0.02)]
+    assert before.damped is None
+    changes = []
+    for k, r in enumerate(modes.tolist()):
+        change = across(
+            (shape_of(ends[1], r, before) - shape_of(ends[0], r, before)) / 0.04, before.shapes[:, r]
+        )
+        found = across(slope.shapes[:, k, i], before.shapes[:, r])
+        np.testing.assert_allclose(found, change, rtol=1e-2, atol=3e-3 * np.abs(before.shapes).max())
+        changes.append(np.abs(change).max())
+    assert max(changes) > 0.1 * np.abs(before.shapes).max()

@@ -106,6 +106,18 @@ class DampedModes:
         weights[:, still] = np.eye(len(values))[:, still]
         return cls(poles, shapes @ weights, weights)
 
+    @classmethod
+    def uncoupled(
+        cls,
+        frequency_hz: NDArray[np.float64],
+        damping_ratio: NDArray[np.float64],
+        shapes: NDArray[np.float64],
+    ) -> DampedModes:
+        """Modes that damping leaves as they are."""
+        ratio = np.minimum(damping_ratio, _LARGEST_RATIO)
+        poles = 2 * np.pi * frequency_hz * (-ratio + 1j * np.sqrt(1 - ratio**2))
+        return cls(poles, shapes.astype(complex), np.eye(len(poles), dtype=complex))
+
     def turned(self, r: int) -> bool:
         """True for a mode whose shape damping turns so far that derivatives have to follow it."""
         return bool(np.sum(np.abs(self.shares[:, r]) > _TURNS) > 1)

@@ -110,7 +110,7 @@ class ModeDerivatives:
     log_frequency : ndarray, (m, n)
     damping_ratio : ndarray, (m, n)
     shapes : ndarray, (n_dofs, m, n)
-        Complex where the modes are damped ones.
+        Complex where the modes are damped ones or an effect turns them.
     """
 
     log_frequency: NDArray[np.float64]
@@ -134,6 +134,9 @@ class ModeDerivatives:
         """
         if solution.damped is not None:
             return cls._damped(matrices, solution, solution.damped, modes, has_ratio)
+        if np.any(matrices.skew_by_shape):  # of no size yet, but shapes lag behind with it
+            damped = DampedModes.uncoupled(solution.frequency_hz, solution.damping_ratio, solution.shapes)
+            return cls._damped(matrices, solution, damped, modes, has_ratio)
         log_frequency, weight = _undamped(matrices, solution, modes)
         ratio = _damping(matrices, solution, modes, log_frequency, weight)
         if has_ratio:

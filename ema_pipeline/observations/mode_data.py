@@ -13,6 +13,8 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.settings import AssumedSettings
 from ema_pipeline.dof import Dof
 
+_WHIRLS = 0.05
+"""Share of its imaginary part in the sum of squares of a shape, from which it is compared as a complex one: MPC 0.8."""
 _DOUBLE = 0.9
 """Share of a shape's squares that shapes of modes within a half-width explain, from which it is no mode of its own."""
 
@@ -33,6 +35,8 @@ class ModeData:
     band_hz : tuple of float
     complete : bool
         False where modes of the band were taken out on purpose: what the model has besides is then no contradiction.
+    imaginary : ndarray, (m, s), optional
+        Imaginary parts of the shapes of `whirling` modes, 0 for all others.
     """
 
     configuration: str
@@ -45,6 +49,7 @@ class ModeData:
     dofs: tuple[Dof, ...]
     band_hz: tuple[float, float]
     complete: bool = True
+    imaginary: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.log_frequency)
@@ -60,9 +65,25 @@ class ModeData:
         return np.isfinite(self.shapes).astype(float)
 
     @cached_property
+    def whirling(self) -> NDArray[np.bool_]:
+        """Mask of modes whose shapes are complex far beyond what a test does to real ones, (m,).
+
+        Gyroscopic coupling makes bodies whirl, and strong dampers let parts of a structure lag behind.
+        """
+        if self.imaginary is None:
+            return np.zeros(len(self), bool)
+        return np.asarray(np.any(self.imaginary, axis=1))
+
+    @cached_property
+    def complex_shapes(self) -> NDArray[np.complex128]:
+        """Shapes with the imaginary parts of `whirling` modes, 0 where not measured, (m, s)."""
+        imaginary = np.zeros_like(self.shapes) if self.imaginary is None else self.imaginary
+        return np.asarray(self.known_shapes + 1j * imaginary, complex)
+
+    @cached_property
     def squares(self) -> NDArray[np.float64]:
         """Sum of squares of every shape, (m,)."""
-        return np.asarray(np.sum(self.known_shapes**2, axis=1))
+        return np.asarray(np.sum(np.abs(self.complex_shapes) ** 2, axis=1))
 
     @cached_property
     def double(self) -> NDArray[np.bool_]:
@@ -94,7 +115,9 @@ class ModeData:
             "shapes",
             "shape_std",
         )
-        return dataclasses.replace(self, complete=False, **{n: getattr(self, n)[keep] for n in names})
+        imaginary = None if self.imaginary is None else self.imaginary[keep]
+        kept = {n: getattr(self, n)[keep] for n in names}
+        return dataclasses.replace(self, complete=False, imaginary=imaginary, **kept)
 
 
 def _known_or(std: NDArray[np.float64], assumed: float) -> NDArray[np.float64]:
@@ -106,17 +129,18 @@ def prepare(measured: MeasuredModes, settings: AssumedSettings | None = None) ->
     """Measured modes in the form that residuals need; where no scatter is known, `settings` say what is assumed."""
     settings = settings or AssumedSettings()
     m, f = len(measured), measured.frequency_hz
-    shapes = np.zeros((m, 0))
+    shapes, imaginary = np.zeros((m, 0)), np.zeros((m, 0))
     std = np.zeros((m, 0))
     dofs: tuple[Dof, ...] = ()
     if measured.shapes is not None and measured.dofs:
         dofs = measured.dofs
-        shapes, std = np.zeros((m, len(dofs))), np.zeros((m, len(dofs)))
+        shapes, imaginary, std = (np.zeros((m, len(dofs))) for _ in range(3))
         for r in range(m):
-            y = measured.shapes[r]
-            real = np.real(y * np.exp(-0.5j * np.angle(np.nansum(y**2))))
-            size = float(np.nanmax(np.abs(real), initial=0.0)) or 1.0
-            shapes[r] = real / size
+            y = measured.shapes[r] * np.exp(-0.5j * np.angle(np.nansum(measured.shapes[r] ** 2)))
+            size = float(np.nanmax(np.abs(y.real), initial=0.0)) or 1.0
+            shapes[r] = y.real / size
+            if np.nansum(y.imag**2) > _WHIRLS * np.nansum(np.abs(y) ** 2):
+                imaginary[r] = np.nan_to_num(y.imag / size)
             given = np.full(len(dofs), np.nan) if measured.shape_std is None else measured.shape_std[r]
             std[r] = _known_or(given / size, settings.shape_std_assumed)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -127,4 +151,5 @@ def prepare(measured: MeasuredModes, settings: AssumedSettings | None = None) ->
     return ModeData(
         measured.configuration, np.log(f), relative, np.log(damping), damping_std, shapes, std, dofs, band,
         complete=measured.band_hz is not None,  # a list of frequencies does not say that there are no others
+        imaginary=imaginary,
     )  # fmt: skip

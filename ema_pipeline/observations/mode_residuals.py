@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy.optimize
@@ -25,6 +26,8 @@ UNEXPLAINED = 12.0
 UNSEEN = 3.0
 """Cost of a model mode in the band that was not measured: it may lie on a node of every sensor or hit point."""
 
+_WHIRL_STD = 0.1
+"""1 σ of complex shapes, in their largest entry: where close modes drift, identification makes real ones complex."""
 _SHAPE_REACH = 0.3
 """Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
 _FREQUENCY_REACH = 0.1
@@ -139,7 +142,7 @@ class Compared:
     Attributes
     ----------
     rows : tuple of Rows
-        Frequencies, damping ratios, shapes.
+        Frequencies, damping ratios, shapes; complex ones apart.
     match : ndarray of int, (m,)
         Model mode of every measured one, -1 for none.
     log_scale, penalty : float
@@ -166,7 +169,8 @@ def whitened(
     """Differences in units of their standard uncertainties, `n` unknowns."""
     total = sum(len(r) for r in found.rows)
     derivatives = all(r.slope is not None for r in found.rows)
-    values, share, block = np.empty(total), {}, np.full(total, -1)
+    values, block = np.empty(total), np.full(total, -1)
+    share: dict[str, NDArray[np.float64]] = {}
     jacobian = np.zeros((total if derivatives else 0, n))
     log_scale, at = 0.0, 0
     for r in found.rows:
@@ -179,12 +183,11 @@ def whitened(
         sigma = np.sqrt(variance) * r.heat
         values[here] = r.difference / sigma
         if r.sensor is not None:  # a shape may be wrong as a whole
-            block[here] = np.unique(r.mode, return_inverse=True)[1]
+            block[here] = np.unique(r.mode, return_inverse=True)[1] + int(np.max(block, initial=-1)) + 1
         if derivatives and r.slope is not None:
             for name, part in ((r.scatter, added), (r.noise, own)):
                 if name:
-                    share[name] = np.zeros(total)
-                    share[name][here] = part / variance
+                    share.setdefault(name, np.zeros(total))[here] = part / variance
             jacobian[here] = r.slope / -sigma[:, None]
     return Residuals(
         values=values,
@@ -254,6 +257,7 @@ class Comparison:
             self._frequencies(solution, on, to, slopes),
             self._damping(solution, on, to, slopes),
             self._shapes(solution, predicted, on, to, slopes),
+            self._complex_shapes(solution, on, to, slopes),
         )
         return Compared(
             rows=rows,
@@ -261,15 +265,18 @@ class Comparison:
             log_scale=self._usual(alone) if len(alone) else 0.0,
             penalty=UNEXPLAINED * len(alone) + UNSEEN * self._unseen(solution, to),
             unexplained=int(np.sum(~self.data.double[alone])),
-            projected=len(on) if self.data.shapes.shape[1] else 0,
+            projected=len(on) + int(np.sum(self.data.whirling[on])) if self.data.shapes.shape[1] else 0,
         )
 
     def seen(self, solution: EigenSolution) -> NDArray[np.float64]:
         """What the sensors read of every shape, (s, n); complex shapes turned as measured ones are, and made real."""
-        width = self.reading.shape[1]
-        if solution.damped is None:
-            return np.asarray(self.reading @ solution.shapes[:width])
-        return _turned(self.reading @ solution.damped.shapes[:width])
+        read = self._read(solution)
+        return np.real(read) if solution.damped is None else _turned(read)
+
+    def _read(self, solution: EigenSolution) -> NDArray[np.complex128]:
+        """The same with complex shapes as they are."""
+        shapes = solution.shapes if solution.damped is None else solution.damped.shapes
+        return np.asarray(self.reading @ shapes[: self.reading.shape[1]])
 
     def matched(self, solution: EigenSolution, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
         """Index of the model mode of every measured one, -1 for none, (m,)."""
@@ -279,6 +286,10 @@ class Comparison:
         if d.shapes.shape[1]:
             cross = (d.known_shapes @ predicted) ** 2
             norm = d.squares[:, None] * (d.seen @ predicted**2)
+            if np.any(whirl := d.whirling):
+                read = self._read(solution)
+                cross[whirl] = np.abs(np.conj(d.complex_shapes[whirl]) @ read) ** 2
+                norm[whirl] = d.squares[whirl, None] * (d.seen[whirl] @ np.abs(read) ** 2)
             reach = _FREQUENCY_REACH * (1 + 0.1 * (self.heat - 1))
             cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / reach, 3.0)
         else:
@@ -295,17 +306,21 @@ class Comparison:
         Without it, leaving a mode out would gain what its rows cost, and no effect would ever bring it back.
         """
         d = self.data
-        seen = np.isfinite(d.shapes[alone])
-        reach = np.maximum(_SHAPE_REACH, np.abs(d.shapes[alone]))[seen]
+        seen, whirl = np.isfinite(d.shapes[alone]), d.whirling[alone]
+        real, both = seen & ~whirl[:, None], seen & whirl[:, None]
+        reach = np.maximum(_SHAPE_REACH, np.abs(d.complex_shapes[alone]))
+        std = np.hypot(d.shape_std[alone], _WHIRL_STD * whirl[:, None])
         damped = alone[np.isfinite(d.log_damping[alone])]
-        count = np.sum(seen, axis=1, dtype=float)
-        total = -0.5 * int(np.sum(np.any(seen, axis=1))) + float(
+        parts = 1 + whirl  # real and imaginary
+        count = np.sum(seen, axis=1, dtype=float) * parts
+        total = -0.5 * float(np.sum(parts[np.any(seen, axis=1)])) + float(
             np.sum(tails.cost(count, count) - 0.5 * count)
         )
         for own, unit, name, noise in (
             (d.log_frequency_std[alone], 1.0, FREQUENCY, FREQUENCY_NOISE),
             (d.log_damping_std[damped], 1.0, DAMPING_SCATTER, ""),
-            (d.shape_std[alone][seen], reach, SHAPE, SHAPE_NOISE),
+            (std[real], reach[real], SHAPE, SHAPE_NOISE),
+            (np.tile(std[both], 2), np.tile(reach[both], 2), SHAPE, ""),
         ):
             now, usual = (
                 (at.get(noise, 1.0) * own) ** 2 + (at[name] * unit) ** 2
@@ -368,8 +383,10 @@ class Comparison:
         to: NDArray[np.int64],
         slopes: ModeDerivatives | None,
     ) -> Rows:
-        """Shapes with the factor projected out that fits them best."""
-        d, p = self.data, predicted[:, to].T
+        """Shapes with the factor projected out that fits them best; none of whirling modes."""
+        d, real = self.data, np.flatnonzero(~self.data.whirling[on])
+        on, to = on[real], to[real]
+        p = predicted[:, to].T
         seen = d.seen[on] > 0
         y, own = d.known_shapes[on], d.shape_std[on]
         unit = np.maximum(_SHAPE_REACH, np.abs(y))
@@ -379,7 +396,10 @@ class Comparison:
         scale = np.sum(weighted * y, axis=1) / squared
         slope = None
         if slopes is not None:
-            dp = self._shape_slopes(slopes.shapes, solution, to)
+            dp = self._shape_slopes(slopes.shapes[:, real], solution, to)
+            if solution.damped is not None:
+                dp = _turned_slopes(self._read(solution)[:, to].T, dp)
+            dp = np.real(dp)
             towards = weight * (y - 2 * scale[:, None] * p) / squared[:, None]
             factor = towards[:, None, :] @ dp
             slope = (scale[:, None, None] * dp + p[:, :, None] * factor)[seen]
@@ -388,6 +408,37 @@ class Comparison:
         return Rows(
             difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode], sensor, slope,
             noise=SHAPE_NOISE,
+        )  # fmt: skip
+
+    def _complex_shapes(
+        self,
+        solution: EigenSolution,
+        on: NDArray[np.int64],
+        to: NDArray[np.int64],
+        slopes: ModeDerivatives | None,
+    ) -> Rows:
+        """Real and imaginary parts of whirling modes' shapes, a complex factor projected out."""
+        d, whirl = self.data, np.flatnonzero(self.data.whirling[on])
+        on, to = on[whirl], to[whirl]
+        p, y, seen = self._read(solution)[:, to].T.astype(complex), d.complex_shapes[on], d.seen[on] > 0
+        own = np.hypot(d.shape_std[on], _WHIRL_STD)
+        unit = np.maximum(_SHAPE_REACH, np.abs(y))
+        weight = seen / (own**2 + (self.scatters[SHAPE] * unit) ** 2)
+        squared = np.maximum(np.sum(weight * np.abs(p) ** 2, axis=1), 1e-300)
+        factor = np.sum(weight * np.conj(p) * y, axis=1) / squared
+        slope = None
+        if slopes is not None:
+            dp = self._shape_slopes(slopes.shapes[:, whirl], solution, to).astype(complex)
+            turns = np.einsum("ks,ksn->kn", weight * y, np.conj(dp))
+            grows = 2 * np.real(np.einsum("ks,ksn->kn", weight * np.conj(p), dp))
+            change = (turns - factor[:, None] * grows) / squared[:, None]
+            both = factor[:, None, None] * dp + p[:, :, None] * change[:, None, :]
+            slope = np.concatenate([np.real(both)[seen], np.imag(both)[seen]])
+        left = (y - factor[:, None] * p)[seen]
+        mode, sensor = np.nonzero(seen)
+        return Rows(
+            np.concatenate([left.real, left.imag]), np.tile(own[seen], 2), np.tile(unit[seen], 2), SHAPE,
+            1 + 0.1 * (self.heat - 1), np.tile(on[mode], 2), np.tile(sensor, 2), slope,
         )  # fmt: skip
 
     def _unseen(self, solution: EigenSolution, to: NDArray[np.int64]) -> int:
@@ -404,13 +455,13 @@ class Comparison:
         by_model: NDArray[np.float64] | NDArray[np.complex128],
         solution: EigenSolution,
         to: NDArray[np.int64],
-    ) -> NDArray[np.float64]:
-        """Derivatives of what the sensors read of some shapes by all unknowns, (k, s, n)."""
+    ) -> NDArray[Any]:
+        """Derivatives of what the sensors read of some shapes by all unknowns, complex where they are, (k, s, n)."""
         width, s = self.reading.shape[1], self.sensing
         shapes = (solution.shapes if solution.damped is None else solution.damped.shapes)[:width, to]
         predicted = (self.reading @ shapes).T
         k, count = predicted.shape
-        slope = np.zeros((k, count, len(self.x)), predicted.dtype)
+        slope = np.zeros((k, count, len(self.x)), np.result_type(predicted, by_model))
         read = self.reading @ by_model[:width].reshape(width, k * by_model.shape[2])
         slope[:, :, : by_model.shape[2]] = read.reshape(count, k, by_model.shape[2]).transpose(1, 0, 2)
         has = np.flatnonzero(s.gain >= 0)
@@ -418,7 +469,7 @@ class Comparison:
         for across, unknown in zip(s.across, s.transverse, strict=True):
             has = np.flatnonzero(unknown >= 0)
             slope[:, has, unknown[has]] += (self.gain[:, None] * (across @ shapes)).T[:, has]
-        return slope if solution.damped is None else _turned_slopes(predicted, slope)
+        return slope
 
 
 def _turned(read: NDArray[np.complex128]) -> NDArray[np.float64]:

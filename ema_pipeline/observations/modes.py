@@ -350,7 +350,7 @@ class ModeProblem(EffectProblem):
                     if reach > 0:
                         starts.append(self.unknowns.clipped(x - 2 * split * variance * slope / reach))
             at += len(own) + int(np.sum(np.isfinite(data.log_damping[match >= 0])))
-            at += int(np.sum(np.isfinite(data.shapes[match >= 0])))
+            at += int(np.sum(np.isfinite(data.shapes[match >= 0]) * (1 + data.whirling[match >= 0, None])))
         return starts
 
     def rows(self, found: Residuals) -> list[ModeRows]:
@@ -365,10 +365,15 @@ class ModeProblem(EffectProblem):
             damping = np.full(len(on), np.nan)
             damping[damped] = stated[at : at + int(np.sum(damped))]
             at += int(np.sum(damped))
-            seen = np.isfinite(data.shapes[on])
+            seen, whirl = np.isfinite(data.shapes[on]), data.whirling[on, None]
             shape = np.full(seen.shape, np.nan)
-            shape[seen] = stated[at : at + int(np.sum(seen))]
-            at += int(np.sum(seen))
+            count = int(np.sum(seen & ~whirl))
+            shape[seen & ~whirl] = stated[at : at + count]
+            at += count
+            count = int(np.sum(seen & whirl))
+            real, imaginary = stated[at : at + 2 * count].reshape(2, count)
+            shape[seen & whirl] = np.sqrt(0.5 * (real**2 + imaginary**2))
+            at += 2 * count
             out += [
                 ModeRows(
                     data.configuration,
