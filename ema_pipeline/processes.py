@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import multiprocessing
 import os
 import signal
@@ -132,6 +133,7 @@ def side_by_side(
     left = list(enumerate(items))
     running: dict[Connection, tuple[int, ForkProcess]] = {}
     failed: dict[int, Exception] = {}
+    gc.freeze()  # what is there is shared by all: a worker that looks for cycles in it would copy it
     try:
         while left or running:
             while left and len(running) < processes:
@@ -157,6 +159,7 @@ def side_by_side(
                 process.join()
                 del running[connection]
     finally:
+        gc.unfreeze()
         for _, process in running.values():
             process.kill()
             process.join()
