@@ -56,13 +56,24 @@ def real_columns(omega: Real, poles: Complex, rest_s: float) -> tuple[Complex, C
         Im Q times row 2r+1.
     """
     columns, derivatives = np.empty((2, 2 * len(poles), len(omega)), dtype=np.complex128)
+    _fill(omega, poles, rest_s, columns, derivatives)
+    return columns, derivatives
+
+
+def mode_columns(omega: Real, poles: Complex, rest_s: float) -> Complex:
+    """The columns of `real_columns` alone, at two thirds of the cost."""
+    columns = np.empty((2 * len(poles), len(omega)), dtype=np.complex128)
+    _fill(omega, poles, rest_s, columns, columns[:0])
+    return columns
+
+
+def _fill(omega: Real, poles: Complex, rest_s: float, columns: Complex, derivatives: Complex) -> None:
     if np.isfinite(rest_s):
         left, turn = _left(poles, rest_s), np.exp(-1j * omega * rest_s)
     else:
         rest_s, left, turn = 0.0, np.zeros_like(poles), np.zeros(len(omega), dtype=np.complex128)
     flat = np.ascontiguousarray(omega), np.ascontiguousarray(poles)
     columns_of_poles(*flat, rest_s, left, turn, columns, derivatives)
-    return columns, derivatives
 
 
 def _left(poles: Complex, rest_s: float) -> Complex:

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, LinearSolution, residual_fit, synthesis
-from ema_pipeline.modal.noise import Noise
+from ema_pipeline.modal.noise import Noise, squared
+from ema_pipeline.threads import in_order
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -50,10 +51,16 @@ def left_over(
     left : complex ndarray, (n_rows, n_references, n_lines)
     ratio : ndarray, (n_lines,)
     """
-    weight = hits.weight(data.measured)
-    modes = synthesis(data, estimate, solution.shapes)
-    left = np.where(data.measured[..., None], data.frf - modes - residual_fit(data, weight, modes), 0.0)
-    power = np.sum(np.abs(left) ** 2 * weight, axis=(0, 1))
+    left = np.empty(data.frf.shape, dtype=np.complex128)
+
+    def of_rows(rows: slice) -> Real:
+        some, weight = data.rows(rows), hits.rows(rows).weight(data.measured[rows])
+        model = synthesis(some, estimate, solution.shapes[rows])
+        model += residual_fit(some, weight, model)
+        left[rows] = np.where(some.measured[..., None], some.frf - model, 0.0)
+        return np.einsum("oil,oil->l", squared(left[rows]), weight)
+
+    power = np.asarray(sum(in_order(of_rows, data.row_blocks())))
     return left, power / max(int(np.count_nonzero(data.measured)), 1)
 
 
