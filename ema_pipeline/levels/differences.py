@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.basis import pole_functions
+from ema_pipeline.modal.basis import pole_functions, pole_values
 from ema_pipeline.modal.noise import fit_noise
 
 Real = NDArray[np.float64]
@@ -137,7 +137,7 @@ def participations(omega: Real, frf: Complex, poles: Complex, shapes: Complex, r
     complex ndarray, (n_modes,)
         Residue over shape.
     """
-    u, _ = pole_functions(omega, poles, rest_s)
+    u = pole_values(omega, poles, rest_s)
     weight = np.ones((len(frf), len(omega)))
     return _least_squares(*_whitened(shapes.T[:, :, None] * u, frf, weight, smooth_terms(len(omega))))
 
@@ -163,7 +163,7 @@ def _of_mean(
     that the mean hardly tells of keep theirs.
     """
     m = len(poles)
-    u, _ = pole_functions(omega, poles, rest_s)
+    u = pole_values(omega, poles, rest_s)
     left = mean - shapes.T @ (start[:, None] * u)
     change = _refined(omega, poles, shapes, rest_s, start, np.zeros(2 * m, complex), left, weight, smooth)[:m]
     strong = np.max(np.abs(start[:, None] * u), axis=1) > PLAIN * np.max(np.abs(left))
@@ -183,7 +183,7 @@ def _refined(
 ) -> Complex:
     """Change of poles and participations of one hit, linearised anew where the last step ended."""
     m = len(poles)
-    before = start[:, None] * pole_functions(omega, poles, rest_s)[0]
+    before = start[:, None] * pole_values(omega, poles, rest_s)
     for _ in range(STEPS):
         now = start + change[m:]
         u, du = pole_functions(omega, poles + change[:m], rest_s)
