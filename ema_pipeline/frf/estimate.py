@@ -266,10 +266,12 @@ def _finish(
         force = {(0, 0): sheet.force}
         shared = True
     else:
-        # each input by itself in memory: what is not yet written to takes none
-        by_input = shape[1], shape[0], shape[2]
-        cross = np.zeros(by_input, dtype=np.complex128).swapaxes(0, 1)
-        auto = np.zeros(by_input).swapaxes(0, 1)
+        if with_coherence:  # to be stored, in the order of the axes
+            cross, auto = np.zeros(shape, dtype=np.complex128), np.zeros(shape)
+        else:  # each input by itself in memory: what is not yet written to takes none
+            by_input = shape[1], shape[0], shape[2]
+            cross = np.zeros(by_input, dtype=np.complex128).swapaxes(0, 1)
+            auto = np.zeros(by_input).swapaxes(0, 1)
         force = {}
         shared = False
         while total.sheets:
