@@ -137,9 +137,11 @@ def participations(omega: Real, frf: Complex, poles: Complex, shapes: Complex, r
     complex ndarray, (n_modes,)
         Residue over shape.
     """
-    u = pole_values(omega, poles, rest_s)
-    weight = np.ones((len(frf), len(omega)))
-    return _least_squares(*_whitened(shapes.T[:, :, None] * u, frf, weight, smooth_terms(len(omega))))
+    smooth, u = smooth_terms(len(omega)), pole_values(omega, poles, rest_s)
+    u -= (u @ smooth.T) @ smooth
+    # columns are shapes times functions of frequency, and all outputs count alike: so do their products
+    gram = (shapes.conj() @ shapes.T) * (u.conj() @ u.T)
+    return _solved(gram, np.sum(shapes.conj() * (u.conj() @ frf.T), axis=1))
 
 
 def smooth_terms(n_lines: int) -> Real:
@@ -219,7 +221,11 @@ def _whitened(columns: Complex, data: Complex, weight: Real, smooth: Real) -> tu
 def _least_squares(columns: Complex, data: Complex) -> Complex:
     """Coefficients of columns (n_outputs, n_columns, n_lines) in data (n_outputs, n_lines)."""
     flat = columns.swapaxes(0, 1).reshape(columns.shape[1], -1)
-    gram, right = flat.conj() @ flat.T, flat.conj() @ data.ravel()
+    return _solved(flat.conj() @ flat.T, flat.conj() @ data.ravel())
+
+
+def _solved(gram: Complex, right: Complex) -> Complex:
+    """Solution of normal equations, columns scaled to unit size."""
     size = 1 / np.sqrt(np.maximum(gram.diagonal().real, 1e-300))
     return np.asarray(size * np.linalg.lstsq(gram * size[:, None] * size, size * right, rcond=1e-10)[0])
 

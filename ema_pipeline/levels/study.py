@@ -44,7 +44,9 @@ def levels_of(hits: Sequence[Hit], settings: LevelSettings) -> Integers:
     """Level of every hit, 0 for the softest, (n_hits,)."""
     from ema_pipeline.levels.sort import sort_levels
 
-    return sort_levels([h.impact.point for h in hits], [abs(h.peak_force) for h in hits], settings.level_ratio)
+    return sort_levels(
+        [h.impact.point for h in hits], [abs(h.peak_force) for h in hits], settings.level_ratio
+    )
 
 
 def study_levels(

@@ -196,7 +196,7 @@ def visibility(data: FitData, estimate: Estimate, solution: LinearSolution) -> R
 
 def misfit(data: FitData, hits: Noise, estimate: Estimate, solution: LinearSolution) -> Real:
     """What the fit leaves over around each mode, over what the scatter between hits explains."""
-    _, ratio = left_over(data, hits, estimate, solution)
+    ratio = left_over(data, hits, estimate, solution)
     out = np.empty(len(estimate.poles))
     for r, pole in enumerate(estimate.poles):
         line = int(np.argmin(np.abs(data.omega - pole.imag)))

@@ -153,8 +153,10 @@ def _with_force(peak: PeakMovement) -> float:
 
 
 def _by_chance(a: Real, b: Real) -> float:
-    """Probability by chance of a rank correlation (Spearman's) as large as that of two samples; NaN of a constant one."""
-    ranked = [np.searchsorted(np.sort(x), x, "left") + np.searchsorted(np.sort(x), x, "right") for x in (a, b)]
+    """Probability by chance of as large a rank correlation (Spearman's) of two samples; NaN if one is constant."""
+    ranked = [
+        np.searchsorted(np.sort(x), x, "left") + np.searchsorted(np.sort(x), x, "right") for x in (a, b)
+    ]
     with np.errstate(divide="ignore", invalid="ignore"):
         r = np.corrcoef(ranked)[0, 1]
         t = r * np.sqrt(max((len(a) - 2) / ((1 + r) * (1 - r)), 0.0))

@@ -26,8 +26,8 @@ def _made(dimensions: int) -> numba.types.Array:
 
 
 _DATA = (_read(_REAL, 3), _read(_REAL, 3), _read(_FLAG, 2))
-"""Squared errors, squared FRFs, and which were measured. One type for arrays of any order in memory: each further one would be
-compiled by itself, for a second or two."""
+"""Squared errors, squared FRFs, and which were measured. One type for arrays of any order in memory: each further one
+would be compiled by itself, for a second or two."""
 
 
 def _loop(*arguments: numba.types.Type) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -115,6 +115,7 @@ def fit_segment(
                 estimate, held = put_back(estimate, before, lost), held | lost
                 continue
         noise = measured_noise(data, hits, estimate, solution.shapes, weight)
+        del weight  # as large as half the data
         solution = solve_linear(data, noise.weight(data.measured), estimate)
         fit = SegmentFit(estimate, solution, noise, held)
         drop = judge(data, fit) if len(estimate.poles) else np.zeros(0, dtype=bool)
@@ -144,7 +145,7 @@ def measured_noise(
     data: FitData, hits: Noise | None, estimate: Estimate, shapes: Complex, weight: Real
 ) -> Noise:
     """Noise from what the fit leaves over, and from the scatter over hits where that is larger."""
-    left, square = np.empty((2, *data.frf.shape))
+    left, square = np.empty(data.frf.shape), np.empty(data.frf.shape)
 
     def of_rows(rows: slice) -> None:
         some = data.rows(rows)
@@ -160,5 +161,7 @@ def measured_noise(
     linear = 2.0 * len(estimate.poles) / max(n_ref, 1) + 8.0
     share = max(1.0 - linear / (2.0 * n_lines), 0.3)
     left /= share
-    found = fit_law_of_squares(left, square, data.measured, inputs_are_rows=data.transposed).at_squares(square)
+    found = fit_law_of_squares(left, square, data.measured, inputs_are_rows=data.transposed).at_squares(
+        square
+    )
     return found if hits is None else larger(found, hits)

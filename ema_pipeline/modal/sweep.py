@@ -403,8 +403,9 @@ def _of_all_rows(window: Window, fit: _Polished, part: SubBand, iterations: int)
             scores = scores_of_points(transposed, estimate, one.solution)
             return _shapes_and_stds(data, one, first), scores
 
-        some, found = zip(*in_order(of_rows, blocks), strict=True)
-        scores, parts = zip(*found, strict=True)
+        each = list(in_order(of_rows, blocks))
+        some = [shapes for shapes, _ in each]
+        scores, parts = zip(*(told for _, told in each), strict=True)
         scatter = scatter_over_points(np.sum(scores, axis=0), np.sum(parts, axis=0))
         parameters = _widened(first, scatter)
     shapes, stds = (np.concatenate(x) for x in zip(*some, strict=True))
