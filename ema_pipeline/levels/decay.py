@@ -115,6 +115,7 @@ def decays(hits: Hits, frfs: FrfSet, modal: ModalModel) -> tuple[DecayCurve, ...
         tasks = wanted.get(number, [])
         if tasks:
             found += _of_hit(hit, tasks, frfs, poles, residues)
+            release_memory()
     return tuple(sorted(found, key=lambda c: (c.mode, c.hit)))
 
 
