@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import multiprocessing
 import os
 import signal
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from multiprocessing.context import ForkProcess
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
-_M_ARENA_MAX = -8  # malloc.h
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # malloc.h
 
 _holders = 0
 """Blocks of `workers_die_with_us` that are open; forked processes inherit the number."""
@@ -58,11 +59,16 @@ def release_memory() -> None:
 def one_store_of_memory() -> None:
     """Have the threads that this process will start take their memory from one store (Linux).
 
-    With a store each, as the C library has it, what one thread has freed is lost to the others.
+    With a store each, as the C library has it, what one thread has freed is lost to the others. Arrays from 4 MB on are
+    kept apart and given back at once; with the C library's own limit, which rises to 32 MB, they leave holes. What is
+    smaller is not given back each time that the store's end is free.
     """
     if sys.platform == "linux":
         with suppress(AttributeError):
-            ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
+            library = ctypes.CDLL(None)
+            library.mallopt(_M_ARENA_MAX, 1)
+            library.mallopt(_M_MMAP_THRESHOLD, 4 << 20)
+            library.mallopt(_M_TRIM_THRESHOLD, 64 << 20)
 
 
 def die_with_parent(parent: int) -> None:
@@ -132,6 +138,7 @@ def side_by_side(
     left = list(enumerate(items))
     running: dict[Connection, tuple[int, ForkProcess]] = {}
     failed: dict[int, Exception] = {}
+    gc.freeze()  # what is there is shared by all: a worker that looks for cycles in it would copy it
     try:
         while left or running:
             while left and len(running) < processes:
@@ -157,6 +164,7 @@ def side_by_side(
                 process.join()
                 del running[connection]
     finally:
+        gc.unfreeze()
         for _, process in running.values():
             process.kill()
             process.join()

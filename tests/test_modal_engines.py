@@ -220,7 +220,9 @@ def test_slopes_of_the_noise_law_equal_sums_over_lines() -> None:
     for common, by in ((True, np.abs(response) ** 2), (False, 1.0)):
         out = np.empty((2, rows, refs, nodes))
         spacing = (lines - 1) / (nodes - 1)
-        slopes(power, response, measured, floor, alpha, shape, level, starts, spacing, common, out)
+        slopes(
+            power, np.abs(response) ** 2, measured, floor, alpha, shape, level, starts, spacing, common, out
+        )
         assert np.allclose(out[0], (less * by) @ hats.T, rtol=1e-10)
         assert np.allclose(out[1], (more * by) @ hats.T, rtol=1e-10)
 

@@ -17,10 +17,11 @@ from ema_pipeline.frf.channels import ChannelQuality, merged
 from ema_pipeline.frf.checks import check_frfs
 from ema_pipeline.frf.parts import joined
 from ema_pipeline.frf.settings import FrfSettings
-from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.frf.types import FrfSet, unknown
 from ema_pipeline.frf.warp import WarpedTransform
 from ema_pipeline.frf.windows import Windows, decay_rate
 from ema_pipeline.ingest.records import HitSamples
+from ema_pipeline.processes import release_memory
 
 Shifts = Callable[[HitSamples], NDArray[np.float64]]
 """Relative shift of frequency of a hit at every line, (n_lines,): line k is read at k·(1 + shift)."""
@@ -45,7 +46,11 @@ STRONG_SHARE = 0.8
 
 
 def estimate_frfs(
-    hits: Iterable[HitSamples], settings: FrfSettings | None = None, shifts: Shifts | None = None
+    hits: Iterable[HitSamples],
+    settings: FrfSettings | None = None,
+    shifts: Shifts | None = None,
+    *,
+    coherence: bool = True,
 ) -> FrfSet:
     """Estimate FRFs, coherence and variance from hits.
 
@@ -75,6 +80,8 @@ def estimate_frfs(
     shifts : callable, optional
         Gives the shift of frequency of each hit, so that hits whose frequencies have moved are averaged where
         they belong together.
+    coherence : bool
+        False where neither coherence nor checks are asked for: a third less memory.
 
     Returns
     -------
@@ -99,14 +106,14 @@ def estimate_frfs(
             total = totals.setdefault(hit.hit.part, _Total())
             _accumulate(total.sheet_of(hit), hit, settings, shifts, pool)
         parts = {
-            name: _finish(total, total.first, settings, pool)
+            name: _finish(total, total.first, settings, pool, coherence)
             for name, total in totals.items()
             if total.first is not None
         }
     if not parts:
         raise EmaError("no accepted hit: there is nothing to estimate FRFs from; see the hits' verdicts")
     frfs = joined(parts)
-    return replace(frfs, verdicts=check_frfs(frfs, settings))
+    return replace(frfs, verdicts=check_frfs(frfs, settings)) if coherence else frfs
 
 
 @dataclass
@@ -241,13 +248,16 @@ def _accumulate(
     list(pool.map(add, range(0, signs.size, BLOCK)))
 
 
-def _finish(total: _Total, first: HitSamples, settings: FrfSettings, pool: ThreadPoolExecutor) -> FrfSet:
+def _finish(
+    total: _Total, first: HitSamples, settings: FrfSettings, pool: ThreadPoolExecutor, with_coherence: bool
+) -> FrfSet:
     """Sums to FRFs, in the sums' own memory where all hits share one sheet."""
     outputs, inputs = list(total.outputs), list(total.inputs)
     n_samples, rate = first.force.size, first.sample_rate_hz
     frequency = np.asarray(np.fft.rfftfreq(n_samples, 1 / rate), dtype=np.float64)
     shape = (len(outputs), len(inputs), frequency.size)
     hits = np.zeros(shape[:2], dtype=np.int64)
+    release_memory()  # what spectra have taken, before the sums are put together
     forces = _forces(total, inputs)
     if len(total.sheets) == 1:
         _, sheet = total.sheets.popitem()
@@ -256,7 +266,12 @@ def _finish(total: _Total, first: HitSamples, settings: FrfSettings, pool: Threa
         force = {(0, 0): sheet.force}
         shared = True
     else:
-        cross, auto = np.zeros(shape, dtype=np.complex128), np.zeros(shape)
+        if with_coherence:  # to be stored, in the order of the axes
+            cross, auto = np.zeros(shape, dtype=np.complex128), np.zeros(shape)
+        else:  # each input by itself in memory: what is not yet written to takes none
+            by_input = shape[1], shape[0], shape[2]
+            cross = np.zeros(by_input, dtype=np.complex128).swapaxes(0, 1)
+            auto = np.zeros(by_input).swapaxes(0, 1)
         force = {}
         shared = False
         while total.sheets:
@@ -270,15 +285,15 @@ def _finish(total: _Total, first: HitSamples, settings: FrfSettings, pool: Threa
                 # Outputs share the force sum of their sheet until a second sheet adds its own.
                 force[o, i] = force[o, i] + sheet.force if (o, i) in force else sheet.force
             del sheet  # as large as its part of the FRFs
-    variance = np.empty(shape)
+    variance = np.empty(shape) if with_coherence else auto
 
     def finish(output: int) -> None:
         for i in range(len(inputs)):
-            key = (0, 0) if shared else (output, i)
+            key, sums = (0, 0) if shared else (output, i), auto[output, i]
             _finish_one(
                 cross[output, i],
-                auto[output, i],
-                variance[output, i],
+                sums,
+                variance[output, i] if with_coherence else sums,
                 force.get(key),
                 int(hits[output, i]),
                 settings,
@@ -288,7 +303,7 @@ def _finish(total: _Total, first: HitSamples, settings: FrfSettings, pool: Threa
     return FrfSet(
         frequency_hz=frequency,
         frf=cross,
-        coherence=auto,
+        coherence=auto if with_coherence else unknown(shape),
         variance=variance,
         outputs=tuple(total.outputs.values()),
         inputs=tuple(total.inputs.values()),
@@ -314,7 +329,10 @@ def _finish_one(
     n: int,
     settings: FrfSettings,
 ) -> None:
-    """Turn, in place, the cross sum into the FRF and the auto sum into the coherence; fill the variance."""
+    """Turn, in place, the cross sum into the FRF and the auto sum into the coherence; fill the variance.
+
+    Where the variance has the memory of the auto sum, there is no room for the coherence.
+    """
     if force is None or n == 0:
         cross[:] = complex(np.nan, np.nan)
         auto[:] = variance[:] = np.nan
@@ -340,7 +358,8 @@ def _finish_one(
         gain = np.divide(1.0, coherence**power, out=np.zeros_like(coherence), where=coherence > 1e-12)
         cross *= gain
         variance *= gain**2
-    auto[:] = coherence if n > 1 else np.nan
+    if variance is not auto:
+        auto[:] = coherence if n > 1 else np.nan
 
 
 def _within(band_hz: tuple[float, float], hit: HitSamples) -> tuple[float, float]:

@@ -27,7 +27,7 @@ def _frfs(run: Run, configuration: str, progress: Progress) -> FrfSet:
 
 
 def _modes(run: Run, configuration: str, progress: Progress) -> ModalModel:
-    from ema_pipeline.modal.circle import attach_circles, identify_by_circle
+    from ema_pipeline.modal.circle import attach_circles
     from ema_pipeline.modal.moving import identify_hits
     from ema_pipeline.modal.pooling import pooled
 
@@ -37,6 +37,8 @@ def _modes(run: Run, configuration: str, progress: Progress) -> ModalModel:
         return without_coherence(run, configuration)
 
     if settings.method == "circle":
+        from ema_pipeline.modal.circle import identify_by_circle
+
         return identify_by_circle(load_frfs(), settings.circle)
     found = identify_hits(
         lambda: accepted_hits(run.store, configuration),

@@ -27,8 +27,9 @@ from ema_pipeline.levels.differences import participations
 from ema_pipeline.levels.single import output_shapes, windows_about
 from ema_pipeline.levels.trend import Samples, Trend, trends
 from ema_pipeline.levels.types import DecayCurve
-from ema_pipeline.modal.basis import pole_functions
+from ema_pipeline.modal.basis import pole_values
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.processes import release_memory
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -107,12 +108,14 @@ def decays(hits: Hits, frfs: FrfSet, modal: ModalModel) -> tuple[DecayCurve, ...
     decay = frfs.response_decay_rad_s
     poles = np.array([m.pole for m in modal.modes], dtype=np.complex128) - decay
     residues = _residues(frfs, modal, poles)  # (n_modes, n_outputs, n_inputs), accelerance
+    release_memory()
     wanted = _tasks([(h.hit.impact.point, abs(h.hit.peak_force)) for h in hits()], frfs, poles, residues)
     found: list[DecayCurve] = []
     for number, hit in enumerate(hits()):
         tasks = wanted.get(number, [])
         if tasks:
             found += _of_hit(hit, tasks, frfs, poles, residues)
+            release_memory()
     return tuple(sorted(found, key=lambda c: (c.mode, c.hit)))
 
 
@@ -172,8 +175,8 @@ def _of_hit(
     curves = []
     for task, band, weight, measured in zip(tasks, bands, weights, combined, strict=True):
         pole, lines, omega = complex(poles[task.mode]), band.lines, 2 * np.pi * band.axis
-        u, _ = pole_functions(omega, poles, n / rate - start_s)
-        mirrored, _ = pole_functions(omega, poles.conj(), n / rate - start_s)
+        u = pole_values(omega, poles, n / rate - start_s)
+        mirrored = pole_values(omega, poles.conj(), n / rate - start_s)
         share = residues[:, outputs, i] @ weight
         other_share = residues[:, outputs, i].conj() @ weight
         mine = u[task.mode] * force[lines]

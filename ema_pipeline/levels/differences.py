@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.basis import pole_functions
+from ema_pipeline.modal.basis import pole_functions, pole_values
 from ema_pipeline.modal.noise import fit_noise
 
 Real = NDArray[np.float64]
@@ -137,9 +137,11 @@ def participations(omega: Real, frf: Complex, poles: Complex, shapes: Complex, r
     complex ndarray, (n_modes,)
         Residue over shape.
     """
-    u, _ = pole_functions(omega, poles, rest_s)
-    weight = np.ones((len(frf), len(omega)))
-    return _least_squares(*_whitened(shapes.T[:, :, None] * u, frf, weight, smooth_terms(len(omega))))
+    smooth, u = smooth_terms(len(omega)), pole_values(omega, poles, rest_s)
+    u -= (u @ smooth.T) @ smooth
+    # columns are shapes times functions of frequency, and all outputs count alike: so do their products
+    gram = (shapes.conj() @ shapes.T) * (u.conj() @ u.T)
+    return _solved(gram, np.sum(shapes.conj() * (u.conj() @ frf.T), axis=1))
 
 
 def smooth_terms(n_lines: int) -> Real:
@@ -163,7 +165,7 @@ def _of_mean(
     that the mean hardly tells of keep theirs.
     """
     m = len(poles)
-    u, _ = pole_functions(omega, poles, rest_s)
+    u = pole_values(omega, poles, rest_s)
     left = mean - shapes.T @ (start[:, None] * u)
     change = _refined(omega, poles, shapes, rest_s, start, np.zeros(2 * m, complex), left, weight, smooth)[:m]
     strong = np.max(np.abs(start[:, None] * u), axis=1) > PLAIN * np.max(np.abs(left))
@@ -183,7 +185,7 @@ def _refined(
 ) -> Complex:
     """Change of poles and participations of one hit, linearised anew where the last step ended."""
     m = len(poles)
-    before = start[:, None] * pole_functions(omega, poles, rest_s)[0]
+    before = start[:, None] * pole_values(omega, poles, rest_s)
     for _ in range(STEPS):
         now = start + change[m:]
         u, du = pole_functions(omega, poles + change[:m], rest_s)
@@ -219,7 +221,11 @@ def _whitened(columns: Complex, data: Complex, weight: Real, smooth: Real) -> tu
 def _least_squares(columns: Complex, data: Complex) -> Complex:
     """Coefficients of columns (n_outputs, n_columns, n_lines) in data (n_outputs, n_lines)."""
     flat = columns.swapaxes(0, 1).reshape(columns.shape[1], -1)
-    gram, right = flat.conj() @ flat.T, flat.conj() @ data.ravel()
+    return _solved(flat.conj() @ flat.T, flat.conj() @ data.ravel())
+
+
+def _solved(gram: Complex, right: Complex) -> Complex:
+    """Solution of normal equations, columns scaled to unit size."""
     size = 1 / np.sqrt(np.maximum(gram.diagonal().real, 1e-300))
     return np.asarray(size * np.linalg.lstsq(gram * size[:, None] * size, size * right, rcond=1e-10)[0])
 

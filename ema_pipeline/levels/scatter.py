@@ -18,8 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.stats import f as fisher
+from scipy.special import betaln, xlogy
 
 Real = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -79,6 +78,8 @@ class Scatter:
         shrunk = (usual.dof * usual.size + self.noise_only) / (usual.dof + self.dof)
         if shrunk <= 1.0:
             return 0.0
+        from scipy.optimize import brentq  # only where scatter exceeds the noise
+
         target = self.noise_only / shrunk
         top = float(np.ptp(self._values)) ** 2 + float(self._variance.max())
         while self._chi_square(top)[0] > target:
@@ -122,12 +123,21 @@ def usual_scatter(scatters: Iterable[Scatter]) -> Usual:
     best, usual = -np.inf, NOTHING_USUAL
     most = max(float(dof.sum()), float(_DOF[0]))
     for shared in (d for d in _DOF.tolist() if d <= most):
-        likelihood = fisher.logpdf(size / _SIZE[:, None], dof, shared) - np.log(_SIZE[:, None])
+        likelihood = _log_density(size / _SIZE[:, None], dof, shared) - np.log(_SIZE[:, None])
         total = np.sum(likelihood, axis=1)
         k = int(np.argmax(total))
         if total[k] > best:
             best, usual = float(total[k]), Usual(float(_SIZE[k]), shared)
     return usual
+
+
+def _log_density(ratio: Real, dof: Real, of_divisor: float) -> Real:
+    """Logarithm of the density of Fisher's F distribution with `dof` over `of_divisor` degrees of freedom."""
+    n, m = dof, of_divisor
+    constant = m / 2 * np.log(m) + n / 2 * np.log(n)
+    return np.asarray(
+        constant + xlogy(n / 2 - 1, ratio) - ((n + m) / 2 * np.log(m + n * ratio) + betaln(n / 2, m / 2))
+    )
 
 
 def _left_over(values: Real, columns: Real) -> tuple[float, int]:

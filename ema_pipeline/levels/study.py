@@ -17,7 +17,7 @@ from ema_pipeline.levels.types import DecayCurve, ForceLevel, HitModes, LevelStu
 from ema_pipeline.modal.settings import ModalSettings
 
 if TYPE_CHECKING:
-    from ema_pipeline.ingest.records import HitSamples
+    from ema_pipeline.ingest.records import Hit, HitSamples
     from ema_pipeline.levels.single import HitPoles
     from ema_pipeline.modal.circle.settings import CircleSettings
     from ema_pipeline.modal.types import ModalModel
@@ -40,6 +40,15 @@ PLAIN_CHANGE = 0.1
 level: smaller ones can be errors of the neighbours that were taken off."""
 
 
+def levels_of(hits: Sequence[Hit], settings: LevelSettings) -> Integers:
+    """Level of every hit, 0 for the softest, (n_hits,)."""
+    from ema_pipeline.levels.sort import sort_levels
+
+    return sort_levels(
+        [h.impact.point for h in hits], [abs(h.peak_force) for h in hits], settings.level_ratio
+    )
+
+
 def study_levels(
     hits: Hits,
     frfs: FrfSet,
@@ -57,7 +66,7 @@ def study_levels(
     hits : callable
         Gives the accepted hits of the configuration, one after the other; may be called more than once.
     frfs : FrfSet
-        Averaged over all hits.
+        Averaged over all hits; their coherence is asked for where there are several levels.
     modal : ModalModel
         Identified from `frfs`.
     settings : LevelSettings
@@ -81,14 +90,12 @@ def study_levels(
     from ema_pipeline.levels.linear import linear_level
     from ema_pipeline.levels.sentences import one_level, several_levels
     from ema_pipeline.levels.signs import signs
-    from ema_pipeline.levels.sort import sort_levels
 
     kept = [h.hit for h in hits()]
-    found = [(h.impact.point, abs(h.peak_force), f"{h.file}#{h.number}") for h in kept]
     unit = kept[0].force_unit
-    force = np.array([f for _, f, _ in found])
-    names = tuple(name for _, _, name in found)
-    place = sort_levels([p for p, _, _ in found], force.tolist(), settings.level_ratio)
+    force = np.array([abs(h.peak_force) for h in kept])
+    names = tuple(f"{h.file}#{h.number}" for h in kept)
+    place = levels_of(kept, settings)
     n_levels = int(place.max()) + 1
     if n_levels == 1:
         level = ForceLevel(float(np.median(force)), names, unit=unit)

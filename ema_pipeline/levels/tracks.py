@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.modal.assurance import mac
@@ -46,6 +45,8 @@ def distances(a: ModalModel, b: ModalModel) -> Real:
 
 def pairs(distance: Real) -> list[tuple[int, int]]:
     """One-to-one pairs with the least total distance, none beyond `FARTHEST`."""
+    from scipy.optimize import linear_sum_assignment  # 14 MB that hits of one level do not need
+
     rows, columns = linear_sum_assignment(np.minimum(distance, FARTHEST))
     return [(int(r), int(c)) for r, c in zip(rows, columns, strict=True) if distance[r, c] < FARTHEST]
 

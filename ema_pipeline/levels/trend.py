@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import f as fisher
-from scipy.stats import t as student
+from scipy.special import fdtrc, stdtr
 
 from ema_pipeline.levels.scatter import NOTHING_USUAL, Scatter, Usual, usual_scatter
 
@@ -188,7 +187,7 @@ def _slope(given: Samples, regressor: Real, extra: float, dof: float) -> tuple[f
     beta = float(np.sum(weight * across * given.values)) / strength
     force = _centred(given.log_force, weight, given.sheet)
     per_log = beta * float(np.sum(weight * across * force) / np.sum(weight * force**2))
-    return 2 * float(student.sf(abs(beta) * np.sqrt(strength), dof)), per_log
+    return 2 * float(stdtr(dof, -abs(beta) * np.sqrt(strength))), per_log
 
 
 def _own_slopes(given: Samples, regressor: Real, extra: float, dof: float) -> float:
@@ -200,7 +199,7 @@ def _own_slopes(given: Samples, regressor: Real, extra: float, dof: float) -> fl
     told = strength > 0
     if not told.any():
         return float("nan")
-    return float(fisher.sf(np.mean(moved[told] ** 2 / strength[told]), int(told.sum()), dof))
+    return float(fdtrc(int(told.sum()), dof, np.mean(moved[told] ** 2 / strength[told])))
 
 
 def combined(p_values: Real) -> float:

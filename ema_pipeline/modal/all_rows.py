@@ -38,14 +38,18 @@ class _Sums:
     step: Step
 
 
-def placed(window: Window, fit: SegmentFit, iterations: int) -> tuple[Estimate, NDArray[np.bool_]]:
+def placed(
+    window: Window, start: Estimate, held: NDArray[np.bool_], iterations: int
+) -> tuple[Estimate, NDArray[np.bool_]]:
     """Modes of combinations of rows, placed where all rows want them.
 
     Parameters
     ----------
     window : Window
-    fit : SegmentFit
+    start : Estimate
         Of the combinations.
+    held : ndarray of bool, (n_modes,)
+        Modes that stay where they are.
     iterations : int
         Of the descent at most; 0 keeps the poles where they are.
 
@@ -53,9 +57,8 @@ def placed(window: Window, fit: SegmentFit, iterations: int) -> tuple[Estimate, 
     -------
     Estimate
     held : ndarray of bool, (n_modes,)
-        Modes that stay where `fit` has them: held there before, or driven away by the rows.
+        Modes that stay where `start` has them: held there before, or driven away by the rows.
     """
-    start, held = fit.estimate, fit.held
     if not iterations:
         return start, held
     blocks = window.data.row_blocks()

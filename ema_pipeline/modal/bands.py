@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
-import scipy.signal
 from numpy.typing import NDArray
 
 from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.maxima import prominent_peaks
 
 Real = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def indicator(data: FitData, level: Real) -> Real:
 def find_peaks(curve: Real) -> NDArray[np.int64]:
     """Peaks that stand out of a curve in dB by 3 dB."""
     smooth = scipy.ndimage.gaussian_filter1d(curve, 1.0)
-    return np.asarray(scipy.signal.find_peaks(smooth, prominence=3.0)[0], dtype=np.int64)
+    return prominent_peaks(smooth, 3.0)[0]
 
 
 def split(omega: Real, curve: Real) -> tuple[SubBand, ...]:

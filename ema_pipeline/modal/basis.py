@@ -36,14 +36,26 @@ def pole_functions(omega: Real, poles: Complex, rest_s: float) -> tuple[Complex,
     -------
     u, du : complex ndarray, (n_poles, n_lines)
     """
-    delta = 1j * omega - poles[:, None]
-    inverse = 1.0 / delta
+    inverse = 1.0 / (1j * omega - poles[:, None])
     if not np.isfinite(rest_s):
         return inverse, inverse**2
-    # as a product, because an exponential of every line and pole costs ten times as much
-    tail = _left(poles, rest_s)[:, None] * np.exp(-1j * omega * rest_s)
+    tail = _tail(omega, poles, rest_s)
     u = (1.0 - tail) * inverse
     return u, u * inverse - rest_s * tail * inverse
+
+
+def pole_values(omega: Real, poles: Complex, rest_s: float) -> Complex:
+    """The first of `pole_functions` alone."""
+    u = 1j * omega - poles[:, None]
+    np.divide(1.0, u, out=u)
+    if np.isfinite(rest_s):
+        u *= 1.0 - _tail(omega, poles, rest_s)
+    return np.asarray(u)
+
+
+def _tail(omega: Real, poles: Complex, rest_s: float) -> Complex:
+    """exp((s - jω)·rest): as a product, because an exponential of every line and pole costs ten times as much."""
+    return np.asarray(_left(poles, rest_s)[:, None] * np.exp(-1j * omega * rest_s))
 
 
 def real_columns(omega: Real, poles: Complex, rest_s: float) -> tuple[Complex, Complex]:
@@ -56,13 +68,24 @@ def real_columns(omega: Real, poles: Complex, rest_s: float) -> tuple[Complex, C
         Im Q times row 2r+1.
     """
     columns, derivatives = np.empty((2, 2 * len(poles), len(omega)), dtype=np.complex128)
+    _fill(omega, poles, rest_s, columns, derivatives)
+    return columns, derivatives
+
+
+def mode_columns(omega: Real, poles: Complex, rest_s: float) -> Complex:
+    """The columns of `real_columns` alone, at two thirds of the cost."""
+    columns = np.empty((2 * len(poles), len(omega)), dtype=np.complex128)
+    _fill(omega, poles, rest_s, columns, columns[:0])
+    return columns
+
+
+def _fill(omega: Real, poles: Complex, rest_s: float, columns: Complex, derivatives: Complex) -> None:
     if np.isfinite(rest_s):
         left, turn = _left(poles, rest_s), np.exp(-1j * omega * rest_s)
     else:
         rest_s, left, turn = 0.0, np.zeros_like(poles), np.zeros(len(omega), dtype=np.complex128)
     flat = np.ascontiguousarray(omega), np.ascontiguousarray(poles)
     columns_of_poles(*flat, rest_s, left, turn, columns, derivatives)
-    return columns, derivatives
 
 
 def _left(poles: Complex, rest_s: float) -> Complex:

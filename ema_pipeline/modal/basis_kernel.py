@@ -42,8 +42,9 @@ def columns_of_poles(
     turn : complex ndarray, (n_lines,)
         exp(−jω·rest).
     columns, slopes : complex ndarray, (2·n_poles, n_lines)
-        Made.
+        Made; slopes not where they have no rows.
     """
+    with_slopes = slopes.shape[0] > 0
     for r in range(poles.size):
         a, place, lr, li = -poles[r].real, poles[r].imag, left[r].real, left[r].imag
         for k in range(omega.size):
@@ -64,5 +65,6 @@ def columns_of_poles(
             er, ei = wr * x - wi * y, wr * y + wi * x
             columns[2 * r, k] = complex(ur + vr, ui + vi)
             columns[2 * r + 1, k] = complex(vi - ui, ur - vr)
-            slopes[2 * r, k] = complex(dr + er, di + ei)
-            slopes[2 * r + 1, k] = complex(ei - di, dr - er)
+            if with_slopes:
+                slopes[2 * r, k] = complex(dr + er, di + ei)
+                slopes[2 * r + 1, k] = complex(ei - di, dr - er)

@@ -114,16 +114,20 @@ def compress(window: Window) -> Local:
 
     gram = sum(in_order(products, blocks))
     mixer = np.linalg.eigh(gram)[1][:, ::-1][:, :MAX_ROWS].T * level  # (kept, rows)
-    parts = list(in_order(lambda lines: _mixed(window.lines(lines.start, lines.stop), mixer), blocks))
+    shape = MAX_ROWS, n_ref, n_lines
+    frf, noise = np.empty(shape, dtype=np.complex128), Noise(np.empty(shape), np.empty(shape))
+
+    def mix(lines: slice) -> None:
+        frf[..., lines], some = _mixed(window.lines(lines.start, lines.stop), mixer)
+        noise.common[..., lines], noise.own[..., lines] = some.common, some.own
+
+    for _ in in_order(mix, blocks):
+        pass
     small = replace(
         data,
-        frf=np.concatenate([frf for frf, _ in parts], axis=-1),
-        variance=np.broadcast_to(np.nan, (MAX_ROWS, n_ref, n_lines)),
+        frf=frf,
+        variance=np.broadcast_to(np.nan, shape),
         measured=np.ones((MAX_ROWS, n_ref), dtype=bool),
-    )
-    noise = Noise(
-        np.concatenate([noise.common for _, noise in parts], axis=-1),
-        np.concatenate([noise.own for _, noise in parts], axis=-1),
     )
     return Local(small, noise, window.from_hits)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import scipy.stats
+import scipy.special
 from numpy.typing import NDArray
 
 from ema_pipeline.modal.assurance import mac, mpc
@@ -196,7 +196,7 @@ def visibility(data: FitData, estimate: Estimate, solution: LinearSolution) -> R
 
 def misfit(data: FitData, hits: Noise, estimate: Estimate, solution: LinearSolution) -> Real:
     """What the fit leaves over around each mode, over what the scatter between hits explains."""
-    _, ratio = left_over(data, hits, estimate, solution)
+    ratio = left_over(data, hits, estimate, solution)
     out = np.empty(len(estimate.poles))
     for r, pole in enumerate(estimate.poles):
         line = int(np.argmin(np.abs(data.omega - pole.imag)))
@@ -265,8 +265,8 @@ def significance(
     rows = int(np.count_nonzero(data.measured.any(axis=1)))
     chance = FALSE_ALARM / len(data.omega)
     free = 2 * rows + 2 * data.measured.shape[1]
-    independent = scipy.stats.chi2.isf(chance, free)
-    coherent = free / 4 * scipy.stats.chi2.isf(chance, 4)
+    independent = scipy.special.chdtri(free, chance)
+    coherent = free / 4 * scipy.special.chdtri(4, chance)
     at = np.clip(np.searchsorted(data.omega, estimate.poles.imag), 0, len(data.omega) - 1)
     weight = noise.weight(data.measured)
     share = np.einsum("oil,oil->l", noise.common, weight)[at] / max(np.count_nonzero(data.measured), 1)

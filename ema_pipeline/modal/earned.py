@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.ndimage
-import scipy.signal
 from numpy.typing import NDArray
 
 from ema_pipeline.modal.assurance import mpc
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, LinearSolution, solve_linear
+from ema_pipeline.modal.maxima import prominent_peaks
 
 Real = NDArray[np.float64]
 
@@ -88,7 +88,7 @@ def has_peak(omega: Real, power: Real, pole: complex) -> bool:
     step = float(omega[1] - omega[0])
     smooth = scipy.ndimage.gaussian_filter1d(power, max(-SMOOTHING * pole.real / step, 1.0), mode="nearest")
     curve = 10 * np.log10(np.maximum(smooth, 1e-300))
-    peaks = scipy.signal.find_peaks(curve, prominence=RISE_DB)[0]
+    peaks, _ = prominent_peaks(curve, RISE_DB)
     return bool(np.any(np.abs(omega[peaks] - pole.imag) < max(-pole.real, 2 * step)))
 
 

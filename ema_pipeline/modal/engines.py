@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.basis import real_columns, residual_columns
+from ema_pipeline.modal.basis import mode_columns, residual_columns
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.lscf import common_denominator_poles
 from ema_pipeline.modal.plscf import MAX_DAMPING_RATIO, polyreference_poles
@@ -122,7 +122,7 @@ def _with_shapes(
     power = np.concatenate([flat.real, flat.imag], axis=1)
     shapes, parts = [np.zeros((0, n_rows), complex)], [np.zeros((0, n_ref), complex)]
     for p in keep:
-        columns, _ = real_columns(omega, p, np.inf)
+        columns = mode_columns(omega, p, np.inf)
         basis = np.concatenate([columns, residual_columns(omega)])
         stacked = np.concatenate([basis.real, basis.imag], axis=1)
         gram = stacked @ stacked.T

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.basis import real_columns, residual_columns
+from ema_pipeline.modal.basis import mode_columns, real_columns, residual_columns
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.gram_kernel import products
 from ema_pipeline.threads import in_order
@@ -208,16 +208,19 @@ def _normal_equations(
     power = np.zeros(n_frfs)
 
     def of_lines(block: slice) -> tuple[Real, Real, Real]:
-        columns, derivatives = real_columns(data.omega[block], estimate.poles, data.rest_s)
+        where = data.omega[block], estimate.poles, data.rest_s
+        of_modes = real_columns(*where) if slopes else (mode_columns(*where),)
         frf, weight = known(block)
         return weighted_grams(
-            np.concatenate([columns, *([derivatives] if slopes else []), residual[:, block]]),
+            np.concatenate([*of_modes, residual[:, block]]),
             weight.reshape(n_frfs, -1),
             frf.reshape(n_frfs, -1),
         )
 
     for some in in_order(of_lines, blocks):
-        gram, moment, power = gram + some[0], moment + some[1], power + some[2]
+        gram += some[0]
+        moment += some[1]
+        power += some[2]
     return _project_out(gram, moment, power, n_modes)
 
 
@@ -329,7 +332,7 @@ def synthesis(data: FitData, estimate: Estimate, shapes: Complex) -> Complex:
     residues = _parts(shapes[:, None, :] * estimate.participation.T[None])
     out = np.empty(data.frf.shape, dtype=np.complex128)
     for block in _blocks(len(data.omega)):
-        columns, _ = real_columns(data.omega[block], estimate.poles, data.rest_s)
+        columns = mode_columns(data.omega[block], estimate.poles, data.rest_s)
         out[..., block] = _summed(residues, columns)
     return out
 

@@ -87,7 +87,9 @@ def identify(
     """
     tell = progress or (lambda share, text: None)
     with single_blas_thread():
-        return _identify(frfs, settings, tell, peaks, wanted)
+        found = _identify(frfs, settings, tell, peaks, wanted)
+    release_memory()
+    return found
 
 
 def _identify(

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, LinearSolution, residual_fit, synthesis
-from ema_pipeline.modal.noise import Noise
+from ema_pipeline.modal.noise import Noise, squared
+from ema_pipeline.threads import in_order
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -41,20 +42,29 @@ a structure that is not linear, and a fit of all of them takes minutes."""
 
 
 def left_over(
-    data: FitData, hits: Noise, estimate: Estimate, solution: LinearSolution
-) -> tuple[Complex, Real]:
-    """What the fit leaves of the FRFs, and its power on each line over what the scatter between hits explains.
+    data: FitData, hits: Noise, estimate: Estimate, solution: LinearSolution, left: Complex | None = None
+) -> Real:
+    """Power on each line of what the fit leaves of the FRFs, over what the scatter between hits explains, (n_lines,).
 
-    Returns
-    -------
-    left : complex ndarray, (n_rows, n_references, n_lines)
-    ratio : ndarray, (n_lines,)
+    Parameters
+    ----------
+    data, hits, estimate, solution
+        As for `missed`.
+    left : complex ndarray, (n_rows, n_references, n_lines), optional
+        Filled with what is left over.
     """
-    weight = hits.weight(data.measured)
-    modes = synthesis(data, estimate, solution.shapes)
-    left = np.where(data.measured[..., None], data.frf - modes - residual_fit(data, weight, modes), 0.0)
-    power = np.sum(np.abs(left) ** 2 * weight, axis=(0, 1))
-    return left, power / max(int(np.count_nonzero(data.measured)), 1)
+
+    def of_rows(rows: slice) -> Real:
+        some, weight = data.rows(rows), hits.rows(rows).weight(data.measured[rows])
+        model = synthesis(some, estimate, solution.shapes[rows])
+        model += residual_fit(some, weight, model)
+        model = np.where(some.measured[..., None], some.frf - model, 0.0)
+        if left is not None:
+            left[rows] = model
+        return np.einsum("oil,oil->l", squared(model), weight)
+
+    power = np.asarray(sum(in_order(of_rows, data.row_blocks())))
+    return power / max(int(np.count_nonzero(data.measured)), 1)
 
 
 def missed(
@@ -74,7 +84,8 @@ def missed(
     found = estimate.take(np.zeros(len(estimate.poles), dtype=bool))
     if np.count_nonzero(data.measured) < FEWEST:
         return found
-    left, ratio = left_over(data, hits, estimate, solution)
+    left = np.empty(data.frf.shape, dtype=np.complex128)
+    ratio = left_over(data, hits, estimate, solution, left)
     ratio = scipy.ndimage.gaussian_filter1d(ratio, 1.5, mode="nearest")
     for _ in range(WINDOWS):
         peak = int(np.argmax(ratio))

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.stats
 from numpy.typing import NDArray
+from scipy.special import ndtri, stdtr, stdtrit
 
 from ema_pipeline.choices import ModeChoice
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
-from ema_pipeline.frf.types import FrfSet, unknown
+from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.chosen import wanted
 from ema_pipeline.modal.data import analysis_band
 from ema_pipeline.modal.drift.align import NOTICED, Alignment, PeakMovement, align
@@ -89,8 +89,7 @@ def identify_hits(
         alignment = align(hits, frfs, frf_settings, analysis_band(frfs, settings))
         if alignment.shifts is not None:
             del frfs
-            frfs = estimate_frfs(hits(), frf_settings, alignment.shifts)
-            frfs = replace(frfs, coherence=unknown(frfs.frf.shape))  # not asked for
+            frfs = estimate_frfs(hits(), frf_settings, alignment.shifts, coherence=False)
     release_memory()
     asked = wanted(included, frfs.response_decay_rad_s)
     modal = identify(frfs, settings, progress, alignment.known_peaks(), asked)
@@ -147,10 +146,21 @@ def _with_force(peak: PeakMovement) -> float:
     if np.count_nonzero(shown) < FEWEST_HITS or np.ptp(peak.force[shown]) == 0:
         return 0.0
     force, moved = peak.force[shown], moved[shown]
-    if scipy.stats.spearmanr(force, moved).pvalue > CHANCE:
+    if _by_chance(force, moved) > CHANCE:
         return 0.0
     low, high = np.quantile(force, [1 / 3, 2 / 3])
     return float(moved[force >= high].mean() - moved[force <= low].mean())
+
+
+def _by_chance(a: Real, b: Real) -> float:
+    """Probability by chance of as large a rank correlation (Spearman's) of two samples; NaN if one is constant."""
+    ranked = [
+        np.searchsorted(np.sort(x), x, "left") + np.searchsorted(np.sort(x), x, "right") for x in (a, b)
+    ]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r = np.corrcoef(ranked)[0, 1]
+        t = r * np.sqrt(max((len(a) - 2) / ((1 + r) * (1 - r)), 0.0))
+    return 2 * float(stdtr(len(a) - 2, -abs(t)))
 
 
 def _of_few(n_hits: int) -> float:
@@ -159,7 +169,7 @@ def _of_few(n_hits: int) -> float:
     The spread is one of maximum likelihood, which leaves out that the mean was estimated too.
     """
     unbiased = np.sqrt(n_hits / max(n_hits - 1, 1))
-    return float(unbiased * scipy.stats.t.ppf(COVERED, max(n_hits - 1, 1)) / scipy.stats.norm.ppf(COVERED))
+    return float(unbiased * stdtrit(max(n_hits - 1, 1), COVERED) / ndtri(COVERED))
 
 
 def _words(spread: float, trend: float) -> str:

@@ -59,6 +59,10 @@ class Noise:
         """The same on lines ``first:stop``."""
         return Noise(self.common[..., first:stop], self.own[..., first:stop])
 
+    def rows(self, rows: slice) -> Noise:
+        """The same for some rows."""
+        return Noise(self.common[rows], self.own[rows])
+
     def weight(self, measured: NDArray[np.bool_]) -> Real:
         """One over variance; 0 where not measured."""
         variance = self.variance
@@ -112,11 +116,14 @@ class NoiseLaw:
 
     def at(self, response: Complex) -> Noise:
         """Noise of FRFs (n_rows, n_references, n_lines)."""
+        return self.at_squares(squared(response))
+
+    def at_squares(self, square: Real) -> Noise:
+        """The same for |H|², which is overwritten."""
         own = self.level[..., None] * (self.shape @ self.hats)
         own += self.floor[..., None]
-        common = squared(response)
-        common *= self.common @ self.hats
-        return Noise(common, own)
+        square *= self.common @ self.hats
+        return Noise(square, own)
 
     def lines(self, first: int, stop: int) -> NoiseLaw:
         """The same on lines ``first:stop``."""
@@ -149,14 +156,28 @@ def fit_noise(power: Real, response: Complex, measured: NDArray[np.bool_], *, in
 def fit_law(
     power: Real, response: Complex, measured: NDArray[np.bool_], *, inputs_are_rows: bool
 ) -> NoiseLaw:
+    """Fit the noise model to squared errors; `response` are the FRFs, the rest as for `fit_law_of_squares`."""
+    square = np.empty(power.shape)
+
+    def of_rows(rows: slice) -> None:
+        square[rows] = squared(response[rows])
+
+    with over_rows(len(power), power.size) as each:
+        each(of_rows)
+    return fit_law_of_squares(power, square, measured, inputs_are_rows=inputs_are_rows)
+
+
+def fit_law_of_squares(
+    power: Real, square: Real, measured: NDArray[np.bool_], *, inputs_are_rows: bool
+) -> NoiseLaw:
     """Fit the noise model to squared errors.
 
     Parameters
     ----------
     power : ndarray, (n_rows, n_references, n_lines)
         Squared modulus of the error, or variance from hits; NaN or 0 where unknown.
-    response : complex ndarray, (n_rows, n_references, n_lines)
-        The FRFs themselves (best from a model, so that their noise does not leak into the weights).
+    square : ndarray, (n_rows, n_references, n_lines)
+        |H|² (best of a model, so that the noise of the FRFs does not leak into the weights).
     measured : ndarray of bool, (n_rows, n_references)
     inputs_are_rows : bool
         True for a roving hammer, where rows are inputs.
@@ -171,7 +192,7 @@ def fit_law(
     axis = 1 if inputs_are_rows else 0  # the axis that outputs run along
 
     def begin(rows: slice) -> None:
-        quiet_lines(power[rows], response[rows], measured[rows], FLOOR**2, floor[rows], quiet[rows])
+        quiet_lines(power[rows], square[rows], measured[rows], FLOOR**2, floor[rows], quiet[rows])
 
     with over_rows(n_rows, power.size) as each:
         each(begin)
@@ -185,7 +206,7 @@ def fit_law(
 
             def work(rows: slice) -> None:
                 a, s = full[0][rows], full[1][rows]
-                known = power[rows], response[rows], measured[rows], floor[rows]
+                known = power[rows], square[rows], measured[rows], floor[rows]
                 slopes(*known, a, s, b[rows], starts, spacing, common, sums[:, rows])
 
             each(work)
@@ -234,6 +255,9 @@ def _intervals(n_lines: int) -> tuple[NDArray[np.int64], float]:
 
 
 def larger(a: Noise, b: Noise) -> Noise:
-    """Line by line the noise with the larger variance."""
-    pick = np.asarray(a.variance >= b.variance)
-    return Noise(np.where(pick, a.common, b.common), np.where(pick, a.own, b.own))
+    """Line by line the noise with the larger variance, in the memory of the first."""
+    for common, own, more_common, more_own in zip(a.common, a.own, b.common, b.own, strict=True):
+        less = ~(common + own >= more_common + more_own)
+        np.copyto(common, more_common, where=less)
+        np.copyto(own, more_own, where=less)
+    return a

@@ -12,7 +12,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
 
 _REAL, _FLAG = numba.float64, numba.boolean
@@ -26,9 +25,9 @@ def _made(dimensions: int) -> numba.types.Array:
     return numba.types.Array(_REAL, dimensions, "A")
 
 
-_DATA = (_read(_REAL, 3), _read(numba.complex128, 3), _read(_FLAG, 2))
-"""Squared errors, FRFs, and which were measured. One type for arrays of any order in memory: each further one would be
-compiled by itself, for a second or two."""
+_DATA = (_read(_REAL, 3), _read(_REAL, 3), _read(_FLAG, 2))
+"""Squared errors, squared FRFs, and which were measured. One type for arrays of any order in memory: each further one
+would be compiled by itself, for a second or two."""
 
 
 def _loop(*arguments: numba.types.Type) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -44,7 +43,7 @@ def _loop(*arguments: numba.types.Type) -> Callable[[Callable[..., None]], Calla
 
 @_loop(*_DATA, _REAL, _made(2), _made(2))
 def quiet_lines(
-    power: Real, response: Complex, measured: NDArray[np.bool_], least: float, floor: Real, quiet: Real
+    power: Real, square: Real, measured: NDArray[np.bool_], least: float, floor: Real, quiet: Real
 ) -> None:
     """Least noise of every FRF, and the mean logarithm of its squared errors.
 
@@ -52,7 +51,8 @@ def quiet_lines(
     ----------
     power : ndarray, (n_rows, n_references, n_lines)
         Squared errors; NaN or 0 where unknown.
-    response : complex ndarray, (n_rows, n_references, n_lines)
+    square : ndarray, (n_rows, n_references, n_lines)
+        |H|².
     measured : ndarray of bool, (n_rows, n_references)
     least : float
         Least noise power over mean power.
@@ -64,11 +64,8 @@ def quiet_lines(
             floor[o, i], quiet[o, i] = least, 0.0
             if not measured[o, i]:
                 continue
-            z, h = np.ascontiguousarray(power[o, i]), np.ascontiguousarray(response[o, i])
-            square = 0.0
-            for k in range(h.size):
-                square += h[k].real ** 2 + h[k].imag ** 2
-            floor[o, i] *= square / h.size
+            z, h = np.ascontiguousarray(power[o, i]), np.ascontiguousarray(square[o, i])
+            floor[o, i] *= h.sum() / h.size
             total, known = 0.0, 0
             for k in range(z.size):
                 if (z[k] > 0.0) & (z[k] < np.inf):
@@ -84,7 +81,7 @@ def quiet_lines(
 )  # fmt: skip
 def slopes(
     power: Real,
-    response: Complex,
+    square: Real,
     measured: NDArray[np.bool_],
     floor: Real,
     alpha: Real,
@@ -101,7 +98,8 @@ def slopes(
     ----------
     power : ndarray, (n_rows, n_references, n_lines)
         Squared errors; NaN or 0 where unknown.
-    response : complex ndarray, (n_rows, n_references, n_lines)
+    square : ndarray, (n_rows, n_references, n_lines)
+        |H|².
     measured : ndarray of bool, (n_rows, n_references)
     floor, level : ndarray, (n_rows, n_references)
     alpha, shape : ndarray, (n_rows, n_references, n_nodes)
@@ -122,7 +120,7 @@ def slopes(
                 continue
             least = floor[o, i]
             # side by side in memory, so that several lines are taken at once
-            errors, row = np.ascontiguousarray(power[o, i]), np.ascontiguousarray(response[o, i])
+            errors, row = np.ascontiguousarray(power[o, i]), np.ascontiguousarray(square[o, i])
             for j in range(starts.size - 1):
                 z, h = errors[starts[j] : starts[j + 1]], row[starts[j] : starts[j + 1]]
                 after, begin = min(j + 1, n_nodes - 1), starts[j] * step - j
@@ -133,20 +131,18 @@ def slopes(
                 l0, l1, m0, m1 = 0.0, 0.0, 0.0, 0.0
                 if common:
                     for k in range(z.size):
-                        square = h[k].real ** 2 + h[k].imag ** 2
-                        less = 1.0 / ((a + k * da) * square + (s + k * ds))
+                        less = 1.0 / ((a + k * da) * h[k] + (s + k * ds))
                         more = less * less * max(z[k], least)
                         known = (z[k] > 0.0) & (z[k] < np.inf)
-                        less = less * square if known else 0.0
-                        more = more * square if known else 0.0
+                        less = less * h[k] if known else 0.0
+                        more = more * h[k] if known else 0.0
                         l0 += less
                         l1 += less * k
                         m0 += more
                         m1 += more * k
                 else:
                     for k in range(z.size):
-                        square = h[k].real ** 2 + h[k].imag ** 2
-                        less = 1.0 / ((a + k * da) * square + (s + k * ds))
+                        less = 1.0 / ((a + k * da) * h[k] + (s + k * ds))
                         more = less * less * max(z[k], least)
                         known = (z[k] > 0.0) & (z[k] < np.inf)
                         less = less if known else 0.0

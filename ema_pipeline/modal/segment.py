@@ -17,9 +17,10 @@ from ema_pipeline.modal.fit import (
     solve_linear,
     synthesis,
 )
-from ema_pipeline.modal.noise import Noise, fit_law, larger, squared
+from ema_pipeline.modal.noise import Noise, fit_law_of_squares, larger, squared
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
 from ema_pipeline.modal.polish import polish
+from ema_pipeline.threads import in_order
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -114,6 +115,7 @@ def fit_segment(
                 estimate, held = put_back(estimate, before, lost), held | lost
                 continue
         noise = measured_noise(data, hits, estimate, solution.shapes, weight)
+        del weight  # as large as half the data
         solution = solve_linear(data, noise.weight(data.measured), estimate)
         fit = SegmentFit(estimate, solution, noise, held)
         drop = judge(data, fit) if len(estimate.poles) else np.zeros(0, dtype=bool)
@@ -143,17 +145,23 @@ def measured_noise(
     data: FitData, hits: Noise | None, estimate: Estimate, shapes: Complex, weight: Real
 ) -> Noise:
     """Noise from what the fit leaves over, and from the scatter over hits where that is larger."""
-    model = synthesis(data, estimate, shapes)
-    model += residual_fit(data, weight, model)
+    left, square = np.empty(data.frf.shape), np.empty(data.frf.shape)
+
+    def of_rows(rows: slice) -> None:
+        some = data.rows(rows)
+        model = synthesis(some, estimate, shapes[rows])
+        model += residual_fit(some, weight[rows], model)
+        left[rows], square[rows] = squared(some.frf - model), squared(model)
+
+    for _ in in_order(of_rows, data.row_blocks()):
+        pass
     n_lines = len(data.omega)
     n_ref = data.measured.shape[1]
     # the fit follows the noise a little: one shape entry per row and mode, and the residual terms
     linear = 2.0 * len(estimate.poles) / max(n_ref, 1) + 8.0
     share = max(1.0 - linear / (2.0 * n_lines), 0.3)
-    left = squared(data.frf - model)
     left /= share
-    law = fit_law(left, model, data.measured, inputs_are_rows=data.transposed)
-    del left  # as large as what follows
-    found = law.at(model)
-    del model
+    found = fit_law_of_squares(left, square, data.measured, inputs_are_rows=data.transposed).at_squares(
+        square
+    )
     return found if hits is None else larger(found, hits)

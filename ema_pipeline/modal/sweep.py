@@ -202,8 +202,12 @@ def refined(
         fit = _fit_part(few, sure.take(near), weak.take(also), _voters(chart), search, iterations, peaks)
         fit = _with_peaks(few, fit, seen.absent(fit.estimate), _voters(chart), iterations, peaks)
         fit = _with_wanted(few, fit, asked.absent(fit.estimate), iterations, peaks)
-        if len(fit.estimate.poles):
-            parts.append(_final(lines, few.data, fit, part, iterations))
+        if len(fit.estimate.poles) and compressible(data):
+            polished = _polished(few.data, fit)
+            del few, fit  # as large as what all rows then need
+            parts.append(_of_all_rows(lines, polished, part, iterations))
+        elif len(fit.estimate.poles):
+            parts.append(_of_these_rows(few.data, fit, part))
     n_rows, n_ref = data.measured.shape
     empty = FittedModes(
         np.zeros(0, complex),
@@ -337,55 +341,98 @@ def _holds(larger: Estimate, smaller: Estimate) -> bool:
     return bool(np.all(distance < 2 * -smaller.poles.real))
 
 
-def _final(window: Window, few: FitData, fit: SegmentFit, part: SubBand, iterations: int) -> FittedModes:
-    """Modes of a sub-band's core with their uncertainties, and with shapes at all rows."""
-    core = np.flatnonzero(between(fit.estimate.poles, part.low, part.high))
-    weight = fit.noise.weight(few.measured)
-    transposed = window.data.transposed
-    estimate, held = fit.estimate, fit.held
-    step = found = newton_step(estimate, fit.solution)
-    if compressible(window.data) and transposed:
-        estimate, held = placed(window, fit, iterations)
-        blocks = window.data.row_blocks()
+@dataclass(frozen=True)
+class _Polished:
+    """What is kept of a fit of combinations of rows: nothing as large as its data.
+
+    Attributes
+    ----------
+    estimate : Estimate
+    held : ndarray of bool, (n_modes,)
+    step : Step
+        That the fit would still take.
+    covariance : ndarray, (n_parameters, n_parameters), or None
+        By noise; None where all rows give it.
+    """
+
+    estimate: Estimate
+    held: NDArray[np.bool_]
+    step: Step
+    covariance: Real | None
+
+
+def _polished(few: FitData, fit: SegmentFit) -> _Polished:
+    covariance = None if few.transposed else _covariance(few, fit)
+    return _Polished(fit.estimate, fit.held, newton_step(fit.estimate, fit.solution), covariance)
+
+
+def _covariance(data: FitData, fit: SegmentFit) -> Real:
+    """Covariance of poles and participations by noise."""
+    weight = fit.noise.weight(data.measured)
+    return parameter_covariance(data, weight, fit.estimate, fit.solution, fit.noise)
+
+
+def _of_these_rows(data: FitData, fit: SegmentFit, part: SubBand) -> FittedModes:
+    """Modes of a sub-band's core with their uncertainties, from a fit that had all rows."""
+    step = newton_step(fit.estimate, fit.solution)
+    scatter = scatter_over_points(*scores_of_points(data.transposed, fit.estimate, fit.solution))
+    parameters = _widened(_covariance(data, fit), scatter)
+    shapes = _shapes_and_stds(data, fit, parameters)
+    return _core(part, fit.estimate, fit.held, (step, step), parameters, shapes)
+
+
+def _of_all_rows(window: Window, fit: _Polished, part: SubBand, iterations: int) -> FittedModes:
+    """The same from a fit of combinations of rows."""
+    transposed, blocks = window.data.transposed, window.data.row_blocks()
+    estimate, held, step, first = fit.estimate, fit.held, fit.step, fit.covariance
+    if first is None:
+        estimate, held = placed(window, estimate, held, iterations)
         linear = list(in_order(lambda rows: linear_fit(window.rows(rows), estimate), blocks))
         scores, parts = zip(
-            *(scores_of_points(True, estimate, one.solution) for _, one in linear), strict=True
+            *(scores_of_points(transposed, estimate, one.solution) for _, one in linear), strict=True
         )
         points, information = np.concatenate(scores), np.sum(parts, axis=0)
         first = sandwich(np.sum([_noise_of(*one) for one in linear], axis=0), information)
         parameters = _widened(first, scatter_over_points(points, information))
         some = [_shapes_and_stds(*one, first) for one in linear]
-        shapes, stds = (np.concatenate(x) for x in zip(*some, strict=True))
         step = Step(information, points.sum(axis=0))
-    elif compressible(window.data):
-        first = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
-
-        def of_rows(rows: slice) -> tuple[Complex, Real, Real, Real]:
-            linear = linear_fit(window.rows(rows), estimate)
-            scores = scores_of_points(transposed, estimate, linear[1].solution)
-            return *_shapes_and_stds(*linear, first), *scores
-
-        each = zip(*in_order(of_rows, window.data.row_blocks()), strict=True)
-        some_shapes, some_stds, some_scores, some_information = (list(x) for x in each)
-        shapes, stds = np.concatenate(some_shapes), np.concatenate(some_stds)
-        scatter = scatter_over_points(np.sum(some_scores, axis=0), np.sum(some_information, axis=0))
-        parameters = _widened(first, scatter)
     else:
-        scatter = scatter_over_points(*scores_of_points(transposed, estimate, fit.solution))
-        parameters = parameter_covariance(few, weight, estimate, fit.solution, fit.noise)
-        parameters = _widened(parameters, scatter)
-        shapes, stds = _shapes_and_stds(few, fit, parameters)
+
+        def of_rows(rows: slice) -> tuple[tuple[Complex, Real], tuple[Real, Real]]:
+            data, one = linear_fit(window.rows(rows), estimate)
+            scores = scores_of_points(transposed, estimate, one.solution)
+            return _shapes_and_stds(data, one, first), scores
+
+        each = list(in_order(of_rows, blocks))
+        some = [shapes for shapes, _ in each]
+        scores, parts = zip(*(told for _, told in each), strict=True)
+        scatter = scatter_over_points(np.sum(scores, axis=0), np.sum(parts, axis=0))
+        parameters = _widened(first, scatter)
+    shapes, stds = (np.concatenate(x) for x in zip(*some, strict=True))
+    return _core(part, estimate, held, (fit.step, step), parameters, (shapes, stds))
+
+
+def _core(
+    part: SubBand,
+    estimate: Estimate,
+    held: NDArray[np.bool_],
+    steps: tuple[Step, Step],
+    parameters: Real,
+    shapes: tuple[Complex, Real],
+) -> FittedModes:
+    """The modes of a sub-band's core; steps are those that the fit and all rows would still take."""
+    core = np.flatnonzero(between(estimate.poles, part.low, part.high))
     pole_cov = np.array([parameters[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] for r in core]).reshape(-1, 2, 2)
     m = len(estimate.poles)
     # a held pole is as far from its place as the fit that drove it away would have it
-    driven, rest = (left_to_go(x)[: 2 * m].reshape(-1, 2) for x in (found, step))
+    driven, rest = (left_to_go(x)[: 2 * m].reshape(-1, 2) for x in steps)
     rest = np.where(held[:, None], driven, rest)[core]
     far = np.einsum("ra,rab,rb->r", rest, np.linalg.pinv(pole_cov), rest)
     return FittedModes(
         poles=estimate.poles[core],
         pole_cov=pole_cov + rest[:, :, None] * rest[:, None, :],
-        shapes=shapes.T[core],
-        shape_stds=stds.T[core],
+        shapes=shapes[0].T[core],
+        shape_stds=shapes[1].T[core],
         participation=estimate.participation[core],
         participation_stds=_participation_stds(estimate, parameters)[core],
         held=held[core],

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.basis import real_columns, residual_columns
+from ema_pipeline.modal.basis import mode_columns, real_columns, residual_columns
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import (
     Estimate,
@@ -68,32 +70,55 @@ def scatter_of_scores(
     mix = mixing(estimate.participation)
     z = parameter_columns(estimate, solution.shapes)
     eliminated = _eliminated(estimate, solution)
-    signal = np.concatenate(real_columns(data.omega, estimate.poles, data.rest_s))
-    residual = residual_columns(data.omega)
-    n_rows, n_ref, n_lines = data.frf.shape
-    n_par = z.shape[-1]
+    columns = np.concatenate(
+        [*real_columns(data.omega, estimate.poles, data.rest_s), residual_columns(data.omega)]
+    )
+    n_rows, n_ref, _ = data.frf.shape
     # what all outputs share adds up over the outputs of one input before it is squared
     together = [[(o, i) for i in range(n_ref)] for o in range(n_rows)]
     if not data.transposed:
         together = [list(group) for group in zip(*together, strict=True)]
+    together = [[(o, i) for o, i in group if np.any(weight[o, i])] for group in together]
 
-    def meat_of(group: list[tuple[int, int]]) -> Real:
-        meat, coherent = np.zeros((n_par, n_par)), np.zeros((n_par, n_lines), dtype=np.complex128)
-        for o, i in group:
-            w = weight[o, i]
-            if not np.any(w):
-                continue
-            coefficients = z[o, i].copy()
-            coefficients[: 2 * m] -= mix[i] @ eliminated[o]
-            seen = coefficients.T @ _parts(_projected(signal, residual, w))
-            a = seen.view(np.complex128) * w  # (n_par, n_lines)
-            meat += 0.5 * power_of(a.conj() * np.sqrt(noise.own[o, i]), data)
-            size = np.abs(data.frf[o, i])
-            phase = np.where(size > 0, data.frf[o, i] / np.maximum(size, 1e-300), 0.0)
-            coherent += a.conj() * (np.sqrt(noise.common[o, i]) * phase)
-        return meat + 0.5 * power_of(coherent, data)
+    def of_columns(pair: tuple[int, int]) -> Real:
+        """How much of every column the scores of one FRF have, (n_parameters, 4M + n_residual)."""
+        o, i = pair
+        own = z[o, i].copy()
+        own[: 2 * m] -= mix[i] @ eliminated[o]
+        return np.asarray(own.T @ _free_of_residuals(columns, 4 * m, weight[o, i]))
 
-    return np.asarray(sum(in_order(meat_of, together)))
+    pairs = [pair for group in together for pair in group]
+    parts = dict(zip(pairs, in_order(of_columns, pairs), strict=True))
+
+    def meat_of(lines: slice) -> Real:
+        some, at = replace(data, omega=data.omega[lines]), _parts(columns[:, lines])
+        meat = np.zeros((z.shape[-1], z.shape[-1]))
+        for group in together:
+            coherent = np.zeros((z.shape[-1], at.shape[1] // 2), dtype=np.complex128)
+            for o, i in group:
+                a = (parts[o, i] @ at).view(np.complex128)
+                np.conj(a, out=a)
+                a *= weight[o, i, lines]
+                meat += 0.5 * power_of(a * np.sqrt(noise.own[o, i, lines]), some)
+                frf = data.frf[o, i, lines]
+                size = np.abs(frf)
+                phase = np.where(size > 0, frf / np.maximum(size, 1e-300), 0.0)
+                a *= np.sqrt(noise.common[o, i, lines]) * phase
+                coherent += a
+            meat += 0.5 * power_of(coherent, some)
+        return meat
+
+    # under a window all lines hang together
+    blocks = [slice(0, len(data.omega))] if data.window_rad_s > 0 else _blocks(len(data.omega))
+    return np.asarray(sum(in_order(meat_of, blocks)))
+
+
+LINES_AT_ONCE = 2048
+"""Lines whose scores are made at a time: what is made of them then fits into the cache."""
+
+
+def _blocks(n_lines: int) -> list[slice]:
+    return [slice(k, min(k + LINES_AT_ONCE, n_lines)) for k in range(0, n_lines, LINES_AT_ONCE)]
 
 
 FEWEST_GROUPS = 5
@@ -196,7 +221,7 @@ def shape_covariance(
 def _meat_of_shapes(data: FitData, estimate: Estimate, noise: Noise) -> Real:
     """Covariance of the right-hand sides that give the shapes of each row, (n_rows, 2M, 2M)."""
     mix = mixing(estimate.participation)
-    columns, _ = real_columns(data.omega, estimate.poles, data.rest_s)
+    columns = mode_columns(data.omega, estimate.poles, data.rest_s)
     residual = residual_columns(data.omega)
     variance, weight = noise.variance, noise.weight(data.measured)
     out = np.zeros((len(data.frf), len(columns), len(columns)))
@@ -217,10 +242,17 @@ def _eliminated(estimate: Estimate, solution: LinearSolution) -> Real:
 
 def _projected(columns: Complex, residual: Complex, weight: Real) -> Complex:
     """Columns with what the residual terms can follow taken off, for one FRF's weights (n_lines,)."""
-    at, to = _parts(residual), _parts(columns)
-    weighted = at * np.repeat(weight, 2)
-    coefficients = np.linalg.lstsq(weighted @ at.T, weighted @ to.T, rcond=None)[0]
-    return np.asarray((to - coefficients.T @ at).view(np.complex128))
+    both = np.concatenate([columns, residual])
+    return np.asarray((_free_of_residuals(both, len(columns), weight) @ _parts(both)).view(np.complex128))
+
+
+def _free_of_residuals(columns: Complex, n_modes: int, weight: Real) -> Real:
+    """What gives the first `n_modes` columns without what the others can follow, (n_modes, n_columns)."""
+    parts = _parts(columns)
+    at = parts[n_modes:]
+    products = (at * np.repeat(weight, 2)) @ parts.T
+    taken = np.linalg.lstsq(products[:, n_modes:], products[:, :n_modes], rcond=None)[0]
+    return np.concatenate([np.eye(n_modes), -taken.T], axis=1)
 
 
 def _parts(values: Complex) -> Real:

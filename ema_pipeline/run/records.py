@@ -12,6 +12,7 @@ import h5py
 from ema_pipeline import codec
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.driven import DrivenRecord
+from ema_pipeline.ingest.readers.apart import end_helper
 from ema_pipeline.ingest.records import Hit, HitSamples, Record, cut_hit
 from ema_pipeline.lazy_samples import StoredSamples
 from ema_pipeline.run.types import Progress, silent
@@ -68,7 +69,10 @@ def driven_records(store: Store, configuration: str) -> tuple[DrivenRecord, ...]
 
 
 def shown(records: Iterator[R], count: int, progress: Progress) -> Iterator[R]:
-    """The records, each named as it is read."""
-    for index, record in enumerate(records):
-        progress(index / count, record.file)
-        yield record
+    """The records, each named as it is read; with the last one ends the process that reads them."""
+    try:
+        for index, record in enumerate(records):
+            progress(index / count, record.file)
+            yield record
+    finally:
+        end_helper()

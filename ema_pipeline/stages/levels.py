@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.run.measured import modes_alone
+from ema_pipeline.ingest.records import Hit
+from ema_pipeline.run.measured import modes_alone, without_coherence
 from ema_pipeline.run.records import accepted_hits
 from ema_pipeline.run.types import Progress, Run
 
@@ -20,9 +21,13 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Follow every mode over the force levels."""
-    from ema_pipeline.levels.study import study_levels, with_circles
+    from ema_pipeline.levels.study import levels_of, study_levels, with_circles
 
-    frfs = run.store.load("frf", configuration, "frfs", FrfSet)
+    hits = [h for h in run.store.load("hits", configuration, "hits", tuple[Hit, ...]) if h.accepted]
+    if levels_of(hits, run.settings.levels).any():
+        frfs = run.store.load("frf", configuration, "frfs", FrfSet)
+    else:
+        frfs = without_coherence(run, configuration)
     modal = modes_alone(run, configuration)
     study = study_levels(
         lambda: accepted_hits(run.store, configuration),

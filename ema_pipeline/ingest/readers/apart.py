@@ -155,7 +155,7 @@ def _helper() -> _Helper:
     """The helper process, started anew where it has died."""
     global _running
     if _running is None:
-        atexit.register(_close)
+        atexit.register(end_helper)
     elif not _running.is_alive():
         _running.close()
         _running = None
@@ -164,6 +164,11 @@ def _helper() -> _Helper:
     return _running
 
 
-def _close() -> None:
-    if _running is not None:
-        _running.close()
+def end_helper() -> None:
+    """End the helper process, which takes 30 MB; the next file starts another."""
+    global _running
+    with _LOCK:
+        if _running is not None:
+            _running.close()
+            _running = None
+            atexit.unregister(end_helper)

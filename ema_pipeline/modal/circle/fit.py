@@ -235,13 +235,12 @@ def _pair_damping(
     useful = np.abs(swept) < np.deg2rad(160)
     above = np.flatnonzero(useful & (f > f_n) & (swept > 0))
     below = np.flatnonzero(useful & (f < f_n) & (swept < 0))
-    a, b = (index.ravel() for index in np.meshgrid(above, below, indexing="ij"))
-    spread = tangent[a] - tangent[b]
-    # equal noise on the angles: d tan(θ/2) = dθ (1 + tan²)/2
-    noise = np.hypot(1 + tangent[a] ** 2, 1 + tangent[b] ** 2) / 2
-    weights = (spread / noise) ** 2
+    spread = np.subtract.outer(tangent[above], tangent[below])
     keep = spread > np.tan(np.deg2rad(15))
-    return (x_damped[a] - x_damped[b])[keep] / (2 * spread[keep]), weights[keep]
+    spread = spread[keep]
+    # equal noise on the angles: d tan(θ/2) = dθ (1 + tan²)/2
+    noise = np.hypot.outer(1 + tangent[above] ** 2, 1 + tangent[below] ** 2)[keep] / 2
+    return np.subtract.outer(x_damped[above], x_damped[below])[keep] / (2 * spread), (spread / noise) ** 2
 
 
 def _standard_deviations(

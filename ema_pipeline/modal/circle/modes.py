@@ -17,7 +17,7 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.circle.fit import MINIMUM_POINTS, SdofCircle, fit_circle, sweep
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.types import CircleFit, ModalModel
-from ema_pipeline.threads import single_blas_thread
+from ema_pipeline.threads import in_order, single_blas_thread
 
 _PASSES = 2  # of refinement; a third changes damping by less than its uncertainty
 _CREDIBLE = 0.3  # residual over radius up to which a neighbour's circle may be taken off
@@ -116,18 +116,18 @@ def fit_targets(
     data: Mobilities, targets: Sequence[Target], settings: CircleSettings
 ) -> list[list[tuple[int, SdofCircle]]]:
     """Circles of every target as (row of `data`, circle), best rows first."""
-    found: list[list[tuple[int, SdofCircle]]] = []
-    for i in range(len(targets)):
+
+    def of_target(i: int) -> list[tuple[int, SdofCircle]]:
         lines = line_range(data.frequency_hz, targets, i, settings)
         if lines.stop - lines.start < MINIMUM_POINTS:
-            found.append([])
-            continue
+            return []
         rows = rank_rows(data, targets[i], lines)
         if settings.channels_per_mode != "all":
             rows = rows[: settings.channels_per_mode]
         circles = [(int(row), _fit_refined(data, int(row), targets, i, settings)) for row in rows]
-        found.append([(row, circle) for row, circle in circles if circle is not None])
-    return found
+        return [(row, circle) for row, circle in circles if circle is not None]
+
+    return list(in_order(of_target, range(len(targets))))
 
 
 def line_range(

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
-import scipy.signal
 from numpy.typing import NDArray
 from scipy.fft import rfft
 
@@ -15,6 +14,7 @@ from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.frf.windows import Windows
 from ema_pipeline.ingest.records import HitSamples
+from ema_pipeline.modal.maxima import prominent_peaks
 from ema_pipeline.threads import in_order
 
 Complex = NDArray[np.complex128]
@@ -99,9 +99,9 @@ def peak_windows(frfs: FrfSet, band_hz: tuple[float, float]) -> tuple[PeakWindow
     curve = _response_curve(frfs, level)
     low, high = (int(k) for k in np.searchsorted(frfs.frequency_hz, band_hz))
     smooth = scipy.ndimage.gaussian_filter1d(curve, 1.0)
-    found, known = scipy.signal.find_peaks(smooth[: high + 1], prominence=PROMINENCE_DB)
+    found, rise = prominent_peaks(smooth[: high + 1], PROMINENCE_DB)
     inside = found > max(low, 1)
-    found, rise = found[inside], known["prominences"][inside]
+    found, rise = found[inside], rise[inside]
     kept = np.sort(found[np.argsort(-rise, kind="stable")[:MAX_PEAKS]])
     step = 2 * np.pi * float(frfs.frequency_hz[1])
     decay = np.array([max(_half_width(curve, k), 0.3) for k in kept]) * step
