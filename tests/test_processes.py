@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from ema_pipeline import keys, pipeline
+from ema_pipeline.diagnose.pool import spread
 from ema_pipeline.errors import EmaError
 from ema_pipeline.processes import Send, side_by_side
 from ema_pipeline.run.opening import describe_run, new_run, save_info
@@ -73,6 +74,15 @@ def test_a_worker_that_is_killed_is_an_error_and_no_hang() -> None:
 
     with pytest.raises(MemoryError, match="ended before its time"):
         side_by_side(job, [1], 2, lambda message: None)
+
+
+@pytest.mark.parametrize(
+    ("processes", "least", "shared"), [(2, 2, True), (2, 4, False), (1, 2, False), (2, 3, True)]
+)
+def test_items_are_shared_from_as_many_as_are_worth_it(processes: int, least: int, shared: bool) -> None:
+    found = list(spread(lambda item: (item, os.getpid()), "abc", processes, least))
+    assert [item for item, _ in found] == list("abc")
+    assert all((process != os.getpid()) == shared for _, process in found)
 
 
 def test_an_interruption_ends_the_workers() -> None:

@@ -2,30 +2,37 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 import ema_pipeline as ema
-from ema_pipeline.diagnose.records import in_windows, record_model
+from ema_pipeline.diagnose.records import in_windows, record_model, whole_ladder
+from ema_pipeline.diagnose.rungs import ladder_of
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.ingest.description import read_description
 from ema_pipeline.ingest.driven import load_driven
-from ema_pipeline.observations.fitting import QUICK, annealed, wide
+from ema_pipeline.observations.fitting import QUICK, annealed, refined, wide
 from ema_pipeline.observations.records import RecordObservations
 from tests.continuous_cases import RIG, write_oscillator
 
 LIBRARY = effect_library()
 
 
+def _oscillator(folder: Path, cubic: float, started: str) -> RecordObservations:
+    raw = write_oscillator(folder / "raw", lambda x, v: cubic * x**3)
+    (folder / "rig.toml").write_text(started)
+    one, two = (r for r in load_driven(read_description(raw)))
+    rig = ema.load_rig(folder / "rig.toml")
+    return RecordObservations(rig, rig.configurations[0], [one], [two])
+
+
 @pytest.fixture(scope="module")
 def windows(tmp_path_factory: pytest.TempPathFactory) -> RecordObservations:
     """An oscillator whose cubic spring carries a good part of the force."""
-    folder = tmp_path_factory.mktemp("hardening")
-    raw = write_oscillator(folder / "raw", lambda x, v: 1e10 * x**3)
-    (folder / "rig.toml").write_text(RIG.replace("1.0 }", "2.0 }").replace("1e4", "5e4"))
-    one, two = (r for r in load_driven(read_description(raw)))
-    rig = ema.load_rig(folder / "rig.toml")
-    return in_windows(RecordObservations(rig, rig.configurations[0], [one], [two]))
+    far_off = RIG.replace("1.0 }", "2.0 }").replace("1e4", "5e4")
+    return in_windows(_oscillator(tmp_path_factory.mktemp("hardening"), 1e10, far_off))
 
 
 def test_windows_lie_in_the_record_and_do_not_overlap(windows: RecordObservations) -> None:
@@ -66,3 +73,37 @@ def test_a_fit_leads_from_far_off_to_a_strong_cubic_spring(windows: RecordObserv
     fit = annealed(windows, model, starts, QUICK)
     assert fit.posterior.error < 1.5
     assert problem.parameter_values(fit.posterior.x)[name] == pytest.approx(1e10, rel=0.05)
+
+
+def test_where_derivatives_are_known_they_are_not_made_again(
+    windows: RecordObservations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = record_model(windows, LIBRARY, ["cubic_spring@mass.x"]).problem(windows)
+    fresh = record_model(windows, LIBRARY, ["cubic_spring@mass.x"]).problem(windows)
+    here, there, scatters = problem.start(), problem.start() + 0.01, wide(windows)
+    calls = []
+    motions = type(problem).motions
+    monkeypatch.setattr(type(problem), "motions", lambda *given: calls.append(1) or motions(*given))
+    narrow = {name: 0.5 * value for name, value in scatters.items()}
+    first = problem.residuals(here, scatters)
+    again = problem.residuals(here, narrow)
+    assert len(calls) == 1
+    problem.residuals(there, scatters, derivatives=False)
+    assert len(calls) == 2
+    assert not np.array_equal(problem.residuals(there, scatters).values, first.values)
+    np.testing.assert_array_equal(fresh.residuals(here, narrow).values, again.values)
+    np.testing.assert_array_equal(fresh.residuals(here, narrow).jacobian, again.jacobian)
+    assert len(calls) == 4
+
+
+def test_a_ladder_of_whole_records_does_not_depend_on_the_number_of_processes(tmp_path: Path) -> None:
+    whole = _oscillator(tmp_path, 1e9, RIG.replace("1.0 }", "2.0 }").replace("1e4", "5e4"))
+    windows = in_windows(whole)
+    models = [record_model(whole, LIBRARY, labels) for labels in ((), ("cubic_spring@mass.x",))]
+    fits = [refined(windows, m, m.problem(windows).start()) for m in models]
+    searched = ladder_of(windows, fits)
+    alone, shared = (whole_ladder(whole, LIBRARY, searched, processes) for processes in (1, 2))
+    assert alone == shared
+    assert "windows" not in alone.note
+    assert alone.rungs[-1].error < 0.2 * alone.rungs[0].error
+    assert np.isfinite(alone.rungs[-1].heldout_error)

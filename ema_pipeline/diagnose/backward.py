@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from ema_pipeline.diagnose.claims import Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.pool import spread
 from ema_pipeline.diagnose.ranking import Ranked, Ranking
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, learned, refined, transferred
+
+_WORTH = 2
+"""Changes that are worth a process each: their scatters are learned, which takes as long as dozens of steps."""
 
 
 def reconsidered(
@@ -50,6 +56,15 @@ def reconsidered(
     return _judged_anew(observations, start, now, fit, settings) if changed else list(claimed)
 
 
+@dataclass(frozen=True)
+class _Plan:
+    """A change: the effects after it, the one that goes, and what takes its place, if anything does."""
+
+    effects: Sequence[Hypothesis]
+    before: Hypothesis
+    rival: Judged | None = None
+
+
 def _best_change(
     observations: Observations,
     known: Model,
@@ -60,21 +75,35 @@ def _best_change(
 ) -> tuple[list[Hypothesis], Fit] | None:
     """The change that raises the evidence most, a needless effect counting as much as a claim needs."""
     labels = {h.label for h in now}
-    options = []
+    plans: list[_Plan] = []
     for i, one in enumerate(now[:-1]):  # the last was judged with all others known
-        rest = [h for h in now if h is not one]
-        without = _fitted(observations, known, rest, fit)
-        options.append((without.log_evidence + settings.claim, rest, without, one, one))
+        plans.append(_Plan([h for h in now if h is not one], one))
         for rival in rivals.get(one.label, ()):
             if rival.hypothesis.label not in labels:
-                moved = [*now[:i], rival.hypothesis, *now[i + 1 :]]
-                found = _fitted(observations, known, moved, fit, rival)
-                options.append((found.log_evidence - settings.alike, moved, found, one, rival.hypothesis))
-    score, change, found, before, after = max(options, key=lambda option: option[0])
-    if score <= fit.log_evidence:
+                plans.append(_Plan([*now[:i], rival.hypothesis, *now[i + 1 :]], one, rival))
+
+    def fitted(plan: _Plan) -> Posterior:
+        return _fitted(observations, known, plan.effects, fit, plan.rival).posterior
+
+    found = list(spread(fitted, plans, settings.processes, _WORTH))
+    scores = [
+        p.log_evidence + (settings.claim if plan.rival is None else -settings.alike)
+        for plan, p in zip(plans, found, strict=True)
+    ]
+    best = max(range(len(plans)), key=scores.__getitem__)
+    if scores[best] <= fit.log_evidence:
         return None
-    rivals.setdefault(after.label, rivals.get(before.label, ()))
-    return change, found
+    plan = plans[best]
+    after = plan.before if plan.rival is None else plan.rival.hypothesis
+    rivals.setdefault(after.label, rivals.get(plan.before.label, ()))
+    return list(plan.effects), Fit(_with(known, plan.effects), found[best])
+
+
+def _with(known: Model, effects: Sequence[Hypothesis]) -> Model:
+    model = known
+    for h in effects:
+        model = model.plus(h.placed, h.scales)
+    return model
 
 
 def _fitted(
@@ -85,9 +114,7 @@ def _fitted(
     rival: Judged | None = None,
 ) -> Fit:
     """A model begun at a fit nearby, a rival at its own sizes; scatters learned."""
-    model = known
-    for h in effects:
-        model = model.plus(h.placed, h.scales)
+    model = _with(known, effects)
     problem = model.problem(observations)
     x = transferred(near.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
     if rival is not None:

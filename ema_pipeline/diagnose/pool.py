@@ -17,14 +17,22 @@ _job: Callable[..., object] | None = None
 _items: Sequence[object] = ()
 
 
-def spread(job: Callable[[A], R], items: Sequence[A], processes: int | None) -> Iterator[R]:
+def spread(job: Callable[[A], R], items: Sequence[A], processes: int | None, least: int = 4) -> Iterator[R]:
     """``map(job, items)`` over forked processes; in this one where the system cannot fork or it is not worth it.
 
     The job and its items go over by forking, so they may hold what cannot be pickled (effects of a user's own file);
     results are pickled. None stands for a process per processor.
+
+    Parameters
+    ----------
+    job : callable
+    items : sequence
+    processes : int or None
+    least : int
+        Items from which processes are worth it: fewer where each takes seconds.
     """
     processes = processes or cores()
-    if processes < 2 or len(items) < 4 or not can_fork():
+    if processes < 2 or len(items) < least or not can_fork():
         with single_blas_thread():
             for item in items:
                 yield job(item)

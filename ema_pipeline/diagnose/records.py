@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
-from ema_pipeline.diagnose.rungs import ladder_of, make_ladder, parameter_sizes
+from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.rungs import (
+    learned_scatters,
+    make_ladder,
+    noise,
+    parameter_sizes,
+    rung_at,
+    with_gains,
+)
 from ema_pipeline.diagnose.selection import Progress
 from ema_pipeline.diagnose.sentences import size_text, summary
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -22,7 +30,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.simulation import COARSE, coded_law
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.observations.base import EffectProblem
-from ema_pipeline.observations.fitting import Model, learned, refined
+from ema_pipeline.observations.fitting import Fit, Model, learned, refined
 from ema_pipeline.observations.records import RecordObservations
 
 SEARCHED = 2048
@@ -90,7 +98,7 @@ def diagnose_records(
         hypotheses=hypotheses,
     )
     progress(0.85, "whole records")
-    ladder = whole_ladder(observations, library, found.ladder)
+    ladder = whole_ladder(observations, library, found.ladder, settings.processes)
     return _with_whole(found, ladder)
 
 
@@ -156,24 +164,32 @@ def _places(observations: RecordObservations) -> tuple[str, ...]:
     return (*dofs, *pairs)
 
 
-def whole_ladder(observations: RecordObservations, library: Mapping[str, Effect], searched: Ladder) -> Ladder:
-    """The rungs of a ladder that was found on windows, fitted to whole records.
+def whole_ladder(
+    observations: RecordObservations,
+    library: Mapping[str, Effect],
+    searched: Ladder,
+    processes: int | None = 1,
+) -> Ladder:
+    """The rungs of a ladder that was found on windows, fitted to whole records, shared among processes.
 
     Where motion depends so much on its start that the model loses step in them, the fits to windows stay.
     """
-    whole = _refitted(observations, library, searched)
+    whole = _refitted(observations, library, searched, processes)
     limit = _LOST * max(searched.rungs[-1].error, 1.0)
     if whole.rungs[-1].error < limit:
         return whole
     windows = observations.in_windows(SEARCHED)
-    rungs = tuple(_with_calibration(windows, library, searched, r) for r in searched.rungs)
+    scatters = {s.name: s.learned for s in searched.scatters}
+    rungs = tuple(_with_calibration(windows, library, r, scatters) for r in searched.rungs)
     told = searched.note  # of a diagnosis, whose ladder may have come this way before
     if _OUT_OF_STEP not in told:
         told = f"{told}; {_OUT_OF_STEP}" if told else _OUT_OF_STEP
     return dataclasses.replace(searched, rungs=rungs, note=told)
 
 
-def _refitted(observations: RecordObservations, library: Mapping[str, Effect], searched: Ladder) -> Ladder:
+def _refitted(
+    observations: RecordObservations, library: Mapping[str, Effect], searched: Ladder, processes: int | None
+) -> Ladder:
     """The rungs fitted to whole records.
 
     The fit takes its reference channels as exact, which costs nothing. Uncertainties are those with all calibrations.
@@ -181,14 +197,20 @@ def _refitted(observations: RecordObservations, library: Mapping[str, Effect], s
     scatters = {s.name: s.learned for s in searched.scatters}
     records = [d.record for d in observations.data]
     fast = observations.with_records(records, observations.held_out, observations.basis.calibrated())
-    fits = []
-    for rung in searched.rungs:
+
+    def begun(rung: Rung) -> Fit:
         model = record_model(observations, library, rung.effects)
-        fits.append(refined(fast, model, begun_at(model.problem(fast), rung), scatters, steps=0))
-    fits[-1] = learned(fast, fits[-1])
-    ladder = ladder_of(fast, fits)
-    rungs = tuple(_with_calibration(observations, library, ladder, r) for r in ladder.rungs)
-    return dataclasses.replace(ladder, rungs=rungs, note=searched.note)
+        return refined(fast, model, begun_at(model.problem(fast), rung), scatters, steps=0)
+
+    last = learned(fast, begun(searched.rungs[-1]))
+    narrow = last.posterior.scatters
+
+    def fitted(rung: Rung) -> Rung:
+        fit = last if rung is searched.rungs[-1] else begun(rung)
+        return _with_calibration(observations, library, rung_at(fast, fit, narrow), narrow)
+
+    rungs = with_gains(list(spread(fitted, searched.rungs, processes, least=2)))
+    return Ladder(rungs, *noise(last), searched.note, scatters=learned_scatters(fast, last))
 
 
 def begun_at(problem: EffectProblem, rung: Rung) -> NDArray[np.float64]:
@@ -201,12 +223,14 @@ def begun_at(problem: EffectProblem, rung: Rung) -> NDArray[np.float64]:
 
 
 def _with_calibration(
-    observations: RecordObservations, library: Mapping[str, Effect], ladder: Ladder, rung: Rung
+    observations: RecordObservations,
+    library: Mapping[str, Effect],
+    rung: Rung,
+    scatters: Mapping[str, float],
 ) -> Rung:
     """A rung whose sizes hold what all channels' calibration leaves open."""
     model = record_model(observations, library, rung.effects)
     problem = model.problem(observations)
-    scatters = {s.name: s.learned for s in ladder.scatters}
     posterior = refined(observations, model, begun_at(problem, rung), scatters, steps=0).posterior
     sizes = parameter_sizes(problem, posterior)
     units = _units(observations)
@@ -219,13 +243,14 @@ def records_ladder(
     library: Mapping[str, Effect],
     effects: Sequence[str],
     known: Ladder | None,
+    processes: int | None = 1,
 ) -> Ladder:
     """The ladder of given effects, fitted on windows where `known` does not hold just these, then on whole records."""
     rungs = () if known is None else known.rungs
     if known is None or not rungs or rungs[-1].effects != tuple(effects):
         models = [record_model(observations, library, effects[:k]) for k in range(len(effects) + 1)]
         known = make_ladder(in_windows(observations), models)
-    return whole_ladder(observations, library, known)
+    return whole_ladder(observations, library, known, processes)
 
 
 def _units(observations: RecordObservations) -> dict[str, str]:

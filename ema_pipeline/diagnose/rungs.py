@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,13 +28,22 @@ from ema_pipeline.observations.fitting import (
 def rungs_of(observations: Observations, fits: Sequence[Fit]) -> tuple[Rung, ...]:
     """Every fit as a rung, at the scatters of the last one."""
     scatters = fits[-1].posterior.scatters
-    alike = tuple(at_scatters(observations, f, scatters) for f in fits)
-    base = alike[0].log_evidence
-    return tuple(_rung(observations, f, f.log_evidence - base) for f in alike)
+    return with_gains([rung_at(observations, f, scatters) for f in fits])
 
 
-def _rung(observations: Observations, fit: Fit, evidence: float) -> Rung:
-    """One model of the ladder, no part further out than parts scatter; its evidence is that of the whole fit."""
+def with_gains(rungs: Sequence[Rung]) -> tuple[Rung, ...]:
+    """The rungs with their log evidence counted from that of the first one."""
+    base = rungs[0].log_evidence
+    return tuple(replace(r, log_evidence=r.log_evidence - base) for r in rungs)
+
+
+def rung_at(observations: Observations, fit: Fit, scatters: Mapping[str, float]) -> Rung:
+    """One model of the ladder at given scatters, with its own log evidence, which is that of the whole fit.
+
+    No part lies further out than parts scatter.
+    """
+    fit = at_scatters(observations, fit, scatters)
+    evidence = fit.log_evidence
     problem, fit = fit.model.problem(observations), within_scatter(observations, fit)
     held = held_out(observations, fit)
     return Rung(
@@ -95,8 +105,12 @@ def ladder_of(
             *fits[:-1],
             at_scatters(observations, fits[-1], {n: scatters.get(n, s) for n, s in known.items()}),
         ]
-    rungs = rungs_of(observations, fits)
-    return Ladder(rungs, *noise(fits[-1]), note="", scatters=learned_scatters(observations, fits[-1]))
+    return Ladder(
+        rungs_of(observations, fits),
+        *noise(fits[-1]),
+        note="",
+        scatters=learned_scatters(observations, fits[-1]),
+    )
 
 
 def _best_of(observations: Observations, model: Model, before: Fit) -> Fit:

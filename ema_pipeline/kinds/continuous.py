@@ -156,7 +156,7 @@ def ladder(run: Run, progress: Progress) -> Results:
         progress(0.1, "fitting every rung")
         searched = run.store.find("diagnose", ALL, "diagnosis", Diagnosis)
         known = None if searched is None else searched.ladder
-        rungs = records_ladder(observations, run.library, effects, known)
+        rungs = records_ladder(observations, run.library, effects, known, run.settings.diagnose.processes)
         return {
             "ladder": rungs,
             "simulation": free_run(observations, run.library, rungs),

@@ -31,6 +31,10 @@ _MEMORY = 0.5
 _ROUNDS = 4
 _LEAST_NOISE = 1e-5
 """Noise, in units of the discrepancy, that nothing falls below."""
+_NO_SLOPES = np.zeros((0, 0, 0, 0))
+
+Lines = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Of one record (n_windows, n_outputs, n_rows), SI, and their derivatives by all n unknowns (..., n)."""
 
 
 class RecordProblem(EffectProblem):
@@ -93,38 +97,52 @@ class RecordProblem(EffectProblem):
         derivatives: bool = True,
     ) -> Residuals:
         """See `Problem`."""
-        if self.observations.finds_states:
-            x = self.settled(x)
-        motions = self.motions(x, derivatives)
-        if motions is None:
+        predicted = self._predicted(x, derivatives)
+        if predicted is None:
             return Residuals(np.full(1, np.inf), np.zeros((1, len(x))))
-        common, gains = len(self.model.unknowns), self.model.gains(x)
         values, rows, spread = [], [], []
-        place = common
-        for data, motion in zip(self.observations.data, motions, strict=True):
-            read = motion.read * gains
-            read += self.model.response_offsets(x, self.observations.rms)
-            predicted = data.lines(_by_output(read[:, data.compared]))
+        for data, (lines, slopes) in zip(self.observations.data, predicted, strict=True):
             variance = self._variance(data, scatters)
             sigma = np.sqrt(variance.total) * heat
-            values.append(((data.measured - predicted) / sigma).ravel())
+            values.append(((data.measured - lines) / sigma).ravel())
             spread.append(variance)
             if derivatives:
-                rows.append(self._rows(data, motion, gains, place, len(x)) / -sigma[..., None])
-            place += self._own(data)
+                rows.append((slopes / -sigma[..., None]).reshape(-1, len(x)))
         windows = [len(d.starts) for d in self.observations.data]
         relative = np.concatenate(
             [np.tile(v.relative.ravel(), n) for v, n in zip(spread, windows, strict=True)]
         )
         return Residuals(
             values=np.concatenate(values),
-            jacobian=np.concatenate([r.reshape(-1, len(x)) for r in rows])
-            if derivatives
-            else np.zeros((0, len(x))),
+            jacobian=np.concatenate(rows) if derivatives else np.zeros((0, len(x))),
             share=self._shares(spread, scatters) if derivatives else {},
             log_scale=float(np.sum(np.log(relative))),
             relative=relative,
         )
+
+    def _predicted(self, x: NDArray[np.float64], derivatives: bool) -> list[Lines] | None:
+        """Lines of every record, with their derivatives where they are asked for; None where there is no motion.
+
+        No scatter changes them. A fit begins where the one before it, at other scatters, has ended: the last ones with
+        derivatives are remembered.
+        """
+        known = self.observations.remembered
+        if derivatives and known is not None and known[0] is self and np.array_equal(known[1], x):
+            return known[2]
+        at = self.settled(x) if self.observations.finds_states else x
+        motions = self.motions(at, derivatives)
+        if motions is None:
+            return None
+        gains, offsets = self.model.gains(at), self.model.response_offsets(at, self.observations.rms)
+        found, place = [], len(self.model.unknowns)
+        for data, motion in zip(self.observations.data, motions, strict=True):
+            lines = data.lines(_by_output((motion.read * gains + offsets)[:, data.compared]))
+            slopes = self._rows(data, motion, gains, place, len(x)) if derivatives else _NO_SLOPES
+            found.append((lines, slopes))
+            place += self._own(data)
+        if derivatives:
+            self.observations.remembered = (self, x.copy(), found)
+        return found
 
     def motions(self, x: NDArray[np.float64], derivatives: bool = False) -> list[Motion] | None:
         """What the model does in every record; None where it grows without bound in one, or has no positive mass."""

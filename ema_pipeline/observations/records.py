@@ -27,7 +27,7 @@ from ema_pipeline.observations.parts import DAMPING
 from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, RecordData
 from ema_pipeline.observations.record_model import Basis, RecordModel, loosened
 from ema_pipeline.observations.record_motion import Motion, simulated
-from ema_pipeline.observations.record_problem import RecordProblem
+from ema_pipeline.observations.record_problem import Lines, RecordProblem
 from ema_pipeline.observations.rig_model import RigModel
 from ema_pipeline.observations.typical import Typical
 from ema_pipeline.rigs.types import Rig
@@ -103,6 +103,9 @@ class RecordObservations:
         self.like, self.modal, self.phase = like, modal, phase
         self.finds_states = (
             False  # True where states at the start are found from the first samples, not fitted
+        )
+        self.remembered: tuple[RecordProblem, NDArray[np.float64], list[Lines]] | None = (
+            None  # what a problem of these records predicted last, with derivatives, and where
         )
 
     @cached_property
