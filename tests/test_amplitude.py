@@ -55,6 +55,7 @@ def synthetic(
         np.array(level), np.array(sheet), np.array(LEVELS), np.tile(np.log(omega / (2 * np.pi)), (count, 1)), std,
         np.full((count, m), RATIO), 1e-5 * np.ones((count, m)), np.array(motion, complex), 0.0,
         np.stack([omega / (2 * np.pi) - 8.0, omega / (2 * np.pi) + 8.0], axis=1), LINE_HZ,
+        reference_level=0,
     )  # fmt: skip
     stretch = element_rows(assembly, list(elements)) @ shapes
     linear = Linear.of(clean, stretch, np.arange(m), values, clean.motion)
@@ -62,7 +63,13 @@ def synthetic(
     frequency = clean.log_frequency + moved.imag / omega + 1e-5 * random.standard_normal((count, m))
     frequency += drift * random.standard_normal((count, 1))
     damping = RATIO - moved.real / omega + 1e-5 * random.standard_normal((count, m))
-    hits = replace(clean, log_frequency=frequency, damping=damping)
+    weight = clean.reference_weights  # the softest hits, too, move a little
+    reference = replace(
+        clean.reference,
+        log_frequency=clean.reference.log_frequency + np.sum(weight * moved.imag / omega, axis=0),
+        log_damping=clean.reference.log_damping + np.sum(weight * -moved.real / omega / RATIO, axis=0),
+    )
+    hits = replace(clean, reference=reference, log_frequency=frequency, damping=damping)
     return AmplitudeObservations(ModeObservations(RIG, [hits.reference]), [hits])
 
 
@@ -157,6 +164,23 @@ def test_a_mode_that_moves_is_not_spared_by_leaving_it_without_a_partner() -> No
     modes, hits = paired.matching  # type: ignore[misc]
     alone = problem.residuals(x, scatters, matching=(modes, tuple(nobody for _ in hits)), derivatives=False)
     assert alone.cost == pytest.approx(paired.cost, rel=1e-9)
+
+
+def test_the_modes_of_the_softest_hits_are_those_that_the_effect_makes_of_them() -> None:
+    """A spring that is stiffer in the softest hits already makes another structure, which no part has to explain."""
+    elements = [PolynomialSpring(f"c{a}", {f"hub.{a}": 1.0}, cubic=1e11) for a in "xy"]
+    observations = synthetic(elements)
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    true = base_fit(synthetic())
+    m, worst = len(observations.hits[0].reference), []
+    for effects in ([], [parse_effect("bearing_cubic@hub", RIG)]):
+        problem = observations.problem(effects, {})
+        begin = problem.start({"bearing_cubic@hub.stiffness": 1e11})
+        x = transferred(true.posterior, problem.unknowns, begin)
+        found = problem.residuals(x, scatters, derivatives=False)
+        worst.append(np.max(np.abs(found.values[:m] - true.posterior.residuals.values[:m])))
+    assert worst[0] > 0.05
+    assert worst[1] < 0.2 * worst[0], worst
 
 
 def test_poles_that_move_far_are_read_less_well_than_near_ones() -> None:

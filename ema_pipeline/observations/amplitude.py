@@ -22,7 +22,12 @@ from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
 from ema_pipeline.mechanics.laws import Nonlinear, Spring
 from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.observations.hit_modes import HitData, Linear, comparable, shifted_poles
-from ema_pipeline.observations.mode_residuals import stacked
+from ema_pipeline.observations.mode_residuals import (
+    DAMPING_SCATTER,
+    FREQUENCY,
+    FREQUENCY_NOISE,
+    stacked,
+)
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem, Paired
 from ema_pipeline.observations.parts import part_key
 from ema_pipeline.observations.rig_model import LOG_STD, RigModel, SizeMap
@@ -33,7 +38,7 @@ HIT_DAMPING = "hit_damping_scatter"
 LINEARISATION = "linearisation"
 AMPLITUDE_STD = 0.02
 """1 σ of the logarithm of all amplitudes: the sensors' calibration, less what their number averages out."""
-FAR_AMPLITUDE_STD, _FAR = 0.3, 0.5
+FAR_AMPLITUDE_STD, _FAR = 0.35, 0.3
 """That of the amplitude at which a law stands whose poles move by many decay rates, and the distance at which half of
 its growth is reached. Teeth simulated with 1.74 µm of preload, whose modes move by 0.7, read as 2.28 µm."""
 
@@ -167,7 +172,7 @@ class AmplitudeProblem:
         moves = [h.moves for h in self.observations.hits]
         total = sum(weight for _, weight in moves)
         far = sum(apart * weight for apart, weight in moves) / total if total else 0.0
-        return float(np.hypot(AMPLITUDE_STD, FAR_AMPLITUDE_STD * far**2 / (far + _FAR)))
+        return float(np.hypot(AMPLITUDE_STD, FAR_AMPLITUDE_STD * far / (far + _FAR)))
 
     def positions(self, data: HitData) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Positions of the hits' drift, (h,), and of what linearisation leaves out, (h, m)."""
@@ -226,27 +231,19 @@ class AmplitudeProblem:
         )
         pairs = given[1] if isinstance(given[1], tuple) else (None,) * len(self.observations.hits)
         wide = np.pad(modes.jacobian, ((0, 0), (0, len(x) - count)))
-        parts = [dataclasses.replace(modes, jacobian=wide)]
+        parts = [dataclasses.replace(modes, values=modes.values.copy(), jacobian=wide)]
         for data, pair in zip(self.observations.hits, pairs, strict=True):
-            parts.append(self._of_hits(data, x, scatters, heat, pair, derivatives))
+            given_pair = pair if isinstance(pair, np.ndarray) else None
+            paired = self.modes.paired(data.reference, x[:count], given_pair)
+            if paired is None:
+                parts.append(Residuals(np.full(1, np.inf), np.zeros((1, len(x)))))
+                continue
+            hits = _Hits(self, data, paired, x, scatters, heat)
+            hits.shift_reference(parts[0], derivatives)
+            parts.append(hits.residuals(derivatives))
         return dataclasses.replace(
             stacked(parts, len(x)), matching=(modes.matching, tuple(p.matching for p in parts[1:]))
         )
-
-    def _of_hits(
-        self,
-        data: HitData,
-        x: NDArray[np.float64],
-        scatters: Mapping[str, float],
-        heat: float,
-        pair: object,
-        derivatives: bool,
-    ) -> Residuals:
-        given = pair if isinstance(pair, np.ndarray) else None
-        paired = self.modes.paired(data.reference, x[: len(self.modes.unknowns)], given)
-        if paired is None:
-            return Residuals(np.full(1, np.inf), np.zeros((1, len(x))))
-        return _Hits(self, data, paired, x, scatters, heat).residuals(derivatives)
 
 
 def _grid(size: SizeMap, points: int) -> NDArray[np.float64]:
@@ -287,33 +284,89 @@ class _Hits:
         data, x = self.data, self.x
         used = data.used  # whether the model has the mode or not: to leave it out must not pay
         hit, mode = np.nonzero(used)
-        omega = np.median(data.poles.imag, axis=0)
-        moved = self._moved(x)
-        left = np.exp(x[self.left])
+        predicted = self.predicted
         jacobian = np.zeros((2 * len(hit) if derivatives else 0, len(x)))
         if derivatives:
-            for i in (*self.problem.nonlinear_sizes, self.scale):
-                ahead = x.copy()
-                ahead[i] += _STEP if ahead[i] + _STEP <= self.problem.unknowns.upper[i] else -_STEP
-                change = (
-                    (self._moved(ahead) - moved) / (ahead[i] - x[i])
-                    if np.any(moved) or i != self.scale
-                    else 0
-                )
-                jacobian[:, i] = -_read(left * change + np.zeros_like(moved), omega, data)[
-                    :, hit, mode
-                ].ravel()
+            for i, change in self.changes.items():
+                jacobian[:, i] = -change[:, hit, mode].ravel()
             rows = np.arange(2 * len(hit))
             jacobian[rows[: len(hit)], self.drift[hit]] = -1.0
-            predicted = _read(left * moved, omega, data)[:, hit, mode].ravel()
-            jacobian[rows, np.tile(self.left[hit, mode], 2)] = -predicted
+            jacobian[rows, np.tile(self.left[hit, mode], 2)] = -predicted[:, hit, mode].ravel()
         difference = np.stack([data.log_frequency, np.log(np.where(used, data.damping, 1.0))])
-        difference = difference - _read(left * moved, omega, data)
+        difference = difference - predicted
         difference[0] -= x[self.drift][:, None]
         values = difference[:, hit, mode]
         own = np.stack([data.log_frequency_std, data.damping_std / np.where(used, data.damping, 1.0)])
         own = np.hypot(own, np.stack([data.linearised_std * data.usual_damping, data.linearised_std]))
         return self._whitened(values, own[:, hit, mode], jacobian, data.sheet[hit], mode)
+
+    @cached_property
+    def predicted(self) -> NDArray[np.float64]:
+        """Changes of ln f and of ln ζ of every hit and mode, (2, h, m)."""
+        return self._read(np.exp(self.x[self.left]) * self._moved(self.x))
+
+    @cached_property
+    def changes(self) -> dict[int, NDArray[np.float64]]:
+        """Derivatives of `predicted` by sizes and by the scale of amplitudes, by their position."""
+        x, moved, left = self.x, self._moved(self.x), np.exp(self.x[self.left])
+        found = {}
+        for i in (*self.problem.nonlinear_sizes, self.scale):
+            if i == self.scale and not np.any(moved):
+                continue
+            ahead = x.copy()
+            ahead[i] += _STEP if ahead[i] + _STEP <= self.problem.unknowns.upper[i] else -_STEP
+            found[i] = self._read(left * (self._moved(ahead) - moved) / (ahead[i] - x[i]))
+        return found
+
+    def shift_reference(self, modes: Residuals, derivatives: bool) -> None:
+        """Move the model's values behind the residuals of the level's modes to where its hits find them.
+
+        Even the hits nearest to the linear structure lock friction, or part teeth.
+        """
+        place = self._rows_of_reference(modes)
+        if place is None or not np.any(self.predicted):
+            return
+        weight = self.data.reference_weights
+        for kind, (row, mode, sigma) in enumerate(place):
+            modes.values[row] -= np.sum(weight * self.predicted[kind], axis=0)[mode] / sigma
+            if not derivatives:
+                continue
+            for i, change in self.changes.items():
+                modes.jacobian[row, i] -= np.sum(weight * change[kind], axis=0)[mode] / sigma
+            for h in range(len(weight)):
+                share = (weight[h] * self.predicted[kind, h])[mode] / sigma
+                modes.jacobian[row, self.left[h, mode]] -= share
+
+    def _rows_of_reference(
+        self, modes: Residuals
+    ) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]], ...] | None:
+        """Rows of frequencies and of damping ratios of the hits' modes, their place among these, and 1 σ."""
+        at, scatters = 0, self.scatters
+        assert isinstance(modes.matching, tuple)
+        for data, match in zip(self.problem.modes.observations.data, modes.matching, strict=True):
+            on = np.flatnonzero(match >= 0)
+            damped = on[np.isfinite(data.log_damping[on])]
+            if data.configuration == self.data.configuration and len(data) == len(self.data.reference):
+                mine = {int(r): k for k, r in enumerate(self.data.modes)}
+                found = []
+                for rows, start, own, scatter, heat in (
+                    (on, at, scatters[FREQUENCY_NOISE] * data.log_frequency_std, FREQUENCY, self.heat),
+                    (damped, at + len(on), data.log_damping_std, DAMPING_SCATTER, 1.0),
+                ):
+                    kept = [(start + i, mine[int(r)], int(r)) for i, r in enumerate(rows) if int(r) in mine]
+                    row, mode, measured = np.array(kept, int).reshape(-1, 3).T
+                    found.append((row, mode, np.hypot(own[measured], scatters[scatter]) * heat))
+                return tuple(found)
+            shapes = np.isfinite(data.shapes[on]) * (1 + data.whirling[on, None])
+            at += len(on) + len(damped) + int(np.sum(shapes))
+        return None
+
+    def _read(self, moved: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Changes of ln f and of ln ζ that changes of poles (h, m) make, (2, h, m)."""
+        usual, omega = self.data.usual_damping, np.median(self.data.poles.imag, axis=0)
+        frequency = moved.imag / omega
+        damping = -moved.real / omega - usual * frequency
+        return np.stack([frequency, damping / usual])
 
     def _moved(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Change of every mode's pole in every hit, 1/s, (h, m)."""
@@ -394,13 +447,6 @@ class _Hits:
         share[HIT_DAMPING] = np.where(first, 0.0, added / variance)
         groups = int(group.max(initial=-1)) + 1
         return Residuals(r, j, share, scale, matching=self.paired.match, projected=groups)
-
-
-def _read(moved: NDArray[np.complex128], omega: NDArray[np.float64], data: HitData) -> NDArray[np.float64]:
-    """Changes of ln f and of ln ζ that changes of poles (h, m) make, (2, h, m)."""
-    frequency = moved.imag / omega
-    damping = -moved.real / omega - data.usual_damping * frequency
-    return np.stack([frequency, damping / data.usual_damping])
 
 
 def _without_mean(

@@ -82,6 +82,8 @@ class HitData:
         Lines from which each mode was read.
     line_hz : float
         Their distance.
+    reference_level : int or None
+        Force level whose hits gave `reference`; None for all.
     """
 
     reference: ModeData
@@ -100,6 +102,7 @@ class HitData:
     window_decay: float
     band_hz: Real
     line_hz: float
+    reference_level: int | None = None
 
     @property
     def configuration(self) -> str:
@@ -114,6 +117,18 @@ class HitData:
         for group in self.groups:
             known[:, group] &= size[:, group] >= _HEARD * size[:, group].max(axis=1, keepdims=True)
         return known
+
+    @cached_property
+    def reference_weights(self) -> Real:
+        """Share of every hit in each mode of `reference`, (h, m): of the hits that it comes from, by their energy."""
+        of = (
+            np.ones(len(self.level), bool)
+            if self.reference_level is None
+            else self.level == self.reference_level
+        )
+        energy = np.where(self.used & of[:, None], np.abs(self.motion) ** 2, 0.0)
+        total = energy.sum(axis=0)
+        return np.asarray(np.divide(energy, total, out=np.zeros_like(energy), where=total > 0))
 
     @cached_property
     def _known(self) -> NDArray[np.bool_]:
@@ -241,7 +256,11 @@ def _fit_weights(instants: Real, pole: complex, lines_hz: Real) -> Complex:
 
 
 def prepare_hits(
-    configuration: str, hits: HitModes, modal: ModalModel, force_n: Sequence[float]
+    configuration: str,
+    hits: HitModes,
+    modal: ModalModel,
+    force_n: Sequence[float],
+    reference_level: int | None = None,
 ) -> HitData | None:
     """What single hits tell, prepared; None where no sheet was struck at several levels.
 
@@ -253,6 +272,8 @@ def prepare_hits(
         Of the level that is nearest to the linear structure.
     force_n : sequence of float
         Of each level.
+    reference_level : int, optional
+        Level that `modal` is of; all hits where left out.
     """
     data = HitData(
         prepare(from_modal_model(modal, configuration)),
@@ -271,6 +292,7 @@ def prepare_hits(
         hits.window_decay_rad_s,
         hits.band_hz,
         hits.line_hz,
+        reference_level,
     )
     return data if comparable(data) else None
 

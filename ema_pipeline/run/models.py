@@ -61,7 +61,8 @@ def amplitude_observations(run: Run) -> AmplitudeObservations | None:
         if study.hit_modes is None:
             continue
         modal = modes_of_structure(run, name)
-        data = prepare_hits(name, study.hit_modes, modal, [level.force_n for level in study.levels])
+        forces = [level.force_n for level in study.levels]
+        data = prepare_hits(name, study.hit_modes, modal, forces, study.linear_level)
         if data is not None:
             hits.append(data)
     return AmplitudeObservations(mode_observations(run), hits) if hits else None
