@@ -110,7 +110,8 @@ def select(
             lambda share, text, low=low: progress(low + share / (settings.most_effects + 1), text),  # type: ignore[misc]
             settings.further_finalists,
         )
-        rounds.append(_round(observations, ranking, left, settings, len(claimed)))
+        asked = _beside(settings, claimed)
+        rounds.append(_round(observations, ranking, left, asked, len(claimed)))
         near = rounds[-1].alike(settings)
         if not near or len(claimed) == settings.most_effects:
             return Selection(tuple(rounds), tuple(claimed), ranking.base)
@@ -122,6 +123,12 @@ def select(
         taken = {j.hypothesis.label for j in claimed}
         left = [h for h in hypotheses if h.label not in taken]
         base = fit_base(observations, claimed[-1].ranked.fit.model, claimed[-1].ranked.fit)
+
+
+def _beside(settings: DiagnoseSettings, claimed: Sequence[Judged]) -> DiagnoseSettings:
+    """What is asked of a further effect beside those that are claimed."""
+    gained = sum(j.gain for j in claimed if not j.hypothesis.placed.effect.linear)
+    return settings.model_copy(update={"claim": settings.claim + settings.linearised * gained})
 
 
 def _round(

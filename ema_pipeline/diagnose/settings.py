@@ -38,6 +38,13 @@ class DiagnoseSettings(Settings):
         description="Log evidence gained from which an effect is claimed: a Bayes factor of 33, strong evidence after "
         "Kass and Raftery (1995).",
     )
+    linearised: float = Field(
+        default=0.1,
+        ge=0,
+        lt=1,
+        description="Share of the log evidence gained by effects that depend on the amplitude which a further effect "
+        "must gain besides: what equivalent linearisation leaves out of the first looks like a second one.",
+    )
     sigmas: float = Field(
         default=2.0, gt=0, description="Distance of a claimed size from nothing, in its standard deviations."
     )
