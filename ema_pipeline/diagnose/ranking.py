@@ -53,6 +53,8 @@ _GRID_HEAT = 30.0
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
+_CLOSE_CALL = 30.0
+"""Log evidence gained up to which scatters learned further could turn a claim."""
 _BETTER = 0.05
 """Log evidence by which a start must lead a fit to be followed."""
 _EXPLAINED = 1.3
@@ -324,7 +326,7 @@ def _finals(
     beaten = _spread_fits(partial(_final, observations, ()), [fit for _, fit in far], processes)
     leaders = sorted(first[1:], key=lambda f: -f.log_evidence)
     job = partial(_final, observations, (first[0], *leaders[:2]))
-    final_base, *again = _spread_fits(job, first, processes)
+    final_base, *again = _learned_on(observations, _spread_fits(job, first, processes), processes)
     finals = [
         Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True)
         for (hypothesis, _), fit in zip((*finalists, *far), (*again, *beaten), strict=True)
@@ -339,6 +341,31 @@ def _finals(
         if hypothesis.label not in taken
     ]
     return Ranking(final_base, (*finals, *others))
+
+
+def _learned_on(observations: Observations, fits: Sequence[Fit], processes: int | None) -> list[Fit]:
+    """The base model and the finalists; where it is close, both learn on, the base model from the finalists' scatters.
+
+    Scatters are learned in few rounds. What a finalist has learned further than the base model is no evidence for it.
+    """
+    base, *finalists = fits
+    order = sorted(range(1, len(fits)), key=lambda i: -fits[i].log_evidence)[:2]
+    if not finalists or not 0 < fits[order[0]].log_evidence - base.log_evidence < _CLOSE_CALL:
+        return list(fits)
+    asked = [(0, i) for i in order] + [(i, i) for i in order]
+    job = partial(_learned_from, observations)
+    items = [(fits[i], fits[source].posterior.scatters) for i, source in asked]
+    best = list(fits)
+    for (i, _), posterior in zip(asked, spread(job, items, processes, len(items)), strict=True):
+        best[i] = max(best[i], Fit(fits[i].model, posterior), key=lambda f: f.log_evidence)
+    return best
+
+
+def _learned_from(observations: Observations, item: tuple[Fit, Mapping[str, float]]) -> Posterior:
+    fit, scatters = item
+    return learned(
+        observations, refined(observations, fit.model, fit.posterior.x, scatters, steps=10)
+    ).posterior
 
 
 def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:

@@ -29,7 +29,7 @@ _ROUNDING = 1e-9
 """Coupling, over ω², that is no more than rounding: modes of one frequency are not mixed by it."""
 _TURNS = 0.01
 """Share of another mode in a shape from which derivatives follow the damped shape."""
-_CLOSE = 2e-5
+_CLOSE = 1e-4
 """Dynamic stiffness of another mode, over ω², below which the rotation of two shapes is no longer linear."""
 _ITERATIONS = 4
 _OSCILLATES = 0.1

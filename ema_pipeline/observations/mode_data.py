@@ -13,6 +13,8 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.settings import AssumedSettings
 from ema_pipeline.dof import Dof
 
+_MIXED_STD = 0.1
+"""1 σ, in the largest entry, of shapes that identification may have mixed."""
 _WHIRLS = 0.05
 """Share of its imaginary part in the sum of squares of a shape, from which it is compared as a complex one: MPC 0.8."""
 _DOUBLE = 0.9
@@ -36,7 +38,7 @@ class ModeData:
     complete : bool
         False where modes of the band were taken out on purpose: what the model has besides is then no contradiction.
     imaginary : ndarray, (m, s), optional
-        Imaginary parts of the shapes of `whirling` modes, 0 for all others.
+        Imaginary parts of plainly complex shapes, 0 for all others.
     """
 
     configuration: str
@@ -68,16 +70,17 @@ class ModeData:
     def whirling(self) -> NDArray[np.bool_]:
         """Mask of modes whose shapes are complex far beyond what a test does to real ones, (m,).
 
-        Gyroscopic coupling makes bodies whirl, and strong dampers let parts of a structure lag behind.
+        Gyroscopic coupling makes bodies whirl, and strong dampers let parts of a structure lag behind. Those of `double`
+        modes are complex because identification mixes them.
         """
         if self.imaginary is None:
             return np.zeros(len(self), bool)
-        return np.asarray(np.any(self.imaginary, axis=1))
+        return np.asarray(np.any(self.imaginary, axis=1) & ~self.double)
 
     @cached_property
     def complex_shapes(self) -> NDArray[np.complex128]:
         """Shapes with the imaginary parts of `whirling` modes, 0 where not measured, (m, s)."""
-        imaginary = np.zeros_like(self.shapes) if self.imaginary is None else self.imaginary
+        imaginary = 0.0 if self.imaginary is None else np.where(self.whirling[:, None], self.imaginary, 0.0)
         return np.asarray(self.known_shapes + 1j * imaginary, complex)
 
     @cached_property
@@ -104,6 +107,11 @@ class ModeData:
             left = own - others @ np.linalg.lstsq(others, own, rcond=None)[0]
             found[i] = left @ left < (1 - _DOUBLE) * (own @ own)
         return found
+
+    @cached_property
+    def compared_std(self) -> NDArray[np.float64]:
+        """1 σ of shapes as they are compared, (m, s): identification mixes those of `double` and `whirling` modes."""
+        return np.hypot(self.shape_std, _MIXED_STD * (self.double | self.whirling)[:, None])
 
     def only(self, keep: NDArray[np.bool_]) -> ModeData:
         """The modes of a mask, (m,)."""

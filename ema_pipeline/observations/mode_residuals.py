@@ -26,8 +26,6 @@ UNEXPLAINED = 12.0
 UNSEEN = 3.0
 """Cost of a model mode in the band that was not measured: it may lie on a node of every sensor or hit point."""
 
-_WHIRL_STD = 0.1
-"""1 σ of complex shapes, in their largest entry: where close modes drift, identification makes real ones complex."""
 _SHAPE_REACH = 0.3
 """Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
 _FREQUENCY_REACH = 0.1
@@ -309,7 +307,7 @@ class Comparison:
         seen, whirl = np.isfinite(d.shapes[alone]), d.whirling[alone]
         real, both = seen & ~whirl[:, None], seen & whirl[:, None]
         reach = np.maximum(_SHAPE_REACH, np.abs(d.complex_shapes[alone]))
-        std = np.hypot(d.shape_std[alone], _WHIRL_STD * whirl[:, None])
+        std = d.compared_std[alone]
         damped = alone[np.isfinite(d.log_damping[alone])]
         parts = 1 + whirl  # real and imaginary
         count = np.sum(seen, axis=1, dtype=float) * parts
@@ -388,7 +386,7 @@ class Comparison:
         on, to = on[real], to[real]
         p = predicted[:, to].T
         seen = d.seen[on] > 0
-        y, own = d.known_shapes[on], d.shape_std[on]
+        y, own = d.known_shapes[on], d.compared_std[on]
         unit = np.maximum(_SHAPE_REACH, np.abs(y))
         weight = seen / (own**2 + (self.scatters[SHAPE] * unit) ** 2)
         weighted = weight * p
@@ -421,7 +419,7 @@ class Comparison:
         d, whirl = self.data, np.flatnonzero(self.data.whirling[on])
         on, to = on[whirl], to[whirl]
         p, y, seen = self._read(solution)[:, to].T.astype(complex), d.complex_shapes[on], d.seen[on] > 0
-        own = np.hypot(d.shape_std[on], _WHIRL_STD)
+        own = d.compared_std[on]
         unit = np.maximum(_SHAPE_REACH, np.abs(y))
         weight = seen / (own**2 + (self.scatters[SHAPE] * unit) ** 2)
         squared = np.maximum(np.sum(weight * np.abs(p) ** 2, axis=1), 1e-300)
