@@ -14,6 +14,7 @@ from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import descend
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
+from ema_pipeline.mechanics.modes import complex_modes
 from ema_pipeline.observations.fitting import Model, fit_base, learned
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.mode_residuals import UNEXPLAINED, UNSEEN
@@ -405,3 +406,59 @@ def test_sensors_of_another_rig_are_refused_in_one_line() -> None:
     problem = observed(chain(), {"all": replace(measured, dofs=dofs)}).problem((), {})
     with pytest.raises(EmaError, match=r"m9\.z"):
         problem.residuals(np.zeros(len(problem.unknowns)), {})
+
+
+def whirling(frequency: np.ndarray) -> MeasuredModes:
+    """Three modes of which the second whirls."""
+    shapes = np.random.default_rng(4).standard_normal((3, 8)).astype(complex)
+    shapes[1, 4:] *= 1j
+    return MeasuredModes(
+        "test", frequency, 1e-4 * frequency, np.full(3, 0.005), np.full(3, 1e-4), shapes,
+        np.full((3, 8), 1e-2), tuple(Dof.parse(f"m{k}.x") for k in range(8)), band_hz=(50.0, 200.0),
+    )  # fmt: skip
+
+
+def test_a_plainly_complex_shape_is_compared_as_one_and_others_as_real_ones() -> None:
+    data = prepare(whirling(np.array([100.0, 130.0, 160.0])))
+    assert data.whirling.tolist() == [False, True, False]
+    assert np.max(np.abs(data.complex_shapes[1].imag)) > 0.3
+    assert not np.any(data.complex_shapes[[0, 2]].imag)
+    assert np.all(data.compared_std[1] > 0.1)
+    assert np.all(data.compared_std[[0, 2]] < 0.1)
+    assert data.only(np.array([False, True, True])).whirling.tolist() == [True, False]
+
+
+def test_gyroscopic_coupling_explains_modes_that_whirl() -> None:
+    """Poles and complex shapes of the true rig; the base model's shapes are real."""
+    rig = planetary()
+    truth = RigModel(rig, [parse_effect("gyroscopic@carrier", rig)])
+    x = truth.start({"gyroscopic@carrier.coefficient": 80.0})
+    exact = complex_modes(truth.system("with_ring", x))
+    on = (exact.frequency_hz > 20) & (exact.frequency_hz < 400)
+    dofs = tuple(Dof.parse(d) for b in ("carrier", "sun", "ring") for d in (f"{b}.x", f"{b}.y", f"{b}.u"))
+    read = RigModel(rig).sensor_rows("with_ring", dofs)
+    shapes = (read @ exact.shapes[: read.shape[1], on]).T
+    f = exact.frequency_hz[on]
+    measured = MeasuredModes(
+        "with_ring", f, 1e-4 * f, exact.damping_ratio[on], np.full(len(f), 1e-4), shapes,
+        1e-3 * np.abs(shapes), dofs, band_hz=(20.0, 400.0),
+    )  # fmt: skip
+    observations = ModeObservations(rig, [prepare(measured)])
+    assert np.sum(observations.data[0].whirling) >= 2
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    base = observations.problem([], {})
+    with_it = observations.problem([parse_effect("gyroscopic@carrier", rig)], {})
+    at = with_it.start({"gyroscopic@carrier.coefficient": 80.0})
+    true = with_it.residuals(at, scatters)
+    assert np.max(np.abs(true.values)) < 0.05
+    assert base.residuals(base.start(), scatters).cost > true.cost + 100
+    for i, name in enumerate(with_it.unknowns.names):
+        h = np.zeros(len(at))
+        h[i] = 1e-5
+        low, high = (with_it.residuals(at + s * h, scatters, matching=true.matching).stated for s in (-1, 1))
+        np.testing.assert_allclose(
+            true.jacobian[:, i],
+            (high - low) / 2e-5,
+            atol=2e-2 * max(1.0, np.abs(true.jacobian[:, i]).max()),
+            err_msg=name,
+        )
