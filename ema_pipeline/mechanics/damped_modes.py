@@ -122,6 +122,13 @@ class DampedModes:
         """True for a mode whose shape damping turns so far that derivatives have to follow it."""
         return bool(np.sum(np.abs(self.shares[:, r]) > _TURNS) > 1)
 
+    def lag(self, coupling: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Shares of the undamped modes that a small skew `coupling`, (n, n), adds to every shape, (n, n)."""
+        apart = self.poles[None, :] ** 2 + values[:, None]
+        apart = apart + 2 * (self.damping_ratio * np.sqrt(values))[:, None] * self.poles[None, :]
+        least = (_CLOSE * np.abs(self.poles[None, :]) ** 2) ** 2
+        return np.asarray(-coupling * self.poles[None, :] * np.conj(apart) / (np.abs(apart) ** 2 + least))
+
     def derivatives(
         self,
         matrices: Matrices,

@@ -156,19 +156,24 @@ class ModeDerivatives:
         has_ratio: bool,
     ) -> ModeDerivatives:
         omega, phi = np.sqrt(solution.eigenvalues), solution.shapes
-        bare, weight = _undamped(matrices, solution, np.arange(len(omega)))
-        log_frequency, ratio = damped.derivatives(matrices, modes, bare[:, modes], weight[:, :, modes], omega)
-        shapes = (phi @ weight[:, :, modes]).astype(complex)
+        bare, weight = _undamped(matrices, solution, modes)
+        log_frequency, ratio = damped.derivatives(matrices, modes, bare, weight, omega)
+        shapes = (phi @ weight).astype(complex)
         at = matrices.terms.log.shape[1]
+        for j in np.flatnonzero(np.any(matrices.skew_by_shape, axis=(1, 2))):
+            shapes[at + j] += (
+                phi @ damped.lag(phi.T @ matrices.skew_by_shape[j] @ phi, solution.eigenvalues)[:, modes]
+            )
         if has_ratio:
             log_frequency = _inserted(log_frequency, at, 0.0)
             ratio = _inserted(ratio, at, matrices.damping_ratio)
             shapes = _inserted(shapes, at, 0.0)
-        gyroscopic = bool(np.any(matrices.skew) or np.any(matrices.skew_by_shape))
-        order = [*range(at), *([len(weight)] if has_ratio else []), *range(at, len(weight))]
-        for k, r in enumerate(modes.tolist()):
-            if gyroscopic or damped.turned(r):
-                own = damped.derivatives_of(r, matrices, phi, omega, bare, weight)
+        turned = [k for k, r in enumerate(modes.tolist()) if damped.turned(r)]
+        if turned:
+            bare, weight = _undamped(matrices, solution, np.arange(len(omega)))
+            order = [*range(at), *([len(weight)] if has_ratio else []), *range(at, len(weight))]
+            for k in turned:
+                own = damped.derivatives_of(int(modes[k]), matrices, phi, omega, bare, weight)
                 log_frequency[:, k], ratio[:, k] = own[0][order], own[1][order]
                 shapes[:, :, k] = own[2].T[order]
         return cls(log_frequency.T, ratio.T, shapes.transpose(1, 2, 0))

@@ -70,8 +70,8 @@ class ModeData:
     def whirling(self) -> NDArray[np.bool_]:
         """Mask of modes whose shapes are complex far beyond what a test does to real ones, (m,).
 
-        Gyroscopic coupling makes bodies whirl, and strong dampers let parts of a structure lag behind. Those of `double`
-        modes are complex because identification mixes them.
+        Gyroscopic coupling makes bodies whirl, and strong dampers let parts of a structure lag behind. Shapes of
+        `double` modes are complex because identification mixes them.
         """
         if self.imaginary is None:
             return np.zeros(len(self), bool)
