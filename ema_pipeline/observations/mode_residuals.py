@@ -140,7 +140,7 @@ class Compared:
     Attributes
     ----------
     rows : tuple of Rows
-        Frequencies, damping ratios, shapes; complex ones apart.
+        Frequencies, damping ratios, shapes; complex ones, where there are any, apart.
     match : ndarray of int, (m,)
         Model mode of every measured one, -1 for none.
     log_scale, penalty : float
@@ -251,12 +251,13 @@ class Comparison:
         on, alone = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
         to = match[on]
         slopes = ModeDerivatives.of(matrices, solution, to, self.model.has_ratio) if derivatives else None
-        rows = (
+        rows: tuple[Rows, ...] = (
             self._frequencies(solution, on, to, slopes),
             self._damping(solution, on, to, slopes),
             self._shapes(solution, predicted, on, to, slopes),
-            self._complex_shapes(solution, on, to, slopes),
         )
+        if np.any(self.data.whirling[on]):
+            rows += (self._complex_shapes(solution, on, to, slopes),)
         return Compared(
             rows=rows,
             match=match,
@@ -268,8 +269,9 @@ class Comparison:
 
     def seen(self, solution: EigenSolution) -> NDArray[np.float64]:
         """What the sensors read of every shape, (s, n); complex shapes turned as measured ones are, and made real."""
-        read = self._read(solution)
-        return np.real(read) if solution.damped is None else _turned(read)
+        if solution.damped is None:
+            return np.asarray(self.reading @ solution.shapes[: self.reading.shape[1]])
+        return _turned(self._read(solution))
 
     def _read(self, solution: EigenSolution) -> NDArray[np.complex128]:
         """The same with complex shapes as they are."""
