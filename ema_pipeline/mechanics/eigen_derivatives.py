@@ -9,7 +9,7 @@ derivative of a shape is expanded over all shapes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy.linalg
@@ -110,7 +110,7 @@ class ModeDerivatives:
     log_frequency : ndarray, (m, n)
     damping_ratio : ndarray, (m, n)
     shapes : ndarray, (n_dofs, m, n)
-        Complex where the modes are damped ones or an effect turns them.
+        Complex where damping or an effect turns them; else those of the undamped ones.
     """
 
     log_frequency: NDArray[np.float64]
@@ -158,9 +158,13 @@ class ModeDerivatives:
         omega, phi = np.sqrt(solution.eigenvalues), solution.shapes
         bare, weight = _undamped(matrices, solution, modes)
         log_frequency, ratio = damped.derivatives(matrices, modes, bare, weight, omega)
-        shapes = (phi @ weight).astype(complex)
+        turned = [k for k, r in enumerate(modes.tolist()) if damped.turned(r)]
+        skew = np.flatnonzero(np.any(matrices.skew_by_shape, axis=(1, 2)))
+        shapes: NDArray[Any] = phi @ weight
+        if turned or len(skew):
+            shapes = shapes.astype(complex)
         at = matrices.terms.log.shape[1]
-        for j in np.flatnonzero(np.any(matrices.skew_by_shape, axis=(1, 2))):
+        for j in skew:
             shapes[at + j] += (
                 phi @ damped.lag(phi.T @ matrices.skew_by_shape[j] @ phi, solution.eigenvalues)[:, modes]
             )
@@ -168,7 +172,6 @@ class ModeDerivatives:
             log_frequency = _inserted(log_frequency, at, 0.0)
             ratio = _inserted(ratio, at, matrices.damping_ratio)
             shapes = _inserted(shapes, at, 0.0)
-        turned = [k for k, r in enumerate(modes.tolist()) if damped.turned(r)]
         if turned:
             bare, weight = _undamped(matrices, solution, np.arange(len(omega)))
             order = [*range(at), *([len(weight)] if has_ratio else []), *range(at, len(weight))]

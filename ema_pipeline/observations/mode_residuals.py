@@ -397,7 +397,7 @@ class Comparison:
         slope = None
         if slopes is not None:
             dp = self._shape_slopes(slopes.shapes[:, real], solution, to)
-            if solution.damped is not None:
+            if solution.damped is not None and np.iscomplexobj(dp):
                 dp = _turned_slopes(self._read(solution)[:, to].T, dp)
             dp = np.real(dp)
             towards = weight * (y - 2 * scale[:, None] * p) / squared[:, None]
@@ -458,7 +458,8 @@ class Comparison:
     ) -> NDArray[Any]:
         """Derivatives of what the sensors read of some shapes by all unknowns, complex where they are, (k, s, n)."""
         width, s = self.reading.shape[1], self.sensing
-        shapes = (solution.shapes if solution.damped is None else solution.damped.shapes)[:width, to]
+        turned = solution.damped is not None and np.iscomplexobj(by_model)
+        shapes = (solution.damped.shapes if turned and solution.damped else solution.shapes)[:width, to]
         predicted = (self.reading @ shapes).T
         k, count = predicted.shape
         slope = np.zeros((k, count, len(self.x)), np.result_type(predicted, by_model))
