@@ -110,7 +110,7 @@ def select(
             lambda share, text, low=low: progress(low + share / (settings.most_effects + 1), text),  # type: ignore[misc]
             settings.further_finalists,
         )
-        asked = _beside(settings, claimed)
+        asked = _beside(settings, claimed) if observations.linearised else settings
         rounds.append(_round(observations, ranking, left, asked, len(claimed)))
         near = rounds[-1].alike(settings)
         if not near or len(claimed) == settings.most_effects:

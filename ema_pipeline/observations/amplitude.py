@@ -75,6 +75,8 @@ class AmplitudeObservations:
         Of the configurations that were struck at several levels.
     """
 
+    linearised = True
+
     def __init__(self, modes: ModeObservations, hits: Sequence[HitData]) -> None:
         self.modes, self.hits = modes, tuple(hits)
         self.scatters = {**modes.scatters, **hit_scatters()}

@@ -56,6 +56,11 @@ class Observations(Protocol):
         """The hyper-parameters that these data depend on."""
         ...
 
+    @property
+    def linearised(self) -> bool:
+        """True where effects that depend on the amplitude are known to first order, whose rest looks like another."""
+        ...
+
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> EffectProblem:
         """The problem of fitting the rig with `effects`, whose sizes have these prior 1 σ, to the data."""
         ...

@@ -83,6 +83,8 @@ class LoopObservations:
         Without loops, and for a rig that has no isolator.
     """
 
+    linearised = False
+
     def __init__(
         self,
         rig: Rig,

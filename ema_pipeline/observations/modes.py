@@ -93,6 +93,8 @@ class ModeObservations:
         Name of the test among several whose unknowns are shared: its drift is its own.
     """
 
+    linearised = False
+
     def __init__(
         self,
         rig: Rig,

@@ -88,6 +88,8 @@ class PairObservations:
     repeat : RepeatSettings, optional
     """
 
+    linearised = False
+
     def __init__(
         self,
         a: ModeObservations,

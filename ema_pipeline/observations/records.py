@@ -82,6 +82,8 @@ class RecordObservations:
         Without records to fit, and for a rig that lacks a measured DOF.
     """
 
+    linearised = False
+
     def __init__(
         self,
         rig: Rig,
