@@ -325,11 +325,10 @@ class _Hits:
 
         Even the hits nearest to the linear structure lock friction, or part teeth.
         """
-        place = self._rows_of_reference(modes)
-        if place is None or not np.any(self.predicted):
+        if not np.any(self.predicted):
             return
         weight = self.data.reference_weights
-        for kind, (row, mode, sigma) in enumerate(place):
+        for kind, (row, mode, sigma) in enumerate(self._rows_of_reference(modes)):
             modes.values[row] -= np.sum(weight * self.predicted[kind], axis=0)[mode] / sigma
             if not derivatives:
                 continue
@@ -341,7 +340,7 @@ class _Hits:
 
     def _rows_of_reference(
         self, modes: Residuals
-    ) -> tuple[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]], ...] | None:
+    ) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
         """Rows of frequencies and of damping ratios of the hits' modes, their place among these, and 1 σ."""
         at, scatters = 0, self.scatters
         assert isinstance(modes.matching, tuple)
@@ -358,14 +357,13 @@ class _Hits:
                     kept = [(start + i, mine[int(r)], int(r)) for i, r in enumerate(rows) if int(r) in mine]
                     row, mode, measured = np.array(kept, int).reshape(-1, 3).T
                     found.append((row, mode, np.hypot(own[measured], scatters[scatter]) * heat))
-                return tuple(found)
-            shapes = np.isfinite(data.shapes[on]) * (1 + data.whirling[on, None])
-            at += len(on) + len(damped) + int(np.sum(shapes))
-        return None
+                return found
+            at += len(on) + len(damped) + data.shape_rows(on)
+        return []
 
     def _read(self, moved: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Changes of ln f and of ln ζ that changes of poles (h, m) make, (2, h, m)."""
-        usual, omega = self.data.usual_damping, np.median(self.data.poles.imag, axis=0)
+        usual, omega = self.data.usual_damping, self.data.omega
         frequency = moved.imag / omega
         damping = -moved.real / omega - usual * frequency
         return np.stack([frequency, damping / usual])

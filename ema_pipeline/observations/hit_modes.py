@@ -158,6 +158,16 @@ class HitData:
         return np.asarray(2 * np.pi * np.exp(own.log_frequency[self.modes]) * (1j - decay))
 
     @cached_property
+    def omega(self) -> Real:
+        """Median of every mode over the hits, rad/s, (m,)."""
+        return np.asarray(np.median(self.poles.imag, axis=0))
+
+    @cached_property
+    def decay(self) -> Real:
+        """Median decay rate of every mode over the hits, 1/s, (m,)."""
+        return np.asarray(np.median(-self.poles.real, axis=0))
+
+    @cached_property
     def usual_damping(self) -> Real:
         """Median damping ratio of every mode over the hits, (m,)."""
         return np.asarray(np.median(-self.poles.real / self.poles.imag, axis=0))
@@ -187,23 +197,22 @@ class HitData:
             np.nanmedian(np.where(used | ~known, part, np.nan), axis=0) for part in (poles.real, poles.imag)
         ]
         apart = np.where(used, np.abs(poles - (middle[0] + 1j * middle[1])), 0.0)
-        usual = np.median(-self.poles.real, axis=0)
-        return np.asarray(apart.max(axis=0, initial=0.0) / usual)
+        return np.asarray(apart.max(axis=0, initial=0.0) / self.decay)
 
     @cached_property
     def _moved(self) -> Real:
         """Distance of every pole from that of the softest hits of its sheet, in decay rates, (h, m)."""
-        usual, apart = np.median(-self.poles.real, axis=0), np.zeros(self.poles.shape)
+        apart = np.zeros(self.poles.shape)
         for sheet in np.unique(self.sheet):
             on = np.flatnonzero(self.sheet == sheet)
             for r in range(len(self.modes)):
                 heard = on[self.used[on, r]]
                 if len(heard):
                     softest = heard[self.level[heard] == self.level[heard].min()]
-                    apart[heard, r] = np.abs(self.poles[heard, r] - self.poles[softest, r].mean()) / usual[r]
-        return apart
+                    apart[heard, r] = np.abs(self.poles[heard, r] - self.poles[softest, r].mean())
+        return np.asarray(apart / self.decay)
 
-    @property
+    @cached_property
     def linearised_std(self) -> Real:
         """1 σ of what a fit of one pole reads of a decay that is no small change, in decay rates, (h, m).
 
@@ -211,7 +220,7 @@ class HitData:
         """
         return np.asarray(_FAR_STD * self._moved**2 / (self._moved + _FAR))
 
-    @property
+    @cached_property
     def moves(self) -> tuple[float, float]:
         """Mean distance of poles from those of the softest hits, in decay rates, each by its square over its variance;
         and the sum of these weights."""
@@ -223,13 +232,12 @@ class HitData:
     @cached_property
     def weights(self) -> tuple[Real, Complex]:
         """Instants after the blow, (t,), and the weight of each in the pole that is read of every mode, (t, m)."""
-        decay = np.median(-self.poles.real, axis=0) + self.window_decay
+        decay = self.decay + self.window_decay
         first, last = np.log(0.5 * _FIRST / decay.max()), np.log(0.5 * _LAST / decay.min())
         instants = np.exp(np.linspace(first, last, int(_PER_EFOLD * (last - first)) + 2))
-        omega = np.median(self.poles.imag, axis=0)
         columns = [
             _fit_weights(instants, complex(-s, w), np.arange(low, high, self.line_hz))
-            for s, w, (low, high) in zip(decay, omega, self.band_hz.tolist(), strict=True)
+            for s, w, (low, high) in zip(decay, self.omega, self.band_hz.tolist(), strict=True)
         ]
         return instants, np.stack(columns, axis=1)
 
@@ -344,7 +352,7 @@ class Linear:
         displacement : complex ndarray, (h, m)
         """
         along = np.where(match >= 0, stretch[:, match], 0.0)
-        lowest = float(np.median(data.poles.imag, axis=0).min())
+        lowest = float(data.omega.min())
         flexible = np.where(eigenvalues < (_QUASI_STATIC * lowest) ** 2, 0.0, 1 / eigenvalues)
         elsewhere = np.zeros((len(stretch), len(data.groups)))
         for c, group in enumerate(data.groups):
@@ -368,8 +376,7 @@ def shifted_poles(data: HitData, elements: Sequence[Nonlinear], linear: Linear) 
     total = np.zeros(linear.displacement.shape, complex)
     if not elements:
         return total
-    instants, weight = data.weights
-    omega = np.median(data.poles.imag, axis=0)
+    (instants, weight), omega = data.weights, data.omega
     centre = np.array([np.mean(omega[g]) for g in data.groups])
     group_of = np.zeros(len(omega), np.int64)
     for k, g in enumerate(data.groups):

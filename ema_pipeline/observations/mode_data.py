@@ -108,6 +108,10 @@ class ModeData:
             found[i] = left @ left < (1 - _DOUBLE) * (own @ own)
         return found
 
+    def shape_rows(self, modes: NDArray[np.int64]) -> int:
+        """Number of values that the shapes of some modes are compared by: two per sensor of a whirling mode."""
+        return int(np.sum(self.seen[modes] * (1 + self.whirling[modes, None])))
+
     @cached_property
     def compared_std(self) -> NDArray[np.float64]:
         """1 σ of shapes as they are compared, (m, s): identification mixes those of `double` and `whirling` modes."""

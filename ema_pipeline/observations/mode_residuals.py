@@ -458,8 +458,8 @@ class Comparison:
     ) -> NDArray[Any]:
         """Derivatives of what the sensors read of some shapes by all unknowns, complex where they are, (k, s, n)."""
         width, s = self.reading.shape[1], self.sensing
-        turned = solution.damped is not None and np.iscomplexobj(by_model)
-        shapes = (solution.damped.shapes if turned and solution.damped else solution.shapes)[:width, to]
+        follows = solution.damped if np.iscomplexobj(by_model) else None
+        shapes = (solution if follows is None else follows).shapes[:width, to]
         predicted = (self.reading @ shapes).T
         k, count = predicted.shape
         slope = np.zeros((k, count, len(self.x)), np.result_type(predicted, by_model))

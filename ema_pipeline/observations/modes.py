@@ -352,7 +352,7 @@ class ModeProblem(EffectProblem):
                     if reach > 0:
                         starts.append(self.unknowns.clipped(x - 2 * split * variance * slope / reach))
             at += len(own) + int(np.sum(np.isfinite(data.log_damping[match >= 0])))
-            at += int(np.sum(np.isfinite(data.shapes[match >= 0]) * (1 + data.whirling[match >= 0, None])))
+            at += data.shape_rows(np.flatnonzero(match >= 0))
         return starts
 
     def rows(self, found: Residuals) -> list[ModeRows]:
