@@ -11,7 +11,17 @@ import scipy.optimize
 import scipy.stats
 from numpy.typing import NDArray
 
-from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns, anneal, descend, joined, learn
+from ema_pipeline.inference import (
+    Posterior,
+    Residuals,
+    Scatter,
+    Unknowns,
+    anneal,
+    descend,
+    joined,
+    learn,
+    widened,
+)
 
 Array = NDArray[np.float64]
 NOISE = "noise"
@@ -293,6 +303,43 @@ def test_a_learned_scatter_far_from_its_default_costs_evidence() -> None:
     assert found.log_evidence == pytest.approx(
         Posterior(found.unknowns, found.x, found.scatters, found.residuals).log_evidence - expected
     )
+
+
+def test_the_evidence_at_other_scatters_is_the_density_of_the_data_there() -> None:
+    problem = parts(6, 0.03, 8)
+    found = descend(problem, {PARTS: 0.02}, np.zeros(8))
+
+    def density(scatter: float) -> float:
+        std = np.hypot(1.0, scatter / 0.01)
+        return float(np.sum(scipy.stats.norm(0.0, std).logpdf(problem.y)))
+
+    for value in (0.005, 0.05):
+        told = found.log_evidence_at(PARTS, value) - found.log_evidence_at(PARTS, 0.02)
+        assert told == pytest.approx(density(value) - density(0.02), abs=1e-6)
+
+
+def masses(rng: np.random.Generator, scatter: Scatter) -> tuple[Linear, float]:
+    """Three masses in proportion to each other, one of them with an unknown mass beside it."""
+    true = scatter.default * np.exp(scatter.spread * rng.normal())
+    x, added = true * rng.normal(size=3), 0.2 * rng.normal()
+    a = np.array([[1.0, -1.0, 0.0, -1.0], [0.0, -1.0, 1.0, -1.0]]) / 1e-4
+    unknowns = joined(
+        Unknowns.plain(("m1", "m2", "m3"), 1.0, PARTS),
+        Unknowns.plain(("added",), 0.2),
+    )
+    return Linear(unknowns, a, a @ np.append(x, added) + rng.normal(size=2)), float(added)
+
+
+def test_intervals_hold_where_two_ratios_are_all_that_tells_how_much_masses_scatter() -> None:
+    scatter = Scatter(PARTS, "parts", 0.005, 1.0, 0.02, 8.0)
+    rng, inside = np.random.default_rng(7), []
+    for _ in range(300):
+        problem, added = masses(rng, scatter)
+        found = learn(problem, descend(problem, {PARTS: 0.02}, np.zeros(4)), {PARTS: scatter})
+        found = descend(problem, widened(found, {PARTS: scatter}), found.x)
+        inside.append(abs(found.value("added") - added) < 1.6449 * found.std[3])
+    # 300 intervals: 1 σ of the share is 1.7 %; a Gaussian with the right second moment is a little too wide
+    assert 0.87 < np.mean(inside) < 0.965
 
 
 # --- data that break careless algebra ---------------------------------------------------------------------

@@ -13,7 +13,7 @@ from bench import ema
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
-from ema_pipeline.mechanics.assembly import Gyroscopic
+from ema_pipeline.mechanics.assembly import Gyroscopic, Mass
 from ema_pipeline.mechanics.laws import (
     BoucWen,
     DryFriction,
@@ -23,6 +23,7 @@ from ema_pipeline.mechanics.laws import (
     PolynomialSpring,
 )
 from ema_pipeline.mechanics.modes import complex_modes
+from ema_pipeline.observations.parts import dependence
 from ema_pipeline.rigs import Rig, load_rig, model_modes
 from ema_pipeline.toml_lines import key_lines, line_of
 
@@ -118,6 +119,27 @@ def test_rig_from_scratch_is_made_of_elements(tmp_path: Path) -> None:
     assert set(rig.used("free")) == {"link", "modal_damping_ratio"}
     soft = rig.system("free", {"link": 5e4}).stiffness
     np.testing.assert_allclose(soft, rig.system("free").stiffness / 2)
+
+
+def test_a_body_that_moves_in_two_directions_has_one_mass_that_deviates_as_one(tmp_path: Path) -> None:
+    more = """
+[[masses]]
+at = "top.y"
+value = 1.0
+[[masses]]
+at = "base.y"
+value = 3.1
+[[masses]]
+at = "top.u"
+value = 1.0
+[[springs]]
+row = { "top.y" = 1.0, "top.u" = 1.0, "base.y" = 1.0 }
+value = 1e5
+"""
+    rig = load_rig(write(tmp_path, ELEMENTS + more))
+    masses = [e for e in rig.assembly("free").elements if isinstance(e, Mass)]
+    assert [m.part for m in masses] == ["top mass", "", "top mass", "", ""]
+    assert {"top mass (mass)", "mass 2 (mass)", "mass 4 (mass)"} <= set(dependence(rig).unknowns.names)
 
 
 def test_a_row_may_name_its_dofs_with_or_without_quotes(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 
 from ema_pipeline.dof import Dof
@@ -222,16 +223,35 @@ def _build(file: ElementRigFile, configuration: str, values: Mapping[str, float]
     elements: list[Element] = []
     numbers: Counter[str] = Counter()
     dofs: dict[str, None] = {}
+    bodies = _bodies(file, configuration)
     for where, entry in file.entries():
         if not file.present(entry, configuration):
             continue
         section = str(where[0])
         numbers[section] += 1
         element = _element(section, numbers[section], entry, _row(entry, sensors, where), values, sensors)
+        if isinstance(element, Mass) and bodies[_body(entry)] > 1:
+            element = replace(element, part=f"{_body(entry)[0]} mass")
         elements.append(element)
         if isinstance(element, Mass):
             dofs |= dict.fromkeys(element.row)
     return Assembly(tuple(dofs), tuple(elements), sensors, values["modal_damping_ratio"])
+
+
+_Body = tuple[str, float | str | None]
+
+
+def _body(entry: ElementEntry) -> _Body:
+    """Body and value of a mass that moves along an axis; an empty name for any other."""
+    body, _, direction = (entry.at or "").rpartition(".")
+    return (body, entry.value) if direction in ALONG else ("", None)
+
+
+def _bodies(file: ElementRigFile, configuration: str) -> Counter[_Body]:
+    """Number of directions in which a body has the same mass: one piece of hardware, off alike in all of them."""
+    masses = (e for where, e in file.entries() if where[0] == "masses" and file.present(e, configuration))
+    counted = Counter(_body(entry) for entry in masses)
+    return Counter({body: count for body, count in counted.items() if body[0]})
 
 
 def _element(
