@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 ROWS = 30
 OFFSET = Unknowns.plain(["offset"], 0.5)
 SCATTERS = {
-    "noise": Scatter("noise", "factor on the stated noise", 1.0, 0.5, at_once=True),
-    "repeat": Scatter("repeat", "from test to test", 0.3, 1.5, 0.0, 10.0, at_once=True),
+    "noise": Scatter("noise", "factor on the stated noise", 1.0, 0.5),
+    "repeat": Scatter("repeat", "from test to test", 0.3, 1.5, 0.0, 10.0),
 }
 KNOWN = {
     "noise": Scatter("noise", "factor on the stated noise", 1.0, 0.0),

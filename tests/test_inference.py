@@ -22,6 +22,7 @@ from ema_pipeline.inference import (
     learn,
     widened,
 )
+from ema_pipeline.inference.scatter import LinearEvidence
 
 Array = NDArray[np.float64]
 NOISE = "noise"
@@ -256,7 +257,7 @@ def test_the_scatter_of_parts_is_learned_from_the_data(true: float) -> None:
 def test_learned_scatter_maximises_the_marginal_density_with_its_prior() -> None:
     scatter = Scatter(PARTS, "parts", 0.02, 0.7)
     problem = parts(1, 0.03, 40)
-    found = learn(problem, descend(problem, {PARTS: 0.02}, np.zeros(40)), {PARTS: scatter}, rounds=60)
+    found = learn(problem, descend(problem, {PARTS: 0.02}, np.zeros(40)), {PARTS: scatter})
 
     def objective(log: float) -> float:
         variance = 1.0 + (np.exp(log) / 0.01) ** 2
@@ -282,7 +283,7 @@ def test_no_scatter_is_learned_beyond_its_bound_so_that_a_failing_model_shows() 
     scatter = Scatter(PARTS, "parts", 0.02, 0.7, most=2.5)
     problem = parts(2, 0.5)
     found = learn(problem, descend(problem, {PARTS: 0.02}, np.zeros(200)), {PARTS: scatter}, rounds=12)
-    assert found.scatters[PARTS] == pytest.approx(0.05)
+    assert 0.049 < found.scatters[PARTS] <= 0.05
     assert found.error > 3
 
 
@@ -307,14 +308,14 @@ def test_a_learned_scatter_far_from_its_default_costs_evidence() -> None:
 
 def test_the_evidence_at_other_scatters_is_the_density_of_the_data_there() -> None:
     problem = parts(6, 0.03, 8)
-    found = descend(problem, {PARTS: 0.02}, np.zeros(8))
+    evidence = LinearEvidence(descend(problem, {PARTS: 0.02}, np.zeros(8)))
 
     def density(scatter: float) -> float:
         std = np.hypot(1.0, scatter / 0.01)
         return float(np.sum(scipy.stats.norm(0.0, std).logpdf(problem.y)))
 
     for value in (0.005, 0.05):
-        told = found.log_evidence_at(PARTS, value) - found.log_evidence_at(PARTS, 0.02)
+        told = evidence.at({PARTS: value}) - evidence.at({PARTS: 0.02})
         assert told == pytest.approx(density(value) - density(0.02), abs=1e-6)
 
 

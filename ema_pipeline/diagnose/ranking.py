@@ -38,11 +38,12 @@ Schedule = tuple[tuple[float, int], ...]
 FINALISTS = 5
 """Hypotheses for which the scatters are learned."""
 _UNBENT = 3.0
-"""Standard deviations of parts, as the scatter is learned, up to which the base model has not bent them to the data."""
+"""Standard deviations of parts, as the scatter is learned, up to which the base model has not bent them to the data: on
+top of a bent part everything promises much."""
 _BEATEN = 200.0
 """Log evidence behind the best hypothesis from which another one cannot catch up: it is not begun again."""
 _SCREENED = 14
-"""Generic hypotheses, best first by their score, that are fitted in full."""
+"""Hypotheses of one kind, generic or the rig's own, best first by their score, that are fitted in full."""
 _UNSEEN = 1e6
 """1 σ of a size, in units of its prior, from which the data hold nothing of it: it cannot be told from nothing."""
 _GRID = tuple(np.linspace(-2.0, 2.0, 9))
@@ -53,8 +54,6 @@ _GRID_HEAT = 30.0
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
-_CLOSE_CALL = 30.0
-"""Log evidence gained up to which scatters learned further could turn a claim."""
 _BETTER = 0.05
 """Log evidence by which a start must lead a fit to be followed."""
 _EXPLAINED = 1.3
@@ -122,31 +121,37 @@ def rank(
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
     promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models)}
     hypotheses = [h for h in hypotheses if h.label not in promise or promise[h.label].std < _UNSEEN]
-    chosen = _screened(hypotheses, promise)
     stuck = base.posterior.error > _EXPLAINED or base.posterior.residuals.penalty > 0
+    settled = base if stuck else learned(observations, base)
+    near = not stuck and not np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT))
+    chosen = _screened(hypotheses, promise, near)
     job = partial(_first_fit, observations, base, models, {} if stuck else promise)
     found: dict[str, tuple[Hypothesis, Fit]] = {}
     for i, (hypothesis, posterior) in enumerate(zip(chosen, spread(job, chosen, processes), strict=True)):
         found[hypothesis.label] = (hypothesis, Fit(models[hypothesis.label], posterior))
         progress(0.6 * (i + 1) / len(chosen), hypothesis.label)
-    base, found = _begun_again(observations, base, found, processes, len(found), steps=5)
+    if not near:
+        base, found = _begun_again(observations, base, found, processes, len(found), steps=5)
     found = _bettered(found, _CONTENDERS, partial(_free, observations), processes)
     base, found = _begun_again(observations, base, found, processes, _CONTENDERS, steps=12)
     progress(0.8, "scatter of parts and channels")
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     others = [h for h in hypotheses if h.label not in {best.label for best, _ in order[:FINALISTS]}]
-    promising = [] if stuck else _promising(observations, base, others, models, further)
+    promising = _promising(observations, settled, others, models, further) if near else []
     return _finals(observations, base, order, promising, processes)
 
 
-def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) -> list[Hypothesis]:
+def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], near: bool) -> list[Hypothesis]:
     """The rig's own hypotheses, and the generic ones that promise most.
 
-    An effect of several sizes (hysteresis) shows its kind at a finite size only, of which a score knows nothing.
+    Near the base model the score tells of the rig's own as well: those that promise little are left out, too. An effect
+    of several sizes (hysteresis) shows its kind at a finite size only, of which a score knows nothing.
     """
-    scored = [h for h in hypotheses if h.generic and len(h.placed.effect.parameters) == 1]
-    order = sorted((h.label for h in scored if h.label in promise), key=lambda label: -promise[label].gain)
-    out = {h.label for h in scored} - set(order[:_SCREENED])
+    out: set[str] = set()
+    scored = [h for h in hypotheses if len(h.placed.effect.parameters) == 1 and h.label in promise]
+    for generic in (True, False) if near else (True,):
+        order = sorted((h for h in scored if h.generic is generic), key=lambda h: -promise[h.label].gain)
+        out |= {h.label for h in order[_SCREENED:]}
     return [h for h in hypotheses if h.label not in out]
 
 
@@ -281,19 +286,13 @@ def _spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes
 
 def _promising(
     observations: Observations,
-    base: Fit,
+    settled: Fit,
     hypotheses: Sequence[Hypothesis],
     models: Mapping[str, Model],
     count: int,
 ) -> list[tuple[Hypothesis, Fit]]:
-    """What promises most on top of the base model with learned scatters, begun at the size of its score.
-
-    Nothing does where the base model has bent a part to the data: on top of it everything would.
-    """
+    """What promises most on top of the base model with learned scatters, begun at the size of its score."""
     if not count:
-        return []
-    settled = learned(observations, base)
-    if np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT)):
         return []
     found = []
     best = sorted(scores(observations, settled, hypotheses, models), key=lambda s: -s.gain)
@@ -321,12 +320,12 @@ def _finals(
     near = [pair for pair in best if pair[1].log_evidence >= best[0][1].log_evidence - _BEATEN]
     far = best[len(near) :]
     finalists = [*near, *promising]
-    job = partial(_final, observations, (base, *(fit for _, fit in near[:2])))
-    first = _spread_fits(job, [base, *(fit for _, fit in finalists)], processes)
-    beaten = _spread_fits(partial(_final, observations, ()), [fit for _, fit in far], processes)
+    fits = [base, *(fit for _, fit in (*finalists, *far))]
+    fits = _spread_fits(partial(_learned, observations), fits, processes)
+    first, beaten = fits[: 1 + len(finalists)], fits[1 + len(finalists) :]
     leaders = sorted(first[1:], key=lambda f: -f.log_evidence)
-    job = partial(_final, observations, (first[0], *leaders[:2]))
-    final_base, *again = _learned_on(observations, _spread_fits(job, first, processes), processes)
+    job = partial(_crossed, observations, (first[0], *leaders[:2]))
+    final_base, *again = _spread_fits(job, first, processes)
     finals = [
         Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True)
         for (hypothesis, _), fit in zip((*finalists, *far), (*again, *beaten), strict=True)
@@ -343,35 +342,16 @@ def _finals(
     return Ranking(final_base, (*finals, *others))
 
 
-def _learned_on(observations: Observations, fits: Sequence[Fit], processes: int | None) -> list[Fit]:
-    """The base model and the finalists; where it is close, both learn on, the base model from the finalists' scatters.
-
-    Scatters are learned in few rounds. What a finalist has learned further than the base model is no evidence for it.
-    """
-    base, *finalists = fits
-    order = sorted(range(1, len(fits)), key=lambda i: -fits[i].log_evidence)[:2]
-    if not finalists or not 0 < fits[order[0]].log_evidence - base.log_evidence < _CLOSE_CALL:
-        return list(fits)
-    asked = [(0, i) for i in order] + [(i, i) for i in order]
-    job = partial(_learned_from, observations)
-    items = [(fits[i], fits[source].posterior.scatters) for i, source in asked]
-    best = list(fits)
-    for (i, _), posterior in zip(asked, spread(job, items, processes, len(items)), strict=True):
-        best[i] = max(best[i], Fit(fits[i].model, posterior), key=lambda f: f.log_evidence)
-    return best
+def _learned(observations: Observations, fit: Fit) -> Posterior:
+    return learned(observations, fit).posterior
 
 
-def _learned_from(observations: Observations, item: tuple[Fit, Mapping[str, float]]) -> Posterior:
-    fit, scatters = item
-    return learned(
-        observations, refined(observations, fit.model, fit.posterior.x, scatters, steps=10)
-    ).posterior
-
-
-def _final(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:
-    """Scatters learned, begun at the fit and at what other fits know, where that is better than the fit itself."""
-    best = learned(observations, fit)
+def _crossed(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:
+    """The fit begun again at what others know, scatters included, and learned from there where that is better."""
+    best = fit
     for source in sources:
+        if source is fit:
+            continue
         scatters = source.posterior.scatters
         start = refined(
             observations, fit.model, _on(observations, fit.model, source, fit), scatters, steps=10

@@ -74,16 +74,6 @@ class Posterior:
         _, log_det = np.linalg.slogdet(self._information())
         return -self.cost - 0.5 * float(log_det) - self.scatter_cost
 
-    def log_evidence_at(self, scatter: str, value: float) -> float:
-        """Log evidence at another value of one scatter of unknowns, the residuals being linear about `x`."""
-        std = self.unknowns.prior_std({**self.scatters, scatter: value})
-        values, jacobian = self.residuals.weighted
-        hessian, slope = jacobian.T @ jacobian, jacobian.T @ values
-        information = np.eye(len(self.x)) + std[:, None] * hessian * std
-        move = -std * np.linalg.solve(information, std * slope + self.x / std)
-        squares = 2 * slope @ move + move @ hessian @ move + np.sum(((self.x + move) / std) ** 2)
-        return float(-0.5 * (squares + np.linalg.slogdet(information)[1]))
-
     @property
     def error(self) -> float:
         """Root mean square of the marginally whitened residual: about 1 where the model explains the data.

@@ -61,7 +61,7 @@ class Residuals:
     @cached_property
     def blocks(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Sum of squares and number of values of every block, (n_blocks,)."""
-        return in_blocks(self.values, self.block)
+        return in_blocks(self.values**2, self.block)
 
     @cached_property
     def weight(self) -> NDArray[np.float64]:
@@ -100,16 +100,14 @@ class Residuals:
 
 
 def in_blocks(
-    values: NDArray[np.float64], block: NDArray[np.int64] | None
+    squares: NDArray[np.float64], block: NDArray[np.int64] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sum of squares and number of values of every block, (n_blocks,)."""
-    count = 0 if block is None else int(np.max(block, initial=-1)) + 1
-    squares, n = np.zeros(count), np.zeros(count)
-    if block is not None:
-        inside = block >= 0
-        np.add.at(squares, block[inside], values[inside] ** 2)
-        np.add.at(n, block[inside], 1.0)
-    return squares, n
+    if block is None:
+        return np.zeros(0), np.zeros(0)
+    inside = block >= 0
+    counts = np.bincount(block[inside])
+    return np.bincount(block[inside], squares[inside]).astype(float), counts.astype(float)
 
 
 class Problem(Protocol):

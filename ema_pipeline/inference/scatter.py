@@ -6,13 +6,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.linalg
+import scipy.optimize
 from numpy.typing import NDArray
 
+from ema_pipeline.inference import tails
 from ema_pipeline.inference.maximise import descend
 from ema_pipeline.inference.posterior import Posterior
-from ema_pipeline.inference.problem import Problem
-
-_NEWTON_STEPS = 20
+from ema_pipeline.inference.problem import Problem, in_blocks
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,6 @@ class Scatter:
     spread: float = 0.5
     wide: float = 0.0
     most: float = 2.5
-    at_once: bool = False
 
     @property
     def start(self) -> float:
@@ -51,10 +51,59 @@ class Scatter:
 Descend = Callable[[Problem, Mapping[str, float], NDArray[np.float64]], Posterior]
 
 
+class LinearEvidence:
+    """Log evidence as a function of the scatters of unknowns, the residuals being linear about a maximum.
+
+    Parameters
+    ----------
+    found : Posterior
+    """
+
+    def __init__(self, found: Posterior) -> None:
+        values, jacobian = found.residuals.weighted
+        self.unknowns, self.scatters = found.unknowns, found.scatters
+        self.curvature = jacobian.T @ jacobian
+        self.pull = self.curvature @ found.x - jacobian.T @ values
+
+    def at(self, scatters: Mapping[str, float]) -> float:
+        """Log evidence with some scatters at other values; less a constant."""
+        std = self.unknowns.prior_std({**self.scatters, **scatters})
+        factor = np.linalg.cholesky(np.eye(len(std)) + std[:, None] * self.curvature * std)
+        explained = scipy.linalg.solve_triangular(factor, std * self.pull, lower=True, check_finite=False)
+        return 0.5 * float(explained @ explained) - float(np.sum(np.log(np.diag(factor))))
+
+
+class ExpectedDensity:
+    """Log density of the residuals as a function of their scatters, averaged over unknowns as uncertain as they are.
+
+    Parameters
+    ----------
+    found : Posterior
+    """
+
+    def __init__(self, found: Posterior) -> None:
+        r = found.residuals
+        self.scatters, self.share, self.block = found.scatters, r.share, r.block
+        self.squares = r.values**2 + np.einsum("ij,ij->i", r.jacobian @ found.covariance, r.jacobian)
+
+    def at(self, scatters: Mapping[str, float]) -> float:
+        """Log density with some scatters at other values; less a constant."""
+        variance = np.ones(len(self.squares))
+        for name, share in self.share.items():
+            variance += share * ((scatters.get(name, self.scatters[name]) / self.scatters[name]) ** 2 - 1)
+        squares = self.squares / variance
+        alone = squares if self.block is None else squares[self.block < 0]
+        together = tails.cost(*in_blocks(squares, self.block))
+        return -0.5 * float(np.sum(np.log(variance))) - 0.5 * float(np.sum(alone)) - float(np.sum(together))
+
+
 def learn(
-    problem: Problem, found: Posterior, scatters: Mapping[str, Scatter], *, rounds: int = 4, steps: int = 8
+    problem: Problem, found: Posterior, scatters: Mapping[str, Scatter], *, rounds: int = 10, steps: int = 8
 ) -> Posterior:
-    """Learn the scatters by expectation-maximisation, each with its log-normal prior, and the fit with them.
+    """Learn the scatters, each with its log-normal prior, and the fit with them.
+
+    In every round each scatter is led to the largest density beside the others, that of the data for scatters of
+    unknowns, that of the residuals for theirs, and the fit follows.
 
     Parameters
     ----------
@@ -63,17 +112,65 @@ def learn(
         Where to begin.
     scatters : dict of str to Scatter
     rounds, steps : int
-        Rounds of learning, and most steps of the fit after each.
+        Most rounds of learning, and most steps of the fit after each.
     """
+    found = replace(found, scatter_cost=_cost(found, scatters))
     for _ in range(rounds):
-        learned = {name: _relaxed(found, scatters[name]) for name in found.scatters}
-        found = descend(problem, learned, found.x, steps=steps)
-    cost = sum(
-        0.5 * (np.log(found.scatters[n] / s.default) / s.spread) ** 2
-        for n, s in scatters.items()
-        if s.spread and n in found.scatters
-    )
-    return replace(found, scatter_cost=float(cost))
+        further = descend(problem, _learned(found, scatters), found.x, steps=steps)
+        further = replace(further, scatter_cost=_cost(further, scatters))
+        gained = further.log_evidence - found.log_evidence
+        if gained > 0:
+            found = further
+        if gained < _SETTLED:
+            break
+    return found
+
+
+def _cost(found: Posterior, scatters: Mapping[str, Scatter]) -> float:
+    known = [(now, scatters[name]) for name, now in found.scatters.items() if scatters[name].spread]
+    return float(sum(0.5 * (np.log(now / s.default) / s.spread) ** 2 for now, s in known))
+
+
+_SETTLED = 0.1
+"""Log evidence gained in one round below which nothing more is learned."""
+_FURTHER = 1.5
+"""Factor on the step of a scatter of residuals, which is too short while unknowns can follow it."""
+_FURTHEST = 1.5
+"""Largest change of the logarithm of a scatter in one round: the fit is linear about its maximum for about as far."""
+_NEAR = 0.01
+"""Relative accuracy of a scatter."""
+
+
+def _learned(found: Posterior, scatters: Mapping[str, Scatter]) -> dict[str, float]:
+    """All scatters after one round, each where the density is largest beside those before it."""
+    of_unknowns, of_residuals = LinearEvidence(found), ExpectedDensity(found)
+    learned = dict(found.scatters)
+    for name in found.scatters:
+        scatter = scatters[name]
+        if not scatter.spread:
+            continue
+        if name in found.unknowns.scatter:
+            learned[name] = _best(of_unknowns, learned, scatter)
+        elif name in found.residuals.share:
+            best = _best(of_residuals, learned, scatter)
+            learned[name] = min(
+                best * (best / learned[name]) ** (_FURTHER - 1), scatter.most * scatter.default
+            )
+        else:
+            learned[name] = scatter.default
+    return learned
+
+
+def _best(density: LinearEvidence | ExpectedDensity, known: Mapping[str, float], scatter: Scatter) -> float:
+    here, most = float(np.log(known[scatter.name] / scatter.default)), float(np.log(scatter.most))
+
+    def cost(log: float) -> float:
+        told = density.at({**known, scatter.name: scatter.default * np.exp(log)})
+        return 0.5 * (log / scatter.spread) ** 2 - told
+
+    bounds = min(here, most) - _FURTHEST, min(here + _FURTHEST, most)
+    found = scipy.optimize.minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": _NEAR})
+    return scatter.default * float(np.exp(found.x))
 
 
 def widened(found: Posterior, scatters: Mapping[str, Scatter]) -> dict[str, float]:
@@ -87,13 +184,13 @@ def widened(found: Posterior, scatters: Mapping[str, Scatter]) -> dict[str, floa
     ----------
     H. Rue, S. Martino, N. Chopin, J. R. Stat. Soc. B 71 (2009) 319-392: hyper-parameters are averaged on a grid.
     """
-    result = {}
+    result, evidence = {}, LinearEvidence(found)
     for name, now in found.scatters.items():
         scatter = scatters[name]
         if not scatter.spread:
             result[name] = now
-        elif np.any(found.unknowns.governed(name)):
-            result[name] = _root_mean_square(found, scatter)
+        elif name in found.unknowns.scatter:
+            result[name] = _root_mean_square(evidence, scatter)
         else:
             result[name] = now * float(np.exp(1 / (2 * determined(found, name) + scatter.spread**-2.0)))
     return result
@@ -103,10 +200,10 @@ _GRID = np.linspace(-3.0, 3.0, 25)
 """Logarithm of a scatter about its default, in units of its prior 1 σ."""
 
 
-def _root_mean_square(found: Posterior, scatter: Scatter) -> float:
+def _root_mean_square(evidence: LinearEvidence, scatter: Scatter) -> float:
     logs = np.minimum(_GRID * scatter.spread, np.log(scatter.most))
     values = scatter.default * np.exp(logs)
-    density = np.array([found.log_evidence_at(scatter.name, v) for v in values]) - 0.5 * _GRID**2
+    density = np.array([evidence.at({scatter.name: v}) for v in values]) - 0.5 * _GRID**2
     weight = np.exp(density - np.max(density))
     return float(np.sqrt(np.sum(weight * values**2) / np.sum(weight)))
 
@@ -117,81 +214,3 @@ def determined(found: Posterior, name: str) -> float:
     told = float(np.sum(1 - np.minimum(found.std[governed] / found.prior_std[governed], 1.0) ** 2))
     share = found.residuals.share.get(name)
     return told + (0.0 if share is None else float(np.sum(share)))
-
-
-_RELAXATION = 1.5
-"""Steps of expectation-maximisation are short where few parts are seen: longer ones converge to the same values."""
-
-
-def _relaxed(found: Posterior, scatter: Scatter) -> float:
-    now = found.scatters[scatter.name]
-    if not scatter.spread:
-        return now
-    if scatter.at_once:
-        return _of_residuals_at_once(found, scatter)
-    step = _RELAXATION * np.log(_learned(found, scatter) / now)
-    return float(min(now * np.exp(step), scatter.most * scatter.default))
-
-
-def _learned(found: Posterior, scatter: Scatter) -> float:
-    """One step of expectation-maximisation for one scatter."""
-    now = found.scatters[scatter.name]
-    squares, count = _of_unknowns(found, scatter.name, now)
-    more, number = _of_residuals(found, scatter.name, now)
-    return _mode_of_log(squares + more, count + number, now, scatter)
-
-
-def _of_unknowns(found: Posterior, name: str, now: float) -> tuple[float, int]:
-    """Expected sum of squares of the unknowns that the scatter governs, in units of their own factor."""
-    governed = found.unknowns.governed(name)
-    if not np.any(governed):
-        return 0.0, 0
-    x, variance = found.x[governed], np.diag(found.covariance)[governed]
-    return float(np.sum((x**2 + variance) / found.unknowns.std[governed] ** 2)), int(np.sum(governed))
-
-
-def _of_residuals(found: Posterior, name: str, now: float) -> tuple[float, int]:
-    """Expected sum of squares of the discrepancies that the scatter adds to residuals.
-
-    A residual e = discrepancy + noise has the discrepancy's mean `share`·e and variance σ²·share·(1 - share).
-    """
-    share = found.residuals.share.get(name)
-    if share is None or not np.any(share > 0):
-        return 0.0, 0
-    rows = share > 0
-    part = share[rows]
-    return float(now**2 * np.sum(part * found.expected_squares(rows) + 1.0 - part)), int(np.sum(rows))
-
-
-def _mode_of_log(squares: float, count: int, now: float, scatter: Scatter) -> float:
-    """Scatter that maximises its expected log density, by Newton's method in its logarithm."""
-    if count == 0:
-        return scatter.default
-    log, weight = np.log(now), scatter.spread**-2.0
-    for _ in range(_NEWTON_STEPS):
-        excess = squares / np.exp(2 * log)
-        slope = -count + excess - (log - np.log(scatter.default)) * weight
-        log -= float(np.clip(slope / (-2 * excess - weight), -0.5, 0.5))
-    return float(np.exp(min(log, np.log(scatter.most * scatter.default))))
-
-
-def _of_residuals_at_once(found: Posterior, scatter: Scatter) -> float:
-    """Scatter that maximises the expected log density of the residuals, the unknowns being what is averaged over.
-
-    With t = (scatter/now)², a residual's variance is 1 - share + share·t times what it is now.
-    """
-    now = found.scatters[scatter.name]
-    share = found.residuals.share.get(scatter.name)
-    if share is None:
-        return now
-    rows = share > 0  # the others do not depend on it
-    share, square = share[rows], found.expected_squares(rows)
-    log, weight = 0.0, scatter.spread**-2.0
-    for _ in range(_NEWTON_STEPS):
-        t = np.exp(2 * log)
-        variance = 1 - share + share * t
-        moved, excess = share * t / variance, square / variance
-        slope = float(np.sum(moved * (excess - 1))) - (log + np.log(now / scatter.default)) * weight
-        # Where the density is not concave in the logarithm, its expected curvature serves.
-        log += float(np.clip(slope / (weight + 2 * np.sum(moved**2 * np.maximum(excess, 1.0))), -1.0, 1.0))
-    return float(min(now * np.exp(log), scatter.most * scatter.default))

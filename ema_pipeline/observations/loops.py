@@ -110,10 +110,8 @@ class LoopObservations:
     def scatters(self) -> Mapping[str, Scatter]:
         """See `Observations`."""
         known = (
-            Scatter(FORCE_SCATTER, "force that no model explains", DISCREPANCY, 1.5, most=MOST, at_once=True),
-            Scatter(
-                NOISE_SCATTER, "noise that the cycles do not show", UNSEEN_NOISE, 1.5, most=MOST, at_once=True
-            ),
+            Scatter(FORCE_SCATTER, "force that no model explains", DISCREPANCY, 1.5, most=MOST),
+            Scatter(NOISE_SCATTER, "noise that the cycles do not show", UNSEEN_NOISE, 1.5, most=MOST),
         )
         return {s.name: s for s in known}
 

@@ -55,9 +55,7 @@ class RepeatSettings(Settings):
     def scatters(self) -> dict[str, Scatter]:
         """As scatters, by the scatter of the model that each takes the place of in a difference."""
         return {
-            kind: Scatter(
-                f"{name}_repeat", f"{title} from test to test", stated, _SPREAD, 0.0, _MOST, at_once=True
-            )
+            kind: Scatter(f"{name}_repeat", f"{title} from test to test", stated, _SPREAD, 0.0, _MOST)
             for kind, name, title, stated in (
                 (FREQUENCY, "frequency", "frequency", self.frequency),
                 (DAMPING_SCATTER, "damping", "ln ζ", self.damping),

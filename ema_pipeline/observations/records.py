@@ -131,7 +131,7 @@ class RecordObservations:
             for b in range(BANDS):
                 title = f"what no model explains at {dof.point}, {b * width:.4g} to {(b + 1) * width:.4g} Hz"
                 name = self.noise_name(o, b)
-                found[name] = Scatter(name, title, 1.0, 1.5, _WIDE, _MOST_NOISE, at_once=True)
+                found[name] = Scatter(name, title, 1.0, 1.5, _WIDE, _MOST_NOISE)
         return found
 
     def noise_name(self, output: int, band: int) -> str:
