@@ -33,6 +33,9 @@ class Scatter:
     most : float
         Largest value, in units of the default. A model that needs more does not explain the data: without this bound
         its failure would be hidden as scatter.
+    least : float
+        Smallest value, in units of the default. Most shapes of a test may agree better than any model is, by which the
+        few that do not are outliers all the more.
     """
 
     name: str
@@ -41,6 +44,7 @@ class Scatter:
     spread: float = 0.5
     wide: float = 0.0
     most: float = 2.5
+    least: float = 0.0
 
     @property
     def start(self) -> float:
@@ -163,12 +167,13 @@ def _learned(found: Posterior, scatters: Mapping[str, Scatter]) -> dict[str, flo
 
 def _best(density: LinearEvidence | ExpectedDensity, known: Mapping[str, float], scatter: Scatter) -> float:
     here, most = float(np.log(known[scatter.name] / scatter.default)), float(np.log(scatter.most))
+    least = float(np.log(scatter.least)) if scatter.least else -np.inf
 
     def cost(log: float) -> float:
         told = density.at({**known, scatter.name: scatter.default * np.exp(log)})
         return 0.5 * (log / scatter.spread) ** 2 - told
 
-    bounds = min(here, most) - _FURTHEST, min(here + _FURTHEST, most)
+    bounds = max(min(here, most) - _FURTHEST, least), max(min(here + _FURTHEST, most), least + _NEAR)
     found = scipy.optimize.minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": _NEAR})
     return scatter.default * float(np.exp(found.x))
 
