@@ -12,7 +12,7 @@ from ema_pipeline.diagnose.naming import Named, named, sizes_of
 from ema_pipeline.diagnose.ranking import Ranked, Ranking
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.inference import widened
+from ema_pipeline.inference import tails, widened
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, within_scatter
 
@@ -85,7 +85,7 @@ def judge(
     doubt = _weak(ranked, gain, settings, nothing)
     if not doubt:
         before, after = held_out(observations, base), held_out(observations, mended)
-        doubt = _contradicted(base, mended, before, after)
+        doubt = _contradicted(base, mended, before, after) or _of_one_shape(base, mended, gain, settings)
         name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, _widened(observations, ranked.fit)))
     return Judged(ranked, name, gain, base, mended, before, after, doubt)
 
@@ -122,4 +122,15 @@ def _contradicted(base: Fit, mended: Fit, before: HeldOut, after: HeldOut) -> st
         return "the error does not fall with it"
     if after.log_density < before.log_density - HELD_OUT_TIE:
         return "data held out are predicted worse with it"
+    return ""
+
+
+def _of_one_shape(base: Fit, mended: Fit, gain: float, settings: DiagnoseSettings) -> str:
+    """A mode of a close pair may be identified with a wrong shape, which some effect or other explains."""
+    costs = [tails.cost(*fit.posterior.residuals.blocks) for fit in (base, mended)]
+    if len(costs[0]) != len(costs[1]):  # other modes have partners
+        return ""
+    left = gain - float(np.max(costs[0] - costs[1], initial=0.0))
+    if left < settings.claim:
+        return f"without the shape of one mode the log evidence that it gains is {left:.1f}, below {settings.claim:g}"
     return ""
