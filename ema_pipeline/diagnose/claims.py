@@ -85,7 +85,7 @@ def judge(
     doubt = _weak(ranked, gain, settings, nothing)
     if not doubt:
         before, after = held_out(observations, base), held_out(observations, mended)
-        doubt = _contradicted(base, mended, before, after) or _of_one_shape(base, mended, gain, settings)
+        doubt = _contradicted(base, mended, before, after) or _of_one_shape(base, mended, settings)
         name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, _widened(observations, ranked.fit)))
     return Judged(ranked, name, gain, base, mended, before, after, doubt)
 
@@ -125,12 +125,15 @@ def _contradicted(base: Fit, mended: Fit, before: HeldOut, after: HeldOut) -> st
     return ""
 
 
-def _of_one_shape(base: Fit, mended: Fit, gain: float, settings: DiagnoseSettings) -> str:
+def _of_one_shape(base: Fit, mended: Fit, settings: DiagnoseSettings) -> str:
     """A mode of a close pair may be identified with a wrong shape, which some effect or other explains."""
     costs = [tails.cost(*fit.posterior.residuals.blocks) for fit in (base, mended)]
     if len(costs[0]) != len(costs[1]):  # other modes have partners
         return ""
-    left = gain - float(np.max(costs[0] - costs[1], initial=0.0))
+    evidence = [
+        fit.log_evidence + fit.posterior.scatter_cost for fit in (base, mended)
+    ]  # at the same scatters
+    left = evidence[1] - evidence[0] - float(np.max(costs[0] - costs[1], initial=0.0))
     if left < settings.claim:
         return f"without the shape of one mode the log evidence that it gains is {left:.1f}, below {settings.claim:g}"
     return ""
