@@ -14,7 +14,7 @@ from imperfect_modes import GOOD, NORMAL, Hidden, Lab, chain, chain_modes, plane
 
 from ema_pipeline import codec
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
-from ema_pipeline.diagnose.claims import judge
+from ema_pipeline.diagnose.claims import judge, of_one_shape
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.heldout import held_out
 from ema_pipeline.diagnose.hypotheses import list_hypotheses
@@ -25,6 +25,7 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import parse_effect, shipped_effects
+from ema_pipeline.inference import Posterior, Residuals, Unknowns
 from ema_pipeline.mechanics.assembly import Damper, Element, Mass, Spring
 from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned
 from ema_pipeline.observations.mode_data import prepare
@@ -102,6 +103,20 @@ def test_what_is_hidden_in_a_chain_is_named_with_its_size(
     assert size.std < limit < 2 * truth
     assert first.gain > SETTINGS.claim
     assert first.heldout_error_after < first.heldout_before
+
+
+@pytest.mark.parametrize(("wrong", "doubted"), [((1,), True), ((1, 2), False)])
+def test_no_effect_is_claimed_for_the_shape_of_one_mode_alone(wrong: tuple[int, ...], doubted: bool) -> None:
+    block = np.repeat(np.arange(4), 6)
+
+    def fit(off: tuple[int, ...]) -> Fit:
+        values = np.where(np.isin(block, off), 20.0, 0.5)
+        unknowns = Unknowns.plain(("a",), 1.0)
+        residuals = Residuals(values, np.zeros((24, 1)), block=block)
+        return Fit(Model(), Posterior(unknowns, np.zeros(1), {}, residuals))
+
+    doubt = of_one_shape(fit(wrong), fit(()), SETTINGS)
+    assert bool(doubt) is doubted
 
 
 def test_two_hidden_effects_are_found_one_after_the_other() -> None:

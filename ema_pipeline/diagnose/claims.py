@@ -85,7 +85,7 @@ def judge(
     doubt = _weak(ranked, gain, settings, nothing)
     if not doubt:
         before, after = held_out(observations, base), held_out(observations, mended)
-        doubt = _contradicted(base, mended, before, after) or _of_one_shape(base, mended, settings)
+        doubt = _contradicted(base, mended, before, after) or of_one_shape(base, mended, settings)
         name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, _widened(observations, ranked.fit)))
     return Judged(ranked, name, gain, base, mended, before, after, doubt)
 
@@ -125,7 +125,7 @@ def _contradicted(base: Fit, mended: Fit, before: HeldOut, after: HeldOut) -> st
     return ""
 
 
-def _of_one_shape(base: Fit, mended: Fit, settings: DiagnoseSettings) -> str:
+def of_one_shape(base: Fit, mended: Fit, settings: DiagnoseSettings) -> str:
     """A mode of a close pair may be identified with a wrong shape, which some effect or other explains."""
     costs = [tails.cost(*fit.posterior.residuals.blocks) for fit in (base, mended)]
     if len(costs[0]) != len(costs[1]):  # other modes have partners

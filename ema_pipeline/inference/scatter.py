@@ -119,7 +119,7 @@ def learn(
         Most rounds of learning, and most steps of the fit after each.
     """
     found = replace(found, scatter_cost=_cost(found, scatters))
-    for _ in range(rounds):
+    for _ in range(rounds if np.isfinite(found.cost) else 0):  # nothing is learned of a model without an answer
         further = descend(problem, _learned(found, scatters), found.x, steps=steps)
         further = replace(further, scatter_cost=_cost(further, scatters))
         gained = further.log_evidence - found.log_evidence
