@@ -170,23 +170,29 @@ def whitened(
     values, block = np.empty(total), np.full(total, -1)
     share: dict[str, NDArray[np.float64]] = {}
     jacobian = np.zeros((total if derivatives else 0, n))
-    log_scale, at = 0.0, 0
+    log_scale, at, blocks = 0.0, 0, 0
     for r in found.rows:
+        if not len(r):
+            continue
         here = slice(at, at + len(r))
         at = here.stop
         added, own = (scatters[r.scatter] * r.unit) ** 2, (r.noise_at(scatters) * r.own) ** 2
         variance = own + added
         usual = (r.noise_at(defaults) * r.own) ** 2 + (defaults[r.scatter] * r.unit) ** 2
-        log_scale += 0.5 * float(np.sum(np.log(variance / usual)))
+        log_scale += 0.5 * float(np.log(variance / usual).sum())
         sigma = np.sqrt(variance) * r.heat
         values[here] = r.difference / sigma
         if r.sensor is not None:  # a shape may be wrong as a whole
-            block[here] = np.unique(r.mode, return_inverse=True)[1] + int(np.max(block, initial=-1)) + 1
+            _, number = np.unique(r.mode, return_inverse=True)
+            block[here] = number + blocks
+            blocks += int(number.max()) + 1
         if derivatives and r.slope is not None:
             for name, part in ((r.scatter, added), (r.noise, own)):
                 if name:
-                    share.setdefault(name, np.zeros(total))[here] = part / variance
-            jacobian[here] = r.slope / -sigma[:, None]
+                    if name not in share:
+                        share[name] = np.zeros(total)
+                    share[name][here] = part / variance
+            np.divide(r.slope, -sigma[:, None], out=jacobian[here])
     return Residuals(
         values=values,
         jacobian=jacobian,
