@@ -119,15 +119,38 @@ def learn(
         Most rounds of learning, and most steps of the fit after each.
     """
     found = replace(found, scatter_cost=_cost(found, scatters))
-    for _ in range(rounds if np.isfinite(found.cost) else 0):  # nothing is learned of a model without an answer
-        further = descend(problem, _learned(found, scatters), found.x, steps=steps)
-        further = replace(further, scatter_cost=_cost(further, scatters))
+    for _ in range(
+        rounds if np.isfinite(found.cost) else 0
+    ):  # nothing is learned of a model without an answer
+        further = _further(problem, found, _learned(found, scatters), scatters, steps)
+        if further is None:
+            break
         gained = further.log_evidence - found.log_evidence
-        if gained > 0:
-            found = further
+        found = further
         if gained < _SETTLED:
             break
     return found
+
+
+def _further(
+    problem: Problem,
+    found: Posterior,
+    learned: Mapping[str, float],
+    scatters: Mapping[str, Scatter],
+    steps: int,
+) -> Posterior | None:
+    """The fit at learned scatters, or nearer to those before where that is worse; None where nothing is better."""
+    for share in _SHARES:
+        tried = {name: now * (learned[name] / now) ** share for name, now in found.scatters.items()}
+        further = descend(problem, tried, found.x, steps=steps)
+        further = replace(further, scatter_cost=_cost(further, scatters))
+        if further.log_evidence > found.log_evidence:
+            return further
+    return None
+
+
+_SHARES = (1.0, 0.4, 0.1)
+"""Shares of the way to what was learned that are tried: scatters that depend on each other may all go too far."""
 
 
 def _cost(found: Posterior, scatters: Mapping[str, Scatter]) -> float:
@@ -138,9 +161,11 @@ def _cost(found: Posterior, scatters: Mapping[str, Scatter]) -> float:
 _SETTLED = 0.1
 """Log evidence gained in one round below which nothing more is learned."""
 _FURTHER = 1.5
-"""Factor on the step of a scatter of residuals, which is too short while unknowns can follow it."""
-_FURTHEST = 1.5
-"""Largest change of the logarithm of a scatter in one round: the fit is linear about its maximum for about as far."""
+"""Factor on the step of a scatter of residuals that shrinks, which is too short while unknowns can follow it."""
+_SHRINK, _GROW = 1.5, 0.4
+"""Largest changes of the logarithm of a scatter in one round. The fit is linear about its maximum for about as far as
+the first; a scatter that grows faster than the fit can follow hides what the fit would find.
+"""
 _NEAR = 0.01
 """Relative accuracy of a scatter."""
 
@@ -173,7 +198,7 @@ def _best(density: LinearEvidence | ExpectedDensity, known: Mapping[str, float],
         told = density.at({**known, scatter.name: scatter.default * np.exp(log)})
         return 0.5 * (log / scatter.spread) ** 2 - told
 
-    bounds = max(min(here, most) - _FURTHEST, least), max(min(here + _FURTHEST, most), least + _NEAR)
+    bounds = max(min(here, most) - _SHRINK, least), max(min(here + _GROW, most), least + _NEAR)
     found = scipy.optimize.minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": _NEAR})
     return scatter.default * float(np.exp(found.x))
 

@@ -26,6 +26,7 @@ from ema_pipeline.observations.mode_residuals import (
     DAMPING_SCATTER,
     FREQUENCY,
     FREQUENCY_NOISE,
+    SHAPE,
     stacked,
 )
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem, Paired
@@ -42,6 +43,10 @@ FAR_AMPLITUDE_STD, _FAR = 0.35, 0.3
 """That of the amplitude at which a law stands whose poles move by many decay rates, and the distance at which half of
 its growth is reached. Teeth simulated with 1.74 µm of preload, whose modes move by 0.7, read as 2.28 µm."""
 
+_LEAST_SHAPE = 0.25
+"""Least discrepancy of shapes, in units of the default: those of a structure that is not linear agree with none better,
+and a smaller one bends calibrations to them.
+"""
 _BEYOND = 3.0
 """Growth of what linearisation leaves out per decay rate by which a pole moves: it is of first order in that."""
 _REMEMBERED = 16
@@ -79,7 +84,8 @@ class AmplitudeObservations:
 
     def __init__(self, modes: ModeObservations, hits: Sequence[HitData]) -> None:
         self.modes, self.hits = modes, tuple(hits)
-        self.scatters = {**modes.scatters, **hit_scatters()}
+        shape = dataclasses.replace(modes.scatters[SHAPE], least=_LEAST_SHAPE)
+        self.scatters = {**modes.scatters, SHAPE: shape, **hit_scatters()}
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> AmplitudeProblem:
         """See `Observations`."""
