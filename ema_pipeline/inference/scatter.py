@@ -162,10 +162,8 @@ _SETTLED = 0.1
 """Log evidence gained in one round below which nothing more is learned."""
 _FURTHER = 1.5
 """Factor on the step of a scatter of residuals that shrinks, which is too short while unknowns can follow it."""
-_SHRINK, _GROW = 1.5, 0.4
-"""Largest changes of the logarithm of a scatter in one round. The fit is linear about its maximum for about as far as
-the first; a scatter that grows faster than the fit can follow hides what the fit would find.
-"""
+_FURTHEST = 1.5
+"""Largest change of the logarithm of a scatter in one round: the fit is linear about its maximum for about as far."""
 _NEAR = 0.01
 """Relative accuracy of a scatter."""
 
@@ -198,7 +196,7 @@ def _best(density: LinearEvidence | ExpectedDensity, known: Mapping[str, float],
         told = density.at({**known, scatter.name: scatter.default * np.exp(log)})
         return 0.5 * (log / scatter.spread) ** 2 - told
 
-    bounds = max(min(here, most) - _SHRINK, least), max(min(here + _GROW, most), least + _NEAR)
+    bounds = max(min(here, most) - _FURTHEST, least), max(min(here + _FURTHEST, most), least + _NEAR)
     found = scipy.optimize.minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": _NEAR})
     return scatter.default * float(np.exp(found.x))
 
