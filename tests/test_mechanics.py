@@ -141,6 +141,18 @@ def test_loss_factor_of_a_single_spring_gives_half_of_it_as_damping_ratio() -> N
     np.testing.assert_allclose(receptance(system, f, np.eye(1), np.eye(1))[0, 0], expected, rtol=1e-12)
 
 
+def test_gyroscopic_coupling_turns_the_velocity_of_a_free_mass_from_x_to_y() -> None:
+    """m·ẍ = -c·ẏ, m·ÿ = c·ẋ: a circle at c/m, run through from +x to +y."""
+    rows = {"a.x": 1.0}, {"a.y": 1.0}
+    system = Assembly(
+        ("a.x", "a.y"),
+        (*(Mass(f"m{i}", row, 2.0) for i, row in enumerate(rows)), Gyroscopic("g", *rows, 6.0)),
+    ).system()
+    time = 0.4
+    turn = scipy.linalg.expm(-np.linalg.solve(system.mass, system.damping) * time)
+    np.testing.assert_allclose(turn @ [1.0, 0.0], [np.cos(3.0 * time), np.sin(3.0 * time)], atol=1e-12)
+
+
 def test_gyroscopic_coupling_parts_a_pair_into_forward_and_backward_whirl() -> None:
     m, k, g = 1.5, 6e4, 30.0
     x, y = {"r.x": 1.0}, {"r.y": 1.0}
