@@ -129,10 +129,10 @@ def test_records_that_do_not_decay_start_at_the_blow_and_decayed_ones_stay_whole
 
 
 def test_trimmed_hits_start_alike_and_keep_every_pulse_whole() -> None:
-    """The soft tip's pulse of 8 ms begins long before its peak, the hard tip's of 1 ms shortly before."""
+    """The soft tip's pulse of 16 ms begins long before its peak, the hard tip's of 1 ms shortly before."""
     pulses = [
         force_of(Blow(RATE, "half-sine", width, length_s=1.0), np.random.default_rng(1))
-        for width in (1e-3, 8e-3)
+        for width in (1e-3, 16e-3)
     ]
     slow = np.array([-0.5 + 1j * 2 * np.pi * 120])
     records = [
