@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+# pytest-xdist gives every core a process; linear algebra with a thread per core in each would make them wait for
+# each other. Set before NumPy is loaded; programs that the tests start inherit it.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 
 @pytest.fixture(scope="session")
 def test_data() -> Path:

@@ -55,14 +55,16 @@ def respond(
     return known[:: 2 * fine][skipped : skipped + samples], found
 
 
-def write_oscillator(folder: Path, law: Law, noise: float = 0.005, seed: int = 1) -> Path:
-    """A raw folder with a record to fit and one held out."""
+def write_oscillator(
+    folder: Path, law: Law, noise: float = 0.005, seed: int = 1, samples: tuple[int, int] = (2048, 1024)
+) -> Path:
+    """A raw folder with a record to fit and one held out, of so many samples."""
     folder.mkdir(parents=True, exist_ok=True)
     random = np.random.default_rng(seed)
     with h5py.File(folder / "records.h5", "w") as file:
         forces, responses = [], []
-        for k, samples in enumerate((2048, 1024)):
-            force, x = respond(Multisine(8192, 5.0, 60.0, 30.0, seed + k), law, samples, 512)
+        for k, count in enumerate(samples):
+            force, x = respond(Multisine(8192, 5.0, 60.0, 30.0, seed + k), law, count, 512)
             forces.append(force)
             responses.append(x + noise * np.std(x) * random.standard_normal(len(x)))
         file["force"], file["x"] = np.concatenate(forces), np.concatenate(responses)
@@ -78,12 +80,12 @@ channels = [
 file = "records.h5"
 name = "one"
 excitation = "multisine"
-last_sample = 2047
+last_sample = {samples[0] - 1}
 [[records]]
 file = "records.h5"
 name = "two"
 excitation = "multisine"
-first_sample = 2048
+first_sample = {samples[0]}
 use = "held_out"
 transient_samples = 50
 """

@@ -11,9 +11,10 @@ from pathlib import Path
 
 
 class Page:
-    """A running ``ema view``: its process, port and address with the token."""
+    """A running ``ema view``: its folder, process, port and address with the token."""
 
     def __init__(self, folder: Path, *options: str) -> None:
+        self.folder = folder
         command = [
             sys.executable,
             "-c",

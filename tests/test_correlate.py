@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
-from ema_pipeline.correlate.pairing import assign, close_groups, pair, pair_rig
+from ema_pipeline.correlate.pairing import assign, close_groups, pair, pair_rig, shape_agreement
 from ema_pipeline.correlate.settings import CompareSettings, PairingSettings
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
@@ -110,6 +110,21 @@ def test_equal_modes_are_compared_by_their_plane_however_they_are_turned() -> No
     assert pairing.mac[0, 0] == pytest.approx(0.5)
     assert pairing.pairs[0].group == pairing.pairs[1].group >= 0
     assert pairing.pairs[2].group == -1
+
+
+def test_two_sensors_do_not_tell_the_plane_of_two_equal_modes() -> None:
+    """Two readings of two modes can be made up of them whatever they are: each is compared by itself."""
+    two, model = np.array([[1.0, 0.5], [0.5, -1.0]], complex), np.eye(2, dtype=complex)
+    places = (Dof.parse("a.x"), Dof.parse("a.y"))
+    measured = replace(from_frequencies("default", [10.0, 10.1]), shapes=two, dofs=places)
+    single, grouped = shape_agreement(measured, model, np.array([0, 0]))
+    np.testing.assert_allclose(single, [[0.8, 0.2], [0.2, 0.8]])
+    np.testing.assert_allclose(grouped, single)
+    third = replace(
+        measured, shapes=np.c_[two, [0.0, 0.0]], dofs=(*places, Dof.parse("b.x"))
+    )  # a third one tells it
+    _, grouped = shape_agreement(third, np.eye(2, 3, dtype=complex), np.array([0, 0]))
+    np.testing.assert_allclose(grouped, 1.0)
 
 
 def test_one_of_two_measured_modes_takes_the_model_mode_and_the_other_is_told_so() -> None:

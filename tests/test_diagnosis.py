@@ -287,8 +287,8 @@ def test_learned_scatters_are_those_of_the_laboratory() -> None:
 
 def test_the_number_of_processes_does_not_change_a_digit() -> None:
     hidden, library = added(Spring, 2e5, {"m2.z": 1.0}), {"mass": GENERIC["mass"]}
-    one = of_chain(1, hidden, library=library)
-    two = of_chain(1, hidden, library=library, settings=SETTINGS.model_copy(update={"processes": 2}))
+    settings = [SETTINGS.model_copy(update={"processes": n, "most_effects": 1}) for n in (1, 2)]
+    one, two = (of_chain(1, hidden, library=library, settings=s) for s in settings)
     assert one.probabilities == two.probabilities
     assert repr(one.ladder) == repr(two.ladder)
 
@@ -299,7 +299,7 @@ def test_effects_that_cannot_be_pickled_are_fitted_in_other_processes_too() -> N
         1,
         added(Spring, 2e5, {"m2.z": 1.0}),
         library={"my_spring": own},
-        settings=SETTINGS.model_copy(update={"processes": 2}),
+        settings=SETTINGS.model_copy(update={"processes": 2, "most_effects": 1}),
     )
     assert found.candidates[0].label == "my_spring@m2"
 

@@ -250,11 +250,15 @@ def test_force_and_exponential_window_give_the_frf_with_the_added_damping() -> N
             assert np.abs(frfs.frf[o, 0, near]) == pytest.approx(np.abs(true[near]), rel=0.01)
 
 
-def test_damping_is_exact_once_the_windows_share_is_taken_off() -> None:
+@pytest.mark.parametrize("recorded", [0.0, 3.0])
+def test_damping_is_exact_once_the_windows_share_is_taken_off(recorded: float) -> None:
+    """The window that is applied, and the one that the analyser has applied already."""
     (h,) = clean_hits(1, 4096, outputs=1)
+    window = np.exp(-recorded * np.arange(h.force.size) / RATE)
+    h = replace(h, force=h.force * window, responses=h.responses * window, window_decay_rad_s=recorded)
     settings = FrfSettings(exponential_window="auto")
     frfs = estimate_frfs([h], settings)
-    assert frfs.response_decay_rad_s == pytest.approx(np.log(100) / 2.0)
+    assert frfs.response_decay_rad_s == pytest.approx(np.log(100) / 2.0 + recorded)
     # Rational fit in z of the exact order: 3 pairs of poles.
     inside = slice(20, 900)
     z = np.exp(-2j * np.pi * frfs.frequency_hz[inside] / RATE)
@@ -434,6 +438,17 @@ def test_the_band_ends_10_db_above_the_flat_part_of_the_force_spectrum() -> None
     assert -40 * (end_hz / 300) ** 2 == pytest.approx(-35 + 10, abs=1.5)
 
 
+def test_a_disturbance_far_above_the_pulse_does_not_widen_the_band() -> None:
+    force = gauss_pulse(300.0)
+    spectrum = np.fft.rfft(np.random.default_rng(0).standard_normal(force.size))
+    frequency = np.fft.rfftfreq(force.size, 1 / RATE)
+    spectrum[(frequency < 700) | (frequency > 760)] = 0.0
+    spectrum *= 0.1 * np.abs(np.fft.rfft(force)).max() / np.abs(spectrum).max()  # 20 dB below the pulse
+    disturbed = force + np.fft.irfft(spectrum, force.size)
+    clean, seen = (estimate_frfs([hit_of(f, force[None])]).band_hz for f in (force, disturbed))
+    assert seen == pytest.approx(clean, abs=5)
+
+
 def test_repeatability_is_the_scatter_of_single_hits_beyond_the_noise() -> None:
     factors = np.array([0.8, 0.9, 1.0, 1.1, 1.2])
     rng = np.random.default_rng(3)
@@ -505,6 +520,19 @@ def test_a_reversed_driving_point_has_nearly_all_of_its_imaginary_part_negative(
     assert value(right, "driving point") < 0.02
     assert value(wrong, "driving point") > 0.98
     assert "reversed" in [v.message for v in wrong.verdicts if v.check == "driving point"][-1]
+
+
+def test_a_sensor_beside_the_point_that_is_struck_is_not_called_reversed() -> None:
+    """One of three modes has another sign there."""
+    force = half_sine(8192, 20, 5, 60.0)
+    shapes = np.array([1.0, -0.7, 0.8])
+    answer = modal_response(force, RATE, POLES, 1j * POLES.imag / 2 * shapes)
+    (found,) = (
+        v for v in estimate_frfs([hit_of(force, answer[None])]).verdicts if v.check == "driving point"
+    )
+    assert found.limit < found.value < 0.5
+    assert "hammer and sensor are not at one point" in found.message
+    assert "reversed" not in found.message
 
 
 def test_one_hit_each_way_is_enough_for_reciprocity() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from simulate_hits import Blow, force_of, record_of
+from simulate_hits import Blow, force_of, modal_response, record_of
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.hit_settings import HitSettings
@@ -126,6 +126,29 @@ def test_records_that_do_not_decay_start_at_the_blow_and_decayed_ones_stay_whole
     (whole,) = hits_of_test([cut], HitSettings(trim="none"))
     assert (whole.start, whole.stop) == (0, cut.force.size)
     assert trim_hits((whole,), [cut], HitSettings(trim="none")) == (whole,)
+
+
+def test_trimmed_hits_start_alike_and_keep_every_pulse_whole() -> None:
+    """The soft tip's pulse of 16 ms begins long before its peak, the hard tip's of 1 ms shortly before."""
+    pulses = [
+        force_of(Blow(RATE, "half-sine", width, length_s=1.0), np.random.default_rng(1))
+        for width in (1e-3, 16e-3)
+    ]
+    slow = np.array([-0.5 + 1j * 2 * np.pi * 120])
+    records = [
+        record_of(
+            f, modal_response(f - np.median(f), RATE, slow, np.array([1j]))[None, :], RATE, file=f"{k}.csv"
+        )
+        for k, f in enumerate(pulses)
+    ]
+    hits = hits_of_test(records)
+    leads = [h.peak - h.start for h in hits]
+    assert leads[0] == leads[1]
+    assert len({h.stop - h.start for h in hits}) == 1
+    for hit, force in zip(hits, pulses, strict=True):
+        assert hit.start > 0
+        cut_off = force[: hit.start] - np.median(force)
+        assert np.abs(cut_off).max() < 0.01 * np.ptp(force)
 
 
 def test_pulse_of_one_sample_is_found_at_4_khz() -> None:

@@ -14,9 +14,11 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnose.limits import detection_limits
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names, named, sizes_of
-from ema_pipeline.diagnose.probability import against_nothing, needed
+from ema_pipeline.diagnose.probability import against_nothing, needed, null_prior, prior
+from ema_pipeline.diagnose.rungs import with_gains
 from ema_pipeline.diagnose.score import Score, scores
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import Rung
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.mechanics.assembly import Damper, Mass, Spring
@@ -284,6 +286,23 @@ def test_an_effect_at_a_body_is_not_taken_for_one_at_its_coordinate() -> None:
     assert body.label == "spring@m2"
     (found,) = scores(observations, base, [body])
     assert len(found.size) == 1
+
+
+@pytest.mark.parametrize(("found", "nothing"), [(0, 0.3), (1, 0.6), (2, 0.6)])
+def test_prior_probabilities_add_up_to_one_and_generic_effects_weigh_less(found: int, nothing: float) -> None:
+    hypotheses, settings = list_hypotheses(planetary(), shipped_effects()), DiagnoseSettings()
+    each = np.array([prior(h, hypotheses, settings, found) for h in hypotheses])
+    assert null_prior(settings, found) == nothing
+    assert each.sum() + nothing == pytest.approx(1.0)
+    generic = np.array([h.generic for h in hypotheses])
+    assert 0 < generic.sum() < len(generic)
+    assert np.ptp(each[generic]) == np.ptp(each[~generic]) == 0.0
+    assert each[generic][0] / each[~generic][0] == pytest.approx(0.3)
+
+
+def test_gains_of_a_ladder_count_from_its_first_rung() -> None:
+    rungs = [Rung((), 1.0, 1.0, 1.0, 1.0, {}, log_evidence=e, unexplained=0) for e in (-40.0, -25.0, -26.5)]
+    assert [r.log_evidence for r in with_gains(rungs)] == [0.0, 15.0, 13.5]
 
 
 @pytest.mark.parametrize("found", [0, 1])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+import scipy.integrate
 import scipy.optimize
 import scipy.stats
 from numpy.typing import NDArray
@@ -17,12 +18,14 @@ from ema_pipeline.inference import (
     Scatter,
     Unknowns,
     anneal,
+    beyond_scatter,
     descend,
     joined,
     learn,
+    tails,
     widened,
 )
-from ema_pipeline.inference.scatter import LinearEvidence
+from ema_pipeline.inference.scatter import LinearEvidence, determined
 
 Array = NDArray[np.float64]
 NOISE = "noise"
@@ -106,6 +109,15 @@ def test_the_error_is_the_root_mean_square_of_the_residual_whitened_by_everythin
     assert found.error == pytest.approx(float(np.sqrt(np.mean(whitened**2))), rel=1e-4)
 
 
+def test_a_penalty_counts_in_the_error_as_the_square_that_costs_as_much() -> None:
+    # -log of a normal density is half a square: a penalty of 8 is worth a residual of 4
+    penalised = Residuals(np.zeros(4), np.zeros((4, 0)), penalty=8.0)
+    off = Residuals(np.array([4.0, 0.0, 0.0, 0.0]), np.zeros((4, 0)))
+    found = [Posterior(Unknowns.plain((), 1.0), np.zeros(0), {}, r) for r in (penalised, off)]
+    assert found[0].cost == found[1].cost == 8.0
+    assert found[0].error == found[1].error == 2.0
+
+
 def test_the_error_of_true_models_is_about_one() -> None:
     errors = []
     for seed in range(60):
@@ -165,11 +177,11 @@ class Exponential:
         return Residuals((self.y - np.sum(each, axis=1)) / sigma, jacobian)
 
 
-def exponential(seed: int, lower: float = -np.inf) -> Exponential:
+def exponential(seed: int, lower: float = -np.inf, upper: float = np.inf) -> Exponential:
     rng = np.random.default_rng(seed)
     b = rng.uniform(0.3, 1.5, size=(9, 3))
     x = rng.normal(size=3)
-    unknowns = Unknowns.plain(("a", "b", "c"), 1.0, lower=lower)
+    unknowns = Unknowns.plain(("a", "b", "c"), 1.0, lower=lower, upper=upper)
     return Exponential(unknowns, b, np.sum(np.exp(b * x), axis=1) + 0.05 * rng.normal(size=9))
 
 
@@ -186,15 +198,20 @@ def test_a_nonlinear_fit_ends_where_scipy_ends(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_bounds_are_kept_and_the_fit_within_them_is_the_best(seed: int) -> None:
-    problem = exponential(seed, lower=-0.2)
+@pytest.mark.parametrize("start", ["inside", "on the bounds"])
+@pytest.mark.parametrize(("lower", "upper"), [(-0.2, np.inf), (-np.inf, 0.5), (-0.3, 0.3)])
+def test_bounds_are_kept_and_the_fit_within_them_is_the_best(
+    seed: int, start: str, lower: float, upper: float
+) -> None:
+    problem = exponential(seed, lower, upper)
 
     def stacked(x: Array) -> Array:
         return np.concatenate([problem.residuals(x, {}).values, x])
 
-    known = scipy.optimize.least_squares(stacked, np.zeros(3), bounds=(-0.2, np.inf), xtol=1e-12)
-    found = anneal(problem, {}, np.zeros(3))
-    assert np.all(found.x >= -0.2)
+    known = scipy.optimize.least_squares(stacked, np.zeros(3), bounds=(lower, upper), xtol=1e-12)
+    edge = upper if np.isfinite(upper) else lower
+    found = anneal(problem, {}, np.full(3, 0.0 if start == "inside" else edge))
+    assert np.all((found.x >= lower) & (found.x <= upper))
     assert found.cost == pytest.approx(known.cost, abs=5e-3)
 
 
@@ -341,6 +358,57 @@ def test_intervals_hold_where_two_ratios_are_all_that_tells_how_much_masses_scat
         inside.append(abs(found.value("added") - added) < 1.6449 * found.std[3])
     # 300 intervals: 1 σ of the share is 1.7 %; a Gaussian with the right second moment is a little too wide
     assert 0.87 < np.mean(inside) < 0.965
+
+
+def test_data_as_precise_as_the_prior_determine_half_of_every_unknown() -> None:
+    # posterior variance half of the prior's: MacKay's number of well-determined parameters
+    problem = Linear(Unknowns.plain([f"part {i}" for i in range(10)], 1.0, PARTS), np.eye(10), np.zeros(10))
+    found = descend(problem, {PARTS: 1.0}, np.zeros(10))
+    assert determined(found, PARTS) == pytest.approx(5.0)
+
+
+def test_a_scatter_is_widened_to_the_root_mean_square_of_its_exact_density() -> None:
+    count, scatter = 30, Scatter(PARTS, "parts", 0.02, 0.7, most=8.0)
+    x = 0.03 * np.random.default_rng(6).normal(size=count)
+    unknowns = Unknowns.plain([f"part {i}" for i in range(count)], 1.0, PARTS)
+    exact = Linear(unknowns, np.eye(count) / 1e-6, x / 1e-6)
+    found = learn(exact, descend(exact, {PARTS: 0.02}, np.zeros(count)), {PARTS: scatter})
+
+    def moment(power: int) -> float:
+        def density(log: float) -> float:
+            told = (
+                scipy.stats.norm(0.0, np.exp(log)).logpdf(x).sum() - 0.5 * ((log - np.log(0.02)) / 0.7) ** 2
+            )
+            return float(np.exp(told - 60.0 + power * log))
+
+        return float(scipy.integrate.quad(density, np.log(0.01), np.log(0.09))[0])
+
+    wide = widened(found, {PARTS: scatter})[PARTS]
+    assert wide == pytest.approx(np.sqrt(moment(2) / moment(0)), rel=2e-3)
+    known = {PARTS: Scatter(PARTS, "parts", 0.02, 0.0)}
+    assert widened(found, known)[PARTS] == found.scatters[PARTS]
+
+
+def test_parts_further_out_than_scatter_reaches_are_told_on_both_sides() -> None:
+    unknowns = joined(Unknowns.plain(("a", "b", "c"), 1.0, PARTS), Unknowns.plain(("gain",), 1.0, "gains"))
+    none = Residuals(np.zeros(0), np.zeros((0, 4)))
+    found = Posterior(unknowns, 0.02 * np.array([5.0, -5.0, 3.0, 9.0]), {PARTS: 0.02, "gains": 0.02}, none)
+    np.testing.assert_array_equal(beyond_scatter(found, [PARTS]), [True, True, False, False])
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_blocks_that_may_be_wrong_together_have_the_multivariate_t_density(count: int) -> None:
+    for size in (0.1, 1.0, 6.0):
+        values = size * np.random.default_rng(count).normal(size=count)
+        squares = float(values @ values)
+        known = scipy.stats.multivariate_t(np.zeros(count), np.eye(count), df=tails.TAIL).logpdf(values)
+        constant = 0.5 * count * np.log(2 * np.pi)  # that of standard normal values at 0
+        assert float(tails.cost(squares, count)) == pytest.approx(-known - constant, abs=1e-9)
+        ends = [float(tails.cost(squares + s, count)) for s in (-1e-6, 1e-6)]
+        normal = 0.5  # slope of half a square
+        assert float(tails.weight(squares, count)) * normal == pytest.approx(
+            (ends[1] - ends[0]) / 2e-6, rel=1e-5
+        )
 
 
 # --- data that break careless algebra ---------------------------------------------------------------------

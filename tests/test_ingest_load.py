@@ -86,6 +86,20 @@ def test_millivolts_that_the_file_declares_are_not_taken_for_volts(tmp_path: Pat
     assert_allclose(load(folder).force, DATA["hammer"], rtol=1e-12)
 
 
+def test_volts_at_full_scale_are_those_of_the_sensors_unit(tmp_path: Path) -> None:
+    """10 V on a channel of 100 mV/g are 100 g."""
+    text = DESCRIPTION.replace('"m/s^2"', '"g"\nsensitivity_mv = 100.0\nfull_scale_v = 10')
+    record = load(make_test(tmp_path, text))
+    assert record.channels[0].full_scale == pytest.approx(100 * 9.80665)
+
+
+def test_millivolts_of_an_uncalibrated_hammer_become_volts(tmp_path: Path) -> None:
+    text = DESCRIPTION.replace('unit = "N"', 'unit = "V"\nuncalibrated = true')
+    folder = make_test(tmp_path, text)
+    write_csv(folder / "hit1.csv", {"hammer [mV]": DATA["hammer"] * 1e3, "tip": DATA["tip"]})
+    assert_allclose(load(folder).force, DATA["hammer"], rtol=EXACT)
+
+
 def test_an_uncalibrated_hammer_stays_in_volts_and_says_so(tmp_path: Path) -> None:
     text = DESCRIPTION.replace('unit = "N"', 'unit = "V"\nuncalibrated = true\nfull_scale_v = 10')
     record = load(make_test(tmp_path, text))

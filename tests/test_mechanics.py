@@ -16,6 +16,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Gyroscopic, Mass, Spring, difference
 from ema_pipeline.mechanics.frf import accelerance, receptance
 from ema_pipeline.mechanics.modes import complex_modes, damping_ratios, normal_modes, total_damping
+from ema_pipeline.mechanics.sampling import anti_alias
 from ema_pipeline.mechanics.system import LinearSystem, sensor_row, sensor_rows
 from ema_pipeline.mechanics.time_response import time_response
 
@@ -139,6 +140,26 @@ def test_loss_factor_of_a_single_spring_gives_half_of_it_as_damping_ratio() -> N
     f = np.array([10.0, 31.0, 40.0])
     expected = 1 / (8e4 * (1 + 1j * eta) - (2 * np.pi * f) ** 2 * 2.0)
     np.testing.assert_allclose(receptance(system, f, np.eye(1), np.eye(1))[0, 0], expected, rtol=1e-12)
+
+
+def test_the_converters_filter_is_flat_to_its_rate_over_2_56_and_shuts_at_half_the_rate() -> None:
+    flat, shut = 1000 / 2.56, 500.0
+    asked = np.array([0.0, 100.0, flat, 0.5 * (flat + shut), shut, 600.0])
+    np.testing.assert_allclose(anti_alias(asked, 1000.0), [1.0, 1.0, 1.0, 0.5, 0.0, 0.0], atol=1e-12)
+    falling = np.diff(anti_alias(np.linspace(flat, shut, 50), 1000.0))
+    assert np.all(falling < 0)
+
+
+def test_gyroscopic_coupling_turns_the_velocity_of_a_free_mass_from_x_to_y() -> None:
+    """m·ẍ = -c·ẏ, m·ÿ = c·ẋ: a circle at c/m, run through from +x to +y."""
+    rows = {"a.x": 1.0}, {"a.y": 1.0}
+    system = Assembly(
+        ("a.x", "a.y"),
+        (*(Mass(f"m{i}", row, 2.0) for i, row in enumerate(rows)), Gyroscopic("g", *rows, 6.0)),
+    ).system()
+    time = 0.4
+    turn = scipy.linalg.expm(-np.linalg.solve(system.mass, system.damping) * time)
+    np.testing.assert_allclose(turn @ [1.0, 0.0], [np.cos(3.0 * time), np.sin(3.0 * time)], atol=1e-12)
 
 
 def test_gyroscopic_coupling_parts_a_pair_into_forward_and_backward_whirl() -> None:

@@ -11,6 +11,7 @@ import scipy.integrate
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
+from ema_pipeline.mechanics.dissipation import HystereticSpring, SquareDamper
 from ema_pipeline.mechanics.frf import receptance
 from ema_pipeline.mechanics.harmonic import describing_function, harmonic_response
 from ema_pipeline.mechanics.laws import (
@@ -54,6 +55,37 @@ def test_duffing_response_to_a_blow_agrees_with_a_tight_integrator() -> None:
     exact = scipy.integrate.solve_ivp(slope, (0, t[-1]), [0, 0], t_eval=t, **options).y[0]
     assert cubic * np.max(np.abs(exact)) ** 2 > 0.5 * k  # strongly nonlinear
     assert np.max(np.abs(ours - exact)) < 1e-4 * np.max(np.abs(exact))
+
+
+@pytest.mark.parametrize(
+    "element",
+    [
+        PolynomialSpring("e", ROW, 2e6, 4e9),
+        DryFriction("e", ROW, 5.0, 2e-2),
+        PartingSpring("e", ROW, 1e6, preload=2e-4, gap=3e-4),
+        PartingSpring("e", ROW, 1e6, preload=-2e-4, gap=3e-4),
+        BoucWen("e", ROW, 80.0, 900.0, 0.6),
+        BoucWen("e", ROW, 80.0, 900.0, 0.6, 2.0),
+        Maxwell("e", ROW, 1e4, 0.02),
+        SquareDamper("e", ROW, 80.0),
+        HystereticSpring("e", ROW, 7e4, 80.0, 0.4, 1.5),
+    ],
+    ids=lambda e: f"{type(e).__name__}",
+)
+def test_every_element_states_the_slopes_of_its_own_force(element: Nonlinear) -> None:
+    """Newton's method and the derivatives of simulations rest on them."""
+    before, h, worst = 1e-4, 1e-9, []
+    for stretch in (-8e-4, -3.5e-4, 1.5e-4, 5e-4):
+        for rate in (-0.03, 0.01):
+            given = before, stretch, rate, element.start, 1e-3
+            _, by_stretch, by_rate, _ = element.step(*given)
+            ends = [element.step(before, stretch + s, rate, element.start, 1e-3)[0] for s in (-h, h)]
+            rates = [element.step(before, stretch, rate + 1e3 * s, element.start, 1e-3)[0] for s in (-h, h)]
+            # one element takes its path in steps of fourth order, which are not exact
+            assert by_stretch == pytest.approx((ends[1] - ends[0]) / (2 * h), rel=1e-2, abs=1.0)
+            assert by_rate == pytest.approx((rates[1] - rates[0]) / (2e3 * h), rel=1e-4, abs=1e-6)
+            worst.append(abs(by_stretch) + abs(by_rate))
+    assert max(worst) > 1.0  # there was something to see
 
 
 def test_error_falls_with_the_square_of_the_step() -> None:

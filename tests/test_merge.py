@@ -6,13 +6,16 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy.linalg
 from bench import ema
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
+from ema_pipeline.cli import app
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
@@ -93,15 +96,21 @@ def tips(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture(scope="module")
+def merged(tips: Path) -> dict[str, Any]:
+    """What merging the two tips into ``tips/both`` says."""
+    command = ["merge", str(tips / "soft"), str(tips / "hard"), "--out", str(tips / "both"), "--json"]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    return json.loads(done.stdout)  # type: ignore[no-any-return]
+
+
+@pytest.mark.usefixtures("merged")
 def test_two_tips_are_as_good_as_each_on_its_own_band(
     tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Frequencies by the chain's own matrices; as precise as the better tip, mode by mode."""
-    code, _out, err = ema(
-        capsys, "merge", tips / "soft", tips / "hard", "--out", tmp_path / "both", "--quiet"
-    )
-    assert (code, err) == (0, "")
-    both = _modes(capsys, tmp_path / "both", tmp_path / "out")
+    both = _modes(capsys, tips / "both", tmp_path / "out")
     alone = [_modes(capsys, tips / name, tmp_path / f"out_{name}") for name in ("soft", "hard")]
     assert len(alone[0]) < BODIES <= len(both)
     for frequency in _truth()[0]:
@@ -119,10 +128,8 @@ def _has(modes: MeasuredModes, frequency_hz: float) -> bool:
     return bool(np.min(np.abs(modes.frequency_hz / frequency_hz - 1)) < 1e-3)
 
 
-def test_what_merge_says(tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, out, _ = ema(capsys, "merge", tips / "soft", tips / "hard", "--out", tmp_path / "both", "--json")
-    found = json.loads(out)
-    assert code == 0
+def test_what_merge_says(tips: Path, merged: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    found = merged
     soft, hard = found["parts"]
     assert (
         375 < soft["band_hz"][1] < 800 < 1900 < hard["band_hz"][1] <= 2000
@@ -131,9 +138,9 @@ def test_what_merge_says(tips: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     (gain,) = found["gains"]
     # FRFs of the hard tip are 3 % too small: its sensitivity is stated 3 % too high, so its force is read too low
     assert gain["ln_ratio"] == pytest.approx(-np.log(1.03), abs=4 * gain["std"] + 1e-3)
-    text = (tmp_path / "both" / "soft" / "test.toml").read_text(encoding="utf-8")
+    text = (tips / "both" / "soft" / "test.toml").read_text(encoding="utf-8")
     assert text.startswith('part = "soft"\nband_hz = [')
-    code, out, _ = ema(capsys, "check", tmp_path / "both", "--json")
+    code, out, _ = ema(capsys, "check", tips / "both", "--json")
     files = {h["file"] for hits in json.loads(out).values() for h in hits}
     assert code == 0
     assert len(files) == 12

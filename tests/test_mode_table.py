@@ -71,6 +71,7 @@ def test_toml_table_is_read_in_ascending_order_with_signs_applied(tmp_path: Path
         ("[30.0, 10.0]", "[30.0, -10.0]", r"frequency_hz = -10.*above 0 Hz"),
         ("0.004]", "-0.004]", r"damping_ratio = -0\.004 is negative"),
         ("0.004]", "1.2]", r"damping_ratio = 1\.2: .* 1 % is written 0\.01"),
+        ("0.004]", "1.0]", r"damping_ratio = 1: .* 1 % is written 0\.01"),
         ("frequency_std_hz = 0.02", "frequency_std_hz = -1", r"frequency_std_hz = -1: .* above 0"),
         ("[0.001, 0.002]", "[0.001, 0.0]", r"damping_std = 0: .* leave out what is unknown"),
         ("[1.0, 50.0]", "[50.0, 1.0]", r"band_hz = \[50, 1\]: give the lower limit first"),
@@ -95,6 +96,18 @@ def test_mistakes_in_a_table_are_one_clear_line(
     with pytest.raises(EmaError, match=message) as caught:
         read_mode_table(path, load_rig("frame"))
     assert "\n" not in str(caught.value)
+
+
+def test_a_standard_deviation_is_no_finer_than_the_rounding_of_the_numbers(tmp_path: Path) -> None:
+    exact = np.random.default_rng(0).uniform(10.0, 400.0, 20_000)
+    rounding = float(np.std(np.round(exact, 1) - exact))
+    text = (
+        "[default]\nfrequency_hz = [12.1, 34.5, 56.7, 80.0]\nfrequency_std_hz = [0.001, 0.001, 0.001, 0.2]\n"
+    )
+    modes = read_mode_table(table(tmp_path, text))["default"]
+    np.testing.assert_allclose(modes.frequency_std_hz, [*[rounding] * 3, 0.2], rtol=0.02)
+    (note,) = modes.notes
+    assert "0.029 Hz is taken" in note
 
 
 def test_csv_table_holds_several_configurations_and_complex_shapes(tmp_path: Path) -> None:

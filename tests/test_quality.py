@@ -86,9 +86,11 @@ def test_ringing_of_the_anti_alias_filter_is_no_second_hit() -> None:
         assert second.ratio < 0.025
 
 
-def test_overload_of_the_hammer_rejects_the_hit_and_of_a_response_only_its_channel() -> None:
+@pytest.mark.parametrize("sign", [1, -1])
+def test_overload_of_the_hammer_rejects_the_hit_and_of_a_response_only_its_channel(sign: int) -> None:
     record = clean()
-    peak = float(record.force.max())
+    record = replace(record, force=sign * record.force, responses=sign * np.asarray(record.responses))
+    peak = float(np.abs(record.force).max())
     hit = checked(replace(record, force_full_scale=peak))
     assert not hit.accepted
     assert "overload on hammer" in hit.reason
@@ -97,6 +99,20 @@ def test_overload_of_the_hammer_rejects_the_hit_and_of_a_response_only_its_chann
     assert hit.accepted
     assert hit.rejected_channels == {"a1"}
     assert checked(replace(record, force_full_scale=1.1 * peak)).accepted
+
+
+@pytest.mark.parametrize(("peak_n", "limit_n"), [(0.05, 0.2), (100.0, None), (3e4, None), (5e5, 4e4)])
+def test_a_peak_that_no_hammer_makes_is_told_with_the_limit_that_it_is_beyond(
+    peak_n: float, limit_n: float | None
+) -> None:
+    record = clean()
+    force = record.force - np.median(record.force)
+    found = verdict(checked(replace(record, force=force * peak_n / force.max())), "force peak")
+    assert found.value == pytest.approx(peak_n, rel=1e-3)
+    assert found.passes == (limit_n is None)
+    if limit_n is not None:
+        assert found.limit == limit_n
+        assert "unit" in found.message
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3, 5e-3])
@@ -126,6 +142,22 @@ def test_clipped_response_loses_its_channel_only(noise: float) -> None:
         assert hit.rejected_channels == {"a0"}
 
 
+@pytest.mark.parametrize(("harder", "clipped"), [(0.7, True), (3.0, False)])
+def test_rounded_tops_are_clipped_unless_the_channel_goes_far_beyond_them_in_another_record(
+    harder: float, clipped: bool
+) -> None:
+    record = clean()
+    x = np.asarray(record.responses)
+    level = 0.5 * np.abs(x[0]).max()
+    rounded = np.stack([x[0] / (1 + np.abs(x[0] / level) ** 8) ** (1 / 8), x[1]])
+    soft = replace(record, responses=rounded)
+    hard = replace(record, file="hard.csv", force=harder * record.force, responses=harder * x)
+    assert checked(soft).rejected_channels == {"a0"}
+    first, second = hits_of_test([soft, hard])
+    assert first.rejected_channels == ({"a0"} if clipped else set())
+    assert not second.rejected_channels
+
+
 def test_dead_channels_are_found_and_a_silent_working_sensor_is_not_dead() -> None:
     record = clean()
     rng = np.random.default_rng(3)
@@ -138,7 +170,9 @@ def test_dead_channels_are_found_and_a_silent_working_sensor_is_not_dead() -> No
         "hum": 0.2 * np.sin(2 * np.pi * 50.03 * t + 1)
         + 0.02 * np.sin(2 * np.pi * 150.09 * t)
         + 1e-4 * rng.standard_normal(n),
+        "hum of 60 Hz": 0.2 * np.sin(2 * np.pi * 59.96 * t + 1) + 1e-4 * rng.standard_normal(n),
         "silent": 2e-3 * rng.standard_normal(n) + 1.2,
+        "noise under hum": 2e-3 * rng.standard_normal(n) + 6e-3 * np.sin(2 * np.pi * 50 * t),
         "silent with hum": 2e-3 * rng.standard_normal(n) + 2e-3 * np.sin(2 * np.pi * 50 * t),
         "answer on hum": 0.1 * np.sin(2 * np.pi * 50 * t)
         + record.responses[1] / np.abs(record.responses[1]).max(),
@@ -150,7 +184,7 @@ def test_dead_channels_are_found_and_a_silent_working_sensor_is_not_dead() -> No
         if hit.rejected_channels:
             assert not verdict(hit, "dead channel", "a0").passes, name
             dead.add(name)
-    assert dead == {"constant", "offset", "one step", "hum"}
+    assert dead == {"constant", "offset", "one step", "hum", "hum of 60 Hz"}
 
 
 def test_response_that_has_not_decayed_is_reported_with_its_ratio() -> None:

@@ -78,7 +78,7 @@ def test_effect_of_the_page_is_diagnosed_and_laddered_by_its_file(
     stages = 'stages=["modal", "ladder", "fit", "correlate", "diagnose"]'
 
     ema("run", "--modes", "modes.toml", "--rig", "rig.toml", "--out", "out", "--effect-file", "oil_film.py",
-        "--set", stages)  # fmt: skip
+        "--set", stages, "--set", "diagnose.most_effects=1")  # fmt: skip
     found = load_results(existing_run(Path("out"))).diagnosis
     assert found is not None
     first = found.candidates[0]

@@ -14,7 +14,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from bench import ema, facts_of_series, write_bench
+from typer.testing import CliRunner
 
+from ema_pipeline.cli import app
 from ema_pipeline.errors import EmaError
 from ema_pipeline.series.database import SeriesDatabase
 from ema_pipeline.series.engine import LOST, in_processes
@@ -43,12 +45,22 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_series_from_raw_folders_to_a_table(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Right rows, one reason, unchanged tests skipped, a changed one run again."""
+@pytest.fixture(scope="module")
+def whole(root: Path) -> tuple[Path, str]:
+    """The series of all four tests in two processes, and what was said."""
     out = root / "S"
+    command = ["series", "run", root / "tree", "--rig", root / "bench.toml", "--out", out, "--jobs", 2]
+    done = CliRunner().invoke(app, [*map(str, command), "--parquet"])
+    assert done.exit_code == 0, done.output
+    return out, done.stdout
+
+
+def test_series_from_raw_folders_to_a_table(
+    root: Path, whole: tuple[Path, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Right rows, one reason, unchanged tests skipped, a changed one run again."""
+    out, said = whole
     command = ("series", "run", root / "tree", "--rig", root / "bench.toml", "--out", out, "--jobs", 2)
-    code, said, _ = ema(capsys, *command, "--parquet")
-    assert code == 0
     assert "4 tests: 4 run, 0 unchanged, 1 without results" in said
     assert "broken" in said
     tests = facts_of_series(out)["tests"].set_index("test")
@@ -138,12 +150,11 @@ def test_a_series_of_which_all_tests_are_lost_ends(tmp_path: Path) -> None:
     assert done.growth != done.growth
 
 
-def test_killed_and_resumed_gives_the_same_table(root: Path, tmp_path: Path) -> None:
+def test_killed_and_resumed_gives_the_same_table(root: Path, whole: tuple[Path, str], tmp_path: Path) -> None:
     """The whole process group is killed after the first test is in the table."""
-    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    resumed = tmp_path / "resumed"
     command = [sys.executable, "-m", "ema_pipeline.cli", "series", "run", str(root / "tree"), "-j", "1", "-q"]
     command += ["--rig", str(root / "bench.toml"), "--out"]
-    subprocess.run([*command, str(whole)], check=True)
     killed = subprocess.Popen([*command, str(resumed)], start_new_session=True)
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and killed.poll() is None:
@@ -162,7 +173,7 @@ def test_killed_and_resumed_gives_the_same_table(root: Path, tmp_path: Path) -> 
     assert 0 < len(database.table("tests")) < 4
     database.close()
     subprocess.run([*command, str(resumed)], check=True)
-    one, other = facts_of_series(whole), facts_of_series(resumed)
+    one, other = facts_of_series(whole[0]), facts_of_series(resumed)
     for name in one:
         pd.testing.assert_frame_equal(one[name], other[name])
 
@@ -248,6 +259,8 @@ def test_own_effects_run_where_they_are_named_and_nowhere_else(
         "-j",
         2,
         "-q",
+        "--set",
+        'stages=["ingest", "hits", "frf", "modal", "ladder", "diagnose", "report"]',
     )
     code, _, err = ema(capsys, *command, "--effect-file", file)
     assert (code, err) == (0, "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -317,6 +318,33 @@ def test_saving_one_stage_does_not_touch_the_large_result_of_another(tmp_path: P
     store.save("frf", ALL, "b", "{}", 0.1, result=np.zeros(10))
     (after,) = ((p.stat().st_ino, p.stat().st_mtime_ns) for p in (tmp_path / "stages").iterdir())
     assert before == after
+
+
+def test_results_of_other_stages_are_dropped_and_those_that_are_kept_stay(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for stage in ("hits", "frf", "modal"):
+        store.save(stage, ALL, "key", "{}", 0.1, x=example())
+    store.keep(["frf", "report"])
+    assert set(store.provenance()) == {("frf", ALL)}
+    assert store.find("hits", ALL, "x", Everything) is None
+    assert store.load("frf", ALL, "x", Everything).text == example().text
+    store.keep(["frf"])
+    assert set(store.provenance()) == {("frf", ALL)}
+
+
+def test_results_copied_from_another_store_need_it_no_more(tmp_path: Path) -> None:
+    one, other = Store(tmp_path / "one"), Store(tmp_path / "other")
+    for store, factor in ((one, 1.0), (other, 0.0)):
+        store.folder.mkdir()
+        store.save("own", "default", "key", "{}", 0.1, x=factor)
+    one.save("frf", "default", "large", "{}", 0.1, x=large(1))
+    one.save("hits", "default", "small", "{}", 0.1, x=np.arange(10.0))
+    other.copy_from(one, ["hits", "frf", "modal"], {"default": "part"})
+    shutil.rmtree(one.folder)
+    assert_array_equal(other.load("frf", "part", "x", np.ndarray), large(1))
+    assert_array_equal(other.load("hits", "part", "x", np.ndarray), np.arange(10.0))
+    assert {*other.provenance()} == {("own", "default"), ("frf", "part"), ("hits", "part")}
+    assert other.load("own", "default", "x", float) == 0.0
 
 
 def test_files_of_replaced_and_of_never_linked_results_are_removed(tmp_path: Path) -> None:

@@ -6,13 +6,12 @@ import json
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from bench import ema
 from chain_rig import RIG
 from live_page import Page, opened
 
@@ -59,6 +58,23 @@ def page(out: Path) -> Iterator[Page]:
         assert served.stop() == 0
 
 
+@pytest.fixture(scope="module")
+def still(results: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Page, str]]:
+    """A live page, and its cookie, for tests that change nothing on it."""
+    served = Page(Path(shutil.copytree(results, tmp_path_factory.mktemp("still") / "out")))
+    yield served, served.enter().partition(";")[0]
+    assert served.stop() == 0
+
+
+def with_cookie(browser, still: tuple[Page, str]):
+    """A browser that has been let in, and the page as it shows it."""
+    served, cookie = still
+    name, _, value = cookie.partition("=")
+    context = browser.new_context()
+    context.add_cookies([{"name": name, "value": value, "url": served.origin, "sameSite": "Strict"}])
+    return context, opened(context, served.origin)
+
+
 # who is let in
 
 
@@ -90,8 +106,8 @@ ROUTES = (
 )
 
 
-def test_nobody_else_is_let_in(page: Page) -> None:
-    cookie = page.enter().partition(";")[0]
+def test_nobody_else_is_let_in(still: tuple[Page, str]) -> None:
+    page, cookie = still
     name = cookie.partition("=")[0]
     for path in ROUTES:
         assert page.ask("GET", path).status == 403
@@ -107,8 +123,9 @@ def test_nobody_else_is_let_in(page: Page) -> None:
     assert upgrade.status == 403
 
 
-def test_nothing_changes_without_the_pages_own_origin_or_by_get(page: Page, out: Path) -> None:
-    cookie = page.enter().partition(";")[0]
+def test_nothing_changes_without_the_pages_own_origin_or_by_get(still: tuple[Page, str]) -> None:
+    page, cookie = still
+    out = page.folder
     before = (out / "ema.h5").stat().st_mtime_ns
     wanted = json.dumps({"verb": "add", "label": CULPRIT})
     kind = "application/json"
@@ -193,7 +210,9 @@ def test_refit_that_is_cancelled_leaves_the_folder_as_it_was(browser, page: Page
     context.close()
 
 
-def test_mode_is_excluded_and_one_included_and_the_commands_repeat_it(browser, page: Page, out: Path) -> None:
+def test_mode_is_excluded_and_one_included_and_the_commands_repeat_it(
+    browser, page: Page, out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     from playwright.sync_api import expect
 
     original = Path(shutil.copytree(out, out.with_name("original")))
@@ -216,10 +235,8 @@ def test_mode_is_excluded_and_one_included_and_the_commands_repeat_it(browser, p
 
     commands = tab.locator("#commands").text_content()
     for line in commands.replace(str(out), str(original)).splitlines():
-        subprocess.run(
-            [sys.executable, "-c", "from ema_pipeline.cli import main; main()", *shlex.split(line)[1:]],
-            check=True,
-        )
+        code, _, err = ema(capsys, *shlex.split(line)[1:])
+        assert code == 0, err
     assert existing_run(original).info.choices == chosen
 
     tab.locator("#undo").click()
@@ -231,9 +248,8 @@ def test_mode_is_excluded_and_one_included_and_the_commands_repeat_it(browser, p
     context.close()
 
 
-def test_a_pole_of_the_chart_that_is_clicked_is_the_one_to_include(browser, page: Page) -> None:
-    context = browser.new_context()
-    tab = opened(context, page.address)
+def test_a_pole_of_the_chart_that_is_clicked_is_the_one_to_include(browser, still: tuple[Page, str]) -> None:
+    context, tab = with_cookie(browser, still)
     tab.locator("[data-figure=stab]").scroll_into_view_if_needed()
     tab.wait_for_selector("[data-figure=stab][data-state=shown] canvas", state="attached", timeout=20_000)
     tab.evaluate(
@@ -291,9 +307,8 @@ def test_server_that_is_killed_leaves_whole_results_and_nothing_behind(page: Pag
     assert not list(out.glob(f"{FOLDER}*"))
 
 
-def test_hostile_names_are_text_on_the_live_page(browser, page: Page) -> None:
-    context = browser.new_context()
-    tab = opened(context, page.address)
+def test_hostile_names_are_text_on_the_live_page(browser, still: tuple[Page, str]) -> None:
+    context, tab = with_cookie(browser, still)
     assert tab.locator("h1").inner_text() == HOSTILE
     assert tab.title().startswith(HOSTILE)
     assert tab.locator("img").count() == 0
