@@ -26,7 +26,7 @@ from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import cut_hit
 from ema_pipeline.modal import segment
-from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.data import FitData, arrange
 from ema_pipeline.modal.fit import Estimate
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.polish import polish
@@ -309,6 +309,17 @@ def test_what_the_polish_drives_away_and_the_frfs_do_not_show_is_no_mode(
 
     monkeypatch.setattr(segment, "polish", failing)
     assert identify(frfs, ModalSettings(low_hz=200, high_hz=290)).modes == ()
+
+
+def test_a_held_pole_stays_where_it_is_to_the_last_bit() -> None:
+    frfs = hammer_test(FIVE, list(range(8)), [0, 3])
+    data = arrange(frfs, (20.0, 390.0))
+    off = FIVE.poles * (1 + 3e-4j * np.arange(5))
+    start = Estimate(off, FIVE.shapes[:, [0, 3]].astype(complex))
+    held = np.array([False, True, False, True, False])
+    found, _ = polish(data, np.ones(data.frf.shape), start, held=held)
+    np.testing.assert_array_equal(found.poles[held], off[held])
+    assert np.all(found.poles[~held] != off[~held])
 
 
 def test_without_polish_the_uncertainty_holds_the_bias_of_the_engine() -> None:
