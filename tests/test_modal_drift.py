@@ -14,7 +14,10 @@ from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.warp import WarpedTransform
 from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import HitSamples, cut_hit
+from ema_pipeline.modal.drift.align import _movements
+from ema_pipeline.modal.drift.local import PeakPoles
 from ema_pipeline.modal.drift.shifts import movement
+from ema_pipeline.modal.drift.windows import HitKey
 from ema_pipeline.modal.earned import has_peak
 from ema_pipeline.modal.fit import Estimate
 from ema_pipeline.modal.identify import identify
@@ -119,6 +122,24 @@ def test_modes_that_soften_say_so_and_are_not_split() -> None:
     assert not any("falls by" in flag for mode in stiff for flag in mode.flags)
     for mode, f in zip(modes, SYSTEM.frequency_hz, strict=True):
         assert abs(mode.frequency_hz - f) < 3 * mode.frequency_std_hz
+
+
+def test_the_pole_of_a_peak_is_told_at_the_mean_drift_of_all_hits() -> None:
+    """One hit that shows the peak ten times as strongly as the others does not bring its own drift with it."""
+    poles = 2 * np.pi * np.array([complex(-0.3, 50.0), complex(-0.4, 80.0)])
+    drift = np.array([2e-3, -1e-3, 0.0, 1e-3, -1e-3, -1e-3])  # 0 on average
+    strength = np.array([10.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    weight = strength**2 / np.sum(strength**2)
+    peaks = [
+        PeakPoles(
+            pole * (1 + weight @ drift), pole * (1 + drift), np.full(6, 1e-4), strength[:, None] * np.ones((1, 3))
+        )
+        for pole in poles
+    ]
+    keys = tuple(HitKey(f"{k}.h5", 0, f"p{k}.z", 100.0) for k in range(6))
+    found = _movements(peaks, keys)[1]
+    assert [p.frequency_hz for p in found] == pytest.approx(np.abs(poles) / (2 * np.pi), rel=1e-4)
+    assert [p.hits for p in found] == pytest.approx([1.1, 1.1], abs=0.05)
 
 
 def test_hits_that_do_not_move_are_left_as_they_are() -> None:

@@ -118,7 +118,9 @@ def _moving(mode: Mode, alignment: Alignment, decay_rad_s: float) -> Mode:
     n = alignment.n_hits
     common = alignment.common_spread
     own = peak.own_spread if peak is not None and peak.single else 0.0
-    mean_std = float(np.hypot(common, own)) * _of_few(n) / np.sqrt(n)
+    # drift was taken off each hit, so that all count alike; its own movement a mode shows in strong hits above all
+    of_own = own / np.sqrt(peak.hits) if peak is not None else 0.0
+    mean_std = float(np.hypot(common / np.sqrt(n), of_own)) * _of_few(n)
     trend = _with_force(peak) if peak is not None and own > 0 else 0.0
     if trend:
         # a mode that moves with the force has no one frequency: the interval holds what it moves by

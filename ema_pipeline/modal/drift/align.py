@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,10 @@ class PeakMovement:
     frequency_hz, damping_ratio : float
         That all hits share, as the FRFs show them.
     pole : complex
-        That fits all hits best, rad/s, as the FRFs show it: hits that show the peak best count most.
+        That fits all hits best, rad/s, as the FRFs show it: hits that show the peak best count most. What all modes
+        share is taken off.
+    hits : float
+        Number of hits that would tell the pole as well if all showed it alike.
     spread : ndarray, (2,)
         Standard deviations of decay and frequency over hits, rad/s, what all modes share taken off.
     single : bool
@@ -70,6 +73,7 @@ class PeakMovement:
     frequency_hz: float
     damping_ratio: float
     pole: complex
+    hits: float
     spread: Real
     single: bool
     proven: bool
@@ -164,12 +168,19 @@ def _movements(peaks: list[PeakPoles], keys: tuple[HitKey, ...]) -> tuple[Moveme
     place = np.array([points.index(k.point) for k in keys])
     typical = np.array([np.median(s[np.isfinite(e)]) for s, e in zip(size.T, std.T, strict=True)])
     moved = movement(shift, std, size / np.maximum(typical, 1e-300), place)
+    # the hits that show a peak best have a drift of their own on average: poles are told at the mean drift of all hits
+    power = np.where(np.isfinite(std), size**2, 0.0)
+    drift = power.T @ moved.common / np.maximum(power.sum(axis=0), 1e-300)
+    peaks = [replace(p, pole=p.pole * (1 - d)) for p, d in zip(peaks, drift, strict=True)]
+    moved = replace(moved, mean=moved.mean + drift)
+    hits = power.sum(axis=0) ** 2 / np.maximum((power**2).sum(axis=0), 1e-300)
     force = np.array([k.force for k in keys])
     looked_at = tuple(
         PeakMovement(
             frequency_hz=abs(p.pole) / (2 * np.pi),
             damping_ratio=-p.pole.real / abs(p.pole),
             pole=p.pole,
+            hits=float(hits[c]),
             spread=_spread(p, float(moved.own_spread[c])),
             single=_is_single(p, one_point=len(points) == 1),
             proven=len(points) > 1 and _is_single(p, one_point=False),
