@@ -11,7 +11,7 @@ from ema_pipeline.frf.estimate import Shifts
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import HitSamples
-from ema_pipeline.modal.drift.local import PeakPoles, peak_poles
+from ema_pipeline.modal.drift.local import DecayChange, PeakPoles, change_in_decay, peak_poles
 from ema_pipeline.modal.drift.shifts import Movement, movement
 from ema_pipeline.modal.drift.windows import HitKey, Hits, peak_windows, spectra_of_hits
 from ema_pipeline.modal.peaks import KnownPeaks
@@ -96,12 +96,15 @@ class Alignment:
     peaks : tuple of PeakMovement
     shifts : callable or None
         With which FRFs are estimated at common frequencies; None where nothing moves enough to be noticed.
+    changes : tuple of DecayChange
+        What peaks do within the decay after one hit, where there is but one.
     """
 
     common_spread: float
     n_hits: int
     peaks: tuple[PeakMovement, ...]
     shifts: Shifts | None = None
+    changes: tuple[DecayChange, ...] = ()
 
     @property
     def aligned(self) -> bool:
@@ -134,16 +137,23 @@ def align(hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float,
     band_hz : tuple of float
         Band in which peaks are looked at.
     """
-    nothing = Alignment(0.0, int(frfs.hits.max(initial=0)), ())
+    nothing = Alignment(0.0, int(frfs.hits.max(axis=0, initial=0).sum()), ())
     windows = peak_windows(frfs, band_hz)
     if not windows:
         return nothing
     keys, spectra = spectra_of_hits(hits, frfs, settings, windows)
     rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
+    omega = 2 * np.pi * frfs.frequency_hz
     found = [
-        peak_poles(w, frf, 2 * np.pi * frfs.frequency_hz[w.lines], rest_s)
-        for w, frf in zip(windows, spectra, strict=True)
+        peak_poles(w, frf, omega[w.lines], rest_s) for w, frf in zip(windows, spectra, strict=True)
     ]
+    if len(keys) == 1:
+        one = [
+            change_in_decay(w, frf[0], complex(p.poles[0]), omega[w.lines], rest_s)
+            for w, frf, p in zip(windows, spectra, found, strict=True)
+            if p is not None and np.isfinite(p.std[0])
+        ]
+        return replace(nothing, changes=tuple(change for change in one if change is not None))
     peaks = [p for p in found if p is not None and 2 * np.isfinite(p.std).sum() >= len(keys)]
     if len(keys) < FEWEST_HITS or not peaks:
         return nothing
