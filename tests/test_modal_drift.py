@@ -132,7 +132,10 @@ def test_the_pole_of_a_peak_is_told_at_the_mean_drift_of_all_hits() -> None:
     weight = strength**2 / np.sum(strength**2)
     peaks = [
         PeakPoles(
-            pole * (1 + weight @ drift), pole * (1 + drift), np.full(6, 1e-4), strength[:, None] * np.ones((1, 3))
+            pole * (1 + weight @ drift),
+            pole * (1 + drift),
+            np.full(6, 1e-4),
+            strength[:, None] * np.ones((1, 3)),
         )
         for pole in poles
     ]
@@ -213,13 +216,13 @@ def test_one_hit_tells_what_a_frequency_does_within_its_decay(change_hz: float) 
     frf = np.fft.rfft(records)[:, lines] / rate
     omega = 2 * np.pi * np.arange(n // 2 + 1)[lines] * rate / n
     window = PeakWindow(lines, 0j, np.zeros(0, complex), np.arange(3))
-    peak = peak_poles(
-        replace(window, pole=complex(-sigma, 2 * np.pi * f)), frf[None], omega, n / rate
-    )
+    peak = peak_poles(replace(window, pole=complex(-sigma, 2 * np.pi * f)), frf[None], omega, n / rate)
     assert peak is not None
     found = change_in_decay(window, frf, complex(peak.poles[0]), omega, n / rate)
     assert found is not None
-    assert found.change / (2 * np.pi) == pytest.approx(change_hz, abs=0.2 * abs(change_hz) + 4 * found.std / 6.3)
+    assert found.change / (2 * np.pi) == pytest.approx(
+        change_hz, abs=0.2 * abs(change_hz) + 4 * found.std / 6.3
+    )
     assert found.std / (2 * np.pi) < 0.003
 
 

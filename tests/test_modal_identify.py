@@ -29,6 +29,7 @@ from ema_pipeline.modal import segment
 from ema_pipeline.modal.data import FitData, arrange
 from ema_pipeline.modal.fit import Estimate
 from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.peaks import KnownPeaks
 from ema_pipeline.modal.polish import polish
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel
@@ -289,6 +290,26 @@ def test_a_mode_that_the_polish_drives_away_is_kept_as_it_was_with_a_flag_and_a_
     kept, polished = model.modes[2], five.modes[2]
     assert kept.damping_std > 2 * polished.damping_std
     assert abs(kept.damping_ratio - 0.008) < 3 * kept.damping_std
+
+
+def test_the_interval_of_a_mode_held_at_its_peak_holds_half_the_way_that_the_fit_would_have_gone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pole = FIVE.poles[2]
+    far = -2 * pole.real  # rad/s
+
+    def straying(data, weight, start, iterations, held):
+        estimate, solution = polish(data, weight, start, iterations, held)
+        gone = (np.abs(estimate.poles.imag / (2 * np.pi) - 120.0) < 1.0) & ~held
+        return Estimate(np.where(gone, pole + 1j * far, estimate.poles), estimate.participation), solution
+
+    monkeypatch.setattr(segment, "polish", straying)
+    peak = KnownPeaks(np.array([pole]), np.array([far]), np.array([[0.01, 0.01]]))
+    frfs = hammer_test(FIVE, list(range(8)), [0, 3])
+    mode = identify(frfs, ModalSettings(), peaks=peak).modes[2]
+    assert any("single hits show it" in flag for flag in mode.flags)
+    assert mode.frequency_hz == pytest.approx(120.0, rel=1e-4)
+    assert mode.frequency_std_hz == pytest.approx(0.5 * far / (2 * np.pi), rel=0.05)
 
 
 def test_what_the_polish_drives_away_and_the_frfs_do_not_show_is_no_mode(

@@ -144,9 +144,7 @@ def align(hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float,
     keys, spectra = spectra_of_hits(hits, frfs, settings, windows)
     rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
     omega = 2 * np.pi * frfs.frequency_hz
-    found = [
-        peak_poles(w, frf, omega[w.lines], rest_s) for w, frf in zip(windows, spectra, strict=True)
-    ]
+    found = [peak_poles(w, frf, omega[w.lines], rest_s) for w, frf in zip(windows, spectra, strict=True)]
     if len(keys) == 1:
         one = [
             change_in_decay(w, frf[0], complex(p.poles[0]), omega[w.lines], rest_s)
