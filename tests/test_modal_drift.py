@@ -14,7 +14,10 @@ from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.warp import WarpedTransform
 from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import HitSamples, cut_hit
+from ema_pipeline.modal.drift.align import _movements
+from ema_pipeline.modal.drift.local import PeakPoles, change_in_decay, peak_poles
 from ema_pipeline.modal.drift.shifts import movement
+from ema_pipeline.modal.drift.windows import HitKey, PeakWindow
 from ema_pipeline.modal.earned import has_peak
 from ema_pipeline.modal.fit import Estimate
 from ema_pipeline.modal.identify import identify
@@ -121,6 +124,27 @@ def test_modes_that_soften_say_so_and_are_not_split() -> None:
         assert abs(mode.frequency_hz - f) < 3 * mode.frequency_std_hz
 
 
+def test_the_pole_of_a_peak_is_told_at_the_mean_drift_of_all_hits() -> None:
+    """One hit that shows the peak ten times as strongly as the others does not bring its own drift with it."""
+    poles = 2 * np.pi * np.array([complex(-0.3, 50.0), complex(-0.4, 80.0)])
+    drift = np.array([2e-3, -1e-3, 0.0, 1e-3, -1e-3, -1e-3])  # 0 on average
+    strength = np.array([10.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+    weight = strength**2 / np.sum(strength**2)
+    peaks = [
+        PeakPoles(
+            pole * (1 + weight @ drift),
+            pole * (1 + drift),
+            np.full(6, 1e-4),
+            strength[:, None] * np.ones((1, 3)),
+        )
+        for pole in poles
+    ]
+    keys = tuple(HitKey(f"{k}.h5", 0, f"p{k}.z", 100.0) for k in range(6))
+    found = _movements(peaks, keys)[1]
+    assert [p.frequency_hz for p in found] == pytest.approx(np.abs(poles) / (2 * np.pi), rel=1e-4)
+    assert [p.hits for p in found] == pytest.approx([1.1, 1.1], abs=0.05)
+
+
 def test_hits_that_do_not_move_are_left_as_they_are() -> None:
     found = identified(SYSTEM, 3, [0, 3])
     assert not found.alignment.aligned
@@ -177,3 +201,36 @@ def test_a_plain_peak_without_a_mode_is_named() -> None:
     (named,) = left_out([], peak, modes, 0.0)
     assert named.frequency_hz == pytest.approx(500 / (2 * np.pi), rel=1e-3)
     assert "has no mode" in sentences((named,))[0]
+
+
+@pytest.mark.parametrize("change_hz", [0.0, 0.05, -0.05])
+def test_one_hit_tells_what_a_frequency_does_within_its_decay(change_hz: float) -> None:
+    """An independent record: the phase is the integral of 2π·(f + change·exp(−2σt))."""
+    rate, n, f, sigma = 512.0, 4096, 60.0, 1.2
+    t = np.arange(n) / rate
+    phase = 2 * np.pi * (f * t + change_hz * (1 - np.exp(-2 * sigma * t)) / (2 * sigma))
+    clean = np.exp(-sigma * t) * np.sin(phase)
+    rng = np.random.default_rng(4)
+    records = np.array([1.0, -0.4, 0.7])[:, None] * clean + 1e-3 * rng.standard_normal((3, n))
+    lines = slice(round((f - 3) * n / rate), round((f + 3) * n / rate))
+    frf = np.fft.rfft(records)[:, lines] / rate
+    omega = 2 * np.pi * np.arange(n // 2 + 1)[lines] * rate / n
+    window = PeakWindow(lines, 0j, np.zeros(0, complex), np.arange(3))
+    peak = peak_poles(replace(window, pole=complex(-sigma, 2 * np.pi * f)), frf[None], omega, n / rate)
+    assert peak is not None
+    found = change_in_decay(window, frf, complex(peak.poles[0]), omega, n / rate)
+    assert found is not None
+    assert found.change / (2 * np.pi) == pytest.approx(
+        change_hz, abs=0.2 * abs(change_hz) + 4 * found.std / 6.3
+    )
+    assert found.std / (2 * np.pi) < 0.003
+
+
+def test_the_interval_of_one_hit_holds_what_it_cannot_show() -> None:
+    found = identified(SYSTEM, 1, [0])
+    assert found.alignment.n_hits == 1
+    assert any("one hit cannot show" in note for note in found.modal.notes)
+    for mode in found.modal.modes:
+        assert mode.frequency_std_hz == pytest.approx(1e-3 * mode.frequency_hz, rel=0.1)
+    several = identified(SYSTEM, 2, [0])
+    assert not any("one hit cannot show" in note for note in several.modal.notes)

@@ -26,9 +26,10 @@ from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import cut_hit
 from ema_pipeline.modal import segment
-from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.data import FitData, arrange
 from ema_pipeline.modal.fit import Estimate
 from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.peaks import KnownPeaks
 from ema_pipeline.modal.polish import polish
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel
@@ -291,6 +292,26 @@ def test_a_mode_that_the_polish_drives_away_is_kept_as_it_was_with_a_flag_and_a_
     assert abs(kept.damping_ratio - 0.008) < 3 * kept.damping_std
 
 
+def test_the_interval_of_a_mode_held_at_its_peak_holds_half_the_way_that_the_fit_would_have_gone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pole = FIVE.poles[2]
+    far = -2 * pole.real  # rad/s
+
+    def straying(data, weight, start, iterations, held):
+        estimate, solution = polish(data, weight, start, iterations, held)
+        gone = (np.abs(estimate.poles.imag / (2 * np.pi) - 120.0) < 1.0) & ~held
+        return Estimate(np.where(gone, pole + 1j * far, estimate.poles), estimate.participation), solution
+
+    monkeypatch.setattr(segment, "polish", straying)
+    peak = KnownPeaks(np.array([pole]), np.array([far]), np.array([[0.01, 0.01]]))
+    frfs = hammer_test(FIVE, list(range(8)), [0, 3])
+    mode = identify(frfs, ModalSettings(), peaks=peak).modes[2]
+    assert any("single hits show it" in flag for flag in mode.flags)
+    assert mode.frequency_hz == pytest.approx(120.0, rel=1e-4)
+    assert mode.frequency_std_hz == pytest.approx(0.5 * far / (2 * np.pi), rel=0.05)
+
+
 def test_what_the_polish_drives_away_and_the_frfs_do_not_show_is_no_mode(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -309,6 +330,17 @@ def test_what_the_polish_drives_away_and_the_frfs_do_not_show_is_no_mode(
 
     monkeypatch.setattr(segment, "polish", failing)
     assert identify(frfs, ModalSettings(low_hz=200, high_hz=290)).modes == ()
+
+
+def test_a_held_pole_stays_where_it_is_to_the_last_bit() -> None:
+    frfs = hammer_test(FIVE, list(range(8)), [0, 3])
+    data = arrange(frfs, (20.0, 390.0))
+    off = FIVE.poles * (1 + 3e-4j * np.arange(5))
+    start = Estimate(off, FIVE.shapes[:, [0, 3]].astype(complex))
+    held = np.array([False, True, False, True, False])
+    found, _ = polish(data, np.ones(data.frf.shape), start, held=held)
+    np.testing.assert_array_equal(found.poles[held], off[held])
+    assert np.all(found.poles[~held] != off[~held])
 
 
 def test_without_polish_the_uncertainty_holds_the_bias_of_the_engine() -> None:

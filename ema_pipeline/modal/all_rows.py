@@ -105,4 +105,5 @@ def linear_fit(window: Window, estimate: Estimate) -> tuple[FitData, SegmentFit]
         shapes = best_shapes(data, weight, estimate)
         noise = measured_noise(data, local.hits, estimate, shapes, weight)
     solution = solve_linear(data, noise.weight(data.measured), estimate)
-    return data, SegmentFit(estimate, solution, noise, np.zeros(len(estimate.poles), dtype=bool))
+    nowhere = np.zeros(len(estimate.poles))
+    return data, SegmentFit(estimate, solution, noise, nowhere.astype(bool), nowhere.astype(complex))

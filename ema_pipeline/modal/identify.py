@@ -155,7 +155,10 @@ def _model(
     estimate = Estimate(modes.poles, modes.participation)
     anchored = modes.held & np.isin(modes.poles, peaks.poles)
     at_peak = modes.held & np.isin(modes.poles, plain.poles)
-    pole_cov = np.where(anchored[:, None, None], _scatter_at(peaks, modes.poles), modes.pole_cov)
+    # the fit of all hits is a second estimate: as where estimates are pooled, half the way to it is in the interval
+    away = 0.5 * np.stack([modes.away.real, modes.away.imag], axis=-1)
+    at_peaks = _scatter_at(peaks, modes.poles) + away[:, :, None] * away[:, None, :]
+    pole_cov = np.where(anchored[:, None, None], at_peaks, modes.pole_cov)
     pole_cov = np.where(at_peak[:, None, None], _scatter_at(plain, modes.poles), pole_cov)
     order = np.argsort(np.abs(modes.poles))
     rows, references = frfs.outputs, frfs.inputs

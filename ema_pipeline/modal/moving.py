@@ -35,6 +35,9 @@ COVERED = 0.95
 FEWEST_HITS = 6
 """Hits without which a trend with the force is not looked for."""
 
+SURE = 3.0
+"""Standard deviations from which a change within the decay is believed."""
+
 WORTH_SAYING = 0.5
 """A mode is flagged for its movement where that makes up so much of its standard deviation."""
 
@@ -93,7 +96,44 @@ def identify_hits(
     release_memory()
     asked = wanted(included, frfs.response_decay_rad_s)
     modal = identify(frfs, settings, progress, alignment.known_peaks(), asked)
+    if alignment.n_hits == 1:
+        modal = of_one_hit(modal, alignment, frfs.response_decay_rad_s, settings.repeatability)
     return HitModes(with_movement(modal, alignment, frfs.response_decay_rad_s), frfs, alignment)
+
+
+def of_one_hit(
+    modal: ModalModel, alignment: Alignment, decay_rad_s: float, repeatability: float
+) -> ModalModel:
+    """The modes of one hit with intervals that hold what it cannot show, and what frequencies do within the decay.
+
+    Parameters
+    ----------
+    modal : ModalModel
+    alignment : Alignment
+    decay_rad_s : float
+        Decay of the exponential window, which the peaks still hold.
+    repeatability : float
+        Relative standard deviation of frequencies from hit to hit.
+    """
+    modes = []
+    for mode in modal.modes:
+        seen = mode.pole - decay_rad_s
+        near = [c for c in alignment.changes if abs(c.pole - seen) < -seen.real]
+        change = min(near, key=lambda c: abs(c.pole - seen), default=None)
+        moved, flags = 0.0, mode.flags
+        if change is not None and abs(change.change) > max(SURE * change.std, NOTICED * -seen.real):
+            # as for modes that move with the force: no one frequency holds
+            moved = 0.5 * abs(change.change) / (2 * np.pi)
+            way = "falls" if change.change > 0 else "rises"
+            share = 100 * abs(change.change) / abs(seen)
+            flags = (*flags, f"moves within the decay: {way} by {share:.2g} % as it gets weaker")
+        std = float(np.sqrt(mode.frequency_std_hz**2 + (repeatability * mode.frequency_hz) ** 2 + moved**2))
+        modes.append(replace(mode, frequency_std_hz=std, flags=flags))
+    note = (
+        f"one hit cannot show how frequencies differ from hit to hit: {100 * repeatability:.2g} % (1 sigma) is taken, "
+        "modal.identify.repeatability"
+    )
+    return replace(modal, modes=tuple(modes), notes=(*modal.notes, *([note] if repeatability else [])))
 
 
 def with_movement(modal: ModalModel, alignment: Alignment, decay_rad_s: float = 0.0) -> ModalModel:
@@ -118,7 +158,9 @@ def _moving(mode: Mode, alignment: Alignment, decay_rad_s: float) -> Mode:
     n = alignment.n_hits
     common = alignment.common_spread
     own = peak.own_spread if peak is not None and peak.single else 0.0
-    mean_std = float(np.hypot(common, own)) * _of_few(n) / np.sqrt(n)
+    # drift was taken off each hit, so that all count alike; its own movement a mode shows in strong hits above all
+    of_own = own / np.sqrt(peak.hits) if peak is not None else 0.0
+    mean_std = float(np.hypot(common / np.sqrt(n), of_own)) * _of_few(n)
     trend = _with_force(peak) if peak is not None and own > 0 else 0.0
     if trend:
         # a mode that moves with the force has no one frequency: the interval holds what it moves by

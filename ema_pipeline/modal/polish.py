@@ -76,8 +76,8 @@ def descend(
     damping = 1e-3
     for _ in range(iterations):
         step = slope(estimate, solution)
-        if held is not None:
-            step = _without(step, estimate, held)
+        fixed = _fixed(estimate, held)
+        step = _without(step, fixed)
         diagonal = np.diag(step.information).copy()
         diagonal = np.where(diagonal > 0, diagonal, 1.0)
         scale = 1 / np.sqrt(diagonal)
@@ -88,7 +88,8 @@ def descend(
             scaled[np.diag_indices_from(scaled)] += damping
             try:
                 change = scale * np.linalg.lstsq(scaled, scale * step.gradient, rcond=1e-13)[0]
-                change = _limited(estimate, change)
+                # rounding must not move what is held: it is recognised by its exact pole
+                change = np.where(fixed, 0.0, _limited(estimate, change))
                 trial = moved(estimate, change)
                 trial_solution = solve(trial)
             except np.linalg.LinAlgError:  # a step too far: a shorter one may do
@@ -138,10 +139,16 @@ def polish(
     return descend(start, partial(solve_linear, data, weight), newton_step, iterations, held)
 
 
-def _without(step: Step, estimate: Estimate, held: NDArray[np.bool_]) -> Step:
-    """Normal equations in which the parameters of some modes do not move."""
+def _fixed(estimate: Estimate, held: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """The parameters of the modes that are held, (n_parameters,)."""
+    if held is None:
+        held = np.zeros(len(estimate.poles), dtype=bool)
     modes = [r for r, _ in free_participations(estimate)]
-    fixed = np.repeat(np.concatenate([held, held[modes]]), 2)
+    return np.repeat(np.concatenate([held, held[modes]]), 2)
+
+
+def _without(step: Step, fixed: NDArray[np.bool_]) -> Step:
+    """Normal equations in which some parameters do not move."""
     information, gradient = step.information.copy(), np.where(fixed, 0.0, step.gradient)
     information[fixed] = information[:, fixed] = 0.0
     return Step(information, gradient)

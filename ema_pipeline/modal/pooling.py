@@ -86,7 +86,7 @@ def _weighed(mode: Mode, peak: PeakMovement | None, record_s: float, decay_rad_s
         dampings.append(Witness("circles", circle.damping_ratio, circle.damping_std))
     if peak is not None and ANCHORED not in mode.flags:
         pole = peak.pole + decay_rad_s
-        few = float(np.sqrt(max(int(np.count_nonzero(np.isfinite(peak.shift))), 1)))
+        few = float(np.sqrt(peak.hits))
         frequencies.append(
             Witness("single hits", abs(pole) / (2 * np.pi), peak.spread[1] / (2 * np.pi * few))
         )

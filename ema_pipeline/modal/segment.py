@@ -44,12 +44,15 @@ class SegmentFit:
     noise : Noise
     held : ndarray of bool, (n_modes,)
         Modes that the polish would have driven away: they stay where they were before it.
+    away : complex ndarray, (n_modes,)
+        How far the polish would have driven the poles that stay at their peaks, rad/s; 0 for all others.
     """
 
     estimate: Estimate
     solution: LinearSolution
     noise: Noise
     held: NDArray[np.bool_]
+    away: Complex
 
 
 Judge = Callable[[FitData, SegmentFit], NDArray[np.bool_]]
@@ -96,6 +99,7 @@ def fit_segment(
     estimate = Estimate(candidates.poles, normalised(candidates.participation))
     noise = start
     held = np.zeros(len(estimate.poles), dtype=bool) if placed is None else placed
+    away = np.zeros(len(estimate.poles), dtype=np.complex128)
     budget = min(iterations, ROUGH)
     while True:
         weight = noise.weight(data.measured)
@@ -104,6 +108,7 @@ def fit_segment(
         strayed, places = peaks.strayed(before, estimate)
         if (strayed & ~held).any():
             strayed &= ~held
+            away = np.where(strayed, estimate.poles - places, away)
             before = Estimate(np.where(strayed, places, before.poles), before.participation)
             estimate, held = put_back(estimate, before, strayed), held | strayed
             continue
@@ -117,10 +122,11 @@ def fit_segment(
         noise = measured_noise(data, hits, estimate, solution.shapes, weight)
         del weight  # as large as half the data
         solution = solve_linear(data, noise.weight(data.measured), estimate)
-        fit = SegmentFit(estimate, solution, noise, held)
+        fit = SegmentFit(estimate, solution, noise, held, away)
         drop = judge(data, fit) if len(estimate.poles) else np.zeros(0, dtype=bool)
         if drop.any():
-            estimate, held, budget = estimate.take(~drop), held[~drop], min(iterations, ROUGH)
+            estimate, held, away = estimate.take(~drop), held[~drop], away[~drop]
+            budget = min(iterations, ROUGH)
         elif budget == iterations or not len(estimate.poles):
             return fit
         else:  # all stand: converge and judge once more

@@ -90,6 +90,8 @@ class FittedModes:
     participation, participation_stds : (n_modes, n_references)
     held : ndarray of bool, (n_modes,)
         True where the polish has found no place for a mode: its pole is the one that the model orders give.
+    away : complex ndarray, (n_modes,)
+        How far the polish would have driven the poles that stay at their peaks, rad/s.
     restless : ndarray of bool, (n_modes,)
         True where the fit has not come to rest.
     """
@@ -101,6 +103,7 @@ class FittedModes:
     participation: Complex
     participation_stds: Real
     held: NDArray[np.bool_]
+    away: Complex
     restless: NDArray[np.bool_]
 
 
@@ -217,6 +220,7 @@ def refined(
         np.zeros((0, n_ref), complex),
         np.zeros((0, n_ref)),
         np.zeros(0, dtype=bool),
+        np.zeros(0, complex),
         np.zeros(0, dtype=bool),
     )
     return FittedModes(
@@ -349,6 +353,7 @@ class _Polished:
     ----------
     estimate : Estimate
     held : ndarray of bool, (n_modes,)
+    away : complex ndarray, (n_modes,)
     step : Step
         That the fit would still take.
     covariance : ndarray, (n_parameters, n_parameters), or None
@@ -357,13 +362,14 @@ class _Polished:
 
     estimate: Estimate
     held: NDArray[np.bool_]
+    away: Complex
     step: Step
     covariance: Real | None
 
 
 def _polished(few: FitData, fit: SegmentFit) -> _Polished:
     covariance = None if few.transposed else _covariance(few, fit)
-    return _Polished(fit.estimate, fit.held, newton_step(fit.estimate, fit.solution), covariance)
+    return _Polished(fit.estimate, fit.held, fit.away, newton_step(fit.estimate, fit.solution), covariance)
 
 
 def _covariance(data: FitData, fit: SegmentFit) -> Real:
@@ -378,7 +384,7 @@ def _of_these_rows(data: FitData, fit: SegmentFit, part: SubBand) -> FittedModes
     scatter = scatter_over_points(*scores_of_points(data.transposed, fit.estimate, fit.solution))
     parameters = _widened(_covariance(data, fit), scatter)
     shapes = _shapes_and_stds(data, fit, parameters)
-    return _core(part, fit.estimate, fit.held, (step, step), parameters, shapes)
+    return _core(part, fit.estimate, (fit.held, fit.away), (step, step), parameters, shapes)
 
 
 def _of_all_rows(window: Window, fit: _Polished, part: SubBand, iterations: int) -> FittedModes:
@@ -409,18 +415,23 @@ def _of_all_rows(window: Window, fit: _Polished, part: SubBand, iterations: int)
         scatter = scatter_over_points(np.sum(scores, axis=0), np.sum(parts, axis=0))
         parameters = _widened(first, scatter)
     shapes, stds = (np.concatenate(x) for x in zip(*some, strict=True))
-    return _core(part, estimate, held, (fit.step, step), parameters, (shapes, stds))
+    return _core(part, estimate, (held, fit.away), (fit.step, step), parameters, (shapes, stds))
 
 
 def _core(
     part: SubBand,
     estimate: Estimate,
-    held: NDArray[np.bool_],
+    kept: tuple[NDArray[np.bool_], Complex],
     steps: tuple[Step, Step],
     parameters: Real,
     shapes: tuple[Complex, Real],
 ) -> FittedModes:
-    """The modes of a sub-band's core; steps are those that the fit and all rows would still take."""
+    """The modes of a sub-band's core.
+
+    `kept` tells modes that are held, and how far the polish would have driven them; `steps` are those that the fit
+    and all rows would still take.
+    """
+    held, away = kept
     core = np.flatnonzero(between(estimate.poles, part.low, part.high))
     pole_cov = np.array([parameters[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] for r in core]).reshape(-1, 2, 2)
     m = len(estimate.poles)
@@ -436,6 +447,7 @@ def _core(
         participation=estimate.participation[core],
         participation_stds=_participation_stds(estimate, parameters)[core],
         held=held[core],
+        away=away[core],
         restless=far > AT_REST,
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from ema_pipeline.frf.estimate import Shifts
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import HitSamples
-from ema_pipeline.modal.drift.local import PeakPoles, peak_poles
+from ema_pipeline.modal.drift.local import DecayChange, PeakPoles, change_in_decay, peak_poles
 from ema_pipeline.modal.drift.shifts import Movement, movement
 from ema_pipeline.modal.drift.windows import HitKey, Hits, peak_windows, spectra_of_hits
 from ema_pipeline.modal.peaks import KnownPeaks
@@ -47,7 +47,10 @@ class PeakMovement:
     frequency_hz, damping_ratio : float
         That all hits share, as the FRFs show them.
     pole : complex
-        That fits all hits best, rad/s, as the FRFs show it: hits that show the peak best count most.
+        That fits all hits best, rad/s, as the FRFs show it: hits that show the peak best count most. What all modes
+        share is taken off.
+    hits : float
+        Number of hits that would tell the pole as well if all showed it alike.
     spread : ndarray, (2,)
         Standard deviations of decay and frequency over hits, rad/s, what all modes share taken off.
     single : bool
@@ -70,6 +73,7 @@ class PeakMovement:
     frequency_hz: float
     damping_ratio: float
     pole: complex
+    hits: float
     spread: Real
     single: bool
     proven: bool
@@ -92,12 +96,15 @@ class Alignment:
     peaks : tuple of PeakMovement
     shifts : callable or None
         With which FRFs are estimated at common frequencies; None where nothing moves enough to be noticed.
+    changes : tuple of DecayChange
+        What peaks do within the decay after one hit, where there is but one.
     """
 
     common_spread: float
     n_hits: int
     peaks: tuple[PeakMovement, ...]
     shifts: Shifts | None = None
+    changes: tuple[DecayChange, ...] = ()
 
     @property
     def aligned(self) -> bool:
@@ -130,16 +137,21 @@ def align(hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float,
     band_hz : tuple of float
         Band in which peaks are looked at.
     """
-    nothing = Alignment(0.0, int(frfs.hits.max(initial=0)), ())
+    nothing = Alignment(0.0, int(frfs.hits.max(axis=0, initial=0).sum()), ())
     windows = peak_windows(frfs, band_hz)
     if not windows:
         return nothing
     keys, spectra = spectra_of_hits(hits, frfs, settings, windows)
     rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
-    found = [
-        peak_poles(w, frf, 2 * np.pi * frfs.frequency_hz[w.lines], rest_s)
-        for w, frf in zip(windows, spectra, strict=True)
-    ]
+    omega = 2 * np.pi * frfs.frequency_hz
+    found = [peak_poles(w, frf, omega[w.lines], rest_s) for w, frf in zip(windows, spectra, strict=True)]
+    if len(keys) == 1:
+        one = [
+            change_in_decay(w, frf[0], complex(p.poles[0]), omega[w.lines], rest_s)
+            for w, frf, p in zip(windows, spectra, found, strict=True)
+            if p is not None and np.isfinite(p.std[0])
+        ]
+        return replace(nothing, changes=tuple(change for change in one if change is not None))
     peaks = [p for p in found if p is not None and 2 * np.isfinite(p.std).sum() >= len(keys)]
     if len(keys) < FEWEST_HITS or not peaks:
         return nothing
@@ -164,12 +176,19 @@ def _movements(peaks: list[PeakPoles], keys: tuple[HitKey, ...]) -> tuple[Moveme
     place = np.array([points.index(k.point) for k in keys])
     typical = np.array([np.median(s[np.isfinite(e)]) for s, e in zip(size.T, std.T, strict=True)])
     moved = movement(shift, std, size / np.maximum(typical, 1e-300), place)
+    # the hits that show a peak best have a drift of their own on average: poles are told at the mean drift of all hits
+    power = np.where(np.isfinite(std), size**2, 0.0)
+    drift = power.T @ moved.common / np.maximum(power.sum(axis=0), 1e-300)
+    peaks = [replace(p, pole=p.pole * (1 - d)) for p, d in zip(peaks, drift, strict=True)]
+    moved = replace(moved, mean=moved.mean + drift)
+    hits = power.sum(axis=0) ** 2 / np.maximum((power**2).sum(axis=0), 1e-300)
     force = np.array([k.force for k in keys])
     looked_at = tuple(
         PeakMovement(
             frequency_hz=abs(p.pole) / (2 * np.pi),
             damping_ratio=-p.pole.real / abs(p.pole),
             pole=p.pole,
+            hits=float(hits[c]),
             spread=_spread(p, float(moved.own_spread[c])),
             single=_is_single(p, one_point=len(points) == 1),
             proven=len(points) > 1 and _is_single(p, one_point=False),

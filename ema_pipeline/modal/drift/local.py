@@ -38,6 +38,9 @@ EXPLAINED = 0.9
 FOLLOWED = 0.7
 """The same for a peak that is followed from hit to hit: noise makes peaks that a pole explains worse."""
 
+FEWEST_LEFT = 6
+"""Lines beyond the unknowns without which nothing is said of what a peak does within a decay."""
+
 MAX_DAMPING = 0.2
 """A pole with more is no peak."""
 
@@ -62,6 +65,25 @@ class PeakPoles:
     poles: Complex
     std: Real
     residues: Complex
+
+
+@dataclass(frozen=True)
+class DecayChange:
+    """What the frequency of one peak does within a decay.
+
+    Attributes
+    ----------
+    pole : complex
+        rad/s.
+    change : float
+        Frequency at the start of the decay over that at its end, rad/s.
+    std : float
+        From noise.
+    """
+
+    pole: complex
+    change: float
+    std: float
 
 
 @dataclass(frozen=True)
@@ -99,6 +121,46 @@ def peak_poles(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> 
     for h in range(n_hits):
         poles[h], std[h], residues[h] = _own_pole(window, data[h], weight[h], pole, omega, rest_s)
     return PeakPoles(pole, poles, std, residues)
+
+
+def change_in_decay(
+    window: PeakWindow, frf: Complex, pole: complex, omega: Real, rest_s: float
+) -> DecayChange | None:
+    """Change of a peak's frequency within the decay after one hit; None where the lines are too few to tell.
+
+    Where frequency depends on the square of the amplitude, as that of a cubic spring does, it settles as exp(−2σt). To
+    first order the decay then is exp(st)·(1 + c·exp(−2σt)) at every sensor: a second pole, which decays three times as
+    fast at the same frequency, has one share c in all residues. The frequency starts 2σ·Im c below where it ends.
+
+    Parameters
+    ----------
+    window : PeakWindow
+    frf : complex ndarray, (n_outputs, n_lines)
+        Accelerance of the hit on the lines of the window; NaN where not measured.
+    pole : complex
+        Of the peak in this hit, rad/s.
+    omega : ndarray, (n_lines,)
+    rest_s : float
+        Time from hit to end of the record.
+    """
+    data = frf[np.isfinite(frf).all(axis=-1)]
+    fit = _linear_fit(pole, window.neighbours, data, omega, rest_s)
+    if fit is None or len(omega) < fit.free + FEWEST_LEFT:
+        return None
+    noise = np.maximum(np.mean(np.abs(fit.left) ** 2, axis=1), 1e-300)
+    weight = fit.residues.conj() / noise
+    # all sensors share c, and the force's noise: they are one curve
+    curve = weight @ fit.left / float(np.sum(np.abs(fit.residues) ** 2 / noise))
+    fast = pole_functions(omega, np.array([complex(3 * pole.real, pole.imag)]), rest_s)[0]
+    columns = np.stack([_across(fast, pole, window.neighbours, omega, rest_s)[0], fit.derivative], axis=1)
+    shares, _, rank, _ = np.linalg.lstsq(columns, curve, rcond=None)
+    if rank < 2:
+        return None
+    left = curve - columns @ shares
+    power = float(np.sum(np.abs(left) ** 2)) / (len(omega) - fit.free - 2)
+    spread = np.sqrt(0.5 * power * np.linalg.inv(columns.conj().T @ columns)[0, 0].real)
+    twice = -2 * pole.real
+    return DecayChange(pole, float(-twice * shares[0].imag), float(twice * spread))
 
 
 def plain_pole(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> complex | None:
@@ -177,11 +239,9 @@ def _own_pole(
 def _linear_fit(pole: complex, others: Complex, data: Complex, omega: Real, rest_s: float) -> _Fit | None:
     """Residues of a pole, its neighbours, and a straight background that fit best, FRF by FRF."""
     u, derivative = pole_functions(omega, np.concatenate([[pole], others]), rest_s)
-    line = np.linspace(-1, 1, len(omega))
-    columns = np.concatenate([u, np.ones((1, len(omega))), line[None]])
+    columns = _columns(u)
     if len(columns) + 2 > len(omega):
         return None
-    columns = columns / np.linalg.norm(columns, axis=1, keepdims=True)
     size = float(np.linalg.norm(u[0]))
     basis, triangle = np.linalg.qr(columns.T)
     inside = data @ basis.conj()
@@ -189,6 +249,20 @@ def _linear_fit(pole: complex, others: Complex, data: Complex, omega: Real, rest
     left = data - inside @ basis.T
     across = derivative[0] - basis @ (basis.conj().T @ derivative[0])
     return _Fit(solved[0] / size, left, across, len(columns))
+
+
+def _columns(u: Complex) -> Complex:
+    """Functions of poles and a straight background, each of norm 1."""
+    n = u.shape[1]
+    columns = np.concatenate([u, np.ones((1, n)), np.linspace(-1, 1, n)[None]])
+    return np.asarray(columns / np.linalg.norm(columns, axis=1, keepdims=True))
+
+
+def _across(values: Complex, pole: complex, others: Complex, omega: Real, rest_s: float) -> Complex:
+    """What poles and background cannot follow of some curves, (n_curves, n_lines)."""
+    u = pole_functions(omega, np.concatenate([[pole], others]), rest_s)[0]
+    basis = np.linalg.qr(_columns(u).T)[0]
+    return np.asarray(values - (values @ basis.conj()) @ basis.T)
 
 
 def _noise_of_outputs(fit: _Fit, known: NDArray[np.bool_]) -> Real:
