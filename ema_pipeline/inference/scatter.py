@@ -119,9 +119,9 @@ def learn(
         Most rounds of learning, and most steps of the fit after each.
     """
     found = replace(found, scatter_cost=_cost(found, scatters))
-    for _ in range(
-        rounds if np.isfinite(found.cost) else 0
-    ):  # nothing is learned of a model without an answer
+    if not np.isfinite(found.cost):  # nothing is learned of a model without an answer
+        return found
+    for _ in range(rounds):
         further = _further(problem, found, _learned(found, scatters), scatters, steps)
         if further is None:
             break
@@ -180,9 +180,8 @@ def _learned(found: Posterior, scatters: Mapping[str, Scatter]) -> dict[str, flo
             learned[name] = _best(of_unknowns, learned, scatter)
         elif name in found.residuals.share:
             best = _best(of_residuals, learned, scatter)
-            learned[name] = min(
-                best * (best / learned[name]) ** (_FURTHER - 1), scatter.most * scatter.default
-            )
+            further = best * min(best / learned[name], 1.0) ** (_FURTHER - 1)
+            learned[name] = max(further, scatter.least * scatter.default)
         else:
             learned[name] = scatter.default
     return learned
