@@ -130,9 +130,8 @@ def of_one_shape(base: Fit, mended: Fit, settings: DiagnoseSettings) -> str:
     costs = [tails.cost(*fit.posterior.residuals.blocks) for fit in (base, mended)]
     if len(costs[0]) != len(costs[1]):  # other modes have partners
         return ""
-    evidence = [
-        fit.log_evidence + fit.posterior.scatter_cost for fit in (base, mended)
-    ]  # at the same scatters
+    # at the same scatters, whose cost is no difference
+    evidence = [fit.log_evidence + fit.posterior.scatter_cost for fit in (base, mended)]
     left = evidence[1] - evidence[0] - float(np.max(costs[0] - costs[1], initial=0.0))
     if left < settings.claim:
         return f"without the shape of one mode the log evidence that it gains is {left:.1f}, below {settings.claim:g}"

@@ -86,15 +86,16 @@ class Posterior:
         count = len(self.residuals.values) - self.residuals.projected
         return float(np.sqrt(squares / max(count, 1)))
 
-    def expected_squares(self, rows: NDArray[np.bool_] | slice = slice(None)) -> NDArray[np.float64]:
-        """Expected squares of the weighted residuals while the unknowns are as uncertain as they are, (m,).
+    def expected_squares(self, weighted: bool = True) -> NDArray[np.float64]:
+        """Expected squares of the residuals while the unknowns are as uncertain as they are, (m,).
 
         Parameters
         ----------
-        rows : ndarray of bool or slice, optional
-            Residuals that are asked for.
+        weighted : bool
+            True for residuals as least squares take them.
         """
-        values, jacobian = (a[rows] for a in self.residuals.weighted)
+        r = self.residuals
+        values, jacobian = r.weighted if weighted else (r.values, r.jacobian)
         return np.asarray(values**2 + np.einsum("ij,ij->i", jacobian @ self.covariance, jacobian))
 
     def of_sums(

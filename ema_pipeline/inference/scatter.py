@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 import scipy.optimize
-from numpy.typing import NDArray
 
 from ema_pipeline.inference import tails
 from ema_pipeline.inference.maximise import descend
@@ -52,9 +51,6 @@ class Scatter:
         return max(self.wide, self.default) if self.spread else self.default
 
 
-Descend = Callable[[Problem, Mapping[str, float], NDArray[np.float64]], Posterior]
-
-
 class LinearEvidence:
     """Log evidence as a function of the scatters of unknowns, the residuals being linear about a maximum.
 
@@ -86,9 +82,8 @@ class ExpectedDensity:
     """
 
     def __init__(self, found: Posterior) -> None:
-        r = found.residuals
-        self.scatters, self.share, self.block = found.scatters, r.share, r.block
-        self.squares = r.values**2 + np.einsum("ij,ij->i", r.jacobian @ found.covariance, r.jacobian)
+        self.scatters, self.share, self.block = found.scatters, found.residuals.share, found.residuals.block
+        self.squares = found.expected_squares(weighted=False)
 
     def at(self, scatters: Mapping[str, float]) -> float:
         """Log density with some scatters at other values; less a constant."""

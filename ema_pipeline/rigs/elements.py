@@ -230,28 +230,27 @@ def _build(file: ElementRigFile, configuration: str, values: Mapping[str, float]
         section = str(where[0])
         numbers[section] += 1
         element = _element(section, numbers[section], entry, _row(entry, sensors, where), values, sensors)
-        if isinstance(element, Mass) and bodies[_body(entry)] > 1:
-            element = replace(element, part=f"{_body(entry)[0]} mass")
+        if isinstance(element, Mass) and (body := _body(entry)) and bodies[body] > 1:
+            element = replace(element, part=f"{body[0]} mass")
         elements.append(element)
         if isinstance(element, Mass):
             dofs |= dict.fromkeys(element.row)
     return Assembly(tuple(dofs), tuple(elements), sensors, values["modal_damping_ratio"])
 
 
-_Body = tuple[str, float | str | None]
+_Body = tuple[str, float | str]
 
 
-def _body(entry: ElementEntry) -> _Body:
-    """Body and value of a mass that moves along an axis; an empty name for any other."""
+def _body(entry: ElementEntry) -> _Body | None:
+    """Body and value of a mass that moves along an axis; None for any other."""
     body, _, direction = (entry.at or "").rpartition(".")
-    return (body, entry.value) if direction in ALONG else ("", None)
+    return (body, entry.value) if body and direction in ALONG else None
 
 
-def _bodies(file: ElementRigFile, configuration: str) -> Counter[_Body]:
+def _bodies(file: ElementRigFile, configuration: str) -> Counter[_Body | None]:
     """Number of directions in which a body has the same mass: one piece of hardware, off alike in all of them."""
-    masses = (e for where, e in file.entries() if where[0] == "masses" and file.present(e, configuration))
-    counted = Counter(_body(entry) for entry in masses)
-    return Counter({body: count for body, count in counted.items() if body[0]})
+    entries = (e for where, e in file.entries() if where[0] == "masses" and file.present(e, configuration))
+    return Counter(map(_body, entries))
 
 
 def _element(
