@@ -105,14 +105,18 @@ def test_what_is_hidden_in_a_chain_is_named_with_its_size(
     assert first.heldout_error_after < first.heldout_before
 
 
-@pytest.mark.parametrize(("wrong", "doubted"), [((1,), True), ((1, 2), False)])
-def test_no_effect_is_claimed_for_the_shape_of_one_mode_alone(wrong: tuple[int, ...], doubted: bool) -> None:
+@pytest.mark.parametrize(
+    ("wrong", "close", "doubted"), [((1,), (1, 2), True), ((1,), (2, 3), False), ((1, 2), (1, 2), False)]
+)
+def test_no_effect_is_claimed_for_the_shape_of_one_close_mode_alone(
+    wrong: tuple[int, ...], close: tuple[int, ...], doubted: bool
+) -> None:
     block = np.repeat(np.arange(4), 6)
 
     def fit(off: tuple[int, ...]) -> Fit:
         values = np.where(np.isin(block, off), 20.0, 0.5)
         unknowns = Unknowns.plain(("a",), 1.0)
-        residuals = Residuals(values, np.zeros((24, 1)), block=block)
+        residuals = Residuals(values, np.zeros((24, 1)), block=block, mixed=np.isin(block, close))
         return Fit(Model(), Posterior(unknowns, np.zeros(1), {}, residuals))
 
     doubt = of_one_shape(fit(wrong), fit(()), SETTINGS)

@@ -145,6 +145,26 @@ def test_the_pole_of_a_peak_is_told_at_the_mean_drift_of_all_hits() -> None:
     assert [p.hits for p in found] == pytest.approx([1.1, 1.1], abs=0.05)
 
 
+def test_a_peak_that_hits_on_one_point_hardly_show_stays_at_its_pole() -> None:
+    """Hits on the second point show the flank of another mode there, far off: no hit is moved for that."""
+    poles = 2 * np.pi * np.array([complex(-0.3, 50.0), complex(-0.4, 80.0), complex(-0.5, 120.0)])
+    common = np.array([-8e-4, 6e-4, -2e-4, -3e-4, 5e-4, 2e-4])
+    flank = np.array([2e-5, -1e-5, -1e-5, -9e-3, -6e-3, -7.5e-3])
+    peaks = []
+    for c, pole in enumerate(poles):
+        shift = common + (flank if c == 2 else 0.0)
+        strength = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0]) if c == 2 else np.ones(6)
+        std = np.where((strength < 10) & (c == 2), 1e-3, 1e-5) * pole.imag
+        mean = np.average(shift, weights=strength**2)
+        peaks.append(
+            PeakPoles(pole * (1 + mean), pole * (1 + shift), std, strength[:, None] * np.ones((1, 3)))
+        )
+    keys = tuple(HitKey(f"{k}.h5", 0, f"p{k // 3}.z", 100.0) for k in range(6))
+    moved, found = _movements(peaks, keys)
+    assert found[2].frequency_hz == pytest.approx(120.0, rel=2e-4)
+    assert np.abs(moved.own[:3, 2]).max() < 2e-4
+
+
 def test_hits_that_do_not_move_are_left_as_they_are() -> None:
     found = identified(SYSTEM, 3, [0, 3])
     assert not found.alignment.aligned

@@ -126,13 +126,17 @@ def _contradicted(base: Fit, mended: Fit, before: HeldOut, after: HeldOut) -> st
 
 
 def of_one_shape(base: Fit, mended: Fit, settings: DiagnoseSettings) -> str:
-    """A mode of a close pair may be identified with a wrong shape, which some effect or other explains."""
+    """A mode close to another may be identified with a wrong shape, which some effect or other explains."""
     costs = [tails.cost(*fit.posterior.residuals.blocks) for fit in (base, mended)]
     if len(costs[0]) != len(costs[1]):  # other modes have partners
         return ""
     # at the same scatters, whose cost is no difference
     evidence = [fit.log_evidence + fit.posterior.scatter_cost for fit in (base, mended)]
-    left = evidence[1] - evidence[0] - float(np.max(costs[0] - costs[1], initial=0.0))
+    mixed = base.posterior.residuals.mixed_blocks
+    left = evidence[1] - evidence[0] - float(np.max((costs[0] - costs[1])[mixed], initial=0.0))
     if left < settings.claim:
-        return f"without the shape of one mode the log evidence that it gains is {left:.1f}, below {settings.claim:g}"
+        return (
+            f"without the shape of one mode that is close to another the log evidence that it gains is {left:.1f}, "
+            f"below {settings.claim:g}"
+        )
     return ""

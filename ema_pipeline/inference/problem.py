@@ -38,6 +38,8 @@ class Residuals:
         σ over the σ that was measured or stated, in which errors count where data have one; 1 where left out.
     block : ndarray of int, (m,), optional
         Number of the block of values that may be wrong together, -1 for values on their own; see `tails`.
+    mixed : ndarray of bool, (m,), optional
+        True for values of shapes that identification may have mixed with another's.
     matching : object
         Whatever the problem wants to have back to evaluate the same assignment of data to model again.
     """
@@ -52,6 +54,7 @@ class Residuals:
     projected: int = 0
     relative: NDArray[np.float64] | None = None
     block: NDArray[np.int64] | None = None
+    mixed: NDArray[np.bool_] | None = None
 
     @property
     def stated(self) -> NDArray[np.float64]:
@@ -62,6 +65,13 @@ class Residuals:
     def blocks(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Sum of squares and number of values of every block, (n_blocks,)."""
         return in_blocks(self.values**2, self.block)
+
+    @property
+    def mixed_blocks(self) -> NDArray[np.bool_]:
+        """Mask of the blocks that hold `mixed` values, (n_blocks,)."""
+        if self.mixed is None:
+            return np.zeros(len(self.blocks[0]), bool)
+        return np.asarray(in_blocks(self.mixed.astype(float), self.block)[0] > 0)
 
     @cached_property
     def weight(self) -> NDArray[np.float64]:

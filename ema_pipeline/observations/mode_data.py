@@ -19,6 +19,8 @@ _WHIRLS = 0.05
 """Share of its imaginary part in the sum of squares of a shape, from which it is compared as a complex one: MPC 0.8."""
 _DOUBLE = 0.9
 """Share of a shape's squares that shapes of modes within a half-width explain, from which it is no mode of its own."""
+_CLOSE = 3.0
+"""Half-power bandwidths within which modes are close: further apart, one is below a sixth of its peak at another's."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,14 @@ class ModeData:
             left = own - others @ np.linalg.lstsq(others, own, rcond=None)[0]
             found[i] = left @ left < (1 - _DOUBLE) * (own @ own)
         return found
+
+    @cached_property
+    def close(self) -> NDArray[np.bool_]:
+        """Mask of modes close to another, whose shapes drift, noise and hits off their mark mix, (m,)."""
+        bandwidth = 2 * np.nan_to_num(np.exp(self.log_damping))
+        apart = np.abs(self.log_frequency[:, None] - self.log_frequency)
+        near = apart < _CLOSE * np.maximum(bandwidth[:, None], bandwidth)
+        return np.asarray(np.sum(near, axis=1) > 1)
 
     def shape_rows(self, modes: NDArray[np.int64]) -> int:
         """Number of values that the shapes of some modes are compared by: two per sensor of a whirling mode."""

@@ -71,6 +71,7 @@ def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
         unexplained=sum(p.unexplained for p in parts),
         projected=sum(p.projected for p in parts),
         block=_blocks(parts),
+        mixed=_mixed(parts),
     )
 
 
@@ -84,6 +85,12 @@ def _blocks(parts: Sequence[Residuals]) -> NDArray[np.int64] | None:
         numbered.append(np.where(block >= 0, block + count, -1))
         count += int(np.max(block, initial=-1)) + 1
     return np.concatenate(numbered)
+
+
+def _mixed(parts: Sequence[Residuals]) -> NDArray[np.bool_] | None:
+    if all(p.mixed is None for p in parts):
+        return None
+    return np.concatenate([np.zeros(len(p.values), bool) if p.mixed is None else p.mixed for p in parts])
 
 
 @dataclass(frozen=True)
@@ -106,6 +113,8 @@ class Rows:
         Measured mode that each belongs to.
     sensor : ndarray of int, (k,), optional
         Sensor that each belongs to, of shapes.
+    close : ndarray of bool, (k,), optional
+        True where the mode is close to another, of shapes.
     slope : ndarray, (k, n), optional
         Derivatives of the model's values by all unknowns.
     model : ndarray, (k,), optional
@@ -121,6 +130,7 @@ class Rows:
     heat: float
     mode: NDArray[np.int64]
     sensor: NDArray[np.int64] | None = None
+    close: NDArray[np.bool_] | None = None
     slope: NDArray[np.float64] | None = None
     model: NDArray[np.float64] | None = None
     noise: str = ""
@@ -167,7 +177,7 @@ def whitened(
     """Differences in units of their standard uncertainties, `n` unknowns."""
     total = sum(len(r) for r in found.rows)
     derivatives = all(r.slope is not None for r in found.rows)
-    values, block = np.empty(total), np.full(total, -1)
+    values, block, mixed = np.empty(total), np.full(total, -1), np.zeros(total, bool)
     share: dict[str, NDArray[np.float64]] = {}
     jacobian = np.zeros((total if derivatives else 0, n))
     log_scale, at, blocks = 0.0, 0, 0
@@ -186,6 +196,8 @@ def whitened(
             _, number = np.unique(r.mode, return_inverse=True)
             block[here] = number + blocks
             blocks += int(number.max()) + 1
+        if r.close is not None:
+            mixed[here] = r.close
         if derivatives and r.slope is not None:
             for name, part in ((r.scatter, added), (r.noise, own)):
                 if name:
@@ -203,6 +215,7 @@ def whitened(
         unexplained=found.unexplained,
         projected=found.projected,
         block=None if found.heated else block,  # far off everything is on the tail
+        mixed=mixed,
     )
 
 
@@ -412,8 +425,8 @@ class Comparison:
         difference = (y - scale[:, None] * p)[seen]
         mode, sensor = np.nonzero(seen)
         return Rows(
-            difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode], sensor, slope,
-            noise=SHAPE_NOISE,
+            difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode], sensor, d.close[on[mode]],
+            slope, noise=SHAPE_NOISE,
         )  # fmt: skip
 
     def _complex_shapes(
@@ -444,7 +457,7 @@ class Comparison:
         mode, sensor = np.nonzero(seen)
         return Rows(
             np.concatenate([left.real, left.imag]), np.tile(own[seen], 2), np.tile(unit[seen], 2), SHAPE,
-            1 + 0.1 * (self.heat - 1), np.tile(on[mode], 2), np.tile(sensor, 2), slope,
+            1 + 0.1 * (self.heat - 1), np.tile(on[mode], 2), np.tile(sensor, 2), np.tile(d.close[on[mode]], 2), slope,
         )  # fmt: skip
 
     def _unseen(self, solution: EigenSolution, to: NDArray[np.int64]) -> int:

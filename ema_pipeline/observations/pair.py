@@ -418,6 +418,7 @@ def _taken(r: Rows, at: NDArray[np.int64]) -> Rows:
         unit=r.unit[at],
         mode=r.mode[at],
         sensor=None if r.sensor is None else r.sensor[at],
+        close=None if r.close is None else r.close[at],
         slope=None if r.slope is None else r.slope[at],
         model=None if r.model is None else r.model[at],
     )
@@ -441,4 +442,5 @@ def _scaled(
         share=dict(share) if slope is not None else {},
         log_scale=0.5 * float(np.sum(np.log(variance / usual))),
         block=np.unique(r.mode, return_inverse=True)[1] if whole else None,
+        mixed=r.close,
     )

@@ -178,9 +178,11 @@ def _movements(peaks: list[PeakPoles], keys: tuple[HitKey, ...]) -> tuple[Moveme
     moved = movement(shift, std, size / np.maximum(typical, 1e-300), place)
     # the hits that show a peak best have a drift of their own on average: poles are told at the mean drift of all hits
     power = np.where(np.isfinite(std), size**2, 0.0)
-    drift = power.T @ moved.common / np.maximum(power.sum(axis=0), 1e-300)
+    share = power / np.maximum(power.sum(axis=0), 1e-300)
+    drift = share.T @ moved.common
     peaks = [replace(p, pole=p.pole * (1 - d)) for p, d in zip(peaks, drift, strict=True)]
-    moved = replace(moved, mean=moved.mean + drift)
+    # own movement is told from the pole: the mean over hits is off where hits on some point show another mode's flank
+    moved = replace(moved, own=moved.own - np.sum(share * moved.own, axis=0))
     hits = power.sum(axis=0) ** 2 / np.maximum((power**2).sum(axis=0), 1e-300)
     force = np.array([k.force for k in keys])
     looked_at = tuple(
@@ -237,8 +239,7 @@ def _warps(
     )
     if not common.any() and not alone.any():
         return {}
-    # brought to the pole that fits all hits best, not to the mean over hits
-    own = np.where(alone, moved.own + moved.mean, 0.0)
+    own = np.where(alone, moved.own, 0.0)
     order = np.argsort([p.frequency_hz for p in looked_at])
     centre = np.array([looked_at[c].frequency_hz for c in order])
     gap = np.diff(centre, prepend=0.0, append=float(frequency_hz[-1]))

@@ -43,8 +43,6 @@ class Movement:
         Factor g + d of every hit, shrunk towards 0 by its own variance.
     spread : float
         Standard deviation of g + d.
-    mean : ndarray, (n_peaks,)
-        m, the mean over hits of every peak.
     own : ndarray, (n_hits, n_peaks)
         Movement x of single peaks beyond it, shrunk; 0 where a hit does not show the peak.
     own_spread : ndarray, (n_peaks,)
@@ -56,7 +54,6 @@ class Movement:
     common: Real
     common_std: Real
     spread: float
-    mean: Real
     own: Real
     own_spread: Real
     point_spread: Real
@@ -124,7 +121,6 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
         common=found.mean[hits] + of_point @ found.mean[points],
         common_std=np.sqrt(found.variance[hits] + of_point @ found.variance[points]),
         spread=float(np.sqrt(common + (moving if n_points else 0.0))),
-        mean=found.mean[:n_peaks],
         own=single,
         own_spread=np.sqrt(own),
         point_spread=np.sqrt(np.where(np.isin(np.arange(n_peaks), groups), per_point, 0.0)),
