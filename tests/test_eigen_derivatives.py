@@ -31,7 +31,7 @@ def derivatives(
 ) -> tuple[EigenSolution, ModeDerivatives]:
     solution = solved(model, configuration, x)
     matrices = model.matrices(configuration, x)
-    return solution, ModeDerivatives.of(matrices, solution, modes, model.has_ratio)
+    return solution, ModeDerivatives.of(matrices, solution, modes)
 
 
 def placed(rig: ParametricRig, label: str) -> PlacedEffect:

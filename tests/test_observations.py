@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 from imperfect_modes import EXACT, GOOD, Hidden, chain, chain_modes, planetary_modes
 
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
@@ -456,6 +457,62 @@ def test_gyroscopic_coupling_explains_modes_that_whirl() -> None:
         h = np.zeros(len(at))
         h[i] = 1e-5
         low, high = (with_it.residuals(at + s * h, scatters, matching=true.matching).stated for s in (-1, 1))
+        np.testing.assert_allclose(
+            true.jacobian[:, i],
+            (high - low) / 2e-5,
+            atol=2e-2 * max(1.0, np.abs(true.jacobian[:, i]).max()),
+            err_msg=name,
+        )
+
+
+def test_damping_ratios_that_differ_turn_the_shapes_of_coupled_modes() -> None:
+    """Complex modes of the true rig, each undamped mode with a damping ratio of its own and a damper besides."""
+    rig = planetary()
+    effect, label = parse_effect("local_damper@planet1", rig), "local_damper@planet1.coefficient"
+    truth = RigModel(rig, [effect])
+    x = truth.start({label: 30.0})
+    bare = truth.system("with_ring", x)
+    values, phi = scipy.linalg.eigh(bare.stiffness, bare.mass)
+    factor = np.exp(0.4 * np.random.default_rng(3).standard_normal(len(values)))
+    modal = 2 * bare.modal_damping_ratio * factor * np.sqrt(np.maximum(values, 0.0))
+    damping = bare.damping + bare.mass @ (phi * modal) @ phi.T @ bare.mass
+    exact = complex_modes(replace(bare, damping=damping, modal_damping_ratio=0.0))
+    on = (exact.frequency_hz > 20) & (exact.frequency_hz < 400)
+    dofs = tuple(
+        Dof.parse(f"{b}.{d}") for b in ("carrier", "sun", "ring", "planet1", "planet2") for d in "xyu"
+    )
+    read = RigModel(rig).sensor_rows("with_ring", dofs)
+    shapes = (read @ exact.shapes[: read.shape[1], on]).T
+    f = exact.frequency_hz[on]
+    measured = MeasuredModes(
+        "with_ring", f, 1e-5 * f, exact.damping_ratio[on], np.full(len(f), 1e-5), shapes,
+        1e-3 * np.abs(shapes) + 1e-4 * np.max(np.abs(shapes), axis=1, keepdims=True), dofs, band_hz=(20.0, 400.0),
+    )  # fmt: skip
+    observations = ModeObservations(rig, [prepare(measured)])
+    assert observations.suited([]) is observations
+    own = observations.suited([effect])
+    assert own.suited([effect]) is own
+    scatters = {n: s.default for n, s in observations.scatters.items()} | {"shape_scatter": 1e-3}
+    costs, sizes = [], []
+    for data in (observations, own):
+        problem = data.problem([effect], {})
+        found = descend(problem, scatters, problem.start({label: 30.0}), steps=40)
+        costs.append(found.cost)
+        sizes.append(problem.parameter_values(found.x)[label])
+    assert costs[1] < costs[0] - 20
+    assert abs(sizes[1] - 30.0) < 0.5
+    solution = problem.solution("with_ring", found.x)
+    to = problem.paired(own.data[0], found.x).match
+    told = [found.value(name) for name in own.own_damping["with_ring"].names]
+    common = found.value("modal_damping_ratio")
+    assert np.array(told) + common == pytest.approx(np.log(factor)[to], abs=0.03)
+    assert len(solution.frequency_hz) == len(factor)
+    at = found.x
+    true = problem.residuals(at, scatters)
+    for i, name in enumerate(problem.unknowns.names):
+        h = np.zeros(len(at))
+        h[i] = 1e-5
+        low, high = (problem.residuals(at + s * h, scatters, matching=true.matching).stated for s in (-1, 1))
         np.testing.assert_allclose(
             true.jacobian[:, i],
             (high - low) / 2e-5,

@@ -71,6 +71,7 @@ def diagnose(
     if hypotheses is None:
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
     found = select(observations, known, hypotheses, settings, progress)
+    observations = found.observations
     explained = explains(observations, found.final, settings)
     verdict = verdict_of(found, settings, explained)
     start = found.rounds[0].ranking.base

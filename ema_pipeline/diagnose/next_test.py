@@ -20,7 +20,6 @@ from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit
 from ema_pipeline.observations.mode_residuals import FREQUENCY, SHAPE
 from ema_pipeline.observations.modes import ModeObservations
-from ema_pipeline.observations.rig_model import RigModel
 
 _ADDED_SHARE = 0.1
 """Mass that is added for a further test, as a share of the body's own."""
@@ -75,10 +74,7 @@ def next_measurement(
 
 def _options(observations: ModeObservations, first: Fit, second: Fit) -> list[Option]:
     """All measurements that were tried, best first."""
-    models = [
-        RigModel(observations.rig, f.model.effects, f.model.scales, observations.shared)
-        for f in (first, second)
-    ]
+    models = [observations.problem(f.model.effects, f.model.scales).model for f in (first, second)]
     options = []
     for data in observations.data:
         systems = tuple(

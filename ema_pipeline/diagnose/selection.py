@@ -70,11 +70,14 @@ class Selection:
         In the order in which they were added.
     final : Fit
         The model with all that is claimed.
+    observations : Observations
+        With the unknowns that this model calls for.
     """
 
     rounds: tuple[Round, ...]
     claimed: tuple[Judged, ...]
     final: Fit
+    observations: Observations
 
 
 def select(
@@ -84,7 +87,7 @@ def select(
     settings: DiagnoseSettings,
     progress: Progress = lambda share, text: None,
 ) -> Selection:
-    """Add effects one by one while the data support them.
+    """Add effects one by one while the data support them, once more with unknowns that what was added calls for.
 
     Parameters
     ----------
@@ -95,6 +98,7 @@ def select(
     settings : DiagnoseSettings
     progress : callable
     """
+    observations = observations.suited(known.effects)
     base = start = fit_base(observations, known)
     rounds: list[Round] = []
     claimed: list[Judged] = []
@@ -114,8 +118,11 @@ def select(
         rounds.append(_round(observations, ranking, left, asked, len(claimed)))
         near = rounds[-1].alike(settings)
         if not near or len(claimed) == settings.most_effects:
-            return Selection(tuple(rounds), tuple(claimed), ranking.base)
+            return Selection(tuple(rounds), tuple(claimed), ranking.base, observations)
         added = next(j for j in near if j.claimed)  # a rival alone does not pass the conditions of a claim
+        if observations.suited(added.ranked.fit.model.effects) is not observations:
+            suited = observations.suited(added.ranked.fit.model.effects)
+            return select(suited, known, hypotheses, settings, progress)
         claimed.append(added)
         rivals[added.hypothesis.label] = rounds[-1].judged
         if len(claimed) > 1:

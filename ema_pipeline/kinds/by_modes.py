@@ -80,9 +80,8 @@ def _compared_with(run: Run, rig: Rig, labels: Sequence[str], unknowns: Mapping[
     from ema_pipeline.run.models import correlate, mode_observations
 
     mended = rig_with_effects(rig, labels, run.library)
-    fitted = fit_modes(
-        mode_observations(run), model_with(labels, mended, run.library), start=unknowns or None
-    )
+    model = model_with(labels, mended, run.library)
+    fitted = fit_modes(mode_observations(run).suited(model.effects), model, start=unknowns or None)
     systems = {f"system after {name}": fitted.system(name) for name in run.info.configurations}
     systems |= {f"like parts {name}": fitted.system_of_like_parts(name) for name in run.info.configurations}
     moved = deviations_of(fitted.fit)
@@ -127,7 +126,7 @@ def _measured(run: Run) -> Ladder:
     models = [Model()]
     for label in run.info.effects:
         models.append(model_with([label], rig, run.library, models[-1], hits is not None))
-    observations = hits or mode_observations(run)
+    observations = (hits or mode_observations(run)).suited(models[-1].effects)
     with single_blas_thread():
         known = earlier_unknowns(run, ())
         fits = fits_of(observations, models, begun_at(observations, models[0], known) if known else None)

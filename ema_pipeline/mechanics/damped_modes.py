@@ -27,7 +27,7 @@ _WEAK = 0.15
 """Share of another mode in a shape up to which eliminating the others one by one is exact enough."""
 _ROUNDING = 1e-9
 """Coupling, over ω², that is no more than rounding: modes of one frequency are not mixed by it."""
-_TURNS = 0.01
+_TURNS = 0.001
 """Share of another mode in a shape from which derivatives follow the damped shape."""
 _CLOSE = 1e-4
 """Dynamic stiffness of another mode, over ω², below which the rotation of two shapes is no longer linear."""
@@ -137,7 +137,7 @@ class DampedModes:
         turning: NDArray[np.float64],
         omega: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Derivatives of ln f and of the damping ratio by all unknowns but the common ratio, two of (n_unknowns, m).
+        """Derivatives of ln f and of the damping ratio by all unknowns but those of ratios, two of (n_unknowns, m).
 
         Of modes whose shapes are nearly the undamped ones, with symmetric matrices.
 
@@ -153,9 +153,8 @@ class DampedModes:
             Of the undamped modes, rad/s.
         """
         terms, pole, shape = matrices.terms, self.poles[modes], self.shapes[:, modes]
-        common = (
-            2 * matrices.damping_ratio * omega[modes]
-        )  # what all modes share goes with ω and the modal mass
+        every = 2 * matrices.damping_ratio * omega
+        common = every[modes]  # what modes have besides the matrices goes with ω and the modal mass
         power = {
             MASS: pole**2 + pole * common,
             DAMPING_MATRIX: pole,
@@ -170,7 +169,7 @@ class DampedModes:
             for kind, factor in power.items():
                 change[terms.log.shape[1] + k] += factor * np.sum(shape * (kinds[kind] @ shape), axis=0)
         change += pole * common * log_frequency
-        apart = 2 * matrices.damping_ratio * (omega[:, None] - omega[modes][None, :])
+        apart = every[:, None] - common[None, :]
         change -= 2 * pole * np.einsum("jsr,sr->jr", turning, self.shares[:, modes] * apart)
         mass, damping = matrices.dense[MASS], matrices.dense[DAMPING_MATRIX]
         slope = np.sum(shape * ((2 * mass) @ shape), axis=0) * pole
@@ -186,7 +185,7 @@ class DampedModes:
         log_frequency: NDArray[np.float64],
         turning: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.complex128]]:
-        """Derivatives of one mode's ln f, damping ratio and shape by all unknowns and, last, by ln of the common ratio.
+        """Derivatives of one mode's ln f, damping ratio and shape by all unknowns, those of damping ratios last.
 
         With P(λ)q = 0 in coordinates of the undamped modes, P·dq + P'q·dλ = -dP·q is solved for dλ and dq; the own
         share in q stays 1. Holds for any damping and for gyroscopic coupling.
@@ -207,14 +206,14 @@ class DampedModes:
 
         Returns
         -------
-        log_frequency, damping_ratio : ndarray, (n_unknowns + 1,)
-        shape : complex ndarray, (n, n_unknowns + 1)
+        log_frequency, damping_ratio : ndarray, (n_unknowns + u,)
+        shape : complex ndarray, (n, n_unknowns + u)
         """
         pole, share, shape, terms = self.poles[r], self.shares[:, r], self.shapes[:, r], matrices.terms
         power = {MASS: pole**2, DAMPING_MATRIX: pole, STIFFNESS: 1.0, STRUCTURAL: 1j}
         logs, n = terms.log.shape[1], len(share)
         common = 2 * matrices.damping_ratio * omega
-        force = np.zeros((len(turning) + 1, n), complex)
+        force = np.zeros((len(turning) + len(matrices.damping_log), n), complex)
         for kind, (on, rows) in terms.by_kind.items():
             pushed = power[kind] * matrices.coefficient[on] * (rows @ shape)
             force[:logs] += terms.log[on].T @ (pushed[:, None] * (rows @ shapes))
@@ -222,10 +221,10 @@ class DampedModes:
             total = pole * (matrices.skew_by_shape[j] @ shape)
             total += sum(factor * (kinds[kind] @ shape) for kind, factor in power.items())
             force[logs + j] = total @ shapes
-        # The damping that all modes share goes with the undamped frequencies and turns with the undamped shapes.
+        # The damping of undamped modes goes with their frequencies and turns with their shapes.
         turns = np.einsum("jts,t->js", turning, common * share) + common * (turning @ share)
-        force[:-1] += pole * (log_frequency * (common * share) - turns)
-        force[-1] = pole * common * share
+        force[: len(turning)] += pole * (log_frequency * (common * share) - turns)
+        force[len(turning) :] = matrices.damping_log * (pole * common * share)
         _, damping, stiffness, structural = (shapes.T @ dense @ shapes for dense in matrices.dense)
         damping = damping + shapes.T @ matrices.skew @ shapes + np.diag(common)
         whole = pole**2 * np.eye(n) + pole * damping + stiffness + 1j * structural

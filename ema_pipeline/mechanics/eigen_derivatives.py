@@ -52,33 +52,46 @@ class EigenSolution:
 
     @classmethod
     def of(
-        cls, dense: NDArray[np.float64], skew: NDArray[np.float64], damping_ratio: float
+        cls,
+        dense: NDArray[np.float64],
+        skew: NDArray[np.float64],
+        damping_ratio: NDArray[np.float64] | float,
+        undamped: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
     ) -> EigenSolution | None:
-        """Modes of M, C, K and structural matrix, (4, n, n); None where a mass or a stiffness is not admissible."""
-        mass, damping, stiffness, structural = dense
-        if not np.all(np.isfinite(dense)):
+        """Modes of M, C, K and structural matrix, (4, n, n); None where a mass or a stiffness is not admissible.
+
+        `damping_ratio` is that of every undamped mode, (n,), or of all. `undamped` modes may be given where they are
+        known already, see `solved`.
+        """
+        undamped = undamped or solved(dense)
+        if undamped is None:
             return None
-        solved = _solved(stiffness, mass)
-        if solved is None:
-            return None
-        values, shapes = solved
-        if values[0] < -_ROUNDING * float(np.max(np.abs(values))):
-            return None
-        values = np.maximum(values, 1.0)  # rigid bodies: far under any band
+        values, shapes = undamped
+        _, damping, _, structural = dense
         omega = np.sqrt(values)
-        ratio = np.full(len(values), damping_ratio)
+        ratio = np.full(len(values), damping_ratio, float)
         damping = damping + skew
         coupling, lag = np.any(damping), np.any(structural)
         modal = shapes.T @ damping @ shapes if coupling else np.zeros_like(shapes)
         modal_lag = shapes.T @ structural @ shapes if lag else np.zeros_like(shapes)
         if coupling or lag:
-            modal[np.diag_indices_from(modal)] += 2 * damping_ratio * omega
+            modal[np.diag_indices_from(modal)] += 2 * ratio * omega
             found = DampedModes.of(values, shapes, modal, modal_lag)
             if found is not None:
                 least = np.maximum(found.damping_ratio, _LEAST_DAMPING_RATIO)
                 return cls(values, shapes, found.frequency_hz, least, found)
             ratio = np.diag(modal) / (2 * omega) + np.diag(modal_lag) / (2 * values)
         return cls(values, shapes, omega / (2 * np.pi), np.maximum(ratio, _LEAST_DAMPING_RATIO))
+
+
+def solved(dense: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """ω² and mass-normalised shapes of undamped modes; None where a mass or a stiffness is not admissible."""
+    if not np.all(np.isfinite(dense)):
+        return None
+    found = _solved(dense[STIFFNESS], dense[MASS])
+    if found is None or found[0][0] < -_ROUNDING * float(np.max(np.abs(found[0]))):
+        return None
+    return np.maximum(found[0], 1.0), found[1]  # rigid bodies: far under any band
 
 
 def _solved(
@@ -118,9 +131,7 @@ class ModeDerivatives:
     shapes: NDArray[np.float64] | NDArray[np.complex128]
 
     @classmethod
-    def of(
-        cls, matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64], has_ratio: bool
-    ) -> ModeDerivatives:
+    def of(cls, matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64]) -> ModeDerivatives:
         """Derivatives of the modes with these indices.
 
         Parameters
@@ -129,21 +140,15 @@ class ModeDerivatives:
         solution : EigenSolution
             Their modes.
         modes : ndarray of int, (m,)
-        has_ratio : bool
-            True where the logarithm of the common damping ratio is an unknown.
         """
         if solution.damped is not None:
-            return cls._damped(matrices, solution, solution.damped, modes, has_ratio)
+            return cls._damped(matrices, solution, solution.damped, modes)
         if np.any(matrices.skew_by_shape):  # of no size yet, but shapes lag behind with it
             damped = DampedModes.uncoupled(solution.frequency_hz, solution.damping_ratio, solution.shapes)
-            return cls._damped(matrices, solution, damped, modes, has_ratio)
+            return cls._damped(matrices, solution, damped, modes)
         log_frequency, weight = _undamped(matrices, solution, modes)
         ratio = _damping(matrices, solution, modes, log_frequency, weight)
-        if has_ratio:
-            at = matrices.terms.log.shape[1]
-            log_frequency = _inserted(log_frequency, at, 0.0)
-            ratio = _inserted(ratio, at, matrices.damping_ratio)
-            weight = _inserted(weight, at, 0.0)
+        log_frequency, ratio, weight = _with_ratios(matrices, modes, log_frequency, ratio, weight)
         return cls(log_frequency.T, ratio.T, (solution.shapes @ weight).transpose(1, 2, 0))
 
     @classmethod
@@ -153,7 +158,6 @@ class ModeDerivatives:
         solution: EigenSolution,
         damped: DampedModes,
         modes: NDArray[np.int64],
-        has_ratio: bool,
     ) -> ModeDerivatives:
         omega, phi = np.sqrt(solution.eigenvalues), solution.shapes
         bare, weight = _undamped(matrices, solution, modes)
@@ -168,13 +172,11 @@ class ModeDerivatives:
             shapes[at + j] += (
                 phi @ damped.lag(phi.T @ matrices.skew_by_shape[j] @ phi, solution.eigenvalues)[:, modes]
             )
-        if has_ratio:
-            log_frequency = _inserted(log_frequency, at, 0.0)
-            ratio = _inserted(ratio, at, matrices.damping_ratio)
-            shapes = _inserted(shapes, at, 0.0)
+        log_frequency, ratio, shapes = _with_ratios(matrices, modes, log_frequency, ratio, shapes)
         if turned:
             bare, weight = _undamped(matrices, solution, np.arange(len(omega)))
-            order = [*range(at), *([len(weight)] if has_ratio else []), *range(at, len(weight))]
+            count = len(weight)
+            order = [*range(at), *range(count, count + len(matrices.damping_log)), *range(at, count)]
             for k in turned:
                 own = damped.derivatives_of(int(modes[k]), matrices, phi, omega, bare, weight)
                 log_frequency[:, k], ratio[:, k] = own[0][order], own[1][order]
@@ -197,9 +199,25 @@ def _undamped(
     return own / (2 * values), weight
 
 
-def _inserted(array: NDArray[T], at: int, value: float) -> NDArray[T]:
-    """`numpy.insert` of one row, which is many times slower."""
-    return np.concatenate([array[:at], np.full((1, *array.shape[1:]), value, array.dtype), array[at:]])
+def _with_ratios(
+    matrices: Matrices,
+    modes: NDArray[np.int64],
+    log_frequency: NDArray[np.float64],
+    ratio: NDArray[np.float64],
+    shapes: NDArray[T],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[T]]:
+    """Derivatives, unknowns first, with those by the damping ratios of undamped modes, which come after the logs."""
+    at, logs = matrices.terms.log.shape[1], matrices.damping_log
+    if not len(logs):
+        return log_frequency, ratio, shapes
+
+    def inserted(array: NDArray[Any], rows: NDArray[np.float64] | float) -> NDArray[Any]:
+        new = np.zeros((len(logs), *array.shape[1:]), array.dtype)
+        new[:] = rows
+        return np.concatenate([array[:at], new, array[at:]])
+
+    own = logs[:, modes] * matrices.damping_ratio[modes]
+    return inserted(log_frequency, 0.0), inserted(ratio, own), inserted(shapes, 0.0)
 
 
 def _forms(

@@ -84,8 +84,10 @@ class Matrices:
         Of the terms at this point.
     dense : ndarray, (4, n, n)
     skew : ndarray, (n, n)
-    damping_ratio : float
-        Of every mode, besides the matrices.
+    damping_ratio : ndarray, (n,)
+        Of every undamped mode, besides the matrices.
+    damping_log : ndarray, (u, n)
+        Derivatives of its logarithm by the unknowns that it depends on.
     by_shape : ndarray, (k, 4, n, n)
         Derivatives by effects' unknowns and geometric ones.
     skew_by_shape : ndarray, (k, n, n)
@@ -95,7 +97,8 @@ class Matrices:
     coefficient: NDArray[np.float64]
     dense: NDArray[np.float64]
     skew: NDArray[np.float64]
-    damping_ratio: float
+    damping_ratio: NDArray[np.float64]
+    damping_log: NDArray[np.float64]
     by_shape: NDArray[np.float64]
     skew_by_shape: NDArray[np.float64]
 

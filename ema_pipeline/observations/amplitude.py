@@ -23,14 +23,13 @@ from ema_pipeline.mechanics.laws import Nonlinear, Spring
 from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.observations.hit_modes import HitData, Linear, comparable, shifted_poles
 from ema_pipeline.observations.mode_residuals import (
-    DAMPING_SCATTER,
     FREQUENCY,
     FREQUENCY_NOISE,
     SHAPE,
     stacked,
 )
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem, Paired
-from ema_pipeline.observations.parts import part_key
+from ema_pipeline.observations.parts import DAMPING_SCATTER, part_key
 from ema_pipeline.observations.rig_model import LOG_STD, RigModel, SizeMap
 
 DRIFT = "drift"
@@ -86,6 +85,10 @@ class AmplitudeObservations:
         self.modes, self.hits = modes, tuple(hits)
         shape = dataclasses.replace(modes.scatters[SHAPE], least=_LEAST_SHAPE)
         self.scatters = {**modes.scatters, SHAPE: shape, **hit_scatters()}
+
+    def suited(self, effects: Sequence[PlacedEffect]) -> AmplitudeObservations:
+        """See `Observations`."""
+        return self
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> AmplitudeProblem:
         """See `Observations`."""

@@ -65,6 +65,10 @@ class Observations(Protocol):
         """The problem of fitting the rig with `effects`, whose sizes have these prior 1 σ, to the data."""
         ...
 
+    def suited(self, effects: Sequence[PlacedEffect]) -> Observations:
+        """The same data for models with these effects: with unknowns that only they need. Often the same object."""
+        ...
+
     def folds(self) -> Sequence[tuple[Observations, Observations]]:
         """Pairs of what is fitted and what is held out: a configuration, a hit point, a level, a share of modes."""
         ...

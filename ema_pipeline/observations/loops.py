@@ -164,6 +164,10 @@ class LoopObservations:
         """The effect with the starts and prior scales of its sizes as these loops' force and motion suggest."""
         return self.typical.scaled(effect)
 
+    def suited(self, effects: Sequence[PlacedEffect]) -> LoopObservations:
+        """See `Observations`."""
+        return self
+
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> LoopProblem:
         """See `Observations`."""
         mine = [self.scaled(e) for e in effects]

@@ -7,15 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.optimize
 from numpy.typing import NDArray
 
 from ema_pipeline.inference import Residuals, tails
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
+from ema_pipeline.mechanics.terms import Matrices
 from ema_pipeline.observations.mode_data import ModeData
+from ema_pipeline.observations.mode_pairing import paired, turned
+from ema_pipeline.observations.parts import DAMPING_SCATTER
 from ema_pipeline.observations.rig_model import RigModel
 
-DAMPING_SCATTER = "damping_scatter"
 FREQUENCY = "frequency_scatter"
 SHAPE = "shape_scatter"
 FREQUENCY_NOISE = "frequency_noise"
@@ -28,11 +29,8 @@ UNSEEN = 3.0
 
 _SHAPE_REACH = 0.3
 """Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
-_FREQUENCY_REACH = 0.1
-"""Difference of ln f that costs a pair as much as shapes that have nothing in common; wider while a fit is annealed."""
-_FREQUENCY_REACH_ALONE = 0.3
-_LEAVE = 0.3
-"""Cost above the best at which an assignment leaves a measured mode without a partner."""
+_DAMPING_STD = 0.02
+"""1 σ of ln ζ that no model is better than, where each mode has a damping ratio of its own."""
 
 
 @dataclass(frozen=True)
@@ -266,13 +264,13 @@ class Comparison:
         if solution is None:
             return None
         predicted = self.seen(solution)
-        match = matching if isinstance(matching, np.ndarray) else self.matched(solution, predicted)
+        match = matching if isinstance(matching, np.ndarray) else self.matched(solution)
         on, alone = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
         to = match[on]
-        slopes = ModeDerivatives.of(matrices, solution, to, self.model.has_ratio) if derivatives else None
+        slopes = ModeDerivatives.of(matrices, solution, to) if derivatives else None
         rows: tuple[Rows, ...] = (
             self._frequencies(solution, on, to, slopes),
-            self._damping(solution, on, to, slopes),
+            self._damping(solution, matrices, on, to, slopes),
             self._shapes(solution, predicted, on, to, slopes),
         )
         if np.any(self.data.whirling[on]):
@@ -288,36 +286,16 @@ class Comparison:
 
     def seen(self, solution: EigenSolution) -> NDArray[np.float64]:
         """What the sensors read of every shape, (s, n); complex shapes turned as measured ones are, and made real."""
-        if solution.damped is None:
-            return np.asarray(self.reading @ solution.shapes[: self.reading.shape[1]])
-        return _turned(self._read(solution))
+        return turned(self._read(solution))
 
-    def _read(self, solution: EigenSolution) -> NDArray[np.complex128]:
+    def _read(self, solution: EigenSolution) -> NDArray[Any]:
         """The same with complex shapes as they are."""
         shapes = solution.shapes if solution.damped is None else solution.damped.shapes
         return np.asarray(self.reading @ shapes[: self.reading.shape[1]])
 
-    def matched(self, solution: EigenSolution, predicted: NDArray[np.float64]) -> NDArray[np.int64]:
+    def matched(self, solution: EigenSolution) -> NDArray[np.int64]:
         """Index of the model mode of every measured one, -1 for none, (m,)."""
-        d = self.data
-        log = np.log(np.maximum(solution.frequency_hz, 1e-6))
-        apart = np.abs(log[None] - d.log_frequency[:, None])
-        if d.shapes.shape[1]:
-            cross = (d.known_shapes @ predicted) ** 2
-            norm = d.squares[:, None] * (d.seen @ predicted**2)
-            if np.any(whirl := d.whirling):
-                read = self._read(solution)
-                cross[whirl] = np.abs(np.conj(d.complex_shapes[whirl]) @ read) ** 2
-                norm[whirl] = d.squares[whirl, None] * (d.seen[whirl] @ np.abs(read) ** 2)
-            reach = _FREQUENCY_REACH * (1 + 0.1 * (self.heat - 1))
-            cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / reach, 3.0)
-        else:
-            # convex, so that close modes keep their order: two crossed pairs would cost as much as two straight ones
-            cost = np.minimum(apart * (1 + apart) / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
-        m = len(d)
-        padded = np.hstack([cost, np.full((m, m), _LEAVE)])
-        column = scipy.optimize.linear_sum_assignment(padded)[1]
-        return np.where(column < cost.shape[1], column, -1)
+        return paired(self.data, solution.frequency_hz, self._read(solution), self.heat)
 
     def _usual(self, alone: NDArray[np.int64]) -> float:
         """What modes without a partner would cost on average if they were explained.
@@ -376,6 +354,7 @@ class Comparison:
     def _damping(
         self,
         solution: EigenSolution,
+        matrices: Matrices,
         on: NDArray[np.int64],
         to: NDArray[np.int64],
         slopes: ModeDerivatives | None,
@@ -383,6 +362,8 @@ class Comparison:
         d = self.data
         damped = np.isfinite(d.log_damping[on])
         modes, of = on[damped], to[damped]
+        # of modes whose damping is an unknown of its own, that unknown scatters, and not what is left
+        own = np.any(matrices.damping_log[int(self.model.has_ratio) :, of], axis=0)
         model = np.log(solution.damping_ratio[of])
         slope = None
         if slopes is not None:
@@ -390,8 +371,8 @@ class Comparison:
             by_model = slopes.damping_ratio[damped] / solution.damping_ratio[of, None]
             slope[:, : by_model.shape[1]] = by_model
         return Rows(
-            d.log_damping[modes] - model, d.log_damping_std[modes], np.ones(len(modes)), DAMPING_SCATTER, 1.0, modes,
-            slope=slope, model=model,
+            d.log_damping[modes] - model, np.hypot(d.log_damping_std[modes], own * _DAMPING_STD),
+            np.where(own, 0.0, 1.0), DAMPING_SCATTER, 1.0, modes, slope=slope, model=model,
         )  # fmt: skip
 
     def _shapes(
@@ -492,13 +473,8 @@ class Comparison:
         return slope
 
 
-def _turned(read: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Complex shapes, (s, k), turned as measured ones are, and made real."""
-    return np.asarray(np.real(read * np.exp(-0.5j * np.angle(np.sum(read**2, axis=0)))))
-
-
 def _turned_slopes(read: NDArray[np.complex128], slope: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Derivatives of `_turned` shapes from those (k, s, n) of the complex ones (k, s), which turn the angle, too."""
+    """Derivatives of `turned` shapes from those (k, s, n) of the complex ones (k, s), which turn the angle, too."""
     square = np.sum(read**2, axis=1)
     back = np.exp(-0.5j * np.angle(square))[:, None]
     angle = np.imag(np.einsum("ks,ksn->kn", read, slope) / square[:, None])

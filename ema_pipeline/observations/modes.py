@@ -23,8 +23,8 @@ from ema_pipeline.ingest.records import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
+from ema_pipeline.observations.mode_pairing import OwnDamping
 from ema_pipeline.observations.mode_residuals import (
-    DAMPING_SCATTER,
     FREQUENCY,
     FREQUENCY_NOISE,
     SHAPE,
@@ -34,6 +34,7 @@ from ema_pipeline.observations.mode_residuals import (
     stacked,
 )
 from ema_pipeline.observations.parts import (
+    DAMPING_SCATTER,
     MASS_SCATTER,
     MASS_STD,
     PART_SCATTER,
@@ -91,6 +92,8 @@ class ModeObservations:
         DOFs whose calibration is unknown; those of `data` where left out.
     test : str
         Name of the test among several whose unknowns are shared: its drift is its own.
+    own_damping : dict of str to OwnDamping, optional
+        Undamped modes whose damping ratios are unknowns of their own, by configuration.
     """
 
     linearised = False
@@ -103,8 +106,9 @@ class ModeObservations:
         shared: Dependence | None = None,
         sensors: tuple[str, ...] = (),
         test: str = "",
+        own_damping: Mapping[str, OwnDamping] | None = None,
     ) -> None:
-        self.rig, self.test = rig, test
+        self.rig, self.test, self.own_damping = rig, test, dict(own_damping or {})
         self.data = tuple(d for d in data if len(d))
         self.sensors = sensors or tuple(dict.fromkeys(d.point for one in data for d in one.dofs))
         self.channels = dict(channels or {})
@@ -125,11 +129,28 @@ class ModeObservations:
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> ModeProblem:
         """See `Observations`."""
-        return ModeProblem(self, RigModel(self.rig, effects, scales, self.shared))
+        return ModeProblem(self, RigModel(self.rig, effects, scales, self.shared, self.own_damping))
+
+    def suited(self, effects: Sequence[PlacedEffect]) -> ModeObservations:
+        """See `Observations`: where damping couples modes, each has a damping ratio of its own.
+
+        How much the damping of single modes scatters then shows in the shapes of close ones, too. Where nothing couples
+        them it shows in their damping ratios alone, which need no unknowns for that.
+        """
+        model = RigModel(self.rig, effects, {}, self.shared)
+        if self.own_damping or not any(model.couples(d.configuration) for d in self.data):
+            return self
+        own = {d.configuration: OwnDamping(d, model.sensor_rows(d.configuration, d.dofs)) for d in self.data}
+        return self._with(self.data, own)
 
     def with_data(self, data: Sequence[ModeData]) -> ModeObservations:
         """The same rig and channels with other modes."""
-        return ModeObservations(self.rig, data, self.channels, self.shared, self.sensors, self.test)
+        return self._with(data, self.own_damping)
+
+    def _with(self, data: Sequence[ModeData], own_damping: Mapping[str, OwnDamping]) -> ModeObservations:
+        return ModeObservations(
+            self.rig, data, self.channels, self.shared, self.sensors, self.test, own_damping
+        )
 
     def folds(self, count: int = 4) -> list[tuple[ModeObservations, ModeObservations]]:
         """Every `count`-th mode held out in turn, over all configurations."""
@@ -300,7 +321,7 @@ class ModeProblem(EffectProblem):
             return None
         if match is None:
             at = self.comparison(data, x, {})
-            match = at.matched(solution, at.seen(solution))
+            match = at.matched(solution)
         return Paired(solution, match)
 
     def comparison(

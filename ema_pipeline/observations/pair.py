@@ -22,7 +22,6 @@ from ema_pipeline.inference import Residuals, Scatter, Unknowns
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_residuals import (
-    DAMPING_SCATTER,
     FREQUENCY,
     SHAPE,
     Compared,
@@ -30,6 +29,7 @@ from ema_pipeline.observations.mode_residuals import (
     stacked,
 )
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem
+from ema_pipeline.observations.parts import DAMPING_SCATTER
 from ema_pipeline.observations.rig_model import RigModel, SizeMap
 from ema_pipeline.settings import Settings
 
@@ -101,6 +101,10 @@ class PairObservations:
         self.repeat = self.settings.scatters()
         self.b = b.with_data([self._commensurate(d) for d in b.data])
         self.scatters = {**a.scatters, **{s.name: s for s in self.repeat.values()}}
+
+    def suited(self, effects: Sequence[PlacedEffect]) -> PairObservations:
+        """See `Observations`."""
+        return self
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> PairProblem:
         """See `Observations`."""

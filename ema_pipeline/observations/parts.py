@@ -18,6 +18,7 @@ from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Mass, Spring
 from ema_pipeline.rigs.types import Parameter, Rig
 
+DAMPING_SCATTER = "damping_scatter"
 PART_SCATTER = "part_scatter"
 MASS_SCATTER = "mass_scatter"
 STIFFNESS_STD = 0.02

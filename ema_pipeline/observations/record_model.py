@@ -310,7 +310,7 @@ class RecordModel:
             structural=structural,
         )
 
-    def _ratios(self, x: NDArray[np.float64], common: float) -> NDArray[np.float64]:
+    def _ratios(self, x: NDArray[np.float64], common: NDArray[np.float64]) -> NDArray[np.float64]:
         """Damping ratio of every mode beside the dampers, (n,)."""
         n = len(self.basis.rows[0][0])
         return np.asarray(common * (np.exp(x[self._parts[0]]) if self.modes else np.ones(n)))

@@ -263,6 +263,10 @@ class RecordObservations:
         """What a system does in one record; None where its motion grows without bound."""
         return simulated(data, self.substeps, self.slowest_rad_s, self.sensors, system, begin, slopes)
 
+    def suited(self, effects: Sequence[PlacedEffect]) -> RecordObservations:
+        """See `Observations`."""
+        return self
+
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> RecordProblem:
         """See `Observations`."""
         return RecordProblem(self, RecordModel(self.basis, [self.scaled(e) for e in effects], scales))

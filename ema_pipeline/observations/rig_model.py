@@ -7,7 +7,7 @@ is one product. Only what an effect edits is differentiated by small differences
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,10 +17,11 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import EffectParameter, PlacedEffect
 from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Assembly, Row
-from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
+from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, solved
 from ema_pipeline.mechanics.system import LinearSystem
-from ema_pipeline.mechanics.terms import Matrices, Terms, assemble_terms
-from ema_pipeline.observations.parts import DAMPING, Dependence, dependence, part_key
+from ema_pipeline.mechanics.terms import DAMPING_MATRIX, STRUCTURAL, Matrices, Terms, assemble_terms
+from ema_pipeline.observations.mode_pairing import OwnDamping
+from ema_pipeline.observations.parts import DAMPING, DAMPING_SCATTER, Dependence, dependence, part_key
 from ema_pipeline.rigs.types import Rig
 
 LOG_STD = 1.2
@@ -126,8 +127,8 @@ def _same_rows(a: Terms, b: Terms) -> bool:
 class RigModel:
     """A rig, with effects on top of it, as a function of unknowns.
 
-    The unknowns are, in this order: families, parts, the damping ratio of all modes (logarithms), geometric
-    parameters, and the effects' sizes.
+    The unknowns are, in this order: families, parts, the damping ratio of all modes and what those of single ones
+    differ from it by (logarithms), geometric parameters, and the effects' sizes.
 
     Parameters
     ----------
@@ -138,6 +139,8 @@ class RigModel:
         Prior 1 σ of effects' sizes by ``id@place.name``; the library's where left out.
     shared : Dependence, optional
         Of the rig, where it is known already.
+    own_damping : dict of str to OwnDamping, optional
+        Undamped modes whose damping ratios are unknowns of their own, by configuration.
     """
 
     def __init__(
@@ -146,8 +149,9 @@ class RigModel:
         effects: Sequence[PlacedEffect] = (),
         scales: Mapping[str, float] | None = None,
         shared: Dependence | None = None,
+        own_damping: Mapping[str, OwnDamping] | None = None,
     ) -> None:
-        self.rig, self.effects = rig, tuple(effects)
+        self.rig, self.effects, self.own_damping = rig, tuple(effects), dict(own_damping or {})
         self.dependence = shared or dependence(rig)
         given = scales or {}
         self.sizes = {
@@ -169,6 +173,11 @@ class RigModel:
         return joined(
             self.dependence.unknowns,
             Unknowns.plain((DAMPING,), damping.tolerance or LOG_STD) if loose and damping else _NOTHING,
+            Unknowns.plain(
+                tuple(name for own in self.own_damping.values() for name in own.names),
+                1.0,
+                DAMPING_SCATTER,
+            ),
             Unknowns.plain(
                 self.dependence.geometric,
                 [self.rig.parameters[g].tolerance for g in self.dependence.geometric],
@@ -228,26 +237,51 @@ class RigModel:
         key, known = x.tobytes(), self._modes.get(configuration)
         if known is None or known[0] != key or (derivatives and not known[1]):
             matrices = self.matrices(configuration, x, derivatives)
-            solution = (
-                known[3]
-                if known is not None and known[0] == key
-                else EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio)
-            )
+            solution = known[3] if known is not None and known[0] == key else None
+            undamped = solved(matrices.dense) if solution is None else (solution.eigenvalues, solution.shapes)
+            if undamped is not None and configuration in self.own_damping:
+                matrices = self._with_own_damping(configuration, x, matrices, *undamped)
+            if solution is None and undamped is not None:
+                solution = EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio, undamped)
             known = self._modes[configuration] = key, derivatives, matrices, solution
         return known[2], known[3]
 
+    def _with_own_damping(
+        self,
+        configuration: str,
+        x: NDArray[np.float64],
+        matrices: Matrices,
+        eigenvalues: NDArray[np.float64],
+        shapes: NDArray[np.float64],
+    ) -> Matrices:
+        """The matrices with the damping ratios of the undamped modes that have one of their own."""
+        at, slopes = int(self.has_ratio), matrices.damping_log.copy()
+        for name, own in self.own_damping.items():
+            if name == configuration:
+                slopes[at : at + len(own.names)] = own.slopes(eigenvalues, shapes)
+            at += len(own.names)
+        return replace(matrices, damping_ratio=self._ratios(x, slopes), damping_log=slopes)
+
+    def _ratios(self, x: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Damping ratios of the undamped modes by the derivatives of their logarithms, (n,)."""
+        parameter = self.rig.parameters.get(DAMPING)
+        nominal = 0.0 if parameter is None else parameter.value
+        return nominal * np.exp(x[self._logs : self._logs + len(slopes)] @ slopes)
+
     def matrices(self, configuration: str, x: NDArray[np.float64], derivatives: bool = True) -> Matrices:
         """Matrices of a configuration at `x`, and their derivatives by effects and geometry."""
-        logs, ratio = x[: self._logs], self._damping_ratio(x)
-        shape = x[self.shape_start :]
+        logs, shape = x[: self._logs], x[self.shape_start :]
         terms = self.terms(configuration, shape)
+        slopes = np.zeros((self.shape_start - self._logs, len(terms.dofs)))
+        slopes[: int(self.has_ratio)] = 1.0
         factor = np.exp(terms.log @ logs)
         coefficient = terms.coefficient * factor
         dense = terms.dense(coefficient)
         by_shape, skew = self._by_shape(
             configuration, terms, factor, logs, shape if derivatives else shape[:0]
         )
-        return Matrices(terms, coefficient, dense, terms.skew, ratio, by_shape, skew)
+        ratios = self._ratios(x, slopes)
+        return Matrices(terms, coefficient, dense, terms.skew, ratios, slopes, by_shape, skew)
 
     def _by_shape(
         self,
@@ -280,13 +314,6 @@ class RigModel:
                 by_shape[i] = (ends[1][0] - ends[0][0]) / (2 * _DIFFERENCE)
                 skew[i] = (ends[1][1] - ends[0][1]) / (2 * _DIFFERENCE)
         return by_shape, skew
-
-    def _damping_ratio(self, x: NDArray[np.float64]) -> float:
-        parameter = self.rig.parameters.get(DAMPING)
-        if parameter is None:
-            return 0.0
-        i = self.unknowns.index.get(DAMPING)
-        return parameter.value * (1.0 if i is None else float(np.exp(x[i])))
 
     def terms(self, configuration: str, shape: NDArray[np.float64]) -> Terms:
         """Elements of a configuration with geometry and effects' unknowns at `shape`."""
@@ -370,6 +397,11 @@ class RigModel:
             self._nominal[key] = self.rig.assembly(configuration, values)
         return self._nominal[key]
 
+    def couples(self, configuration: str) -> bool:
+        """True where dampers, losses or gyroscopic effects couple the modes, with the effects at their start values."""
+        m = self.matrices(configuration, self.start(), derivatives=False)
+        return bool(np.any(m.dense[[DAMPING_MATRIX, STRUCTURAL]]) or np.any(m.skew))
+
     def system(self, configuration: str, x: NDArray[np.float64]) -> LinearSystem:
         """The linear system of a configuration at `x`, every part with its own deviation."""
         matrices = self.matrices(configuration, x, derivatives=False)
@@ -381,7 +413,7 @@ class RigModel:
             stiffness=stiffness,
             damping=damping + matrices.skew,
             structural=structural,
-            modal_damping_ratio=matrices.damping_ratio,
+            modal_damping_ratio=self.parameter_values(x).get(DAMPING, 0.0),
             sensors={name: _row(row, matrices.terms.dofs) for name, row in assembly.sensors.items()},
         )
 

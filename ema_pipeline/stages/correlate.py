@@ -32,8 +32,9 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     from ema_pipeline.observations.fitting import Model
     from ema_pipeline.run.models import base_unknowns, correlate, known_model, mode_observations
 
-    fit, observations = run.store.load("fit", ALL, "fit", FitResult), mode_observations(run)
-    fitted = restored(observations, known_model(run), fit)
+    fit, model = run.store.load("fit", ALL, "fit", FitResult), known_model(run)
+    observations = mode_observations(run).suited(model.effects)
+    fitted = restored(observations, model, fit)
     pairings, comparison = correlate(run, run.require_model(NAME), fitted)
     results: dict[str, object] = {f"pairing {name}": p for name, p in pairings.items()}
     if fitted.fit.model.effects and run.rig is not None:

@@ -38,7 +38,8 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
     rig = run.require_model(NAME)
     with single_blas_thread():
-        observations, model, told = mode_observations(run), known_model(run), diagnosed_scatters(run)
+        model, told = known_model(run), diagnosed_scatters(run)
+        observations = mode_observations(run).suited(model.effects)
         scatters = {name: told[name] for name in observations.scatters if name in told} or None
         ladder = run.store.find("ladder", ALL, "ladder", Ladder)
 

@@ -1,0 +1,101 @@
+"""Which mode of the model is which measured one: by frequency and shape, all modes of a configuration at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+from numpy.typing import NDArray
+
+from ema_pipeline.observations.mode_data import ModeData
+
+_FREQUENCY_REACH = 0.1
+"""Difference of ln f that costs a pair as much as shapes that have nothing in common; wider while a fit is annealed."""
+_FREQUENCY_REACH_ALONE = 0.3
+_LEAVE = 0.3
+"""Cost above the best at which an assignment leaves a measured mode without a partner."""
+
+
+def paired(
+    data: ModeData,
+    frequency_hz: NDArray[np.float64],
+    read: NDArray[np.float64] | NDArray[np.complex128],
+    heat: float = 1.0,
+) -> NDArray[np.int64]:
+    """Index of the model mode of every measured one, -1 for none, (m,).
+
+    Parameters
+    ----------
+    data : ModeData
+    frequency_hz : ndarray, (n,)
+        Of the model's modes.
+    read : ndarray, (s, n)
+        What the sensors read of their shapes.
+    heat : float
+        Factor on all uncertainties while a fit is annealed.
+    """
+    log = np.log(np.maximum(frequency_hz, 1e-6))
+    apart = np.abs(log[None] - data.log_frequency[:, None])
+    if data.shapes.shape[1]:
+        real = turned(read)
+        cross = (data.known_shapes @ real) ** 2
+        norm = data.squares[:, None] * (data.seen @ real**2)
+        if np.any(whirl := data.whirling):
+            cross[whirl] = np.abs(np.conj(data.complex_shapes[whirl]) @ read) ** 2
+            norm[whirl] = data.squares[whirl, None] * (data.seen[whirl] @ np.abs(read) ** 2)
+        reach = _FREQUENCY_REACH * (1 + 0.1 * (heat - 1))
+        cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / reach, 3.0)
+    else:
+        # convex, so that close modes keep their order: two crossed pairs would cost as much as two straight ones
+        cost = np.minimum(apart * (1 + apart) / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
+    m = len(data)
+    padded = np.hstack([cost, np.full((m, m), _LEAVE)])
+    column = scipy.optimize.linear_sum_assignment(padded)[1]
+    return np.where(column < cost.shape[1], column, -1)
+
+
+def turned(read: NDArray[np.float64] | NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Complex shapes, (s, k), turned as measured ones are, and made real; real ones as they are."""
+    if not np.iscomplexobj(read):
+        return np.asarray(read, float)
+    return np.asarray(np.real(read * np.exp(-0.5j * np.angle(np.sum(read**2, axis=0)))), float)
+
+
+@dataclass(frozen=True)
+class OwnDamping:
+    """Undamped modes of a configuration whose damping ratios are unknowns of their own.
+
+    They are known by the measured modes that they resemble: numbers of modes change where frequencies cross.
+
+    Attributes
+    ----------
+    data : ModeData
+    along : ndarray, (s, n)
+        Rows of the motion along the sensors.
+    """
+
+    data: ModeData
+    along: NDArray[np.float64]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the unknowns, one for every measured mode."""
+        return tuple(
+            f"damping of measured mode {r + 1} of {self.data.configuration}" for r in range(len(self.data))
+        )
+
+    def slopes(self, eigenvalues: NDArray[np.float64], shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+        """1 for the undamped mode that each unknown is of, 0 elsewhere, (m, n).
+
+        Parameters
+        ----------
+        eigenvalues : ndarray, (n,)
+        shapes : ndarray, (n_dofs, n)
+        """
+        read = self.along @ shapes[: self.along.shape[1]]
+        to = paired(self.data, np.sqrt(eigenvalues) / (2 * np.pi), read)
+        found = np.zeros((len(to), shapes.shape[1]))
+        on = np.flatnonzero(to >= 0)
+        found[on, to[on]] = 1.0
+        return found
