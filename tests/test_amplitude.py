@@ -229,6 +229,7 @@ def test_hits_without_any_motion_or_with_gaps_are_left_out() -> None:
     assert np.isfinite(found.log_evidence)
 
 
+@pytest.mark.slow
 def test_a_cubic_bearing_is_told_from_simulated_hits() -> None:
     """Direct integration, FRFs, modes and the study of the levels: nothing here knows describing functions."""
     elements = [PolynomialSpring(f"c{a}", {f"hub.{a}": 1.0}, cubic=1e11) for a in "xy"]

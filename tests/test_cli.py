@@ -307,6 +307,7 @@ def test_a_run_loads_no_pyplot_and_no_window_toolkit(small_raw: Path) -> None:
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_a_run_killed_again_and_again_ends_with_the_same_tables(
     small_raw: Path, results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -27,6 +27,7 @@ def _run(raw: Path, out: Path, rig: Path | None = None) -> dict:
     return json.loads((out / "summary.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_hidden_cubic_spring_is_named_with_its_size(tmp_path: Path) -> None:
     raw = write_oscillator(tmp_path / "raw", lambda x, v: 3e9 * x**3, samples=(1536, 1024))
     (tmp_path / "rig.toml").write_text(RIG)

@@ -289,6 +289,7 @@ def test_learned_scatters_are_those_of_the_laboratory() -> None:
     assert 0.01 < told["calibration"].learned < 0.1
 
 
+@pytest.mark.slow
 def test_the_number_of_processes_does_not_change_a_digit() -> None:
     hidden, library = added(Spring, 2e5, {"m2.z": 1.0}), {"mass": GENERIC["mass"]}
     settings = [SETTINGS.model_copy(update={"processes": n, "most_effects": 1}) for n in (1, 2)]

@@ -10,6 +10,7 @@ import pytest
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "method_isolator.md"
 
 
+@pytest.mark.slow
 def test_python_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)

@@ -162,6 +162,7 @@ def test_one_configuration_alone_has_a_process_of_its_own(
     assert (store.load("ingest", "default", "process", int) != os.getpid()) == apart
 
 
+@pytest.mark.slow
 def test_configurations_side_by_side_give_the_digits_of_one_after_the_other(tmp_path: Path) -> None:
     sample = Path(__file__).parents[1] / "sample_data" / "hidden_effect"
     tables = []

@@ -150,6 +150,7 @@ def test_a_series_of_which_all_tests_are_lost_ends(tmp_path: Path) -> None:
     assert done.growth != done.growth
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_gives_the_same_table(root: Path, whole: tuple[Path, str], tmp_path: Path) -> None:
     """The whole process group is killed after the first test is in the table."""
     resumed = tmp_path / "resumed"
