@@ -12,9 +12,9 @@ from ema_pipeline.diagnose.naming import Named, named, sizes_of
 from ema_pipeline.diagnose.ranking import Ranked, Ranking
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.inference import tails, widened
+from ema_pipeline.inference import tails
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, at_scatters, within_scatter
+from ema_pipeline.observations.fitting import Fit, at_scatters, averaged, within_scatter
 
 HELD_OUT_TIE = 1.0
 """Log density of data held out by which a claim may be behind: few modes foretell a small effect no better than
@@ -86,13 +86,8 @@ def judge(
     if not doubt:
         before, after = held_out(observations, base), held_out(observations, mended)
         doubt = _contradicted(base, mended, before, after) or of_one_shape(base, mended, settings)
-        name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, _widened(observations, ranked.fit)))
+        name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, averaged(observations, mended)))
     return Judged(ranked, name, gain, base, mended, before, after, doubt)
-
-
-def _widened(observations: Observations, fit: Fit) -> Fit:
-    """The fit at scatters that hold how well they are known, for intervals that are true."""
-    return at_scatters(observations, fit, widened(fit.posterior, observations.scatters))
 
 
 def _weak(ranked: Ranked, gain: float, settings: DiagnoseSettings, nothing: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.claims import Judged
@@ -16,7 +17,7 @@ from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder
 from ema_pipeline.diagnose.verdict import alike, explains, outlying_parts, verdict_of
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.observations.base import Observations
@@ -83,7 +84,7 @@ def diagnose(
     in_model = set(found.final.model.labels)
     further = [h for h in hypotheses if h.label not in in_model]
     group = alike(found, settings)
-    candidates = _candidates(found, settings, group, hypotheses)
+    candidates = _candidates(found, settings, group, hypotheses, rungs[-1].parameters)
     told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.claimed]
     if verdict == "ambiguous":
         names = [j.named.label for j in group]
@@ -114,9 +115,13 @@ def diagnose(
 
 
 def _candidates(
-    found: Selection, settings: DiagnoseSettings, group: Sequence[Judged], hypotheses: Sequence[Hypothesis]
+    found: Selection,
+    settings: DiagnoseSettings,
+    group: Sequence[Judged],
+    hypotheses: Sequence[Hypothesis],
+    final: Mapping[str, EffectSize],
 ) -> tuple[Candidate, ...]:
-    """What is claimed, in the order in which it was added, then the best of the rest."""
+    """What is claimed, in the order in which it was added, with sizes of the final model; then the best of the rest."""
     last = found.rounds[min(len(found.claimed), len(found.rounds)) - 1] if found.claimed else found.rounds[0]
     mine = []
     for k, j in enumerate(found.claimed):
@@ -126,7 +131,8 @@ def _candidates(
             j is one for one in of.judged
         ):  # it took the place of an earlier claim once others were known
             told = against_nothing(j.hypothesis, j.gain, hypotheses, settings, k)
-        mine.append(_candidate(j, told, settings, True))
+        sizes = {n: final.get(f"{j.named.label}.{n}", s) for n, s in j.named.sizes.items()}
+        mine.append(replace(_candidate(j, told, settings, True), parameters=sizes))
     taken = {c.label for c in mine}
     rest = [j for j in last.judged if j.named.label not in taken]
     rest.sort(key=lambda j: (j not in group, -j.gain))

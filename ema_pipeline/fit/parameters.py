@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,16 @@ from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate, Ste
 from ema_pipeline.inference import Posterior
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned, made_up_of, wide
+from ema_pipeline.observations.fitting import (
+    Fit,
+    Model,
+    at_scatters,
+    averaged,
+    fit_base,
+    learned,
+    made_up_of,
+    wide,
+)
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem
 from ema_pipeline.rigs.types import Parameter, Rig
 
@@ -138,9 +147,10 @@ def fit_result(
     settings : FitSettings
     """
     posterior = fitted.posterior
-    estimates = _estimates(fitted, rig, settings)
+    sized = replace(fitted, fit=averaged(fitted.observations, fitted.fit))
+    estimates = _estimates(sized, rig, settings)
     names = tuple(n for n in estimates if n in posterior.unknowns.index)
-    covariance, _ = posterior.of_sums([made_up_of(fitted.problem, n) for n in names])
+    covariance, _ = sized.posterior.of_sums([made_up_of(fitted.problem, n) for n in names])
     deviation = np.sqrt(np.diag(covariance))
     sweeps, steps = seed_route(rig, measured, settings)
     count = len(posterior.residuals.values) - posterior.residuals.projected

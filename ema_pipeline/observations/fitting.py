@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.effects.library import depends_on_level, parse_effect
-from ema_pipeline.inference import Bounded, Posterior, Unknowns, anneal, beyond_scatter, descend, learn
+from ema_pipeline.inference import (
+    Bounded,
+    Posterior,
+    Unknowns,
+    anneal,
+    beyond_scatter,
+    descend,
+    learn,
+    widened,
+)
 from ema_pipeline.inference.maximise import ANNEALING
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.parts import MASS_SCATTER, PART_SCATTER
@@ -197,6 +206,12 @@ def learned(observations: Observations, fit: Fit) -> Fit:
 def at_scatters(observations: Observations, fit: Fit, scatters: Mapping[str, float]) -> Fit:
     """The fit at given scatters, so that the errors of several models compare."""
     return refined(observations, fit.model, fit.posterior.x, scatters)
+
+
+def averaged(observations: Observations, fit: Fit) -> Fit:
+    """The fit at scatters that hold how well they are known, for sizes whose intervals are true."""
+    wide = at_scatters(observations, fit, widened(fit.posterior, observations.scatters))
+    return within_scatter(observations, wide)
 
 
 def within_scatter(observations: Observations, fit: Fit) -> Fit:
