@@ -178,22 +178,21 @@ class DampedModes:
 
     def derivatives_of(
         self,
-        r: int,
+        modes: NDArray[np.int64],
         matrices: Matrices,
         shapes: NDArray[np.float64],
         omega: NDArray[np.float64],
         log_frequency: NDArray[np.float64],
         turning: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.complex128]]:
-        """Derivatives of one mode's ln f, damping ratio and shape by all unknowns, those of damping ratios last.
+        """Derivatives of modes' ln f, damping ratios and shapes by all unknowns, those of damping ratios last.
 
         With P(λ)q = 0 in coordinates of the undamped modes, P·dq + P'q·dλ = -dP·q is solved for dλ and dq; the own
         share in q stays 1. Holds for any damping and for gyroscopic coupling.
 
         Parameters
         ----------
-        r : int
-            Index of the mode.
+        modes : ndarray of int, (m,)
         matrices : Matrices
         shapes : ndarray, (n, n)
             Mass-normalised, undamped.
@@ -206,35 +205,55 @@ class DampedModes:
 
         Returns
         -------
-        log_frequency, damping_ratio : ndarray, (n_unknowns + u,)
-        shape : complex ndarray, (n, n_unknowns + u)
+        log_frequency, damping_ratio : ndarray, (m, n_unknowns + u)
+        shapes : complex ndarray, (m, n, n_unknowns + u)
         """
-        pole, share, shape, terms = self.poles[r], self.shares[:, r], self.shapes[:, r], matrices.terms
-        power = {MASS: pole**2, DAMPING_MATRIX: pole, STIFFNESS: 1.0, STRUCTURAL: 1j}
-        logs, n = terms.log.shape[1], len(share)
+        pole, share, shape, terms = (
+            self.poles[modes],
+            self.shares[:, modes],
+            self.shapes[:, modes],
+            matrices.terms,
+        )
+        power = {
+            MASS: pole**2,
+            DAMPING_MATRIX: pole,
+            STIFFNESS: np.ones_like(pole),
+            STRUCTURAL: 1j + 0 * pole,
+        }
+        logs, n, count = terms.log.shape[1], len(share), len(turning)
         common = 2 * matrices.damping_ratio * omega
-        force = np.zeros((len(turning) + len(matrices.damping_log), n), complex)
+        force = np.zeros((count + len(matrices.damping_log), n, len(modes)), complex)
         for kind, (on, rows) in terms.by_kind.items():
-            pushed = power[kind] * matrices.coefficient[on] * (rows @ shape)
-            force[:logs] += terms.log[on].T @ (pushed[:, None] * (rows @ shapes))
+            pushed = power[kind] * matrices.coefficient[on, None] * (rows @ shape)
+            along = (terms.log[on][:, :, None] * (rows @ shapes)[:, None, :]).reshape(len(on), logs * n)
+            force[:logs] += _product(along.T, pushed).reshape(logs, n, len(modes))
         for j, kinds in enumerate(matrices.by_shape):
             total = pole * (matrices.skew_by_shape[j] @ shape)
             total += sum(factor * (kinds[kind] @ shape) for kind, factor in power.items())
-            force[logs + j] = total @ shapes
+            force[logs + j] = shapes.T @ total
         # The damping of undamped modes goes with their frequencies and turns with their shapes.
-        turns = np.einsum("jts,t->js", turning, common * share) + common * (turning @ share)
-        force[: len(turning)] += pole * (log_frequency * (common * share) - turns)
-        force[len(turning) :] = matrices.damping_log * (pole * common * share)
+        shared = common[:, None] * share
+        turns = _product(turning.transpose(0, 2, 1), shared) + common[:, None] * _product(turning, share)
+        force[:count] += pole * (log_frequency[:, :, None] * shared - turns)
+        force[count:] = matrices.damping_log[:, :, None] * (pole * shared)
         _, damping, stiffness, structural = (shapes.T @ dense @ shapes for dense in matrices.dense)
         damping = damping + shapes.T @ matrices.skew @ shapes + np.diag(common)
-        whole = pole**2 * np.eye(n) + pole * damping + stiffness + 1j * structural
-        own = np.diag(whole) + 1e-30
-        whole[np.diag_indices(n)] = own + (_CLOSE * np.abs(pole) ** 2) ** 2 / np.conj(own)
-        whole[:, r] = 2 * pole * share + damping @ share
-        found = np.linalg.solve(whole, -force.T)
-        frequency, ratio = _of_pole(pole, found[r].copy())
-        found[r] = 0.0
+        whole = pole[:, None, None] * damping + (stiffness + 1j * structural)
+        at, every = np.arange(len(modes)), np.arange(n)
+        own = whole[:, every, every] + (pole**2)[:, None] + 1e-30
+        whole[:, every, every] = own + (_CLOSE * np.abs(pole[:, None]) ** 2) ** 2 / np.conj(own)
+        whole[at, :, modes] = (2 * pole * share + damping @ share).T
+        found = np.linalg.solve(whole, -force.transpose(2, 1, 0))
+        frequency, ratio = _of_pole(pole[:, None], found[at, modes])
+        found[at, modes] = 0.0
         return frequency, ratio, np.asarray(shapes @ found, complex)
+
+
+def _product(matrix: NDArray[np.float64], columns: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Product of a real matrix, or several, with complex columns; no complex copy of the matrix is made."""
+    both = matrix @ np.concatenate([columns.real, columns.imag], axis=1)
+    m = columns.shape[1]
+    return np.asarray(both[..., :m] + 1j * both[..., m:])
 
 
 def _of_pole(

@@ -177,10 +177,9 @@ class ModeDerivatives:
             bare, weight = _undamped(matrices, solution, np.arange(len(omega)))
             count = len(weight)
             order = [*range(at), *range(count, count + len(matrices.damping_log)), *range(at, count)]
-            for k in turned:
-                own = damped.derivatives_of(int(modes[k]), matrices, phi, omega, bare, weight)
-                log_frequency[:, k], ratio[:, k] = own[0][order], own[1][order]
-                shapes[:, :, k] = own[2].T[order]
+            own = damped.derivatives_of(modes[turned], matrices, phi, omega, bare, weight)
+            log_frequency[:, turned], ratio[:, turned] = own[0][:, order].T, own[1][:, order].T
+            shapes[:, :, turned] = own[2][:, :, order].transpose(2, 1, 0)
         return cls(log_frequency.T, ratio.T, shapes.transpose(1, 2, 0))
 
 
