@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Hit
-from ema_pipeline.run.settings import load_pipeline, toml_value
+from ema_pipeline.run.settings import PipelineSettings, load_pipeline, toml_value
 
 if TYPE_CHECKING:
     from ema_pipeline.ingest.description import TestDescription
@@ -35,22 +35,35 @@ def check_raw(raw: Path, overrides: Iterable[str] = ()) -> dict[str, tuple[Hit, 
 
 
 def check_records(raw: Path, overrides: Iterable[str] = ()) -> list[str] | None:
-    """A line on every record of a continuous test, or None for hits; EmaError for a record that is not right."""
+    """A line on every record of a test without hits, or None for hits; EmaError for a record that is not right."""
+    tests, settings = read_campaign(raw).tests, load_pipeline(DEFAULT_PIPELINE, overrides)
+    told = {"continuous": _driven_lines, "hysteresis": _loop_lines}
+    if any(t.kind not in told for t in tests):
+        return None
+    return [line for test in tests for line in told[test.kind](test, settings)]
+
+
+def _driven_lines(test: TestDescription, settings: PipelineSettings) -> Iterator[str]:
     from ema_pipeline.ingest.driven import load_driven
 
-    tests, settings = read_campaign(raw).tests, load_pipeline(DEFAULT_PIPELINE, overrides)
-    if any(t.kind != "continuous" for t in tests):
-        return None
-    lines = []
-    for test in tests:
-        for r in load_driven(test, settings.ingest):
-            period = f", {r.n_samples // r.period} periods" if r.period else ""
-            level = ", ".join(f"{c.name} {np.std(f):.3g} N" for c, f in zip(r.forces, r.force, strict=True))
-            lines.append(
-                f"{r.name}: {r.n_samples} samples at {r.sample_rate_hz:.6g} Hz{period}, "
-                f"{r.excitation or 'continuous'}, {r.use.replace('_', ' ')}; force {level} (root mean square)"
-            )
-    return lines
+    for r in load_driven(test, settings.ingest):
+        period = f", {r.n_samples // r.period} periods" if r.period else ""
+        level = ", ".join(f"{c.name} {np.std(f):.3g} N" for c, f in zip(r.forces, r.force, strict=True))
+        yield (
+            f"{r.name}: {r.n_samples} samples at {r.sample_rate_hz:.6g} Hz{period}, "
+            f"{r.excitation or 'continuous'}, {r.use.replace('_', ' ')}; force {level} (root mean square)"
+        )
+
+
+def _loop_lines(test: TestDescription, settings: PipelineSettings) -> Iterator[str]:
+    from ema_pipeline.loops.read import load_loops
+
+    for loop in load_loops(test, settings.loops):
+        yield (
+            f"{loop.name}: {loop.cycles} cycles at {loop.frequency_hz:.4g} Hz, amplitude {loop.amplitude_m:.3g} m, "
+            f"force up to {np.max(np.abs(loop.force)):.3g} N, "
+            f"{loop.energy_j:.3g} ± {loop.energy_std_j:.2g} J lost per cycle"
+        )
 
 
 def draft_raw(raw: Path, overrides: Iterable[str] = ()) -> list[Path]:

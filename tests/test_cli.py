@@ -589,6 +589,29 @@ def test_check_fits_80_columns_with_units_and_clauses_and_fails_where_a_point_ha
     assert {hit["force_unit"] for hit in json.loads(listed[1])["default"]} == {"N"}
 
 
+def test_check_tells_what_loops_hold_and_what_is_wrong_with_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_sine_tests(tmp_path, PRINTED, frequencies_hz=(10.0,), amplitudes_m=(1e-3, 2e-3))
+    code, out, err = ema(capsys, "check", tmp_path)
+    assert (code, err) == (0, "")
+    first, second = out.splitlines()
+    found = re.fullmatch(
+        r"10Hz_1mm\.csv: (\d+) cycles at 10 Hz, amplitude 0\.001 m, force up to (\S+) N, (\S+) ± \S+ J lost per cycle",
+        first,
+    )
+    assert found
+    assert all(float(number) > 0 for number in found.groups())
+    assert "amplitude 0.002 m" in second
+    table = tmp_path / "10Hz_1mm.csv"
+    table.write_text("\n".join(table.read_text().splitlines()[:40]) + "\n")
+    code, out, err = ema(capsys, "check", tmp_path)
+    assert code == 1
+    assert err.count("\n") == 1
+    assert "10Hz_1mm.csv" in err
+    assert "hammer" not in err
+
+
 def test_init_takes_the_struck_node_and_direction_from_universal_files(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

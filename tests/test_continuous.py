@@ -12,9 +12,7 @@ from typer.testing import CliRunner
 
 import ema_pipeline as ema
 from ema_pipeline.cli import app
-from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.description import read_description
-from ema_pipeline.ingest.driven import load_driven
+from tests.bench import ema as command
 from tests.continuous_cases import RIG, write_oscillator
 
 RUNNER = CliRunner()
@@ -80,10 +78,10 @@ period_samples = 512
 """
 
 
-def _folder(tmp_path: Path, text: str, samples: int = 1024, clip: float = np.inf) -> Path:
+def _folder(tmp_path: Path, text: str, samples: int = 1024) -> Path:
     force = np.tile(np.random.default_rng(0).standard_normal(512), -(-samples // 512))[:samples]
     with h5py.File(tmp_path / "r.h5", "w") as file:
-        file["f"], file["x"] = np.clip(force, -clip, clip), 1e-3 * np.cumsum(force)
+        file["f"], file["x"] = force, 1e-3 * np.cumsum(force)
     (tmp_path / "test.toml").write_text(text)
     return tmp_path
 
@@ -104,21 +102,43 @@ def _folder(tmp_path: Path, text: str, samples: int = 1024, clip: float = np.inf
         (('"multisine"', '"random"'), "has no period"),
     ],
 )  # fmt: skip
-def test_bad_descriptions_are_one_line(tmp_path: Path, change: tuple[str, str], words: str) -> None:
-    folder = _folder(tmp_path, DESCRIPTION.replace(*change))
-    with pytest.raises(EmaError) as caught:
-        list(load_driven(read_description(folder)))
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-    found = RUNNER.invoke(app, ["run", str(folder), "--out", str(tmp_path / "out")])
-    assert found.exit_code == 1
-    assert "Traceback" not in found.output
+def test_bad_descriptions_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: tuple[str, str], words: str
+) -> None:
+    _one_line(capsys, _folder(tmp_path, DESCRIPTION.replace(*change)), words)
 
 
-def test_a_clipped_force_is_refused(tmp_path: Path) -> None:
-    folder = _folder(tmp_path, DESCRIPTION, samples=8192, clip=1.2)
-    with pytest.raises(EmaError, match=r"channel 'f': is clipped"):
-        list(load_driven(read_description(folder)))
+def _one_line(capsys: pytest.CaptureFixture[str], folder: Path, *words: str) -> None:
+    """Both `check` and `run` end with one line on stderr that names the folder's file and holds the words."""
+    for verb in (("check", folder), ("run", folder, "--out", folder / "out")):
+        code, _, err = command(capsys, *verb)
+        assert code == 1
+        assert err.count("\n") == 1
+        assert err.startswith(f"ema: {folder}")
+        assert all(w in err for w in words)
+
+
+@pytest.mark.parametrize(("channel", "share"), [("f", 0.3), ("x", 0.6)])
+def test_a_clipped_channel_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], channel: str, share: float
+) -> None:
+    folder = _folder(tmp_path, DESCRIPTION, samples=8192)
+    with h5py.File(tmp_path / "r.h5", "r+") as file:
+        limit = share * np.max(np.abs(file[channel][:]))
+        file[channel][:] = np.clip(file[channel][:], -limit, limit)
+    _one_line(capsys, folder, f"channel '{channel}': is clipped at {limit:.3g}", "with a larger range")
+
+
+def test_a_model_of_modes_that_grows_without_bound_says_what_to_look_at(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = _folder(
+        tmp_path, DESCRIPTION.replace("period_samples = 512", "")
+    )  # a displacement that wanders off
+    code, _, err = command(capsys, "run", folder, "--out", tmp_path / "out", "--quiet")
+    assert code == 1
+    assert err.count("\n") == 1
+    assert "a sensor that drifts" in err
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 
 import ema_pipeline as ema
 from ema_pipeline.diagnose.records import in_windows, record_model, whole_ladder
-from ema_pipeline.diagnose.rungs import ladder_of
+from ema_pipeline.diagnose.rungs import ladder_of, make_ladder
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import Candidate, Diagnosis
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.ingest.description import read_description
 from ema_pipeline.ingest.driven import load_driven
@@ -20,8 +23,8 @@ from tests.continuous_cases import RIG, write_oscillator
 LIBRARY = effect_library()
 
 
-def _oscillator(folder: Path, cubic: float, started: str) -> RecordObservations:
-    raw = write_oscillator(folder / "raw", lambda x, v: cubic * x**3)
+def _oscillator(folder: Path, cubic: float, started: str, friction: float = 0.0) -> RecordObservations:
+    raw = write_oscillator(folder / "raw", lambda x, v: cubic * x**3 + friction * np.tanh(v / 0.02))
     (folder / "rig.toml").write_text(started)
     one, two = (r for r in load_driven(read_description(raw)))
     rig = ema.load_rig(folder / "rig.toml")
@@ -107,3 +110,29 @@ def test_a_ladder_of_whole_records_does_not_depend_on_the_number_of_processes(tm
     assert "windows" not in alone.note
     assert alone.rungs[-1].error < 0.2 * alone.rungs[0].error
     assert np.isfinite(alone.rungs[-1].heldout_error)
+
+
+@pytest.mark.parametrize("friction", [0.0, pytest.param(8.0, marks=pytest.mark.slow)])
+def test_a_further_claim_that_whole_records_do_not_support_is_withdrawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, friction: float
+) -> None:
+    whole = _oscillator(tmp_path, 1e9, RIG.replace("1.0 }", "2.0 }").replace("1e4", "5e4"), friction)
+    windows = in_windows(whole)
+    labels = ("cubic_spring@mass.x", "dry_friction@mass.x")
+    searched = make_ladder(windows, [record_model(whole, LIBRARY, labels[:k]) for k in range(3)])
+    candidates = tuple(
+        Candidate(*label.split("@"), "", 0.99, {}, 9.0, 1.0, 9.0, 1.0, 90.0, 3.5, 90.0, True, "Its signs.")
+        for label in labels
+    )
+    told = Diagnosis("effect", "", 0.0, candidates, (labels,), "", (), {}, 9.0, 9.0, searched)
+    records = importlib.import_module("ema_pipeline.diagnose.records")
+    monkeypatch.setattr(records, "diagnose", lambda *given, **named: told)
+    found = records.diagnose_records(whole, LIBRARY, settings=DiagnoseSettings(processes=1))
+    kept = labels if friction else labels[:1]
+    assert tuple(c.label for c in found.candidates if c.claimed) == kept
+    assert found.ladder.rungs[-1].effects == kept
+    if not friction:
+        assert "Not claimed: the log evidence that it gains in whole records" in found.candidates[1].why
+        assert "dry friction at mass.x" in found.ladder.note
+        assert "dry friction" not in found.summary
+        assert found.indistinguishable == ()

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
 from ema_pipeline.mechanics.dissipation import HystereticSpring, SquareDamper
-from ema_pipeline.mechanics.laws import BoucWen, DryFriction, Maxwell, PolynomialSpring
+from ema_pipeline.mechanics.laws import BoucWen, DryFriction, Maxwell, PartingSpring, PolynomialSpring
 from ema_pipeline.mechanics.nonlinear import nonlinear_response
 from ema_pipeline.mechanics.simulation import (
     Sensors,
@@ -53,6 +53,34 @@ LAWS = {
     "friction": (DryFriction("e", BETWEEN, 3.0, 0.05), lambda d, v: 3.0 * np.tanh(v / 0.05)),
     "square damper": (SquareDamper("e", BETWEEN, 80.0), lambda d, v: 80.0 * abs(v) * v),
 }
+
+
+ALONE = {
+    "linear": (),
+    "cubic and friction": (PolynomialSpring("e", ROW, 1e6, 4e9), DryFriction("f", ROW, 3.0, 0.05)),
+    "square damper": (SquareDamper("e", ROW, 80.0),),
+    "hysteresis": (HystereticSpring("e", ROW, 2e4, 20.0, 0.3, 1.0),),
+    "relaxation beside a contact": (PartingSpring("e", ROW, 1e4, preload=1e-4), Maxwell("f", ROW, 1e4, 5e-3)),
+    "two that remember": (HystereticSpring("e", ROW, 2e4, 20.0, 0.3, 1.6), Maxwell("f", ROW, 1e4, 5e-3)),
+}
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_one_coordinate_alone_moves_as_beside_one_that_rests(name: str) -> None:
+    parts = (Mass("a", ROW, 1.5), Spring("ground", ROW, 4e4), Damper("damper", ROW, 12.0), *ALONE[name])
+    idle = (Mass("b", {"b.x": 1.0}, 1.0), Spring("idle", {"b.x": 1.0}, 1e3))
+    fine = between_samples(_force(300)[None], 2 * SUBSTEPS)
+    motions = []
+    for assembly in (Assembly(("a.x",), parts), Assembly(("a.x", "b.x"), (*parts, *idle))):
+        n = len(assembly.dofs)
+        system = driven_system(assembly, np.eye(n)[:1])
+        begin = np.zeros(system.size)
+        begin[[0, n]], begin[2 * n :] = (1e-3, 0.1), 1e-4
+        found = march(system, RATE, SUBSTEPS, fine, begin)
+        assert found is not None
+        motions.append(np.delete(found[0], [1, 3], axis=1) if n == 2 else found[0])
+    scale = np.max(np.abs(motions[1]), axis=0)
+    np.testing.assert_allclose(motions[0] / scale, motions[1] / scale, atol=1e-11)
 
 
 @pytest.mark.parametrize("name", LAWS)

@@ -21,7 +21,7 @@ from ema_pipeline.diagnose.rungs import (
     with_gains,
 )
 from ema_pipeline.diagnose.selection import Progress
-from ema_pipeline.diagnose.sentences import size_text, summary
+from ema_pipeline.diagnose.sentences import label_text, size_text, summary
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder, Rung
 from ema_pipeline.effects.base import Effect, PlacedEffect
@@ -98,8 +98,40 @@ def diagnose_records(
         hypotheses=hypotheses,
     )
     progress(0.85, "whole records")
-    ladder = whole_ladder(observations, library, found.ladder, settings.processes)
+    searched = found.ladder
+    ladder = whole_ladder(observations, library, searched, settings.processes)
+    while doubt := _unconfirmed(found, ladder, settings):
+        found, searched = _withdrawn(found, searched, doubt)
+        ladder = whole_ladder(observations, library, searched, settings.processes)
     return _with_whole(found, ladder)
+
+
+def _unconfirmed(found: Diagnosis, ladder: Ladder, settings: DiagnoseSettings) -> str:
+    """Why whole records do not support the last of several claims; empty where they do, or tell nothing of it.
+
+    Windows take coarser steps, and states of their own, which an effect too many may make up for.
+    """
+    if len(ladder.rungs) < 3 or found.verdict == "ambiguous" or _OUT_OF_STEP in ladder.note:
+        return ""
+    gain = ladder.rungs[-1].log_evidence - ladder.rungs[-2].log_evidence
+    if gain >= settings.claim:
+        return ""
+    return f"the log evidence that it gains in whole records, {gain:.1f}, is below {settings.claim:g}"
+
+
+def _withdrawn(found: Diagnosis, searched: Ladder, doubt: str) -> tuple[Diagnosis, Ladder]:
+    """Diagnosis and ladder of the search without the last claim."""
+    label = searched.rungs[-1].effects[-1]
+    candidates = tuple(
+        dataclasses.replace(c, claimed=False, why=f"Not claimed: {doubt}.") if c.label == label else c
+        for c in found.candidates
+    )
+    groups = tuple(g for g in found.indistinguishable if label not in g)
+    note = f"the best further effect is {label_text(label)}, and {doubt}"
+    return (
+        dataclasses.replace(found, candidates=candidates, indistinguishable=groups),
+        dataclasses.replace(searched, rungs=searched.rungs[:-1], note=note),
+    )
 
 
 def in_windows(observations: RecordObservations) -> RecordObservations:

@@ -20,6 +20,8 @@ COLUMNS = 8
 FEW = (0,) * COLUMNS
 """As `known` of a march with just so many: a number that the compiler knows lets it unroll all loops over them."""
 
+_SATURATED = 20.0
+"""Argument from which a hyperbolic tangent is 1 to the last digit."""
 _WILD = 1e12
 """Motion, in SI units, that no structure has."""
 
@@ -52,32 +54,29 @@ def _law(kind, d, v, z, a, b, c, e):  # type: ignore[no-untyped-def]
         ga = d * d
         gb = ga * d
     elif kind == 1:
-        t = np.tanh(v / b)
+        fast = abs(v * (1.0 / b))
+        gap = np.exp(-2.0 * fast) if fast < _SATURATED else 0.0  # np.tanh takes three times as long
+        t = (1.0 - gap) / (1.0 + gap)
+        if v < 0.0:
+            t = -t
         s = 1.0 - t * t
         g, gv, ga, gb = a * t, a * s / b, t, -a * s * v / (b * b)
     elif kind == 2:
         g, gv, ga = a * abs(v) * v, 2.0 * a * abs(v), abs(v) * v
     elif kind == 3:
         g, gz = z, 1.0
-        u = z / b
+        u = z * (1.0 / b)  # the quotient is ready before z is, and the loop waits for z
         size = abs(u)
-        if e == 1.0:
-            low, power = 1.0, size
-        else:
-            low = size ** (e - 1.0)
-            power = low * size
-        way = abs(v)
-        sign = 1.0 if v >= 0.0 else -1.0
-        side = 1.0 if u >= 0.0 else -1.0
-        inner = v - way * low * u - c * v * power
+        low = 1.0 if e == 1.0 else size ** (e - 1.0)
+        drag = abs(v) + c * v if u >= 0.0 else abs(v) - c * v
+        inner = v - low * drag * u
         r, ra = a * inner, inner
-        rv = a * (1.0 - sign * low * u - c * power)
-        by_u = -a * e * (way * low + c * v * low * side)
-        rz = by_u / b
-        rb = -by_u * u / b
-        rc = -a * v * power
+        rv = a * (1.0 - low * ((1.0 if v >= 0.0 else -1.0) * u + c * size))
+        rz = -a * e * low * drag * (1.0 / b)
+        rb = -rz * u
+        rc = -a * v * low * size
         if size > 1e-12:
-            re = -a * np.log(size) * (way * low * u + c * v * power)
+            re = -a * np.log(size) * low * drag * u
     elif kind == 4:
         over = d + b
         if over > 0.0:
@@ -314,9 +313,66 @@ def march_with_slopes(  # type: ignore[no-untyped-def]
     return True
 
 
+@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+def _march_one(  # type: ignore[no-untyped-def]
+    stiffness, damping, inputs, push, rows, kinds, numbers, force, begin, step, every, out, memory
+):  # fmt: skip
+    """`march` of one coordinate in a third to two thirds of the time: its motion stays in registers.
+
+    `memory` is the number of the one element that has a memory, or of any where none has.
+    """
+    m, ins = kinds.shape[0], inputs.shape[1]
+    spring, damper = stiffness[0, 0], damping[0, 0]
+    out[:] = begin
+    x, v, z = begin[0], begin[1], begin[2 + memory] if m > 0 else 0.0
+    for k in range((force.shape[0] - 1) // 2):
+        x_at, v_at, z_at = x, v, z
+        x_total = v_total = z_total = 0.0
+        for stage in range(4):
+            half = 2 * k + (0 if stage == 0 else (2 if stage == 3 else 1))
+            rate, z_rate = -spring * x_at - damper * v_at, 0.0
+            for q in range(ins):
+                rate += inputs[0, q] * force[half, q]
+            for j in range(m):
+                row = rows[j, 0]
+                found = _law(
+                    kinds[j], row * x_at, row * v_at, z_at,
+                    numbers[j, 0], numbers[j, 1], numbers[j, 2], numbers[j, 3],
+                )  # fmt: skip
+                rate -= push[0, j] * found[0]
+                z_rate += found[6]
+            weight = 1.0 if stage == 0 or stage == 3 else 2.0
+            ahead = 0.5 * step if stage < 2 else step
+            x_total += weight * v_at
+            v_total += weight * rate
+            z_total += weight * z_rate
+            x_at, v_at, z_at = x + ahead * v_at, v + ahead * rate, z + ahead * z_rate
+        x += step / 6.0 * x_total
+        v += step / 6.0 * v_total
+        z += step / 6.0 * z_total
+        if not max(abs(x), abs(v), abs(z)) < _WILD:
+            return False
+        if (k + 1) % every == 0:
+            at = (k + 1) // every
+            out[at, 0], out[at, 1] = x, v
+            if m > 0:
+                out[at, 2 + memory] = z
+    return True
+
+
 @numba.njit(cache=True)
 def march_windows(stiffness, damping, inputs, push, rows, kinds, numbers, force, begin, step, every, out):  # type: ignore[no-untyped-def]
     """`march` for every force (n_windows, ...), from `begin` (n_windows, 2n + m) into `out`; False where one fails."""
+    remembers = (kinds == BOUC_WEN) | (kinds == MAXWELL)
+    if len(stiffness) == 1 and np.sum(remembers) <= 1:
+        memory = np.argmax(remembers) if len(kinds) > 0 else 0
+        for w in range(len(force)):
+            if not _march_one(
+                stiffness, damping, inputs, push, rows, kinds, numbers, force[w], begin[w], step, every, out[w],
+                memory,
+            ):  # fmt: skip
+                return False
+        return True
     for w in range(len(force)):
         if not march(
             stiffness, damping, inputs, push, rows, kinds, numbers, force[w], begin[w], step, every, out[w]

@@ -183,6 +183,11 @@ class RecordObservations:
         system = model.driven(x)
         found = self.motion(self.data[0], system, np.zeros((len(self.data[0].starts), system.size)))
         if found is None:
+            if self.modal:
+                raise EmaError(
+                    "the model that the identified modes make grows without bound; look at the FRFs: a sensor that "
+                    "drifts or has a wrong unit gives modes that are none. Leave it out, or give a rig file with --rig"
+                )
             raise EmaError(f"rig '{self.rig.name}' without effects grows without bound; check its elements")
         return found.states.reshape(-1, system.size), model.linear(x).mass
 
