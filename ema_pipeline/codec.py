@@ -75,8 +75,9 @@ def write(parent: h5py.Group, name: str, value: Any) -> None:
             chunks=(1, _share(value.shape[1], _ROW_CHUNK)),
             fletcher32=True,
         )
-        for row in range(len(value)):
-            dataset[row] = value[row]
+        with value.held_open():
+            for row in range(len(value)):
+                dataset[row] = value[row]
     elif dataclasses.is_dataclass(value) and not isinstance(value, type):
         group = parent.create_group(name)
         for field in dataclasses.fields(value):

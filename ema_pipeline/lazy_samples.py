@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,6 +31,10 @@ class LazySamples(ABC):
     """
 
     shape: tuple[int, int]
+
+    def held_open(self) -> AbstractContextManager[None]:
+        """Keeps what the samples are read from open while many rows are read."""
+        return nullcontext()
 
     @abstractmethod
     def read(self, row: int, start: int, stop: int) -> Real:

@@ -16,6 +16,7 @@ from scipy.io import wavfile
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest import load_channels, load_record, load_records, read_campaign, read_description
+from ema_pipeline.ingest.readers.hdf5 import LONG
 from ema_pipeline.ingest.records import Record
 from ema_pipeline.ingest.swap import find_swap
 
@@ -232,6 +233,45 @@ def test_channels_of_different_length_are_refused(tmp_path: Path) -> None:
     with h5py.File(folder / "hit.h5", "w") as file:
         file["hammer"], file["tip"] = DATA["hammer"], DATA["tip"][:-5]
     assert "hit.h5: channels differ in length ('tip' 2043 samples, 'hammer' 2048)" in message_of(folder)
+
+
+def test_a_file_of_many_channels_is_opened_once_to_check_and_once_to_store_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import h5py
+
+    from ema_pipeline import codec
+
+    folder = make_test(tmp_path, file="hit.h5")
+    long = {name: np.concatenate([samples, np.zeros(LONG)]) for name, samples in DATA.items()}
+    more = [f"more{k}" for k in range(6)]
+    with h5py.File(folder / "hit.h5", "w") as file:
+        for name in ("hammer", "tip", *more):
+            file[name] = long["hammer" if name == "hammer" else "tip"]
+    channels = "".join(
+        f'[[channels]]\nname = "{name}"\nquantity = "acceleration"\nunit = "m/s^2"\ndof = "{name}.x"\n'
+        for name in more
+    )
+    text = (folder / "test.toml").read_text(encoding="utf-8")
+    (folder / "test.toml").write_text(text + channels, encoding="utf-8")
+    opened, really = [], h5py.File
+
+    def counting(path: Path, *args: object, **kwargs: object) -> h5py.File:
+        opened.append(Path(path).name)
+        return really(path, *args, **kwargs)
+
+    monkeypatch.setattr(h5py, "File", counting)
+    record = load(folder)
+    assert opened == ["hit.h5"] * 2  # to check all channels, and for the force
+    with really(tmp_path / "store.h5", "w") as store:
+        codec.write(store, "responses", record.responses)
+        assert opened == ["hit.h5"] * 3
+        assert_allclose(store["responses"][()], np.tile(long["tip"], (7, 1)), rtol=0)
+    assert record.responses[3, 5:9].shape == (4,)  # opened for itself
+    assert opened == ["hit.h5"] * 4
+    (folder / "hit.h5").unlink()
+    with pytest.raises(EmaError, match=r"hit\.h5: .*cannot be read"), really(tmp_path / "b.h5", "w") as store:
+        codec.write(store, "responses", record.responses)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

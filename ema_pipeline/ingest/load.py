@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.ingest.description import ChannelDescription, RecordDescription, TestDescription
 from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers import read_raw
-from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord, Samples, split_unit
+from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord, Samples, held_open, split_unit
 from ema_pipeline.ingest.records import ANY_BAND_HZ, Record, ResponseChannel, Transducer
 from ema_pipeline.ingest.swap import find_swap
 from ema_pipeline.lazy_samples import LazySamples
@@ -70,6 +71,10 @@ class _ScaledSamples(LazySamples):
     def __init__(self, sources: list[_Source]) -> None:
         self._sources = sources
         self.shape = (len(sources), sources[0].samples.size)
+
+    def held_open(self) -> AbstractContextManager[None]:
+        """The record's file, which holds all channels."""
+        return held_open(self._sources[0].samples)
 
     def read(self, row: int, start: int, stop: int) -> NDArray[np.float64]:
         return self._sources[row].scaled(start, stop)
@@ -204,14 +209,15 @@ def _open(
     found = {c.name: _find_channel(c.name, raw, str(path)) for c in test.channels}
     _check_lengths(found, str(path))
     sources = {}
-    for channel in test.channels:
-        where = f"{path}: channel '{channel.name}'"
-        source = found[channel.name]
-        samples = np.asarray(source.samples)
-        factor, in_volts = _factor(channel, source, where), _in_volts(channel, source)
-        _check_finite(samples, rate, where)
-        _check_believable(samples, rate, factor, in_volts, where)
-        sources[channel.name] = _Source(source.samples, factor, _full_scale(channel))
+    with held_open(found[test.channels[0].name].samples):
+        for channel in test.channels:
+            where = f"{path}: channel '{channel.name}'"
+            source = found[channel.name]
+            samples = np.asarray(source.samples)
+            factor, in_volts = _factor(channel, source, where), _in_volts(channel, source)
+            _check_finite(samples, rate, where)
+            _check_believable(samples, rate, factor, in_volts, where)
+            sources[channel.name] = _Source(source.samples, factor, _full_scale(channel))
     return rate, sources
 
 

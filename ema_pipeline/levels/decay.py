@@ -166,7 +166,10 @@ def _of_hit(
     derivatives = np.array([DERIVATIVES[c.quantity] for c in hit.channels])
     bands = [_band(complex(poles[task.mode]), axis, n, rate) for task in tasks]
     weights = [
-        _weights(residues[task.mode, outputs, i], frfs.variance[outputs, i, band.lines])
+        _weights(
+            residues[task.mode, outputs, i],
+            np.array([frfs.variance[o, i, band.lines].mean() for o in outputs]),
+        )
         for task, band in zip(tasks, bands, strict=True)
     ]
     combined = _combined(hit, bands, weights)
@@ -182,9 +185,10 @@ def _of_hit(
         mine = u[task.mode] * force[lines]
         others = (share @ u + other_share @ mirrored) * force[lines] - mine
         signal = measured - others
-        scatter = frfs.variance[outputs, i, lines] * frfs.hits[outputs, i, None]
-        scatter *= omega ** (2 * derivatives[:, None])
-        noise = band.noise(np.abs(weight) ** 2 @ scatter * np.abs(force[lines]) ** 2, signal - mine)
+        scatter = np.zeros(len(omega))
+        for o, gain, power in zip(outputs, np.abs(weight) ** 2, 2 * derivatives, strict=True):
+            scatter += gain * frfs.hits[o, i] * frfs.variance[o, i, lines] * omega**power
+        noise = band.noise(scatter * np.abs(force[lines]) ** 2, signal - mine)
         table = _read(band, signal, LEFT_OVER * others, noise, start_s, -FILTERED * pole.real)
         if table is not None:
             best = float(np.abs(residues[task.mode, task.sensor, i]))
@@ -221,9 +225,8 @@ def _width(pole: complex, step_hz: float) -> float:
     return float(min(max(-BANDWIDTHS * pole.real / (2 * np.pi), FEWEST_LINES * step_hz), WIDEST * frequency))
 
 
-def _weights(own: Complex, variance: Real) -> Complex:
+def _weights(own: Complex, noise: Real) -> Complex:
     """Combination of sensors with the best signal-to-noise ratio that gives the mode a share of 1."""
-    noise = np.mean(variance, axis=1)
     known = np.isfinite(noise).all() and (noise > 0).all()  # one hit per point: no scatter is known
     weight = own.conj() / (noise if known else 1.0)
     return np.asarray(weight / np.sum(weight * own))

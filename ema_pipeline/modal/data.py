@@ -19,6 +19,9 @@ HIGHEST_SHARE_OF_NYQUIST = 0.95
 AT_ONCE = 1 << 18
 """Numbers of a block, so that what is made of it on the way fits into a few megabytes."""
 
+FEW_AT_ONCE = 1 << 17
+"""The same where every row is worked on by itself, with several arrays of the block at a time in every thread."""
+
 
 @dataclass(frozen=True)
 class FitData:
@@ -67,9 +70,9 @@ class FitData:
         """Some rows on the same lines."""
         return replace(self, frf=self.frf[rows], variance=self.variance[rows], measured=self.measured[rows])
 
-    def row_blocks(self) -> list[slice]:
+    def row_blocks(self, numbers: int = AT_ONCE) -> list[slice]:
         """Rows in blocks that are small beside the whole, for what can be done row by row."""
-        at_once = max(1, AT_ONCE // max(1, self.frf[0].size))
+        at_once = max(1, numbers // max(1, self.frf[0].size))
         return [slice(k, min(k + at_once, len(self.frf))) for k in range(0, len(self.frf), at_once)]
 
     def line_blocks(self) -> list[slice]:

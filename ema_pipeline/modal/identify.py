@@ -11,7 +11,7 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.assurance import mpc
 from ema_pipeline.modal.bands import SubBand, indicator, split
 from ema_pipeline.modal.compress import Window
-from ema_pipeline.modal.data import FitData, analysis_band, arrange
+from ema_pipeline.modal.data import FEW_AT_ONCE, FitData, analysis_band, arrange
 from ema_pipeline.modal.drift.plain import plain_peaks
 from ema_pipeline.modal.engines import poles_of_all_orders
 from ema_pipeline.modal.fit import (
@@ -304,9 +304,10 @@ def _synthesis(window: Window, modes: FittedModes) -> NDArray[np.complex64]:
         fitted = synthesis(some, estimate, modes.shapes.T[rows])
         noise = window.noise.rows(rows).at(some.frf)
         fitted += residual_fit(some, noise.weight(some.measured), fitted)
-        total[rows] = np.where(some.measured[..., None], fitted, np.nan)
+        fitted[~some.measured] = np.nan
+        total[rows] = fitted
 
-    for _ in in_order(fill, data.row_blocks()):
+    for _ in in_order(fill, data.row_blocks(FEW_AT_ONCE)):
         pass
     return np.asarray(total.swapaxes(0, 1) if data.transposed else total)
 

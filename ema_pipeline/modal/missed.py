@@ -14,7 +14,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.data import FEW_AT_ONCE, FitData
 from ema_pipeline.modal.fit import Estimate, LinearSolution, residual_fit, synthesis
 from ema_pipeline.modal.noise import Noise, squared
 from ema_pipeline.threads import in_order
@@ -58,12 +58,13 @@ def left_over(
         some, weight = data.rows(rows), hits.rows(rows).weight(data.measured[rows])
         model = synthesis(some, estimate, solution.shapes[rows])
         model += residual_fit(some, weight, model)
-        model = np.where(some.measured[..., None], some.frf - model, 0.0)
+        np.subtract(some.frf, model, out=model)
+        model[~some.measured] = 0.0
         if left is not None:
             left[rows] = model
         return np.einsum("oil,oil->l", squared(model), weight)
 
-    power = np.asarray(sum(in_order(of_rows, data.row_blocks())))
+    power = np.asarray(sum(in_order(of_rows, data.row_blocks(FEW_AT_ONCE))))
     return power / max(int(np.count_nonzero(data.measured)), 1)
 
 

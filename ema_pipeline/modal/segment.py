@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.data import FitData
+from ema_pipeline.modal.data import FEW_AT_ONCE, FitData
 from ema_pipeline.modal.fit import (
     Estimate,
     LinearSolution,
@@ -150,16 +150,21 @@ def put_back(estimate: Estimate, before: Estimate, lost: NDArray[np.bool_]) -> E
 def measured_noise(
     data: FitData, hits: Noise | None, estimate: Estimate, shapes: Complex, weight: Real
 ) -> Noise:
-    """Noise from what the fit leaves over, and from the scatter over hits where that is larger."""
-    left, square = np.empty(data.frf.shape), np.empty(data.frf.shape)
+    """Noise from what the fit leaves over, and from the scatter over hits where that is larger; overwrites `weight`."""
+    left, square = (
+        weight,
+        np.empty(data.frf.shape),
+    )  # where the weights of a row have been used, what it leaves
 
     def of_rows(rows: slice) -> None:
         some = data.rows(rows)
         model = synthesis(some, estimate, shapes[rows])
         model += residual_fit(some, weight[rows], model)
-        left[rows], square[rows] = squared(some.frf - model), squared(model)
+        square[rows] = squared(model)
+        model -= some.frf
+        left[rows] = squared(model)
 
-    for _ in in_order(of_rows, data.row_blocks()):
+    for _ in in_order(of_rows, data.row_blocks(FEW_AT_ONCE)):
         pass
     n_lines = len(data.omega)
     n_ref = data.measured.shape[1]

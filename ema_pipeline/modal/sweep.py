@@ -46,6 +46,7 @@ from ema_pipeline.modal.uncertainty import (
     scores_of_points,
     shape_covariance,
 )
+from ema_pipeline.processes import release_memory
 from ema_pipeline.threads import in_order
 
 Complex = NDArray[np.complex128]
@@ -160,6 +161,7 @@ def first_guess(window: Window, bands: tuple[SubBand, ...], modes: Estimate, ite
     found = modes.take(np.zeros(len(modes.poles), dtype=bool))
     for part in bands:
         few = compress(window.lines(part.first, part.stop))
+        release_memory()
         near = modes.take(between(modes.poles, few.data.omega[0], few.data.omega[-1]))
         fit = fit_segment(few.data, few.hits, few.noise, near, significant, min(iterations, FIRST_ITERATIONS))
         found = _stitched(found, fit.estimate.take(between(fit.estimate.poles, part.low, part.high)))
@@ -202,6 +204,7 @@ def refined(
             window.lines(part.first, part.stop), far=sure.take(~near), far_shapes=everywhere[:, ~near]
         )
         few = compress(lines)
+        release_memory()  # small pieces of many blocks, which none of the large arrays that follow could take
         fit = _fit_part(few, sure.take(near), weak.take(also), _voters(chart), search, iterations, peaks)
         fit = _with_peaks(few, fit, seen.absent(fit.estimate), _voters(chart), iterations, peaks)
         fit = _with_wanted(few, fit, asked.absent(fit.estimate), iterations, peaks)

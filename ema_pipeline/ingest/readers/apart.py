@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.limits import ReadLimits
-from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, StoredSamples
+from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, StoredFile, StoredSamples
 
 SECONDS = 8.0
 """Processor time for any file; ordinary ones take a fraction of a second."""
@@ -116,10 +116,10 @@ class _Helper:
         return answer
 
     def _record(self, answer: dict[str, Any], path: Path) -> RawRecord:
-        channels = {}
+        channels, file = {}, StoredFile(path)
         for channel in answer["channels"]:
             size, stored = int(channel["size"]), channel["stored"]
-            samples = self._samples(size) if stored is None else StoredSamples(path, stored, size)
+            samples = self._samples(size) if stored is None else StoredSamples(file, stored, size)
             channels[channel["name"]] = RawChannel(samples, channel["unit"], channel["dof"])
         rate = answer["sample_rate_hz"]
         return RawRecord(channels, rate, tuple(answer["notes"]), answer["rate_tolerance"])

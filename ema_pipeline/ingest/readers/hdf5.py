@@ -11,7 +11,7 @@ import numpy as np
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.ingest.readers.arrays import NamedArray, assemble
-from ema_pipeline.ingest.readers.raw import RawRecord, StoredSamples
+from ema_pipeline.ingest.readers.raw import RawRecord, StoredFile, StoredSamples
 from ema_pipeline.ingest.readers.timebase import is_time_name
 
 if TYPE_CHECKING:
@@ -52,23 +52,23 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
     attributes: dict[str, Any] = {}
     with h5py.File(path, "r") as file:
         attributes.update(small_attributes(file))
-        budget = Budget(path, limits)
+        budget, stored = Budget(path, limits), StoredFile(path)
         for at, item in walk(file, limits):
             if isinstance(item, h5py.Group):
                 attributes = {**small_attributes(item), **attributes}
             elif item.dtype.names is None and item.shape is not None:
-                found = _array(path, at, item, budget)
+                found = _array(stored, at, item, budget)
                 if found is not None:
                     arrays.append(found)
     return assemble(arrays, attributes, limits)
 
 
-def _array(path: Path, at: tuple[str, ...], item: h5py.Dataset, budget: Budget) -> NamedArray | None:
+def _array(stored: StoredFile, at: tuple[str, ...], item: h5py.Dataset, budget: Budget) -> NamedArray | None:
     import h5py
 
     budget.take(item)
     if item.ndim == 1 and item.size >= LONG and item.dtype.kind in "fiu" and not is_time_name(at[-1]):
-        return NamedArray(at, StoredSamples(path, "/".join(at), item.size), small_attributes(item))
+        return NamedArray(at, StoredSamples(stored, "/".join(at), item.size), small_attributes(item))
     if h5py.check_string_dtype(item.dtype) is None:
         values = item[()] if item.dtype.kind in "fiuc" else None
     else:

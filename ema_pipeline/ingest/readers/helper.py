@@ -14,7 +14,7 @@ import numpy as np
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.limits import ReadLimits
-from ema_pipeline.ingest.readers.raw import RawRecord, StoredSamples
+from ema_pipeline.ingest.readers.raw import RawRecord, StoredSamples, held_open
 from ema_pipeline.processes import die_with_parent
 
 _SPARE_BYTES = 256_000_000
@@ -92,10 +92,13 @@ def _lower(what: int, limit: int) -> None:
 
 def _try_stored(record: RawRecord) -> None:
     """Read what the caller will read itself later, so that it is this process that crashes if any does."""
-    for channel in record.channels.values():
-        if isinstance(channel.samples, StoredSamples):
-            for start in range(0, channel.samples.size, _PIECE):
-                channel.samples[start : start + _PIECE]
+    stored = [c.samples for c in record.channels.values() if isinstance(c.samples, StoredSamples)]
+    if not stored:
+        return
+    with held_open(stored[0]):
+        for samples in stored:
+            for start in range(0, samples.size, _PIECE):
+                samples[start : start + _PIECE]
 
 
 def _described(record: RawRecord) -> dict[str, Any]:

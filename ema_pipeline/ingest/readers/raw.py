@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+import threading
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +16,63 @@ from numpy.typing import NDArray
 from ema_pipeline.errors import EmaError
 from ema_pipeline.units import find_unit
 
+if TYPE_CHECKING:
+    import h5py
+
 FULL_SCALE = "fraction of full scale"
 """Stands in place of a unit where samples are fractions of the converter's range (integer WAV)."""
+
+
+class StoredFile(threading.local):
+    """An HDF5 file of which channels are read; opened for each read, or once for many of a thread in `held_open`.
+
+    Parameters
+    ----------
+    path : Path
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._open: h5py.File | None = None
+
+    @contextmanager
+    def held_open(self) -> Iterator[None]:
+        """While the block is open, so is the file: opening it takes as long as reading a channel.
+
+        Raises
+        ------
+        EmaError
+            If the file cannot be opened.
+        """
+        import h5py
+
+        try:
+            file = h5py.File(self.path, "r")
+        except OSError as error:
+            raise self._damaged("", error) from None
+        with file:
+            before, self._open = self._open, file
+            try:
+                yield
+            finally:
+                self._open = before
+
+    def read(self, name: str, cut: slice) -> NDArray[np.float64]:
+        """Some samples of a one-dimensional dataset."""
+        import h5py
+
+        try:
+            if self._open is not None:
+                return np.asarray(self._open[name][cut], dtype=np.float64)
+            with h5py.File(self.path, "r") as file:
+                return np.asarray(file[name][cut], dtype=np.float64)
+        except (OSError, KeyError) as error:
+            raise self._damaged(f"dataset '{name}' ", error) from None
+
+    def _damaged(self, what: str, error: Exception) -> EmaError:
+        return EmaError(
+            f"{self.path}: {what}cannot be read ({error}); the file is damaged, copy or export it again"
+        )
 
 
 @dataclass(frozen=True)
@@ -23,33 +81,29 @@ class StoredSamples:
 
     Attributes
     ----------
-    path : Path
+    file : StoredFile
     name : str
         Path of a one-dimensional dataset within the file.
     size : int
     """
 
-    path: Path
+    file: StoredFile
     name: str
     size: int
 
     def __getitem__(self, cut: slice) -> NDArray[np.float64]:
-        import h5py
-
-        try:
-            with h5py.File(self.path, "r") as file:
-                return np.asarray(file[self.name][cut], dtype=np.float64)
-        except (OSError, KeyError) as error:
-            raise EmaError(
-                f"{self.path}: dataset '{self.name}' cannot be read ({error}); the file is damaged, "
-                "copy or export it again"
-            ) from None
+        return self.file.read(self.name, cut)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(self[:], dtype=dtype)
 
 
 Samples = NDArray[np.float64] | StoredSamples
+
+
+def held_open(samples: Samples) -> AbstractContextManager[None]:
+    """The file in which samples and those of the channels beside them are stored, held open; nothing for an array."""
+    return samples.file.held_open() if isinstance(samples, StoredSamples) else nullcontext()
 
 
 @dataclass(frozen=True)
