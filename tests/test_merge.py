@@ -97,6 +97,16 @@ def tips(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def run_of(tips: Path) -> dict[str, Path]:
+    """Results folders of the two tips, run up to their modes: `merge` takes them in place of raw folders."""
+    for name in ("soft", "hard"):
+        words = ["run", str(tips / name), "--out", str(tips / f"out_{name}"), "--set", MEASURE, "--quiet"]
+        done = CliRunner().invoke(app, words)
+        assert done.exit_code == 0, done.output
+    return {name: tips / f"out_{name}" for name in ("soft", "hard")}
+
+
+@pytest.fixture(scope="module")
 def merged(tips: Path) -> dict[str, Any]:
     """What merging the two tips into ``tips/both`` says."""
     command = ["merge", str(tips / "soft"), str(tips / "hard"), "--out", str(tips / "both"), "--json"]
@@ -107,11 +117,11 @@ def merged(tips: Path) -> dict[str, Any]:
 
 @pytest.mark.usefixtures("merged")
 def test_two_tips_are_as_good_as_each_on_its_own_band(
-    tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tips: Path, run_of: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Frequencies by the chain's own matrices; as precise as the better tip, mode by mode."""
     both = _modes(capsys, tips / "both", tmp_path / "out")
-    alone = [_modes(capsys, tips / name, tmp_path / f"out_{name}") for name in ("soft", "hard")]
+    alone = [measured_modes(existing_run(run_of[name]))["default"] for name in ("soft", "hard")]
     assert len(alone[0]) < BODIES <= len(both)
     for frequency in _truth()[0]:
         k = _nearest(both, frequency)
@@ -170,49 +180,42 @@ def test_roving_sensors_make_whole_shapes(tmp_path: Path, capsys: pytest.Capture
 
 
 def test_tests_of_two_states_are_refused(
-    tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run_of: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A mass of 30 g between the two set-ups."""
     _simulate(tmp_path / "later", effects=["mass@m3.x"], values={"mass@m3.x.mass": 0.03}, **HARD)
-    _refused(capsys, tmp_path / "both", "are not of one state", "mode at", tips / "soft", tmp_path / "later")
-    code, _, err = ema(
-        capsys,
-        "merge",
-        tips / "soft",
-        tmp_path / "later",
-        "--out",
-        tmp_path / "both",
-        "--tolerance",
-        "0.05",
-        "--quiet",
-    )
+    _modes(capsys, tmp_path / "later", tmp_path / "out_later")
+    sources = (run_of["soft"], tmp_path / "out_later")
+    _refused(capsys, tmp_path / "both", "are not of one state", "mode at", *sources)
+    out = ("--out", tmp_path / "both")
+    code, _, err = ema(capsys, "merge", *sources, *out, "--tolerance", "0.05", "--quiet")
     assert (code, err) == (0, "")
 
 
 def test_what_cannot_be_one_test_is_refused(
-    tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tips: Path, run_of: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    out = tmp_path / "both"
+    out, hard = tmp_path / "both", run_of["hard"]
     _simulate(tmp_path / "slow", **SOFT | {"sample_rate_hz": 2560.0})
-    _refused(capsys, out, "sample rate", "record all parts at one rate", tips / "hard", tmp_path / "slow")
+    _refused(capsys, out, "sample rate", "record all parts at one rate", hard, tmp_path / "slow")
     _simulate(tmp_path / "apart", **HARD | {"impacts": ["m2.x"], "sensors": ["m3.x"]})
     _simulate(tmp_path / "alone", **HARD | {"impacts": ["m1.x"], "sensors": ["m1.x"]})
     _refused(capsys, out, "strikes no point", "leave one sensor", tmp_path / "alone", tmp_path / "apart")
-    _refused(capsys, out, "nothing to merge", "two or more", tips / "hard")
-    _refused(capsys, out, "called 'hard', too", "rename one", tips / "hard", tips / "hard")
+    _refused(capsys, out, "nothing to merge", "two or more", hard)
+    _refused(capsys, out, "called 'hard', too", "rename one", hard, tips / "hard")
     shutil.copytree(tips / "hard", tmp_path / "other")
     description = tmp_path / "other" / "test.toml"
     text = description.read_text(encoding="utf-8")
     description.write_text(text.replace("sensitivity_mv = 2.3175", "sensitivity_mv = 22.5"), encoding="utf-8")
-    _refused(capsys, out, "differ by a factor of 9.7", "sensitivity_mv", tips / "hard", tmp_path / "other")
+    _refused(capsys, out, "differ by a factor of 9.7", "sensitivity_mv", hard, tmp_path / "other")
     description.write_text(text.replace('impact = "m6.x"', 'impact = "-m6.x"'), encoding="utf-8")
-    _refused(capsys, out, "opposite signs", "reversed", tips / "hard", tmp_path / "other")
+    _refused(capsys, out, "opposite signs", "reversed", hard, tmp_path / "other")
     description.write_text(
         'configuration = "else"\n' + text.replace("configuration =", "# "), encoding="utf-8"
     )
-    _refused(capsys, out, "only tests of one configuration", "'else'", tips / "hard", tmp_path / "other")
+    _refused(capsys, out, "only tests of one configuration", "'else'", hard, tmp_path / "other")
     out.mkdir()
-    code, _, err = ema(capsys, "merge", tips / "soft", tips / "hard", "--out", out)
+    code, _, err = ema(capsys, "merge", run_of["soft"], hard, "--out", out)
     assert code == 1
     assert "exists already" in err
 
@@ -341,9 +344,8 @@ def test_a_band_that_is_stated_holds(tips: Path, tmp_path: Path, capsys: pytest.
         assert said in err, err
 
 
-def test_merge_takes_results_folders(tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    _modes(capsys, tips / "soft", tmp_path / "out")
-    merged = merge([tmp_path / "out", tips / "hard"], tmp_path / "both")
+def test_merge_takes_results_folders(tips: Path, run_of: dict[str, Path], tmp_path: Path) -> None:
+    merged = merge([run_of["soft"], tips / "hard"], tmp_path / "both")
     assert [p.name for p in merged.parts] == ["soft", "hard"]
     assert (tmp_path / "both" / "hard" / "test.toml").is_file()
     assert (tmp_path / "both" / "rig.toml").is_file()
