@@ -79,9 +79,8 @@ def write(folder: Path, case: int, effect: str, masses: int) -> tuple[str, float
     raw.mkdir()
     wrong = 1 + GAIN_STD * random.standard_normal(masses + 1)
     motions = [respond(chain, law, numbers, force, driven) for force in forces]
-    while not all(
-        np.all(np.isfinite(x)) for x, _ in motions
-    ):  # a quadratic spring lets go where it is pulled far
+    # A quadratic spring lets go where it is pulled far.
+    while not all(np.all(np.isfinite(x)) for x, _ in motions):
         numbers = numbers / 2
         motions = [respond(chain, law, numbers, force, driven) for force in forces]
     signals = []

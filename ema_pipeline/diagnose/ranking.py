@@ -44,6 +44,11 @@ _BEATEN = 200.0
 """Log evidence behind the best hypothesis from which another one cannot catch up: it is not begun again."""
 _SCREENED = 14
 """Hypotheses of one kind, generic or the rig's own, best first by their score, that are fitted in full."""
+_UNPROMISING = 6
+"""The same where the score promises nothing and the base model is near, so that a fit gains what its score says to some
+tenths: more than `FINALISTS`, so that the reader sees what comes next."""
+_PROMISING = 1.0
+"""Log evidence that is something: a third of what a claim needs."""
 _UNSEEN = 1e6
 """1 σ of a size, in units of its prior, from which the data hold nothing of it: it cannot be told from nothing."""
 _GRID = tuple(np.linspace(-2.0, 2.0, 9))
@@ -52,7 +57,7 @@ _GRID_STARTS = 2
 _GRID_HEAT = 30.0
 """Factor on the uncertainties there: two neighbours of the grid differ by a third in the frequency of an added mode."""
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
-_CONTENDERS = 12
+CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
 _BETTER = 0.05
 """Log evidence by which a start must lead a fit to be followed."""
@@ -90,10 +95,16 @@ class Ranking:
         With learned scatters.
     ranked : tuple of Ranked
         Best first.
+    unpaired : float
+        What measured modes without a partner, and unseen ones of the model, cost with every one of them at least.
     """
 
     base: Fit
     ranked: tuple[Ranked, ...]
+
+    @property
+    def unpaired(self) -> float:
+        return min((r.fit.posterior.residuals.penalty for r in self.ranked), default=0.0)
 
 
 def rank(
@@ -103,6 +114,7 @@ def rank(
     processes: int | None = 1,
     progress: Progress = lambda share, text: None,
     further: int = 0,
+    unpaired: float = 0.0,
 ) -> Ranking:
     """Fit every hypothesis and rank it.
 
@@ -117,11 +129,13 @@ def rank(
     progress : callable
     further : int
         Finalists that promise most beside learned scatters, which may be far narrower than those begun with.
+    unpaired : float
+        What modes without a partner cost whatever was added in an earlier ranking: no reason to search further.
     """
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
     promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models)}
     hypotheses = [h for h in hypotheses if h.label not in promise or promise[h.label].std < _UNSEEN]
-    stuck = base.posterior.error > _EXPLAINED or base.posterior.residuals.penalty > 0
+    stuck = base.posterior.error > _EXPLAINED or base.posterior.residuals.penalty > unpaired
     settled = base if stuck else learned(observations, base)
     near = not stuck and not np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT))
     chosen = _screened(hypotheses, promise, near)
@@ -132,8 +146,8 @@ def rank(
         progress(0.6 * (i + 1) / len(chosen), hypothesis.label)
     if not near:
         base, found = _begun_again(observations, base, found, processes, len(found), steps=5)
-    found = _bettered(found, _CONTENDERS, partial(_free, observations), processes)
-    base, found = _begun_again(observations, base, found, processes, _CONTENDERS, steps=12)
+    found = _bettered(found, CONTENDERS, partial(_free, observations), processes)
+    base, found = _begun_again(observations, base, found, processes, CONTENDERS, steps=12)
     progress(0.8, "scatter of parts and channels")
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     others = [h for h in hypotheses if h.label not in {best.label for best, _ in order[:FINALISTS]}]
@@ -144,14 +158,16 @@ def rank(
 def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], near: bool) -> list[Hypothesis]:
     """The rig's own hypotheses, and the generic ones that promise most.
 
-    Near the base model the score tells of the rig's own as well: those that promise little are left out, too. An effect
-    of several sizes (hysteresis) shows its kind at a finite size only, of which a score knows nothing.
+    Near the base model the score tells of the rig's own as well: those that promise nothing are left out, too. An
+    effect of several sizes (hysteresis) shows its kind at a finite size only, of which a score knows nothing.
     """
     out: set[str] = set()
     scored = [h for h in hypotheses if len(h.placed.effect.parameters) == 1 and h.label in promise]
     for generic in (True, False) if near else (True,):
         order = sorted((h for h in scored if h.generic is generic), key=lambda h: -promise[h.label].gain)
         out |= {h.label for h in order[_SCREENED:]}
+        if near:
+            out |= {h.label for h in order[_UNPROMISING:] if promise[h.label].gain < _PROMISING}
     return [h for h in hypotheses if h.label not in out]
 
 

@@ -89,6 +89,8 @@ class Marginal:
         self.kept = np.array([not without or effect_of(n) != without for n in p.unknowns.names], bool)
         self.whitened = (jacobian * p.prior_std)[:, self.kept]
         information = np.eye(self.whitened.shape[1]) + self.whitened.T @ self.whitened
+        # Zero at the maximum, which a fit of repeated modes need not have reached to the last bit.
+        self.ascent = self.whitened.T @ self.residual + (p.x / p.prior_std)[self.kept]
         self.factor = scipy.linalg.cho_factor(information, check_finite=False)
 
     def information(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -113,10 +115,11 @@ class Marginal:
     def score(
         self, hypothesis: Hypothesis, columns: NDArray[np.float64], lower: NDArray[np.float64]
     ) -> Score:
-        """At the maximum the residual is orthogonal to what was fitted, so that it needs no correction."""
+        """From the base model's maximum, to first order."""
         information = self.information(columns)
         precision = information + np.eye(len(information))
-        slope = -columns.T @ self.residual
+        to_maximum = scipy.linalg.cho_solve(self.factor, self.ascent, check_finite=False)
+        slope = -columns.T @ (self.residual - self.whitened @ to_maximum)
         size = np.linalg.solve(precision, slope)
         if size[0] < lower[0]:
             size = np.zeros_like(size)

@@ -9,7 +9,7 @@ from ema_pipeline.diagnose.backward import reconsidered
 from ema_pipeline.diagnose.claims import Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.probability import NOTHING, probabilities
-from ema_pipeline.diagnose.ranking import Ranking, rank
+from ema_pipeline.diagnose.ranking import CONTENDERS, Ranking, rank
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, fit_base
@@ -86,6 +86,7 @@ def select(
     hypotheses: Sequence[Hypothesis],
     settings: DiagnoseSettings,
     progress: Progress = lambda share, text: None,
+    first: Sequence[Hypothesis] = (),
 ) -> Selection:
     """Add effects one by one while the data support them, once more with unknowns that what was added calls for.
 
@@ -97,13 +98,15 @@ def select(
     hypotheses : sequence of Hypothesis
     settings : DiagnoseSettings
     progress : callable
+    first : sequence of Hypothesis
+        What is asked about at first, where it is known what leads; all where it is empty.
     """
     observations = observations.suited(known.effects)
     base = start = fit_base(observations, known)
     rounds: list[Round] = []
     claimed: list[Judged] = []
     rivals: dict[str, tuple[Judged, ...]] = {}
-    left: Sequence[Hypothesis] = hypotheses
+    left: Sequence[Hypothesis] = first or hypotheses
     while True:
         low = len(rounds) / (settings.most_effects + 1)
         ranking = rank(
@@ -113,16 +116,19 @@ def select(
             settings.processes,
             lambda share, text, low=low: progress(low + share / (settings.most_effects + 1), text),  # type: ignore[misc]
             settings.further_finalists,
+            rounds[-1].ranking.unpaired if rounds else 0.0,
         )
         asked = _beside(settings, claimed) if observations.linearised else settings
-        rounds.append(_round(observations, ranking, left, asked, len(claimed)))
+        among = left if claimed else hypotheses
+        rounds.append(_round(observations, ranking, among, asked, len(claimed)))
         near = rounds[-1].alike(settings)
         if not near or len(claimed) == settings.most_effects:
             return Selection(tuple(rounds), tuple(claimed), ranking.base, observations)
         added = next(j for j in near if j.claimed)  # a rival alone does not pass the conditions of a claim
         if observations.suited(added.ranked.fit.model.effects) is not observations:
             suited = observations.suited(added.ranked.fit.model.effects)
-            return select(suited, known, hypotheses, settings, progress)
+            leading = [r.hypothesis for r in ranking.ranked[:CONTENDERS]]
+            return select(suited, known, hypotheses, settings, progress, leading)
         claimed.append(added)
         rivals[added.hypothesis.label] = rounds[-1].judged
         if len(claimed) > 1:

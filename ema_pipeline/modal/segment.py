@@ -151,10 +151,7 @@ def measured_noise(
     data: FitData, hits: Noise | None, estimate: Estimate, shapes: Complex, weight: Real
 ) -> Noise:
     """Noise from what the fit leaves over, and from the scatter over hits where that is larger; overwrites `weight`."""
-    left, square = (
-        weight,
-        np.empty(data.frf.shape),
-    )  # where the weights of a row have been used, what it leaves
+    left, square = weight, np.empty(data.frf.shape)  # what a row leaves goes where its weights were used
 
     def of_rows(rows: slice) -> None:
         some = data.rows(rows)
