@@ -262,6 +262,8 @@ def test_own_effects_run_where_they_are_named_and_nowhere_else(
         "-q",
         "--set",
         'stages=["ingest", "hits", "frf", "modal", "ladder", "diagnose", "report"]',
+        "--set",
+        "diagnose.most_effects=1",
     )
     code, _, err = ema(capsys, *command, "--effect-file", file)
     assert (code, err) == (0, "")
