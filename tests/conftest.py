@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,17 @@ def test_data() -> Path:
     if not path.is_dir():
         pytest.skip(f"EMA_TEST_DATA={folder} is not a folder")
     return path
+
+
+@pytest.fixture(scope="module")
+def without_figures() -> Iterator[None]:
+    """Reports without their interactive figures, which take as long as half of a small run.
+
+    For modules that look at what is computed, not at the page; the figures have tests of their own.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ema_pipeline.report.html.figures_of", lambda context, results: {})
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -36,6 +36,8 @@ from ema_pipeline.run.opening import existing_run
 from ema_pipeline.simulate.campaign import simulate_campaign
 from ema_pipeline.stages.results import load_results
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 LINEAR = Case(
     frequency_hz=np.array([80.0, 130.0, 215.0]),
     damping=np.array([0.008, 0.006, 0.01]),

@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 from imperfect_modes import GOOD, NORMAL, Hidden, chain, chain_modes
+from scipy.stats import norm
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnose.limits import detection_limits
@@ -192,6 +193,36 @@ def test_a_fit_under_another_name_is_the_same_fit(said: int) -> None:
     found = after.parameter_values(again.posterior.x)[f"{name.label}.{name.placed.effect.parameters[0].name}"]
     assert found == pytest.approx(size.value, rel=0.2)
     assert abs(again.posterior.error - fit.posterior.error) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("unknown", "said", "other"),
+    [(0.4, "shaft_torsion@sun", True), (2.5, "spring@sun.u", True), (4.0, "spring@sun.u", False)],
+)
+def test_a_name_is_said_where_its_prior_allows_the_size(unknown: float, said: str, other: bool) -> None:
+    """The rig's own name comes first up to three, and is told beside the other up to six, of log prior density."""
+    rig, one = planetary(), of_planetary()["shaft_torsion@sun"]
+    own, generic = one.names
+    assert one.representative is generic  # of the wider prior; its fit serves for both
+    fit = fitted_on_top(one, unknown, rig, ModeObservations(rig, []))
+    found = named(one, fit)
+    assert found.label == said
+    assert bool(found.equivalents) == other
+    size = unknown * generic.scales["stiffness"]
+    assert found.sizes["stiffness"].value == pytest.approx(size)
+    if found.label == own.label:
+        density = [norm.logpdf(size, scale=s) for s in (3e5, generic.scales["stiffness"])]
+        assert found.advantage == pytest.approx(density[0] - density[1])
+
+
+def test_sizes_follow_the_ratio_of_the_priors_alone() -> None:
+    rig, one = planetary(), of_planetary()["shaft_torsion@sun"]
+    halved = replace(one, names=tuple(replace(n, relative=0.5 * n.relative) for n in one.names))
+    fit = fitted_on_top(one, 0.4, rig, ModeObservations(rig, []))
+    assert sizes_of(halved, one.names[0], fit)["stiffness"].value == pytest.approx(
+        0.5 * sizes_of(one, one.names[0], fit)["stiffness"].value
+    )
+    assert sizes_of(halved, halved.names[0], fit) == sizes_of(one, one.names[0], fit)
 
 
 # --- scores and limits against a refit in full ------------------------------------------------------------

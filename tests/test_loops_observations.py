@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Literal
+
 import numpy as np
 import pytest
 
@@ -14,13 +18,15 @@ from ema_pipeline.loops.model import loop_force
 from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.loops.simulate import simulate_sine_test, steady_force
 from ema_pipeline.loops.types import Loop
-from ema_pipeline.mechanics.assembly import Damper, Spring
+from ema_pipeline.mechanics.assembly import Assembly, Damper, Spring
 from ema_pipeline.mechanics.cycles import Cycles
 from ema_pipeline.mechanics.laws import BoucWen, DryFriction, LooseSpring, Maxwell, PolynomialSpring
 from ema_pipeline.mechanics.limit_cycle import LimitCycle
 from ema_pipeline.mechanics.nonlinear import force_along, steady_deviation
-from ema_pipeline.observations.loop_data import left_out, settings_differ
+from ema_pipeline.observations.loop_data import LoopData, have_own_scales, left_out, settings_differ
+from ema_pipeline.observations.loop_regions import regions
 from ema_pipeline.observations.loops import FORCE_SCATTER, NOISE_SCATTER, LoopObservations
+from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.isolator import isolator
 
 SPRING = {"stiffness": 9e4}
@@ -183,3 +189,63 @@ def test_scales_of_sizes_follow_the_measured_force() -> None:
 def test_no_loops_are_refused() -> None:
     with pytest.raises(EmaError, match="no loops"):
         LoopObservations(isolator(), [])
+
+
+def test_a_misfit_is_placed_on_its_third_of_the_way_and_told_by_what_acts_like_it() -> None:
+    """A spring that is there only on the last third of the way up."""
+    one = loop(SPRING, 12.0, 1e-3, noise=0.0)
+    rising = one.velocity > -0.03 * np.max(one.velocity)  # with the turning point
+    top = rising & (one.displacement > one.amplitude_m / 3)
+    odd = replace(one, force=one.force + 2e4 * one.displacement * top, force_std_n=0.5)
+    problem = LoopObservations(isolator(), [odd]).problem([], {})
+    found = regions(problem, problem.start({}))
+    assert len(found) == 6
+    assert found[0].place == "way up, last third"
+    assert {r.place for r in found if "after the reversal" in r.place} == {
+        f"way {way}, first third (after the reversal)" for way in ("up", "down")
+    }
+    assert found[0].acts_like == "stiffness"
+    rest = odd.force - problem.forces(problem.start({}))[0]
+    rest = (rest - rest.mean())[top]
+    x = one.displacement[top]
+    assert found[0].size == pytest.approx(x @ rest / (x @ x), rel=0.05)
+    assert found[0].squares == pytest.approx(rest @ rest / 0.5**2, rel=0.1)
+
+
+def test_the_unit_of_the_scatter_is_the_force_at_the_first_harmonic_whatever_its_phase() -> None:
+    one = loop(SPRING, 12.0, 1e-3, noise=0.0)
+    units = [
+        LoopData.of(replace(one, force=30.0 * np.cos(2 * np.pi * one.phase - turn))).unit
+        for turn in (0.0, 1.3)
+    ]
+    np.testing.assert_allclose(units[1], units[0], rtol=1e-5)
+    assert units[0][0] == pytest.approx(30.0 * np.sqrt(len(one.phase) / 2), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("count", "stated", "several", "own"),
+    [
+        (1, "auto", True, False), (1, "yes", True, False), (2, "yes", False, True), (2, "no", True, False),
+        (2, "auto", True, True), (2, "auto", False, False),
+    ],
+)  # fmt: skip
+def test_loops_have_scales_of_their_own_where_that_is_stated_or_their_settings_differ(
+    count: int, stated: Literal["auto", "yes", "no"], several: bool, own: bool
+) -> None:
+    loops = [loop(SPRING, f, 1e-3) for f in (10.0, 16.0)[:count]]
+    assert have_own_scales(loops, LoopSettings(own_scales=stated), several) == own
+
+
+def test_an_element_that_is_stretched_twice_as_much_makes_four_times_the_force() -> None:
+    """By the row of a lever of two: k·(2·x)·2."""
+    one = loop(SPRING, 12.0, 1e-3, noise=0.0)
+    rig = isolator()
+
+    def levered(configuration: str, values: Mapping[str, float]) -> Assembly:
+        built = rig.build(configuration, values)
+        return built.add(Spring("lever", {"mass.x": 2.0}, 1e4))
+
+    more = ParametricRig("levered", rig.configurations, rig.parameters, levered)
+    problems = [LoopObservations(r, [one]).problem([], {}) for r in (rig, more)]
+    plain, both = (p.forces(np.zeros(len(p.unknowns)))[0] for p in problems)
+    np.testing.assert_allclose(both - plain, 4e4 * one.displacement, atol=1e-6 * np.ptp(plain))

@@ -264,6 +264,23 @@ def test_a_reversed_sensor_reads_what_it_should() -> None:
     assert fits[0].posterior.error == pytest.approx(fits[1].posterior.error, rel=1e-6)
 
 
+def test_a_shape_is_left_with_the_least_of_all_factors() -> None:
+    """σ of an entry: the test's own, and a share of the entry, of 0.3 at the least."""
+    observations = chain_observations(8)
+    (data,) = observations.data
+    problem = observations.problem((), {})
+    scatters = {n: s.default for n, s in observations.scatters.items()} | {"shape_scatter": 0.2}
+    x = np.zeros(len(problem.unknowns))
+    found = problem.residuals(x, scatters)
+    shapes = RigModel(chain()).sensor_rows("all", data.dofs) @ problem.solution("all", x).shapes
+    for row in problem.rows(found):
+        y, p = data.known_shapes[row.measured], shapes[:, row.model]
+        sigma = np.hypot(data.compared_std[row.measured], 0.2 * np.maximum(0.3, np.abs(y)))
+        factor, (left, *_) = np.linalg.lstsq((p / sigma)[:, None], y / sigma, rcond=None)[:2]
+        assert np.sum(((y - factor[0] * p) / sigma) ** 2) == pytest.approx(left)
+        assert np.sum(row.shape**2) == pytest.approx(left, rel=1e-6), row.measured
+
+
 def test_a_mode_that_the_model_lacks_and_one_that_was_not_measured_cost_what_they_cost() -> None:
     measured = chain_modes(6, EXACT)["all"]
     scatters = {n: s.default for n, s in chain_observations(6).scatters.items()}
@@ -419,6 +436,19 @@ def whirling(frequency: np.ndarray) -> MeasuredModes:
     )  # fmt: skip
 
 
+def test_a_scatter_of_nothing_is_taken_for_one_that_is_not_known() -> None:
+    measured = whirling(np.array([100.0, 130.0, 160.0]))
+    assert measured.shape_std is not None
+    none, nan = (
+        prepare(replace(measured, frequency_std_hz=v * np.ones(3), damping_std=v * np.ones(3),
+                        shape_std=v * measured.shape_std))
+        for v in (0.0, np.nan)
+    )  # fmt: skip
+    for name in ("log_frequency_std", "log_damping_std", "shape_std"):
+        assert np.all(getattr(none, name) > 0)
+        assert np.array_equal(getattr(none, name), getattr(nan, name))
+
+
 def test_a_plainly_complex_shape_is_compared_as_one_and_others_as_real_ones() -> None:
     data = prepare(whirling(np.array([100.0, 130.0, 160.0])))
     assert data.whirling.tolist() == [False, True, False]
@@ -452,6 +482,7 @@ def test_gyroscopic_coupling_explains_modes_that_whirl() -> None:
     at = with_it.start({"gyroscopic@carrier.coefficient": 80.0})
     true = with_it.residuals(at, scatters)
     assert np.max(np.abs(true.values)) < 0.05
+    assert true.projected == len(f) + np.sum(observations.data[0].whirling)  # two parts of complex factors
     assert base.residuals(base.start(), scatters).cost > true.cost + 100
     for i, name in enumerate(with_it.unknowns.names):
         h = np.zeros(len(at))

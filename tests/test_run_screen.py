@@ -13,6 +13,8 @@ from bench import ema, write_bench
 from ema_pipeline.commands.screen import program
 from ema_pipeline.report.run_screen import SCREEN_LINES
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 NO_FIGURES = ("--set", "report.plots=false")
 
 
