@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from imperfect_modes import GOOD, NORMAL, Hidden, chain, chain_modes
 from scipy.stats import norm
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
-from ema_pipeline.diagnose.limits import detection_limits
+from ema_pipeline.diagnose.limits import _Shown, detection_limits
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names, named, sizes_of
 from ema_pipeline.diagnose.probability import against_nothing, needed, null_prior, prior
@@ -22,6 +23,7 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Rung
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.effects.rig import rig_with_effects
+from ema_pipeline.inference import Residuals
 from ema_pipeline.mechanics.assembly import Damper, Mass, Spring
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, refined
 from ema_pipeline.observations.mode_data import prepare
@@ -312,6 +314,30 @@ def test_an_effect_of_twice_its_limit_is_seen_and_one_far_below_it_is_not(label:
     below = np.mean([seen(0.1 * limit.size, 40 + i) for i in range(3)])
     assert at >= 0.75
     assert below == 0
+
+
+@pytest.mark.parametrize("power", [0.35, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize("off", [0.2, 5.0])
+def test_the_search_for_a_limit_ends_at_the_size_that_gains_enough(power: float, off: float) -> None:
+    """Whatever power of the size the gain grows with, and wherever first order would have begun."""
+    wanted, sigma = 8.0 + 0.5 * np.log1p(0.1**-2.0), 0.1
+    true = off * sigma * (np.sqrt(2 * wanted) + 1.2816)
+
+    class Power(_Shown):
+        def _gained(self, unknown: float) -> float:
+            return float(wanted * (unknown / true) ** power)
+
+    def least(most: float, gain: float = 8.0, sigmas: float = 2.0) -> float:
+        problem = SimpleNamespace(unknowns=SimpleNamespace(upper=np.array([most])))
+        nothing = Residuals(np.zeros(0), np.zeros((0, 1)))
+        return Power(problem, np.zeros(1), 0, {}, nothing, None, sigma).least(gain, sigmas)  # type: ignore[arg-type]
+
+    assert least(np.inf) == pytest.approx(true, rel=0.12 / power)
+    assert least(0.5 * true) == (np.inf if 0.5**power < 0.9 else 0.5 * true)
+    # a claim needs its sigmas, too, however little evidence it needs
+    assert least(np.inf, gain=-4.0, sigmas=6.0) == pytest.approx(
+        true * (18.0 / wanted) ** (1 / power), rel=0.12 / power
+    )
 
 
 def test_limits_of_several_names_are_the_same_change() -> None:

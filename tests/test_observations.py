@@ -229,6 +229,15 @@ def test_derivatives_of_the_residuals_hold_for_two_configurations_with_transvers
         np.testing.assert_allclose(slopes[:, i], (high - low) / 2e-6, atol=1e-4 * scale, err_msg=name)
 
 
+def test_a_sensor_reads_across_what_others_of_its_body_measure_and_one_that_turns_reads_both() -> None:
+    rig = planetary()
+    names = observed(rig, planetary_modes(rig, 2, GOOD)).problem((), {}).unknowns.names
+    told = "transverse sensitivity at sun."
+    assert sorted(n.removeprefix(told) for n in names if n.startswith(told)) == [
+        "u along x", "u along y", "x along y", "y along x"
+    ]  # fmt: skip
+
+
 def test_a_rig_that_is_as_drawn_has_residuals_of_nothing_but_noise() -> None:
     observations = chain_observations(3, EXACT)
     problem = observations.problem((), {})
