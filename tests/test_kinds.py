@@ -24,6 +24,8 @@ from ema_pipeline.run.settings import STAGES
 
 PACKAGE = Path(ema_pipeline.__file__).parent
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 
 def ema(*words: str | Path) -> None:
     found = CliRunner().invoke(app, [str(w) for w in words])

@@ -26,6 +26,8 @@ from ema_pipeline.series.one_test import Task
 from ema_pipeline.series.rows import TestRow, failed_row
 from ema_pipeline.series.run import run_series
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 
 def _simulate(root: Path, names: list[str], **settings: object) -> Path:
     for i, name in enumerate(names):
