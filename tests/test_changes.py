@@ -16,6 +16,8 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.job import run_raw
 from ema_pipeline.observations.fitting import Model, fit_base
+from ema_pipeline.observations.mode_residuals import Rows
+from ema_pipeline.observations.pair import _conditional
 
 TESTS = {"before": (1, ()), "again": (2, ()), "after": (3, ("mass@m2:mass=0.06",))}
 
@@ -113,6 +115,28 @@ def test_derivatives_of_the_pair_are_exact(root: Path) -> None:
         assert here.jacobian[:, k] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-3, abs=2e-2)
     drifts = [n for n in problem.unknowns.names if n.startswith("drift")]
     assert drifts == ["drift of default in B", "drift of default in A"]
+
+
+@pytest.mark.parametrize("noise", ["frequency_noise", ""])
+def test_what_one_test_tells_of_the_other_is_the_conditional_normal_distribution(noise: str) -> None:
+    """One deviation in both tests, noise and repetition in each: the covariance written out, mode by mode."""
+    unit, own = (np.array([[1.0, 0.5, 2.0], [0.8, 0.5, 3.0]]), np.array([[0.3, 0.2, 0.1], [0.1, 0.4, 0.2]]))
+    a, b = (
+        Rows(np.zeros(3), own[k], unit[k], "frequency_scatter", 1.0, np.arange(3), noise=noise)
+        for k in (0, 1)
+    )
+    scatters = {"frequency_scatter": 0.7, "frequency_noise": 1.5, "repeat": 0.25}
+    found = _conditional(a, b, scatters, "repeat")
+    factor = 1.5 if noise else 1.0
+    for k in range(3):
+        u = unit[:, k]
+        joint = 0.7**2 * np.outer(u, u) + np.diag((factor * own[:, k]) ** 2 + (0.25 * u) ** 2)
+        assert found.slope[k] == pytest.approx(joint[0, 1] / joint[0, 0])
+        assert found.variance[k] == pytest.approx(np.linalg.det(joint) / joint[0, 0])
+    assert ("frequency_noise" in found.shares) == bool(noise)
+    for name, share in found.shares.items():  # of the variance, as it grows with each scatter's square
+        more = _conditional(a, b, scatters | {name: scatters[name] * np.exp(1e-5)}, "repeat")
+        assert np.log(more.variance / found.variance) / 2e-5 == pytest.approx(share, rel=1e-3)
 
 
 def test_held_out_pairs_stay_together(root: Path) -> None:
