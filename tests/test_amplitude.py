@@ -13,12 +13,13 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.inference import Posterior
+from ema_pipeline.levels.differences import smooth_terms
 from ema_pipeline.mechanics.laws import DryFriction, Nonlinear, PartingSpring, PolynomialSpring
 from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.observations.amplitude import AmplitudeObservations, AmplitudeProblem
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, refined, transferred
-from ema_pipeline.observations.hit_modes import HitData, Linear, comparable, shifted_poles
+from ema_pipeline.observations.hit_modes import HitData, Linear, _fit_weights, comparable, shifted_poles
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
 
@@ -227,6 +228,20 @@ def test_hits_without_any_motion_or_with_gaps_are_left_out() -> None:
     observations = AmplitudeObservations(ModeObservations(RIG, [holed.reference]), [holed])
     _, found = fitted(observations, base_fit(observations), "bearing_cubic@hub")
     assert np.isfinite(found.log_evidence)
+
+
+@pytest.mark.parametrize("fading", [0.0, 4.0, 40.0])
+def test_what_a_fit_reads_of_a_pole_that_drifts_back_has_a_closed_form(fading: float) -> None:
+    """A change exp(-μt) of the pole adds 1/(s'(s' + μ)) to its line, s' = s - λ; a lasting one is read as it is."""
+    pole, lines = complex(-3.0, 2 * np.pi * 50.0), np.arange(45.0, 55.0, 0.25)
+    instants = np.geomspace(1e-3, 3.0, 40)
+    found = _fit_weights(instants, pole, lines) @ np.exp(-fading * instants)
+    s = 2j * np.pi * lines - pole
+    columns = np.stack([s**-2, 1 / s, *smooth_terms(len(s))], axis=1)
+    expected = np.linalg.lstsq(columns, 1 / (s * (s + fading)), rcond=1e-12)[0][0]
+    assert abs(found - expected) < 0.02
+    if not fading:
+        assert expected == pytest.approx(1.0)
 
 
 @pytest.mark.slow
