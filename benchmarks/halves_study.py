@@ -1,10 +1,12 @@
 """Do the modes of half the hits agree with those of the other half, within their stated intervals?
 
-    python benchmarks/halves_study.py RAW [RAW ...] [--splits 8] [--rig planetary] [--verbose]
+    python benchmarks/halves_study.py RAW [RAW ...] [--splits 8] [--blocks 1] [--rig planetary] [--verbose]
 
-Every other hit of a raw folder goes to one half, the others to the other; further splits are drawn at random. `ema run`
-identifies the modes of both. Modes of the halves are paired by frequency, and the differences of frequency and of
-ln ζ compared with the standard deviations that the program states: χ² per degree of freedom is 1 where these are true.
+Every other hit of a raw folder, or every other block of hits, goes to one half, the others to the other; further splits
+are drawn at random. `ema run` identifies the modes of both. Modes of the halves are paired by frequency, and the
+differences of frequency and of ln ζ compared with the standard deviations that the program states: χ² per degree of
+freedom is 1 where these are true and no hit of one half depends on one of the other. Where neighbours in the order of
+records are alike, halves of every other record differ by less than two tests would, and large blocks by more.
 A folder of gzipped records is unpacked first, and described by `ema` where it has no test.toml.
 """
 
@@ -66,9 +68,9 @@ def unpacked(raw: Path, to: Path) -> Path:
     return to
 
 
-def halves(n: int, split: int) -> NDArray[np.bool_]:
-    """Which of n records go to the first half: every other one in split 0, else drawn at random."""
-    every_other = np.arange(n) % 2 == 0
+def halves(n: int, split: int, block: int = 1) -> NDArray[np.bool_]:
+    """Which of n records go to the first half: every other block of them in split 0, else drawn at random."""
+    every_other = np.arange(n) // block % 2 == 0
     return every_other if split == 0 else np.random.default_rng(split).permutation(every_other)
 
 
@@ -124,7 +126,7 @@ def per_degree(values: Sequence[float]) -> str:
     return f"{square.mean():.2f} (median {np.median(square):.2f})"
 
 
-def study(raw: Path, splits: int, arguments: Sequence[str], verbose: bool) -> None:
+def study(raw: Path, splits: int, block: int, arguments: Sequence[str], verbose: bool) -> None:
     pairs: list[Pair] = []
     single: list[Mode] = []
     with tempfile.TemporaryDirectory(prefix="halves-") as temporary:
@@ -132,7 +134,7 @@ def study(raw: Path, splits: int, arguments: Sequence[str], verbose: bool) -> No
         source = unpacked(raw, work / "unpacked")
         n = len(read_toml(source / "test.toml")["records"])
         for split in range(splits):
-            first = halves(n, split)
+            first = halves(n, split, block)
             models = []
             for name, keep in (("a", first), ("b", ~first)):
                 part = part_of(source, keep, work / f"{split}{name}")
@@ -167,12 +169,13 @@ def main() -> None:
     )
     parser.add_argument("raw", type=Path, nargs="+")
     parser.add_argument("--splits", type=int, default=1)
+    parser.add_argument("--blocks", type=int, default=1, help="records that go to a half together, in order")
     parser.add_argument("--rig", help="for the folders that need one")
     parser.add_argument("--verbose", action="store_true", help="a line per mode")
     given = parser.parse_args()
     arguments = ["--rig", given.rig] if given.rig else []
     for raw in given.raw:
-        study(raw, given.splits, arguments, given.verbose)
+        study(raw, given.splits, given.blocks, arguments, given.verbose)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@
     python benchmarks/identification_study.py noise --cases 30
     python benchmarks/identification_study.py window --cases 60
     python benchmarks/identification_study.py moving --cases 20
+    python benchmarks/identification_study.py roving --cases 24
 
 Records are simulated by the simulator of the tests (blow, response, noise on all channels) and go through the
 program's own hit finding, checks and FRFs. A true mode counts as found when an identified mode lies within
@@ -21,7 +22,7 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -340,16 +341,44 @@ def moving_case(seed: int) -> tuple[TrueSystem, Hits, list[int], list[int]]:
     return system, hits, dofs_out, dofs_in
 
 
-def moving_study(cases: int, first: int, settings: ModalSettings, verbose: bool) -> None:
+def roving_case(seed: int) -> tuple[TrueSystem, Hits, list[int], list[int]]:
+    """A hammer that strikes 20 to 50 points once each, three sensors; frequencies drift together and each by itself.
+
+    In every other case a hit keeps 0.7 of what the one before it had moved by; in the others hits are independent.
+    """
+    rng = np.random.default_rng(60_000 + seed)
+    n_in, n_out = int(rng.integers(20, 51)), 3
+    system = random_system(
+        rng, n_modes=int(rng.integers(4, 9)), n_dofs=n_in, low_hz=40, high_hz=360, min_spacing=0.03,
+        damping=(0.002, 0.01),
+    )  # fmt: skip
+    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
+    dofs_in = list(range(n_in))
+    dofs_out = sorted(rng.choice(n_in, n_out, replace=False).tolist())
+    hits = simulate_hits(
+        system, dofs_out, dofs_in, f_max=400.0, record_s=float(np.clip(6.0 / slowest, 2.56, 10.0)), n_hits=1,
+        force_noise=rng.uniform(0.002, 0.02), response_noise=rng.uniform(0.002, 0.02), rng=rng,
+        drift=1e-4, wander=2e-4, alike=0.7 * (seed % 2), softening=2e-4, calibration=0.04,
+    )  # fmt: skip
+    return system, hits, dofs_out, dofs_in
+
+
+def hits_study(
+    case: Callable[[int], tuple[TrueSystem, Hits, list[int], list[int]]],
+    seeds: Iterable[int],
+    settings: ModalSettings,
+    verbose: bool,
+) -> None:
     """Modes of hits that differ in frequency, as the stage finds them: aligned, with circles, pooled.
 
     One hit in all, or hits on one point only once each, cannot tell drift; coverage is given for both.
     """
     truth = found = spurious = 0
     z: dict[str, list[float]] = {"frequency": [], "frequency, several hits": [], "damping": []}
-    clock = 0.0
-    for seed in range(first, first + cases):
-        system, made, dofs_out, dofs_in = moving_case(seed)
+    clock, cases = 0.0, 0
+    for seed in seeds:
+        system, made, dofs_out, dofs_in = case(seed)
+        cases += 1
         records = records_of(made, dofs_out, dofs_in)
         by_file, judged = {r.file: r for r in records}, [h for h in hits_of_test(records) if h.accepted]
 
@@ -470,7 +499,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("study", choices=["random", "pairs", "noise", "coverage", "window", "moving"])
+    parser.add_argument(
+        "study", choices=["random", "pairs", "noise", "coverage", "window", "moving", "roving"]
+    )
     parser.add_argument("--cases", type=int, default=50)
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
     parser.add_argument("--engine", default="plscf", choices=["plscf", "lscf", "sdypy"])
@@ -488,7 +519,15 @@ def main() -> None:
     elif args.study == "window":
         window_study(args.cases, args.first, settings, args.verbose)
     elif args.study == "moving":
-        moving_study(args.cases, args.first, settings, args.verbose)
+        hits_study(moving_case, range(args.first, args.first + args.cases), settings, args.verbose)
+    elif args.study == "roving":
+        for start, words in (
+            (0, "hits that do not depend on each other"),
+            (1, "each like the one before it"),
+        ):
+            print(words)
+            seeds = range(args.first + start, args.first + args.cases, 2)
+            hits_study(roving_case, seeds, settings, args.verbose)
     else:
         coverage_study(args.cases, args.first, settings)
 

@@ -65,14 +65,17 @@ def simulate_hits(
     pretrigger: int = 20,
     decay_rad_s: float = 0.0,
     drift: float = 0.0,
+    wander: float = 0.0,
+    alike: float = 0.0,
     softening: float = 0.0,
     calibration: float = 0.0,
 ) -> Hits:
     """Simulate hits; noise levels are rms of the noise over rms of the channel's signal in the record.
 
-    `drift` is the standard deviation of a factor on all frequencies of a hit; `softening` the relative drop of the
-    first half of the modes from the softest hit (80 N) to the hardest (160 N), zero in their middle;
-    `calibration` the standard deviation of a constant factor on each channel.
+    `drift` is the standard deviation of a factor on all frequencies of a hit, `wander` that of a factor on each,
+    `alike` the correlation of both from one hit to the next; `softening` the relative drop of the first half of the
+    modes from the softest hit (80 N) to the hardest (160 N), zero in their middle; `calibration` the standard
+    deviation of a constant factor on each channel.
 
     Response noise is set per channel from its signal averaged over inputs, as a sensor's noise floor is.
     """
@@ -85,16 +88,22 @@ def simulate_hits(
     f = np.fft.rfftfreq(n_long, 1 / rate)
     taper = np.clip((0.5 * rate - f) / (0.5 * rate - 1.05 * f_max), 0, 1)
     taper = 0.5 - 0.5 * np.cos(np.pi * taper)
-    still = system.accelerance(f, dofs_out, dofs_in) if not (drift or softening) else None
+    still = system.accelerance(f, dofs_out, dofs_in) if not (drift or wander or softening) else None
     soft = np.arange(len(system.frequency_hz)) < len(system.frequency_hz) // 2
     width = 0.9 / f_max  # half-sine: first zero of the spectrum at 1.67 f_max
     force = np.zeros((len(dofs_in), n_hits, n))
     resp = np.zeros((len(dofs_in), n_hits, len(dofs_out), n))
+    common, own = 0.0, np.zeros(len(soft))
+    fresh = 1.0  # of the first hit, which follows none
     for i in range(len(dofs_in)):
         for h in range(n_hits):
             peak = rng.uniform(80, 160)
             if still is None:
-                moved = (1 + drift * rng.standard_normal()) * (1 - softening * soft * (peak - 120) / 80)
+                common = alike * common + fresh * rng.standard_normal()
+                if wander:
+                    own = alike * own + fresh * rng.standard_normal(len(own))
+                fresh = np.sqrt(1 - alike**2)
+                moved = (1 + drift * common + wander * own) * (1 - softening * soft * (peak - 120) / 80)
                 here = replace(system, frequency_hz=system.frequency_hz * moved)
                 column = here.accelerance(f, dofs_out, [dofs_in[i]])[:, 0]
             else:

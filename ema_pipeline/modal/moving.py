@@ -18,6 +18,7 @@ from ema_pipeline.modal.data import analysis_band
 from ema_pipeline.modal.drift.align import NOTICED, Alignment, PeakMovement, align
 from ema_pipeline.modal.drift.windows import Hits
 from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.serial import widening
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel, Mode
 from ema_pipeline.processes import release_memory
@@ -159,8 +160,8 @@ def _moving(mode: Mode, alignment: Alignment, decay_rad_s: float) -> Mode:
     common = alignment.common_spread
     own = peak.own_spread if peak is not None and peak.single else 0.0
     # drift was taken off each hit, so that all count alike; its own movement a mode shows in strong hits above all
-    of_own = own / np.sqrt(peak.hits) if peak is not None else 0.0
-    mean_std = float(np.hypot(common / np.sqrt(n), of_own)) * _of_few(n)
+    of_own = _mean_std(own, peak.hits, peak.shift - peak.common) if peak is not None else 0.0
+    mean_std = float(np.hypot(_mean_std(common, n, alignment.peaks[0].common), of_own)) * _of_few(n)
     trend = _with_force(peak) if peak is not None and own > 0 else 0.0
     if trend:
         # a mode that moves with the force has no one frequency: the interval holds what it moves by
@@ -172,6 +173,11 @@ def _moving(mode: Mode, alignment: Alignment, decay_rad_s: float) -> Mode:
     if peak is not None and own > NOTICED * peak.damping_ratio and worth:
         flags = (*flags, _words(own, trend))
     return replace(mode, frequency_std_hz=std, flags=flags)
+
+
+def _mean_std(spread: float, hits: float, moved: Real) -> float:
+    """Standard deviation of a mean over so many hits: hits that follow one another may have moved alike."""
+    return spread / float(np.sqrt(hits)) * widening(moved[np.isfinite(moved)])
 
 
 def peak_of(mode: Mode, alignment: Alignment, decay_rad_s: float) -> PeakMovement | None:

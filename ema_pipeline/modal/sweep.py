@@ -38,7 +38,9 @@ from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.segment import SegmentFit, fit_segment
 from ema_pipeline.modal.selection import link, votes
 from ema_pipeline.modal.uncertainty import (
+    PointScores,
     left_to_go,
+    of_all_blocks,
     parameter_covariance,
     sandwich,
     scatter_of_scores,
@@ -384,7 +386,7 @@ def _covariance(data: FitData, fit: SegmentFit) -> Real:
 def _of_these_rows(data: FitData, fit: SegmentFit, part: SubBand) -> FittedModes:
     """Modes of a sub-band's core with their uncertainties, from a fit that had all rows."""
     step = newton_step(fit.estimate, fit.solution)
-    scatter = scatter_over_points(*scores_of_points(data.transposed, fit.estimate, fit.solution))
+    scatter = scatter_over_points(scores_of_points(data.transposed, fit.estimate, fit.solution))
     parameters = _widened(_covariance(data, fit), scatter)
     shapes = _shapes_and_stds(data, fit, parameters)
     return _core(part, fit.estimate, (fit.held, fit.away), (step, step), parameters, shapes)
@@ -397,26 +399,24 @@ def _of_all_rows(window: Window, fit: _Polished, part: SubBand, iterations: int)
     if first is None:
         estimate, held = placed(window, estimate, held, iterations)
         linear = list(in_order(lambda rows: linear_fit(window.rows(rows), estimate), blocks))
-        scores, parts = zip(
-            *(scores_of_points(transposed, estimate, one.solution) for _, one in linear), strict=True
+        points = of_all_blocks(
+            [scores_of_points(transposed, estimate, one.solution) for _, one in linear], transposed
         )
-        points, information = np.concatenate(scores), np.sum(parts, axis=0)
-        first = sandwich(np.sum([_noise_of(*one) for one in linear], axis=0), information)
-        parameters = _widened(first, scatter_over_points(points, information))
+        first = sandwich(np.sum([_noise_of(*one) for one in linear], axis=0), points.information)
+        parameters = _widened(first, scatter_over_points(points))
         some = [_shapes_and_stds(*one, first) for one in linear]
-        step = Step(information, points.sum(axis=0))
+        step = points.step
     else:
 
-        def of_rows(rows: slice) -> tuple[tuple[Complex, Real], tuple[Real, Real]]:
+        def of_rows(rows: slice) -> tuple[tuple[Complex, Real], PointScores]:
             data, one = linear_fit(window.rows(rows), estimate)
             scores = scores_of_points(transposed, estimate, one.solution)
             return _shapes_and_stds(data, one, first), scores
 
         each = list(in_order(of_rows, blocks))
         some = [shapes for shapes, _ in each]
-        scores, parts = zip(*(told for _, told in each), strict=True)
-        scatter = scatter_over_points(np.sum(scores, axis=0), np.sum(parts, axis=0))
-        parameters = _widened(first, scatter)
+        points = of_all_blocks([told for _, told in each], transposed)
+        parameters = _widened(first, scatter_over_points(points))
     shapes, stds = (np.concatenate(x) for x in zip(*some, strict=True))
     return _core(part, estimate, (held, fit.away), (fit.step, step), parameters, (shapes, stds))
 
@@ -461,9 +461,9 @@ def _noise_of(data: FitData, fit: SegmentFit) -> Real:
 
 
 def _widened(covariance: Real, scatter: Real) -> Real:
-    """A covariance with each variance raised to that of the scatter where that is larger."""
+    """A covariance with each variance raised to that of the scatter, (n_parameters,), where that is larger."""
     own = np.diag(covariance)
-    factor = np.sqrt(np.maximum(np.diag(scatter) / np.where(own > 0, own, np.inf), 1.0))
+    factor = np.sqrt(np.maximum(scatter / np.where(own > 0, own, np.inf), 1.0))
     return np.asarray(covariance * factor[:, None] * factor)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from ema_pipeline.modal.fit import (
     solve_scaled,
 )
 from ema_pipeline.modal.noise import Noise
+from ema_pipeline.modal.serial import variance_of_sum
 from ema_pipeline.modal.windowed import power_of
 from ema_pipeline.threads import in_order
 
@@ -124,8 +126,35 @@ def _blocks(n_lines: int) -> list[slice]:
 FEWEST_GROUPS = 5
 """Struck points without which their scatter does not tell an interval."""
 
+LARGEST_SHARE = 0.9
+"""Share of one point in what is known of a parameter, past which the others do not tell what it does to the pole."""
 
-def scores_of_points(transposed: bool, estimate: Estimate, solution: LinearSolution) -> tuple[Real, Real]:
+
+@dataclass(frozen=True)
+class PointScores:
+    """What the hits on each point ask of the parameters.
+
+    Attributes
+    ----------
+    scores : ndarray, (n_points, n_parameters)
+        Gradient of each point's FRFs, shapes eliminated; points in the order in which they were struck.
+    own : ndarray, (n_points, n_parameters)
+        Diagonal of each point's information.
+    information : ndarray, (n_parameters, n_parameters)
+        Of all points.
+    """
+
+    scores: Real
+    own: Real
+    information: Real
+
+    @property
+    def step(self) -> Step:
+        """That all points would still take."""
+        return Step(self.information, self.scores.sum(axis=0))
+
+
+def scores_of_points(transposed: bool, estimate: Estimate, solution: LinearSolution) -> PointScores:
     """What the hits on each point ask of the parameters, and the information of all of them.
 
     Parameters
@@ -134,12 +163,6 @@ def scores_of_points(transposed: bool, estimate: Estimate, solution: LinearSolut
         True where rows are struck points, False where references are.
     estimate, solution
         Result of a fit.
-
-    Returns
-    -------
-    scores : ndarray, (n_points, n_parameters)
-        Gradient of each point's FRFs, shapes eliminated.
-    information : ndarray, (n_parameters, n_parameters)
     """
     m = len(estimate.poles)
     mix = mixing(estimate.participation)
@@ -148,36 +171,46 @@ def scores_of_points(transposed: bool, estimate: Estimate, solution: LinearSolut
     psi = np.stack([solution.shapes.real, solution.shapes.imag], axis=-1).reshape(len(solution.shapes), -1)
     coefficients = np.einsum("iab,ob->oia", mix, psi)
     misfit = solution.moment - np.einsum("oiab,oib->oia", solution.gram[..., : 2 * m], coefficients)
-    scores = np.einsum("oiap,oia->op" if transposed else "oiap,oia->ip", z, misfit, optimize=True)
-    return scores, newton_step(estimate, solution).information
+    over = "op" if transposed else "ip"
+    scores = np.einsum(f"oiap,oia->{over}", z, misfit, optimize=True)
+    own = np.einsum(f"oiap,oiap->{over}", z, np.matmul(solution.gram, z))
+    return PointScores(scores, own, newton_step(estimate, solution).information)
 
 
-def scatter_over_points(scores: Real, information: Real) -> Real:
-    """Covariance of the parameters from the scatter of what single struck points ask for.
+def of_all_blocks(parts: list[PointScores], transposed: bool) -> PointScores:
+    """What blocks of rows add up to: rows are points with `transposed`, and all hit the same points without."""
+    of = np.concatenate if transposed else partial(np.sum, axis=0)
+    return PointScores(
+        of([p.scores for p in parts]),
+        of([p.own for p in parts]),
+        np.asarray(sum(p.information for p in parts)),
+    )
+
+
+def scatter_over_points(found: PointScores) -> Real:
+    """Variance of every parameter from the scatter of what single struck points ask for, (n_parameters,).
 
     This is the jackknife over points, to first order: it holds whatever differs from hit to hit, be it noise, drift or
     a structure that is not quite linear. Drift moves a peak as a whole, which noise from line to line does not know.
 
-    Parameters
-    ----------
-    scores : ndarray, (n_points, n_parameters)
-    information : ndarray, (n_parameters, n_parameters)
-
-    Returns
-    -------
-    ndarray, (n_parameters, n_parameters)
-        0 for few points.
+    A point that has a large share in what is known of a parameter pulls it along, and then asks for less than it would
+    of a fit without it: its part is that of the fit without it. Points struck one after the other may ask for the same,
+    as where the rig drifts slowly or a part of the structure answers differently: they count as fewer
+    (`serial.variance_of_sum`). Few points give 0.
 
     References
     ----------
     Efron, B., "The Jackknife, the Bootstrap and Other Resampling Plans", SIAM 1982 (infinitesimal jackknife).
+    MacKinnon, J. G. & White, H., "Some heteroskedasticity-consistent covariance matrix estimators with improved
+    finite sample properties", Journal of Econometrics 29, 1985 (HC3).
     """
-    n = len(scores)
+    n = len(found.scores)
     if n < FEWEST_GROUPS:
-        return np.zeros_like(information)
-    off = scores - scores.mean(axis=0)
-    inverse = _inverse(information)
-    return np.asarray(inverse @ (off.T @ off) @ inverse * n / (n - 1))
+        return np.zeros(len(found.information))
+    total = np.diag(found.information)
+    share = np.clip(found.own / np.where(total > 0, total, np.inf), 0.0, LARGEST_SHARE)
+    asked = found.scores @ _inverse(found.information) / (1 - share)
+    return np.asarray(variance_of_sum(asked - asked.mean(axis=0)) * (n - 1) / n)
 
 
 def left_to_go(step: Step) -> Real:
