@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import ema_pipeline as ema
+from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.records import in_windows, record_model, whole_ladder
 from ema_pipeline.diagnose.rungs import ladder_of, make_ladder
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -16,7 +18,8 @@ from ema_pipeline.diagnose.types import Candidate, Diagnosis
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.ingest.description import read_description
 from ema_pipeline.ingest.driven import load_driven
-from ema_pipeline.observations.fitting import QUICK, annealed, refined, wide
+from ema_pipeline.observations.fitting import QUICK, annealed, fit_base, learned, refined, wide
+from ema_pipeline.observations.record_data import SHARE
 from ema_pipeline.observations.records import RecordObservations
 from tests.continuous_cases import RIG, write_oscillator
 
@@ -110,6 +113,50 @@ def test_a_ladder_of_whole_records_does_not_depend_on_the_number_of_processes(tm
     assert "windows" not in alone.note
     assert alone.rungs[-1].error < 0.2 * alone.rungs[0].error
     assert np.isfinite(alone.rungs[-1].heldout_error)
+
+
+def test_the_only_claim_is_taken_back_where_whole_records_do_not_support_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The verdict, its words and all probabilities follow."""
+    whole = _oscillator(tmp_path, 0.0, RIG, 0.0)
+    label = "dry_friction@mass.x"
+    searched = make_ladder(
+        in_windows(whole), [record_model(whole, LIBRARY, given) for given in ((), (label,))]
+    )
+    claim = Candidate(*label.split("@"), "", 0.9, {}, 1.0, 0.9, 1.0, 0.9, 5.0, 3.5, 5.0, True, "Its signs.")
+    odds = {label: 0.9, NOTHING: 0.1}
+    told = Diagnosis("effect", "", 0.1, (claim,), (), "", (), odds, 1.0, 1.0, searched)
+    records = importlib.import_module("ema_pipeline.diagnose.records")
+    monkeypatch.setattr(records, "diagnose", lambda *given, **named: told)
+    found = records.diagnose_records(whole, LIBRARY, settings=DiagnoseSettings(processes=1))
+    assert found.verdict == "adequate"
+    assert not any(c.claimed for c in found.candidates)
+    assert found.summary.startswith("The model explains the data")
+    assert found.probabilities[NOTHING] == found.null_probability > 0.2
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+    assert found.candidates[0].probability == found.probabilities[label]
+    assert len(found.ladder.rungs) == 1
+
+
+def test_noise_in_the_force_is_learned_as_a_share_of_the_response(tmp_path: Path) -> None:
+    """It is the larger the nearer a resonance; noise of the sensor is not."""
+    whole = _oscillator(tmp_path, 0.0, RIG, 0.0)
+    (data, *_) = whole.data
+    assert data.level.shape == data.measured.shape[1:]
+    count = (data.level.shape[-1] - 1) // 2
+    np.testing.assert_array_equal(data.level[:, 1 : count + 1], data.level[:, count + 1 :])
+    assert np.mean(data.level**2) == pytest.approx(np.mean(data.measured**2), rel=0.1)
+    wrong = np.random.default_rng(5).standard_normal(data.measured.shape)
+    learned_shares = []
+    for noise in (0.02 * data.level * wrong, 0.02 * float(data.rms[0]) * wrong):
+        lines = replace(data)
+        lines.__dict__.update(measured=data.measured + noise, level=data.level)
+        noisy = whole.with_records([lines], ())
+        model = record_model(noisy, LIBRARY, ())
+        learned_shares.append(learned(noisy, fit_base(noisy, model)).posterior.scatters[SHARE])
+    assert learned_shares[0] == pytest.approx(2.0, rel=0.15)
+    assert learned_shares[1] < 1.0
 
 
 @pytest.mark.parametrize("friction", [0.0, pytest.param(8.0, marks=pytest.mark.slow)])

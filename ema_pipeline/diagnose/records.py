@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
 from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.rungs import (
     learned_scatters,
     make_ladder,
@@ -23,7 +24,7 @@ from ema_pipeline.diagnose.rungs import (
 from ema_pipeline.diagnose.selection import Progress
 from ema_pipeline.diagnose.sentences import label_text, size_text, summary
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder, Rung
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder, Rung, VerdictWord
 from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.errors import EmaError
@@ -38,6 +39,9 @@ SEARCHED = 2048
 quick enough for all."""
 _LOST = 3.0
 """Error in whole records, over that in windows, from which a simulation has lost step with the measured motion."""
+_OF_OTHERS = 0.01
+"""Share of the log evidence of earlier claims that a further one must gain: what the form of a law leaves of the
+motion, friction that sticks and slips for one, looks like another effect."""
 _SAME_CHANGE = 1e-5
 """Relative difference of two changes of the linear system below which they are the same physics."""
 _TRIAL = 1e-6
@@ -101,25 +105,42 @@ def diagnose_records(
     searched = found.ladder
     ladder = whole_ladder(observations, library, searched, settings.processes)
     while doubt := _unconfirmed(found, ladder, settings):
-        found, searched = _withdrawn(found, searched, doubt)
+        lost = max(0.0, _claimed(found)[-1].gain - _last_gain(ladder))
+        found, searched = _withdrawn(found, searched, doubt, lost, settings)
         ladder = whole_ladder(observations, library, searched, settings.processes)
     return _with_whole(found, ladder)
 
 
 def _unconfirmed(found: Diagnosis, ladder: Ladder, settings: DiagnoseSettings) -> str:
-    """Why whole records do not support the last of several claims; empty where they do, or tell nothing of it.
+    """Why whole records do not support the last claim; empty where they do, or tell nothing of it.
 
     Windows take coarser steps, and states of their own, which an effect too many may make up for.
     """
-    if len(ladder.rungs) < 3 or found.verdict == "ambiguous" or _OUT_OF_STEP in ladder.note:
+    if len(ladder.rungs) < 2 or _OUT_OF_STEP in ladder.note:
         return ""
-    gain = ladder.rungs[-1].log_evidence - ladder.rungs[-2].log_evidence
-    if gain >= settings.claim:
-        return ""
-    return f"the log evidence that it gains in whole records, {gain:.1f}, is below {settings.claim:g}"
+    gain = _last_gain(ladder)
+    if gain < settings.claim:
+        return f"the log evidence that it gains in whole records, {gain:.1f}, is below {settings.claim:g}"
+    *before, last = (c.gain for c in _claimed(found))
+    if last < _OF_OTHERS * sum(before):
+        return (
+            f"the log evidence that it gains, {last:.1f}, is below {100 * _OF_OTHERS:g} % of what the others gain, "
+            "whose laws are not known better"
+        )
+    return ""
 
 
-def _withdrawn(found: Diagnosis, searched: Ladder, doubt: str) -> tuple[Diagnosis, Ladder]:
+def _last_gain(ladder: Ladder) -> float:
+    return ladder.rungs[-1].log_evidence - ladder.rungs[-2].log_evidence
+
+
+def _claimed(found: Diagnosis) -> list[Candidate]:
+    return [c for c in found.candidates if c.claimed]
+
+
+def _withdrawn(
+    found: Diagnosis, searched: Ladder, doubt: str, lost: float, settings: DiagnoseSettings
+) -> tuple[Diagnosis, Ladder]:
     """Diagnosis and ladder of the search without the last claim."""
     label = searched.rungs[-1].effects[-1]
     candidates = tuple(
@@ -128,9 +149,28 @@ def _withdrawn(found: Diagnosis, searched: Ladder, doubt: str) -> tuple[Diagnosi
     )
     groups = tuple(g for g in found.indistinguishable if label not in g)
     note = f"the best further effect is {label_text(label)}, and {doubt}"
-    return (
-        dataclasses.replace(found, candidates=candidates, indistinguishable=groups),
-        dataclasses.replace(searched, rungs=searched.rungs[:-1], note=note),
+    rungs = searched.rungs[:-1]
+    kept = dataclasses.replace(found, candidates=candidates, indistinguishable=groups)
+    if len(rungs) == 1:
+        kept = _nothing_claimed(kept, rungs[0].error, lost, settings)
+    return kept, dataclasses.replace(searched, rungs=rungs, note=note)
+
+
+def _nothing_claimed(found: Diagnosis, error: float, lost: float, settings: DiagnoseSettings) -> Diagnosis:
+    """Verdict and probabilities where whole records take back the only claim, by `lost` in log evidence."""
+    told = {n: p if n == NOTHING else p * float(np.exp(-lost)) for n, p in found.probabilities.items()}
+    total = sum(told.values())
+    told = {n: p / total for n, p in told.items()}
+    verdict: VerdictWord = "adequate" if error <= settings.error_limit else "unknown_effect"
+    return dataclasses.replace(
+        found,
+        verdict=verdict,
+        summary=summary(verdict, (), (error, error), told[NOTHING]),
+        candidates=tuple(
+            dataclasses.replace(c, probability=told.get(c.label, c.probability)) for c in found.candidates
+        ),
+        probabilities=told,
+        null_probability=told[NOTHING],
     )
 
 
@@ -298,8 +338,8 @@ def _with_whole(found: Diagnosis, ladder: Ladder) -> Diagnosis:
     told = [(c.label, size_text(c.parameters)) for c in candidates if c.claimed]
     first = ladder.rungs[0]
     words = found.summary
-    if found.verdict == "effect":
-        words = summary("effect", told, (first.error, last.error), found.null_probability)
+    if found.verdict in ("effect", "adequate"):
+        words = summary(found.verdict, told, (first.error, last.error), found.null_probability)
     return dataclasses.replace(
         found,
         candidates=candidates,

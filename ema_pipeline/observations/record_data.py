@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
+from scipy.ndimage import uniform_filter1d
 
 from ema_pipeline.ingest.driven import DrivenRecord
 from ema_pipeline.mechanics.simulation import between_samples
@@ -16,10 +17,14 @@ BANDS = 8
 """Bands of frequency, each with a noise of its own: what a model leaves is seldom white."""
 DISCREPANCY = 1e-2
 """Standard uncertainty of a response as a share of its root mean square: sensors, and a force known at samples only."""
+SHARE = "share of the response"
+"""Name of the scatter in proportion to the response itself."""
 _LEAST_NOISE = 1e-5
 """Noise, in units of the discrepancy, below which records are not told apart from exact ones."""
 _RESTLESS = 1.5
 """A first period that differs from the mean by this many times what others do holds a transient."""
+_AROUND = 5
+"""Lines over which the level of a response is taken: as many as a half-power width, few beside a band."""
 _LEAST_WINDOW = 64
 """Shortest window, samples: fewer do not fill the bands of frequency."""
 
@@ -112,6 +117,18 @@ class RecordData:
     def measured(self) -> NDArray[np.float64]:
         """Lines of the responses, (n_windows, n_outputs, n_rows), SI."""
         return self.lines(self.responses[..., self.compared])
+
+    @cached_property
+    def level(self) -> NDArray[np.float64]:
+        """Root mean square of `measured` over windows and the lines around each, (n_outputs, n_rows).
+
+        A force that is measured wrong by a share of itself moves the response by that share of its own, line by line.
+        """
+        power = np.mean(self.measured**2, axis=0)
+        count = (power.shape[-1] - 1) // 2
+        power = 0.5 * (power[:, 1 : count + 1] + power[:, count + 1 :])
+        waves = np.sqrt(uniform_filter1d(power, _AROUND, axis=-1, mode="nearest"))
+        return np.concatenate([waves[:, :1], waves, waves], axis=-1)
 
     def lines(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
         """Lines of signals, (n_windows, n_outputs, ..., n_samples) to (n_windows, n_outputs, ..., n_rows).

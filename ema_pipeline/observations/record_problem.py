@@ -14,7 +14,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Residuals, Unknowns, joined
 from ema_pipeline.mechanics.simulation import HYSTERESIS, DrivenSystem, Slopes
 from ema_pipeline.observations.base import EffectProblem
-from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, RecordData
+from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, SHARE, RecordData
 from ema_pipeline.observations.record_model import RecordModel
 from ema_pipeline.observations.record_motion import Motion
 from ema_pipeline.observations.rig_model import SizeMap
@@ -266,32 +266,34 @@ class RecordProblem(EffectProblem):
         """Variance of a record's lines at these scatters."""
         o = self.observations
         unit = DISCREPANCY * o.rms[:, None]
-        noise = np.maximum(data.noise, _LEAST_NOISE * unit)
+        own = np.maximum(data.noise, _LEAST_NOISE * unit)[:, data.band] ** 2
         each = np.array([[scatters[o.noise_name(k, b)] for b in range(BANDS)] for k in range(len(unit))])
-        added = (each * unit) ** 2
-        stated = noise**2 + unit**2
-        total = noise**2 + added
-        return Variance(
-            total[:, data.band],
-            (added / total)[:, data.band],
-            np.sqrt(total / stated)[:, data.band],
-            data.band,
-        )
+        added = ((each * unit) ** 2)[:, data.band]
+        level = (DISCREPANCY * data.level) ** 2
+        of_response = scatters[SHARE] ** 2 * level
+        total = own + added + of_response
+        stated = own + unit**2 + o.scatters[SHARE].default ** 2 * level
+        return Variance(total, added / total, of_response / total, np.sqrt(total / stated), data.band)
 
     def _shares(
         self, spread: Sequence[Variance], scatters: Mapping[str, float]
     ) -> dict[str, NDArray[np.float64]]:
         """Share of every scatter in the variance of every row."""
         o = self.observations
-        found = {}
+        windows = [len(data.starts) for data in o.data]
+
+        def rows(of: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+            return np.concatenate([np.tile(one.ravel(), n) for one, n in zip(of, windows, strict=True)])
+
+        found = {SHARE: rows([v.of_response for v in spread])}
         for k in range(len(o.basis.outputs)):
             for b in range(BANDS):
                 parts = []
-                for v, data in zip(spread, o.data, strict=True):
+                for v in spread:
                     share = np.zeros(v.share.shape)
                     share[k] = np.where(v.band == b, v.share[k], 0.0)
-                    parts.append(np.tile(share.ravel(), len(data.starts)))
-                found[o.noise_name(k, b)] = np.concatenate(parts)
+                    parts.append(share)
+                found[o.noise_name(k, b)] = rows(parts)
         return found
 
 
@@ -302,9 +304,10 @@ def _by_output(read: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Variance:
-    """Of a window's lines, each (n_outputs, n_rows): the whole, the learned share, and σ over the stated one."""
+    """Of a window's lines, each (n_outputs, n_rows): the whole, what noise and the response add, σ over the stated."""
 
     total: NDArray[np.float64]
     share: NDArray[np.float64]
+    of_response: NDArray[np.float64]
     relative: NDArray[np.float64]
     band: NDArray[np.int64]

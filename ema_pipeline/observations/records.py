@@ -1,7 +1,8 @@
 """Records of continuous excitation as observations: the model driven by the measured force, its response compared.
 
 A response is compared line by line of its Fourier transform. Each band of frequency has a noise of its own, learned
-with everything else, so that what no model explains at a resonance does not drown what it explains elsewhere. The state
+with everything else, and so is a share of the response itself: noise in the measured force is the larger the nearer a
+resonance, so that peaks tell less of the model than their height above the rest promises. The state
 at the start of a record is unknown; a periodic record is compared with the steady response.
 """
 
@@ -24,7 +25,7 @@ from ema_pipeline.ingest.driven import DrivenRecord
 from ema_pipeline.mechanics.simulation import FINE, DrivenSystem, Sensors, Slopes, substeps_for
 from ema_pipeline.observations.linear_start import linear_start
 from ema_pipeline.observations.parts import DAMPING
-from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, RecordData
+from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, SHARE, RecordData
 from ema_pipeline.observations.record_model import Basis, RecordModel, loosened
 from ema_pipeline.observations.record_motion import Motion, simulated
 from ema_pipeline.observations.record_problem import Lines, RecordProblem
@@ -37,6 +38,8 @@ MOST_COORDINATES = 5
 _WIDE = 10.0
 """Noise, in units of the discrepancy, with which fits begin: a linear model of a nonlinear rig misses a tenth."""
 _MOST_NOISE = 1e3
+_LITTLE = 0.3
+"""Median of the share of a response that no model explains, in units of the discrepancy."""
 _SET_UP = 0.1
 """Mean of a displacement, as a share of its root mean square, from which its zero is arbitrary."""
 _RIGID = 1e-9
@@ -132,6 +135,8 @@ class RecordObservations:
                 title = f"what no model explains at {dof.point}, {b * width:.4g} to {(b + 1) * width:.4g} Hz"
                 name = self.noise_name(o, b)
                 found[name] = Scatter(name, title, 1.0, 1.5, _WIDE, _MOST_NOISE)
+        title = "share of every line of a response that no model explains, as where noise is in the force, %"
+        found[SHARE] = Scatter(SHARE, title, _LITTLE, 1.5, 1.0, _MOST_NOISE)
         return found
 
     def noise_name(self, output: int, band: int) -> str:
