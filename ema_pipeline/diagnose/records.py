@@ -39,7 +39,7 @@ SEARCHED = 2048
 quick enough for all."""
 _LOST = 3.0
 """Error in whole records, over that in windows, from which a simulation has lost step with the measured motion."""
-_OF_OTHERS = 0.01
+_OF_OTHERS = 0.02
 """Share of the log evidence of earlier claims that a further one must gain: what the form of a law leaves of the
 motion, friction that sticks and slips for one, looks like another effect."""
 _SAME_CHANGE = 1e-5
