@@ -169,15 +169,8 @@ NUMBER = re.compile(r"[+-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def _alike(row: str, line: str) -> bool:
-    """Equal but for what rounding changes between machines: 4 % of a number, 0.3 of a percentage, 1 of two digits."""
+    """Equal but for what rounding changes between machines: 4 % of a number, 0.3 of a percentage."""
     if NUMBER.sub("0", row) != NUMBER.sub("0", line):
         return False
     found, printed = (np.array([float(n) for n in NUMBER.findall(text)]) for text in (row, line))
-    last = [_last_place(n) for n in NUMBER.findall(line)]
-    return bool(np.all(np.abs(found - printed) <= np.maximum(np.maximum(0.04 * np.abs(printed), 0.3), last)))
-
-
-def _last_place(text: str) -> float:
-    """What one more in the last place of a printed number is worth."""
-    mantissa, _, exponent = text.partition("e")
-    return 1.01 * 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+    return bool(np.all(np.abs(found - printed) <= np.maximum(0.04 * np.abs(printed), 0.3)))
