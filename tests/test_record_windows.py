@@ -183,3 +183,7 @@ def test_a_further_claim_that_whole_records_do_not_support_is_withdrawn(
         assert "dry friction at mass.x" in found.ladder.note
         assert "dry friction" not in found.summary
         assert found.indistinguishable == ()
+        told = replace(told, verdict="ambiguous")  # the group of which one was claimed goes with it
+        found = records.diagnose_records(whole, LIBRARY, settings=DiagnoseSettings(processes=1))
+        assert found.verdict == "effect"
+        assert found.summary.startswith("The model lacks cubic spring")

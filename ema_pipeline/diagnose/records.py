@@ -150,7 +150,10 @@ def _withdrawn(
     groups = tuple(g for g in found.indistinguishable if label not in g)
     note = f"the best further effect is {label_text(label)}, and {doubt}"
     rungs = searched.rungs[:-1]
-    kept = dataclasses.replace(found, candidates=candidates, indistinguishable=groups)
+    verdict = found.verdict
+    if verdict == "ambiguous" and label in found.indistinguishable[0]:  # the group of which one was claimed
+        verdict = "effect"
+    kept = dataclasses.replace(found, verdict=verdict, candidates=candidates, indistinguishable=groups)
     if len(rungs) == 1:
         kept = _nothing_claimed(kept, rungs[0].error, lost, settings)
     return kept, dataclasses.replace(searched, rungs=rungs, note=note)
