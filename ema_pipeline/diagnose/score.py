@@ -89,9 +89,11 @@ class Marginal:
         self.kept = np.array([not without or effect_of(n) != without for n in p.unknowns.names], bool)
         self.whitened = (jacobian * p.prior_std)[:, self.kept]
         information = np.eye(self.whitened.shape[1]) + self.whitened.T @ self.whitened
-        # Zero at the maximum, which a fit of repeated modes need not have reached to the last bit.
-        self.ascent = self.whitened.T @ self.residual + (p.x / p.prior_std)[self.kept]
         self.factor = scipy.linalg.cho_factor(information, check_finite=False)
+        # Zero at the maximum, which a fit of repeated modes need not have reached to the last bit.
+        ascent = self.whitened.T @ self.residual + (p.x / p.prior_std)[self.kept]
+        to_maximum = scipy.linalg.cho_solve(self.factor, ascent, check_finite=False)
+        self.at_maximum = self.residual - self.whitened @ to_maximum
 
     def information(self, columns: NDArray[np.float64]) -> NDArray[np.float64]:
         """Fisher information of weighted directions, the rest marginalised, (k, k)."""
@@ -118,8 +120,7 @@ class Marginal:
         """From the base model's maximum, to first order."""
         information = self.information(columns)
         precision = information + np.eye(len(information))
-        to_maximum = scipy.linalg.cho_solve(self.factor, self.ascent, check_finite=False)
-        slope = -columns.T @ (self.residual - self.whitened @ to_maximum)
+        slope = -columns.T @ self.at_maximum
         size = np.linalg.solve(precision, slope)
         if size[0] < lower[0]:
             size = np.zeros_like(size)

@@ -125,8 +125,8 @@ def select(
         if not near or len(claimed) == settings.most_effects:
             return Selection(tuple(rounds), tuple(claimed), ranking.base, observations)
         added = next(j for j in near if j.claimed)  # a rival alone does not pass the conditions of a claim
-        if observations.suited(added.ranked.fit.model.effects) is not observations:
-            suited = observations.suited(added.ranked.fit.model.effects)
+        suited = observations.suited(added.ranked.fit.model.effects)
+        if suited is not observations:
             leading = [r.hypothesis for r in ranking.ranked[:CONTENDERS]]
             return select(suited, known, hypotheses, settings, progress, leading)
         claimed.append(added)
