@@ -353,7 +353,7 @@ def test_report_begins_with_the_verdict_its_numbers_and_the_command(run: RunResu
     ]
     assert "ema add &#39;results/a b&#39; mesh_stiffness_loss@sun-planet1" in band
     assert "scatter by 18 %" in band
-    assert band.count('class="named"') == 2  # the sun and planet 1 are drawn as the culprits
+    assert band.count('class="named"') == 2  # the sun and planet 1 are marked
 
 
 def test_report_lists_the_candidates_with_size_probability_and_drop(run: RunResults) -> None:
@@ -365,7 +365,7 @@ def test_report_lists_the_candidates_with_size_probability_and_drop(run: RunResu
     assert "Where the misfit sits" not in text
 
 
-def test_report_without_diagnosis_names_no_culprit(base: RunResults) -> None:
+def test_report_without_diagnosis_marks_no_place(base: RunResults) -> None:
     html = page(base)
     assert 'class="candidates"' not in html
     assert 'class="named"' not in html

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from ema_pipeline.changes.compare import Changes
 from ema_pipeline.changes.modes import LEVEL, ModeChange
+from ema_pipeline.changes.two_tests import Changes
 from ema_pipeline.diagnose.sentences import label_text, probability_text
 from ema_pipeline.report.numbers import format_percent, format_value
 from ema_pipeline.report.tables import Row, Table

@@ -190,8 +190,8 @@ def limits(
     json: Json = False,
 ) -> None:
     """Learn limits from a good lot, as normal tolerance intervals; edit the file as you like."""
+    from ema_pipeline.series.acceptance_limits import good_lot, learn_limits, write_limits
     from ema_pipeline.series.features import features_of, modes_of_tests, reference_of
-    from ema_pipeline.series.limits import good_lot, learn_limits, write_limits
 
     with _opened(s) as database:
         lot = good_lot(database.table("tests"), tests or ())
@@ -227,8 +227,8 @@ def judge(
     from dataclasses import asdict
 
     from ema_pipeline.report.summary_files import finite
+    from ema_pipeline.series.acceptance_limits import read_limits
     from ema_pipeline.series.judge import judge_series
-    from ema_pipeline.series.limits import read_limits
     from ema_pipeline.series.screens import judged_counts, judged_table
 
     with _opened(s) as database:
@@ -317,7 +317,7 @@ def report(
     quiet: Quiet = False,
 ) -> None:
     """Write one page: a table that sorts and filters, distributions, outliers, links to each test's report."""
-    from ema_pipeline.series.limits import read_limits
+    from ema_pipeline.series.acceptance_limits import read_limits
     from ema_pipeline.series.page import write_page
 
     file = limits or s / "limits.toml"

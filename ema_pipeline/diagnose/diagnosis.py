@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.claims import Judged
+from ema_pipeline.diagnose.detection_limits import detection_limits
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
-from ema_pipeline.diagnose.limits import detection_limits
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names
 from ema_pipeline.diagnose.next_test import next_measurement

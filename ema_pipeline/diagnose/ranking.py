@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.score import Score, scores
 from ema_pipeline.inference import Posterior, beyond_scatter
 from ema_pipeline.observations.base import EffectProblem, Observations

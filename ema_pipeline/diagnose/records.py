@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
-from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.rungs import (
     learned_scatters,

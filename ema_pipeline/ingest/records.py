@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.dof import Dof
 from ema_pipeline.lazy_samples import CutSamples, LazySamples
-from ema_pipeline.verdict import Verdict
 
 CALIBRATION_STD = 0.02
 """Relative 1 σ of a sensitivity that is not stated: what calibration certificates of accelerometers and
@@ -145,7 +145,7 @@ class Hit:
         Sample of the force peak within the record.
     peak_force : float
         Force at the peak, in `force_unit`, with its sign.
-    verdicts : tuple of Verdict
+    verdicts : tuple of CheckResult
         Outcome of every check that could be made.
     force_unit : str
         ``"N"``, ``"V"`` for an uncalibrated hammer.
@@ -160,7 +160,7 @@ class Hit:
     stop: int
     peak: int
     peak_force: float
-    verdicts: tuple[Verdict, ...] = ()
+    verdicts: tuple[CheckResult, ...] = ()
     force_unit: str = "N"
     part: str = ""
 

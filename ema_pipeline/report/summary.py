@@ -9,10 +9,10 @@ from ema_pipeline.fit.types import FitResult, ParameterEstimate
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import cautions, fails, identified_words, suspicions
 from ema_pipeline.report.levels import has_to_say
-from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_ERROR
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.simulation import error_lines, loop_words
+from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC, POOR_ERROR
 
 __all__ = ["cautions", "fails", "findings", "identified_words", "stiffnesses"]
 

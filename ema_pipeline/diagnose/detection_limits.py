@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.expected_gain import Change, ExpectedGain
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
-from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.probability import needed
 from ema_pipeline.diagnose.score import Marginal
 from ema_pipeline.diagnose.settings import DiagnoseSettings
