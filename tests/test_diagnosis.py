@@ -101,8 +101,8 @@ def test_what_is_hidden_in_a_chain_is_named_with_its_size(
     assert found.ladder.rungs[-1].error < 1.5
     limit = {d.label: d.size for d in found.detection_limits}[first.label]  # of the rig without it
     assert size.std < limit < 2 * truth
-    assert first.gain > SETTINGS.claim
-    assert first.heldout_error_after < first.heldout_before
+    assert first.log_evidence > SETTINGS.claim
+    assert first.heldout_error_after < first.heldout_error_before
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ def prediction(observations: Level):
     return held_out(observations, Fit(Model(), found))
 
 
-def test_a_linear_model_foretells_as_its_normal_distribution_does() -> None:
+def test_a_linear_model_predicts_as_its_normal_distribution_does() -> None:
     squares, density = closed_form(Y)
     found = prediction(Level(Y))
     assert found.error == close(np.sqrt(squares / 6))

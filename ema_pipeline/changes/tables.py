@@ -66,8 +66,8 @@ def notes(found: Changes) -> list[str]:
             told = ", ".join(f"{c} mode {k} at {f:.2f} Hz" for c, k, f in lone[:6])
             lines.append(f"Modes of {name} alone: {told}{' …' if len(lone) > 6 else ''}.")
     lines.append(
-        "Intervals (± 1 σ) hold each test's own scatter; what a new set-up changes besides (temperature, mounting, "
-        "suspension) is a change to them."
+        "Intervals (± 1 σ) include each test's own scatter; effects of a new set-up (temperature, mounting, "
+        "suspension) are not included and appear as changes."
     )
     return lines
 

@@ -1,4 +1,4 @@
-"""How well a model foretells what its fit has not seen."""
+"""How well a model predicts what its fit has not seen."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ NOTHING_HELD_OUT = HeldOut(float("nan"), float("nan"))
 
 
 def held_out(observations: Observations, fit: Fit) -> HeldOut:
-    """Fit to all but one part, foretell that part, in turn; scatters as they are in `fit`.
+    """Fit to all but one part, predict that part, in turn; scatters as they are in `fit`.
 
-    No part may lie further out than parts scatter: a model that bends one as far as an effect would has the effect,
-    under another name, and foretells as well.
+    No part may lie further out than parts scatter: otherwise a part moved far from its prior would stand in for the
+    effect and predict just as well.
     """
     squares, count, density = 0.0, 0, 0.0
     for kept, out in observations.folds():

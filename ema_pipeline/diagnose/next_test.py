@@ -26,7 +26,7 @@ _ADDED_SHARE = 0.1
 _LEAST_SHAPE_STD = 0.02
 _LEAST_FREQUENCY_STD = 1e-3
 _WORTH = 1.0
-"""Difference, in standard deviations, below which a measurement is not worth its name."""
+"""Difference, in standard deviations, below which a measurement is not worth proposing."""
 _CERTAIN = 0.9
 
 

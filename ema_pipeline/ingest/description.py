@@ -11,9 +11,9 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.defaults import CALIBRATION_STD, TRANSVERSE
 from ema_pipeline.ingest.driven_entries import check_driven_test
 from ema_pipeline.ingest.record_entries import check_records
-from ema_pipeline.ingest.records import CALIBRATION_STD, TRANSVERSE
 from ema_pipeline.names import check_name
 from ema_pipeline.plain_text import has_control_characters
 from ema_pipeline.settings import Settings, parse

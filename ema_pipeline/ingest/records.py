@@ -9,14 +9,8 @@ from numpy.typing import NDArray
 
 from ema_pipeline.check_result import CheckResult
 from ema_pipeline.dof import Dof
+from ema_pipeline.ingest.defaults import CALIBRATION_STD, TRANSVERSE
 from ema_pipeline.lazy_samples import CutSamples, LazySamples
-
-CALIBRATION_STD = 0.02
-"""Relative 1 σ of a sensitivity that is not stated: what calibration certificates of accelerometers and
-modal hammers usually claim, 3 to 5 % at two sigma."""
-
-TRANSVERSE = 0.03
-"""Transverse sensitivity where none is stated, 1 σ: data sheets promise less than 3 to 5 %."""
 
 ANY_BAND_HZ = (0.0, float("inf"))
 

@@ -270,7 +270,7 @@ def _candidate(results: RunResults, c: Any) -> dict[str, Any]:
         "standing": diagnosis.standing(found, c),
         "before": plain(c.error_before, 3),
         "error": plain(c.error_after, 3),
-        "held": f"{plain(c.heldout_before, 3)} → {plain(c.heldout_error_after, 3)}",
+        "held": f"{plain(c.heldout_error_before, 3)} → {plain(c.heldout_error_after, 3)}",
         "claimed": c.claimed,
         "why": c.why,
         "in_model": c.label in results.added,
