@@ -25,7 +25,7 @@ def verdict_text(found: Changes) -> str:
             f"library explains what differs. {_of_modes(found)}"
         )
     if diagnosis.verdict == "not_enough_data":
-        return f"The tests have too few modes in common to tell a physical change. {_of_modes(found)}"
+        return f"The tests have too few modes in common to show a physical change. {_of_modes(found)}"
     odds = probability_text(diagnosis.null_probability)
     return f"The same within what these tests can show (probability that nothing changed: {odds})."
 

@@ -101,7 +101,7 @@ def _change(
     with progress(quiet) as show_stage:
         run_on(out, AFTER_EFFECTS, [], show_stage, effect_files)
     if not quiet and not json:
-        show(f"Fit, comparison and report hold this model now: {run.store.folder / 'report.html'}")
+        show(f"Fit, comparison and report now use this model: {run.store.folder / 'report.html'}")
 
 
 def ladder(out: Out, effect_file: EffectFiles = None, json: Json = False) -> None:

@@ -55,7 +55,7 @@ def run(
 ) -> None:
     """Run every raw folder under TREE, and keep a table of all in S/series.db and S/tests.csv.
 
-    A test that fails is a row with its reason; unchanged tests are skipped; a killed series goes on where it was.
+    A test that fails is a row with its reason; unchanged tests are skipped; a killed series resumes where it stopped.
     """
     from ema_pipeline.series.database import SeriesDatabase
     from ema_pipeline.series.export import export_series
@@ -302,8 +302,8 @@ def trend(
         return
     show(trend_table(found, order))
     show(
-        f"Drifts and steps are told at p < {LEVEL:g} over all features together (Holm); control limits: mean ± 2.66 "
-        f"mean moving ranges (ISO 7870-2). Modes have the numbers of test {numbers}."
+        f"Drifts and steps are reported at p < {LEVEL:g} over all features together (Holm); control limits: mean ± "
+        f"2.66 mean moving ranges (ISO 7870-2). Modes have the numbers of test {numbers}."
     )
 
 

@@ -78,7 +78,7 @@ def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, 
 
 
 def _in_blocks(found: Residuals, covariance: NDArray[np.float64]) -> tuple[float, float]:
-    """Sum of squares in which errors count, and -log density, each value foretold from those before it."""
+    """Sum of squares in which errors count, and -log density, each value predicted from those before it."""
     spread = np.eye(len(found.values)) + found.jacobian @ covariance @ found.jacobian.T
     factor = scipy.linalg.cholesky(spread, lower=True, check_finite=False)
     values = scipy.linalg.solve_triangular(factor, found.values, lower=True, check_finite=False)

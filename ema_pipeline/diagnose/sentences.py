@@ -75,7 +75,8 @@ def summary(
         odds = f"Probability that nothing is missing: {probability_text(nothing)}."
         return f"The model explains the data: error {before:.2f}. {odds}"
     if verdict == "unknown_effect":
-        best = f" The closest is {named}." if named else ""
+        verb = "are" if len(claimed) > 1 else "is"
+        best = f" The closest {verb} {named}." if named else ""
         failed = f"The model does not explain the data (error {after:.2f})"
         return f"{failed}, and no effect in the library corrects this.{best}"
     return "These data are not sufficient to show what is missing."

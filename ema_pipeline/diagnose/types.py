@@ -202,7 +202,7 @@ class Ladder:
         Hits, as ``file#number``, that were not compared because their motion is too sensitive to the
         measured force.
     scatters : tuple of LearnedScatter
-        What σ holds beside the test's own scatter.
+        What σ includes in addition to the test's own scatter.
     """
 
     rungs: tuple[Rung, ...]

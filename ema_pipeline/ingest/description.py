@@ -145,7 +145,7 @@ class _TestFile(Settings):
     )
     band_hz: tuple[float, float] | None = Field(
         default=None,
-        description="Band that its FRFs may speak for; left out: what its force spectrum carries",
+        description="Band in which its FRFs are used; left out: what its force spectrum carries",
     )
     exponential_window_rad_s: float = Field(
         default=0.0,

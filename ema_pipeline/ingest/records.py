@@ -102,7 +102,7 @@ class Record:
     part : str
         Set-up (hammer, sensors) of which several make up the test; empty where there is but one.
     band_hz : tuple of float
-        Band that the description lets the record speak for.
+        Band in which the description lets the record be used.
     """
 
     file: str

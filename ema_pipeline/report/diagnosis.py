@@ -148,19 +148,19 @@ def of_modes(ladder: Ladder) -> bool:
 
 
 def noise_words(ladder: Ladder) -> str:
-    """What σ holds beside the test's own scatter."""
+    """What σ includes in addition to the test's own scatter."""
     if ladder.force_n:
         of_sigma = (
             "Error: simulated against measured hits, in standard uncertainties: the sensors' noise, "
             f"{plain(100 * ladder.hit_noise, 2)} % of the signal around each frequency, and an error of the linear "
-            "model that is alike at every force level. A linear model can therefore have an error of about 1 and "
+            "model that is the same at every force level. A linear model can therefore have an error of about 1 and "
             "still miss much of the hard hits: look at the shares that are missed."
         )
         return " ".join(filter(None, (hits_words(ladder), of_sigma)))
     if not of_modes(ladder):
         return "σ: the scatter of the measured signals."
     return (
-        f"σ: the test's own scatter and, beside it, {plain(100 * ladder.frequency_noise, 2)} % of frequency, "
+        f"σ: the test's own scatter plus {plain(100 * ladder.frequency_noise, 2)} % of frequency, "
         f"{plain(100 * ladder.damping_noise, 2)} % of damping, "
         f"{plain(100 * ladder.shape_noise, 2)} % of a shape's largest entry."
     )
