@@ -1,4 +1,4 @@
-"""Verdicts: what a check measured, against which limit, by which clause."""
+"""Results of checks: what was measured, against which limit, by which clause."""
 
 from __future__ import annotations
 

@@ -276,6 +276,10 @@ def test_an_effect_is_claimed_only_where_everything_supports_it() -> None:
     assert judged
     assert not any(j.claimed for j in judged)
     assert all(j.doubt for j in judged)
+    dearer = SETTINGS.model_copy(update={"claim": 50.0})  # as for a further effect
+    again = judge(observations, ranking, judged[0].ranked, dearer)
+    assert (judged[0].needed, again.needed) == (SETTINGS.claim, 50.0)
+    assert again.doubt.endswith("is below 50")
 
 
 def test_learned_scatters_are_those_of_the_laboratory() -> None:

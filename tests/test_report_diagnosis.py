@@ -16,6 +16,7 @@ import report_example as example
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import (
     Candidate,
@@ -362,6 +363,16 @@ def test_report_lists_the_candidates_with_size_probability_and_drop(run: RunResu
         assert needed in text
     assert "no further effect is supported by the data" in text
     assert "Where the misfit sits" not in text
+
+
+def test_the_sentence_on_what_is_missing_names_one_effect_or_several() -> None:
+    crack, mass = (CRACK, "fraction 0.34 ± 0.01"), ("mass@sun", "mass 0.1 ± 0.01 kg")
+    one, two = (sentences.summary("effect", named, (3.1, 1.02), 0.0) for named in ([crack], [crack, mass]))
+    named = "Missing from the model: mesh stiffness loss at sun-planet1, fraction 0.34 ± 0.01"
+    assert one == f"{named}. Adding this reduces the error from 3.10 to 1.02."
+    assert (
+        two == f"{named}; mass at sun, mass 0.1 ± 0.01 kg. Adding these reduces the error from 3.10 to 1.02."
+    )
 
 
 def test_report_without_diagnosis_marks_no_place(base: RunResults) -> None:
