@@ -64,8 +64,8 @@ def summary(
     before, after = error
     named = "; ".join(f"{label_text(label)}, {size}" for label, size in claimed)
     if verdict == "effect":
-        added = "these reduce" if len(claimed) > 1 else "this reduces"
-        return f"Missing from the model: {named}. Adding {added} the error from {before:.2f} to {after:.2f}."
+        added = "these" if len(claimed) > 1 else "this"
+        return f"Missing from the model: {named}. Adding {added} reduces the error from {before:.2f} to {after:.2f}."
     if verdict == "ambiguous":
         return (
             f"Several effects explain the data equally well: {named}. Adding one of them reduces the error from "
