@@ -12,8 +12,8 @@ import pytest
 from imperfect_modes import GOOD, NORMAL, Hidden, chain, chain_modes
 from scipy.stats import norm
 
+from ema_pipeline.diagnose.detection_limits import _Shown, detection_limits
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
-from ema_pipeline.diagnose.limits import _Shown, detection_limits
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names, named, sizes_of
 from ema_pipeline.diagnose.probability import against_nothing, needed, null_prior, prior

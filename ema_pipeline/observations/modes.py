@@ -19,7 +19,7 @@ from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
-from ema_pipeline.ingest.records import CALIBRATION_STD
+from ema_pipeline.ingest.defaults import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData

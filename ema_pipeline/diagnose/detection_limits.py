@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.expected_gain import Change, ExpectedGain
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
-from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.probability import needed
-from ema_pipeline.diagnose.score import Marginal
+from ema_pipeline.diagnose.score import UNSEEN, Marginal
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import DetectionLimit
 from ema_pipeline.inference import Residuals
@@ -22,8 +22,6 @@ from ema_pipeline.observations.rig_model import SizeMap
 
 _NINE_OF_TEN = 1.2816
 """Quantile of the normal distribution: in nine tests of ten the estimate is no further than this below the truth."""
-_UNSEEN = 1e6
-"""1 σ of a size, in units of its prior, from which the data hold nothing of it."""
 _TRIALS = 5
 _NEAR = 0.1
 """Relative accuracy of the gain at a limit."""
@@ -39,7 +37,7 @@ def detection_limits(
     hypotheses: Sequence[Hypothesis],
     settings: DiagnoseSettings,
 ) -> tuple[DetectionLimit, ...]:
-    """Limit of every effect, from what the data hold of its size beside everything uncertain.
+    """Limit of every effect, from what the data say of its size beside everything uncertain.
 
     Its expected gain in log evidence (`ExpectedGain`), less what its freedom costs, ½ ln(1 + (prior σ/σ)²), has to be
     as much as a claim needs among so many hypotheses. How far an effect moves the predictions is calculated at its
@@ -70,7 +68,7 @@ def detection_limits(
             return None
         return shown.least(needed(hypothesis, hypotheses, settings, found=0), settings.sigmas)
 
-    asked = [h for h in hypotheses if not h.extends]
+    asked = [h for h in hypotheses if not h.size_cannot_be_zero]
     found = zip(asked, spread(least, asked, settings.processes), strict=True)
     return tuple(_under(name, h, size) for h, size in found if size is not None for name in h.names)
 
@@ -92,7 +90,7 @@ class _Shown:
     ----------
     problem : EffectProblem
     null : ndarray, (n,)
-        Unknowns with the effect at nothing.
+        Unknowns with the effect at zero.
     at : int
         Position of its first size.
     scatters : dict of str to float
@@ -100,7 +98,7 @@ class _Shown:
         At `null`, with derivatives.
     gains : ExpectedGain
     std : float
-        1 σ of the unknown at nothing.
+        1 σ of the unknown at zero.
     """
 
     problem: EffectProblem
@@ -115,7 +113,7 @@ class _Shown:
     def of(
         cls, observations: Observations, fit: Fit, model: Model, hypothesis: Hypothesis, gains: ExpectedGain
     ) -> _Shown | None:
-        """Of one hypothesis; None where these data hold nothing of it."""
+        """Of one hypothesis; None where these data carry no information on it."""
         problem, scatters = model.problem(observations), fit.posterior.scatters
         null = transferred(fit.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
         size = hypothesis.placed.effect.parameters[0].name
@@ -125,7 +123,7 @@ class _Shown:
         if len(before.values) != gains.marginal.count or not np.all(np.isfinite(before.values)):
             return None
         std = 1 / np.sqrt(max(gains.change(before.jacobian[:, at]).total, 1e-300))
-        if std > _UNSEEN:
+        if std > UNSEEN:
             return None
         return cls(problem, null, at, scatters, before, gains, float(std))
 
