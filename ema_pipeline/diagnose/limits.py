@@ -24,13 +24,13 @@ _NINE_OF_TEN = 1.2816
 """Quantile of the normal distribution: in nine tests of ten the estimate is no further than this below the truth."""
 _UNSEEN = 1e6
 """1 σ of a size, in units of its prior, from which the data hold nothing of it."""
-_TRIALS, _MOST_TRIALS = 5, 10
+_TRIALS, _MOST_TRIALS = 5, 14
 """Sizes that are tried, of effects in proportion to their size and of others."""
 _NEAR = 0.1
 """Relative accuracy of the gain at a limit."""
-_LARGEST_STEP = 1.4
-"""Largest step in the logarithm of a limit from one trial to the next."""
-_SLOPES = (0.3, 3.0)
+_LARGEST_STEP, _LONGEST_STEP = 1.4, 4.0
+"""Largest step in the logarithm of a limit from one trial to the next, of the same."""
+_SLOPES = (0.3, 5.0)
 """Least and largest power of the size with which the gain is taken to grow."""
 
 
@@ -134,7 +134,9 @@ class _Shown:
             x = null.copy()
             x[at] = 1.0
             usual = problem.residuals(x, scatters, matching=before.matching, derivatives=False).values
-            usual = usual - before.values if len(usual) == len(before.values) else np.zeros_like(before.values)
+            usual = (
+                usual - before.values if len(usual) == len(before.values) else np.zeros_like(before.values)
+            )
         std = 1 / np.sqrt(max(gains.change(np.nan_to_num(usual)).total, 1e-300))
         return None if std > _UNSEEN else cls(problem, null, at, scatters, before, gains, float(std), linear)
 
@@ -142,9 +144,10 @@ class _Shown:
         """Unknown of the least size that gains so much in nine tests of ten; infinite where none does."""
         most = float(self.problem.unknowns.upper[self.at])
         unknown = self.std * (np.sqrt(2 * self._wanted(gain, sigmas, 1 / self.std)) + _NINE_OF_TEN)
+        trials, longest = (_TRIALS, _LARGEST_STEP) if self.linear else (_MOST_TRIALS, _LONGEST_STEP)
         low, high = 0.0, np.inf
         known: list[tuple[float, float]] = []
-        for _ in range(_TRIALS if self.linear else _MOST_TRIALS):
+        for _ in range(trials):
             unknown = min(unknown, most)
             log, off = float(np.log(unknown)), self._above(unknown, gain, sigmas)
             if abs(off) < _NEAR or (unknown == most and off < 0):
@@ -154,18 +157,22 @@ class _Shown:
             if known and log != known[-1][0]:
                 slope = float(np.clip((off - known[-1][1]) / (log - known[-1][0]), *_SLOPES))
             known.append((log, off))
-            unknown = float(np.exp(log - np.clip(off / slope, -_LARGEST_STEP, _LARGEST_STEP)))
+            unknown = float(np.exp(log - np.clip(off / slope, -longest, longest)))
             if not low < unknown < high:
                 unknown = float(np.sqrt(low * high))
         return unknown if unknown < most or off >= 0 else float("inf")
 
     def _above(self, unknown: float, gain: float, sigmas: float) -> float:
         """Logarithm of what a size gains in nine tests of ten, over what is asked of it."""
+        gained, known = self._gained(unknown)
+        return float(np.log(max(gained, 1e-9) / self._wanted(gain, sigmas, known)))
+
+    def _gained(self, unknown: float) -> tuple[float, float]:
+        """Log evidence that a size gains in nine tests of ten, and how many times better than its prior it is known."""
         change = self._moved(unknown)
         distance = float(np.sqrt(max(change.total, 1e-300)))
-        wanted = self._wanted(gain, sigmas, 1 / self.std if self.linear else distance / unknown)
         gained = self.gains.of(change, max(1 - _NINE_OF_TEN / distance, 0.0) ** 2)
-        return float(np.log(max(gained, 1e-9) / wanted))
+        return gained, 1 / self.std if self.linear else distance / unknown
 
     @staticmethod
     def _wanted(gain: float, sigmas: float, known: float) -> float:
