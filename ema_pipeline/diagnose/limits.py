@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.diagnose.claims import sigmas_asked
 from ema_pipeline.diagnose.expected_gain import Change, ExpectedGain
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
 from ema_pipeline.diagnose.pool import spread
@@ -69,7 +70,8 @@ def detection_limits(
         shown = _Shown.of(observations, fit, model, hypothesis, gains)
         if shown is None:
             return None
-        return shown.least(needed(hypothesis, hypotheses, settings, found=0), settings.sigmas)
+        sigmas = sigmas_asked(observations, hypothesis, settings)
+        return shown.least(needed(hypothesis, hypotheses, settings, found=0), sigmas)
 
     asked = [h for h in hypotheses if not h.extends]
     found = zip(asked, spread(least, asked, settings.processes), strict=True)
