@@ -51,8 +51,8 @@ class DiagnoseSettings(Settings):
     linearised_sigmas: float = Field(
         default=3.0,
         gt=0,
-        description="The same for an effect that depends on the amplitude, in tests at several force levels. A true one "
-        "is four or more, since equivalent linearisation gives sizes to a fifth or a quarter; motion that it does not "
+        description="The same for an effect that depends on the amplitude, in tests at several force levels. A true "
+        "one is four or more, since equivalent linearisation gives sizes to a fifth or a quarter; motion that it does not "
         "describe gains evidence with sizes that are near two.",
     )
     alike: float = Field(

@@ -21,6 +21,7 @@ from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
 from ema_pipeline.ingest.records import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
+from ema_pipeline.modal.assurance import mac
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_pairing import OwnDamping
@@ -54,6 +55,8 @@ _CLOSE_PAIR = 0.2
 """Difference of ln f within which two modes may have changed places."""
 _WRONG = 4.0
 """σ from which a shape is another one."""
+_TWIN = 0.8
+"""Modal assurance criterion of two measured modes from which one may be the other's twin."""
 
 _FRAMES = (("x", "y", "z"), ("zeta", "eta"))
 _TURNING = "u"
@@ -207,6 +210,11 @@ class ModeRows:
         return float(np.max(np.abs(np.nan_to_num(self.shape)), initial=0.0))
 
 
+def _other_shapes(a: ModeRows, b: ModeRows) -> bool:
+    """True where each of two modes has another one's shape."""
+    return a.shape_off > _WRONG and b.shape_off > _WRONG
+
+
 @dataclass(frozen=True)
 class Paired:
     """Modes of the model at one point, and which of them each measured mode belongs to.
@@ -351,7 +359,8 @@ class ModeProblem(EffectProblem):
     def escapes(
         self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
     ) -> list[NDArray[np.float64]]:
-        """See `EffectProblem`: close pairs of modes whose order is the wrong way round, split the other way.
+        """See `EffectProblem`: close pairs of modes whose order is the wrong way round, split the other way, and modes
+        moved to a measured one of the same shape that has no partner (one of two such may be a twin that drift makes).
 
         No descent leads through the point where two modes coincide. The least probable part of the way is saved by
         moving all unknowns as little as their priors allow.
@@ -359,19 +368,27 @@ class ModeProblem(EffectProblem):
         assert isinstance(found.matching, tuple)
         variance = self.unknowns.prior_std(scatters) ** 2
         rows, starts, at = self.rows(found), [], 0
+
+        def moved(slope: NDArray[np.float64], change: float) -> None:
+            reach = float(slope @ (variance * slope))
+            if reach > 0:
+                starts.append(self.unknowns.clipped(x + change * variance * slope / reach))
+
         for data, match in zip(self.observations.data, found.matching, strict=True):
             own = [r for r in rows if r.configuration == data.configuration]
-            modes = self.solution(data.configuration, x)
+            log = np.log(np.maximum(self.solution(data.configuration, x).frequency_hz, 1e-6))
             std = np.hypot(scatters[FREQUENCY_NOISE] * data.log_frequency_std, scatters[FREQUENCY])
+            slopes = [-found.jacobian[at + i] * std[r.measured] for i, r in enumerate(own)]
             for (i, a), (j, b) in pairwise(enumerate(own)):
-                split = float(np.log(modes.frequency_hz[b.model] / max(modes.frequency_hz[a.model], 1e-6)))
-                if abs(split) < _CLOSE_PAIR and a.shape_off > _WRONG and b.shape_off > _WRONG:
-                    slope = (
-                        found.jacobian[at + i] * std[a.measured] - found.jacobian[at + j] * std[b.measured]
-                    )
-                    reach = float(slope @ (variance * slope))
-                    if reach > 0:
-                        starts.append(self.unknowns.clipped(x - 2 * split * variance * slope / reach))
+                split = float(log[b.model] - log[a.model])
+                if abs(split) < _CLOSE_PAIR and _other_shapes(a, b):
+                    moved(slopes[j] - slopes[i], -2 * split)
+            for alone in np.flatnonzero(match < 0):
+                like = mac(data.shapes[alone], data.shapes)[0]
+                for i, r in enumerate(own):
+                    change = float(data.log_frequency[alone] - log[r.model])
+                    if abs(change) < _CLOSE_PAIR and like[r.measured] > _TWIN:
+                        moved(slopes[i], change)
             at += len(own) + int(np.sum(np.isfinite(data.log_damping[match >= 0])))
             at += data.shape_rows(np.flatnonzero(match >= 0))
         return starts
