@@ -58,6 +58,8 @@ _WRONG = 4.0
 _TWIN = 0.8
 """Modal assurance criterion of two measured modes from which one may be the other's twin."""
 
+MIXING = "shape_mixing"
+
 _FRAMES = (("x", "y", "z"), ("zeta", "eta"))
 _TURNING = "u"
 
@@ -75,6 +77,7 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
         # What hits have in common (drift, aim) is in their scatter, and no error of one mode against another.
         Scatter(FREQUENCY_NOISE, "stated uncertainty of frequencies", 1.0, 0.5),
         Scatter(SHAPE_NOISE, "stated uncertainty of shapes", 1.0, 0.5),
+        Scatter(MIXING, "shapes of close modes along each other", 0.01, 1.0, 0.03, 20.0),
     )
     return {s.name: s for s in known}
 
@@ -237,7 +240,7 @@ class ModeProblem(EffectProblem):
         self.observations, self.model = observations, model
         self.offset = len(model.unknowns)
         self._defaults = {name: s.default for name, s in observations.scatters.items()}
-        self._sensing: dict[tuple[str, int], tuple[tuple[Dof, ...], Sensing]] = {}
+        self._sensing: dict[tuple[str, int], tuple[ModeData, Sensing]] = {}
 
     @property
     def sizes(self) -> Mapping[str, SizeMap]:
@@ -274,6 +277,10 @@ class ModeProblem(EffectProblem):
             Unknowns.plain(drifts, DRIFT_STD),
             Unknowns.plain(tuple(gains), list(gains.values()), CALIBRATION),
             Unknowns.plain(tuple(across), list(across.values())),
+            *(
+                Unknowns.plain(self._mixing(d), [share for _, _, share in d.mixes], MIXING)
+                for d in self.observations.data
+            ),
         )
 
     def _directions_across(self, sensor: str) -> tuple[str, ...]:
@@ -289,14 +296,17 @@ class ModeProblem(EffectProblem):
     def _anywhere(self, dof: Dof) -> bool:
         return any(self.observations.has(d.configuration, dof) for d in self.observations.data)
 
+    def _mixing(self, d: ModeData) -> tuple[str, ...]:
+        """Names of unknowns: what the shape of a mode holds of that of another. Numbers of modes differ among data."""
+        hz, test = np.exp(d.log_frequency), self.observations.test
+        where = f"{d.configuration}{' in ' + test if test else ''}"
+        return tuple(f"shape of {hz[a]:.7g} Hz along that of {hz[b]:.7g} Hz, {where}" for a, b, _ in d.mixes)
+
     def sensing(self, data: ModeData) -> Sensing:
         """What the sensors of one configuration's modes read."""
-        key = (
-            data.configuration,
-            id(data.dofs),
-        )  # what is remembered holds the sensors, so that their id stays
+        key = (data.configuration, id(data))  # what is remembered holds the data, so that their id stays
         if key not in self._sensing:
-            self._sensing[key] = data.dofs, self._found_sensing(data)
+            self._sensing[key] = data, self._found_sensing(data)
         return self._sensing[key][1]
 
     def _found_sensing(self, d: ModeData) -> Sensing:
@@ -315,7 +325,8 @@ class ModeProblem(EffectProblem):
                 if transverse[k, i] >= 0 and self.observations.has(d.configuration, other):
                     across[k, i] = self.model.sensor_rows(d.configuration, (other,))[0]
         drift = self.unknowns.index.get(_drift(d.configuration, self.observations.test), -1)
-        return Sensing(along, across, gain, transverse, drift)
+        mixing = np.array([self.unknowns.index.get(n, -1) for n in self._mixing(d)], np.int64)
+        return Sensing(along, across, gain, transverse, drift, mixing)
 
     def paired(
         self, data: ModeData, x: NDArray[np.float64], match: NDArray[np.int64] | None = None
