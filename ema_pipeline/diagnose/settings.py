@@ -51,9 +51,9 @@ class DiagnoseSettings(Settings):
     linearised_sigmas: float = Field(
         default=3.0,
         gt=0,
-        description="The same for an effect that depends on the amplitude, in tests at several force levels. A true "
-        "one is four or more, since equivalent linearisation gives sizes to a fifth or a quarter; motion that it does not "
-        "describe gains evidence with sizes that are near two.",
+        description="The same for an effect that depends on the amplitude, in tests at several force levels. Those of "
+        "true effects are four or more: equivalent linearisation gives sizes to a fifth or a quarter. Motion that it "
+        "does not describe gains evidence with about two.",
     )
     alike: float = Field(
         default=3.0,
@@ -70,7 +70,7 @@ class DiagnoseSettings(Settings):
         ge=0,
         le=10,
         description="Finalists, beside the best by evidence, that promise most beside learned scatters; two tests of "
-        "one rig, which repeat far better than is stated, have 2 in any case.",
+        "one rig, which repeat far better than is stated, have 2 in any case, continuous records 3.",
     )
     candidates: int = Field(default=5, ge=1, description="Number of candidates that are reported.")
     processes: int | None = Field(
