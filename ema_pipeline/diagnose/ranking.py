@@ -58,9 +58,8 @@ _GRID_HEAT = 30.0
 """Factor on the uncertainties there: two neighbours of the grid differ by a third in the frequency of an added mode."""
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _UNHEATED: Schedule = ((1.0, 6), (1.0, 14))
-"""Where starts are given, and beside `_FROM_GRID`. Heated, the data weigh less than the prior, which takes the first
-size to nothing, where the shape of a law (the yield of hysteresis) has no slope left, or parts take an effect's place.
-"""
+"""Where starts are given. Heated, the data weigh less than the prior, which takes the first size to nothing, where the
+shape of a law (the yield of hysteresis) has no slope left."""
 CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
 _BETTER = 0.05
@@ -197,10 +196,9 @@ def _first_fit(
         fit = refined(observations, model, unknowns.clipped(begin))
         if fit.posterior.cost <= base.posterior.cost:
             return fit.posterior
+    schedule = _UNHEATED if hypothesis.begun else _FROM_GRID if hypothesis.extends else QUICK
     starts = _starts(observations, problem, hypothesis, begin)
-    schedules = (_FROM_GRID, _UNHEATED) if hypothesis.extends else (_UNHEATED if hypothesis.begun else QUICK,)
-    fits = [annealed(observations, model, starts, schedule) for schedule in schedules]
-    return max(fits, key=lambda f: f.log_evidence).posterior
+    return annealed(observations, model, starts, schedule).posterior
 
 
 def _starts(
