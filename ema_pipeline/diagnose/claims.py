@@ -85,7 +85,7 @@ def judge(
     base = at_scatters(observations, ranking.base, ranked.fit.posterior.scatters)
     base, mended = within_scatter(observations, base), within_scatter(observations, ranked.fit)
     before = after = NOTHING_HELD_OUT
-    doubt = _weak(ranked, gain, settings, nothing)
+    doubt = _weak(observations, ranked, gain, settings, nothing)
     if not doubt:
         before, after = held_out(observations, base), held_out(observations, mended)
         doubt = _contradicted(base, mended, before, after) or of_one_shape(base, mended, settings)
@@ -93,7 +93,9 @@ def judge(
     return Judged(ranked, name, gain, base, mended, before, after, doubt, settings.claim)
 
 
-def _weak(ranked: Ranked, gain: float, settings: DiagnoseSettings, nothing: float) -> str:
+def _weak(
+    observations: Observations, ranked: Ranked, gain: float, settings: DiagnoseSettings, nothing: float
+) -> str:
     if gain < settings.claim:
         return f"its gain in log evidence, {gain:.1f}, is below {settings.claim:g}"
     if nothing > settings.doubt:
@@ -105,9 +107,17 @@ def _weak(ranked: Ranked, gain: float, settings: DiagnoseSettings, nothing: floa
         p = ranked.hypothesis.placed.effect.parameters[0]
         i = ranked.fit.posterior.unknowns.index[ranked.hypothesis.placed.parameter_name(p.name)]
         x, std = ranked.fit.posterior.x[i], _std_of_first(ranked)
-        if abs(x) < settings.sigmas * std:
-            return f"its size is within {settings.sigmas:g} standard deviations of zero"
+        sigmas = sigmas_asked(observations, ranked.hypothesis, settings)
+        if abs(x) < sigmas * std:
+            return f"its size is within {sigmas:g} standard deviations of zero"
     return ""
+
+
+def sigmas_asked(observations: Observations, hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
+    """Distance from nothing that a claim asks of a size, in its standard deviations."""
+    if observations.linearised and not hypothesis.placed.effect.linear:
+        return settings.linearised_sigmas
+    return settings.sigmas
 
 
 def _std_of_first(ranked: Ranked) -> float:

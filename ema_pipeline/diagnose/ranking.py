@@ -56,6 +56,9 @@ _GRID_STARTS = 2
 _GRID_HEAT = 30.0
 """Factor on the uncertainties there: two neighbours of the grid differ by a third in the frequency of an added mode."""
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
+_UNHEATED: Schedule = ((1.0, 6), (1.0, 14))
+"""Where starts are given. Heated, the data weigh less than the prior, which takes the first size to nothing, where the
+shape of a law (the yield of hysteresis) has no slope left."""
 CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
 _BETTER = 0.05
@@ -192,10 +195,9 @@ def _first_fit(
         fit = refined(observations, model, unknowns.clipped(begin))
         if fit.posterior.cost <= base.posterior.cost:
             return fit.posterior
-    schedule = _FROM_GRID if hypothesis.size_cannot_be_zero else QUICK
-    return annealed(
-        observations, model, _starts(observations, problem, hypothesis, begin), schedule
-    ).posterior
+    schedule = _UNHEATED if hypothesis.begun else _FROM_GRID if hypothesis.size_cannot_be_zero else QUICK
+    starts = _starts(observations, problem, hypothesis, begin)
+    return annealed(observations, model, starts, schedule).posterior
 
 
 def _starts(

@@ -43,6 +43,11 @@ motion."""
 _OF_OTHERS = 0.02
 """Share of the log evidence of earlier claims that a further one must gain: what the form of a law leaves of the
 motion, friction that sticks and slips for one, looks like another effect."""
+_FURTHER_FINALISTS = 3
+"""Finalists beside those that lead at wide scatters: noise of a tenth, with which fits begin, hides most of a small
+effect that is plain at the noise that the records have."""
+_PREDICTED_BETTER = 1e-3
+"""Share of the error of held-out records that a claim must take away."""
 _SAME_CHANGE = 1e-5
 """Relative difference of two changes of the linear system below which they are the same physics."""
 _TRIAL = 1e-6
@@ -79,6 +84,8 @@ def diagnose_records(
         Its search used windows of the records; its ladder holds the whole ones, where the model can follow them.
     """
     settings = settings or DiagnoseSettings()
+    further = max(settings.further_finalists, _FURTHER_FINALISTS)
+    settings = settings.model_copy(update={"further_finalists": further})
     windows = in_windows(observations)
     hypotheses = record_hypotheses(observations, library, known)
     found = diagnose(
@@ -94,14 +101,16 @@ def diagnose_records(
     progress(0.85, "whole records")
     searched = found.ladder
     ladder = whole_ladder(observations, library, searched, settings.processes)
-    while doubt := _unconfirmed(found, ladder, settings):
+    while doubt := _unconfirmed(observations, found, ladder, settings):
         lost = max(0.0, _claimed(found)[-1].log_evidence - _last_gain(ladder))
         found, searched = _withdrawn(found, searched, doubt, lost, settings)
         ladder = whole_ladder(observations, library, searched, settings.processes)
     return _with_whole(found, ladder)
 
 
-def _unconfirmed(found: Diagnosis, ladder: Ladder, settings: DiagnoseSettings) -> str:
+def _unconfirmed(
+    observations: RecordObservations, found: Diagnosis, ladder: Ladder, settings: DiagnoseSettings
+) -> str:
     """Why whole records do not support the last claim; empty where they do, or carry no information on it.
 
     Windows take coarser steps, and states of their own, which an effect too many may make up for.
@@ -111,6 +120,9 @@ def _unconfirmed(found: Diagnosis, ladder: Ladder, settings: DiagnoseSettings) -
     gain = _last_gain(ladder)
     if gain < settings.claim:
         return f"its gain in log evidence over whole records, {gain:.1f}, is below {settings.claim:g}"
+    held = [r.heldout_error for r in ladder.rungs[-2:]]
+    if observations.held_out and not held[1] < (1 - _PREDICTED_BETTER) * held[0]:
+        return "it does not predict held-out records better"
     *before, last = (c.log_evidence for c in _claimed(found))
     if last < _OF_OTHERS * sum(before):
         return (

@@ -53,6 +53,13 @@ class DiagnoseSettings(Settings):
         gt=0,
         description="Smallest distance of a claimed size from zero, in its standard deviations.",
     )
+    linearised_sigmas: float = Field(
+        default=3.0,
+        gt=0,
+        description="The same for an effect that depends on the amplitude, in tests at several force levels. Those of "
+        "true effects are four or more: equivalent linearisation gives sizes to a fifth or a quarter. Motion that it "
+        "does not describe gains evidence with about two.",
+    )
     alike: float = Field(
         default=3.0,
         gt=0,
@@ -73,7 +80,7 @@ class DiagnoseSettings(Settings):
         ge=0,
         le=10,
         description="Extra finalists, chosen by expected gain at the learned scatters; two tests of one rig, which "
-        "repeat far better than is stated, have 2 in any case.",
+        "repeat far better than is stated, have 2 in any case, continuous records 3.",
     )
     candidates: int = Field(default=5, ge=1, description="Number of candidates that are reported.")
     processes: int | None = Field(
