@@ -22,6 +22,7 @@ from ema_pipeline.inference import (
     descend,
     joined,
     learn,
+    lower_factor,
     tails,
     widened,
 )
@@ -489,3 +490,20 @@ def test_blocks_of_unknowns_keep_their_order_bounds_and_scatters() -> None:
     np.testing.assert_allclose(both.prior_std({PARTS: 0.5}), [0.1, 1.0, 1.5])
     np.testing.assert_allclose(both.clipped(np.array([-1.0, 2.0, -9.0])), [0.0, 1.0, -9.0])
     np.testing.assert_array_equal(both.governed(PARTS), [False, True, True])
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e6, 1e12, 1e20])
+def test_a_precision_has_its_factor_however_large_it_is(scale: float) -> None:
+    """One row that is known far better than the machine resolves: the determinant is 1 + |row|²."""
+    row = np.sqrt(scale) * np.array([1.0, 1.0, -2.0, 0.5])
+    factor = lower_factor(np.eye(4) + np.outer(row, row))
+    assert np.all(np.triu(factor, 1) == 0)
+    assert np.all(np.diag(factor) > 0)
+    np.testing.assert_allclose(factor @ factor.T, np.eye(4) + np.outer(row, row), rtol=1e-12, atol=1.0)
+    log_det = 2 * float(np.sum(np.log(np.diag(factor))))
+    assert log_det == pytest.approx(np.log1p(row @ row), abs=1e-3 if scale < 1e12 else 30.0)
+
+
+def test_a_precision_that_rounding_spoilt_has_the_factor_of_the_nearest_one() -> None:
+    spoilt = np.diag([1.0, 1e20, -3e3])  # as differences of 1e20 leave a 1
+    np.testing.assert_allclose(lower_factor(spoilt), np.diag([1.0, 1e10, 1.0]), rtol=1e-12)

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from ema_pipeline.inference import Bounded, Posterior, Residuals, descend
+from ema_pipeline.inference import Bounded, Posterior, Residuals, descend, lower_factor
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import PARTS, Fit, transferred
 
@@ -80,7 +80,7 @@ def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, 
 def _in_blocks(found: Residuals, covariance: NDArray[np.float64]) -> tuple[float, float]:
     """Sum of squares in which errors count, and -log density, each value predicted from those before it."""
     spread = np.eye(len(found.values)) + found.jacobian @ covariance @ found.jacobian.T
-    factor = scipy.linalg.cholesky(spread, lower=True, check_finite=False)
+    factor = lower_factor(spread)
     values = scipy.linalg.solve_triangular(factor, found.values, lower=True, check_finite=False)
     whitened = Residuals(values, np.zeros((0, len(covariance))), block=found.block)
     return whitened.squares, whitened.cost + float(np.sum(np.log(np.diag(factor))))
@@ -92,6 +92,6 @@ def _marginal(
     """vᵀ(I + J C Jᵀ)⁻¹v and half the log determinant, by the smaller matrix of as many rows as unknowns."""
     size, directions = np.linalg.eigh(covariance)
     reach = jacobian @ (directions * np.sqrt(np.maximum(size, 0.0)))
-    factor = scipy.linalg.cholesky(np.eye(len(size)) + reach.T @ reach, lower=True, check_finite=False)
+    factor = lower_factor(np.eye(len(size)) + reach.T @ reach)
     taken = scipy.linalg.solve_triangular(factor, reach.T @ values, lower=True, check_finite=False)
     return float(values @ values - taken @ taken), float(np.sum(np.log(np.diag(factor))))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.effects.base import effect_of
+from ema_pipeline.inference import lower_factor
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, transferred
 
@@ -92,7 +93,7 @@ class Marginal:
         self.kept = np.array([not without or effect_of(n) != without for n in p.unknowns.names], bool)
         self.whitened = (jacobian * p.prior_std)[:, self.kept]
         information = np.eye(self.whitened.shape[1]) + self.whitened.T @ self.whitened
-        self.factor = scipy.linalg.cho_factor(information, check_finite=False)
+        self.factor = lower_factor(information), True
         # Zero at the maximum, which a fit of repeated modes need not have reached to the last bit.
         ascent = self.whitened.T @ self.residual + (p.x / p.prior_std)[self.kept]
         to_maximum = scipy.linalg.cho_solve(self.factor, ascent, check_finite=False)

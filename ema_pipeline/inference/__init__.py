@@ -5,6 +5,7 @@ everything else that a user sees is read from the `Posterior`.
 """
 
 from ema_pipeline.inference.bounded import Bounded, beyond_scatter
+from ema_pipeline.inference.factor import lower_factor
 from ema_pipeline.inference.maximise import anneal, descend
 from ema_pipeline.inference.posterior import Posterior
 from ema_pipeline.inference.problem import Problem, Residuals
@@ -23,5 +24,6 @@ __all__ = [
     "descend",
     "joined",
     "learn",
+    "lower_factor",
     "widened",
 ]

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.inference.factor import lower_factor
 from ema_pipeline.inference.problem import Residuals
 from ema_pipeline.inference.unknowns import Unknowns
 
@@ -71,8 +72,8 @@ class Posterior:
         """Natural logarithm of the evidence, up to a constant that is the same for all models of the same data."""
         if not np.isfinite(self.cost):
             return -np.inf
-        _, log_det = np.linalg.slogdet(self._information())
-        return -self.cost - 0.5 * float(log_det) - self.scatter_cost
+        half_log_det = float(np.sum(np.log(np.diag(lower_factor(self._information())))))
+        return -self.cost - half_log_det - self.scatter_cost
 
     @property
     def error(self) -> float:

@@ -10,6 +10,7 @@ import scipy.linalg
 import scipy.optimize
 
 from ema_pipeline.inference import tails
+from ema_pipeline.inference.factor import lower_factor
 from ema_pipeline.inference.maximise import descend
 from ema_pipeline.inference.posterior import Posterior
 from ema_pipeline.inference.problem import Problem, in_blocks
@@ -68,7 +69,7 @@ class LinearEvidence:
     def at(self, scatters: Mapping[str, float]) -> float:
         """Log evidence with some scatters at other values; less a constant."""
         std = self.unknowns.prior_std({**self.scatters, **scatters})
-        factor = np.linalg.cholesky(np.eye(len(std)) + std[:, None] * self.curvature * std)
+        factor = lower_factor(np.eye(len(std)) + std[:, None] * self.curvature * std)
         explained = scipy.linalg.solve_triangular(factor, std * self.pull, lower=True, check_finite=False)
         return 0.5 * float(explained @ explained) - float(np.sum(np.log(np.diag(factor))))
 
