@@ -36,9 +36,9 @@ def cores() -> int:
 
 
 def share_cores(processes: int) -> None:
-    """From here on use only this process's share of the processors: others work beside it."""
+    """From here on use only a share of the processors that this process had: so many processes work beside it."""
     global _sharers
-    _sharers = processes
+    _sharers *= processes
 
 
 A = TypeVar("A")

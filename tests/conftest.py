@@ -9,9 +9,30 @@ from pathlib import Path
 
 import pytest
 
+from ema_pipeline import threads
+
 # pytest-xdist gives every core a process; linear algebra with a thread per core in each would make them wait for
 # each other. Set before NumPy is loaded; programs that the tests start inherit it.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# For the same reason a test process works on its share of the cores, as configurations side by side do: a diagnosis
+# that forks where no core is free takes a sixth longer. Results are the same; `all_cores` is for tests of sharing.
+threads.share_cores(int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
+
+FIRST = ("test_view", "test_modal_real", "test_changes", "test_series", "test_merge", "test_api")
+"""Modules whose tests take longest. With short ones at the end no process waits long for the last of another, and
+what a module prepares is not prepared again by a process that takes half of its tests over."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long modules first, the others in their order."""
+    rank = {name: k for k, name in enumerate(FIRST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(FIRST)))
+
+
+@pytest.fixture
+def all_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work shared among processes and threads as a user has it, on two cores and more."""
+    monkeypatch.setattr(threads, "_sharers", 1)
 
 
 @pytest.fixture(scope="session")

@@ -19,14 +19,17 @@ class Multisine:
 
     def __init__(self, samples: int, low_hz: float, high_hz: float, rms: float, seed: int) -> None:
         self.samples, random = samples, np.random.default_rng(seed)
-        first, last = int(np.ceil(low_hz * samples / RATE)), int(high_hz * samples / RATE)
-        self.omega = 2 * np.pi * np.arange(first, last + 1) * RATE / samples
-        self.phase = random.uniform(0, 2 * np.pi, len(self.omega))
-        self.size = rms * np.sqrt(2 / len(self.omega))
+        self.lines = np.arange(int(np.ceil(low_hz * samples / RATE)), int(high_hz * samples / RATE) + 1)
+        self.phase = random.uniform(0, 2 * np.pi, len(self.lines))
+        self.size = rms * np.sqrt(2 / len(self.lines))
 
-    def __call__(self, time: NDArray[np.float64] | float) -> NDArray[np.float64]:
-        angle = np.multiply.outer(np.asarray(time), self.omega) + self.phase
-        return np.asarray(self.size * np.sum(np.cos(angle), axis=-1))
+    def points(self, per_sample: int, count: int) -> NDArray[np.float64]:
+        """The first `count` of so many points per sample, no more than a period."""
+        all_ = self.samples * per_sample
+        assert count <= all_
+        spectrum = np.zeros(all_ // 2 + 1, complex)
+        spectrum[self.lines] = 0.5 * all_ * self.size * np.exp(1j * self.phase)
+        return np.fft.irfft(spectrum, all_)[:count]
 
 
 def respond(
@@ -35,8 +38,7 @@ def respond(
     """Force and displacement of an oscillator with one more force law(x, v), from rest, `skipped` samples left out."""
     fine = 8
     count = (samples + skipped) * fine
-    grid = np.arange(2 * count + 1) / (2 * RATE * fine)
-    known = np.concatenate([force(part) for part in np.array_split(grid, 64)])
+    known = force.points(2 * fine, 2 * count + 1)
     x, v, step = 0.0, 0.0, 1 / (RATE * fine)
     found = np.empty(samples)
 

@@ -228,7 +228,7 @@ def test_a_test_without_a_model_says_what_its_results_do_not_hold(raw: Path, tmp
 
 
 def test_loops_are_run_and_opened_but_have_no_frfs(tmp_path: Path) -> None:
-    write_sine_tests(tmp_path / "loops", PRINTED)
+    write_sine_tests(tmp_path / "loops", PRINTED, (10.0, 15.0), (1e-3, 2e-3))
     with pytest.raises(ema.EmaError, match=r"loops, which have no FRFs; use ema\.run"):
         ema.read(tmp_path / "loops")
     done = ema.run(tmp_path / "loops", out=tmp_path / "out", settings={"stages": ["loops", "ladder"]})

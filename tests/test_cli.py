@@ -655,7 +655,7 @@ def test_init_takes_the_struck_node_and_direction_from_universal_files(
     ("stage", "stages"),
     [
         ("ingest", 'stages=["ingest", "hits", "frf", "modal"]'),
-        ("modal", STAGES),
+        ("modal", 'stages=["ingest", "hits", "frf", "modal", "ladder"]'),
     ],
     ids=["ingest", "modal"],
 )

@@ -17,6 +17,8 @@ from tests.continuous_cases import RIG, write_oscillator
 
 RUNNER = CliRunner()
 
+pytestmark = pytest.mark.usefixtures("without_figures")
+
 
 def _run(raw: Path, out: Path, rig: Path | None = None) -> dict:
     given = ["--rig", str(rig)] if rig else []
@@ -164,6 +166,7 @@ def test_bouc_wen(test_data: Path, tmp_path: Path) -> None:
     assert loop["energy_per_cycle_j"] > 5 * loop["energy_per_cycle_std_j"] > 0
 
 
+@pytest.mark.usefixtures("all_cores")
 def test_the_python_interface_reads_identifies_and_diagnoses(tmp_path: Path) -> None:
     test = ema.read(write_oscillator(tmp_path / "raw", lambda x, v: 3e9 * x**3, samples=(1024, 512)))
     assert isinstance(test, ema.ContinuousTest)

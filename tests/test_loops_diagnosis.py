@@ -186,6 +186,7 @@ def test_friction_device_shows_hysteresis_and_the_report_says_what_is_missing(te
     assert found.localisation
 
 
+@pytest.mark.usefixtures("all_cores")
 def test_commands_and_report_tell_the_story_of_the_loops(tmp_path: Path) -> None:
     raw, out = tmp_path / "raw", tmp_path / "out"
     write_sine_tests(raw, SPRING | {"viscous_damping": 40.0}, (10.0, 16.0), (1e-3, 2e-3))

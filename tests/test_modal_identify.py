@@ -17,6 +17,7 @@ from simulate_modal import (
     write_raw_folder,
 )
 
+from ema_pipeline import threads
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
@@ -187,16 +188,24 @@ def test_rigid_body_motion_is_not_a_mode_but_is_in_the_synthesis() -> None:
     assert model.synthesis[0, 0, low].real == pytest.approx(0.5, abs=0.05)
 
 
-def test_modes_of_a_wide_band_are_found_at_both_ends() -> None:
+def test_modes_of_a_wide_band_are_found_at_both_ends_whatever_the_number_of_threads(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     system = TrueSystem(
         np.array([50.2, 52.1, 108.0, 330.0, 1100.0, 1400.0]),
         np.full(6, 0.01),
         np.random.default_rng(3).standard_normal((6, 12)),
     )
     frfs = hammer_test(system, list(range(12)), [0, 5], f_max=2000.0, record_s=2.0, n_hits=2)
-    model = identify(frfs, ModalSettings())
-    assert frequencies(model) == pytest.approx(system.frequency_hz, rel=3e-4)
-    assert dampings(model) == pytest.approx(np.full(6, 0.01), rel=0.04)
+    monkeypatch.setattr(threads, "WORTH_A_THREAD", 1 << 12)
+    models = []
+    for cores in (1, 3):
+        monkeypatch.setattr(threads, "cores", lambda n=cores: n)
+        models.append(identify(frfs, ModalSettings()))
+    assert frequencies(models[0]) == pytest.approx(system.frequency_hz, rel=3e-4)
+    assert dampings(models[0]) == pytest.approx(np.full(6, 0.01), rel=0.04)
+    assert [repr(m) for m in models[0].modes] == [repr(m) for m in models[1].modes]
+    assert np.array_equal(models[0].synthesis, models[1].synthesis)
 
 
 def test_a_cut_record_does_not_bias_frequency_damping_or_scale() -> None:

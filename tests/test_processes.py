@@ -23,6 +23,8 @@ from ema_pipeline.run.types import Progress, Run
 from ema_pipeline.store import Store
 from ema_pipeline.threads import cores, in_order, over_rows, share_cores
 
+pytestmark = pytest.mark.usefixtures("all_cores")
+
 
 def test_jobs_are_done_in_processes_of_their_own_and_what_they_tell_is_heard() -> None:
     heard: list[tuple[str, int, int]] = []

@@ -94,7 +94,22 @@ def _law(kind, d, v, z, a, b, c, e):  # type: ignore[no-untyped-def]
     return g, gd, gv, gz, ga, gb, r, rd, rv, rz, ra, rb, rc, re
 
 
-@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+@numba.njit(inline="always")
+def _copy(values, out):  # type: ignore[no-untyped-def]
+    """`out[:] = values`, which takes the compiler seconds: it makes the words of an error that there cannot be."""
+    for i in range(values.shape[0]):
+        out[i] = values[i]
+
+
+@numba.njit(inline="always")
+def _copy_rows(values, out):  # type: ignore[no-untyped-def]
+    """`_copy` of two axes."""
+    for i in range(values.shape[0]):
+        for c in range(values.shape[1]):
+            out[i, c] = values[i, c]
+
+
+@numba.njit(inline="always")
 def march(stiffness, damping, inputs, push, rows, kinds, numbers, force, begin, step, every, out):  # type: ignore[no-untyped-def]
     """March the states from `begin`; False where the motion grows without bound.
 
@@ -124,11 +139,11 @@ def march(stiffness, damping, inputs, push, rows, kinds, numbers, force, begin, 
     size, ins = 2 * n + m, inputs.shape[1]
     s, at, total, rate = begin.copy(), begin.copy(), np.zeros(size), np.zeros(size)
     g = np.zeros(m)
-    out[0] = s
+    _copy(s, out[0])
     steps = (force.shape[0] - 1) // 2
     for k in range(steps):
         total[:] = 0.0
-        at[:] = s
+        _copy(s, at)
         for stage in range(4):
             half = 2 * k + (0 if stage == 0 else (2 if stage == 3 else 1))
             for j in range(m):
@@ -163,11 +178,11 @@ def march(stiffness, damping, inputs, push, rows, kinds, numbers, force, begin, 
         if not wild < _WILD:
             return False
         if (k + 1) % every == 0:
-            out[(k + 1) // every] = s
+            _copy(s, out[(k + 1) // every])
     return True
 
 
-@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+@numba.njit(inline="always")
 def march_with_slopes(  # type: ignore[no-untyped-def]
     stiffness,
     damping,
@@ -220,13 +235,14 @@ def march_with_slopes(  # type: ignore[no-untyped-def]
             moved[i, q] = np.any(d_stiffness[i, q] != 0.0) or np.any(d_damping[i, q] != 0.0)
         for j in range(m):
             pushed[i, j] = np.any(d_push[i, j] != 0.0)
-    out[0], d_out[0] = s, t
+    _copy(s, out[0])
+    _copy_rows(t, d_out[0])
     steps = (force.shape[0] - 1) // 2
     for k in range(steps):
         total[:] = 0.0
         t_total[:] = 0.0
-        at[:] = s
-        t_at[:] = t
+        _copy(s, at)
+        _copy_rows(t, t_at)
         for stage in range(4):
             half = 2 * k + (0 if stage == 0 else (2 if stage == 3 else 1))
             for j in range(m):
@@ -308,12 +324,12 @@ def march_with_slopes(  # type: ignore[no-untyped-def]
         if not wild < _WILD:
             return False
         if (k + 1) % every == 0:
-            out[(k + 1) // every] = s
-            d_out[(k + 1) // every] = t
+            _copy(s, out[(k + 1) // every])
+            _copy_rows(t, d_out[(k + 1) // every])
     return True
 
 
-@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+@numba.njit(inline="always")
 def _march_one(  # type: ignore[no-untyped-def]
     stiffness, damping, inputs, push, rows, kinds, numbers, force, begin, step, every, out, memory
 ):  # fmt: skip
@@ -323,7 +339,8 @@ def _march_one(  # type: ignore[no-untyped-def]
     """
     m, ins = kinds.shape[0], inputs.shape[1]
     spring, damper = stiffness[0, 0], damping[0, 0]
-    out[:] = begin
+    for k in range(out.shape[0]):
+        _copy(begin, out[k])
     x, v, z = begin[0], begin[1], begin[2 + memory] if m > 0 else 0.0
     for k in range((force.shape[0] - 1) // 2):
         x_at, v_at, z_at = x, v, z
@@ -360,7 +377,7 @@ def _march_one(  # type: ignore[no-untyped-def]
     return True
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
 def march_windows(stiffness, damping, inputs, push, rows, kinds, numbers, force, begin, step, every, out):  # type: ignore[no-untyped-def]
     """`march` for every force (n_windows, ...), from `begin` (n_windows, 2n + m) into `out`; False where one fails."""
     remembers = (kinds == BOUC_WEN) | (kinds == MAXWELL)
@@ -381,7 +398,7 @@ def march_windows(stiffness, damping, inputs, push, rows, kinds, numbers, force,
     return True
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
 def march_windows_with_slopes(  # type: ignore[no-untyped-def]
     stiffness,
     damping,

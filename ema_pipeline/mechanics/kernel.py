@@ -241,7 +241,8 @@ def _march(  # type: ignore[no-untyped-def]
                         for p in range(2 * size):
                             s += outputs[a, c, p] * y[p]
                         result[a, h, at, c] = s
-            last[a, h] = y
+            for p in range(2 * size):  # `last[a, h] = y` takes the compiler seconds more
+                last[a, h, p] = y[p]
 
 
 @numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})

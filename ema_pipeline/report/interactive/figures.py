@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 from bokeh.embed import json_item
@@ -372,5 +372,11 @@ _FIGURES: dict[str, Callable[[], Any]] = {
 
 def figure_items(names: list[str], log_x: bool) -> dict[str, Any]:
     """Documents of the named figures, as BokehJS embeds them."""
+    return {name: _item(name, log_x) for name in names}
+
+
+@cache
+def _item(name: str, log_x: bool) -> Any:
+    """Document of one figure, made once in a process: it holds no data, and a report is half made of making them."""
     makers = _FIGURES | {"frf": partial(frf_viewer, log_x), "stab": partial(stabilisation, log_x)}
-    return {name: json_item(makers[name]()) for name in names}
+    return json_item(makers[name]())
