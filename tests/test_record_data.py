@@ -97,6 +97,16 @@ def test_of_few_periods_a_transient_is_not_guessed_and_one_is_always_left() -> N
     assert two.noise[0, 0] > 0
 
 
+def test_level_is_the_mean_of_five_lines_and_nought_where_a_noiseless_record_has_none() -> None:
+    wave = 7e3 * np.sin(2 * np.pi * 20 * np.arange(256) / 256) + np.sin(2 * np.pi * 90 * np.arange(256) / 256)
+    level = RecordData.of(record(wave[None], period=256)).level[0]
+    expected = np.zeros(127)
+    expected[17:22] = np.sqrt(7e3**2 * 128 / 2 / 5)
+    expected[87:92] = np.sqrt(128 / 2 / 5)
+    np.testing.assert_allclose(level[1:], [*expected, *expected], atol=1e-3)
+    assert level[0] == level[1]
+
+
 @pytest.mark.parametrize(("period", "first", "last"), [(0, 60, 850), (400, 0, 400)])
 def test_windows_lie_evenly_between_the_ends_that_no_state_is_known_at(
     period: int, first: int, last: int
