@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -226,7 +225,7 @@ def test_noise_over_periods_counts_beside_what_is_learned(rig: Rig) -> None:
     six = replace(one, force=np.tile(one.force, 6), responses=np.tile(one.responses, 6) + noise)
     observations = RecordObservations(rig, rig.configurations[0], [six])
     problem = observations.problem((), {})
-    tiny = {n: 1e-9 for n in observations.scatters}
+    tiny = dict.fromkeys(observations.scatters, 1e-09)
     found = problem.residuals(problem.start(), tiny)
     (data,) = observations.data
     assert np.all(data.noise > 0)
