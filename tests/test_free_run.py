@@ -40,6 +40,8 @@ def test_a_wrong_calibration_is_an_error_of_its_size_in_every_record(rig) -> Non
     ]
     assert [e.use for e in found] == ["fit"] * 4 + ["held_out"] * 4
     assert [e.samples for e in found] == [64, 64, 100, 100, 180, 180, 64, 64]
+    zero = 3.0 * DISCREPANCY * observations.rms[0]
+    np.testing.assert_allclose(found[0].linear - found[0].measured, zero, rtol=1e-3)
     records = [*(d.record for d in observations.data), *held]
     for k, e in enumerate(found):
         measured = records[k // 2].responses[k % 2][-e.samples :]
@@ -52,7 +54,7 @@ def test_a_wrong_calibration_is_an_error_of_its_size_in_every_record(rig) -> Non
         ):  # the states of the record held out are searched, and take up some of what is wrong
             assert e.before == pytest.approx(0.1 * np.sqrt(np.mean(measured**2)), rel=1e-3)
         elif k in (0, 2, 6):
-            assert e.before == pytest.approx(3.0 * DISCREPANCY * observations.rms[0], rel=1e-3)
+            assert e.before == pytest.approx(zero, rel=1e-3)
         else:
             assert 0.02 < e.before / np.std(measured) < 0.15
 
@@ -88,6 +90,7 @@ def test_errors_leave_the_transient_out_and_show_the_largest_response(rig) -> No
         (50, 100, 9000, None),
         (8900, None, 9000, (7500, 9000)),
         (30, 20, 60, (20, 60)),
+        (30, None, 60, (0, 60)),
     ],
 )
 def test_an_excerpt_lies_about_the_largest_response_behind_the_transient(

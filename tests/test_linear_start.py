@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 import ema_pipeline as ema
 from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.mechanics.frf import receptance
-from ema_pipeline.observations.linear_start import MeasuredFrfs, linear_start
+from ema_pipeline.mechanics.system import LinearSystem
+from ema_pipeline.observations.linear_start import MeasuredFrfs, _starts, linear_start
 from ema_pipeline.observations.parts import DAMPING
 from ema_pipeline.observations.record_model import loosened
 from ema_pipeline.observations.rig_model import RigModel
@@ -68,6 +70,35 @@ def test_values_far_off_are_led_to_those_of_the_frfs(
     assert list(found) == [*loose, DAMPING]
     expected = [np.log(TRUE[n] / FAR[n]) for n in ("a", "b", "k", "l", "ratio")]
     np.testing.assert_allclose(list(found.values()), expected, atol=2e-3)
+
+
+def test_searches_begin_at_the_rigs_own_frequencies_and_with_each_mode_at_the_peak(
+    true: tuple[RigModel, str, list[str]], tmp_path: Path
+) -> None:
+    """All values scaled alike so that FRFs agree on average, springs so that a mode is there; 2 % of damping."""
+    model, configuration, loose = loose_model(tmp_path / "rig.toml", CHAIN.format(**FAR))
+    given = frfs_of(true[0])
+    measured = MeasuredFrfs.of(given)
+    names = [*loose, DAMPING]
+    at = [model.unknowns.index[n] for n in names]
+
+    def system(values: np.ndarray) -> LinearSystem:
+        x = np.zeros(len(model.unknowns))
+        x[at] = values
+        return model.system(configuration, x)
+
+    def residual(values: np.ndarray) -> np.ndarray:
+        return measured.difference(system(values), given)
+
+    found = list(_starts(model, configuration, names, DAMPING, measured, residual))
+    assert len(found) == 3
+    own = np.sqrt(scipy.linalg.eigvalsh(*(getattr(system(np.zeros(5)), m) for m in ("stiffness", "mass"))))
+    for k, start in enumerate(found):
+        there = system(start)
+        assert there.modal_damping_ratio == pytest.approx(0.02)
+        factor = 1.0 if k == 0 else measured.peak / own[k - 1]
+        np.testing.assert_allclose(np.sqrt(scipy.linalg.eigvalsh(there.stiffness, there.mass)), factor * own)
+        assert np.median(residual(start)[: measured.log.size]) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_damper_is_found_where_no_ratio_is(tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ def test_masses_springs_and_dampers_are_those_of_the_poles_and_sensors_see_the_s
     shapes = [[0.5, -0.2, complex(np.nan)], [0.1, 0.4, 0.3]]
     turned = [
         shapes[0],
-        [1j * v for v in shapes[1]],
+        [np.exp(0.6j) * v for v in shapes[1]],
     ]  # a phase that all of a shape has is none of the structure
     modal = modal_model(mode(10.0, 0.02, turned[0]), mode(25.0, 0.05, turned[1]))
     system = rig_of_modes(modal, NO_FRFS, "test", 5).system("test")
@@ -66,10 +66,11 @@ def test_masses_springs_and_dampers_are_those_of_the_poles_and_sensors_see_the_s
 
 def test_the_modes_that_move_most_are_kept_in_order_of_frequency() -> None:
     """By the height of their peak, φ²/σ."""
-    high = mode(40.0, 0.001, [0.3, 0.0, 0.0])
+    high = mode(40.0, 0.0005, [0.2, 0.0, 0.0])
+    small = mode(30.0, 0.0005, [0.1, 0.1, 0.1])  # of less damping than the low one, and no higher
     damped = mode(20.0, 0.2, [0.4, 0.0, 0.0])
-    low = mode(10.0, 0.01, [0.0, -1.0, complex(np.nan)])
-    rig = rig_of_modes(modal_model(low, damped, high), NO_FRFS, "test", 2)
+    low = mode(10.0, 0.02, [0.0, -0.5, complex(np.nan)])
+    rig = rig_of_modes(modal_model(low, damped, small, high), NO_FRFS, "test", 2)
     stiffness = np.diag(rig.system("test").stiffness)
     np.testing.assert_allclose(np.sqrt(stiffness) / (2 * np.pi), [10.0, 40.0])
 

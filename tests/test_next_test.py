@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.linalg
-from imperfect_modes import EXACT, chain, chain_modes
+from imperfect_modes import EXACT, chain, chain_modes, planetary_modes
 
 from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.effects.library import parse_effect
@@ -18,6 +18,7 @@ from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.observations.fitting import Fit, Model
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
+from ema_pipeline.rigs.planetary import planetary
 
 next_test = importlib.import_module("ema_pipeline.diagnose.next_test")
 
@@ -99,6 +100,36 @@ def test_every_place_without_a_sensor_and_a_tenth_of_every_mass_is_tried() -> No
     expected = next_test._frequency_gap(systems, band, "m1.z", 0.2) / frequency_std
     assert told["A mass of 0.2 kg added at m1.z (all)"] == pytest.approx(expected, rel=1e-6)
     assert told["A mass of 0.2 kg added at m1.z (all)"] > 1.0
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_places_that_only_one_model_knows_and_turning_are_not_tried(order: tuple[int, int]) -> None:
+    """A support that one model adds cannot be measured in the other."""
+    rig = planetary()
+    measured = planetary_modes(rig, 2, EXACT, configurations=("no_ring",))["no_ring"]
+    assert measured.shapes is not None
+    assert measured.shape_std is not None
+    seen = [k for k, d in enumerate(measured.dofs) if d.point != "sun.y"]
+    few = replace(
+        measured,
+        dofs=tuple(measured.dofs[k] for k in seen),
+        shapes=measured.shapes[:, seen],
+        shape_std=measured.shape_std[:, seen],
+    )
+    observations = ModeObservations(rig, [prepare(few)])
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    fits = []
+    for label in ("flexible_support@sun", "mass@sun"):
+        model = Model().plus(parse_effect(label, rig), {})
+        problem = observations.problem(model.effects, model.scales)
+        fits.append(Fit(model, descend(problem, scatters, problem.start(), steps=0)))
+    told = [o.text for o in next_test._options(observations, *(fits[k] for k in order))]
+    assert any(t.startswith("A sensor at sun.y") for t in told)
+    assert not any(t.startswith("A sensor at sun.x") for t in told)
+    masses = [t for t in told if t.startswith("A mass")]
+    assert any(t.endswith("at sun.x (no_ring)") for t in masses)
+    assert not any(".u (" in t for t in masses)
+    assert not any("support" in t for t in told)
 
 
 def asked(
