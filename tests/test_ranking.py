@@ -173,7 +173,7 @@ class Parabola:
         self.at = np.zeros(n) if at is None else at
 
     def residuals(self, x: np.ndarray, scatters: object, **how: Any) -> Residuals:
-        assert how["heat"] == 30.0
+        assert how == {"heat": 30.0, "derivatives": False}
         return Residuals((x - self.at) / how["heat"], np.zeros((0, len(x))))
 
     def begun(self, x: np.ndarray, scatters: object) -> None:
@@ -314,3 +314,94 @@ def test_what_promises_most_beside_learned_scatters_begins_at_its_size(
         ("c", ("c", [0.4, 1.9], {"part": 1.0})),
     ]
     assert _promising(NO_DATA, settled, asked, models, 0) == []
+
+
+# --- all of it -----------------------------------------------------------------------------------------------------
+
+
+class Stages:
+    """Stands for every stage of `rank`, and keeps what it was asked."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, bent: bool = False) -> None:
+        self.asked: list[Any] = []
+        labels = ("a", "b", "c", "d", "e", "f", "unseen")
+        self.hypotheses = [hypothesis(k) for k in labels]
+        stds = dict.fromkeys(labels, 9e5) | {"unseen": 1e6}
+        told = [SimpleNamespace(hypothesis=h, std=stds[h.label]) for h in self.hypotheses if h.label != "f"]
+        monkeypatch.setattr(ranking, "scores", lambda *given: told)
+        monkeypatch.setattr(ranking, "learned", lambda o, one: fit("learned", 0.0))
+        monkeypatch.setattr(
+            ranking, "beyond_scatter", lambda posterior, parts, most: np.array([bent and most == 3.0])
+        )
+        monkeypatch.setattr(ranking, "_screened", self.screened)
+        monkeypatch.setattr(ranking, "_first_fit", self.first_fit)
+        monkeypatch.setattr(ranking, "_begun_again", self.begun_again)
+        monkeypatch.setattr(ranking, "_bettered", self.bettered)
+        monkeypatch.setattr(ranking, "_promising", self.promising)
+        monkeypatch.setattr(
+            ranking, "_finals", lambda o, base, order, promising, processes: (base, order, promising)
+        )
+        for h in self.hypotheses:
+            h.scales = {}
+        self.base = fit("base", 0.0, error=1.3, residuals=SimpleNamespace(penalty=2.0))
+        self.base.model.plus = lambda placed, scales: placed.label  # type: ignore[attr-defined]
+
+    def screened(self, hypotheses: Any, promise: Any, near: bool) -> Any:
+        self.asked.append(("screened", [h.label for h in hypotheses], near))
+        return hypotheses
+
+    def first_fit(self, o: object, base: object, models: Any, promise: Any, h: Any) -> Any:
+        self.asked.append(("first", h.label, len(promise)))
+        return SimpleNamespace(log_evidence=float("fedcba".index(h.label)))
+
+    def begun_again(
+        self, o: object, base: Any, found: Any, processes: object, contenders: int, steps: int
+    ) -> Any:
+        self.asked.append(("again", contenders, steps))
+        return base, found
+
+    def bettered(self, found: Any, count: int, job: Any, processes: object) -> Any:
+        self.asked.append(("freed", count))
+        return found
+
+    def promising(self, o: object, settled: Any, others: Any, models: Any, further: int) -> Any:
+        self.asked.append(("promising", settled.model.name, [h.label for h in others], further))
+        return ["more"]
+
+    def rank(self, base: Fit, **given: Any) -> Any:
+        told: list[tuple[float, str]] = []
+        found = ranking.rank(
+            NO_DATA, base, self.hypotheses, progress=lambda share, text: told.append((share, text)), **given
+        )
+        assert [share for share, _ in told] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8])
+        return found
+
+
+def test_near_the_base_model_scores_tell_where_fits_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    stages = Stages(monkeypatch)
+    base, order, promising = stages.rank(stages.base, further=2, unpaired=2.0)
+    assert base is stages.base
+    assert [h.label for h, _ in order] == ["a", "b", "c", "d", "e", "f"]
+    assert promising == ["more"]
+    assert stages.asked[0] == (
+        "screened",
+        ["a", "b", "c", "d", "e", "f"],
+        True,
+    )  # what cannot be seen is left out
+    assert stages.asked[1] == ("first", "a", 6)
+    assert stages.asked[7:] == [("freed", 12), ("again", 12, 12), ("promising", "learned", ["f"], 2)]
+
+
+@pytest.mark.parametrize(
+    ("error", "unpaired", "bent"), [(1.31, 2.0, False), (1.3, 1.9, False), (1.3, 2.0, True)]
+)
+def test_a_base_model_that_is_stuck_or_bent_is_begun_again_with_all(
+    monkeypatch: pytest.MonkeyPatch, error: float, unpaired: float, bent: bool
+) -> None:
+    stages = Stages(monkeypatch, bent)
+    stages.base.posterior.error = error  # type: ignore[misc]
+    _, _, promising = stages.rank(stages.base, further=2, unpaired=unpaired)
+    assert promising == []
+    assert stages.asked[0][2] is False
+    assert stages.asked[1] == ("first", "a", 6 if bent else 0)  # of one that is stuck, scores tell no size
+    assert stages.asked[7:] == [("again", 6, 5), ("freed", 12), ("again", 12, 12)]

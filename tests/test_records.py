@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.linalg
+from imperfect_modes import chain
 from numpy.typing import NDArray
 
 import ema_pipeline as ema
@@ -15,10 +17,14 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.ingest.driven import DrivenRecord, ForceChannel
 from ema_pipeline.ingest.records import ResponseChannel
+from ema_pipeline.mechanics.assembly import Assembly, Spring
+from ema_pipeline.mechanics.laws import Maxwell
 from ema_pipeline.observations import record_motion
+from ema_pipeline.observations.parts import DAMPING as RATIO
 from ema_pipeline.observations.record_data import DISCREPANCY, SHARE
+from ema_pipeline.observations.record_model import loosened
 from ema_pipeline.observations.record_problem import RecordProblem
-from ema_pipeline.observations.records import RecordObservations
+from ema_pipeline.observations.records import RecordObservations, _zero_std
 from ema_pipeline.rigs.types import Rig
 
 Array = NDArray[np.float64]
@@ -101,11 +107,11 @@ def scattered(observations: RecordObservations, seed: int = 0) -> dict[str, floa
     return {n: s.default * float(np.exp(random.standard_normal())) for n, s in observations.scatters.items()}
 
 
-def truth(problem: RecordProblem) -> Array:
+def truth(problem: RecordProblem, effects: str = "") -> Array:
     """Unknowns of the true model: the rig's own values, and the state that the decay begins at."""
     x = problem.start()
     for k, value in enumerate(BEGIN / problem.observations.begin_scale):
-        x[problem.unknowns.index[f"state {k + 1} at sample 0 of decaying"]] = value
+        x[problem.unknowns.index[f"state {k + 1} at sample 0 of decaying{effects}"]] = value
     return x
 
 
@@ -160,7 +166,17 @@ def test_an_offset_of_the_force_moves_the_mean_by_the_flexibility(both: RecordOb
     assert whole.basis.force_rms[0] == pytest.approx(np.std(np.r_[steady().force[0], np.zeros(120)]))
 
 
-@pytest.mark.parametrize("labels", [(), ("hysteresis@b.x", "cubic_spring@a.x")])
+def _branch(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
+    return assembly.add(Maxwell("branch", {place: 1.0}, values["stiffness"], values["time"]))
+
+
+OWN = replace(LIBRARY["relaxation"], id="branch", find_places=lambda assembly: assembly.dofs, edit=_branch)
+"""A user's own effect, which remembers a stretch, as hysteresis remembers a force."""
+
+
+@pytest.mark.parametrize(
+    "labels", [(), ("cubic_spring@a.x", "hysteresis@b.x"), ("cubic_spring@b.x", "branch@a.x")]
+)
 @pytest.mark.parametrize("windowed", [False, True])
 def test_derivatives_of_all_outputs_are_those_of_differences(
     both: RecordObservations, labels: tuple[str, ...], windowed: bool
@@ -168,7 +184,7 @@ def test_derivatives_of_all_outputs_are_those_of_differences(
     observations = both
     if windowed:
         observations = both.with_records([both.data[1].windows(64, 10**4)], ())
-    problem = record_model(observations, LIBRARY, labels).problem(observations)
+    problem = record_model(observations, {**LIBRARY, OWN.id: OWN}, labels).problem(observations)
     assert isinstance(problem, RecordProblem)
     x = problem.start() + 0.2 * np.random.default_rng(1).standard_normal(len(problem.unknowns))
     x, scatters = problem.unknowns.clipped(x), scattered(observations)
@@ -182,6 +198,89 @@ def test_derivatives_of_all_outputs_are_those_of_differences(
         slope = (ends[1] - ends[0]) / 2e-5
         close = 2e-3 * max(float(np.max(np.abs(slope))), 1e-5)
         np.testing.assert_allclose(found.jacobian[:, i], slope, atol=close, err_msg=name)
+
+
+def test_an_effect_of_no_size_at_all_has_a_slope(both: RecordObservations) -> None:
+    problem = record_model(both, LIBRARY, ["cubic_spring@a.x"]).problem(both)
+    assert isinstance(problem, RecordProblem)
+    x, scatters = truth(problem, ", cubic_spring@a.x"), {n: s.default for n, s in both.scatters.items()}
+    i = problem.unknowns.index["cubic_spring@a.x.stiffness"]
+    x[i] = 0.0
+    assert problem.model.driven(x).kinds.shape == (1,)
+    ends = []
+    for h in (-1e-3, 1e-3):
+        moved = x.copy()
+        moved[i] = h
+        ends.append(problem.residuals(moved, scatters, derivatives=False).values)
+    slope = (ends[1] - ends[0]) / 2e-3
+    assert np.max(np.abs(slope)) > 1.0
+    found = problem.residuals(x, scatters).jacobian[:, i]
+    np.testing.assert_allclose(found, slope, atol=1e-3 * np.max(np.abs(slope)))
+
+
+def test_the_accelerometer_of_the_driven_body_reads_the_force_as_well(rig: Rig) -> None:
+    one = steady()
+    time, read = np.arange(PERIOD) / RATE, np.zeros(PERIOD)
+    for line in (3, 5, 7):
+        s = 2j * np.pi * line * RATE / PERIOD
+        x = np.linalg.solve(s**2 * MASS + s * DAMPING + STIFFNESS, [30.0, 0.0])
+        read += (s**2 * x[0] * np.exp(s * time + 1j * line)).real
+    channels = (replace(CHANNELS[1], name="aa", dof=Dof("a", "x")),)
+    driven = replace(one, channels=channels, responses=read[None])
+    (motion,) = (
+        RecordObservations(rig, rig.configurations[0], [driven]).problem((), {}).motions(np.zeros(10)) or ()
+    )
+    np.testing.assert_allclose(motion.read[0, :PERIOD, 0], read, atol=1e-3 * np.max(np.abs(read)))
+
+
+def test_friction_is_smoothed_at_the_step_of_the_simulation(
+    both: RecordObservations, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, steps, smoothed = both.problem((), {}), [], record_motion.resolved
+    monkeypatch.setattr(
+        record_motion,
+        "resolved",
+        lambda system, step, slopes: steps.append(step) or smoothed(system, step, slopes),
+    )
+    problem.motions(problem.start())
+    assert both.substeps > 1
+    assert steps == pytest.approx([1 / (RATE * both.substeps)] * 2)
+
+
+def test_a_mean_of_a_displacement_is_arbitrary_from_a_tenth_of_its_motion() -> None:
+    wave = np.tile([1.0, -1.0], 50)
+    found = _zero_std(np.stack([wave + 0.09, wave - 0.11, 1e3 * (wave + 2.0), np.zeros(100)]))
+    np.testing.assert_allclose(found, [1e-9, 0.11 / DISCREPANCY, 2.0 / DISCREPANCY, 1e-9])
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_values_that_nothing_is_stated_for_are_loose_and_parts_scatter_as_they_do(free: bool) -> None:
+    """A chain of five masses and six springs, each kind of one family."""
+    _, shared, loose = loosened(chain(free=free), "all")
+    std = dict(zip(shared.unknowns.names, shared.unknowns.std, strict=True))
+    assert shared.families == ("mass", "stiffness")
+    assert loose == (("stiffness",) if free else ())
+    assert (std["mass"], std["stiffness"]) == (0.01, 0.35 if free else 0.03)
+    assert (std["mass 2 (mass)"], std["spring 3 (spring)"]) == (0.005, 0.02)
+    assert len(std) == 2 + 5 + 6
+    row = shared.elements["all"][Spring, "spring 3"]
+    names = [n for n, v in zip(shared.unknowns.names, row, strict=True) if v]
+    assert names == ["stiffness", "spring 3 (spring)"]
+    alone = loosened(chain(masses=1), "all")[1].unknowns.names
+    assert "mass 1 (mass)" not in alone  # the only mass deviates from no other
+    assert "spring 1 (spring)" in alone
+
+
+def test_a_damping_ratio_without_dampers_is_known_only_roughly() -> None:
+    given = chain()
+    loose = loosened(given, "all")[0].parameters[RATIO]
+    assert (loose.value, loose.tolerance, loose.free) == (0.01, 0.35, False)
+    none = replace(given, parameters={**given.parameters, RATIO: replace(given.parameters[RATIO], value=0.0)})
+    assert loosened(none, "all")[0].parameters[RATIO].value == 0.01
+
+
+def test_dampers_leave_the_stated_damping_ratio_as_it_is(rig: Rig) -> None:
+    assert loosened(rig, rig.configurations[0])[0] is rig
 
 
 def test_variance_of_a_line_is_noise_of_its_band_and_a_share_of_the_response(

@@ -115,14 +115,15 @@ def test_a_ladder_is_measured_at_given_scatters_as_far_as_they_are_known(
     )
     fits = [
         fit("base", {"frequency_scatter": 1.0}),
+        fit("one", {"frequency_scatter": 4.0}),
         fit("last", {"frequency_scatter": 2.0, "shape_scatter": 3.0}),
     ]
     told: Any = ladder_of(data, fits)
-    assert told.rungs[1] == ("last", {"frequency_scatter": 2.0, "shape_scatter": 3.0})
+    assert told.rungs[2] == ("last", {"frequency_scatter": 2.0, "shape_scatter": 3.0})
     assert (told.frequency_noise, told.damping_noise, told.shape_noise, told.note) == (2.0, 0.0, 3.0, "")
     told = ladder_of(data, fits, {"frequency_scatter": 5.0, "other": 7.0})
-    assert [name for name, _ in told.rungs] == ["base", "last again"]
-    assert told.rungs[1][1] == {"frequency_scatter": 5.0, "shape_scatter": 3.0}
+    assert [name for name, _ in told.rungs] == ["base", "one", "last again"]
+    assert told.rungs[2][1] == {"frequency_scatter": 5.0, "shape_scatter": 3.0}
     assert told.frequency_noise == 5.0
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from ema_pipeline.diagnose import selection
 from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _groups
+from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.selection import Round, Selection, _beside, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import EffectSize
@@ -88,7 +89,7 @@ def test_the_rigs_own_come_before_generic_ones_and_ties_are_in_the_order_of_name
         judged("b@own", 8.95),
         judged("a@generic", 9.0, generic=True),
         judged("c@own", 7.0),
-        judged("a@own", 8.0),
+        judged("a@own", 8.85),
     )
     assert labels(one.alike(SETTINGS)) == ["b@own", "z@own", "a@own", "c@own", "a@generic"]
 
@@ -117,10 +118,16 @@ class Steps:
         monkeypatch.setattr(selection, "fit_base", self.fit_base)
         monkeypatch.setattr(selection, "rank", self.rank)
         monkeypatch.setattr(selection, "_round", self.round)
-        monkeypatch.setattr(selection, "reconsidered", lambda o, start, claimed, rivals, settings: claimed)
+        self.reconsidered: list[tuple[list[str], list[str]]] = []
+        monkeypatch.setattr(selection, "reconsidered", self.reconsider)
         for found in rounds:
             for j in found:
                 j.ranked.fit.model = SimpleNamespace(effects=(j.hypothesis.placed,), name=j.hypothesis.label)
+
+    def reconsider(self, observations: Any, start: Any, claimed: Any, rivals: Any, settings: Any) -> Any:
+        assert start.at == 1
+        self.reconsidered.append((labels(claimed), [*rivals]))
+        return claimed
 
     def fit_base(self, observations: Any, model: Any, start: Any = None) -> Any:
         self.begun.append((getattr(model, "name", "base"), start))
@@ -155,6 +162,26 @@ def test_effects_are_added_one_by_one_until_nothing_more_is_claimed(monkeypatch:
     assert found.final.at == 3  # type: ignore[attr-defined]
     assert steps.shares == [(3, 3.5, 0), (2, 5.5, 1), (1, pytest.approx(5.5), 2)]
     assert told == pytest.approx([0.125, 0.375, 0.625])
+    assert steps.reconsidered == [(["a@x", "b@x"], ["a@x", "b@x"])]  # one alone has nothing beside it
+
+
+def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (1.0, 9.0, 4.0, 2.0)]
+    told = {NOTHING: 0.7}
+    monkeypatch.setattr(
+        selection, "probabilities", lambda ranking, hypotheses, settings, found: told | {"n": found}
+    )
+    monkeypatch.setattr(
+        selection,
+        "judge",
+        lambda o, ranking, r, settings, nothing: SimpleNamespace(gain=r.gain, nothing=nothing),
+    )
+    given: Any = SimpleNamespace(ranked=ranked)
+    data: Any = None
+    found = selection._round(data, given, [], SETTINGS, 2)
+    assert [(j.gain, j.nothing) for j in found.judged] == [(4.0, 0.7), (2.0, 0.7), (1.0, 0.7)]  # type: ignore[attr-defined]
+    assert found.probabilities == told | {"n": 2}
+    assert found.ranking is given
 
 
 def test_no_more_effects_are_added_than_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
