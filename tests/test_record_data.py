@@ -89,6 +89,9 @@ def test_of_few_periods_a_transient_is_not_guessed_and_one_is_always_left() -> N
     three = np.concatenate([one + 5.0, one, one])[None]
     data = RecordData.of(record(three, period=period))
     np.testing.assert_allclose(data.record.responses[0], one + 5.0 / 3)
+    twice = np.concatenate([one + 5.0, one + 5.0, one, one, one, one])[None]
+    data = RecordData.of(record(twice, period=period))  # the first is no further off than another one
+    np.testing.assert_allclose(data.record.responses[0], one + 10.0 / 6)
     last = RecordData.of(record(three, period=period, transient=5 * period))
     np.testing.assert_allclose(last.record.responses[0], one)
     assert not np.any(last.noise)
@@ -150,12 +153,13 @@ def test_motion_of_a_sine_is_known_from_any_of_its_derivatives(quantity: str, po
     """What is slower than the structure is noise, but for a displacement, which is read as it is."""
     time = np.arange(512) / RATE
     omega, slow = 2 * np.pi * 10.0, 2 * np.pi * 0.5
-    wave, drift = np.exp(1j * omega * time), np.exp(1j * slow * time)
-    signal = ((1j * omega) ** power * wave).imag + drift.imag
+    low = 2 * np.pi * 2.5
+    wave, near, drift = (np.exp(1j * w * time) for w in (omega, low, slow))
+    signal = ((1j * omega) ** power * wave + (1j * low) ** power * near + drift).imag
     ((x,), (v,)) = RecordData.of(record(signal[None], (quantity,), period=512)).motion(2.0)
     seen = power == 0
-    np.testing.assert_allclose(x, (wave + seen * drift).imag, atol=1e-9)
-    np.testing.assert_allclose(v, (omega * wave).real + seen * (slow * drift).real, atol=1e-7)
+    np.testing.assert_allclose(x, (wave + near + seen * drift).imag, atol=1e-9)
+    np.testing.assert_allclose(v, (omega * wave + low * near + seen * slow * drift).real, atol=1e-7)
 
 
 @pytest.mark.parametrize(("quantity", "power"), [("velocity", 1), ("acceleration", 2)])

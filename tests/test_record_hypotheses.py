@@ -203,3 +203,61 @@ def test_where_the_model_loses_step_in_whole_records_windows_stay(
         found = whole_ladder(data, {}, ladder(rung(0.0, error=searched), note=note))
         assert found.note == ("whole" if kept else told)
         assert found.rungs[0].error == (whole if kept else searched)
+
+
+def test_what_whole_records_do_not_gain_of_the_only_claim_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = replace(diagnosis(candidate("a@x", 9.0)), ladder=ladder(rung(0.0), rung(9.0, ("a@x",))))
+    shares: list[float] = []
+    whole = {2: ladder(rung(0.0, error=1.2), rung(2.0, ("a@x",))), 1: ladder(rung(0.0, error=1.2))}
+
+    def search(*given: Any, **named: Any) -> Diagnosis:
+        progress = given[5]
+        progress(0.5, "half")
+        return told
+
+    monkeypatch.setattr(records, "in_windows", lambda data: None)
+    monkeypatch.setattr(records, "record_hypotheses", lambda *given: ())
+    monkeypatch.setattr(records, "record_model", lambda *given: None)
+    monkeypatch.setattr(records, "diagnose", search)
+    monkeypatch.setattr(
+        records, "whole_ladder", lambda data, library, searched, processes: whole[len(searched.rungs)]
+    )
+    data: Any = SimpleNamespace(rig=None)
+    found = records.diagnose_records(data, {}, (), SETTINGS, lambda share, text: shares.append(share))
+    assert found.verdict == "adequate"
+    odds = 0.4 * np.exp(-(9.0 - 2.0))
+    assert found.null_probability == pytest.approx(0.2 / (0.2 + odds))
+    assert shares == [0.425, 0.85]
+    monkeypatch.setitem(whole, 2, ladder(rung(0.0, error=1.2), rung(30.0, ("a@x",))))
+    assert records.diagnose_records(data, {}, (), SETTINGS).verdict == "effect"
+
+
+def test_the_diagnosis_tells_errors_and_sizes_of_whole_records() -> None:
+    found = diagnosis(candidate("a@x", 9.0), candidate("b@x", 1.0, claimed=False))
+    last = replace(rung(9.0, ("a@x",), error=1.1), parameters={"a@x.size": EffectSize(5.0, 0.2, "N")})
+    whole = ladder(rung(0.0, error=8.0), rung(5.0, error=4.0), last)
+    told = records._with_whole(found, whole)
+    assert (told.error, told.heldout_error, told.ladder) == (8.0, 2.0, whole)
+    assert told.candidates[0].parameters["size"].value == 5.0
+    assert told.summary.startswith("The model lacks")
+    assert "8" in told.summary
+    assert "1.1" in told.summary
+    assert " b " not in told.summary
+    ambiguous = replace(found, verdict="ambiguous", summary="as it was")
+    assert records._with_whole(ambiguous, whole).summary == "as it was"
+
+
+def test_a_ladder_of_effects_is_searched_where_no_known_one_has_just_these(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(records, "record_model", lambda data, library, labels: tuple(labels))
+    monkeypatch.setattr(records, "in_windows", lambda data: "windows")
+    monkeypatch.setattr(records, "make_ladder", lambda data, models: (data, models))
+    monkeypatch.setattr(records, "whole_ladder", lambda data, library, known, processes: known)
+    data: Any = None
+    effects = ["a@x", "b@x"]
+    searched = ("windows", [(), ("a@x",), ("a@x", "b@x")])
+    known = ladder(rung(0.0), rung(1.0, ("a@x",)), rung(2.0, ("a@x", "b@x")))
+    for other in (None, ladder(), ladder(rung(0.0), rung(1.0, ("a@x",)))):
+        assert records.records_ladder(data, {}, effects, other) == searched
+    assert records.records_ladder(data, {}, effects, known) is known
