@@ -12,13 +12,13 @@ from imperfect_modes import EXACT, GOOD, Hidden, chain, chain_modes, planetary_m
 
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
 from ema_pipeline.dof import Dof
-from ema_pipeline.effects.library import parse_effect
+from ema_pipeline.effects.library import effect_library, parse_effect
 from ema_pipeline.errors import EmaError
-from ema_pipeline.inference import Unknowns, descend
+from ema_pipeline.inference import Scatter, Unknowns, descend
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Gyroscopic, Mass, Spring
 from ema_pipeline.mechanics.modes import complex_modes
 from ema_pipeline.observations import fitting
-from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned
+from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, model_with
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.mode_residuals import UNEXPLAINED, UNSEEN
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem
@@ -236,6 +236,64 @@ def test_a_fit_is_led_past_barriers_as_long_as_it_gains_more_than_one(
     assert past({float(k): [k - 2.0] for k in range(2, 21)}, 20.0) == 12.0
     assert asked == [20.0, 18.0, 16.0, 14.0]
     assert past({np.inf: [0.0]}, np.inf) == np.inf
+
+
+def test_the_two_best_starts_that_did_not_meet_are_annealed_to_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They have met within a twentieth of the prior 1 σ in every unknown."""
+    unknowns = Unknowns.plain(("a", "b"), np.array([1.0, 10.0]))
+    model = SimpleNamespace(problem=lambda data: SimpleNamespace(unknowns=unknowns))
+    data = SimpleNamespace(scatters={})
+    asked: list[tuple[tuple[float, ...], object]] = []
+
+    def anneal(problem: object, scatters: object, x: tuple[float, ...], schedule: object) -> SimpleNamespace:
+        asked.append((tuple(x), schedule))
+        cost = 10.0 * x[0] + x[1]
+        return SimpleNamespace(x=np.array(x), cost=cost, log_evidence=cost)
+
+    monkeypatch.setattr(fitting, "anneal", anneal)
+    starts = [(0.9, 0.0), (0.2, 0.0), (0.25, 0.0), (0.24, 0.4), (0.2, 0.6), (0.3, 0.0)]
+    schedule = ((30.0, 5), (1.0, 8))
+    best = fitting.annealed(data, model, starts, schedule)  # type: ignore[arg-type]
+    assert [x for x, s in asked if s == schedule[:1]] == starts
+    assert [x for x, s in asked if s == schedule[1:]] == [(0.2, 0.0), (0.2, 0.6)]
+    assert best.posterior.x.tolist() == [0.2, 0.6]  # the one of more evidence in the end
+
+
+def test_a_parameter_is_made_up_of_its_family_and_its_only_part() -> None:
+    problem = SimpleNamespace(sole_parts={"k": ("k (spring)", 0.5)})
+    assert fitting.made_up_of(problem, "k") == {"k": 1.0, "k (spring)": 0.5}  # type: ignore[arg-type]
+    assert fitting.made_up_of(problem, "m") == {"m": 1.0}  # type: ignore[arg-type]
+
+
+def test_effects_that_depend_on_the_level_are_added_where_hits_show_them() -> None:
+    rig, library = planetary(), effect_library()
+    labels = ["mass@sun", "bearing_cubic@sun"]
+    assert model_with(labels, rig, library).labels == ("mass@sun",)
+    both = model_with(labels, rig, library, with_hits=True)
+    assert both.labels == tuple(labels)
+    assert model_with(["mass@carrier"], rig, library, both).labels == (*labels, "mass@carrier")
+    (placed, *_) = both.effects
+    scales = placed.effect.scales(rig.assembly("no_ring"), "sun")
+    assert {n.rpartition(".")[2]: v for n, v in both.scales.items() if n.startswith("mass@sun")} == scales
+
+
+def test_scatters_are_learned_from_what_is_stated_where_none_was_learned_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = {"a": Scatter("a", "", 0.1, 1.0, 0.5, 9.0), "b": Scatter("b", "", 0.2, 1.0, 0.6, 9.0)}
+    begun = []
+    monkeypatch.setattr(
+        fitting, "descend", lambda problem, scatters, x, steps: begun.append(scatters) or "begun"
+    )
+    monkeypatch.setattr(fitting, "learn", lambda problem, start, scatters: (start, scatters))
+    fit = Fit(
+        SimpleNamespace(problem=lambda data: None), SimpleNamespace(scatters={"a": 0.5, "b": 0.7}, x=None)
+    )  # type: ignore[arg-type]
+    told = fitting.learned(SimpleNamespace(scatters=known), fit)  # type: ignore[arg-type]
+    assert begun == [{"a": 0.1, "b": 0.7}]
+    assert told.posterior == ("begun", known)
 
 
 # --- sizes of effects -------------------------------------------------------------------------------------
