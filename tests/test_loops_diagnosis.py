@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 from pathlib import Path
@@ -29,7 +30,8 @@ from ema_pipeline.diagnose.loops import (
     placed_effects,
 )
 from ema_pipeline.diagnose.rungs import make_ladder
-from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Rung
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import descend
@@ -43,6 +45,7 @@ from ema_pipeline.observations.loops import LoopObservations
 from ema_pipeline.report.html import bokeh_script
 from ema_pipeline.rigs.isolator import isolator
 
+module = importlib.import_module("ema_pipeline.diagnose.loops")
 SPRING = {"stiffness": 9e4}
 COARSE = LoopSettings(points_per_cycle=96)
 LIBRARY = shipped_effects()
@@ -331,3 +334,53 @@ def test_effects_of_the_same_force_are_names_of_one_with_their_relative_size() -
         [1.0],
         [1.0],
     ]
+
+
+def told_apart(monkeypatch: pytest.MonkeyPatch, behind: float, separations: dict[str, float]) -> Diagnosis:
+    """What is left of a group of three, the claimed one `behind` above its rivals, a loop telling them apart so far."""
+    labels = ("a@x", "b@x", "c@x")
+    sizes = {"s": EffectSize(3.0, 0.1, "N")}
+    candidates = tuple(
+        Candidate(*one.split("@"), "", 0.5, sizes, 9.0, 1.0, 9.0, 1.0, 9.0, 3.5, 9.0, one == "b@x", "")
+        for one in labels
+    )
+    rungs = tuple(
+        Rung(given, 1.0, 1.0, 1.0, 1.0, {"b@x.s": sizes["s"]}, 0.0, 0)
+        for given in ((), ("w@x",), ("w@x", "b@x"))
+    )
+    group = ((*labels,), ("w@x", "v@x"))
+    ladder = Ladder(rungs, 0.0, 0.0, 0.0, "")
+    found = Diagnosis("ambiguous", "as it was", 0.1, candidates, group, "", (), {}, 9.0, 9.0, ladder)
+
+    def near(data: object, effects: tuple[str, ...], values: dict[str, float]) -> Any:
+        assert values["b@x.s"] == 3.0
+        assert effects[0] == "w@x"
+        assert f"{effects[1]}.s" in values
+        value = 0.0 if effects[1] == "b@x" else -behind
+        return SimpleNamespace(label=effects[1], posterior=SimpleNamespace(log_evidence=value))
+
+    monkeypatch.setattr(module, "_learned_near", near)
+    monkeypatch.setattr(module, "placed_effects", lambda data, library, labels: tuple(labels))
+    monkeypatch.setattr(
+        module,
+        "furthest",
+        lambda data, one, other: module.Further(f"of {other.label}", separations[other.label]),
+    )
+    none: Any = None
+    return module._told_apart(none, {}, found, DiagnoseSettings(alike=3.0))
+
+
+def test_rivals_stay_that_are_near_in_evidence_and_that_a_further_loop_would_tell_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    both = told_apart(monkeypatch, 2.9, {"a@x": 2.1, "c@x": 7.0})
+    assert both.verdict == "ambiguous"
+    assert both.indistinguishable == (("b@x", "a@x", "c@x"), ("w@x", "v@x"))
+    assert both.next_measurement.startswith("A loop of c@x would tell b at x from a at x: a difference of 7 ")
+    one = told_apart(monkeypatch, 2.9, {"a@x": 2.0, "c@x": 7.0})
+    assert one.indistinguishable[0] == ("b@x", "c@x")
+    for behind, far in ((3.0, 7.0), (2.9, 2.0)):
+        none = told_apart(monkeypatch, behind, {"a@x": far, "c@x": far})
+        assert none.verdict == "effect"
+        assert none.indistinguishable == (("w@x", "v@x"),)
+        assert none.summary.startswith("The model lacks b")
