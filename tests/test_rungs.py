@@ -108,7 +108,8 @@ def test_a_ladder_is_measured_at_given_scatters_as_far_as_they_are_known(
     def fit(name: str, scatters: dict[str, float]) -> Any:
         return SimpleNamespace(name=name, posterior=SimpleNamespace(scatters=scatters))
 
-    data: Any = SimpleNamespace(scatters={})
+    one = Scatter("frequency_scatter", "of f", 0.1, 1.0, 0.1, 9.0)
+    data: Any = SimpleNamespace(scatters={one.name: one})
     monkeypatch.setattr(rungs, "at_scatters", lambda data, one, scatters: fit(f"{one.name} again", scatters))
     monkeypatch.setattr(
         rungs, "rungs_of", lambda data, fits: tuple((f.name, f.posterior.scatters) for f in fits)
@@ -121,6 +122,7 @@ def test_a_ladder_is_measured_at_given_scatters_as_far_as_they_are_known(
     told: Any = ladder_of(data, fits)
     assert told.rungs[2] == ("last", {"frequency_scatter": 2.0, "shape_scatter": 3.0})
     assert (told.frequency_noise, told.damping_noise, told.shape_noise, told.note) == (2.0, 0.0, 3.0, "")
+    assert [s.learned for s in told.scatters] == [2.0]
     told = ladder_of(data, fits, {"frequency_scatter": 5.0, "other": 7.0})
     assert [name for name, _ in told.rungs] == ["base", "one", "last again"]
     assert told.rungs[2][1] == {"frequency_scatter": 5.0, "shape_scatter": 3.0}
