@@ -23,8 +23,8 @@ from simulate_modal import TrueSystem, random_system
 
 from ema_pipeline.modal.lscf import common_denominator_poles
 from ema_pipeline.modal.plscf import polyreference_poles
+from ema_pipeline.modal.pole_tracks import link
 from ema_pipeline.modal.poles import PoleSet
-from ema_pipeline.modal.selection import link
 from ema_pipeline.threads import single_blas_thread
 
 SIZES = ((12, 4096, 60), (100, 4096, 60), (400, 16384, 100))

@@ -24,7 +24,7 @@ import numpy as np
 import scipy.stats
 from study_own_rigs import draw_rig
 
-from ema_pipeline.changes.compare import Changes, changes_content, compare_runs, open_test
+from ema_pipeline.changes.two_tests import Changes, changes_content, compare_runs, open_test
 from ema_pipeline.observations.pair import RepeatSettings
 from ema_pipeline.run.types import Run
 from ema_pipeline.simulate import simulate_campaign

@@ -43,13 +43,13 @@ from simulate_modal import (
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.ingest.description import read_description
+from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.load import load_records
-from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import Record, cut_hit
 from ema_pipeline.modal.circle import attach_circles
+from ema_pipeline.modal.combine_estimates import pooled
+from ema_pipeline.modal.hit_to_hit import identify_hits
 from ema_pipeline.modal.identify import identify
-from ema_pipeline.modal.moving import identify_hits
-from ema_pipeline.modal.pooling import pooled
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel
 

@@ -86,7 +86,7 @@ def effects_of(values: dict[str, float]) -> list[str]:
 
 def ratios(found: Diagnosis, values: dict[str, float]) -> dict[str, float]:
     """Log evidence that every hidden effect gains, over what a claim needs; 0 where it was never a finalist."""
-    gains = {c.effect: c.gain / c.threshold for c in found.candidates}
+    gains = {c.effect: c.log_evidence / c.threshold for c in found.candidates}
     return {e: max(gains.get(e, 0.0), 0.0) for e in effects_of(values)}
 
 

@@ -11,7 +11,18 @@ from typing import Annotated, NoReturn
 import typer
 
 from ema_pipeline import __version__
-from ema_pipeline.commands import changes, choices, diagnosis, listings, merge, raw, runs, series, watch
+from ema_pipeline.commands import (
+    changes,
+    choices,
+    compare,
+    diagnosis,
+    listings,
+    merge,
+    raw,
+    runs,
+    series,
+    watch,
+)
 from ema_pipeline.commands.interrupts import INTERRUPTED, answer_ctrl_c
 from ema_pipeline.commands.screen import program
 from ema_pipeline.crash import write_crash_report
@@ -110,7 +121,7 @@ for _verb in (
     runs.report,
     raw.check,
     raw.init,
-    diagnosis.compare,
+    compare.compare,
     runs.levels,
     diagnosis.diagnose,
     diagnosis.add,

@@ -10,7 +10,7 @@ from ema_pipeline.files import replace_file
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.kinds import kind_of
 from ema_pipeline.pipeline import ShowStage
-from ema_pipeline.report.limits import POOR_ERROR
+from ema_pipeline.report.thresholds import POOR_ERROR
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.run.types import Run
 from ema_pipeline.store import ALL, Store

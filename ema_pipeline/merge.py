@@ -64,7 +64,7 @@ class Part:
 
     @property
     def band_hz(self) -> tuple[float, float]:
-        """What it may speak for: the band of its force spectrum, within what its description states."""
+        """Band in which it is used: that of its force spectrum, within what its description states."""
         return self.frfs.band_hz
 
 

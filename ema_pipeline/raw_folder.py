@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def check_raw(raw: Path, overrides: Iterable[str] = ()) -> dict[str, tuple[Hit, ...]]:
     """Hits of every configuration of a raw folder with their verdicts; nothing is written."""
-    from ema_pipeline.ingest.quality import hits_of_test
+    from ema_pipeline.ingest.hit_checks import hits_of_test
 
     settings = load_pipeline(DEFAULT_PIPELINE, overrides)
     tests: dict[str, list[TestDescription]] = {}

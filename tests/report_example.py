@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.correlate.types import (
     BandDifference,
     Comparison,
@@ -25,7 +26,6 @@ from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import CircleFit, ModalModel, Mode, StabilisationChart
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.rigs.types import ModelMode
-from ema_pipeline.verdict import Verdict
 
 PLANETS = 4
 
@@ -209,7 +209,7 @@ def configuration(
         True,
         np.zeros(len(dofs)),
         (
-            Verdict(
+            CheckResult(
                 "reciprocity",
                 0.11,
                 0.05,
@@ -289,7 +289,7 @@ def hits(rng: np.random.Generator) -> tuple[Hit, ...]:
         for n in range(6):
             bad = dof == "sun.x" and n == 3
             verdicts = (
-                Verdict(
+                CheckResult(
                     "double hit",
                     0.12 if bad else 0.02,
                     0.1,
@@ -300,7 +300,7 @@ def hits(rng: np.random.Generator) -> tuple[Hit, ...]:
                     "",
                     "second impact of 12 % after 8.1 ms" if bad else "",
                 ),
-                Verdict(
+                CheckResult(
                     "overload",
                     1.0 if n == 5 else 0.6,
                     0.98,

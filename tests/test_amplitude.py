@@ -10,6 +10,9 @@ import pytest
 from simulate_amplitude import COORDINATES, LEVELS, RIG, STRUCK, observed, simulated_hits, true_assembly
 
 from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.diagnose.detection_limits import detection_limits
+from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
+from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.inference import Posterior
@@ -116,6 +119,28 @@ def test_each_effect_is_told_at_its_place_with_its_size(label: str) -> None:
     assert max(gains, key=lambda k: gains[k]) == label, gains
     assert gains[label] > 5
     assert abs(values[label][f"{label}.{parameter}"]) == pytest.approx(size, rel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("label", "law"), [("bearing_cubic@hub", "cubic"), ("bearing_quadratic@rim", "quadratic")]
+)
+def test_effects_twice_their_limit_are_claimed_and_those_of_half_of_it_are_not(label: str, law: str) -> None:
+    def element(size: float) -> list[Nonlinear]:
+        place = label.partition("@")[2]
+        return [PolynomialSpring(f"p{a}", {f"{place}.{a}": 1.0}, **{law: size}) for a in "xy"]
+
+    healthy = synthetic()
+    hypothesis = Hypothesis((Name(parse_effect(label, RIG), {}),))
+    settings = DiagnoseSettings(processes=1)
+    (limit,) = detection_limits(healthy, base_fit(healthy), [hypothesis], settings)
+    assert limit.label == label
+    for factor, claimed in ((2.0, True), (0.5, False)):
+        gains = []
+        for seed in range(3):
+            observations = synthetic(element(factor * limit.size), seed)
+            base = base_fit(observations)
+            gains.append(fitted(observations, base, label)[1].log_evidence - base.log_evidence)
+        assert all((g > settings.claim) is claimed for g in gains), gains
 
 
 def test_nothing_is_claimed_where_only_drift_moves_the_modes() -> None:

@@ -39,7 +39,7 @@ def _told(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, o
 
 def _results(root: Path, name: str) -> Path:
     """The test run up to its modes, once."""
-    from ema_pipeline.changes.compare import MEASURING
+    from ema_pipeline.changes.two_tests import MEASURING
 
     run_raw(root / name, str(root / "bench.toml"), root / "out" / name, None, [MEASURING])
     return root / "out" / name
@@ -56,7 +56,7 @@ def test_two_tests_share_rig_and_sensors(root: Path) -> None:
 
 def test_an_added_mass_is_found_with_its_size(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By the command, and back again by the function behind it: what B has, A has not."""
-    from ema_pipeline.changes.compare import changes_content, compare_runs
+    from ema_pipeline.changes.two_tests import changes_content, compare_runs
     from ema_pipeline.run.opening import existing_run
 
     out = root / "changed"

@@ -101,8 +101,8 @@ def test_what_is_hidden_in_a_chain_is_named_with_its_size(
     assert found.ladder.rungs[-1].error < 1.5
     limit = {d.label: d.size for d in found.detection_limits}[first.label]  # of the rig without it
     assert size.std < limit < 2 * truth
-    assert first.gain > SETTINGS.claim
-    assert first.heldout_error_after < first.heldout_before
+    assert first.log_evidence > SETTINGS.claim
+    assert first.heldout_error_after < first.heldout_error_before
 
 
 @pytest.mark.parametrize(
@@ -276,6 +276,10 @@ def test_an_effect_is_claimed_only_where_everything_supports_it() -> None:
     assert judged
     assert not any(j.claimed for j in judged)
     assert all(j.doubt for j in judged)
+    dearer = SETTINGS.model_copy(update={"claim": 50.0})  # as for a further effect
+    again = judge(observations, ranking, judged[0].ranked, dearer)
+    assert (judged[0].needed, again.needed) == (SETTINGS.claim, 50.0)
+    assert again.doubt.endswith("is below 50")
 
 
 def test_learned_scatters_are_those_of_the_laboratory() -> None:

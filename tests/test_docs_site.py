@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -23,6 +24,15 @@ def test_the_tutorial_runs_and_gives_the_numbers_that_it_prints() -> None:
     assert numbers[-1].startswith("0.34")
     assert numbers[-1] == printed.cells[-2].outputs[-1]["text"]
     assert any("mesh stiffness loss at sun-planet1" in str(cell.get("outputs")) for cell in run.cells)
+
+
+def test_every_path_of_the_page_on_architecture_exists() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    table = page.partition("## Where is it?")[2].partition("\n## ")[0]
+    named = re.findall(r"`([\w/]+\.(?:py|js)|[\w/]+/)`", table)
+    assert len(named) > 25
+    named += re.findall(r"`([a-z_]+/[\w/]+\.py)`", page)
+    assert not [path for path in named if not (ROOT / "ema_pipeline" / path).exists()]
 
 
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:

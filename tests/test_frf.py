@@ -18,8 +18,8 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.frf import FrfSet, FrfSettings, estimate_frfs
 from ema_pipeline.frf.windows import force_window
 from ema_pipeline.ingest.campaign import read_campaign
+from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.load import load_records
-from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import Hit, HitSamples, Record, ResponseChannel, cut_hit
 
 RATE = 2048.0

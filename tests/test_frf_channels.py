@@ -20,8 +20,8 @@ from ema_pipeline.frf import (
     hammer_uncertainty,
 )
 from ema_pipeline.ingest.description import read_description
+from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.load import load_records
-from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import HitSamples, ResponseChannel, cut_hit
 from ema_pipeline.store import Store
 

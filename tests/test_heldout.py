@@ -46,7 +46,7 @@ class Level:
 
 
 def closed_form(y: Array, relative: float = 1.0) -> tuple[float, float]:
-    """Sum of squares and log density but for ln 2π of all pairs, each foretold from the others."""
+    """Sum of squares and log density but for ln 2π of all pairs, each predicted from the others."""
     squares = density = 0.0
     for i in range(0, len(y), 2):
         others, pair = np.delete(y, [i, i + 1]), y[i : i + 2]
@@ -64,7 +64,7 @@ def prediction(observations: Level):
     return held_out(observations, Fit(Model(), found))
 
 
-def test_a_linear_model_foretells_as_its_normal_distribution_does() -> None:
+def test_a_linear_model_predicts_as_its_normal_distribution_does() -> None:
     squares, density = closed_form(Y)
     found = prediction(Level(Y))
     assert found.error == close(np.sqrt(squares / 6))

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from simulate_hits import Blow, force_of, modal_response, record_of
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.hit_checks import check_hit, hits_of_test
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.hits import align_hits, find_hits, trim_hits
 from ema_pipeline.ingest.pulse import find_pulse
-from ema_pipeline.ingest.quality import check_hit, hits_of_test
 from ema_pipeline.ingest.records import Record, cut_hit
 
 RATE = 5120.0

@@ -14,7 +14,7 @@ import pytest
 from hostile_files import SIGNAL, TRAPS
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers import apart, read_raw
 from ema_pipeline.ingest.readers.apart import read_apart
 

@@ -12,6 +12,7 @@ import pytest
 from imperfect_modes import GOOD, NORMAL, Hidden, chain, chain_modes
 from scipy.stats import norm
 
+from ema_pipeline.diagnose.detection_limits import _Shown, detection_limits
 from ema_pipeline.diagnose.hypotheses import (
     Hypothesis,
     Name,
@@ -20,7 +21,6 @@ from ema_pipeline.diagnose.hypotheses import (
     list_hypotheses,
     size_starts,
 )
-from ema_pipeline.diagnose.limits import _Shown, detection_limits
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names, named, sizes_of
 from ema_pipeline.diagnose.probability import against_nothing, needed, null_prior, prior
@@ -373,21 +373,25 @@ def test_an_effect_of_twice_its_limit_is_seen_and_one_far_below_it_is_not(label:
     assert below == 0
 
 
-@pytest.mark.parametrize("power", [0.35, 1.0, 2.0, 3.0])
+@pytest.mark.parametrize(
+    ("power", "linear"), [(0.35, True), (1.0, True), (2.0, True), (3.0, True), (4.0, False)]
+)
 @pytest.mark.parametrize("off", [0.2, 5.0])
-def test_the_search_for_a_limit_ends_at_the_size_that_gains_enough(power: float, off: float) -> None:
+def test_the_search_for_a_limit_ends_at_the_size_that_gains_enough(
+    power: float, linear: bool, off: float
+) -> None:
     """Whatever power of the size the gain grows with, and wherever first order would have begun."""
     wanted, sigma = 8.0 + 0.5 * np.log1p(0.1**-2.0), 0.1
     true = off * sigma * (np.sqrt(2 * wanted) + 1.2816)
 
     class Power(_Shown):
-        def _gained(self, unknown: float) -> float:
-            return float(wanted * (unknown / true) ** power)
+        def _gained(self, unknown: float) -> tuple[float, float]:
+            return float(wanted * (unknown / true) ** power), 1 / sigma
 
     def least(most: float, gain: float = 8.0, sigmas: float = 2.0) -> float:
         problem = SimpleNamespace(unknowns=SimpleNamespace(upper=np.array([most])))
         nothing = Residuals(np.zeros(0), np.zeros((0, 1)))
-        return Power(problem, np.zeros(1), 0, {}, nothing, None, sigma).least(gain, sigmas)  # type: ignore[arg-type]
+        return Power(problem, np.zeros(1), 0, {}, nothing, None, sigma, linear).least(gain, sigmas)  # type: ignore[arg-type]
 
     assert least(np.inf) == pytest.approx(true, rel=0.12 / power)
     assert least(0.5 * true) == (np.inf if 0.5**power < 0.9 else 0.5 * true)

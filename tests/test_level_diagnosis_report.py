@@ -81,11 +81,11 @@ def test_bars_say_fitted_and_held_out_by_hatching_and_number(ladder: Ladder) -> 
     assert {p.get_hatch() or "" for p in ax.patches} == {"", "////"}
 
 
-def test_a_size_that_the_data_do_not_tell_is_not_given() -> None:
+def test_a_size_that_the_data_do_not_determine_is_not_given() -> None:
     sizes = {
         "mesh_backlash@m.preload": EffectSize(2.7e-7, 6e-9, "m"),
         "mesh_backlash@m.gap": EffectSize(1e-4, 3.2, "m"),
     }
-    assert size_text(sizes) == "preload 2.7e-07 ± 6e-09 m, gap not told by these data"
-    assert "gap not told by these data" in size_words(sizes)
+    assert size_text(sizes) == "preload 2.7e-07 ± 6e-09 m, gap not determined by these data"
+    assert "gap not determined by these data" in size_words(sizes)
     assert "force 0.0 ± 1.4 N" in size_words({"dry_friction@m.force": EffectSize(0.0, 1.4, "N")})

@@ -12,9 +12,9 @@ from simulate_levels import Case, hits_of
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.ingest.campaign import read_campaign
+from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.load import load_records
-from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import HitSamples, cut_hit
 from ema_pipeline.levels import LevelSettings, LevelStudy, study_levels
 from ema_pipeline.levels.sentences import flagged

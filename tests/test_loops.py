@@ -201,4 +201,4 @@ def test_summary_is_plain_json_and_the_terminal_says_what_was_found(identified: 
     text = "\n".join(terminal_lines(identified))
     assert "9 loops" in text
     assert "cubic stiffness" in text
-    assert "not told from zero" in text
+    assert "not distinguishable from zero" in text

@@ -341,7 +341,7 @@ def told_apart(monkeypatch: pytest.MonkeyPatch, behind: float, separations: dict
     labels = ("a@x", "b@x", "c@x")
     sizes = {"s": EffectSize(3.0, 0.1, "N")}
     candidates = tuple(
-        Candidate(*one.split("@"), "", 0.5, sizes, 9.0, 1.0, 9.0, 1.0, 9.0, 3.5, 9.0, one == "b@x", "")
+        Candidate(*one.split("@"), "", 0.5, sizes, 9.0, 1.0, 9.0, 1.0, 9.0, 3.5, one == "b@x", "")
         for one in labels
     )
     rungs = tuple(
@@ -376,11 +376,13 @@ def test_rivals_stay_that_are_near_in_evidence_and_that_a_further_loop_would_tel
     both = told_apart(monkeypatch, 2.9, {"a@x": 2.1, "c@x": 7.0})
     assert both.verdict == "ambiguous"
     assert both.indistinguishable == (("b@x", "a@x", "c@x"), ("w@x", "v@x"))
-    assert both.next_measurement.startswith("A loop of c@x would tell b at x from a at x: a difference of 7 ")
+    assert both.next_measurement.startswith(
+        "A loop of c@x would distinguish b at x from a at x: a difference of 7 "
+    )
     one = told_apart(monkeypatch, 2.9, {"a@x": 2.0, "c@x": 7.0})
     assert one.indistinguishable[0] == ("b@x", "c@x")
     for behind, far in ((3.0, 7.0), (2.9, 2.0)):
         none = told_apart(monkeypatch, behind, {"a@x": far, "c@x": far})
         assert none.verdict == "effect"
         assert none.indistinguishable == (("w@x", "v@x"),)
-        assert none.summary.startswith("The model lacks b")
+        assert none.summary.startswith("Missing from the model: b at x")

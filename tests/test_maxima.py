@@ -8,8 +8,8 @@ import scipy.signal
 import scipy.stats
 
 from ema_pipeline.levels.scatter import _log_density
+from ema_pipeline.modal.hit_to_hit import _by_chance
 from ema_pipeline.modal.maxima import prominent_peaks
-from ema_pipeline.modal.moving import _by_chance
 
 
 @pytest.mark.parametrize("prominence", [0.0, 0.5, 2.0])

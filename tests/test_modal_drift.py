@@ -12,19 +12,19 @@ from simulate_modal import TrueSystem, frf_set, random_system, records_of, simul
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.warp import WarpedTransform
-from ema_pipeline.ingest.quality import hits_of_test
+from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.records import HitSamples, cut_hit
+from ema_pipeline.modal.combine_estimates import Witness, pool
 from ema_pipeline.modal.drift.align import _movements
 from ema_pipeline.modal.drift.local import PeakPoles, change_in_decay, peak_poles
 from ema_pipeline.modal.drift.shifts import movement
 from ema_pipeline.modal.drift.windows import HitKey, PeakWindow
-from ema_pipeline.modal.earned import has_peak
 from ema_pipeline.modal.fit import Estimate
+from ema_pipeline.modal.heavily_damped import has_peak
+from ema_pipeline.modal.hit_to_hit import HitModes, identify_hits
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.left_out import left_out, sentences
-from ema_pipeline.modal.moving import HitModes, identify_hits
 from ema_pipeline.modal.peaks import KnownPeaks
-from ema_pipeline.modal.pooling import Witness, pool
 from ema_pipeline.modal.settings import ModalSettings
 
 SYSTEM = random_system(

@@ -16,9 +16,9 @@ from ema_pipeline.modal.lscf import common_denominator_poles
 from ema_pipeline.modal.noise_kernel import slopes
 from ema_pipeline.modal.normal_equations import fractions, normal_equations, numerator
 from ema_pipeline.modal.plscf import polyreference_poles
+from ema_pipeline.modal.pole_tracks import link
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.roots import stable_roots
-from ema_pipeline.modal.selection import link
 
 
 def noisy(

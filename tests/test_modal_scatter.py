@@ -9,14 +9,14 @@ from simulate_modal import frf_set, random_system
 
 from ema_pipeline.modal.data import FitData, arrange
 from ema_pipeline.modal.fit import Estimate, normalised, solve_linear
-from ema_pipeline.modal.serial import lags, variance_of_sum, widening
-from ema_pipeline.modal.uncertainty import (
+from ema_pipeline.modal.fit_covariance import (
     FEWEST_GROUPS,
     PointScores,
     of_all_blocks,
     scatter_over_points,
     scores_of_points,
 )
+from ema_pipeline.modal.serial import lags, variance_of_sum, widening
 
 INSIDE = 1.645
 """Standard deviations of a 90 % interval."""

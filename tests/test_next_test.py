@@ -169,13 +169,16 @@ def asked(
 def test_rivals_are_told_apart_by_the_best_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
     told = asked(monkeypatch, "ambiguous", 2.34)
     assert told == (
-        "A sensor (fit of spring@m2, fit of mass@m3) would tell spring at m2 from mass at m3: "
+        "A sensor (fit of spring@m2, fit of mass@m3) would distinguish spring at m2 from mass at m3: "
         "a difference of 2.3 standard deviations is expected."
     )
-    assert "would tell" in asked(monkeypatch, "ambiguous", 1.0)
+    assert "would distinguish" in asked(monkeypatch, "ambiguous", 1.0)
     for weak in (0.9, None):
         told = asked(monkeypatch, "ambiguous", weak)
-        assert told == "No single further measurement that was tried would tell spring at m2 from mass at m3."
+        assert (
+            told
+            == "No single further measurement that was tried would distinguish spring at m2 from mass at m3."
+        )
     assert asked(monkeypatch, "ambiguous", labels=("spring@m2",)) == ""
 
 
@@ -184,7 +187,7 @@ def test_an_adequate_model_that_is_not_sure_is_told_from_its_best_rival(
 ) -> None:
     told = asked(monkeypatch, "adequate", 3.0)
     assert told.startswith(
-        "A sensor (fit of spring@m2, fit of the base) would tell spring at m2 from nothing missing"
+        "A sensor (fit of spring@m2, fit of the base) would distinguish spring at m2 from nothing missing"
     )
     assert asked(monkeypatch, "adequate", 0.9) == ""
     assert asked(monkeypatch, "adequate", None) == ""

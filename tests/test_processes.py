@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ema_pipeline import keys, pipeline
-from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.errors import EmaError
 from ema_pipeline.processes import Send, side_by_side
 from ema_pipeline.run.opening import describe_run, new_run, save_info

@@ -40,7 +40,12 @@ def hypothesis(label: str, generic: bool = False, sizes: int = 1, extends: bool 
     )
     starts = [{f"{label}.s1": 0.5}, {f"{label}.s1": -0.5}]
     return SimpleNamespace(
-        label=label, generic=generic, placed=placed, extends=extends, starts=lambda: starts
+        label=label,
+        generic=generic,
+        placed=placed,
+        size_cannot_be_zero=extends,
+        begun=(),
+        starts=lambda: starts,
     )
 
 

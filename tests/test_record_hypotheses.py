@@ -12,7 +12,7 @@ import pytest
 from ema_pipeline.diagnose import records
 from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.records import (
-    _OUT_OF_STEP,
+    _OUT_OF_PHASE,
     _linear_change,
     _loose_columns,
     _nothing_claimed,
@@ -33,6 +33,7 @@ from ema_pipeline.rigs.types import Rig
 from tests.test_records import BEGIN, LIBRARY, STIFFNESS, decaying, rig, steady
 
 __all__ = ["rig"]  # a fixture
+NO_HELD_OUT: Any = SimpleNamespace(held_out=())
 SETTINGS = DiagnoseSettings(claim=3.5, error_limit=1.5)
 
 
@@ -112,9 +113,7 @@ def ladder(*rungs: Rung, note: str = "") -> Ladder:
 def candidate(label: str, gain: float, claimed: bool = True) -> Candidate:
     effect, _, place = label.partition("@")
     sizes = {"size": EffectSize(1.0, 0.1, "N")}
-    return Candidate(
-        effect, place, "", 0.5, sizes, 9.0, 1.0, 9.0, 1.0, gain, 3.5, gain, claimed, "Its signs."
-    )
+    return Candidate(effect, place, "", 0.5, sizes, 9.0, 1.0, 9.0, 1.0, gain, 3.5, claimed, "Its signs.")
 
 
 def diagnosis(
@@ -127,16 +126,19 @@ def diagnosis(
 def test_a_claim_stands_where_whole_records_gain_enough_by_it() -> None:
     found = diagnosis(candidate("a@x", 100.0), candidate("w@x", 50.0, claimed=False), candidate("b@x", 9.0))
     up = (rung(0.0), rung(100.0))
-    assert _unconfirmed(found, ladder(*up, rung(103.5)), SETTINGS) == ""
-    doubt = _unconfirmed(found, ladder(*up, rung(103.4)), SETTINGS)
-    assert doubt == "the log evidence that it gains in whole records, 3.4, is below 3.5"
-    assert _unconfirmed(found, ladder(*up, rung(103.4), note=f"so far; {_OUT_OF_STEP}"), SETTINGS) == ""
-    assert _unconfirmed(found, ladder(rung(0.0)), SETTINGS) == ""
+    assert _unconfirmed(NO_HELD_OUT, found, ladder(*up, rung(103.5)), SETTINGS) == ""
+    doubt = _unconfirmed(NO_HELD_OUT, found, ladder(*up, rung(103.4)), SETTINGS)
+    assert doubt == "its gain in log evidence over whole records, 3.4, is below 3.5"
+    assert (
+        _unconfirmed(NO_HELD_OUT, found, ladder(*up, rung(103.4), note=f"so far; {_OUT_OF_PHASE}"), SETTINGS)
+        == ""
+    )
+    assert _unconfirmed(NO_HELD_OUT, found, ladder(rung(0.0)), SETTINGS) == ""
     strong = diagnosis(candidate("a@x", 300.0), candidate("c@x", 200.0), candidate("b@x", 9.9))
-    doubt = _unconfirmed(strong, ladder(*up, rung(120.0)), SETTINGS)
-    assert doubt.startswith("the log evidence that it gains, 9.9, is below 2 % of what the others gain")
+    doubt = _unconfirmed(NO_HELD_OUT, strong, ladder(*up, rung(120.0)), SETTINGS)
+    assert doubt.startswith("its gain in log evidence, 9.9, is below 2 % of that of the other effects")
     enough = diagnosis(candidate("a@x", 300.0), candidate("c@x", 200.0), candidate("b@x", 10.0))
-    assert _unconfirmed(enough, ladder(*up, rung(120.0)), SETTINGS) == ""
+    assert _unconfirmed(NO_HELD_OUT, enough, ladder(*up, rung(120.0)), SETTINGS) == ""
 
 
 def test_a_claim_that_is_withdrawn_takes_its_group_and_its_rung_with_it() -> None:
@@ -196,9 +198,9 @@ def test_where_the_model_loses_step_in_whole_records_windows_stay(
     monkeypatch.setattr(records, "_with_calibration", lambda o, library, rung, scatters: rung)
     data: Any = SimpleNamespace(in_windows=lambda samples: None)
     for note, told in (
-        ("", _OUT_OF_STEP),
-        ("so far", f"so far; {_OUT_OF_STEP}"),
-        (_OUT_OF_STEP, _OUT_OF_STEP),
+        ("", _OUT_OF_PHASE),
+        ("so far", f"so far; {_OUT_OF_PHASE}"),
+        (_OUT_OF_PHASE, _OUT_OF_PHASE),
     ):
         found = whole_ladder(data, {}, ladder(rung(0.0, error=searched), note=note))
         assert found.note == ("whole" if kept else told)
@@ -222,7 +224,7 @@ def test_what_whole_records_do_not_gain_of_the_only_claim_is_lost(monkeypatch: p
     monkeypatch.setattr(
         records, "whole_ladder", lambda data, library, searched, processes: whole[len(searched.rungs)]
     )
-    data: Any = SimpleNamespace(rig=None)
+    data: Any = SimpleNamespace(rig=None, held_out=())
     found = records.diagnose_records(data, {}, (), SETTINGS, lambda share, text: shares.append(share))
     assert found.verdict == "adequate"
     odds = 0.4 * np.exp(-(9.0 - 2.0))
@@ -239,7 +241,7 @@ def test_the_diagnosis_tells_errors_and_sizes_of_whole_records() -> None:
     told = records._with_whole(found, whole)
     assert (told.error, told.heldout_error, told.ladder) == (8.0, 2.0, whole)
     assert told.candidates[0].parameters["size"].value == 5.0
-    assert told.summary.startswith("The model lacks")
+    assert told.summary.startswith("Missing from the model: a at x")
     assert "8" in told.summary
     assert "1.1" in told.summary
     assert " b " not in told.summary

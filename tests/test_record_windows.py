@@ -11,7 +11,7 @@ import pytest
 
 import ema_pipeline as ema
 from ema_pipeline.diagnose.probability import NOTHING
-from ema_pipeline.diagnose.records import in_windows, record_model, whole_ladder
+from ema_pipeline.diagnose.records import in_windows, record_hypotheses, record_model, whole_ladder
 from ema_pipeline.diagnose.rungs import ladder_of, make_ladder
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Candidate, Diagnosis
@@ -49,6 +49,15 @@ def test_windows_lie_in_the_record_and_do_not_overlap(windows: RecordObservation
     np.testing.assert_array_equal(
         data.responses[1, 0], data.record.responses[0, data.starts[1] :][: data.samples]
     )
+
+
+def test_generic_effects_are_sought_everywhere_and_the_simplest_to_say_comes_first(
+    windows: RecordObservations,
+) -> None:
+    new = replace(LIBRARY["quadratic_damping"], id="a_new_law", records_order=None)
+    found = [h.label for h in record_hypotheses(windows, LIBRARY | {new.id: new})]
+    laws = ("cubic_spring", "quadratic_spring", "dry_friction", "hysteresis", "quadratic_damping", new.id)
+    assert found == [f"{law}@mass.x" for law in laws]
 
 
 @pytest.mark.parametrize("label", ["cubic_spring@mass.x", "hysteresis@mass.x"])
@@ -124,7 +133,7 @@ def test_the_only_claim_is_taken_back_where_whole_records_do_not_support_it(
     searched = make_ladder(
         in_windows(whole), [record_model(whole, LIBRARY, given) for given in ((), (label,))]
     )
-    claim = Candidate(*label.split("@"), "", 0.9, {}, 1.0, 0.9, 1.0, 0.9, 5.0, 3.5, 5.0, True, "Its signs.")
+    claim = Candidate(*label.split("@"), "", 0.9, {}, 1.0, 0.9, 1.0, 0.9, 5.0, 3.5, True, "Its signs.")
     odds = {label: 0.9, NOTHING: 0.1}
     told = Diagnosis("effect", "", 0.1, (claim,), (), "", (), odds, 1.0, 1.0, searched)
     records = importlib.import_module("ema_pipeline.diagnose.records")
@@ -168,7 +177,7 @@ def test_a_further_claim_that_whole_records_do_not_support_is_withdrawn(
     labels = ("cubic_spring@mass.x", "dry_friction@mass.x")
     searched = make_ladder(windows, [record_model(whole, LIBRARY, labels[:k]) for k in range(3)])
     candidates = tuple(
-        Candidate(*label.split("@"), "", 0.99, {}, 9.0, 1.0, 9.0, 1.0, 90.0, 3.5, 90.0, True, "Its signs.")
+        Candidate(*label.split("@"), "", 0.99, {}, 9.0, 1.0, 9.0, 1.0, 90.0, 3.5, True, "Its signs.")
         for label in labels
     )
     told = Diagnosis("effect", "", 0.0, candidates, (labels,), "", (), {}, 9.0, 9.0, searched)
@@ -179,11 +188,11 @@ def test_a_further_claim_that_whole_records_do_not_support_is_withdrawn(
     assert tuple(c.label for c in found.candidates if c.claimed) == kept
     assert found.ladder.rungs[-1].effects == kept
     if not friction:
-        assert "Not claimed: the log evidence that it gains in whole records" in found.candidates[1].why
+        assert "Not claimed: its gain in log evidence over whole records" in found.candidates[1].why
         assert "dry friction at mass.x" in found.ladder.note
         assert "dry friction" not in found.summary
         assert found.indistinguishable == ()
         told = replace(told, verdict="ambiguous")  # the group of which one was claimed goes with it
         found = records.diagnose_records(whole, LIBRARY, settings=DiagnoseSettings(processes=1))
         assert found.verdict == "effect"
-        assert found.summary.startswith("The model lacks cubic spring")
+        assert found.summary.startswith("Missing from the model: cubic spring")

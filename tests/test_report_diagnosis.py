@@ -16,6 +16,7 @@ import report_example as example
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import (
     Candidate,
@@ -61,7 +62,6 @@ def candidate(label: str, probability: float, after: float, held: float, **chang
         held,
         120.0 if after < 2 else 1.5,
         11.0,
-        55.0,
         False,
         f"Its signs: mode pairs split. The misfit falls most at 1441.9 Hz for {at}.",
     )
@@ -149,9 +149,9 @@ def flowing(text: str) -> str:
     [
         ("adequate", "Nothing is missing as far as these data can tell"),
         ("effect", "Missing: mesh stiffness loss at sun-planet1"),
-        ("ambiguous", "Two explanations fit equally well"),
-        ("unknown_effect", "Something is missing that the library does not hold"),
-        ("not_enough_data", "Not enough data to tell what is missing"),
+        ("ambiguous", "Two effects explain the data equally well"),
+        ("unknown_effect", "Something is missing that is not in the library"),
+        ("not_enough_data", "Not enough data to show what is missing"),
     ],
 )
 def test_every_verdict_has_its_plain_heading(verdict: VerdictWord, expected: str) -> None:
@@ -160,7 +160,7 @@ def test_every_verdict_has_its_plain_heading(verdict: VerdictWord, expected: str
 
 def test_three_that_fit_alike_are_counted_in_the_heading() -> None:
     three = replace(found("ambiguous"), indistinguishable=((CRACK, OTHER, SUPPORT),))
-    assert diagnosis.heading(three) == "Three explanations fit equally well"
+    assert diagnosis.heading(three) == "Three effects explain the data equally well"
 
 
 def test_probability_is_never_rounded_to_certainty_or_to_nothing() -> None:
@@ -353,19 +353,29 @@ def test_report_begins_with_the_verdict_its_numbers_and_the_command(run: RunResu
     ]
     assert "ema add &#39;results/a b&#39; mesh_stiffness_loss@sun-planet1" in band
     assert "scatter by 18 %" in band
-    assert band.count('class="named"') == 2  # the sun and planet 1 are drawn as the culprits
+    assert band.count('class="named"') == 2  # the sun and planet 1 are marked
 
 
 def test_report_lists_the_candidates_with_size_probability_and_drop(run: RunResults) -> None:
     html = page(run)
     text = html[html.index('<section id="model"') : html.index('<section id="modes"')]
-    for needed in ("fraction 0.340 ± 0.010", "97 %", "3.10 → 1.02", "3.30 → 1.05", "no better than chance"):
+    for needed in ("fraction 0.340 ± 0.010", "97 %", "3.10 → 1.02", "3.30 → 1.05", "not enough evidence"):
         assert needed in text
     assert "no further effect is supported by the data" in text
     assert "Where the misfit sits" not in text
 
 
-def test_report_without_diagnosis_names_no_culprit(base: RunResults) -> None:
+def test_the_sentence_on_what_is_missing_names_one_effect_or_several() -> None:
+    crack, mass = (CRACK, "fraction 0.34 ± 0.01"), ("mass@sun", "mass 0.1 ± 0.01 kg")
+    one, two = (sentences.summary("effect", named, (3.1, 1.02), 0.0) for named in ([crack], [crack, mass]))
+    named = "Missing from the model: mesh stiffness loss at sun-planet1, fraction 0.34 ± 0.01"
+    assert one == f"{named}. Adding this reduces the error from 3.10 to 1.02."
+    assert (
+        two == f"{named}; mass at sun, mass 0.1 ± 0.01 kg. Adding these reduces the error from 3.10 to 1.02."
+    )
+
+
+def test_report_without_diagnosis_marks_no_place(base: RunResults) -> None:
     html = page(base)
     assert 'class="candidates"' not in html
     assert 'class="named"' not in html
@@ -373,7 +383,7 @@ def test_report_without_diagnosis_names_no_culprit(base: RunResults) -> None:
 
 def test_report_names_what_cannot_be_told_apart_and_what_to_measure(base: RunResults) -> None:
     html = page(replace(base, diagnosis=found("ambiguous")))
-    assert "Two explanations fit equally well" in html
+    assert "Two effects explain the data equally well" in html
     assert (
         "These data cannot tell apart: mesh stiffness loss at sun-planet1; planet bearing mistune at planet2."
         in html
@@ -405,7 +415,7 @@ def test_screens_fit_80_columns_without_colour(verdict: VerdictWord, encoding: s
 def test_diagnosis_screen_tells_all_that_matters() -> None:
     text = printed(terminal.diagnosis_screen(found("ambiguous"), "results/a"))
     plain = flowing(text)
-    assert plain.startswith("Two explanations fit equally well What was found, in a sentence.")
+    assert plain.startswith("Two effects explain the data equally well What was found, in a sentence.")
     assert "fraction 0.340 ± 0.010" in text  # never broken
     assert "The misfit falls most at 1441.9 Hz for sun-planet1." in plain
     assert "The misfit falls most at 1441.9 Hz for planet2." in plain

@@ -53,7 +53,7 @@ def test_a_run_is_told_in_fifteen_lines_with_one_story_through_add_and_remove(
     assert summary["effects"] == ["spring@m2"]
     assert summary["diagnosis"]["on_top_of"] == []
     report = (out / "report.html").read_text(encoding="utf-8")
-    assert "The model holds spring at m2 now" in report
+    assert "The model now includes spring at m2" in report
 
     assert ema(capsys, "remove", out, "spring@m2")[0] == 0
     code, text, _ = ema(capsys, "ladder", out, "--json")

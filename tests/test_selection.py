@@ -42,6 +42,7 @@ def judged(
             sizes={"size": EffectSize(gain, 0.1, "N")},
         ),
         gain=gain,
+        needed=3.5,
         doubt=doubt,
         claimed=not doubt,
         base=SimpleNamespace(posterior=SimpleNamespace(error=2.0)),
@@ -190,7 +191,8 @@ def test_no_more_effects_are_added_than_may_be(monkeypatch: pytest.MonkeyPatch) 
     found = steps.select([a.hypothesis, b.hypothesis], SETTINGS.model_copy(update={"most_effects": 1}), [])
     assert found.claimed == (a,)
     assert len(found.rounds) == 2
-    assert _ended(found) == "the most effects that are added by themselves"
+    told = _ended(found, SETTINGS.model_copy(update={"most_effects": 1}))
+    assert told == "the limit of 1 automatically added effects is reached (`most_effects`)"
     assert [claim for _, claim, _ in steps.shares] == [3.5, 3.5]  # not linearised
 
 
@@ -204,8 +206,10 @@ def selected(claimed: list[Any], *rounds: Round) -> Selection:
 
 def test_how_the_search_ended() -> None:
     weak = judged("spring@m2", 1.0, "it gains little")
-    assert _ended(selected([], a_round(judged("x@y", 9.0)), a_round())) == "no further effect to try"
-    told = _ended(selected([], a_round(weak, judged("x@y", 0.0, "none"))))
+    assert (
+        _ended(selected([], a_round(judged("x@y", 9.0)), a_round()), SETTINGS) == "no further effect to try"
+    )
+    told = _ended(selected([], a_round(weak, judged("x@y", 0.0, "none"))), SETTINGS)
     assert told == "the best further effect is spring at m2, and it gains little"
 
 
@@ -225,13 +229,13 @@ def test_candidates_are_the_claimed_ones_with_final_sizes_then_the_group_then_th
     assert found[0].why == "Its signs: signs."
     assert found[2].why == "Not claimed: held-out."
     one = found[1]
-    assert (one.error_before, one.error_after, one.heldout_before, one.heldout_error_after) == (
+    assert (one.error_before, one.error_after, one.heldout_error_before, one.heldout_error_after) == (
         2.0,
         1.0,
         3.0,
         1.5,
     )
-    assert (one.gain, one.threshold, one.title) == (9.0, 3.5, "title of b@x")
+    assert (one.log_evidence, one.threshold, one.title) == (9.0, 3.5, "title of b@x")
     few = SETTINGS.model_copy(update={"candidates": 1})
     four = _candidates(selected([a, b], first, second, third), few, (b, alike), hypotheses, final)
     assert len(four) == 4

@@ -11,10 +11,10 @@ import scipy.stats
 from bench import ema
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.series.acceptance_limits import Range, learn_limits, read_limits
 from ema_pipeline.series.database import SeriesDatabase
 from ema_pipeline.series.features import features_of_series, modes_of_tests
 from ema_pipeline.series.judge import judged_value
-from ema_pipeline.series.limits import Range, learn_limits, read_limits
 from ema_pipeline.series.rows import COLUMNS, Row, TestRow, failed_row
 from ema_pipeline.series.trend import order_of, trends_of
 from ema_pipeline.significance import holm, tolerance_factor

@@ -164,7 +164,7 @@ def errors_shown(tab) -> tuple[float, float]:
     return float(tile.locator(".was").inner_text()), float(tile.locator("strong").inner_text())
 
 
-def test_click_on_the_culprit_and_the_error_falls_in_every_tab(browser, page: Page, out: Path) -> None:
+def test_click_on_the_effect_and_the_error_falls_in_every_tab(browser, page: Page, out: Path) -> None:
     from playwright.sync_api import expect
 
     context = browser.new_context()

@@ -105,8 +105,8 @@ class ModeChanges:
 def mode_changes(a: Mapping[str, MeasuredModes], b: Mapping[str, MeasuredModes]) -> ModeChanges:
     """Match the modes of two tests and compare them.
 
-    Intervals hold each test's own scatter. They do not hold what changes from one set-up to the next without being a
-    change of the structure: temperature, mounting, suspension.
+    Intervals include each test's own scatter. They do not include what changes from one set-up to the next
+    without being a change of the structure: temperature, mounting, suspension.
     """
     modes: list[ModeChange] = []
     only_a, only_b, shifts = [], [], {}

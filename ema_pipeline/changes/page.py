@@ -6,9 +6,9 @@ import base64
 from pathlib import Path
 from typing import Any
 
-from ema_pipeline.changes.compare import Changes
 from ema_pipeline.changes.figures import overlays
 from ema_pipeline.changes.tables import change_lines, modes_table, notes, verdict_text
+from ema_pipeline.changes.two_tests import Changes
 from ema_pipeline.diagnose.sentences import label_text, probability_text, size_text
 from ema_pipeline.files import replace_file
 from ema_pipeline.report.diagnosis_tables import detection_table

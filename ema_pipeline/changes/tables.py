@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from ema_pipeline.changes.compare import Changes
 from ema_pipeline.changes.modes import LEVEL, ModeChange
+from ema_pipeline.changes.two_tests import Changes
 from ema_pipeline.diagnose.sentences import label_text, probability_text
 from ema_pipeline.report.numbers import format_percent, format_value
 from ema_pipeline.report.tables import Row, Table
@@ -25,7 +25,7 @@ def verdict_text(found: Changes) -> str:
             f"library explains what differs. {_of_modes(found)}"
         )
     if diagnosis.verdict == "not_enough_data":
-        return f"The tests have too few modes in common to tell a physical change. {_of_modes(found)}"
+        return f"The tests have too few modes in common to show a physical change. {_of_modes(found)}"
     odds = probability_text(diagnosis.null_probability)
     return f"The same within what these tests can show (probability that nothing changed: {odds})."
 
@@ -66,8 +66,8 @@ def notes(found: Changes) -> list[str]:
             told = ", ".join(f"{c} mode {k} at {f:.2f} Hz" for c, k, f in lone[:6])
             lines.append(f"Modes of {name} alone: {told}{' …' if len(lone) > 6 else ''}.")
     lines.append(
-        "Intervals (± 1 σ) hold each test's own scatter; what a new set-up changes besides (temperature, mounting, "
-        "suspension) is a change to them."
+        "Intervals (± 1 σ) include each test's own scatter; effects of a new set-up (temperature, mounting, "
+        "suspension) are not included and appear as changes."
     )
     return lines
 

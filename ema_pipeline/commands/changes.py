@@ -46,9 +46,9 @@ def changes(
     With a rig both tests are fitted as one problem, in which parts, sensors and calibration are the same. Without one
     modes are matched and compared one by one.
     """
-    from ema_pipeline.changes.compare import changes_content, compare_runs, open_test, write_changes
     from ema_pipeline.changes.page import write_page
     from ema_pipeline.changes.tables import notes, short_modes_table, verdict_text
+    from ema_pipeline.changes.two_tests import changes_content, compare_runs, open_test, write_changes
 
     repeats = _repeats(repeat or [])
     folder = out or Path("results") / f"changes_{a.resolve().name}_{b.resolve().name}"
@@ -116,8 +116,8 @@ def mac(
     """Show the MAC of the modes of test A with those of test B, or with those of the rig's model."""
     import tempfile
 
-    from ema_pipeline.changes.compare import open_test
     from ema_pipeline.changes.matrices import mac_with_model, mac_with_test
+    from ema_pipeline.changes.two_tests import open_test
 
     with tempfile.TemporaryDirectory(prefix="ema-mac-") as scratch, progress(True) as show_stage:
         run_a = open_test(a, rig, Path(scratch) / "A", show_stage)

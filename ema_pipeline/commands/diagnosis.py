@@ -1,4 +1,4 @@
-"""Model against measurement, and the effects that the model is missing."""
+"""The effects that the model is missing: found, added, removed, and the ladder of models."""
 
 from __future__ import annotations
 
@@ -11,46 +11,10 @@ import typer
 
 from ema_pipeline.commands.interrupts import go_on_with
 from ema_pipeline.commands.options import EffectFiles, Json, Out, Overrides, Quiet
-from ema_pipeline.commands.screen import program, progress, show, show_json
+from ema_pipeline.commands.screen import program, progress, show, show_summary
 
 if TYPE_CHECKING:
-    from ema_pipeline.report.results import RunResults
     from ema_pipeline.run.types import Run
-
-
-def compare(out: Out, effect_file: EffectFiles = None, json: Json = False) -> None:
-    """Show where model and measurement differ, in units of the measurement's uncertainty."""
-    from ema_pipeline.job import run_on
-    from ema_pipeline.kinds import require_judge, stages_of
-    from ema_pipeline.report import terminal
-    from ema_pipeline.report.simulation import error_lines
-    from ema_pipeline.run.opening import existing_run
-    from ema_pipeline.stages.results import load_results
-
-    with progress(False) as show_stage:
-        stage = "correlate" if "correlate" in stages_of(existing_run(out)) else "ladder"
-        run, _ = run_on(out, [stage], show=show_stage, effect_files=effect_file or [])
-    require_judge(run, "compare")
-    results = load_results(run)
-    if results.loops is not None:
-        from ema_pipeline.kinds.loops import own_models
-        from ema_pipeline.report.loops import comparison_rows, comparison_screen
-
-        loops, models = results.loops.loops, own_models(run)
-        if json:
-            show_json({"loops": comparison_rows(loops, models)})
-        else:
-            show(comparison_screen(loops, models))
-    elif results.comparison is not None:
-        if json:
-            _show_json(results, "comparison")
-        else:
-            show(terminal.comparison_tables(results.comparison))
-    elif json:
-        _show_json(results, "simulation")
-    else:
-        for line in error_lines(results.simulation):
-            show(line)
 
 
 def diagnose(
@@ -82,7 +46,7 @@ def diagnose(
     if quiet:
         return
     if json:
-        _show_json(load_results(run), "diagnosis", "ladder")
+        show_summary(load_results(run), "diagnosis", "ladder")
         return
     show(terminal.diagnosis_screen(found, str(out), program(), suspicions(results)))
     if auto and supported:
@@ -137,7 +101,7 @@ def _change(
     with progress(quiet) as show_stage:
         run_on(out, AFTER_EFFECTS, [], show_stage, effect_files)
     if not quiet and not json:
-        show(f"Fit, comparison and report hold this model now: {run.store.folder / 'report.html'}")
+        show(f"Fit, comparison and report now use this model: {run.store.folder / 'report.html'}")
 
 
 def ladder(out: Out, effect_file: EffectFiles = None, json: Json = False) -> None:
@@ -147,21 +111,13 @@ def ladder(out: Out, effect_file: EffectFiles = None, json: Json = False) -> Non
     _show_ladder(existing_run(out, effect_file or []), json)
 
 
-def _show_json(results: RunResults, *parts: str) -> None:
-    """Parts of what summary.json holds."""
-    from ema_pipeline.report.summary_files import finite, summary
-
-    content = finite(summary(results))
-    show_json({part: content[part] for part in parts if part in content})
-
-
 def _show_ladder(run: Run, json: bool = False) -> None:
     from ema_pipeline.report import terminal
     from ema_pipeline.stages.results import load_results
 
     results, folder = load_results(run), run.store.folder
     if json:
-        _show_json(results, "effects", "ladder")
+        show_summary(results, "effects", "ladder")
     elif run.info.effects and results.ladder is not None:
         show(terminal.ladder_screen(results.ladder))
     elif (

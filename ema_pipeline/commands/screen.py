@@ -18,6 +18,7 @@ from ema_pipeline.plain_text import printable
 
 if TYPE_CHECKING:
     from ema_pipeline.pipeline import ShowStage
+    from ema_pipeline.report.results import RunResults
     from ema_pipeline.run.types import Progress
 
 
@@ -50,6 +51,14 @@ def show_json(content: Any) -> None:
 
     text = json.dumps(content, indent=2, ensure_ascii=False)
     typer.echo("".join(c if printable(c) == c else json.dumps(c)[1:-1] for c in text))
+
+
+def show_summary(results: RunResults, *parts: str) -> None:
+    """Show parts of what summary.json holds, as JSON."""
+    from ema_pipeline.report.summary_files import finite, summary
+
+    content = finite(summary(results))
+    show_json({part: content[part] for part in parts if part in content})
 
 
 @contextmanager

@@ -55,7 +55,7 @@ def run(
 ) -> None:
     """Run every raw folder under TREE, and keep a table of all in S/series.db and S/tests.csv.
 
-    A test that fails is a row with its reason; unchanged tests are skipped; a killed series goes on where it was.
+    A test that fails is a row with its reason; unchanged tests are skipped; a killed series resumes where it stopped.
     """
     from ema_pipeline.series.database import SeriesDatabase
     from ema_pipeline.series.export import export_series
@@ -190,8 +190,8 @@ def limits(
     json: Json = False,
 ) -> None:
     """Learn limits from a good lot, as normal tolerance intervals; edit the file as you like."""
+    from ema_pipeline.series.acceptance_limits import good_lot, learn_limits, write_limits
     from ema_pipeline.series.features import features_of, modes_of_tests, reference_of
-    from ema_pipeline.series.limits import good_lot, learn_limits, write_limits
 
     with _opened(s) as database:
         lot = good_lot(database.table("tests"), tests or ())
@@ -227,8 +227,8 @@ def judge(
     from dataclasses import asdict
 
     from ema_pipeline.report.summary_files import finite
+    from ema_pipeline.series.acceptance_limits import read_limits
     from ema_pipeline.series.judge import judge_series
-    from ema_pipeline.series.limits import read_limits
     from ema_pipeline.series.screens import judged_counts, judged_table
 
     with _opened(s) as database:
@@ -302,8 +302,8 @@ def trend(
         return
     show(trend_table(found, order))
     show(
-        f"Drifts and steps are told at p < {LEVEL:g} over all features together (Holm); control limits: mean ± 2.66 "
-        f"mean moving ranges (ISO 7870-2). Modes have the numbers of test {numbers}."
+        f"Drifts and steps are reported at p < {LEVEL:g} over all features together (Holm); control limits: mean ± "
+        f"2.66 mean moving ranges (ISO 7870-2). Modes have the numbers of test {numbers}."
     )
 
 
@@ -317,7 +317,7 @@ def report(
     quiet: Quiet = False,
 ) -> None:
     """Write one page: a table that sorts and filters, distributions, outliers, links to each test's report."""
-    from ema_pipeline.series.limits import read_limits
+    from ema_pipeline.series.acceptance_limits import read_limits
     from ema_pipeline.series.page import write_page
 
     file = limits or s / "limits.toml"

@@ -17,8 +17,8 @@ from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, averaged, within_scatter
 
 HELD_OUT_TIE = 1.0
-"""Log density of data held out by which a claim may be behind: few modes foretell a small effect no better than
-none."""
+"""Log density of data held out by which a claim may be behind: few modes predict no better with
+a small effect than without."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,8 @@ class Judged:
         Of data held out, without and with it.
     doubt : str
         Why it is not claimed; empty where it is.
+    needed : float
+        Log evidence that a claim needs.
     """
 
     ranked: Ranked
@@ -47,6 +49,7 @@ class Judged:
     held_before: HeldOut
     held_after: HeldOut
     doubt: str
+    needed: float
 
     @property
     def hypothesis(self) -> Hypothesis:
@@ -82,26 +85,39 @@ def judge(
     base = at_scatters(observations, ranking.base, ranked.fit.posterior.scatters)
     base, mended = within_scatter(observations, base), within_scatter(observations, ranked.fit)
     before = after = NOTHING_HELD_OUT
-    doubt = _weak(ranked, gain, settings, nothing)
+    doubt = _weak(observations, ranked, gain, settings, nothing)
     if not doubt:
         before, after = held_out(observations, base), held_out(observations, mended)
         doubt = _contradicted(base, mended, before, after) or of_one_shape(base, mended, settings)
         name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, averaged(observations, mended)))
-    return Judged(ranked, name, gain, base, mended, before, after, doubt)
+    return Judged(ranked, name, gain, base, mended, before, after, doubt, settings.claim)
 
 
-def _weak(ranked: Ranked, gain: float, settings: DiagnoseSettings, nothing: float) -> str:
+def _weak(
+    observations: Observations, ranked: Ranked, gain: float, settings: DiagnoseSettings, nothing: float
+) -> str:
     if gain < settings.claim:
-        return f"the log evidence that it gains, {gain:.1f}, is below {settings.claim:g}"
+        return f"its gain in log evidence, {gain:.1f}, is below {settings.claim:g}"
     if nothing > settings.doubt:
-        return f"that nothing is missing has a probability of {probability_text(nothing)}"
-    if not ranked.hypothesis.extends:
+        return (
+            f"the probability that nothing is missing, {probability_text(nothing)}, is above "
+            f"{probability_text(settings.doubt)}"
+        )
+    if not ranked.hypothesis.size_cannot_be_zero:
         p = ranked.hypothesis.placed.effect.parameters[0]
         i = ranked.fit.posterior.unknowns.index[ranked.hypothesis.placed.parameter_name(p.name)]
         x, std = ranked.fit.posterior.x[i], _std_of_first(ranked)
-        if abs(x) < settings.sigmas * std:
-            return f"its size is within {settings.sigmas:g} standard deviations of nothing"
+        sigmas = sigmas_asked(observations, ranked.hypothesis, settings)
+        if abs(x) < sigmas * std:
+            return f"its size is within {sigmas:g} standard deviations of zero"
     return ""
+
+
+def sigmas_asked(observations: Observations, hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
+    """Distance from nothing that a claim asks of a size, in its standard deviations."""
+    if observations.linearised and not hypothesis.placed.effect.linear:
+        return settings.linearised_sigmas
+    return settings.sigmas
 
 
 def _std_of_first(ranked: Ranked) -> float:
@@ -114,9 +130,9 @@ def _std_of_first(ranked: Ranked) -> float:
 
 def _contradicted(base: Fit, mended: Fit, before: HeldOut, after: HeldOut) -> str:
     if mended.posterior.error >= base.posterior.error:
-        return "the error does not fall with it"
+        return "adding it does not reduce the error"
     if after.log_density < before.log_density - HELD_OUT_TIE:
-        return "data held out are predicted worse with it"
+        return "held-out data are predicted worse when it is added"
     return ""
 
 
@@ -131,7 +147,7 @@ def of_one_shape(base: Fit, mended: Fit, settings: DiagnoseSettings) -> str:
     left = evidence[1] - evidence[0] - float(np.max((costs[0] - costs[1])[mixed], initial=0.0))
     if left < settings.claim:
         return (
-            f"without the shape of one mode that is close to another the log evidence that it gains is {left:.1f}, "
-            f"below {settings.claim:g}"
+            f"its gain in log evidence drops to {left:.1f}, below {settings.claim:g}, when the shape of one closely "
+            "spaced mode is left out"
         )
     return ""

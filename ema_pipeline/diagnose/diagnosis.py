@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.claims import Judged
+from ema_pipeline.diagnose.detection_limits import detection_limits
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
-from ema_pipeline.diagnose.limits import detection_limits
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names
 from ema_pipeline.diagnose.next_test import next_measurement
@@ -53,7 +53,7 @@ def diagnose(
     notes : sequence of str
         Remarks on the data that a reader should see beside the verdict.
     linear : bool
-        True for effects whose answer is in proportion to the force only.
+        True for effects whose response is proportional to the force only.
     hypotheses : sequence of Hypothesis, optional
         What may be missing; every effect at every place of the rig where left out.
 
@@ -91,7 +91,7 @@ def diagnose(
         told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.label in names]
     nothing = found.rounds[0].probabilities[NOTHING]
     scatter = learned_scatters(observations, found.final)
-    ladder = Ladder(rungs, *noise(found.final), note=_ended(found), scatters=scatter)
+    ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
     remarks = list(notes)
     outlying = outlying_parts(found.final)
     remarks.insert(0, sentences.standing_out(outlying, found.final.posterior.scatters.get(PART_SCATTER, 0.0)))
@@ -132,15 +132,15 @@ def _candidates(
         ):  # it took the place of an earlier claim once others were known
             told = against_nothing(j.hypothesis, j.gain, hypotheses, settings, k)
         sizes = {n: final.get(f"{j.named.label}.{n}", s) for n, s in j.named.sizes.items()}
-        mine.append(replace(_candidate(j, told, settings, True), parameters=sizes))
+        mine.append(replace(_candidate(j, told, True), parameters=sizes))
     taken = {c.label for c in mine}
     rest = [j for j in last.judged if j.named.label not in taken]
     rest.sort(key=lambda j: (j not in group, -j.gain))
-    others = [_candidate(j, last.probabilities.get(j.named.label, 0.0), settings, False) for j in rest]
+    others = [_candidate(j, last.probabilities.get(j.named.label, 0.0), False) for j in rest]
     return (*mine, *others)[: max(settings.candidates, len(mine) + len(group))]
 
 
-def _candidate(j: Judged, probability: float, settings: DiagnoseSettings, claimed: bool) -> Candidate:
+def _candidate(j: Judged, probability: float, claimed: bool) -> Candidate:
     effect = j.named.name.placed.effect
     why = f"Its signs: {effect.signs}." if claimed or j.claimed else f"Not claimed: {j.doubt}."
     return Candidate(
@@ -151,11 +151,10 @@ def _candidate(j: Judged, probability: float, settings: DiagnoseSettings, claime
         parameters=dict(j.named.sizes),
         error_before=j.base.posterior.error,
         error_after=j.after.posterior.error,
-        heldout_before=j.held_before.error,
+        heldout_error_before=j.held_before.error,
         heldout_error_after=j.held_after.error,
-        gain=j.gain,
-        threshold=settings.claim,
         log_evidence=j.gain,
+        threshold=j.needed,
         claimed=claimed,
         why=why,
         equivalents=j.named.equivalents,
@@ -175,10 +174,11 @@ def _groups(
     return tuple(groups)
 
 
-def _ended(found: Selection) -> str:
+def _ended(found: Selection, settings: DiagnoseSettings) -> str:
+    """Why no further effect was added."""
     best = found.rounds[-1].judged[0] if found.rounds[-1].judged else None
     if best is None:
         return "no further effect to try"
     if best.claimed:
-        return "the most effects that are added by themselves"
+        return f"the limit of {settings.most_effects} automatically added effects is reached (`most_effects`)"
     return f"the best further effect is {sentences.label_text(best.named.label)}, and {best.doubt}"

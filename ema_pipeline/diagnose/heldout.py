@@ -1,4 +1,4 @@
-"""How well a model foretells what its fit has not seen."""
+"""How well a model predicts what its fit has not seen."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ NOTHING_HELD_OUT = HeldOut(float("nan"), float("nan"))
 
 
 def held_out(observations: Observations, fit: Fit) -> HeldOut:
-    """Fit to all but one part, foretell that part, in turn; scatters as they are in `fit`.
+    """Fit to all but one part, predict that part, in turn; scatters as they are in `fit`.
 
-    No part may lie further out than parts scatter: a model that bends one as far as an effect would has the effect,
-    under another name, and foretells as well.
+    No part may lie further out than parts scatter: otherwise a part moved far from its prior would stand in for the
+    effect and predict just as well.
     """
     squares, count, density = 0.0, 0, 0.0
     for kept, out in observations.folds():
@@ -78,7 +78,7 @@ def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, 
 
 
 def _in_blocks(found: Residuals, covariance: NDArray[np.float64]) -> tuple[float, float]:
-    """Sum of squares in which errors count, and -log density, each value foretold from those before it."""
+    """Sum of squares in which errors count, and -log density, each value predicted from those before it."""
     spread = np.eye(len(found.values)) + found.jacobian @ covariance @ found.jacobian.T
     factor = scipy.linalg.cholesky(spread, lower=True, check_finite=False)
     values = scipy.linalg.solve_triangular(factor, found.values, lower=True, check_finite=False)

@@ -81,8 +81,8 @@ class Hypothesis:
         return all(n.placed.effect.generic for n in self.names)
 
     @property
-    def extends(self) -> bool:
-        """True where the size cannot be zero: the effect is absent at the end of its range only."""
+    def size_cannot_be_zero(self) -> bool:
+        """True where the effect is absent at the end of its range only, as a support that is infinitely stiff."""
         return any(SizeMap.of(p, p.scale).logarithmic for p in self.placed.effect.parameters[:1])
 
     def starts(self) -> list[dict[str, float]]:

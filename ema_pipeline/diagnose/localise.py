@@ -1,4 +1,4 @@
-"""Where a misfit sits and what it acts like, whatever the library holds."""
+"""Where a misfit is and what it acts like, whatever the library includes."""
 
 from __future__ import annotations
 

@@ -188,7 +188,7 @@ def _told_apart(
             best = max(best, further, key=lambda f: f.separation)
     if left:
         text = (
-            f"A loop {best.text} would tell {label_text(mine)} from {label_text(left[0])}: a difference of "
+            f"A loop {best.text} would distinguish {label_text(mine)} from {label_text(left[0])}: a difference of "
             f"{best.separation:.2g} standard deviations is expected."
         )
         return dataclasses.replace(
@@ -313,8 +313,8 @@ def _next_loop(observations: LoopObservations) -> str:
     if max(frequencies) < (1 + SAME_FREQUENCY) * min(frequencies):
         return (
             f"Repeat the loops at {0.5 * min(frequencies):.3g} and at {2 * max(frequencies):.3g} Hz: what stays "
-            "is friction or play, what changes depends on the rate. Ten cycles or more of each loop would tell "
-            "scatter from what repeats."
+            "is friction or play, what changes depends on the rate. Ten cycles or more of each loop would "
+            "distinguish scatter from what repeats."
         )
     return (
         "Repeat one loop about another mean position, and record ten cycles or more of each: what moves with "

@@ -26,7 +26,7 @@ _ADDED_SHARE = 0.1
 _LEAST_SHAPE_STD = 0.02
 _LEAST_FREQUENCY_STD = 1e-3
 _WORTH = 1.0
-"""Difference, in standard deviations, below which a measurement is not worth its name."""
+"""Difference, in standard deviations, below which a measurement is not worth proposing."""
 _CERTAIN = 0.9
 
 
@@ -64,10 +64,10 @@ def next_measurement(
     if not options or options[0].separation < _WORTH:
         if verdict == "adequate":
             return ""
-        return f"No single further measurement that was tried would tell {names[0]} from {names[1]}."
+        return f"No single further measurement that was tried would distinguish {names[0]} from {names[1]}."
     best_option = options[0]
     return (
-        f"{best_option.text} would tell {names[0]} from {names[1]}: a difference of "
+        f"{best_option.text} would distinguish {names[0]} from {names[1]}: a difference of "
         f"{best_option.separation:.1f} standard deviations is expected."
     )
 

@@ -1,7 +1,8 @@
 """Every hypothesis fitted on top of the model as it stands, and ranked by its evidence.
 
-Local optima are the only cause of wrong names: a base model that is stuck lends fake gains to whatever frees it. So
-fits are annealed, and the base and every hypothesis are begun again from the best values known of all else.
+Most wrong names come from local optima: if the base fit is stuck in one, any hypothesis that escapes it appears to gain
+evidence. So fits are annealed, and the base and every hypothesis are begun again from the best values known of all
+else.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.pool import spread
-from ema_pipeline.diagnose.score import Score, scores
+from ema_pipeline.diagnose.parallel import spread
+from ema_pipeline.diagnose.score import UNSEEN, Score, scores
 from ema_pipeline.inference import Posterior, beyond_scatter
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import (
@@ -49,14 +50,15 @@ _UNPROMISING = 6
 tenths: more than `FINALISTS`, so that the reader sees what comes next."""
 _PROMISING = 1.0
 """Log evidence that is something: a third of what a claim needs."""
-_UNSEEN = 1e6
-"""1 σ of a size, in units of its prior, from which the data hold nothing of it: it cannot be told from nothing."""
 _GRID = tuple(np.linspace(-2.0, 2.0, 9))
 """Unknowns of sizes, in units of their prior σ, at which an effect that adds modes is tried."""
 _GRID_STARTS = 2
 _GRID_HEAT = 30.0
 """Factor on the uncertainties there: two neighbours of the grid differ by a third in the frequency of an added mode."""
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
+_UNHEATED: Schedule = ((1.0, 6), (1.0, 14))
+"""Where starts are given. Heated, the data weigh less than the prior, which takes the first size to nothing, where the
+shape of a law (the yield of hysteresis) has no slope left."""
 CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
 _BETTER = 0.05
@@ -96,7 +98,7 @@ class Ranking:
     ranked : tuple of Ranked
         Best first.
     unpaired : float
-        What measured modes without a partner, and unseen ones of the model, cost with every one of them at least.
+        Smallest penalty for unpaired modes over all hypotheses.
     """
 
     base: Fit
@@ -134,7 +136,7 @@ def rank(
     """
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
     promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models)}
-    hypotheses = [h for h in hypotheses if h.label not in promise or promise[h.label].std < _UNSEEN]
+    hypotheses = [h for h in hypotheses if h.label not in promise or promise[h.label].std < UNSEEN]
     stuck = base.posterior.error > _EXPLAINED or base.posterior.residuals.penalty > unpaired
     settled = base if stuck else learned(observations, base)
     near = not stuck and not np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT))
@@ -193,10 +195,9 @@ def _first_fit(
         fit = refined(observations, model, unknowns.clipped(begin))
         if fit.posterior.cost <= base.posterior.cost:
             return fit.posterior
-    schedule = _FROM_GRID if hypothesis.extends else QUICK
-    return annealed(
-        observations, model, _starts(observations, problem, hypothesis, begin), schedule
-    ).posterior
+    schedule = _UNHEATED if hypothesis.begun else _FROM_GRID if hypothesis.size_cannot_be_zero else QUICK
+    starts = _starts(observations, problem, hypothesis, begin)
+    return annealed(observations, model, starts, schedule).posterior
 
 
 def _starts(
@@ -211,7 +212,7 @@ def _starts(
     """
     unbent = begin.copy()
     unbent[[bool(s) for s in problem.unknowns.scatter]] = 0.0
-    if hypothesis.extends:
+    if hypothesis.size_cannot_be_zero:
         plans = [
             (x, start)
             for x in (begin, unbent)

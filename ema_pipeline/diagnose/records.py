@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
-from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.rungs import (
     learned_scatters,
@@ -35,30 +35,25 @@ from ema_pipeline.observations.fitting import Fit, Model, learned, refined
 from ema_pipeline.observations.records import RecordObservations
 
 SEARCHED = 2048
-"""Samples of all responses together, in windows, on which hypotheses are compared: enough for evidence by the hundred,
-quick enough for all."""
+"""Samples of all responses together, in windows, on which hypotheses are compared: enough to give gains of hundreds
+in log evidence, quick enough for all."""
 _LOST = 3.0
-"""Error in whole records, over that in windows, from which a simulation has lost step with the measured motion."""
+"""Error in whole records, over that in windows, from which a simulation has drifted out of phase with the measured
+motion."""
 _OF_OTHERS = 0.02
 """Share of the log evidence of earlier claims that a further one must gain: what the form of a law leaves of the
 motion, friction that sticks and slips for one, looks like another effect."""
+_FURTHER_FINALISTS = 3
+"""Finalists beside those that lead at wide scatters: noise of a tenth, with which fits begin, hides most of a small
+effect that is plain at the noise that the records have."""
+_PREDICTED_BETTER = 1e-3
+"""Share of the error of held-out records that a claim must take away."""
 _SAME_CHANGE = 1e-5
 """Relative difference of two changes of the linear system below which they are the same physics."""
 _TRIAL = 1e-6
 """Change of a logarithm by which a matrix is differentiated."""
-_GENERIC = (
-    "cubic_spring",
-    "quadratic_spring",
-    "dry_friction",
-    "hysteresis",
-    "quadratic_damping",
-    "spring",
-    "mass",
-    "damper",
-)
-"""Effects that are sought at every DOF and between any two bodies; what is simplest to say comes first."""
-_OUT_OF_STEP = (
-    "the model is fitted to windows of a few cycles; through whole records it does not stay in step"
+_OUT_OF_PHASE = (
+    "the model is fitted to windows of a few cycles; over whole records the simulation drifts out of phase"
 )
 
 
@@ -89,6 +84,8 @@ def diagnose_records(
         Its search used windows of the records; its ladder holds the whole ones, where the model can follow them.
     """
     settings = settings or DiagnoseSettings()
+    further = max(settings.further_finalists, _FURTHER_FINALISTS)
+    settings = settings.model_copy(update={"further_finalists": further})
     windows = in_windows(observations)
     hypotheses = record_hypotheses(observations, library, known)
     found = diagnose(
@@ -104,28 +101,33 @@ def diagnose_records(
     progress(0.85, "whole records")
     searched = found.ladder
     ladder = whole_ladder(observations, library, searched, settings.processes)
-    while doubt := _unconfirmed(found, ladder, settings):
-        lost = max(0.0, _claimed(found)[-1].gain - _last_gain(ladder))
+    while doubt := _unconfirmed(observations, found, ladder, settings):
+        lost = max(0.0, _claimed(found)[-1].log_evidence - _last_gain(ladder))
         found, searched = _withdrawn(found, searched, doubt, lost, settings)
         ladder = whole_ladder(observations, library, searched, settings.processes)
     return _with_whole(found, ladder)
 
 
-def _unconfirmed(found: Diagnosis, ladder: Ladder, settings: DiagnoseSettings) -> str:
-    """Why whole records do not support the last claim; empty where they do, or tell nothing of it.
+def _unconfirmed(
+    observations: RecordObservations, found: Diagnosis, ladder: Ladder, settings: DiagnoseSettings
+) -> str:
+    """Why whole records do not support the last claim; empty where they do, or carry no information on it.
 
     Windows take coarser steps, and states of their own, which an effect too many may make up for.
     """
-    if len(ladder.rungs) < 2 or _OUT_OF_STEP in ladder.note:
+    if len(ladder.rungs) < 2 or _OUT_OF_PHASE in ladder.note:
         return ""
     gain = _last_gain(ladder)
     if gain < settings.claim:
-        return f"the log evidence that it gains in whole records, {gain:.1f}, is below {settings.claim:g}"
-    *before, last = (c.gain for c in _claimed(found))
+        return f"its gain in log evidence over whole records, {gain:.1f}, is below {settings.claim:g}"
+    held = [r.heldout_error for r in ladder.rungs[-2:]]
+    if observations.held_out and not held[1] < (1 - _PREDICTED_BETTER) * held[0]:
+        return "it does not predict held-out records better"
+    *before, last = (c.log_evidence for c in _claimed(found))
     if last < _OF_OTHERS * sum(before):
         return (
-            f"the log evidence that it gains, {last:.1f}, is below {100 * _OF_OTHERS:g} % of what the others gain, "
-            "whose laws are not known better"
+            f"its gain in log evidence, {last:.1f}, is below {100 * _OF_OTHERS:g} % of that of the other effects, "
+            "whose laws are not known more exactly"
         )
     return ""
 
@@ -178,7 +180,7 @@ def _nothing_claimed(found: Diagnosis, error: float, lost: float, settings: Diag
 
 
 def in_windows(observations: RecordObservations) -> RecordObservations:
-    """The same test by windows of its records, with coarser steps, and what loose values absorb left out."""
+    """The same test by windows of its records, with coarser steps, and what free values absorb left out."""
     windows = observations.in_windows(SEARCHED)
     return observations.with_records(windows.data, windows.held_out, observations.basis.calibrated(), COARSE)
 
@@ -198,17 +200,16 @@ def record_hypotheses(
 ) -> tuple[Hypothesis, ...]:
     """The generic effects, and the user's own, at every DOF and between any two bodies.
 
-    What changes the linear system as a loose value of the rig does, is that value.
+    An effect that changes the linear system like a free rig parameter is left out.
     """
     skip = set(known)
     assembly = observations.basis.rig.assembly(observations.configuration)
-    own = (
-        [] if observations.modal else [e for e in library.values() if e.id not in _GENERIC and not e.generic]
-    )
+    anywhere = _sought_anywhere(library)
+    ids = {e.id for e in anywhere}
+    own = [] if observations.modal else [e for e in library.values() if e.id not in ids]
     placed = [PlacedEffect(e, place) for e in own for place in e.find_places(assembly)]
     for place in _places(observations):
-        for effect_id in _GENERIC:
-            effect = library[effect_id].at(assembly, place)
+        for effect in (e.at(assembly, place) for e in anywhere):
             if effect.fits(assembly, place) and not (observations.modal and effect.linear):
                 placed.append(PlacedEffect(effect, place))
     loose = _loose_columns(observations)
@@ -221,6 +222,12 @@ def record_hypotheses(
         if change is None or not _spanned(change, loose):
             _grouped(groups, Name(scaled, {}), change)
     return tuple(Hypothesis(tuple(names), begun=size_starts(names[0].placed)) for _, names in groups)
+
+
+def _sought_anywhere(library: Mapping[str, Effect]) -> list[Effect]:
+    """Effects that are sought at every DOF and between any two bodies; what is simplest to say comes first."""
+    found = [e for e in library.values() if e.generic or e.records_order is not None]
+    return sorted(found, key=lambda e: (e.records_order is None, e.records_order or 0, e.id))
 
 
 def _places(observations: RecordObservations) -> tuple[str, ...]:
@@ -247,7 +254,7 @@ def whole_ladder(
 ) -> Ladder:
     """The rungs of a ladder that was found on windows, fitted to whole records, shared among processes.
 
-    Where motion depends so much on its start that the model loses step in them, the fits to windows stay.
+    Where motion depends so much on its start that the model drifts out of phase in them, the fits to windows stay.
     """
     whole = _refitted(observations, library, searched, processes)
     limit = _LOST * max(searched.rungs[-1].error, 1.0)
@@ -257,8 +264,8 @@ def whole_ladder(
     scatters = {s.name: s.learned for s in searched.scatters}
     rungs = tuple(_with_calibration(windows, library, r, scatters) for r in searched.rungs)
     told = searched.note  # of a diagnosis, whose ladder may have come this way before
-    if _OUT_OF_STEP not in told:
-        told = f"{told}; {_OUT_OF_STEP}" if told else _OUT_OF_STEP
+    if _OUT_OF_PHASE not in told:
+        told = f"{told}; {_OUT_OF_PHASE}" if told else _OUT_OF_PHASE
     return dataclasses.replace(searched, rungs=rungs, note=told)
 
 
@@ -412,7 +419,7 @@ def _can_be_simulated(observations: RecordObservations, placed: PlacedEffect) ->
 
 
 def _spanned(change: NDArray[np.float64], loose: NDArray[np.float64]) -> bool:
-    """True where loose values of the rig make the same change together."""
+    """True where free values of the rig make the same change together."""
     if not np.any(change):
         return True
     factors = np.linalg.lstsq(loose, change, rcond=1e-12)[0]

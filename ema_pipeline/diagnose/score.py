@@ -1,4 +1,4 @@
-"""What an effect promises to first order: the gain of one step from the model as it stands."""
+"""The gain in evidence that is expected of an effect to first order: one step from the model as it stands."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.effects.base import effect_of
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, transferred
+
+UNSEEN = 1e6
+"""1 σ of a size, in units of its prior, above which the data carry no information on it."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ def scores(
     found = []
     factor = Marginal(base)
     for hypothesis in hypotheses:
-        if hypothesis.extends:
+        if hypothesis.size_cannot_be_zero:
             continue
         model = models[hypothesis.label] if models else base.model.plus(hypothesis.placed, hypothesis.scales)
         problem = model.problem(observations)

@@ -1,4 +1,5 @@
-"""Forward selection: the best supported effect is added, and the rest is asked again on top of it."""
+"""Forward selection: the best supported effect is added, and the remaining hypotheses are tested again with it in the
+model."""
 
 from __future__ import annotations
 

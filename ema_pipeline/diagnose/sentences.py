@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from ema_pipeline.diagnose.types import NOT_TOLD, EffectSize, VerdictWord
+from ema_pipeline.diagnose.types import NOT_DETERMINED, EffectSize, VerdictWord
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
 
 _SHOWN = 3
@@ -41,8 +41,8 @@ def size_text(sizes: Mapping[str, EffectSize]) -> str:
 
 
 def _one_size(s: EffectSize) -> str:
-    if not s.told:
-        return NOT_TOLD
+    if not s.determined:
+        return NOT_DETERMINED
     return f"{s.value:.4g} ± {s.std:.2g}{'' if s.unit in ('', '1') else ' ' + s.unit}"
 
 
@@ -55,7 +55,7 @@ def summary(
     ----------
     verdict : str
     claimed : sequence of (label, size)
-        What is claimed, or explains the data alike.
+        What is claimed, or explains the data equally well.
     error : (float, float)
         Before and after.
     nothing : float
@@ -64,23 +64,30 @@ def summary(
     before, after = error
     named = "; ".join(f"{label_text(label)}, {size}" for label, size in claimed)
     if verdict == "effect":
-        return f"The model lacks {named}. With it the error falls from {before:.2f} to {after:.2f}."
+        added = "these" if len(claimed) > 1 else "this"
+        return f"Missing from the model: {named}. Adding {added} reduces the error from {before:.2f} to {after:.2f}."
     if verdict == "ambiguous":
-        return f"Several effects explain the data alike: {named}. The error falls from {before:.2f} to {after:.2f}."
+        return (
+            f"Several effects explain the data equally well: {named}. Adding one of them reduces the error from "
+            f"{before:.2f} to {after:.2f}."
+        )
     if verdict == "adequate":
         odds = f"Probability that nothing is missing: {probability_text(nothing)}."
         return f"The model explains the data: error {before:.2f}. {odds}"
     if verdict == "unknown_effect":
-        best = f" The best that the library has is {named}." if named else ""
-        return f"The model does not explain the data (error {after:.2f}), and no effect in the library mends it.{best}"
-    return "These data do not suffice to tell what is missing."
+        verb = "are" if len(claimed) > 1 else "is"
+        best = f" The closest {verb} {named}." if named else ""
+        failed = f"The model does not explain the data (error {after:.2f})"
+        return f"{failed}, and no effect in the library corrects this.{best}"
+    return "These data are not sufficient to show what is missing."
 
 
 def standing_out(parts: Mapping[str, float], scatter: float) -> str:
-    """Parts that deviate more than parts do; empty without any."""
+    """Parts that deviate more than their scatter; empty without any."""
     if not parts:
         return ""
     named = ", ".join(f"{name} {100 * value:+.0f} %" for name, value in list(parts.items())[:_SHOWN])
     return (
-        f"Parts that stand out from their like: {named}; all others scatter by {100 * scatter:.1f} % (1 σ)."
+        f"Parts that deviate from similar parts by more than the scatter: {named}; all others scatter by "
+        f"{100 * scatter:.1f} % (1 σ)."
     )

@@ -6,6 +6,9 @@ from pydantic import Field
 
 from ema_pipeline.settings import Settings
 
+ERROR_LIMIT = 1.5
+"""Error above which a model does not explain the data."""
+
 
 class DiagnoseSettings(Settings):
     """How missing physics is looked for."""
@@ -17,14 +20,14 @@ class DiagnoseSettings(Settings):
         default=0.6,
         gt=0,
         lt=1,
-        description="The same once an effect was found: a rig seldom misses two.",
+        description="The same once an effect was found: a model seldom misses two effects.",
     )
     doubt: float = Field(
         default=0.2,
         gt=0,
         lt=1,
-        description="Probability of nothing up to which an effect is claimed; the more hypotheses there are, the more "
-        "evidence one of them needs.",
+        description="Largest probability that nothing is missing at which an effect is still claimed; the more "
+        "hypotheses there are, the more evidence one of them needs.",
     )
     generic_prior: float = Field(
         default=0.3,
@@ -35,35 +38,49 @@ class DiagnoseSettings(Settings):
     claim: float = Field(
         default=3.5,
         gt=0,
-        description="Log evidence gained from which an effect is claimed: a Bayes factor of 33, strong evidence after "
-        "Kass and Raftery (1995).",
+        description="Smallest gain in log evidence at which an effect is claimed: a Bayes factor of 33, strong "
+        "evidence after Kass and Raftery (1995).",
     )
     linearised: float = Field(
         default=0.1,
         ge=0,
         lt=1,
-        description="Share of the log evidence gained by effects that depend on the amplitude which a further effect "
-        "must gain besides: what equivalent linearisation leaves out of the first looks like a second one.",
+        description="Once amplitude-dependent effects are claimed, a further effect must gain this share of their log "
+        "evidence in addition: the residual error of equivalent linearisation can look like a second effect.",
     )
     sigmas: float = Field(
-        default=2.0, gt=0, description="Distance of a claimed size from nothing, in its standard deviations."
+        default=2.0,
+        gt=0,
+        description="Smallest distance of a claimed size from zero, in its standard deviations.",
+    )
+    linearised_sigmas: float = Field(
+        default=3.0,
+        gt=0,
+        description="The same for an effect that depends on the amplitude, in tests at several force levels. Those of "
+        "true effects are four or more: equivalent linearisation gives sizes to a fifth or a quarter. Motion that it "
+        "does not describe gains evidence with about two.",
     )
     alike: float = Field(
         default=3.0,
         gt=0,
-        description="Difference of log evidence within which two effects explain the data alike (a factor of 20).",
+        description="Difference of log evidence within which two effects explain the data equally well (a factor of "
+        "20).",
     )
     error_limit: float = Field(
-        default=1.5, gt=1, description="Error up to which a model counts as one that explains the data."
+        default=ERROR_LIMIT,
+        gt=1,
+        description="Error up to which a model counts as one that explains the data.",
     )
-    folds: int = Field(default=4, ge=2, le=20, description="Parts that the modes are held out in, in turn.")
-    most_effects: int = Field(default=3, ge=1, le=6, description="Most effects that are added in turn.")
+    folds: int = Field(default=4, ge=2, le=20, description="Number of cross-validation folds.")
+    most_effects: int = Field(
+        default=3, ge=1, le=6, description="Largest number of effects that are added automatically."
+    )
     further_finalists: int = Field(
         default=0,
         ge=0,
         le=10,
-        description="Finalists, beside the best by evidence, that promise most beside learned scatters; two tests of "
-        "one rig, which repeat far better than is stated, have 2 in any case.",
+        description="Extra finalists, chosen by expected gain at the learned scatters; two tests of one rig, which "
+        "repeat far better than is stated, have 2 in any case, continuous records 3.",
     )
     candidates: int = Field(default=5, ge=1, description="Number of candidates that are reported.")
     processes: int | None = Field(

@@ -18,10 +18,10 @@ EXTRA_COORDINATE = "a degree of freedom of its own"
 """What a misfit acts like where a test shows more modes than the model has."""
 
 
-NOT_TOLD = "not told by these data"
+NOT_DETERMINED = "not determined by these data"
 
-_UNTOLD = 100.0
-"""Standard deviations of this many times the value tell nothing of a size."""
+_UNDETERMINED = 100.0
+"""Above this ratio of standard deviation to value a size counts as not determined."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class EffectSize:
     unit: str
 
     @property
-    def told(self) -> bool:
+    def determined(self) -> bool:
         """False where the data say nothing of it: a free gap that never closes stays where its fit began."""
-        return self.value == 0.0 or not self.std > _UNTOLD * abs(self.value)
+        return self.value == 0.0 or not self.std > _UNDETERMINED * abs(self.value)
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,14 @@ class Candidate:
     parameters : dict of str to EffectSize
     error_before, error_after : float
         Root-mean-square of (measurement - model)/standard uncertainty without and with it.
-    heldout_before, heldout_error_after : float
+    heldout_error_before, heldout_error_after : float
         The same on data that the fit has not seen; NaN where it was not computed.
-    gain : float
-        Fall of -2 log posterior.
-    threshold : float
-        Gain that a claim of its family needs; tests with nothing missing stay below it.
     log_evidence : float
-        Natural logarithm of the evidence against "nothing is missing" (its Bayes factor).
+        Log evidence gained (natural logarithm of a Bayes factor) over the model without it: the model as it stood, with
+        the effects that were added before this one.
+    threshold : float
+        Log evidence that a claim needed: the setting `claim`, more for a further effect beside those that depend on the
+        amplitude.
     claimed : bool
         True where probability, gain and held-out data all support it.
     why : str
@@ -76,11 +76,10 @@ class Candidate:
     parameters: dict[str, EffectSize]
     error_before: float
     error_after: float
-    heldout_before: float
+    heldout_error_before: float
     heldout_error_after: float
-    gain: float
-    threshold: float
     log_evidence: float
+    threshold: float
     claimed: bool
     why: str
     equivalents: tuple[str, ...] = ()
@@ -190,7 +189,7 @@ class Ladder:
         Standard uncertainties added to the test's own scatter (relative; shape in units of the largest
         entry).
     note : str
-        Why climbing stopped.
+        Why no further effect was added.
     force_n : tuple of float
         Force levels at which hits were simulated; empty where modes were compared.
     hit_noise : float
@@ -200,9 +199,10 @@ class Ladder:
     compared_s : float
         Length of what was compared of each hit, where that is only the first part of its window; else NaN.
     left_out : tuple of str
-        Hits, as ``file#number``, that were not compared because their motion hangs on the last thousandth of the force.
+        Hits, as ``file#number``, that were not compared because their motion is too sensitive to the
+        measured force.
     scatters : tuple of LearnedScatter
-        What σ holds beside the test's own scatter.
+        What σ includes in addition to the test's own scatter.
     """
 
     rungs: tuple[Rung, ...]
@@ -230,9 +230,9 @@ class Localisation:
         ``"stiffness"``, ``"mass"``, ``"viscous damping"``, ``"hysteretic damping"`` or ``"a degree of freedom of its
         own"``.
     size : float
-        Of the element that would mend it best, N/m, kg, N·s/m; of a degree of freedom its frequency, Hz.
+        Of the element that would correct it best, N/m, kg, N·s/m; of a degree of freedom its frequency, Hz.
     score : float
-        Fall of the sum of squares that it promises to first order.
+        Reduction of the sum of squares that is expected to first order.
     """
 
     place: str
@@ -282,7 +282,7 @@ class Diagnosis:
         What would tell them apart, or raise the certainty, with its expected effect; empty where nothing
         is needed.
     localisation : tuple of Localisation
-        Best first; empty unless the model fails and nothing in the library mends it.
+        Best first; empty unless the model fails and nothing in the library corrects it.
     probabilities : dict of str to float
         Of every hypothesis, ``"nothing"`` among them; adds up to 1.
     error, heldout_error : float

@@ -78,6 +78,10 @@ class Effect:
         out.
     records_only : bool
         True for an effect that is sought in records of continuous excitation only.
+    records_order : int, optional
+        Where given, the effect is sought in records of continuous excitation at every DOF and between any two bodies,
+        as generic effects are, and this is its place among them: what is simplest to say comes first. Generic effects
+        that do not give it come last, by their ids.
     elsewhere : Effect, optional
         The same physics, under the same id, with the parameters that it has at places where this effect cannot sit.
     """
@@ -94,6 +98,7 @@ class Effect:
     generic: bool = False
     scales: Callable[[Assembly, str], Mapping[str, float]] = _library_scales
     records_only: bool = False
+    records_order: int | None = None
     elsewhere: Effect | None = None
 
     def places(self, rig: Rig, configuration: str) -> tuple[str, ...]:

@@ -31,4 +31,5 @@ EFFECT = Effect(
     linear=False,
     other_places=is_place,
     generic=True,
+    records_order=10,
 )

@@ -26,4 +26,5 @@ EFFECT = Effect(
     other_places=is_place,
     generic=True,
     scales=damping_scale,
+    records_order=80,
 )

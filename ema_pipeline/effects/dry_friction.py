@@ -51,4 +51,5 @@ EFFECT = Effect(
     reference="K. Worden, G. R. Tomlinson, Nonlinearity in Structural Dynamics (2001), chapter 2",
     linear=False,
     other_places=is_place,
+    records_order=30,
 )

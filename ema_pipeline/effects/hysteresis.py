@@ -71,4 +71,5 @@ EFFECT = Effect(
     reference="F. Ikhouane, J. Rodellar, Systems with Hysteresis (2007), chapter 2",
     linear=False,
     elsewhere=ANYWHERE,
+    records_order=40,
 )

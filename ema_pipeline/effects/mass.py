@@ -24,4 +24,5 @@ EFFECT = Effect(
     other_places=is_place,
     generic=True,
     scales=mass_scale,
+    records_order=70,
 )

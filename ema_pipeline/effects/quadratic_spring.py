@@ -25,4 +25,5 @@ EFFECT = Effect(
     other_places=is_place,
     generic=True,
     records_only=True,
+    records_order=20,
 )

@@ -254,7 +254,9 @@ def _as_published(effect: Effect) -> Effect:
 
 def _estimate(value: float, std: float, unit: str, significance: float) -> Estimate:
     identified = bool(abs(value) > significance * std)
-    return Estimate(value, std, unit, identified, "" if identified else "not told from zero by these loops")
+    return Estimate(
+        value, std, unit, identified, "" if identified else "not distinguishable from zero by these loops"
+    )
 
 
 def _giving(loops: Sequence[Loop], significance: float) -> list[str]:

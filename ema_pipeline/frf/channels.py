@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.ingest.records import CALIBRATION_STD, TRANSVERSE
+from ema_pipeline.ingest.defaults import CALIBRATION_STD, TRANSVERSE
 
 if TYPE_CHECKING:
     from ema_pipeline.frf.types import FrfSet

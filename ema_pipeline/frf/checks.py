@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.frf.sensitivities import (
+from ema_pipeline.check_result import CheckResult, judged
+from ema_pipeline.frf.channel_faults import (
     RECIPROCAL_FACTOR,
     SENSITIVITY,
     channels_words,
@@ -17,7 +18,6 @@ from ema_pipeline.frf.sensitivities import (
 )
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.verdict import Verdict, judged
 
 COHERENCE = "ISO 7626-5, coherence function"
 DRIVING_POINT = "ISO 7626-5, driving-point measurement"
@@ -44,7 +44,7 @@ NOISE_MARGIN = 2.0
 """Reciprocal FRFs may differ by their noise: this many times its power is taken off their difference."""
 
 
-def check_frfs(frfs: FrfSet, settings: FrfSettings | None = None) -> tuple[Verdict, ...]:
+def check_frfs(frfs: FrfSet, settings: FrfSettings | None = None) -> tuple[CheckResult, ...]:
     """Check FRFs in their band.
 
     Parameters
@@ -54,7 +54,7 @@ def check_frfs(frfs: FrfSet, settings: FrfSettings | None = None) -> tuple[Verdi
 
     Returns
     -------
-    tuple of Verdict
+    tuple of CheckResult
         All with consequence "warn". Coherence and repeatability per pair of output and input with at least
         two hits (one verdict for the whole set where no pair has two); the sign of each driving point;
         reciprocity of each pair of points measured both ways, or "sensitivity" where a constant factor or a sign
@@ -71,11 +71,11 @@ def check_frfs(frfs: FrfSet, settings: FrfSettings | None = None) -> tuple[Verdi
     )
 
 
-def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict]:
+def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[CheckResult]:
     """Coherence and repeatability."""
     if not (frfs.hits > 1).any():
         return [
-            Verdict(
+            CheckResult(
                 check="coherence",
                 value=float("nan"),
                 limit=settings.minimum_coherence,
@@ -159,7 +159,7 @@ def _floor(variance: NDArray[np.float64], lines: NDArray[np.intp]) -> NDArray[np
     return np.asarray(np.interp(lines, centres, medians))
 
 
-def _driving_points(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict]:
+def _driving_points(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[CheckResult]:
     """Sign of driving points: a passive structure takes power in, so that Im(accelerance) ≥ 0."""
     verdicts = []
     driver = "force" if frfs.excitation else "hammer"
@@ -182,9 +182,9 @@ def _driving_points(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[
     return verdicts
 
 
-def _reciprocity(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Verdict]:
+def _reciprocity(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[CheckResult]:
     """H_ij against H_ji, in accelerance."""
-    verdicts: list[Verdict] = []
+    verdicts: list[CheckResult] = []
     place = {d: o for o, d in enumerate(frfs.outputs)}
     both = [(place[d], i) for i, d in enumerate(frfs.inputs) if d in place]
     if len(both) < 2:
@@ -222,7 +222,7 @@ def _reciprocity(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Ver
     return verdicts
 
 
-def _contradiction(frfs: FrfSet, one: int, other: int, factor: float) -> Verdict:
+def _contradiction(frfs: FrfSet, one: int, other: int, factor: float) -> CheckResult:
     """Two channels whose reciprocal FRFs differ by one constant: a sensitivity or a sign is wrong."""
     sensors = channels_words([_sensor(frfs, one), _sensor(frfs, other)])
     what = ["their signs"] if factor < 0 else []
@@ -232,7 +232,9 @@ def _contradiction(frfs: FrfSet, one: int, other: int, factor: float) -> Verdict
         what.append(f"sensitivity_mv and unit: {sides}{likely_cause(size, frfs.quantities[one])}")
     fault = f"{sensors} contradict each other (reciprocity of their FRFs): look up {', and '.join(what)}"
     channel = f"{frfs.outputs[one]} and {frfs.outputs[other]}"
-    return Verdict(SENSITIVITY, factor, RECIPROCAL_FACTOR, "1", False, RECIPROCITY, "warn", channel, fault)
+    return CheckResult(
+        SENSITIVITY, factor, RECIPROCAL_FACTOR, "1", False, RECIPROCITY, "warn", channel, fault
+    )
 
 
 def _sensor(frfs: FrfSet, output: int) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import ChannelQuality, merged
 from ema_pipeline.frf.checks import check_frfs
@@ -20,7 +21,6 @@ from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.spectra import Spectra, solved
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.driven import DrivenRecord
-from ema_pipeline.verdict import Verdict
 
 AVERAGES = 6
 """Blocks side by side that a record is cut into where no length is set; overlap nearly doubles them."""
@@ -286,7 +286,7 @@ def _check_inputs(
 
 def _notable(
     first: DrivenRecord, coherence: NDArray[np.float64], lines: NDArray[np.bool_], settings: FrfSettings
-) -> list[Verdict]:
+) -> list[CheckResult]:
     """Pairs of forces that are correlated, though not so much that they cannot be told apart."""
     found = []
     for a in range(len(first.forces)):
@@ -295,7 +295,7 @@ def _notable(
             if shared > _NOTABLE:
                 names = f"{first.forces[b].name} and {first.forces[a].name}"
                 found.append(
-                    Verdict(
+                    CheckResult(
                         check="inputs",
                         value=shared,
                         limit=_NOTABLE,

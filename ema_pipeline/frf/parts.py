@@ -215,7 +215,7 @@ def _averaged(
 
 
 def _covered(bands: Mapping[str, tuple[float, float]], frfs: FrfSet) -> tuple[float, float]:
-    """The band that the parts speak for together.
+    """The band that the parts cover together.
 
     Raises
     ------

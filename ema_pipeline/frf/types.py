@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.dof import Dof
 from ema_pipeline.frf.channels import ChannelQuality
-from ema_pipeline.verdict import Verdict
 
 ALL_LINES = slice(None)
 
@@ -74,7 +74,7 @@ class FrfSet:
     detected_distortion : ndarray, (n_outputs, 2, n_lines), or None
         Response at lines that carry no force, over the typical force of a line that does, SI: distortion of odd and
         of even order; NaN elsewhere.
-    verdicts : tuple of Verdict
+    verdicts : tuple of CheckResult
         Checks that need several hits or several points: coherence, driving point, reciprocity.
     """
 
@@ -93,7 +93,7 @@ class FrfSet:
     band_hz: tuple[float, float]
     force_calibrated: bool
     sensor_mass_kg: NDArray[np.float64]
-    verdicts: tuple[Verdict, ...] = ()
+    verdicts: tuple[CheckResult, ...] = ()
     channels: tuple[ChannelQuality, ...] = ()
     hammer: ChannelQuality | None = None
     excitation: str = ""

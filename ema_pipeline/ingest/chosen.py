@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.choices import HitChoice
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.records import Hit
-from ema_pipeline.verdict import Verdict
 
 CHOICE = "choice"
 """Name of the verdict on hits that the user excluded."""
@@ -17,7 +17,7 @@ CHOICE = "choice"
 def without_excluded(hits: tuple[Hit, ...], excluded: Collection[HitChoice]) -> tuple[Hit, ...]:
     """The hits, with a verdict that rejects those that the user excluded."""
     named = {(x.file, x.number) for x in excluded}
-    verdict = Verdict(CHOICE, 1.0, 0.0, "1", False, "", "reject_hit", message="excluded by the user")
+    verdict = CheckResult(CHOICE, 1.0, 0.0, "1", False, "", "reject_hit", message="excluded by the user")
     return tuple(
         replace(h, verdicts=(*h.verdicts, verdict)) if (h.file, h.number + 1) in named else h for h in hits
     )

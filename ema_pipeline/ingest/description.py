@@ -11,9 +11,9 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.defaults import CALIBRATION_STD, TRANSVERSE
 from ema_pipeline.ingest.driven_entries import check_driven_test
 from ema_pipeline.ingest.record_entries import check_records
-from ema_pipeline.ingest.records import CALIBRATION_STD, TRANSVERSE
 from ema_pipeline.names import check_name
 from ema_pipeline.plain_text import has_control_characters
 from ema_pipeline.settings import Settings, parse
@@ -145,7 +145,7 @@ class _TestFile(Settings):
     )
     band_hz: tuple[float, float] | None = Field(
         default=None,
-        description="Band that its FRFs may speak for; left out: what its force spectrum carries",
+        description="Band in which its FRFs are used; left out: what its force spectrum carries",
     )
     exponential_window_rad_s: float = Field(
         default=0.0,

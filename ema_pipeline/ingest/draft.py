@@ -15,7 +15,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.files import replace_file
 from ema_pipeline.ingest.derived import derived_channels
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers import read_raw, reader_of
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord
 from ema_pipeline.ingest.swap import is_pulse

@@ -13,7 +13,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.clipping import flat_top_share
 from ema_pipeline.ingest.description import ChannelDescription, RecordDescription, TestDescription
 from ema_pipeline.ingest.driven_entries import record_name
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.load import RATE_TOLERANCE, ScaledChannels, load_channels
 from ema_pipeline.ingest.pulse import noise_of
 from ema_pipeline.ingest.records import ResponseChannel

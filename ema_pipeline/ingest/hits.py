@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len
 from scipy.ndimage import uniform_filter1d, white_tophat
 
+from ema_pipeline.check_result import judged
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.pulse import find_pulse, noise_of
 from ema_pipeline.ingest.records import Hit, Record
-from ema_pipeline.verdict import judged
 
 LONGEST_PULSE_S = 0.03
 """What lasts longer is drift, not a blow."""

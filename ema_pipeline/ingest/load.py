@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.ingest.description import ChannelDescription, RecordDescription, TestDescription
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers import read_raw
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord, Samples, held_open, split_unit
 from ema_pipeline.ingest.records import ANY_BAND_HZ, Record, ResponseChannel, Transducer

@@ -7,16 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.dof import Dof
+from ema_pipeline.ingest.defaults import CALIBRATION_STD, TRANSVERSE
 from ema_pipeline.lazy_samples import CutSamples, LazySamples
-from ema_pipeline.verdict import Verdict
-
-CALIBRATION_STD = 0.02
-"""Relative 1 σ of a sensitivity that is not stated: what calibration certificates of accelerometers and
-modal hammers usually claim, 3 to 5 % at two sigma."""
-
-TRANSVERSE = 0.03
-"""Transverse sensitivity where none is stated, 1 σ: data sheets promise less than 3 to 5 %."""
 
 ANY_BAND_HZ = (0.0, float("inf"))
 
@@ -108,7 +102,7 @@ class Record:
     part : str
         Set-up (hammer, sensors) of which several make up the test; empty where there is but one.
     band_hz : tuple of float
-        Band that the description lets the record speak for.
+        Band in which the description lets the record be used.
     """
 
     file: str
@@ -145,7 +139,7 @@ class Hit:
         Sample of the force peak within the record.
     peak_force : float
         Force at the peak, in `force_unit`, with its sign.
-    verdicts : tuple of Verdict
+    verdicts : tuple of CheckResult
         Outcome of every check that could be made.
     force_unit : str
         ``"N"``, ``"V"`` for an uncalibrated hammer.
@@ -160,7 +154,7 @@ class Hit:
     stop: int
     peak: int
     peak_force: float
-    verdicts: tuple[Verdict, ...] = ()
+    verdicts: tuple[CheckResult, ...] = ()
     force_unit: str = "N"
     part: str = ""
 

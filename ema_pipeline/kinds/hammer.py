@@ -28,8 +28,8 @@ def _frfs(run: Run, configuration: str, progress: Progress) -> FrfSet:
 
 def _modes(run: Run, configuration: str, progress: Progress) -> ModalModel:
     from ema_pipeline.modal.circle import attach_circles
-    from ema_pipeline.modal.moving import identify_hits
-    from ema_pipeline.modal.pooling import pooled
+    from ema_pipeline.modal.combine_estimates import pooled
+    from ema_pipeline.modal.hit_to_hit import identify_hits
 
     settings = run.settings.modal
 

@@ -70,7 +70,7 @@ def several_levels(study: LevelStudy, modal: ModalModel, settings: LevelSettings
     tested = [m for m in study.modes if np.isfinite(m.frequency_p) or np.isfinite(m.damping_p)]
     if not tested:
         return (
-            f"Hits at {forces}, but too few to tell a change with the force from scatter: strike every point at "
+            f"Hits at {forces}, but too few to distinguish a change with the force from scatter: strike every point at "
             "least twice at each force."
         )
     if not study.level_dependent:

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels.types import ForceLevel
 from ema_pipeline.modal.circle.compare import distortion
 from ema_pipeline.modal.circle.modes import circle_fits
 from ema_pipeline.modal.circle.settings import CircleSettings
 from ema_pipeline.modal.types import ModalModel, Mode
-from ema_pipeline.verdict import Verdict
 
 Real = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ SMOOTH = 0.3
 """Correlation of the misfit from line to line above which it is no noise."""
 
 
-def signs(levels: Sequence[ForceLevel], frfs: FrfSet, modal: ModalModel) -> tuple[Verdict, ...]:
+def signs(levels: Sequence[ForceLevel], frfs: FrfSet, modal: ModalModel) -> tuple[CheckResult, ...]:
     """Signs at every mode, all with consequence "warn".
 
     Parameters
@@ -57,10 +57,10 @@ def signs(levels: Sequence[ForceLevel], frfs: FrfSet, modal: ModalModel) -> tupl
 
     Returns
     -------
-    tuple of Verdict
+    tuple of CheckResult
         `channel` names the mode.
     """
-    found: list[Verdict] = []
+    found: list[CheckResult] = []
     soft, hard = (circle_fits(level.frfs, modal, CircleSettings()) for level in (levels[0], levels[-1]))
     for mode, soft_circles, hard_circles in zip(modal.modes, soft, hard, strict=True):
         found += _homogeneity(levels[0].frfs, levels[-1].frfs, mode)
@@ -80,7 +80,7 @@ def _lines(frfs: FrfSet, mode: Mode) -> slice:
     return slice(max(int(first), 1), max(int(stop), int(first) + 1))
 
 
-def _homogeneity(soft: FrfSet, hard: FrfSet, mode: Mode) -> list[Verdict]:
+def _homogeneity(soft: FrfSet, hard: FrfSet, mode: Mode) -> list[CheckResult]:
     """Difference of the FRFs of two levels in units of its own standard deviation."""
     lines = _lines(soft, mode)
     shared_out = [d for d in soft.outputs if d in hard.outputs]
@@ -104,7 +104,7 @@ def _homogeneity(soft: FrfSet, hard: FrfSet, mode: Mode) -> list[Verdict]:
     return [_verdict("FRF homogeneity", value, HOMOGENEOUS, value <= HOMOGENEOUS, mode, message)]
 
 
-def _coherence(hard: FrfSet, everything: FrfSet, mode: Mode) -> list[Verdict]:
+def _coherence(hard: FrfSet, everything: FrfSet, mode: Mode) -> list[CheckResult]:
     """Coherence lost over all levels against that within the hardest level."""
     lost_hard, lost = _lost(hard, mode), _lost(everything, mode)
     if not (np.isfinite(lost_hard) and np.isfinite(lost)):
@@ -124,9 +124,9 @@ def _lost(frfs: FrfSet, mode: Mode) -> float:
     return float(np.sum(power[known] * (1 - coherence[known])) / max(float(np.sum(power[known])), 1e-300))
 
 
-def _verdict(check: str, value: float, limit: float, passes: bool, mode: Mode, message: str) -> Verdict:
+def _verdict(check: str, value: float, limit: float, passes: bool, mode: Mode, message: str) -> CheckResult:
     where = f"{mode.frequency_hz:.5g} Hz"
-    return Verdict(
+    return CheckResult(
         check=check,
         value=value,
         limit=limit,

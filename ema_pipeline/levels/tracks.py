@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.modal.assurance import mac
-from ema_pipeline.modal.credibility import ECHO_MAC, ECHO_REACH, SAME_RESPONSE
+from ema_pipeline.modal.mode_acceptance import ECHO_MAC, ECHO_REACH, SAME_RESPONSE
 from ema_pipeline.modal.types import ModalModel, Mode
 
 Real = NDArray[np.float64]

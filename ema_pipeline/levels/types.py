@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ class LevelStudy:
         Impact points.
     modes : tuple of ModeLevels
     decays : tuple of DecayCurve
-    verdicts : tuple of Verdict
+    verdicts : tuple of CheckResult
         Homogeneity of the FRFs, coherence dips at resonances, distortion of Nyquist circles.
     level_dependent : bool
         The answer of all tests together, at the false-alarm rate of the settings.
@@ -213,7 +213,7 @@ class LevelStudy:
     inputs: tuple[Dof, ...]
     modes: tuple[ModeLevels, ...]
     decays: tuple[DecayCurve, ...]
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[CheckResult, ...]
     level_dependent: bool
     p_value: float
     summary: str

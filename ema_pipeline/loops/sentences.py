@@ -104,7 +104,7 @@ def _sides(loops: Sequence[Loop], fits: Sequence[LoopFit]) -> list[str]:
         return []
     return [
         f"the force is larger one way than the other, by up to {100 * 2 * share:.2g} % of its size ({name}): a brake "
-        "that tightens itself one way, or an offset of the force channel; the model is alike both ways"
+        "that tightens itself one way, or an offset of the force channel; the model is the same both ways"
     ]
 
 

@@ -22,11 +22,11 @@ from ema_pipeline.modal.fit import (
 from ema_pipeline.modal.left_out import left_out, sentences
 from ema_pipeline.modal.noise import Noise, fit_law, flat_law, second_difference_power
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, seeded
+from ema_pipeline.modal.pole_tracks import link, votes
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.scaling import scale_shapes, scaling_note
-from ema_pipeline.modal.selection import link, votes
 from ema_pipeline.modal.settings import ModalSettings
-from ema_pipeline.modal.sweep import (
+from ema_pipeline.modal.sub_bands import (
     FittedModes,
     between,
     candidates,

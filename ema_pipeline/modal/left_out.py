@@ -7,11 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.credibility import PLAIN_DAMPING
 from ema_pipeline.modal.fit import Estimate
+from ema_pipeline.modal.mode_acceptance import PLAIN_DAMPING
 from ema_pipeline.modal.peaks import KnownPeaks
+from ema_pipeline.modal.pole_tracks import link
 from ema_pipeline.modal.poles import PoleSet
-from ema_pipeline.modal.selection import link
 from ema_pipeline.modal.types import LeftOut
 
 STABLE = 0.8

@@ -15,7 +15,7 @@ class ModalSettings(Settings):
     engine: Literal["plscf", "lscf", "sdypy"] = Field(
         default="plscf",
         description="Estimator of the poles: 'plscf' (polyreference LSCF, all references at once; the only "
-        "one that can tell both modes of a repeated pole), 'lscf' (common-denominator LSCF), 'sdypy' "
+        "one that can separate both modes of a repeated pole), 'lscf' (common-denominator LSCF), 'sdypy' "
         "(the LSCF of sdypy-EMA, for comparison; slow).",
     )
     low_hz: float | None = Field(
@@ -47,9 +47,9 @@ class ModalSettings(Settings):
     repeatability: float = Field(
         default=1e-3,
         ge=0,
-        description="Relative standard deviation of natural frequencies from hit to hit that the intervals of a test "
-        "of one hit hold, which cannot show it; several hits show their own. 0.1 % is what one structure was seen to "
-        "move by between two campaigns.",
+        description="Relative standard deviation of natural frequencies from hit to hit that is included in the "
+        "intervals of a test with one hit, which cannot show it; several hits show their own. 0.1 % is what one "
+        "structure was seen to move by between two campaigns.",
     )
 
     @model_validator(mode="after")

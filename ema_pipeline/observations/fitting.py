@@ -200,7 +200,11 @@ def learned(observations: Observations, fit: Fit) -> Fit:
     known = fit.posterior.scatters
     scatters = {n: s.default if known[n] == s.start else known[n] for n, s in observations.scatters.items()}
     start = descend(problem, scatters, fit.posterior.x, steps=10)
-    return replace(fit, posterior=learn(problem, start, observations.scatters))
+    found = replace(fit, posterior=learn(problem, start, observations.scatters))
+    free = freed(observations, found)  # a barrier that was low while scatters were wide
+    if free is found:
+        return found
+    return replace(fit, posterior=learn(problem, free.posterior, observations.scatters))
 
 
 def at_scatters(observations: Observations, fit: Fit, scatters: Mapping[str, float]) -> Fit:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, descend, joined
+from ema_pipeline.ingest.defaults import CALIBRATION_STD
 from ema_pipeline.loops.types import Loop
 from ema_pipeline.mechanics.assembly import Spring
 from ema_pipeline.mechanics.cycles import Cycles
@@ -41,8 +42,6 @@ MOST = 1e3
 FORCE, DISPLACEMENT = "calibration of force", "calibration of displacement"
 CHANNELS = (FORCE, DISPLACEMENT)
 """Unknowns of the two channels: logarithms of what is read over what is."""
-CALIBRATION_STD = 0.02
-"""Relative 1 σ of a channel's sensitivity where none is stated."""
 
 SETTING_STD = 0.7
 """1 σ of the logarithm of a loop's force scale where loops are of several settings: mostly within a factor of four."""

@@ -21,6 +21,8 @@ _DOUBLE = 0.9
 """Share of a shape's squares that shapes of modes within a half-width explain, from which it is no mode of its own."""
 _CLOSE = 3.0
 """Half-power bandwidths within which modes are close: further apart, one is below a sixth of its peak at another's."""
+_OVERLAP = 6.0
+"""Half-widths within which one mode's shape may hold some of another's."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,24 @@ class ModeData:
         apart = np.abs(self.log_frequency[:, None] - self.log_frequency)
         near = apart < _CLOSE * np.maximum(bandwidth[:, None], bandwidth)
         return np.asarray(np.sum(near, axis=1) > 1)
+
+    @cached_property
+    def mixes(self) -> tuple[tuple[int, int, float], ...]:
+        """Modes whose shape identification may have mixed with that of another: mode, other one, and how much.
+
+        What a fit mistakes of one resonance (drift, hits off their mark) goes to those that it overlaps: it falls with
+        their distance over the half-width.
+        """
+        pairs = []
+        width = np.nan_to_num(np.exp(self.log_damping))
+        shaped = np.flatnonzero(np.any(self.seen, axis=1) & ~self.whirling)
+        for a in shaped:
+            for b in shaped:
+                half = max(width[a], width[b])
+                apart = abs(self.log_frequency[a] - self.log_frequency[b]) / max(half, 1e-300)
+                if a != b and apart < _OVERLAP:
+                    pairs.append((int(a), int(b), float(1 / np.hypot(1.0, apart))))
+        return tuple(pairs)
 
     def shape_rows(self, modes: NDArray[np.int64]) -> int:
         """Number of values that the shapes of some modes are compared by: two per sensor of a whirling mode."""

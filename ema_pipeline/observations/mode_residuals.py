@@ -47,6 +47,8 @@ class Sensing:
         Positions of their unknowns, -1 for none.
     drift : int
         Position of the unknown by which all frequencies are off together; -1 where no frequencies are compared.
+    mixing : ndarray of int, (k,)
+        Positions of the unknowns of `ModeData.mixes`.
     """
 
     along: NDArray[np.float64]
@@ -54,6 +56,7 @@ class Sensing:
     gain: NDArray[np.int64]
     transverse: NDArray[np.int64]
     drift: int
+    mixing: NDArray[np.int64]
 
 
 def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
@@ -390,6 +393,9 @@ class Comparison:
         seen = d.seen[on] > 0
         y, own = d.known_shapes[on], d.compared_std[on]
         unit = np.maximum(_SHAPE_REACH, np.abs(y))
+        mixed = self._mixed(on)
+        for k, other, unknown in mixed:
+            y[k] -= self.x[unknown] * d.known_shapes[other]
         weight = seen / (own**2 + (self.scatters[SHAPE] * unit) ** 2)
         weighted = weight * p
         squared = np.maximum(np.sum(weighted * p, axis=1), 1e-300)
@@ -402,13 +408,26 @@ class Comparison:
             dp = np.real(dp)
             towards = weight * (y - 2 * scale[:, None] * p) / squared[:, None]
             factor = towards[:, None, :] @ dp
-            slope = (scale[:, None, None] * dp + p[:, :, None] * factor)[seen]
+            slope = scale[:, None, None] * dp + p[:, :, None] * factor
+            for k, other, unknown in mixed:
+                along = d.known_shapes[other]
+                slope[k, :, unknown] += along - p[k] * (weighted[k] @ along) / squared[k]
+            slope = slope[seen]
         difference = (y - scale[:, None] * p)[seen]
         mode, sensor = np.nonzero(seen)
         return Rows(
             difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode], sensor, d.close[on[mode]],
             slope, noise=SHAPE_NOISE,
         )  # fmt: skip
+
+    def _mixed(self, on: NDArray[np.int64]) -> list[tuple[int, int, int]]:
+        """Place in `on`, other mode and unknown of every shape that may hold some of another's."""
+        place = {int(r): k for k, r in enumerate(on)}
+        return [
+            (place[a], b, int(unknown))
+            for (a, b, _), unknown in zip(self.data.mixes, self.sensing.mixing, strict=True)
+            if a in place
+        ]
 
     def _complex_shapes(
         self,

@@ -19,8 +19,9 @@ from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
-from ema_pipeline.ingest.records import CALIBRATION_STD
+from ema_pipeline.ingest.defaults import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
+from ema_pipeline.modal.assurance import mac
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_pairing import OwnDamping
@@ -54,6 +55,10 @@ _CLOSE_PAIR = 0.2
 """Difference of ln f within which two modes may have changed places."""
 _WRONG = 4.0
 """σ from which a shape is another one."""
+_TWIN = 0.8
+"""Modal assurance criterion of two measured modes from which one may be the other's twin."""
+
+MIXING = "shape_mixing"
 
 _FRAMES = (("x", "y", "z"), ("zeta", "eta"))
 _TURNING = "u"
@@ -72,6 +77,7 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
         # What hits have in common (drift, aim) is in their scatter, and no error of one mode against another.
         Scatter(FREQUENCY_NOISE, "stated uncertainty of frequencies", 1.0, 0.5),
         Scatter(SHAPE_NOISE, "stated uncertainty of shapes", 1.0, 0.5),
+        Scatter(MIXING, "shapes of close modes along each other", 0.01, 1.0, 0.03, 20.0),
     )
     return {s.name: s for s in known}
 
@@ -207,6 +213,11 @@ class ModeRows:
         return float(np.max(np.abs(np.nan_to_num(self.shape)), initial=0.0))
 
 
+def _other_shapes(a: ModeRows, b: ModeRows) -> bool:
+    """True where each of two modes has another one's shape."""
+    return a.shape_off > _WRONG and b.shape_off > _WRONG
+
+
 @dataclass(frozen=True)
 class Paired:
     """Modes of the model at one point, and which of them each measured mode belongs to.
@@ -229,7 +240,7 @@ class ModeProblem(EffectProblem):
         self.observations, self.model = observations, model
         self.offset = len(model.unknowns)
         self._defaults = {name: s.default for name, s in observations.scatters.items()}
-        self._sensing: dict[tuple[str, int], tuple[tuple[Dof, ...], Sensing]] = {}
+        self._sensing: dict[tuple[str, int], tuple[ModeData, Sensing]] = {}
 
     @property
     def sizes(self) -> Mapping[str, SizeMap]:
@@ -266,6 +277,10 @@ class ModeProblem(EffectProblem):
             Unknowns.plain(drifts, DRIFT_STD),
             Unknowns.plain(tuple(gains), list(gains.values()), CALIBRATION),
             Unknowns.plain(tuple(across), list(across.values())),
+            *(
+                Unknowns.plain(self._mixing(d), [share for _, _, share in d.mixes], MIXING)
+                for d in self.observations.data
+            ),
         )
 
     def _directions_across(self, sensor: str) -> tuple[str, ...]:
@@ -281,14 +296,17 @@ class ModeProblem(EffectProblem):
     def _anywhere(self, dof: Dof) -> bool:
         return any(self.observations.has(d.configuration, dof) for d in self.observations.data)
 
+    def _mixing(self, d: ModeData) -> tuple[str, ...]:
+        """Names of unknowns: what the shape of a mode holds of that of another. Numbers of modes differ among data."""
+        hz, test = np.exp(d.log_frequency), self.observations.test
+        where = f"{d.configuration}{' in ' + test if test else ''}"
+        return tuple(f"shape of {hz[a]:.7g} Hz along that of {hz[b]:.7g} Hz, {where}" for a, b, _ in d.mixes)
+
     def sensing(self, data: ModeData) -> Sensing:
         """What the sensors of one configuration's modes read."""
-        key = (
-            data.configuration,
-            id(data.dofs),
-        )  # what is remembered holds the sensors, so that their id stays
+        key = (data.configuration, id(data))  # what is remembered holds the data, so that their id stays
         if key not in self._sensing:
-            self._sensing[key] = data.dofs, self._found_sensing(data)
+            self._sensing[key] = data, self._found_sensing(data)
         return self._sensing[key][1]
 
     def _found_sensing(self, d: ModeData) -> Sensing:
@@ -307,7 +325,8 @@ class ModeProblem(EffectProblem):
                 if transverse[k, i] >= 0 and self.observations.has(d.configuration, other):
                     across[k, i] = self.model.sensor_rows(d.configuration, (other,))[0]
         drift = self.unknowns.index.get(_drift(d.configuration, self.observations.test), -1)
-        return Sensing(along, across, gain, transverse, drift)
+        mixing = np.array([self.unknowns.index.get(n, -1) for n in self._mixing(d)], np.int64)
+        return Sensing(along, across, gain, transverse, drift, mixing)
 
     def paired(
         self, data: ModeData, x: NDArray[np.float64], match: NDArray[np.int64] | None = None
@@ -351,7 +370,8 @@ class ModeProblem(EffectProblem):
     def escapes(
         self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
     ) -> list[NDArray[np.float64]]:
-        """See `EffectProblem`: close pairs of modes whose order is the wrong way round, split the other way.
+        """See `EffectProblem`: close pairs of modes whose order is the wrong way round, split the other way, and modes
+        moved to a measured one of the same shape that has no partner (one of two such may be a twin that drift makes).
 
         No descent leads through the point where two modes coincide. The least probable part of the way is saved by
         moving all unknowns as little as their priors allow.
@@ -359,19 +379,27 @@ class ModeProblem(EffectProblem):
         assert isinstance(found.matching, tuple)
         variance = self.unknowns.prior_std(scatters) ** 2
         rows, starts, at = self.rows(found), [], 0
+
+        def moved(slope: NDArray[np.float64], change: float) -> None:
+            reach = float(slope @ (variance * slope))
+            if reach > 0:
+                starts.append(self.unknowns.clipped(x + change * variance * slope / reach))
+
         for data, match in zip(self.observations.data, found.matching, strict=True):
             own = [r for r in rows if r.configuration == data.configuration]
-            modes = self.solution(data.configuration, x)
+            log = np.log(np.maximum(self.solution(data.configuration, x).frequency_hz, 1e-6))
             std = np.hypot(scatters[FREQUENCY_NOISE] * data.log_frequency_std, scatters[FREQUENCY])
+            slopes = [-found.jacobian[at + i] * std[r.measured] for i, r in enumerate(own)]
             for (i, a), (j, b) in pairwise(enumerate(own)):
-                split = float(np.log(modes.frequency_hz[b.model] / max(modes.frequency_hz[a.model], 1e-6)))
-                if abs(split) < _CLOSE_PAIR and a.shape_off > _WRONG and b.shape_off > _WRONG:
-                    slope = (
-                        found.jacobian[at + i] * std[a.measured] - found.jacobian[at + j] * std[b.measured]
-                    )
-                    reach = float(slope @ (variance * slope))
-                    if reach > 0:
-                        starts.append(self.unknowns.clipped(x - 2 * split * variance * slope / reach))
+                split = float(log[b.model] - log[a.model])
+                if abs(split) < _CLOSE_PAIR and _other_shapes(a, b):
+                    moved(slopes[j] - slopes[i], -2 * split)
+            for alone in np.flatnonzero(match < 0):
+                like = mac(data.shapes[alone], data.shapes)[0]
+                for i, r in enumerate(own):
+                    change = float(data.log_frequency[alone] - log[r.model])
+                    if abs(change) < _CLOSE_PAIR and like[r.measured] > _TWIN:
+                        moved(slopes[i], change)
             at += len(own) + int(np.sum(np.isfinite(data.log_damping[match >= 0])))
             at += data.shape_rows(np.flatnonzero(match >= 0))
         return starts

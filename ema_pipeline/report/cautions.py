@@ -7,12 +7,12 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from enum import IntEnum
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
-from ema_pipeline.frf.sensitivities import SENSITIVITY
-from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_ERROR
+from ema_pipeline.frf.channel_faults import SENSITIVITY
 from ema_pipeline.report.numbers import below, format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
-from ema_pipeline.verdict import Verdict
+from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC, POOR_ERROR
 
 SAME_KIND = 2
 """Cautions of one kind that are written out; the rest is counted."""
@@ -84,7 +84,7 @@ def _where(results: RunResults, c: ConfigurationResults) -> str:
     return f"{c.name}: " if len(results.configurations) > 1 else ""
 
 
-def _of_sensor(v: Verdict) -> bool:
+def _of_sensor(v: CheckResult) -> bool:
     """True for a check that a wrong sign or sensitivity fails."""
     return v.check == SENSITIVITY or (v.check == "driving point" and v.value > 0.5)
 
@@ -162,7 +162,7 @@ def left_out(c: ConfigurationResults) -> list[str]:
         )
     copies = [v for h in c.hits for v in h.verdicts if v.check == "copy" and not v.passes]
     lines += list(dict.fromkeys(v.message for v in copies))
-    dropped: dict[str, list[Verdict]] = {}
+    dropped: dict[str, list[CheckResult]] = {}
     used = [h for h in c.hits if h.accepted]
     for h in used:
         for name in sorted(h.rejected_channels):

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 from ema_pipeline.diagnose.sentences import label_text, probability_text
 from ema_pipeline.diagnose.types import (
-    NOT_TOLD,
+    NOT_DETERMINED,
     OUT_OF_TOLERANCE,
     Candidate,
     DetectionLimit,
@@ -30,11 +30,11 @@ def heading(found: Diagnosis) -> str:
         )
     if found.verdict == "ambiguous":
         count = len(found.indistinguishable[0]) if found.indistinguishable else 2
-        return f"{_COUNTS.get(count, str(count))} explanations fit equally well"
+        return f"{_COUNTS.get(count, str(count))} effects explain the data equally well"
     return {
         "adequate": "Nothing is missing as far as these data can tell",
-        "unknown_effect": "Something is missing that the library does not hold",
-        "not_enough_data": "Not enough data to tell what is missing",
+        "unknown_effect": "Something is missing that is not in the library",
+        "not_enough_data": "Not enough data to show what is missing",
     }[found.verdict]
 
 
@@ -51,7 +51,7 @@ def claimed(found: Diagnosis) -> tuple[Candidate, ...]:
 
 
 def leading(found: Diagnosis) -> tuple[Candidate, ...]:
-    """What a reader should hear of: the group that fits alike, the claimed candidates, or the best one."""
+    """What a reader should know of: the group that fits equally well, the claimed candidates, or the best one."""
     alike = {label for group in found.indistinguishable for label in group}
     if alike and found.verdict == "ambiguous":
         return tuple(c for c in found.candidates if c.label in alike)
@@ -61,7 +61,7 @@ def leading(found: Diagnosis) -> tuple[Candidate, ...]:
 def size_words(parameters: Mapping[str, EffectSize], between: str = "; ") -> str:
     """Sizes with their uncertainty, e.g. ``fraction 0.3500 ± 0.0020``."""
     return between.join(
-        f"{words(n)} {format_value(s.value, s.std, s.unit) if s.told else NOT_TOLD}"
+        f"{words(n)} {format_value(s.value, s.std, s.unit) if s.determined else NOT_DETERMINED}"
         for n, s in parameters.items()
     )
 
@@ -70,11 +70,11 @@ def standing(found: Diagnosis, candidate: Candidate) -> str:
     """What the data say of a candidate, in a word or two."""
     grouped = any(candidate.label in group for group in found.indistinguishable)
     if grouped and found.verdict == "ambiguous":
-        return "fits alike"
+        return "fits equally well"
     if candidate.claimed:
         return "best, not enough" if found.verdict == "unknown_effect" else "supported"
-    if candidate.gain < candidate.threshold:
-        return "no better than chance"
+    if candidate.log_evidence < candidate.threshold:
+        return "not enough evidence"
     return "less likely"
 
 
@@ -148,19 +148,19 @@ def of_modes(ladder: Ladder) -> bool:
 
 
 def noise_words(ladder: Ladder) -> str:
-    """What σ holds beside the test's own scatter."""
+    """What σ includes in addition to the test's own scatter."""
     if ladder.force_n:
         of_sigma = (
             "Error: simulated against measured hits, in standard uncertainties: the sensors' noise, "
             f"{plain(100 * ladder.hit_noise, 2)} % of the signal around each frequency, and an error of the linear "
-            "model that is alike at every force level. A linear model can therefore have an error of about 1 and "
+            "model that is the same at every force level. A linear model can therefore have an error of about 1 and "
             "still miss much of the hard hits: look at the shares that are missed."
         )
         return " ".join(filter(None, (hits_words(ladder), of_sigma)))
     if not of_modes(ladder):
         return "σ: the scatter of the measured signals."
     return (
-        f"σ: the test's own scatter and, beside it, {plain(100 * ladder.frequency_noise, 2)} % of frequency, "
+        f"σ: the test's own scatter plus {plain(100 * ladder.frequency_noise, 2)} % of frequency, "
         f"{plain(100 * ladder.damping_noise, 2)} % of damping, "
         f"{plain(100 * ladder.shape_noise, 2)} % of a shape's largest entry."
     )

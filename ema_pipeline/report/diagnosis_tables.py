@@ -46,7 +46,7 @@ def candidates_table(found: Diagnosis) -> Table:
                 probability_text(c.probability),
                 standing(found, c),
                 _change(c.error_before, c.error_after),
-                _change(c.heldout_before, c.heldout_error_after),
+                _change(c.heldout_error_before, c.heldout_error_after),
                 _why_words(c, c in told),
             ),
             _stands_out(found, c),

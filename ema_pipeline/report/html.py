@@ -14,12 +14,12 @@ from ema_pipeline.correlate.types import ModeDifference
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.files import replace_file
 from ema_pipeline.report import diagnosis, diagnosis_tables, levels, summary, tables
-from ema_pipeline.report.band import band_of
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.loops import loops_context
 from ema_pipeline.report.moved_modes import Seen, error_words, moved_table, still
 from ema_pipeline.report.moving_shapes import moving_shapes
 from ema_pipeline.report.numbers import format_percent, format_value, plain, signed, slug, words
+from ema_pipeline.report.page_top import page_top
 from ema_pipeline.report.pages import page_templates
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.simulation import simulation_context
@@ -147,7 +147,7 @@ def page_context(
         "results": results,
         "live": live,
         "addable": _addable(results) if live else (),
-        "band": band_of(results),
+        "band": page_top(results),
         "sections": _sections(results, figures),
         "figures": figures,
         "diagnosis": None if found is None else _diagnosis(results),
@@ -270,7 +270,7 @@ def _candidate(results: RunResults, c: Any) -> dict[str, Any]:
         "standing": diagnosis.standing(found, c),
         "before": plain(c.error_before, 3),
         "error": plain(c.error_after, 3),
-        "held": f"{plain(c.heldout_before, 3)} → {plain(c.heldout_error_after, 3)}",
+        "held": f"{plain(c.heldout_error_before, 3)} → {plain(c.heldout_error_after, 3)}",
         "claimed": c.claimed,
         "why": c.why,
         "in_model": c.label in results.added,

@@ -18,7 +18,7 @@ from PIL import Image
 from ema_pipeline.files import replacing
 from ema_pipeline.plain_text import printable
 from ema_pipeline.report import diagnosis, diagnosis_tables, summary, tables, terminal
-from ema_pipeline.report.band import band_of
+from ema_pipeline.report.page_top import page_top
 from ema_pipeline.report.plots import FigureSpec, figure_specs
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.test_sheet import set_up_table, transducers_table
@@ -67,7 +67,7 @@ def write_pdf(
 
 def _text(results: RunResults) -> Iterator[str]:
     """All lines, none longer than a page is wide."""
-    band = band_of(results)
+    band = page_top(results)
     yield from _wrapped(f"{results.title}: modal test report")
     yield ""
     yield from _wrapped(band.heading.upper())

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.choices import NO_CHOICES, Choices
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.free_run import RecordError
@@ -17,7 +18,6 @@ from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.loops.types import IsolatorResult, Loop, LoopModel
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ class RunResults:
         Loops of Bouc-Wen elements that records were simulated with.
     loops : LoopResults or None
         Of a test of force-displacement loops.
-    sensitivities : tuple of Verdict
+    sensitivities : tuple of CheckResult
         Channels whose scale or sign the model contradicts, see `fit.sensitivities`.
     """
 
@@ -137,7 +137,7 @@ class RunResults:
     diagnosis: Diagnosis | None = None
     ladder: Ladder | None = None
     comparison_after: Comparison | None = None
-    sensitivities: tuple[Verdict, ...] = ()
+    sensitivities: tuple[CheckResult, ...] = ()
     comparison_base: Comparison | None = None
     deviations: tuple[dict[str, float], ...] = ({}, {}, {})
     added: tuple[str, ...] = ()

@@ -1,4 +1,4 @@
-"""A run on one screen: verdict and culprit, modes, the gravest cautions, and what to type next."""
+"""A run on one screen: verdict, modes, the gravest cautions, and what to type next."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import Weight, cautions, left_out, suspicions
 from ema_pipeline.report.levels import has_to_say
-from ema_pipeline.report.limits import LOW_MAC
 from ema_pipeline.report.numbers import below, format_percent, format_value, plain, signed
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.simulation import error_lines
 from ema_pipeline.report.summary import changed_words
 from ema_pipeline.report.tables import Row, Table
 from ema_pipeline.report.terminal import build_table, console_text
+from ema_pipeline.report.thresholds import LOW_MAC
 
 SCREEN_LINES = 15
 """Lines of the summary: what a reader takes in at a glance, and what a terminal of 24 lines holds with its prompt."""

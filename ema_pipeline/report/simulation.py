@@ -85,7 +85,7 @@ def loop_words(loop: HysteresisLoop) -> str:
     stiffness = format_value(loop.stiffness_n_m, loop.stiffness_std_n_m, "N/m")
     return (
         f"{loop.label.replace('@', ' at ')}: at an amplitude of {plain(loop.amplitude_m, 3)} m it takes {energy} per "
-        f"cycle and has a stiffness of {stiffness} from tip to tip. Of its parameters the records tell "
+        f"cycle and has a stiffness of {stiffness} from tip to tip. Of its parameters the records determine "
         f"{_combination(loop.best[0])} to {100 * loop.best[1]:.2g} %, and {_combination(loop.worst[0])} to "
         f"{100 * loop.worst[1]:.2g} % only."
     )

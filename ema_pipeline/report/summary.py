@@ -9,10 +9,10 @@ from ema_pipeline.fit.types import FitResult, ParameterEstimate
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import cautions, fails, identified_words, suspicions
 from ema_pipeline.report.levels import has_to_say
-from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_ERROR
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.simulation import error_lines, loop_words
+from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC, POOR_ERROR
 
 __all__ = ["cautions", "fails", "findings", "identified_words", "stiffnesses"]
 
@@ -25,7 +25,7 @@ def findings(results: RunResults) -> tuple[str, ...]:
     lines: list[str] = []
     if suspicions(results):
         lines.append(
-            "A sensor is suspected, see the cautions: all that follows holds only if it reads right."
+            "A sensor is suspected, see the cautions: all that follows is valid only if it reads right."
         )
     if results.diagnosis is not None:
         lines += [] if not results.diagnosis_is_old else [changed_words(results)]
@@ -71,13 +71,13 @@ def changed_words(results: RunResults) -> str:
     """What was added or taken out since the diagnosis, and what that brought."""
     named = " and ".join(diagnosis.label_words(x) for x in results.added)
     error = "" if results.fit is None else f" (error {plain(results.fit.error, 3)})"
-    holds = f"The model holds {named} now{error}" if named else f"The model has no added effects now{error}"
+    now = f"The model now includes {named}{error}" if named else f"The model now has no added effects{error}"
     if results.added == results.diagnosed_on:
         changed = f"Other hits or modes were chosen{error}"
         return f"{changed}; the diagnosis was made before: 'ema diagnose' renews it."
     before = " and ".join(diagnosis.label_words(x) for x in results.diagnosed_on)
     of = f"the model with {before}" if before else "the base model"
-    return f"{holds}; the diagnosis is of {of}: 'ema diagnose' renews it."
+    return f"{now}; the diagnosis is of {of}: 'ema diagnose' renews it."
 
 
 def stiffnesses(fit: FitResult) -> tuple[ParameterEstimate, ...]:

@@ -160,7 +160,7 @@ def _candidate(c: Candidate) -> dict[str, Any]:
         "parameters": _sizes(c.parameters),
         "error_before": c.error_before,
         "error_after": c.error_after,
-        "heldout_error_before": c.heldout_before,
+        "heldout_error_before": c.heldout_error_before,
         "heldout_error_after": c.heldout_error_after,
         "log_evidence": c.log_evidence,
         "claimed": c.claimed,

@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.correlate.types import Comparison, Pairing, percent_off
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.modal.types import ModalModel, Mode
-from ema_pipeline.report.limits import FAR_SIGMA, LOW_MAC, POOR_ERROR
 from ema_pipeline.report.numbers import (
     below,
     format_percent,
@@ -21,7 +21,7 @@ from ema_pipeline.report.numbers import (
     signed,
     words,
 )
-from ema_pipeline.verdict import Verdict
+from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC, POOR_ERROR
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def rejected_hits_table(hits: Sequence[Hit]) -> Table:
 
 def verdicts_table(hits: Sequence[Hit]) -> Table:
     """One row per hit, one column per check: the worst value over its channels, marked where it fails."""
-    checks: dict[str, Verdict] = {}
+    checks: dict[str, CheckResult] = {}
     for h in hits:
         for v in h.verdicts:
             checks.setdefault(v.check, v)
@@ -289,7 +289,7 @@ def hits_table(hits: Sequence[Hit]) -> Table:
 
 def checks_table(hits: Sequence[Hit]) -> Table:
     """One row per check: limit, worst value, how many hits fail it (FAIL where that rejects something), and clause."""
-    found: dict[str, list[Verdict]] = {}
+    found: dict[str, list[CheckResult]] = {}
     failing: dict[str, set[tuple[str, int]]] = {}
     for h in hits:
         for v in h.verdicts:
@@ -313,7 +313,7 @@ def checks_table(hits: Sequence[Hit]) -> Table:
     return Table(("check", "limit", "worst", "result", "clause"), tuple(rows))
 
 
-def failed_checks_table(verdicts: Sequence[Verdict]) -> Table:
+def failed_checks_table(verdicts: Sequence[CheckResult]) -> Table:
     """Checks over several hits or points that failed."""
     rows = tuple(
         Row(
@@ -349,18 +349,18 @@ def _short(value: float) -> str:
     return text.rstrip("0").rstrip(".") if "." in text and "e" not in text else text
 
 
-def _worst(verdicts: Sequence[Verdict]) -> Verdict:
+def _worst(verdicts: Sequence[CheckResult]) -> CheckResult:
     """The verdict nearest to its limit, or furthest beyond it."""
     pool = [v for v in verdicts if not v.passes] or list(verdicts)
 
-    def beyond(v: Verdict) -> float:
+    def beyond(v: CheckResult) -> float:
         distance = abs(v.value - v.limit) if math.isfinite(v.value) else 0.0
         return distance if not v.passes else -distance
 
     return max(pool, key=beyond)
 
 
-def _verdict_cell(verdicts: Sequence[Verdict]) -> str:
+def _verdict_cell(verdicts: Sequence[CheckResult]) -> str:
     if not verdicts:
         return "–"
     failed = [v for v in verdicts if not v.passes]

@@ -18,8 +18,8 @@ from ema_pipeline.fit.parameters import fit_modes, fit_result
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.frf import estimate_frfs
 from ema_pipeline.ingest.campaign import read_campaign
+from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.load import load_records
-from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import cut_hit
 from ema_pipeline.mechanics.frf import accelerance
 from ema_pipeline.mechanics.system import sensor_rows

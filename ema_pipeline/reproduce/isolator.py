@@ -121,7 +121,9 @@ def _parameter_table(result: IsolatorResult) -> Table:
             result.parameters[name].value,
             UNITS[name],
             f"± {result.parameters[name].std:.2g}"
-            + ("" if result.parameters[name].identified else ": not told from zero by these loops"),
+            + (
+                "" if result.parameters[name].identified else ": not distinguishable from zero by these loops"
+            ),
         )
         for name, printed in PRINTED.items()
     ]

@@ -14,8 +14,8 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.hit_settings import HitSettings
-from ema_pipeline.ingest.limits import ReadLimits
 from ema_pipeline.levels.settings import LevelSettings
 from ema_pipeline.loops.settings import LoopSettings
 from ema_pipeline.modal.circle.settings import CircleSettings

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from ema_pipeline.report.numbers import prefixed
 from ema_pipeline.report.style import BLACK, BLUE, GREY, VERMILLION, margins, new_figure, styled
+from ema_pipeline.series.acceptance_limits import Range
 from ema_pipeline.series.features import DAMPING, FREQUENCY, PARAMETER, Features
-from ema_pipeline.series.limits import Range
 from ema_pipeline.series.screens import shown_in
 
 MOST_FEATURES = 24

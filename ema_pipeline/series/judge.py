@@ -11,9 +11,9 @@ import scipy.stats
 
 from ema_pipeline.diagnose.sentences import label_text, probability_text
 from ema_pipeline.report.numbers import format_value, plain
+from ema_pipeline.series.acceptance_limits import Limits, Range, reference_modes
 from ema_pipeline.series.database import SeriesDatabase, rows_of
 from ema_pipeline.series.features import DAMPING, FREQUENCY, MAC, Features, features_of, modes_of_tests
-from ema_pipeline.series.limits import Limits, Range, reference_modes
 
 Outcome = Literal["pass", "fail", "undecided"]
 

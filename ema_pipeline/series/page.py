@@ -18,12 +18,12 @@ from ema_pipeline.report.numbers import format_value, plain
 from ema_pipeline.report.pages import page_templates
 from ema_pipeline.report.style import png
 from ema_pipeline.report.tables import Row, Table
+from ema_pipeline.series.acceptance_limits import Limits, reference_modes
 from ema_pipeline.series.compare import Comparison, compare_tests
 from ema_pipeline.series.database import SeriesDatabase, rows_of
 from ema_pipeline.series.features import features_of, modes_of_tests, reference_of
 from ema_pipeline.series.figures import feature_figures
 from ema_pipeline.series.judge import JudgedTest, effects_text, judge_series
-from ema_pipeline.series.limits import Limits, reference_modes
 from ema_pipeline.series.screens import finding, judged_counts, shown_in, slope_text, verdict_counts
 from ema_pipeline.series.trend import Order, Trend, order_of, trends_of
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.run.measured import measured_frfs
 from ema_pipeline.run.types import Progress, Run
 from ema_pipeline.store import ALL
-from ema_pipeline.verdict import Verdict
 
 if TYPE_CHECKING:
     from ema_pipeline.fit.parameters import FittedModes
@@ -43,9 +43,9 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     return results | {"comparison": comparison, "sensitivities": _suspected(run, fitted)}
 
 
-def _suspected(run: Run, fitted: FittedModes) -> tuple[Verdict, ...]:
+def _suspected(run: Run, fitted: FittedModes) -> tuple[CheckResult, ...]:
     """Sensitivities that neither the nominal nor the fitted model can explain."""
-    from ema_pipeline.fit.sensitivities import suspected_sensitivities
+    from ema_pipeline.fit.channel_faults import suspected_sensitivities
 
     model, frfs = run.require_model(NAME), measured_frfs(run)
     systems = {name: (model.system(name), fitted.system(name)) for name in frfs}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from ema_pipeline.diagnose.types import Ladder
+from ema_pipeline.diagnose.types import NOT_DETERMINED, Ladder
 from ema_pipeline.fit.types import FitResult, ParameterEstimate
 from ema_pipeline.run.measured import measured_modes, modes_key
 from ema_pipeline.run.types import Progress, Run
@@ -71,6 +71,7 @@ def _with_sizes(found: FitResult, ladder: Ladder) -> FitResult:
         if "@" in name and name not in found.parameters:
             more[name] = ParameterEstimate(
                 name, size.value, size.std, size.value - size.std, size.value + size.std, size.unit, True,
-                size.value, float("nan"), size.told, float("nan"), "" if size.told else "not told by these data",
+                size.value, float("nan"), size.determined, float("nan"),
+                "" if size.determined else NOT_DETERMINED,
             )  # fmt: skip
     return replace(found, parameters=found.parameters | more)

@@ -20,7 +20,7 @@ def inputs(run: Run, configuration: str) -> str:
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
     """Find the hits of every record and judge them; every impact point needs one that is good."""
-    from ema_pipeline.ingest.quality import hits_of_test
+    from ema_pipeline.ingest.hit_checks import hits_of_test
 
     with stored_records(run.store, configuration) as records:
         hits = hits_of_test(records, run.settings.hits)

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from typing import TypeVar, cast
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.free_run import RecordError
 from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
@@ -25,7 +26,6 @@ from ema_pipeline.run.measured import level_study
 from ema_pipeline.run.models import diagnosed_choices, diagnosis_is_of_other_data
 from ema_pipeline.run.types import Run
 from ema_pipeline.store import ALL
-from ema_pipeline.verdict import Verdict
 
 
 def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
@@ -77,7 +77,7 @@ def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
         simulation=_of_records(run, "simulation", RecordError),
         hysteresis=_of_records(run, "hysteresis", HysteresisLoop),
         loops=_loops(run),
-        sensitivities=run.store.find("correlate", ALL, "sensitivities", tuple[Verdict, ...]) or (),
+        sensitivities=run.store.find("correlate", ALL, "sensitivities", tuple[CheckResult, ...]) or (),
         deviations=tuple(
             run.store.find(stage, ALL, name, dict[str, float]) or {}
             for stage, name in (

@@ -14,9 +14,9 @@ from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.description import RecordDescription, TestDescription
+from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.load import load_record
-from ema_pipeline.ingest.quality import hits_of_test
 from ema_pipeline.ingest.records import Hit, HitSamples, Record, cut_hit
 
 LEAST_COHERENCE = 0.8

@@ -15,7 +15,7 @@ from typing import Protocol
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import check_regular
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers import hdf5, lvm, mat, tdms, text, uff, wav
 from ema_pipeline.ingest.readers.apart import read_apart
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord

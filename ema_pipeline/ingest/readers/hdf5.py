@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers.arrays import NamedArray, assemble
 from ema_pipeline.ingest.readers.raw import RawRecord, StoredFile, StoredSamples
 from ema_pipeline.ingest.readers.timebase import is_time_name

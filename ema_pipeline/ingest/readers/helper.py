@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers.raw import RawRecord, StoredSamples, held_open
 from ema_pipeline.processes import die_with_parent
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, clean_unit, split_unit
 from ema_pipeline.ingest.readers.text import decode
 from ema_pipeline.ingest.readers.timebase import rate_from_times, whole_rate

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers.arrays import NamedArray, assemble
 from ema_pipeline.ingest.readers.hdf5 import Budget, small_attributes, walk
 from ema_pipeline.ingest.readers.raw import RawRecord

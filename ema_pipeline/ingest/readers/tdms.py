@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers.arrays import NamedArray, assemble
 from ema_pipeline.ingest.readers.raw import RawRecord
 

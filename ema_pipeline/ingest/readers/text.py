@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers.lines import Lines
 from ema_pipeline.ingest.readers.preamble import Preamble, read_preamble
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.limits import ReadLimits
+from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord
 
 NAME = "WAV"

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from simulate_hits import Blow, force_of, modal_response, random_record, record_of
 
+from ema_pipeline.check_result import CheckResult
+from ema_pipeline.ingest.hit_checks import check_hit, hits_of_test, usable_band_hz
 from ema_pipeline.ingest.hits import find_hits
 from ema_pipeline.ingest.pulse import find_pulse, find_second_impact, noise_of
-from ema_pipeline.ingest.quality import check_hit, hits_of_test, usable_band_hz
 from ema_pipeline.ingest.records import Hit, Record
-from ema_pipeline.verdict import Verdict
 
 RATE = 12800.0
 
@@ -23,7 +23,7 @@ def checked(record: Record) -> Hit:
     return check_hit(record, find_hits(record)[0])
 
 
-def verdict(hit: Hit, check: str, channel: str | None = None) -> Verdict:
+def verdict(hit: Hit, check: str, channel: str | None = None) -> CheckResult:
     """The verdict of one check."""
     return next(v for v in hit.verdicts if v.check == check and channel in (None, v.channel))
 

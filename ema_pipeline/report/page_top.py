@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import Diagnosis, Rung
 from ema_pipeline.report import diagnosis
-from ema_pipeline.report.culprit import CulpritDrawing, culprit_drawing
+from ema_pipeline.report.effect_places import EffectPlaces, effect_places
 from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.shapes import drawing_for
@@ -30,7 +30,7 @@ class Tile:
 
 
 @dataclass(frozen=True)
-class Band:
+class PageTop:
     """What a reader sees first.
 
     Attributes
@@ -46,7 +46,7 @@ class Band:
         What to measure next; may be empty.
     commands : tuple of str
         What a user would type next.
-    drawing : CulpritDrawing or None
+    drawing : EffectPlaces or None
     """
 
     heading: str
@@ -56,19 +56,19 @@ class Band:
     against: tuple[str, ...] = ()
     next: str = ""
     commands: tuple[str, ...] = ()
-    drawing: CulpritDrawing | None = None
+    drawing: EffectPlaces | None = None
 
 
-def band_of(results: RunResults) -> Band:
+def page_top(results: RunResults) -> PageTop:
     """The top of the page for these results."""
     found = results.diagnosis
     if found is None:
-        return Band(_heading_without_diagnosis(results), "", _tiles(results))
+        return PageTop(_heading_without_diagnosis(results), "", _tiles(results))
     commands = list(diagnosis.next_commands(found, results.folder, results.added))
     if results.added:
         folder = shlex.quote(results.folder) if results.folder else "OUT"
         commands = [*commands, f"ema diagnose {folder}", f"ema remove {folder} {results.added[-1]}"]
-    known = Band("", "", _tiles(results), commands=tuple(commands), drawing=_drawing(results))
+    known = PageTop("", "", _tiles(results), commands=tuple(commands), drawing=_drawing(results))
     if results.diagnosis_is_old:
         told = "The diagnosis below was made before; make it anew to see what is still missing."
         return replace(known, heading=_changed(results), summary=told)
@@ -157,10 +157,10 @@ def _against(found: Diagnosis) -> tuple[str, ...]:
     return (*lines, *found.notes)
 
 
-def _drawing(results: RunResults) -> CulpritDrawing | None:
+def _drawing(results: RunResults) -> EffectPlaces | None:
     """The rig with the places of what is named or added; of the configuration with most bodies."""
     places = _places(results)
-    drawings = [culprit_drawing(drawing_for(c), places) for c in results.configurations]
+    drawings = [effect_places(drawing_for(c), places) for c in results.configurations]
     known = [d for d in drawings if d is not None]
     return max(known, key=lambda d: len(d.bodies), default=None)
 

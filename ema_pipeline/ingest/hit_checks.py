@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
+from ema_pipeline.check_result import CheckResult, Consequence, judged
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.clipping import flat_top_share
 from ema_pipeline.ingest.hit_settings import HitSettings
@@ -17,7 +18,6 @@ from ema_pipeline.ingest.hits import align_hits, find_hits, trim_hits
 from ema_pipeline.ingest.pulse import Pulse, find_pulse, find_second_impact, noise_of, step_of
 from ema_pipeline.ingest.records import Hit, Record, ResponseChannel
 from ema_pipeline.threads import in_order
-from ema_pipeline.verdict import Consequence, Verdict, judged
 
 DOUBLE_HIT = "ISO 7626-5, avoidance of double impacts"
 OVERLOAD = "ISO 7626-5, overload of the measuring channels"
@@ -100,7 +100,7 @@ def _without_false_clipping(
     """Channels whose tops are somewhat flat at a level that they exceed by far in another record are not clipped."""
     highest: dict[str, float] = {}
 
-    def exceeded(verdict: Verdict, hit: Hit, record: Record) -> bool:
+    def exceeded(verdict: CheckResult, hit: Hit, record: Record) -> bool:
         if verdict.check != "clipping" or verdict.passes or verdict.value >= SURE_FLAT_TOP:
             return False
         name = verdict.channel
@@ -170,7 +170,7 @@ def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> 
     # Before the first hit of a record the structure is at rest: what is there is noise and hum.
     rest = pulse.start if hit.start == 0 and hit.number == 0 else 0
 
-    def check(row: int) -> list[Verdict]:
+    def check(row: int) -> list[CheckResult]:
         samples = record.responses[row, hit.start : hit.stop]
         return _check_response(record.channels[row], samples, pulse, rest, rate, settings)
 
@@ -205,7 +205,7 @@ def usable_band_hz(
     return band, float(np.interp(sample_rate_hz * BAND_OVER_RATE, frequency, relative))
 
 
-def _double_hit(force: NDArray[np.float64], pulse: Pulse, rate: float, settings: HitSettings) -> Verdict:
+def _double_hit(force: NDArray[np.float64], pulse: Pulse, rate: float, settings: HitSettings) -> CheckResult:
     second = find_second_impact(force, pulse, rate, settings.double_hit)
     passes = second.ratio < settings.double_hit
     when = "after" if second.delay_s > 0 else "before"
@@ -221,7 +221,7 @@ def _overload(
     peak: int,
     rate: float,
     settings: HitSettings,
-) -> Verdict:
+) -> CheckResult:
     largest = float(max(samples.max(), -samples.min()))
     share = largest / full_scale if np.isfinite(full_scale) else 0.0
     passes = share < settings.overload
@@ -232,7 +232,7 @@ def _overload(
 
 def _flat_top(
     samples: NDArray[np.float64], full_scale: float, name: str, consequence: Consequence, noise: float
-) -> Verdict:
+) -> CheckResult:
     share = flat_top_share(samples, noise)
     far_below = float(max(samples.max(), -samples.min())) < FAR_BELOW_SCALE * full_scale
     passes = share < FLAT_TOP_LIMIT or (np.isfinite(full_scale) and far_below)
@@ -240,7 +240,7 @@ def _flat_top(
     return judged("clipping", share, FLAT_TOP_LIMIT, passes, OVERLOAD, consequence, fault, channel=name)
 
 
-def _force_level(pulse: Pulse, noise: float, name: str, settings: HitSettings) -> Verdict:
+def _force_level(pulse: Pulse, noise: float, name: str, settings: HitSettings) -> CheckResult:
     ratio = min(pulse.height / noise, 1e12) if noise > 0 else 1e12
     passes = ratio >= settings.trigger_noise
     fault = f"{name} does not stand out of its noise: {ratio:.1f} times"
@@ -248,7 +248,7 @@ def _force_level(pulse: Pulse, noise: float, name: str, settings: HitSettings) -
     return judged("force level", ratio, limit, passes, "", "reject_hit", fault, channel=name, unit="×")
 
 
-def _force_peak(peak: float, name: str) -> Verdict:
+def _force_peak(peak: float, name: str) -> CheckResult:
     """Whether an impact hammer can have made this peak; its unit or sensitivity is wrong if not."""
     size, (low, high) = abs(peak), HAMMER_PEAKS_N
     limit = low if size < low else high
@@ -262,7 +262,7 @@ def _force_peak(peak: float, name: str) -> Verdict:
 
 def _force_spectrum(
     force: NDArray[np.float64], pulse: Pulse, rate: float, name: str, settings: HitSettings
-) -> Verdict:
+) -> CheckResult:
     band, top_db = usable_band_hz(force, pulse, rate, settings.force_drop_db)
     wanted = rate * BAND_OVER_RATE
     drop = f"{settings.force_drop_db:.0f} dB up to {band:.4g} Hz"
@@ -278,7 +278,7 @@ def _check_response(
     rest: int,
     rate: float,
     settings: HitSettings,
-) -> list[Verdict]:
+) -> list[CheckResult]:
     step = step_of(samples)
     dead = _dead_channel(channel.name, samples, step, pulse, rest, rate)
     if not dead.passes:
@@ -294,7 +294,7 @@ def _check_response(
 
 def _dead_channel(
     name: str, samples: NDArray[np.float64], step: float, pulse: Pulse, rest: int, rate: float
-) -> Verdict:
+) -> CheckResult:
     """A channel that carries a constant, a flickering last bit, or nothing but mains hum.
 
     A working sensor at a node shows its own broadband noise instead, many steps of the converter high; it is
@@ -365,7 +365,7 @@ def _answers(samples: NDArray[np.float64], pulse: Pulse, rest: int) -> bool:
 
 def _decay(
     name: str, samples: NDArray[np.float64], pulse: Pulse, rest: int, noise: float, settings: HitSettings
-) -> Verdict:
+) -> CheckResult:
     """Response at the end of the record over its largest, noise and hum taken off.
 
     Both are rms over a twentieth of the record. What the channel shows before the blow (or, in the middle

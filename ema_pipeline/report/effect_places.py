@@ -27,7 +27,7 @@ class DrawnBody:
 
 
 @dataclass(frozen=True)
-class CulpritDrawing:
+class EffectPlaces:
     """Bodies from back to front, and the points where two named bodies meet."""
 
     view_box: str
@@ -36,7 +36,7 @@ class CulpritDrawing:
     words: str
 
 
-def culprit_drawing(drawing: Drawing | None, places: Sequence[str]) -> CulpritDrawing | None:
+def effect_places(drawing: Drawing | None, places: Sequence[str]) -> EffectPlaces | None:
     """Where effects sit on the rig; None where the rig has no drawing or no body is named.
 
     Parameters
@@ -64,7 +64,7 @@ def culprit_drawing(drawing: Drawing | None, places: Sequence[str]) -> CulpritDr
     )
     reach = 1.08 * drawing.reach * UNITS
     box = " ".join(f"{v:.0f}" for v in (-reach, -reach, 2 * reach, 2 * reach))
-    return CulpritDrawing(box, bodies, tuple(marks), f"Rig with {', '.join(places)} marked")
+    return EffectPlaces(box, bodies, tuple(marks), f"Rig with {', '.join(places)} marked")
 
 
 def _meeting(a: Body, b: Body) -> tuple[float, float] | None:

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.fit.comparison import windowed_accelerance
-from ema_pipeline.frf.channels import SEVERAL
-from ema_pipeline.frf.sensitivities import (
+from ema_pipeline.frf.channel_faults import (
     SAME_FACTOR,
     SENSITIVITY,
     SUSPECT_FACTOR,
@@ -24,9 +24,9 @@ from ema_pipeline.frf.sensitivities import (
     factor_words,
     likely_cause,
 )
+from ema_pipeline.frf.channels import SEVERAL
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.mechanics.system import LinearSystem
-from ema_pipeline.verdict import Verdict
 
 Real = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ class _Suspicion:
 
 def suspected_sensitivities(
     frfs: Mapping[str, FrfSet], systems: Mapping[str, Sequence[LinearSystem]]
-) -> tuple[Verdict, ...]:
+) -> tuple[CheckResult, ...]:
     """Check the scale and the sign of every channel against the model.
 
     Parameters
@@ -70,7 +70,7 @@ def suspected_sensitivities(
 
     Returns
     -------
-    tuple of Verdict
+    tuple of CheckResult
         One per suspicion, ``passes`` False: `value` is the factor by which the channel reads too high (below 1: too
         low; −1 where it is reversed), `channel` its name, `message` what to look up. Empty where nothing is suspected.
     """
@@ -88,17 +88,17 @@ def suspected_sensitivities(
     return tuple(verdicts)
 
 
-def _verdict(where: str, s: _Suspicion) -> Verdict:
+def _verdict(where: str, s: _Suspicion) -> CheckResult:
     if s.factor < 0:
         fault = (
             f"{where}{s.what} points the wrong way against the model: turn the sign of its dof in test.toml"
         )
-        return Verdict(SENSITIVITY, -1.0, 0.0, "1", False, "", "warn", s.what, fault)
+        return CheckResult(SENSITIVITY, -1.0, 0.0, "1", False, "", "warn", s.what, fault)
     fault = (
         f"{where}{s.what} reads {factor_words(s.factor)} against the model's masses and stiffnesses: "
         f"look up sensitivity_mv and unit{s.cause}"
     )
-    return Verdict(SENSITIVITY, s.factor, SUSPECT_FACTOR, "1", False, "", "warn", s.what, fault)
+    return CheckResult(SENSITIVITY, s.factor, SUSPECT_FACTOR, "1", False, "", "warn", s.what, fault)
 
 
 def _against_model(frfs: FrfSet, systems: Sequence[LinearSystem]) -> tuple[Real, Real]:

@@ -12,15 +12,6 @@ from numpy.typing import NDArray
 from ema_pipeline.modal.all_rows import linear_fit, placed
 from ema_pipeline.modal.bands import SubBand
 from ema_pipeline.modal.compress import Local, Window, compress, compressible
-from ema_pipeline.modal.credibility import (
-    COINCIDENT,
-    MIN_VOTES,
-    PLAIN_DAMPING,
-    SURE_VOTES,
-    credible,
-    evident,
-    significant,
-)
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.engines import MODES_PER_PEAK, SPARE_MODES
 from ema_pipeline.modal.fit import (
@@ -31,13 +22,7 @@ from ema_pipeline.modal.fit import (
     normalised,
     shapes_by_lines,
 )
-from ema_pipeline.modal.missed import Search, missed
-from ema_pipeline.modal.noise import NoiseLaw
-from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, at_peak
-from ema_pipeline.modal.poles import PoleSet
-from ema_pipeline.modal.segment import SegmentFit, fit_segment
-from ema_pipeline.modal.selection import link, votes
-from ema_pipeline.modal.uncertainty import (
+from ema_pipeline.modal.fit_covariance import (
     PointScores,
     left_to_go,
     of_all_blocks,
@@ -48,6 +33,21 @@ from ema_pipeline.modal.uncertainty import (
     scores_of_points,
     shape_covariance,
 )
+from ema_pipeline.modal.missed import Search, missed
+from ema_pipeline.modal.mode_acceptance import (
+    COINCIDENT,
+    MIN_VOTES,
+    PLAIN_DAMPING,
+    SURE_VOTES,
+    credible,
+    evident,
+    significant,
+)
+from ema_pipeline.modal.noise import NoiseLaw
+from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, at_peak
+from ema_pipeline.modal.pole_tracks import link, votes
+from ema_pipeline.modal.poles import PoleSet
+from ema_pipeline.modal.segment import SegmentFit, fit_segment
 from ema_pipeline.processes import release_memory
 from ema_pipeline.threads import in_order
 

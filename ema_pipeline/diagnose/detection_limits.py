@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.diagnose.claims import sigmas_asked
 from ema_pipeline.diagnose.expected_gain import Change, ExpectedGain
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
-from ema_pipeline.diagnose.pool import spread
+from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.probability import needed
-from ema_pipeline.diagnose.score import Marginal
+from ema_pipeline.diagnose.score import UNSEEN, Marginal
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import DetectionLimit
 from ema_pipeline.inference import Residuals
@@ -22,14 +23,13 @@ from ema_pipeline.observations.rig_model import SizeMap
 
 _NINE_OF_TEN = 1.2816
 """Quantile of the normal distribution: in nine tests of ten the estimate is no further than this below the truth."""
-_UNSEEN = 1e6
-"""1 σ of a size, in units of its prior, from which the data hold nothing of it."""
-_TRIALS = 5
+_TRIALS, _MOST_TRIALS = 5, 14
+"""Sizes that are tried, of effects in proportion to their size and of others."""
 _NEAR = 0.1
 """Relative accuracy of the gain at a limit."""
-_LARGEST_STEP = 1.4
-"""Largest step in the logarithm of a limit from one trial to the next."""
-_SLOPES = (0.3, 3.0)
+_LARGEST_STEP, _LONGEST_STEP = 1.4, 4.0
+"""Largest step in the logarithm of a limit from one trial to the next, of the same."""
+_SLOPES = (0.3, 5.0)
 """Least and largest power of the size with which the gain is taken to grow."""
 
 
@@ -39,7 +39,7 @@ def detection_limits(
     hypotheses: Sequence[Hypothesis],
     settings: DiagnoseSettings,
 ) -> tuple[DetectionLimit, ...]:
-    """Limit of every effect, from what the data hold of its size beside everything uncertain.
+    """Limit of every effect, from what the data say of its size beside everything uncertain.
 
     Its expected gain in log evidence (`ExpectedGain`), less what its freedom costs, ½ ln(1 + (prior σ/σ)²), has to be
     as much as a claim needs among so many hypotheses. How far an effect moves the predictions is calculated at its
@@ -68,9 +68,10 @@ def detection_limits(
         shown = _Shown.of(observations, fit, model, hypothesis, gains)
         if shown is None:
             return None
-        return shown.least(needed(hypothesis, hypotheses, settings, found=0), settings.sigmas)
+        sigmas = sigmas_asked(observations, hypothesis, settings)
+        return shown.least(needed(hypothesis, hypotheses, settings, found=0), sigmas)
 
-    asked = [h for h in hypotheses if not h.extends]
+    asked = [h for h in hypotheses if not h.size_cannot_be_zero]
     found = zip(asked, spread(least, asked, settings.processes), strict=True)
     return tuple(_under(name, h, size) for h, size in found if size is not None for name in h.names)
 
@@ -92,7 +93,7 @@ class _Shown:
     ----------
     problem : EffectProblem
     null : ndarray, (n,)
-        Unknowns with the effect at nothing.
+        Unknowns with the effect at zero.
     at : int
         Position of its first size.
     scatters : dict of str to float
@@ -100,7 +101,10 @@ class _Shown:
         At `null`, with derivatives.
     gains : ExpectedGain
     std : float
-        1 σ of the unknown at nothing.
+        1 σ of the unknown at zero; of an effect that depends on the amplitude, as its usual size shows it.
+    linear : bool
+        False for such an effect: how it begins says little of it. What a quadratic spring changes grows with the
+        square of its size.
     """
 
     problem: EffectProblem
@@ -110,12 +114,13 @@ class _Shown:
     before: Residuals
     gains: ExpectedGain
     std: float
+    linear: bool
 
     @classmethod
     def of(
         cls, observations: Observations, fit: Fit, model: Model, hypothesis: Hypothesis, gains: ExpectedGain
     ) -> _Shown | None:
-        """Of one hypothesis; None where these data hold nothing of it."""
+        """Of one hypothesis; None where these data carry no information on it."""
         problem, scatters = model.problem(observations), fit.posterior.scatters
         null = transferred(fit.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
         size = hypothesis.placed.effect.parameters[0].name
@@ -124,40 +129,62 @@ class _Shown:
         before = problem.residuals(null, scatters, matching=fit.posterior.residuals.matching)
         if len(before.values) != gains.marginal.count or not np.all(np.isfinite(before.values)):
             return None
-        std = 1 / np.sqrt(max(gains.change(before.jacobian[:, at]).total, 1e-300))
-        if std > _UNSEEN:
-            return None
-        return cls(problem, null, at, scatters, before, gains, float(std))
+        linear, usual = hypothesis.placed.effect.linear, before.jacobian[:, at]
+        if not linear:
+            x = null.copy()
+            x[at] = 1.0
+            usual = problem.residuals(x, scatters, matching=before.matching, derivatives=False).values
+            usual = (
+                usual - before.values if len(usual) == len(before.values) else np.zeros_like(before.values)
+            )
+        std = 1 / np.sqrt(max(gains.change(np.nan_to_num(usual)).total, 1e-300))
+        return None if std > UNSEEN else cls(problem, null, at, scatters, before, gains, float(std), linear)
 
     def least(self, gain: float, sigmas: float) -> float:
         """Unknown of the least size that gains so much in nine tests of ten; infinite where none does."""
-        wanted = max(gain + 0.5 * float(np.log1p(self.std**-2.0)), 0.5 * sigmas**2)
         most = float(self.problem.unknowns.upper[self.at])
-        unknown = self.std * (np.sqrt(2 * wanted) + _NINE_OF_TEN)
+        unknown = self.std * (np.sqrt(2 * self._wanted(gain, sigmas, 1 / self.std)) + _NINE_OF_TEN)
+        trials, longest = (_TRIALS, _LARGEST_STEP) if self.linear else (_MOST_TRIALS, _LONGEST_STEP)
+        low, high = 0.0, np.inf
         known: list[tuple[float, float]] = []
-        for _ in range(_TRIALS):
+        for _ in range(trials):
             unknown = min(unknown, most)
-            log, off = float(np.log(unknown)), float(np.log(max(self._gained(unknown), 1e-9) / wanted))
+            log, off = float(np.log(unknown)), self._above(unknown, gain, sigmas)
             if abs(off) < _NEAR or (unknown == most and off < 0):
                 break
+            low, high = (unknown, high) if off < 0 else (low, unknown)
             slope = 2.0
             if known and log != known[-1][0]:
                 slope = float(np.clip((off - known[-1][1]) / (log - known[-1][0]), *_SLOPES))
             known.append((log, off))
-            unknown = float(np.exp(log - np.clip(off / slope, -_LARGEST_STEP, _LARGEST_STEP)))
+            unknown = float(np.exp(log - np.clip(off / slope, -longest, longest)))
+            if not low < unknown < high:
+                unknown = float(np.sqrt(low * high))
         return unknown if unknown < most or off >= 0 else float("inf")
 
-    def _gained(self, unknown: float) -> float:
-        """Log evidence that a size gains in nine tests of ten."""
+    def _above(self, unknown: float, gain: float, sigmas: float) -> float:
+        """Logarithm of what a size gains in nine tests of ten, over what is asked of it."""
+        gained, known = self._gained(unknown)
+        return float(np.log(max(gained, 1e-9) / self._wanted(gain, sigmas, known)))
+
+    def _gained(self, unknown: float) -> tuple[float, float]:
+        """Log evidence that a size gains in nine tests of ten, and how many times better than its prior it is known."""
         change = self._moved(unknown)
         distance = float(np.sqrt(max(change.total, 1e-300)))
-        return self.gains.of(change, max(1 - _NINE_OF_TEN / distance, 0.0) ** 2)
+        gained = self.gains.of(change, max(1 - _NINE_OF_TEN / distance, 0.0) ** 2)
+        return gained, 1 / self.std if self.linear else distance / unknown
+
+    @staticmethod
+    def _wanted(gain: float, sigmas: float, known: float) -> float:
+        """Log evidence asked of a size that the data know `known` times better than its prior."""
+        return max(gain + 0.5 * float(np.log1p(known**2)), 0.5 * sigmas**2)
 
     def _moved(self, unknown: float) -> Change:
         """How far the predictions move: as calculated, or to first order where that is less.
 
         What is uncertain follows a size to first order only. Beyond, close modes turn into each other in ways that a
-        fit would follow, so that a larger change than that of first order says nothing.
+        fit would follow, so that a larger change than that of first order says nothing. Effects that depend on the
+        amplitude change no mode of the model, and have no first order of their own.
         """
         first = self.gains.change(self.before.jacobian[:, self.at] * unknown)
         x = self.null.copy()
@@ -165,7 +192,8 @@ class _Shown:
         there = self.problem.residuals(x, self.scatters, derivatives=False)
         if not _same_pairs(there.matching, self.before.matching) or not np.all(np.isfinite(there.values)):
             return first
-        return min(first, self.gains.change(there.values - self.before.values), key=lambda c: c.total)
+        whole = self.gains.change(there.values - self.before.values)
+        return min(first, whole, key=lambda c: c.total) if self.linear else whole
 
 
 def _same_pairs(a: object, b: object) -> bool:

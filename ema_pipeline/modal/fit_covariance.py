@@ -1,4 +1,16 @@
-"""Covariance of poles, participations and shapes, and how significant each mode is."""
+"""Covariance of poles, participations and shapes from the fit, and how significant each mode is.
+
+Where the interval of a mode begins. Later steps, in their order:
+
+1. `sub_bands`: where many points are struck, variances are raised to the scatter between points; the step that the fit
+   would still take is added.
+2. `identify`: a pole that is held at its peak gets the scatter over hits there, and half the way that the fit would
+   have gone; variances of poles become those of frequency and damping ratio.
+3. `hit_to_hit`: of one hit, the scatter that it cannot show; of many, how far frequencies move from hit to hit, and a
+   trend with the force.
+4. `combine_estimates`: where circles or single hits disagree with the pole, the interval covers them.
+5. `levels.study`: for modes that move with the force, one size at each force level.
+"""
 
 from __future__ import annotations
 

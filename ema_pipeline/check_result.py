@@ -1,4 +1,4 @@
-"""Verdicts: what a check measured, against which limit, by which clause."""
+"""Results of checks: what was measured, against which limit, by which clause."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Consequence = Literal["reject_hit", "reject_channel", "warn"]
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CheckResult:
     """The outcome of one quality check.
 
     Attributes
@@ -28,7 +28,7 @@ class Verdict:
         What happens when the check fails: the hit is left out, one channel of the hit is left
         out, or it is only reported.
     channel : str
-        Channel the verdict speaks about, ``""`` for the hit as a whole.
+        Channel that it is about, ``""`` for the hit as a whole.
     message : str
         One plain sentence for the technician, e.g. ``"second impact of 12 % after 8.1 ms"``.
     """
@@ -55,9 +55,9 @@ def judged(
     *,
     channel: str = "",
     unit: str = "1",
-) -> Verdict:
-    """Verdict whose message is the fault where the check fails, and empty where it passes."""
+) -> CheckResult:
+    """Result whose message is the fault where the check fails, and empty where it passes."""
     message = "" if passes else fault
-    return Verdict(
+    return CheckResult(
         check, float(value), float(limit), unit, bool(passes), clause, consequence, channel, message
     )

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from ema_pipeline.modal.assurance import mac, mpc
 from ema_pipeline.modal.data import FitData
-from ema_pipeline.modal.earned import unearned
 from ema_pipeline.modal.fit import Estimate, LinearSolution, newton_step, synthesis
+from ema_pipeline.modal.fit_covariance import evidence
+from ema_pipeline.modal.heavily_damped import unearned
 from ema_pipeline.modal.missed import left_over
 from ema_pipeline.modal.noise import Noise
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
 from ema_pipeline.modal.segment import SegmentFit, impossible
-from ema_pipeline.modal.uncertainty import evidence
 from ema_pipeline.modal.windowed import likeness
 
 Real = NDArray[np.float64]

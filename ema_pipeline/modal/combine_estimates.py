@@ -18,8 +18,8 @@ import numpy as np
 
 from ema_pipeline.modal.circle.compare import CLOSE_BANDWIDTHS, FEW_LINES, average
 from ema_pipeline.modal.drift.align import Alignment, PeakMovement
+from ema_pipeline.modal.hit_to_hit import peak_of
 from ema_pipeline.modal.identify import ANCHORED
-from ema_pipeline.modal.moving import peak_of
 from ema_pipeline.modal.types import ModalModel, Mode
 
 SIGMA = 3.0
