@@ -313,6 +313,7 @@ def test_scatters_are_learned_from_what_is_stated_where_none_was_learned_before(
         fitting, "descend", lambda problem, scatters, x, steps: begun.append(scatters) or "begun"
     )
     monkeypatch.setattr(fitting, "learn", lambda problem, start, scatters: (start, scatters))
+    monkeypatch.setattr(fitting, "freed", lambda data, fit: fit)
     fit = Fit(
         SimpleNamespace(problem=lambda data: None), SimpleNamespace(scatters={"a": 0.5, "b": 0.7}, x=None)
     )  # type: ignore[arg-type]
