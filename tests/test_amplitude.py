@@ -20,11 +20,13 @@ from ema_pipeline.levels.differences import smooth_terms
 from ema_pipeline.mechanics.laws import DryFriction, Nonlinear, PartingSpring, PolynomialSpring
 from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import eigen_solution
-from ema_pipeline.observations.amplitude import AmplitudeObservations, AmplitudeProblem
+from ema_pipeline.observations.amplitude import AmplitudeObservations, AmplitudeProblem, _grid
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, refined, transferred
 from ema_pipeline.observations.hit_modes import HitData, Linear, _fit_weights, comparable, shifted_poles
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
+from ema_pipeline.observations.rig_model import LOG_STD, SizeMap
+from ema_pipeline.rigs.isolator import isolator
 
 RATIO, LINE_HZ, HITS = 0.01, 0.5, 2
 IMPULSE_S = 1e-3
@@ -151,14 +153,18 @@ def test_nothing_is_claimed_where_only_drift_moves_the_modes() -> None:
 
 
 def test_derivatives_by_sizes_are_those_of_small_differences() -> None:
-    elements, _, size = CASES["bearing_cubic@hub"]
-    observations = synthetic(elements)
+    """Those of the level's modes as well, which an effect this strong moves in the softest hits."""
+    size = 1e11
+    observations = synthetic([PolynomialSpring(f"c{a}", {f"hub.{a}": 1.0}, cubic=size) for a in "xy"])
     problem = observations.problem((parse_effect("bearing_cubic@hub", RIG),), {})
     scatters = {n: s.start for n, s in observations.scatters.items()}
     x = problem.start({"bearing_cubic@hub.stiffness": size})
+    left = [i for i, n in enumerate(problem.unknowns.names) if n.startswith("linearisation")]
+    x[left] = 0.2 * np.random.default_rng(0).standard_normal(len(left))
     here = problem.residuals(x, scatters)
+    count = len(problem.modes.residuals(problem.modes.start(), scatters).values)
     drift = next(i for i, n in enumerate(problem.unknowns.names) if n.startswith("drift"))
-    for i in (*problem.nonlinear_sizes, problem.unknowns.index["amplitude of all modes"], drift):
+    for i in (*problem.nonlinear_sizes, problem.unknowns.index["amplitude of all modes"], drift, *left):
         ahead, behind = x.copy(), x.copy()
         ahead[i], behind[i] = x[i] + 1e-5, x[i] - 1e-5
         values = [
@@ -166,7 +172,121 @@ def test_derivatives_by_sizes_are_those_of_small_differences() -> None:
             for p in (ahead, behind)
         ]
         slope = (values[0] - values[1]) / 2e-5
-        np.testing.assert_allclose(here.jacobian[:, i], slope, atol=0.01 * np.abs(slope).max())
+        for rows in (slice(count), slice(count, None)):
+            close = 0.01 * np.abs(slope[rows]).max() + 1e-9
+            np.testing.assert_allclose(here.jacobian[rows, i], slope[rows], atol=close)
+
+
+def test_what_the_hits_of_a_second_configuration_move_is_moved_there() -> None:
+    """Rows of the level's modes are found between those of other configurations, whose modes stay as they are."""
+    one = synthetic([PolynomialSpring(f"c{a}", {f"hub.{a}": 1.0}, cubic=1e11) for a in "xy"])
+    rig = replace(RIG, configurations=("first", "test", "last"))
+    first, last = (replace(one.modes.data[0], configuration=name) for name in ("first", "last"))
+    three = AmplitudeObservations(ModeObservations(rig, [first, *one.modes.data, last]), one.hits)
+    effects = [parse_effect("bearing_cubic@hub", RIG)]
+    moved = {}
+    for name, data in (("one", one), ("three", three)):
+        problem = data.problem(effects, {})
+        scatters = {n: s.default for n, s in data.scatters.items()}
+        values = [
+            problem.residuals(
+                problem.start({"bearing_cubic@hub.stiffness": size}), scatters, derivatives=False
+            ).values
+            for size in (0.0, 1e11)
+        ]
+        count = len(problem.modes.residuals(problem.modes.start(), scatters).values)
+        moved[name] = (values[1] - values[0])[:count]
+    before, mine, after = moved["three"].reshape(3, -1)
+    assert not np.any(before)
+    assert not np.any(after)
+    assert np.max(np.abs(moved["one"])) > 1e-3
+    np.testing.assert_allclose(mine, moved["one"], atol=1e-9)
+
+
+def test_a_spring_that_parts_is_as_stiff_as_the_spring_that_it_replaces() -> None:
+    label, stiffer = "mesh_backlash@hub-rim", 0.3
+    observations = synthetic(CASES[label][0])
+    parameters = {**RIG.parameters, "link": replace(RIG.parameters["link"], value=2e5 * np.exp(stiffer))}
+    rigs = RIG, replace(RIG, parameters=parameters)
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    found = []
+    for rig in rigs:
+        data = AmplitudeObservations(ModeObservations(rig, observations.modes.data), observations.hits)
+        problem = data.problem([parse_effect(label, rig)], {})
+        x = problem.start({f"{label}.preload": 3e-4})
+        x[problem.unknowns.index["link"]] = stiffer if rig is RIG else 0.0
+        found.append(problem.residuals(x, scatters, derivatives=False).values)
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-6, atol=1e-6)
+
+
+def test_the_scale_of_amplitudes_is_known_less_well_the_further_poles_move() -> None:
+    observations = synthetic(drift=0.0)
+    still = AmplitudeObservations(observations.modes, [])
+    assert still.problem([], {})._amplitude_std == 0.02
+    (hits,) = observations.hits
+    hard = (hits.level == hits.level.max())[:, None]
+    far = replace(hits, log_frequency=hits.log_frequency + np.where(hard, 0.7 * RATIO, 0.0))
+    problem = AmplitudeObservations(observations.modes, [far, replace(far)]).problem([], {})
+    apart = far.moves[0]
+    assert apart == pytest.approx(0.7, rel=0.05)
+    assert problem._amplitude_std == pytest.approx(np.hypot(0.02, 0.35 * apart / (apart + 0.3)))
+
+
+def test_sizes_are_tried_over_six_decades_of_both_signs_where_there_are_two() -> None:
+    effect = parse_effect("bearing_quadratic@rim", RIG).effect
+    (p,) = effect.parameters
+    grid = _grid(SizeMap.of(p, p.scale), 4)
+    one = np.array([1e-5, 1e-3, 0.1, 10.0])
+    np.testing.assert_allclose(grid, one if p.minimum == 0.0 else [*one, *-one])
+    times = SizeMap.of(parse_effect("relaxation@isolator", isolator()).effect.parameters[1], 0.1)
+    reach = 3.0 * np.log(10) / LOG_STD
+    low, high = times.bounds
+    expected = np.linspace(-reach, reach, 5)
+    np.testing.assert_allclose(_grid(times, 5), expected[(expected >= low) & (expected <= high)])
+    assert _grid(times, 1).tolist() == [0.0]
+
+
+def test_modes_within_four_decay_rates_move_in_step() -> None:
+    """Of the faster one. Each joins the one below it: a row of them is one group."""
+    hits = synthetic().hits[0]
+    width = 50.0 * RATIO  # decay rate over 2π, Hz
+    hertz = np.array([50.0, 50.0 + 3.5 * width, 50.0 + 7.0 * width, 60.0])
+    names = np.arange(4)
+    for frequency, groups in (
+        (hertz, [[0, 1, 2], [3]]),
+        (hertz[::-1], [[3, 2, 1], [0]]),
+        (np.array([50.0, 60.0, 60.0 + 3.5 * width, 80.0]), [[0], [1, 2], [3]]),
+        (np.array([50.0, 60.0, 80.0, 83.4]), [[0], [1], [2], [3]]),
+        (np.array([50.0, 60.0, 80.0, 83.28]), [[0], [1], [2, 3]]),
+    ):
+        reference = replace(
+            hits.reference,
+            log_frequency=np.log(frequency),
+            log_damping=np.full(len(frequency), np.log(RATIO)),
+        )
+        given = replace(hits, reference=reference, modes=names[: len(frequency)])
+        assert [g.tolist() for g in given.groups] == groups
+
+
+def test_what_other_modes_give_is_their_flexibility_at_the_frequency_of_the_group() -> None:
+    (hits,) = synthetic().hits
+    omega = hits.omega
+    slow = (0.4 * omega.min()) ** 2
+    values = np.array([slow, *omega**2, (3 * omega.max()) ** 2])
+    stretch = np.random.default_rng(2).standard_normal((2, len(values)))
+    match = np.arange(1, len(omega) + 1)
+    match[2] = -1
+    found = Linear.of(hits, stretch, match, values, hits.motion)
+    np.testing.assert_allclose(found.along, stretch[:, match] * (match >= 0))
+    fast = values > slow
+    np.testing.assert_allclose(found.flexibility, (stretch[:, fast] / values[fast]) @ stretch[:, fast].T)
+    assert [len(g) for g in hits.groups] == [1] * len(omega)
+    for c, (mode,) in enumerate(hits.groups):
+        square = float(np.mean(hits.poles.imag[:, mode])) ** 2
+        apart = values - square
+        each = stretch**2 * apart / (apart**2 + (0.05 * square) ** 2)
+        others = [k for k in range(len(values)) if match[mode] < 0 or k != match[mode]]
+        np.testing.assert_allclose(found.elsewhere[:, c], each[:, others].sum(axis=1))
 
 
 def test_every_level_is_held_out_once_beside_another() -> None:

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
-from ema_pipeline.diagnose.heldout import NOTHING_HELD_OUT, held_out
+from ema_pipeline.diagnose.heldout import NOTHING_HELD_OUT, _marginal, held_out
 from ema_pipeline.inference import Residuals, Scatter, Unknowns, descend
 from ema_pipeline.observations.fitting import Fit, Model
 
@@ -92,6 +92,23 @@ def test_values_that_were_spent_on_factors_do_not_count(projected: int, count: i
     squares, _ = closed_form(Y)
     found = prediction(Level(Y, Residuals(np.zeros(0), np.zeros((0, 1)), projected=projected)))
     assert found.error == close(np.sqrt(squares / count))
+
+
+def test_a_penalty_costs_as_much_beside_blocks() -> None:
+    alone = Residuals(np.zeros(0), np.zeros((0, 1)), log_scale=0.7, penalty=1.5, block=np.full(2, -1))
+    squares, density = closed_form(Y)
+    found = prediction(Level(Y, alone))
+    assert found.error == close(np.sqrt((squares + 3 * 2 * 1.5) / 6))
+    assert found.log_density == close(density - 3 * (0.7 + 1.5))
+
+
+def test_sums_over_several_unknowns_are_those_of_the_normal_distribution() -> None:
+    random = np.random.default_rng(1)
+    values, jacobian, root = (random.standard_normal(n) for n in (6, (6, 3), (3, 3)))
+    spread = np.eye(6) + jacobian @ root @ root.T @ jacobian.T
+    squares, half = _marginal(values, jacobian, root @ root.T)
+    assert squares == pytest.approx(values @ np.linalg.solve(spread, values))
+    assert half == pytest.approx(0.5 * np.linalg.slogdet(spread)[1])
 
 
 def test_errors_count_in_the_stated_uncertainty_where_there_is_one() -> None:

@@ -13,7 +13,14 @@ from imperfect_modes import GOOD, NORMAL, Hidden, chain, chain_modes
 from scipy.stats import norm
 
 from ema_pipeline.diagnose.detection_limits import _Shown, detection_limits
-from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
+from ema_pipeline.diagnose.hypotheses import (
+    Hypothesis,
+    Name,
+    _change,
+    _starts_of,
+    list_hypotheses,
+    size_starts,
+)
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names, named, sizes_of
 from ema_pipeline.diagnose.probability import against_nothing, needed, null_prior, prior
@@ -21,13 +28,15 @@ from ema_pipeline.diagnose.rungs import with_gains
 from ema_pipeline.diagnose.score import Score, scores
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Rung
+from ema_pipeline.effects.base import EffectParameter, PlacedEffect
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.inference import Residuals
-from ema_pipeline.mechanics.assembly import Damper, Mass, Spring
+from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, refined
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
+from ema_pipeline.observations.rig_model import SizeMap
 from ema_pipeline.rigs import load_rig
 from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.planetary import planetary
@@ -121,6 +130,54 @@ def test_starts_lie_within_the_range_of_the_size() -> None:
 
 
 # --- names ------------------------------------------------------------------------------------------------
+
+
+def of_size(start: float, low: float, high: float, null: float = 0.0, unit: str = "N/m") -> EffectParameter:
+    return EffectParameter("s", unit, null, start, 1.0, low, high, "")
+
+
+def test_fits_begin_at_a_few_usual_sizes() -> None:
+    """Within the range; of loads in time the first size, and the shape that follows it."""
+
+    def starts(unit: str, p: EffectParameter) -> tuple[float, ...]:
+        return _starts_of(unit, SizeMap.of(p, 1.0))
+
+    both, positive, yielding = of_size(1.0, -9.0, 9.0), of_size(1.0, 0.0, 9.0), of_size(1.0, 1e-3, 9.0)
+    assert starts("N/m", both) == (0.5, -0.5)
+    assert starts("N/m", positive) == (0.3, 2.0)
+    assert starts("N/m", yielding) == (0.5, -0.5)
+    assert starts("deg", positive) == (0.0, 0.5, 1.0, -0.5)
+
+    def begun(*parameters: EffectParameter) -> list[list[float]]:
+        named = tuple(replace(p, name=f"s{k}") for k, p in enumerate(parameters))
+        effect = replace(shipped_effects()["spring"], parameters=named)
+        return [list(one.values()) for one in size_starts(PlacedEffect(effect, "m1"))]
+
+    assert begun(both) == [[0.3], [-0.3]]
+    assert begun(positive) == [[0.1], [0.6]]
+    assert begun(yielding) == [[-1.0], [0.4], [1.5]]
+    assert begun(both, both) == [[0.3, 0.0]]
+    assert begun(positive, yielding, yielding) == [[0.3, v, 0.0] for v in (-1.0, 0.4, 1.5)]
+    assert begun(of_size(1.0, -0.2, 9.0)) == [[0.3], [-0.2]]
+
+
+@pytest.mark.parametrize(("bent", "told"), [(0.0, True), (1e-6, True), (1e-5, False)])
+def test_only_changes_in_proportion_to_a_size_are_told_by_their_matrices(bent: float, told: bool) -> None:
+    """By one prior 1 σ of it, of whatever size that is."""
+    row = {"m2.z": 1.0}
+
+    def edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
+        share = values["s"] / 2e3
+        return assembly.add(Spring("more", row, values["s"] * (1 + bent * share)))
+
+    p = EffectParameter("s", "N/m", 0.0, 1e3, 2e3, -1e9, 1e9, "")
+    effect = replace(shipped_effects()["spring"], parameters=(p,), edit=edit)
+    assembly = chain().assembly("all")
+    change = _change(Name(PlacedEffect(effect, "m2"), {}), {"all": assembly})
+    assert (change is not None) is told
+    if change is not None:
+        assert np.count_nonzero(np.abs(change) > 1e-9) == 1
+        assert np.max(change) == pytest.approx(2e3, rel=1e-5)
 
 
 def fitted_on_top(hypothesis: Hypothesis, size: float, rig: Rig, observations: ModeObservations) -> Fit:

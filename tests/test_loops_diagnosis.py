@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,11 +15,26 @@ from typer.testing import CliRunner
 
 from ema_pipeline import codec
 from ema_pipeline.cli import app
-from ema_pipeline.diagnose.loops import diagnose_loops, loop_hypotheses, loop_model, loop_models
+from ema_pipeline.diagnose.hypotheses import Name
+from ema_pipeline.diagnose.loops import (
+    Fitted,
+    _extreme,
+    _grouped,
+    _next_loop,
+    _setting_words,
+    diagnose_loops,
+    furthest,
+    loop_hypotheses,
+    loop_model,
+    loop_models,
+    placed_effects,
+)
 from ema_pipeline.diagnose.rungs import make_ladder
-from ema_pipeline.diagnose.types import Diagnosis, Ladder
-from ema_pipeline.effects.library import shipped_effects
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Rung
+from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.errors import EmaError
+from ema_pipeline.inference import descend
 from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.loops.extract import measure_loop, share_noise
 from ema_pipeline.loops.read import load_loops
@@ -27,6 +45,7 @@ from ema_pipeline.observations.loops import LoopObservations
 from ema_pipeline.report.html import bokeh_script
 from ema_pipeline.rigs.isolator import isolator
 
+module = importlib.import_module("ema_pipeline.diagnose.loops")
 SPRING = {"stiffness": 9e4}
 COARSE = LoopSettings(points_per_cycle=96)
 LIBRARY = shipped_effects()
@@ -249,3 +268,122 @@ def test_play_of_the_spring_alone_is_told_from_play_of_the_whole_isolator() -> N
     assert set(top.effects) == {"backlash@isolator", "viscous_damping@isolator"}
     assert top.parameters["backlash@isolator.gap"].value == pytest.approx(2e-4, rel=0.02)
     assert top.error == pytest.approx(1.0, abs=0.12)
+
+
+# --- the further loop ----------------------------------------------------------------------------------------------
+
+
+def test_the_further_loop_is_the_one_in_which_the_models_forces_differ_most() -> None:
+    """A damper's force beside a spring's grows with the frequency, whatever the amplitude."""
+    data = observed(loops(SPRING, (8.0, 16.0)))
+    scatters = {n: s.default for n, s in data.scatters.items()}
+    fits = []
+    for labels in ((), ("viscous_damping@isolator",)):
+        problem = data.problem(placed_effects(data, LIBRARY, labels), {})
+        sizes = {f"{label}.coefficient": 40.0 for label in labels}
+        x = np.zeros(len(problem.unknowns))
+        for name, value in sizes.items():
+            x[problem.unknowns.index[name]] = problem.sizes[name].unknown(value)
+        fits.append(Fitted(problem, descend(problem, scatters, x, steps=0)))
+    found = furthest(data, *fits)
+    assert found.text == "at 64 Hz and 1.5 mm"
+    stiffness = data.rig.parameters["stiffness"].value
+    share = np.median([loop.force_std_n / np.ptp(loop.force) for loop in data.loops])
+    swing = 2 * np.cos(np.pi / 128)  # of a sine at 128 points, none of them at its peak
+    expected = 40.0 * 2 * np.pi * 64.0 * np.sqrt(64) / (share * swing * stiffness)
+    assert found.separation == pytest.approx(expected, rel=1e-4)
+    back = furthest(data, *fits[::-1])  # counted by the first one's swing
+    assert back.separation == pytest.approx(
+        expected / np.hypot(1, 40.0 * 2 * np.pi * 64.0 / stiffness), rel=1e-3
+    )
+
+
+def test_a_further_loop_is_outside_what_was_measured_or_in_its_middle() -> None:
+    assert [_extreme([3.0, 1.0, 8.0], f) for f in (0.5, 1.0, 1.5)] == [0.5, 3.0, 12.0]
+
+
+def test_what_to_record_next_depends_on_whether_frequencies_differ() -> None:
+    def told(*frequencies: float) -> str:
+        given: Any = SimpleNamespace(loops=[SimpleNamespace(frequency_hz=f) for f in frequencies])
+        return _next_loop(given)
+
+    assert told(10.0, 10.01).startswith("Repeat the loops at 5 and at 20 Hz: ")
+    assert told(10.0, 12.0).startswith("Repeat one loop about another mean position")
+
+
+def test_settings_are_told_with_their_scales_and_range() -> None:
+    def told(scales: dict[str, float]) -> tuple[str, ...]:
+        problem: Any = SimpleNamespace(force_scales=lambda x: scales)
+        none: Any = None
+        return _setting_words(none, problem, np.zeros(1))
+
+    assert told({}) == ()
+    (text,) = told({"one": 0.5, "two": 1.25})
+    assert text.endswith("over a range of 1 : 2.5 (one 0.50, two 1.25)")
+
+
+def test_effects_of_the_same_force_are_names_of_one_with_their_relative_size() -> None:
+    groups: Any = []
+    row = np.array([1.0, 2.0, 0.0])
+    other = np.array([1.0, 2.0, 1e-3])
+    names = [Name(parse_effect("damper@mass.x", isolator()), {}) for _ in range(5)]
+    for name, change in zip(names, (row, 3 * row, None, -row, other), strict=True):
+        _grouped(groups, name, change)
+    assert [[n.relative for n in mine] for _, mine in groups] == [
+        [1.0, pytest.approx(3.0)],
+        [1.0],
+        [1.0],
+        [1.0],
+    ]
+
+
+def told_apart(monkeypatch: pytest.MonkeyPatch, behind: float, separations: dict[str, float]) -> Diagnosis:
+    """What is left of a group of three, the claimed one `behind` above its rivals, a loop telling them apart so far."""
+    labels = ("a@x", "b@x", "c@x")
+    sizes = {"s": EffectSize(3.0, 0.1, "N")}
+    candidates = tuple(
+        Candidate(*one.split("@"), "", 0.5, sizes, 9.0, 1.0, 9.0, 1.0, 9.0, 3.5, one == "b@x", "")
+        for one in labels
+    )
+    rungs = tuple(
+        Rung(given, 1.0, 1.0, 1.0, 1.0, {"b@x.s": sizes["s"]}, 0.0, 0)
+        for given in ((), ("w@x",), ("w@x", "b@x"))
+    )
+    group = ((*labels,), ("w@x", "v@x"))
+    ladder = Ladder(rungs, 0.0, 0.0, 0.0, "")
+    found = Diagnosis("ambiguous", "as it was", 0.1, candidates, group, "", (), {}, 9.0, 9.0, ladder)
+
+    def near(data: object, effects: tuple[str, ...], values: dict[str, float]) -> Any:
+        assert values["b@x.s"] == 3.0
+        assert effects[0] == "w@x"
+        assert f"{effects[1]}.s" in values
+        value = 0.0 if effects[1] == "b@x" else -behind
+        return SimpleNamespace(label=effects[1], posterior=SimpleNamespace(log_evidence=value))
+
+    monkeypatch.setattr(module, "_learned_near", near)
+    monkeypatch.setattr(module, "placed_effects", lambda data, library, labels: tuple(labels))
+    monkeypatch.setattr(
+        module,
+        "furthest",
+        lambda data, one, other: module.Further(f"of {other.label}", separations[other.label]),
+    )
+    none: Any = None
+    return module._told_apart(none, {}, found, DiagnoseSettings(alike=3.0))
+
+
+def test_rivals_stay_that_are_near_in_evidence_and_that_a_further_loop_would_tell_apart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    both = told_apart(monkeypatch, 2.9, {"a@x": 2.1, "c@x": 7.0})
+    assert both.verdict == "ambiguous"
+    assert both.indistinguishable == (("b@x", "a@x", "c@x"), ("w@x", "v@x"))
+    assert both.next_measurement.startswith(
+        "A loop of c@x would distinguish b at x from a at x: a difference of 7 "
+    )
+    one = told_apart(monkeypatch, 2.9, {"a@x": 2.0, "c@x": 7.0})
+    assert one.indistinguishable[0] == ("b@x", "c@x")
+    for behind, far in ((3.0, 7.0), (2.9, 2.0)):
+        none = told_apart(monkeypatch, behind, {"a@x": far, "c@x": far})
+        assert none.verdict == "effect"
+        assert none.indistinguishable == (("w@x", "v@x"),)
+        assert none.summary.startswith("Missing from the model: b at x")

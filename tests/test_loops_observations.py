@@ -249,3 +249,20 @@ def test_an_element_that_is_stretched_twice_as_much_makes_four_times_the_force()
     problems = [LoopObservations(r, [one]).problem([], {}) for r in (rig, more)]
     plain, both = (p.forces(np.zeros(len(p.unknowns)))[0] for p in problems)
     np.testing.assert_allclose(both - plain, 4e4 * one.displacement, atol=1e-6 * np.ptp(plain))
+
+
+def test_fits_begin_as_stiff_as_the_loops_and_at_several_shapes() -> None:
+    data = LoopObservations(isolator(), [loop(SPRING, 12.0, a, noise=0.0) for a in (1e-3, 2e-3)])
+    plain = data.problem((), {})
+    stated = data.rig.parameters["stiffness"].value
+    assert plain.start()[plain.unknowns.index["stiffness"]] == pytest.approx(np.log(9e4 / stated), abs=1e-3)
+    effect = placed("relaxation@isolator")
+    problem = data.problem([effect], {})
+    names = [effect.parameter_name(p.name) for p in effect.effect.parameters]
+    assert [problem._is_shape(n) for n in names] == [False, True]
+    assert problem._options(names[1]) == (-1.5, 0.0, 1.5)
+    x = np.full(len(problem.unknowns), 0.1)
+    tried = np.array(list(problem._shapes(x)))
+    at = problem.unknowns.index[names[1]]
+    assert tried[:, at].tolist() == [0.1, -1.5, 0.0, 1.5]
+    assert np.all(np.delete(tried, at, axis=1) == 0.1)

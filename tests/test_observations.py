@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,12 +12,13 @@ from imperfect_modes import EXACT, GOOD, Hidden, chain, chain_modes, planetary_m
 
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
 from ema_pipeline.dof import Dof
-from ema_pipeline.effects.library import parse_effect
+from ema_pipeline.effects.library import effect_library, parse_effect
 from ema_pipeline.errors import EmaError
-from ema_pipeline.inference import descend
-from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
+from ema_pipeline.inference import Scatter, Unknowns, descend
+from ema_pipeline.mechanics.assembly import Assembly, Damper, Gyroscopic, Mass, Spring
 from ema_pipeline.mechanics.modes import complex_modes
-from ema_pipeline.observations.fitting import Model, fit_base, learned
+from ema_pipeline.observations import fitting
+from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, model_with
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.mode_residuals import UNEXPLAINED, UNSEEN
 from ema_pipeline.observations.modes import MIXING, ModeObservations, ModeProblem
@@ -178,6 +180,146 @@ def test_a_parameter_that_two_powers_follow_is_one_family() -> None:
     i = known.unknowns.index["thickness"]
     assert known.elements["all"][Spring, "beam"][i] == pytest.approx(3.0)
     assert known.elements["all"][Mass, "tip"][i] == pytest.approx(1.0)
+
+
+def test_what_is_known_for_sure_is_no_family_and_dampers_scatter_more_than_springs() -> None:
+    """Nor is the damping ratio of all modes, nor what is nought; what turns elements of another kind builds anew."""
+    stated = {
+        "k": Parameter("k", 1e5, "N/m", 0.05),
+        "sure": Parameter("sure", 2.0, "kg", 0.0),
+        "none": Parameter("none", 0.0, "N·s/m", 0.1),
+        "spin": Parameter("spin", 3.0, "rad/s", 0.1),
+        "modal_damping_ratio": Parameter("modal_damping_ratio", 0.01, "1", 0.3),
+    }
+
+    def build(configuration, values):
+        a, b = {"a.x": 1.0}, {"b.x": 1.0}
+        factor = 1.0 + (values["modal_damping_ratio"] if values["none"] == 0.0 else 0.0)
+        elements = (
+            Mass("a", a, values["sure"]), Mass("b", b, 1.0 * factor), Spring("k", a, values["k"]),
+            Spring("l", b, 1e4), Damper("c", a, 5.0), Gyroscopic("g", a, b, values["spin"]),
+        )  # fmt: skip
+        return Assembly(("a.x", "b.x"), elements)
+
+    known = dependence(ParametricRig("two", ("all",), stated, build))
+    assert known.families == ("k",)
+    assert known.geometric == ("spin",)
+    assert value_of(Gyroscopic("g", {}, {}, 3.0)) == 0.0
+    std = dict(
+        zip(
+            known.unknowns.names,
+            known.unknowns.prior_std({PART_SCATTER: 0.02, MASS_SCATTER: 0.005}),
+            strict=True,
+        )
+    )
+    assert std["c (damper)"] == pytest.approx(0.3)
+    assert std["l (spring)"] == pytest.approx(0.02)
+    assert (Gyroscopic, "g") not in known.elements["all"]
+
+
+def test_a_fit_begins_a_decade_to_either_side_of_what_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the first two families that are loose; not of parts, nor of sizes."""
+    names = ("close", "part", "one", "a@x.s", "two", "three")
+    std = np.array([0.39, 1.0, 0.4, 1.0, 2.0, 2.0])
+    many = np.full(6, np.inf)
+    unknowns = Unknowns(names, std, ("", "part_scatter", "", "", "", ""), -many, many)
+    problem = SimpleNamespace(unknowns=unknowns, sizes={"a@x.s": None}, start=lambda: np.full(6, 0.1))
+    model = SimpleNamespace(problem=lambda data: problem)
+    monkeypatch.setattr(fitting, "annealed", lambda data, model, starts, schedule: starts)
+    monkeypatch.setattr(fitting, "freed", lambda data, starts: starts)
+    starts = np.array(fitting.fit_base(None, model)) - 0.1  # type: ignore[arg-type]
+    assert starts.shape == (9, 6)
+    np.testing.assert_allclose(starts[:, [0, 1, 3, 5]], 0.0)
+    steps = (0.0, 1.2, -1.2)
+    np.testing.assert_allclose(starts[:, [2, 4]], [(a, b) for a in steps for b in steps], atol=1e-12)
+    before = SimpleNamespace(
+        posterior=SimpleNamespace(unknowns=Unknowns.plain(("two",), 1.0), x=np.array([0.7]))
+    )
+    (only,) = fitting.fit_base(None, model, before)  # type: ignore[arg-type]
+    np.testing.assert_allclose(only, [0.1, 0.1, 0.1, 0.1, 0.7, 0.1])
+
+
+def test_a_fit_is_led_past_barriers_as_long_as_it_gains_more_than_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By the best way each time, four times at the most."""
+
+    def stuck(cost: float) -> SimpleNamespace:
+        return SimpleNamespace(cost=cost, x=cost, scatters={}, residuals=None)
+
+    asked = []
+
+    def past(costs: dict[float, list[float]], start: float) -> float:
+        problem = SimpleNamespace(escapes=lambda x, scatters, residuals: asked.append(x) or costs.get(x, []))
+        fit = Fit(SimpleNamespace(problem=lambda data: problem), stuck(start))  # type: ignore[arg-type]
+        monkeypatch.setattr(fitting, "descend", lambda problem, scatters, to: stuck(to))
+        return fitting.freed(None, fit).posterior.cost  # type: ignore[arg-type]
+
+    assert past({10.0: [9.1, 12.0]}, 10.0) == 10.0
+    assert past({10.0: [8.9, 8.0, 8.5], 8.0: [7.5, 9.0]}, 10.0) == 8.0
+    asked.clear()
+    assert past({float(k): [k - 2.0] for k in range(2, 21)}, 20.0) == 12.0
+    assert asked == [20.0, 18.0, 16.0, 14.0]
+    assert past({np.inf: [0.0]}, np.inf) == np.inf
+
+
+def test_the_two_best_starts_that_did_not_meet_are_annealed_to_the_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They have met within a twentieth of the prior 1 σ in every unknown."""
+    unknowns = Unknowns.plain(("a", "b"), np.array([1.0, 10.0]))
+    model = SimpleNamespace(problem=lambda data: SimpleNamespace(unknowns=unknowns))
+    data = SimpleNamespace(scatters={})
+    asked: list[tuple[tuple[float, ...], object]] = []
+
+    def anneal(problem: object, scatters: object, x: tuple[float, ...], schedule: object) -> SimpleNamespace:
+        asked.append((tuple(x), schedule))
+        cost = 10.0 * x[0] + x[1]
+        return SimpleNamespace(x=np.array(x), cost=cost, log_evidence=cost)
+
+    monkeypatch.setattr(fitting, "anneal", anneal)
+    starts = [(0.9, 0.0), (0.2, 0.0), (0.25, 0.0), (0.24, 0.4), (0.2, 0.6), (0.3, 0.0)]
+    schedule = ((30.0, 5), (1.0, 8))
+    best = fitting.annealed(data, model, starts, schedule)  # type: ignore[arg-type]
+    assert [x for x, s in asked if s == schedule[:1]] == starts
+    assert [x for x, s in asked if s == schedule[1:]] == [(0.2, 0.0), (0.2, 0.6)]
+    assert best.posterior.x.tolist() == [0.2, 0.6]  # the one of more evidence in the end
+
+
+def test_a_parameter_is_made_up_of_its_family_and_its_only_part() -> None:
+    problem = SimpleNamespace(sole_parts={"k": ("k (spring)", 0.5)})
+    assert fitting.made_up_of(problem, "k") == {"k": 1.0, "k (spring)": 0.5}  # type: ignore[arg-type]
+    assert fitting.made_up_of(problem, "m") == {"m": 1.0}  # type: ignore[arg-type]
+
+
+def test_effects_that_depend_on_the_level_are_added_where_hits_show_them() -> None:
+    rig, library = planetary(), effect_library()
+    labels = ["mass@sun", "bearing_cubic@sun"]
+    assert model_with(labels, rig, library).labels == ("mass@sun",)
+    both = model_with(labels, rig, library, with_hits=True)
+    assert both.labels == tuple(labels)
+    assert model_with(["mass@carrier"], rig, library, both).labels == (*labels, "mass@carrier")
+    (placed, *_) = both.effects
+    scales = placed.effect.scales(rig.assembly("no_ring"), "sun")
+    assert {n.rpartition(".")[2]: v for n, v in both.scales.items() if n.startswith("mass@sun")} == scales
+
+
+def test_scatters_are_learned_from_what_is_stated_where_none_was_learned_before(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known = {"a": Scatter("a", "", 0.1, 1.0, 0.5, 9.0), "b": Scatter("b", "", 0.2, 1.0, 0.6, 9.0)}
+    begun = []
+    monkeypatch.setattr(
+        fitting, "descend", lambda problem, scatters, x, steps: begun.append(scatters) or "begun"
+    )
+    monkeypatch.setattr(fitting, "learn", lambda problem, start, scatters: (start, scatters))
+    monkeypatch.setattr(fitting, "freed", lambda data, fit: fit)
+    fit = Fit(
+        SimpleNamespace(problem=lambda data: None), SimpleNamespace(scatters={"a": 0.5, "b": 0.7}, x=None)
+    )  # type: ignore[arg-type]
+    told = fitting.learned(SimpleNamespace(scatters=known), fit)  # type: ignore[arg-type]
+    assert begun == [{"a": 0.1, "b": 0.7}]
+    assert told.posterior == ("begun", known)
 
 
 # --- sizes of effects -------------------------------------------------------------------------------------

@@ -159,7 +159,6 @@ def _starts(
     plain = model.system(configuration, np.zeros(len(model.unknowns)))
     values = scipy.linalg.eigh(plain.stiffness, plain.mass, eigvals_only=True)
     powers = np.array([_STIFFENED[_kind(model, configuration, n)] for n in names])
-    powers[len(names) - bool(damping) :] = 0.0
     sized = np.arange(len(names)) < len(names) - bool(damping)
     peaks = measured.peak / np.sqrt(values[values > 1e-9 * np.max(values)])
     for factor in (1.0, *peaks.tolist()):

@@ -127,7 +127,10 @@ class RecordData:
         power = np.mean(self.measured**2, axis=0)
         count = (power.shape[-1] - 1) // 2
         power = 0.5 * (power[:, 1 : count + 1] + power[:, count + 1 :])
-        waves = np.sqrt(uniform_filter1d(power, _AROUND, axis=-1, mode="nearest"))
+        around = uniform_filter1d(power, _AROUND, axis=-1, mode="nearest")
+        waves = np.sqrt(
+            np.maximum(around, 0.0)
+        )  # its running sum leaves less than nought where lines are nought
         return np.concatenate([waves[:, :1], waves, waves], axis=-1)
 
     def lines(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,412 @@
+"""Which hypotheses are fitted, from where, and how they are ranked: on fits written down by hand."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ema_pipeline.diagnose import ranking
+from ema_pipeline.diagnose.ranking import (
+    Found,
+    Ranked,
+    Ranking,
+    _begun_again,
+    _best_of_grid,
+    _better,
+    _bettered,
+    _crossed,
+    _finals,
+    _first_fit,
+    _on,
+    _promising,
+    _screened,
+    _starts,
+)
+from ema_pipeline.inference import Residuals, Unknowns
+from ema_pipeline.observations.fitting import Fit
+
+NO_DATA: Any = object()
+
+
+def hypothesis(label: str, generic: bool = False, sizes: int = 1, extends: bool = False) -> Any:
+    parameters = [SimpleNamespace(name=f"s{k + 1}") for k in range(sizes)]
+    placed = SimpleNamespace(
+        label=label,
+        effect=SimpleNamespace(parameters=parameters),
+        parameter_name=lambda name: f"{label}.{name}",
+    )
+    starts = [{f"{label}.s1": 0.5}, {f"{label}.s1": -0.5}]
+    return SimpleNamespace(
+        label=label,
+        generic=generic,
+        placed=placed,
+        size_cannot_be_zero=extends,
+        begun=(),
+        starts=lambda: starts,
+    )
+
+
+def score(gain: float, size: float = 0.0) -> Any:
+    return SimpleNamespace(gain=gain, size=np.array([size]), std=1.0)
+
+
+def test_of_many_hypotheses_those_of_each_kind_are_fitted_that_promise_most() -> None:
+    own = [hypothesis(f"own{k}") for k in range(16)]
+    generic = [hypothesis(f"generic{k}", generic=True) for k in range(16)]
+    others = [hypothesis("two sizes", sizes=2), hypothesis("not scored", generic=True)]
+    everything = [*own, *others, *generic]
+    promise = {h.label: score(float(k)) for k, h in enumerate(own)}
+    promise |= {h.label: score(-3.0 if k < 4 else 0.5) for k, h in enumerate(generic)}
+    promise["generic9"] = score(0.999)
+    promise["generic10"] = score(1.0)
+    promise["two sizes"] = score(-100.0)
+    far = _screened(everything, promise, near=False)
+    assert far == [*own, *others, *[h for h in generic if h.label not in ("generic2", "generic3")]]
+    near = [h.label for h in _screened(everything, promise, near=True)]
+    assert near[:16] == [*(f"own{k}" for k in range(2, 16)), "two sizes", "not scored"]
+    assert near[16:] == [f"generic{k}" for k in (4, 5, 6, 7, 9, 10)]
+    promise |= {h.label: score(1.0) for h in generic[4:]}
+    assert len(_screened(everything, promise, near=True)) == 16 + 12
+
+
+# --- the order of fits ---------------------------------------------------------------------------------------------
+
+
+def fit(name: str, log_evidence: float, **more: Any) -> Fit:
+    posterior: Any = SimpleNamespace(log_evidence=log_evidence, scatters={}, x=np.zeros(1), **more)
+    model: Any = SimpleNamespace(name=name)
+    return Fit(model, posterior)
+
+
+def found_of(**values: float) -> Found:
+    return {name: (hypothesis(name), fit(name, value)) for name, value in values.items()}
+
+
+def test_finalists_are_learned_and_compared_with_the_learned_base(monkeypatch: pytest.MonkeyPatch) -> None:
+    learned: list[str] = []
+    crossed: list[str] = []
+    among: set[tuple[str, ...]] = set()
+
+    def learn(observations: object, one: Any) -> Any:
+        learned.append(one.model.name)
+        return SimpleNamespace(log_evidence=one.log_evidence + (30.0 if one.model.name == "b" else 3.0))
+
+    def cross(observations: object, sources: Any, one: Any) -> Any:
+        crossed.append(one.model.name)
+        among.add(tuple(s.model.name for s in sources))
+        return SimpleNamespace(log_evidence=one.log_evidence + (1.0 if one.model.name == "base" else 0.0))
+
+    monkeypatch.setattr(ranking, "_learned", learn)
+    monkeypatch.setattr(ranking, "_crossed", cross)
+    found = found_of(a=60.0, b=50.0, c=-139.0, d=-140.0, e=-141.0, f=-150.0, g=-200.0)
+    promising = [(hypothesis("g"), fit("g", 20.0))]
+    told = _finals(NO_DATA, fit("base", 10.0), list(found.values()), promising, 1)
+    assert learned == ["base", "a", "b", "c", "d", "g", "e"]  # e can no longer catch up
+    assert crossed == ["base", "a", "b", "c", "d", "g"]
+    assert among == {("base", "b", "a")}
+    assert told.base.log_evidence == 14.0
+    gains = {r.hypothesis.label: (r.gain, r.final) for r in told.ranked}
+    assert list(gains) == ["b", "a", "g", "c", "d", "e", "f"]
+    assert gains["b"] == (50.0 + 30.0 - 14.0, True)
+    assert gains["g"] == (9.0, True)
+    assert gains["e"] == (-141.0 + 3.0 - 14.0, True)
+    assert gains["f"] == (-160.0, False)
+    close = list(found_of(a=13.0, b=12.8, c=12.6, d=12.4, e=12.0, f=11.5).values())
+    told = _finals(NO_DATA, fit("base", 10.0), close, [], 1)
+    last = told.ranked[-1]  # at wide scatters ahead of nothing by 1.5, no finalist by 1
+    assert (last.hypothesis.label, last.gain) == ("f", told.ranked[-2].gain) == ("f", 1.0)
+    assert _finals(NO_DATA, fit("base", 10.0), [], [], 1).ranked == ()
+
+
+def test_what_modes_without_a_partner_cost_is_the_least_over_all() -> None:
+    def ranked(penalty: float) -> Ranked:
+        residuals = SimpleNamespace(penalty=penalty)
+        return Ranked(hypothesis("a"), fit("a", 0.0, residuals=residuals), 0.0, True)
+
+    assert Ranking(fit("base", 0.0), (ranked(3.0), ranked(1.0), ranked(2.0))).unpaired == 1.0
+    assert Ranking(fit("base", 0.0), ()).unpaired == 0.0
+
+
+def test_only_the_best_are_bettered() -> None:
+    found = found_of(a=1.0, b=3.0, c=2.0)
+    told = _bettered(found, 2, lambda one: fit("x", one.log_evidence + 10.0).posterior, 1)
+    assert {k: f.log_evidence for k, (_, f) in told.items()} == {"a": 1.0, "b": 13.0, "c": 12.0}
+    assert [f.model.name for _, f in told.values()] == ["a", "b", "c"]  # type: ignore[attr-defined]
+
+
+def test_the_base_and_the_best_begin_again_at_what_the_best_of_all_knows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    starts: list[Any] = []
+
+    def refined(observations: object, model: Any, x: Any, steps: int = 12) -> Fit:
+        starts.append((model.name, x, steps))
+        return fit(model.name, 11.0)
+
+    monkeypatch.setattr(ranking, "refined", refined)
+    monkeypatch.setattr(
+        ranking, "_on", lambda o, model, source, sizes: f"{sizes.model.name} at {source.model.name}"
+    )
+    monkeypatch.setattr(
+        ranking,
+        "_better",
+        lambda o, sources, steps, one: SimpleNamespace(
+            log_evidence=one.log_evidence + 1.0,
+            of=(*(s.model.name for s in sources), sources[0].log_evidence, steps),
+        ),
+    )
+    base, found = _begun_again(NO_DATA, fit("base", 10.0), found_of(a=1.0, b=3.0), 1, 1, steps=7)
+    assert starts == [("base", "base at b", 20)]
+    assert base.log_evidence == 11.0
+    assert {k: f.log_evidence for k, (_, f) in found.items()} == {"a": 1.0, "b": 4.0}
+    assert found["b"][1].posterior.of == ("base", "b", 11.0, 7)  # type: ignore[attr-defined]
+    better, _ = _begun_again(NO_DATA, fit("base", 12.0), found_of(a=1.0), 1, 1, steps=7)
+    assert better.log_evidence == 12.0
+
+
+class Parabola:
+    """Problem of `ranking`: two unknowns and sizes, the residual their distance from a point."""
+
+    def __init__(self, names: tuple[str, ...], sizes: tuple[str, ...], at: np.ndarray | None = None) -> None:
+        scatter = tuple("part" if n.startswith("part") else "" for n in names)
+        n = len(names)
+        self.unknowns = Unknowns(names, np.ones(n), scatter, np.full(n, -1.9), np.full(n, 1.9))
+        self.sizes = dict.fromkeys(sizes)
+        self.at = np.zeros(n) if at is None else at
+
+    def residuals(self, x: np.ndarray, scatters: object, **how: Any) -> Residuals:
+        assert how == {"heat": 30.0, "derivatives": False}
+        return Residuals((x - self.at) / how["heat"], np.zeros((0, len(x))))
+
+    def begun(self, x: np.ndarray, scatters: object) -> None:
+        return None
+
+
+def with_model(name: str, problem: Parabola, x: list[float], log_evidence: float = 0.0) -> Fit:
+    posterior: Any = SimpleNamespace(
+        unknowns=problem.unknowns, x=np.array(x), log_evidence=log_evidence, scatters={"part": 1.0}, cost=5.0
+    )
+    model: Any = SimpleNamespace(name=name, problem=lambda observations: problem)
+    return Fit(model, posterior)
+
+
+def test_what_another_fit_knows_is_taken_over_but_for_the_sizes() -> None:
+    mine = with_model("a", Parabola(("part", "common", "a.s"), ("a.s",)), [0.1, 0.2, 0.3])
+    other = with_model("b", Parabola(("part", "a.s", "b.s"), ("a.s", "b.s")), [0.7, 0.8, 0.9])
+    np.testing.assert_array_equal(_on(NO_DATA, mine.model, other, mine), [0.7, 0.2, 0.3])
+    new = with_model("c", Parabola(("part", "b.s"), ("b.s",)), [0.0, 0.0])
+    np.testing.assert_array_equal(
+        _on(NO_DATA, new.model, other, mine), [0.7, 0.9]
+    )  # nobody else knows that size
+
+
+def test_a_better_fit_is_kept_and_the_same_start_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    mine = with_model("a", Parabola(("part", "a.s"), ("a.s",)), [0.1, 0.3], 5.0)
+    sources = [with_model("b", Parabola(("part",), ()), [v]) for v in (0.1, 0.5, 0.7)]
+    tried = []
+
+    def refined(observations: object, model: Any, x: np.ndarray, steps: int) -> Fit:
+        tried.append((x.tolist(), steps))
+        return with_model("a", Parabola(("part", "a.s"), ("a.s",)), x.tolist(), 10.0 * (1.2 - x[0]))
+
+    monkeypatch.setattr(ranking, "refined", refined)
+    best = _better(NO_DATA, sources, 4, mine)
+    assert tried == [([0.5, 0.3], 4), ([0.7, 0.3], 4)]
+    assert best.x.tolist() == [0.5, 0.3]
+
+
+def test_scatters_are_learned_again_where_another_start_leads_further(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mine = with_model("a", Parabola(("part", "a.s"), ("a.s",)), [0.1, 0.3], 5.0)
+    there, elsewhere = (with_model("b", Parabola(("part",), ()), [v]) for v in (0.5, 0.7))
+
+    def refined(observations: object, model: Any, x: np.ndarray, scatters: object, steps: int) -> Fit:
+        reached = {(0.5, 10): 6.0, (0.7, 10): 6.04, (0.1, 4): 6.0}
+        return with_model("a", Parabola(("part", "a.s"), ("a.s",)), x.tolist(), reached[x[0], steps])
+
+    def learned(observations: object, one: Fit) -> Fit:
+        asked.append(float(one.posterior.x[0]))
+        return with_model("a", Parabola(("part", "a.s"), ("a.s",)), one.posterior.x.tolist(), value)
+
+    monkeypatch.setattr(ranking, "refined", refined)
+    monkeypatch.setattr(ranking, "learned", learned)
+    asked: list[float] = []
+    value = 9.0
+    assert _crossed(NO_DATA, [mine, there, elsewhere], mine) is mine.posterior
+    assert asked == []  # neither leads further by as much as is worth it
+    monkeypatch.setattr(ranking, "_BETTER", 0.03)
+    assert _crossed(NO_DATA, [mine, there, elsewhere], mine).log_evidence == 9.0
+    assert asked == [0.7]
+    value = 4.0
+    assert _crossed(NO_DATA, [elsewhere], mine) is mine.posterior
+
+
+# --- where fits begin ----------------------------------------------------------------------------------------------
+
+
+def test_fits_begin_at_usual_sizes_and_once_with_parts_that_are_not_bent() -> None:
+    problem: Any = Parabola(("part", "common", "a.s1"), ("a.s1",))
+    begin = np.array([0.4, 0.5, 0.0])
+    starts = _starts(NO_DATA, problem, hypothesis("a"), begin)
+    np.testing.assert_array_equal(starts, [[0.4, 0.5, 0.5], [0.4, 0.5, -0.5], [0.0, 0.5, 0.5]])
+
+
+def test_an_effect_that_adds_modes_begins_at_the_best_of_a_grid() -> None:
+    names = ("part", "a.s1", "a.s2")
+    problem: Any = Parabola(names, names[1:], np.array([0.0, 0.55, -1.1]))
+    data: Any = SimpleNamespace(scatters={})
+    one = hypothesis("a", sizes=2, extends=True)
+    best = _best_of_grid(data, problem, np.array([0.4, 0.0, 0.0]), one)
+    assert best == [{"a.s1": 0.5, "a.s2": -1.0}, {"a.s1": 0.5, "a.s2": -1.5}]
+    starts = _starts(data, problem, one, np.array([0.4, 0.0, 0.0]))
+    np.testing.assert_array_equal(starts, [[k, 0.5, s] for k in (0.4, 0.0) for s in (-1.0, -1.5)])
+
+
+@pytest.mark.parametrize(("promised", "cost", "begun"), [(0.8, 5.0, 0.4), (4.0, 5.0, 1.0), (0.8, 5.1, None)])
+def test_the_first_fit_begins_at_half_the_size_that_its_score_tells(
+    monkeypatch: pytest.MonkeyPatch, promised: float, cost: float, begun: float | None
+) -> None:
+    """Where that makes matters worse, and where nothing is promised, it is annealed."""
+    base = with_model("base", Parabola(("part",), ()), [0.4])
+    problem = Parabola(("part", "a.s1"), ("a.s1",))
+    model = with_model("a", problem, [0.0, 0.0]).model
+    annealed: list[Any] = []
+
+    def refined(observations: object, model: Any, x: np.ndarray) -> Any:
+        return SimpleNamespace(posterior=SimpleNamespace(cost=cost, x=x))
+
+    def anneal(observations: object, model: Any, starts: Any, schedule: Any) -> Any:
+        annealed.append((len(starts), schedule))
+        return SimpleNamespace(posterior="annealed")
+
+    monkeypatch.setattr(ranking, "refined", refined)
+    monkeypatch.setattr(ranking, "annealed", anneal)
+    found: Any = _first_fit(NO_DATA, base, {"a": model}, {"a": score(3.0, promised)}, hypothesis("a"))
+    if begun is None:
+        assert found == "annealed"
+        assert annealed == [(3, ranking.QUICK)]
+    else:
+        assert found.x.tolist() == [0.4, begun]
+        assert annealed == []
+    without: Any = _first_fit(NO_DATA, base, {"a": model}, {}, hypothesis("a"))
+    assert without == "annealed"
+
+
+def test_what_promises_most_beside_learned_scatters_begins_at_its_size(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    settled = with_model("base", Parabola(("part",), ()), [0.4])
+    names = {k: (f"{k}.s1",) for k in "abc"}
+    models = {k: with_model(k, Parabola(("part", *names[k]), names[k]), [0.0, 0.0]).model for k in "abc"}
+    told = {"a": (1.0, 0.1), "b": (3.0, 0.2), "c": (2.0, 9.0)}
+
+    def scores(observations: object, fit: object, hypotheses: Any, models: object) -> list[Any]:
+        return [
+            SimpleNamespace(hypothesis=h, gain=told[h.label][0], size=np.array([told[h.label][1]]))
+            for h in hypotheses
+        ]
+
+    monkeypatch.setattr(ranking, "scores", scores)
+    monkeypatch.setattr(ranking, "refined", lambda o, model, x, scatters: (model.name, x.tolist(), scatters))
+    asked = [hypothesis(k) for k in "abc"]
+    found: Any = _promising(NO_DATA, settled, asked, models, 2)
+    assert [(h.label, f) for h, f in found] == [
+        ("b", ("b", [0.4, 0.2], {"part": 1.0})),
+        ("c", ("c", [0.4, 1.9], {"part": 1.0})),
+    ]
+    assert _promising(NO_DATA, settled, asked, models, 0) == []
+
+
+# --- all of it -----------------------------------------------------------------------------------------------------
+
+
+class Stages:
+    """Stands for every stage of `rank`, and keeps what it was asked."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, bent: bool = False) -> None:
+        self.asked: list[Any] = []
+        labels = ("a", "b", "c", "d", "e", "f", "unseen")
+        self.hypotheses = [hypothesis(k) for k in labels]
+        stds = dict.fromkeys(labels, 9e5) | {"unseen": 1e6}
+        told = [SimpleNamespace(hypothesis=h, std=stds[h.label]) for h in self.hypotheses if h.label != "f"]
+        monkeypatch.setattr(ranking, "scores", lambda *given: told)
+        monkeypatch.setattr(ranking, "learned", lambda o, one: fit("learned", 0.0))
+        monkeypatch.setattr(
+            ranking, "beyond_scatter", lambda posterior, parts, most: np.array([bent and most == 3.0])
+        )
+        monkeypatch.setattr(ranking, "_screened", self.screened)
+        monkeypatch.setattr(ranking, "_first_fit", self.first_fit)
+        monkeypatch.setattr(ranking, "_begun_again", self.begun_again)
+        monkeypatch.setattr(ranking, "_bettered", self.bettered)
+        monkeypatch.setattr(ranking, "_promising", self.promising)
+        monkeypatch.setattr(
+            ranking, "_finals", lambda o, base, order, promising, processes: (base, order, promising)
+        )
+        for h in self.hypotheses:
+            h.scales = {}
+        self.base = fit("base", 0.0, error=1.3, residuals=SimpleNamespace(penalty=2.0))
+        self.base.model.plus = lambda placed, scales: placed.label  # type: ignore[attr-defined]
+
+    def screened(self, hypotheses: Any, promise: Any, near: bool) -> Any:
+        self.asked.append(("screened", [h.label for h in hypotheses], near))
+        return hypotheses
+
+    def first_fit(self, o: object, base: object, models: Any, promise: Any, h: Any) -> Any:
+        self.asked.append(("first", h.label, len(promise)))
+        return SimpleNamespace(log_evidence=float("fedcba".index(h.label)))
+
+    def begun_again(
+        self, o: object, base: Any, found: Any, processes: object, contenders: int, steps: int
+    ) -> Any:
+        self.asked.append(("again", contenders, steps))
+        return base, found
+
+    def bettered(self, found: Any, count: int, job: Any, processes: object) -> Any:
+        self.asked.append(("freed", count))
+        return found
+
+    def promising(self, o: object, settled: Any, others: Any, models: Any, further: int) -> Any:
+        self.asked.append(("promising", settled.model.name, [h.label for h in others], further))
+        return ["more"]
+
+    def rank(self, base: Fit, **given: Any) -> Any:
+        told: list[tuple[float, str]] = []
+        found = ranking.rank(
+            NO_DATA, base, self.hypotheses, progress=lambda share, text: told.append((share, text)), **given
+        )
+        assert [share for share, _ in told] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8])
+        return found
+
+
+def test_near_the_base_model_scores_tell_where_fits_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+    stages = Stages(monkeypatch)
+    base, order, promising = stages.rank(stages.base, further=2, unpaired=2.0)
+    assert base is stages.base
+    assert [h.label for h, _ in order] == ["a", "b", "c", "d", "e", "f"]
+    assert promising == ["more"]
+    assert stages.asked[0] == (
+        "screened",
+        ["a", "b", "c", "d", "e", "f"],
+        True,
+    )  # what cannot be seen is left out
+    assert stages.asked[1] == ("first", "a", 6)
+    assert stages.asked[7:] == [("freed", 12), ("again", 12, 12), ("promising", "learned", ["f"], 2)]
+
+
+@pytest.mark.parametrize(
+    ("error", "unpaired", "bent"), [(1.31, 2.0, False), (1.3, 1.9, False), (1.3, 2.0, True)]
+)
+def test_a_base_model_that_is_stuck_or_bent_is_begun_again_with_all(
+    monkeypatch: pytest.MonkeyPatch, error: float, unpaired: float, bent: bool
+) -> None:
+    stages = Stages(monkeypatch, bent)
+    stages.base.posterior.error = error  # type: ignore[misc]
+    _, _, promising = stages.rank(stages.base, further=2, unpaired=unpaired)
+    assert promising == []
+    assert stages.asked[0][2] is False
+    assert stages.asked[1] == ("first", "a", 6 if bent else 0)  # of one that is stuck, scores tell no size
+    assert stages.asked[7:] == [("again", 6, 5), ("freed", 12), ("again", 12, 12)]

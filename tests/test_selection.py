@@ -1,0 +1,271 @@
+"""Which hypotheses explain the data alike, what a further effect must gain, and what of it is told."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ema_pipeline.diagnose import selection
+from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _groups
+from ema_pipeline.diagnose.probability import NOTHING
+from ema_pipeline.diagnose.selection import Round, Selection, _beside, select
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import EffectSize
+
+SETTINGS = DiagnoseSettings(alike=3.0, claim=3.5, linearised=0.1, candidates=5)
+
+
+def judged(
+    label: str,
+    gain: float,
+    doubt: str = "",
+    generic: bool = False,
+    linear: bool = True,
+    equivalents: tuple[str, ...] = (),
+) -> Any:
+    """A hypothesis with what it gains; every number of it another one."""
+    effect_id, _, place = label.partition("@")
+    effect = SimpleNamespace(id=effect_id, title=f"title of {label}", signs="signs", linear=linear)
+    placed = SimpleNamespace(effect=effect, place=place, label=label)
+    fit = SimpleNamespace(model=f"model of {label}")
+    hypothesis = SimpleNamespace(label=label, generic=generic, placed=placed)
+    return SimpleNamespace(
+        hypothesis=hypothesis,
+        ranked=SimpleNamespace(hypothesis=hypothesis, fit=fit),
+        named=SimpleNamespace(
+            label=label,
+            name=SimpleNamespace(placed=placed),
+            equivalents=equivalents,
+            sizes={"size": EffectSize(gain, 0.1, "N")},
+        ),
+        gain=gain,
+        needed=3.5,
+        doubt=doubt,
+        claimed=not doubt,
+        base=SimpleNamespace(posterior=SimpleNamespace(error=2.0)),
+        after=SimpleNamespace(posterior=SimpleNamespace(error=1.0)),
+        held_before=SimpleNamespace(error=3.0),
+        held_after=SimpleNamespace(error=1.5),
+    )
+
+
+def a_round(*found: Any, told: dict[str, float] | None = None) -> Round:
+    ranking: Any = SimpleNamespace(ranked=(), base=None, unpaired=0.0)
+    return Round(ranking, tuple(found), told or {})
+
+
+def labels(found: tuple[Any, ...]) -> list[str]:
+    return [j.hypothesis.label for j in found]
+
+
+def test_the_best_is_the_first_that_is_claimed_and_rivals_need_not_be() -> None:
+    better = judged("spring@m1", 12.0, "held-out data")
+    best = judged("mass@m2", 10.0)
+    near = judged("damper@m3", 7.1, "weak")
+    far = judged("mass@m4", 7.0)
+    one = a_round(better, best, near, far)
+    assert one.best is best
+    assert labels(one.alike(SETTINGS)) == [
+        "mass@m2",
+        "spring@m1",
+        "damper@m3",
+    ]  # in order of names: the first is not behind
+    assert a_round(better, near).best is None
+    assert a_round(better, near).alike(SETTINGS) == ()
+
+
+def test_a_rival_that_gains_nothing_is_none() -> None:
+    one = a_round(
+        judged("mass@m2", 2.0), judged("spring@m1", 0.0), judged("spring@m3", -0.5), judged("a@b", 0.1)
+    )
+    assert labels(one.alike(SETTINGS)) == ["mass@m2", "a@b"]
+
+
+def test_the_rigs_own_come_before_generic_ones_and_ties_are_in_the_order_of_names() -> None:
+    one = a_round(
+        judged("z@own", 9.0),
+        judged("b@own", 8.95),
+        judged("a@generic", 9.0, generic=True),
+        judged("c@own", 7.0),
+        judged("a@own", 8.85),
+    )
+    assert labels(one.alike(SETTINGS)) == ["b@own", "z@own", "a@own", "c@own", "a@generic"]
+
+
+def test_a_further_effect_must_gain_a_share_of_what_those_gained_that_are_linearised() -> None:
+    claimed = [
+        judged("cubic@a", 50.0, linear=False),
+        judged("mass@a", 1e3),
+        judged("friction@b", 20.0, linear=False),
+    ]
+    assert _beside(SETTINGS, claimed).claim == pytest.approx(3.5 + 0.1 * 70.0)
+    assert _beside(SETTINGS, claimed[1:2]).claim == 3.5
+    assert _beside(SETTINGS, claimed).alike == SETTINGS.alike
+
+
+class Steps:
+    """Stands for all that `select` asks: rounds as they are written down."""
+
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, rounds: list[list[Any]], linearised: bool = False
+    ) -> None:
+        self.rounds, self.asked, self.begun, self.shares = rounds, [], [], []
+        self.observations: Any = SimpleNamespace(
+            linearised=linearised, suited=lambda effects: self.observations
+        )
+        monkeypatch.setattr(selection, "fit_base", self.fit_base)
+        monkeypatch.setattr(selection, "rank", self.rank)
+        monkeypatch.setattr(selection, "_round", self.round)
+        self.reconsidered: list[tuple[list[str], list[str]]] = []
+        monkeypatch.setattr(selection, "reconsidered", self.reconsider)
+        for found in rounds:
+            for j in found:
+                j.ranked.fit.model = SimpleNamespace(effects=(j.hypothesis.placed,), name=j.hypothesis.label)
+
+    def reconsider(self, observations: Any, start: Any, claimed: Any, rivals: Any, settings: Any) -> Any:
+        assert start.at == 1
+        self.reconsidered.append((labels(claimed), [*rivals]))
+        return claimed
+
+    def fit_base(self, observations: Any, model: Any, start: Any = None) -> Any:
+        self.begun.append((getattr(model, "name", "base"), start))
+        return SimpleNamespace(model=model, at=len(self.begun))
+
+    def rank(self, observations, base, left, processes, progress, further, unpaired) -> Any:
+        progress(0.5, "half")
+        self.asked.append(([h.label for h in left], unpaired))
+        return SimpleNamespace(base=base, ranked=(), unpaired=10.0 * len(self.asked))
+
+    def round(self, observations, ranking, among, settings, found) -> Round:
+        self.shares.append((len(among), settings.claim, found))
+        return Round(ranking, tuple(self.rounds[found]), {})
+
+    def select(self, hypotheses: list[Any], settings: DiagnoseSettings, told: list[float]) -> Selection:
+        known: Any = SimpleNamespace(effects=(), name="base")
+        return select(self.observations, known, hypotheses, settings, lambda share, text: told.append(share))
+
+
+def test_effects_are_added_one_by_one_until_nothing_more_is_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b, c = judged("a@x", 20.0, linear=False), judged("b@x", 9.0), judged("c@x", 4.0, "weak")
+    rival = judged("b@y", 9.05, "weak")  # would stand first among those alike
+    steps = Steps(monkeypatch, [[a], [rival, b], [c]], linearised=True)
+    told: list[float] = []
+    found = steps.select([j.hypothesis for j in (a, b, c)], SETTINGS, told)
+    assert found.claimed == (a, b)
+    assert len(found.rounds) == 3
+    assert steps.asked == [(["a@x", "b@x", "c@x"], 0.0), (["b@x", "c@x"], 10.0), (["c@x"], 20.0)]
+    assert [name for name, _ in steps.begun] == ["base", "a@x", "b@x"]
+    assert steps.begun[1][1] is a.ranked.fit
+    assert found.final is found.rounds[-1].ranking.base
+    assert found.final.at == 3  # type: ignore[attr-defined]
+    assert steps.shares == [(3, 3.5, 0), (2, 5.5, 1), (1, pytest.approx(5.5), 2)]
+    assert told == pytest.approx([0.125, 0.375, 0.625])
+    assert steps.reconsidered == [(["a@x", "b@x"], ["a@x", "b@x"])]  # one alone has nothing beside it
+
+
+def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (1.0, 9.0, 4.0, 2.0)]
+    told = {NOTHING: 0.7}
+    monkeypatch.setattr(
+        selection, "probabilities", lambda ranking, hypotheses, settings, found: told | {"n": found}
+    )
+    monkeypatch.setattr(
+        selection,
+        "judge",
+        lambda o, ranking, r, settings, nothing: SimpleNamespace(gain=r.gain, nothing=nothing),
+    )
+    given: Any = SimpleNamespace(ranked=ranked)
+    data: Any = None
+    found = selection._round(data, given, [], SETTINGS, 2)
+    assert [(j.gain, j.nothing) for j in found.judged] == [(4.0, 0.7), (2.0, 0.7), (1.0, 0.7)]  # type: ignore[attr-defined]
+    assert found.probabilities == told | {"n": 2}
+    assert found.ranking is given
+
+
+def test_no_more_effects_are_added_than_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = judged("a@x", 20.0, linear=False), judged("b@x", 9.0)
+    steps = Steps(monkeypatch, [[a], [b]])
+    found = steps.select([a.hypothesis, b.hypothesis], SETTINGS.model_copy(update={"most_effects": 1}), [])
+    assert found.claimed == (a,)
+    assert len(found.rounds) == 2
+    told = _ended(found, SETTINGS.model_copy(update={"most_effects": 1}))
+    assert told == "the limit of 1 automatically added effects is reached (`most_effects`)"
+    assert [claim for _, claim, _ in steps.shares] == [3.5, 3.5]  # not linearised
+
+
+# --- what of it is told --------------------------------------------------------------------------------------------
+
+
+def selected(claimed: list[Any], *rounds: Round) -> Selection:
+    nothing: Any = None
+    return Selection(tuple(rounds), tuple(claimed), nothing, nothing)
+
+
+def test_how_the_search_ended() -> None:
+    weak = judged("spring@m2", 1.0, "it gains little")
+    assert (
+        _ended(selected([], a_round(judged("x@y", 9.0)), a_round()), SETTINGS) == "no further effect to try"
+    )
+    told = _ended(selected([], a_round(weak, judged("x@y", 0.0, "none"))), SETTINGS)
+    assert told == "the best further effect is spring at m2, and it gains little"
+
+
+def test_candidates_are_the_claimed_ones_with_final_sizes_then_the_group_then_the_rest() -> None:
+    a, b = judged("a@x", 20.0), judged("b@x", 9.0)
+    alike, rest = judged("c@x", 7.0, "held-out"), judged("d@x", 8.0, "weak")
+    first = a_round(a, told={"a@x": 0.9, "b@x": 0.05})
+    second = a_round(b, rest, alike, judged("a@x", 1.0, "again"), told={"b@x": 0.8, "c@x": 0.15, "d@x": 0.01})
+    third = a_round(judged("e@x", 1.0, "none"), told={"e@x": 0.1})
+    final = {"a@x.size": EffectSize(5.0, 0.5, "N"), "b@x.size": EffectSize(6.0, 0.6, "N")}
+    hypotheses: Any = [j.hypothesis for j in (a, b, alike, rest)]
+    found = _candidates(selected([a, b], first, second, third), SETTINGS, (b, alike), hypotheses, final)
+    assert [(c.label, c.claimed, c.probability) for c in found] == [
+        ("a@x", True, 0.9), ("b@x", True, 0.8), ("c@x", False, 0.15), ("d@x", False, 0.01)
+    ]  # fmt: skip
+    assert [c.parameters["size"].value for c in found] == [5.0, 6.0, 7.0, 8.0]
+    assert found[0].why == "Its signs: signs."
+    assert found[2].why == "Not claimed: held-out."
+    one = found[1]
+    assert (one.error_before, one.error_after, one.heldout_error_before, one.heldout_error_after) == (
+        2.0,
+        1.0,
+        3.0,
+        1.5,
+    )
+    assert (one.log_evidence, one.threshold, one.title) == (9.0, 3.5, "title of b@x")
+    few = SETTINGS.model_copy(update={"candidates": 1})
+    four = _candidates(selected([a, b], first, second, third), few, (b, alike), hypotheses, final)
+    assert len(four) == 4
+    assert len(_candidates(selected([a, b], first, second, third), few, (), hypotheses, final)) == 2
+
+
+def test_without_a_claim_the_candidates_are_those_of_the_first_round() -> None:
+    one = a_round(judged("a@x", 2.0, "weak"), judged("b@x", 1.0, "weak"), told={"a@x": 0.2})
+    found = _candidates(selected([], one), SETTINGS, (), [], {})
+    assert [(c.label, c.probability) for c in found] == [("a@x", 0.2), ("b@x", 0.0)]
+    assert len(_candidates(selected([], one), SETTINGS.model_copy(update={"candidates": 1}), (), [], {})) == 1
+
+
+def test_a_claim_that_took_the_place_of_an_earlier_one_has_a_probability_of_its_own() -> None:
+    """Against nothing alone, by its prior: it was no finalist of that round."""
+    late = judged("a@x", 10.0)
+    own: Any = SimpleNamespace(generic=False)
+    found = _candidates(
+        selected([late], a_round(judged("b@x", 5.0))), SETTINGS, (), [late.hypothesis, own], {}
+    )
+    odds = np.exp(10.0) * (1 - SETTINGS.null_prior) / 2 / SETTINGS.null_prior
+    assert found[0].probability == pytest.approx(odds / (1 + odds), rel=1e-3)
+
+
+def test_groups_are_rivals_and_names_of_one_each_told_once() -> None:
+    a, b = judged("a@x", 20.0, equivalents=("a@z",)), judged("b@x", 9.0)
+    rival, generic = judged("c@x", 8.0), judged("s@x", 19.0, generic=True)
+    rounds = a_round(a, generic), a_round(b, rival), a_round()
+    found = selected([a, b], *rounds)
+    assert _groups(found, (b, rival), SETTINGS) == (("b@x", "c@x"), ("a@x", "a@z", "s@x"))
+    assert _groups(found, (), SETTINGS) == (("a@x", "a@z", "s@x"), ("b@x", "c@x"))
+    assert _groups(selected([b], a_round(b)), (), SETTINGS) == ()
+    assert _groups(selected([b], a_round(b)), (b,), SETTINGS) == ()
