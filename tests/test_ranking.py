@@ -23,6 +23,7 @@ from ema_pipeline.diagnose.ranking import (
     _on,
     _promising,
     _screened,
+    _short_fits,
     _starts,
 )
 from ema_pipeline.inference import Residuals, Unknowns
@@ -35,7 +36,7 @@ def hypothesis(label: str, generic: bool = False, sizes: int = 1, extends: bool 
     parameters = [SimpleNamespace(name=f"s{k + 1}") for k in range(sizes)]
     placed = SimpleNamespace(
         label=label,
-        effect=SimpleNamespace(parameters=parameters),
+        effect=SimpleNamespace(parameters=parameters, linear=True),
         parameter_name=lambda name: f"{label}.{name}",
     )
     starts = [{f"{label}.s1": 0.5}, {f"{label}.s1": -0.5}]
@@ -70,6 +71,33 @@ def test_of_many_hypotheses_those_of_each_kind_are_fitted_that_promise_most() ->
     assert near[16:] == [f"generic{k}" for k in (4, 5, 6, 7, 9, 10)]
     promise |= {h.label: score(1.0) for h in generic[4:]}
     assert len(_screened(everything, promise, near=True)) == 16 + 12
+
+
+def test_where_the_base_fails_only_those_that_lead_after_a_short_fit_are_annealed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    everything = [hypothesis(f"h{k}") for k in range(20)]
+    others = [hypothesis("two sizes", sizes=2), hypothesis("not scored"), hypothesis("by level")]
+    others[2].placed.effect.linear = False
+    promise = {h.label: score(0.0) for h in [*everything, *others]} | {
+        "two sizes": SimpleNamespace(size=np.zeros(2))
+    }
+    del promise["not scored"]
+    asked: list[tuple[str, Any, int]] = []
+
+    def refined(observations: object, model: str, x: Any, steps: int) -> Any:
+        asked.append((model, x, steps))
+        return SimpleNamespace(
+            posterior=SimpleNamespace(name=model, log_evidence=float(7 * int(model[1:]) % 20))
+        )
+
+    monkeypatch.setattr(ranking, "refined", refined)
+    monkeypatch.setattr(ranking, "_at_score", lambda o, base, model, h, told: (h.label, told))
+    models = {h.label: h.label for h in [*everything, *others]}
+    kept = _short_fits(NO_DATA, fit("base", 0.0), models, promise, [*others, *everything], 1)  # type: ignore[arg-type]
+    assert asked == [(h.label, (h.label, promise[h.label]), 8) for h in everything]
+    assert {p.log_evidence for p in kept.values()} == {0.0, 1.0, 2.0, 3.0}  # type: ignore[attr-defined]
+    assert all(p.name == label for label, p in kept.items())  # type: ignore[attr-defined]
 
 
 # --- the order of fits ---------------------------------------------------------------------------------------------
@@ -339,6 +367,7 @@ class Stages:
             ranking, "beyond_scatter", lambda posterior, parts, most: np.array([bent and most == 3.0])
         )
         monkeypatch.setattr(ranking, "_screened", self.screened)
+        monkeypatch.setattr(ranking, "_short_fits", lambda *given: {})
         monkeypatch.setattr(ranking, "_first_fit", self.first_fit)
         monkeypatch.setattr(ranking, "_begun_again", self.begun_again)
         monkeypatch.setattr(ranking, "_bettered", self.bettered)

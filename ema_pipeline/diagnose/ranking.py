@@ -45,6 +45,9 @@ _BEATEN = 200.0
 """Log evidence behind the best hypothesis from which another one cannot catch up: it is not begun again."""
 _SCREENED = 14
 """Hypotheses of one kind, generic or the rig's own, best first by their score, that are fitted in full."""
+_SHORT, _ANNEALED = 8, 16
+"""Steps of a short fit, and how many hypotheses, best first by it, are annealed where the base model fails. What led in
+the end was among the first eight of some sixty."""
 _UNPROMISING = 6
 """The same where the score promises nothing and the base model is near, so that a fit gains what its score says to some
 tenths: more than `FINALISTS`, so that the reader sees what comes next."""
@@ -141,11 +144,13 @@ def rank(
     settled = base if stuck else learned(observations, base)
     near = not stuck and not np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT))
     chosen = _screened(hypotheses, promise, near)
+    first = _short_fits(observations, base, models, promise, chosen, processes) if stuck else {}
+    asked = [h for h in chosen if h.label not in first]
     job = partial(_first_fit, observations, base, models, {} if stuck else promise)
-    found: dict[str, tuple[Hypothesis, Fit]] = {}
-    for i, (hypothesis, posterior) in enumerate(zip(chosen, spread(job, chosen, processes), strict=True)):
-        found[hypothesis.label] = (hypothesis, Fit(models[hypothesis.label], posterior))
-        progress(0.6 * (i + 1) / len(chosen), hypothesis.label)
+    for i, (hypothesis, posterior) in enumerate(zip(asked, spread(job, asked, processes), strict=True)):
+        first[hypothesis.label] = posterior
+        progress(0.6 * (i + 1) / len(asked), hypothesis.label)
+    found = {h.label: (h, Fit(models[h.label], first[h.label])) for h in chosen}
     if not near:
         base, found = _begun_again(observations, base, found, processes, len(found), steps=5)
     found = _bettered(found, CONTENDERS, partial(_free, observations), processes)
@@ -173,6 +178,43 @@ def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], ne
     return [h for h in hypotheses if h.label not in out]
 
 
+def _short_fits(
+    observations: Observations,
+    base: Fit,
+    models: Mapping[str, Model],
+    promise: Mapping[str, Score],
+    hypotheses: Sequence[Hypothesis],
+    processes: int | None,
+) -> dict[str, Posterior]:
+    """Fits of a few steps from the sizes that scores tell, of hypotheses too far behind by them to be annealed."""
+    scored = [
+        h
+        for h in hypotheses
+        if h.label in promise and len(promise[h.label].size) == 1 and h.placed.effect.linear and not h.begun
+    ]
+
+    def fitted(hypothesis: Hypothesis) -> Posterior:
+        model = models[hypothesis.label]
+        x = _at_score(observations, base, model, hypothesis, promise[hypothesis.label])
+        return refined(observations, model, x, steps=_SHORT).posterior
+
+    found = list(zip(scored, spread(fitted, scored, processes), strict=True))
+    found.sort(key=lambda pair: -pair[1].log_evidence)
+    return {h.label: posterior for h, posterior in found[_ANNEALED:]}
+
+
+def _at_score(
+    observations: Observations, base: Fit, model: Model, hypothesis: Hypothesis, score: Score
+) -> NDArray[np.float64]:
+    """The base model's fit with half of the size that the score tells, (n,)."""
+    unknowns = model.problem(observations).unknowns
+    x = transferred(base.posterior, unknowns, np.zeros(len(unknowns)))
+    placed = hypothesis.placed
+    at = unknowns.index[placed.parameter_name(placed.effect.parameters[0].name)]
+    x[at] = float(np.clip(0.5 * score.size[0], -1.0, 1.0))
+    return unknowns.clipped(x)
+
+
 def _first_fit(
     observations: Observations,
     base: Fit,
@@ -190,9 +232,7 @@ def _first_fit(
         return refined(observations, model, begun).posterior
     score = promise.get(hypothesis.label)
     if score is not None and len(score.size) == 1:
-        at = unknowns.index[hypothesis.placed.parameter_name(hypothesis.placed.effect.parameters[0].name)]
-        begin[at] = float(np.clip(0.5 * score.size[0], -1.0, 1.0))
-        fit = refined(observations, model, unknowns.clipped(begin))
+        fit = refined(observations, model, _at_score(observations, base, model, hypothesis, score))
         if fit.posterior.cost <= base.posterior.cost:
             return fit.posterior
     schedule = _UNHEATED if hypothesis.begun else _FROM_GRID if hypothesis.size_cannot_be_zero else QUICK
