@@ -210,6 +210,11 @@ def test_a_heavy_pole_without_a_peak_is_told_from_one_that_makes_a_peak() -> Non
     pole = complex(-0.04, 1.0) * 2 * np.pi * 50
     power = np.abs(1 / (1j * omega - pole)) ** 2
     assert has_peak(omega, power, pole)
+    beside = (
+        complex(-0.02, 1.0) * 2 * np.pi * 45.8
+    )  # what lies between the two is filled where it is smoothed away
+    pair = np.abs(1 / (1j * omega - pole) - 0.5 / (1j * omega - beside)) ** 2
+    assert has_peak(omega, pair, pole)
     slope = 1 / (1 + (omega / omega[0]) ** 2)
     noise = np.random.default_rng(2).exponential(size=len(omega))
     assert not has_peak(omega, slope * (1 + 0.1 * noise), pole)
@@ -254,3 +259,20 @@ def test_the_interval_of_one_hit_holds_what_it_cannot_show() -> None:
         assert mode.frequency_std_hz == pytest.approx(1e-3 * mode.frequency_hz, rel=0.1)
     several = identified(SYSTEM, 2, [0])
     assert not any("one hit cannot show" in note for note in several.modal.notes)
+
+
+def test_a_second_mode_under_a_peak_is_no_change_of_its_frequency() -> None:
+    rate, n = 512.0, 2048
+    time = np.arange(n) / rate
+    near, far = complex(-6, 2 * np.pi * 60), complex(-9, 2 * np.pi * 61.5)
+    decay = np.real(np.exp(near * time)) - 0.8 * np.real(np.exp(far * time))
+    lines = np.arange(200, 281)
+    omega = 2 * np.pi * lines * rate / n
+    frf = (np.fft.rfft(decay) / rate)[None, None, lines]
+    window = PeakWindow(slice(200, 281), near, np.zeros(0, complex), np.array([0]))
+    peak = peak_poles(window, frf, omega, n / rate)
+    assert peak is not None
+    found = change_in_decay(window, frf[0], complex(peak.poles[0]), omega, n / rate)
+    assert found is not None
+    assert not found.single
+    assert abs(found.change) == pytest.approx(-2 * peak.poles[0].real)

@@ -16,6 +16,7 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.chosen import wanted
 from ema_pipeline.modal.data import analysis_band
 from ema_pipeline.modal.drift.align import NOTICED, Alignment, PeakMovement, align
+from ema_pipeline.modal.drift.local import DecayChange
 from ema_pipeline.modal.drift.windows import Hits
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.serial import widening
@@ -125,9 +126,7 @@ def of_one_hit(
         if change is not None and abs(change.change) > max(SURE * change.std, NOTICED * -seen.real):
             # as for modes that move with the force: no one frequency holds
             moved = 0.5 * abs(change.change) / (2 * np.pi)
-            way = "falls" if change.change > 0 else "rises"
-            share = 100 * abs(change.change) / abs(seen)
-            flags = (*flags, f"moves within the decay: {way} by {share:.2g} % as it gets weaker")
+            flags = (*flags, _decay_words(change, abs(seen)))
         std = float(np.sqrt(mode.frequency_std_hz**2 + (repeatability * mode.frequency_hz) ** 2 + moved**2))
         modes.append(replace(mode, frequency_std_hz=std, flags=flags))
     note = (
@@ -135,6 +134,13 @@ def of_one_hit(
         "modal.identify.repeatability"
     )
     return replace(modal, modes=tuple(modes), notes=(*modal.notes, *([note] if repeatability else [])))
+
+
+def _decay_words(change: DecayChange, size: float) -> str:
+    if not change.single:
+        return "one mode does not describe its decay: another lies under the peak, or it is far from linear"
+    way = "falls" if change.change > 0 else "rises"
+    return f"moves within the decay: {way} by {100 * abs(change.change) / size:.2g} % as it gets weaker"
 
 
 def with_movement(modal: ModalModel, alignment: Alignment, decay_rad_s: float = 0.0) -> ModalModel:
