@@ -274,4 +274,4 @@ def test_a_second_mode_under_a_peak_is_no_change_of_its_frequency() -> None:
     assert found is not None
     assert abs(found.change) > 3 * found.std
     assert not found.single
-    assert abs(found.change) == pytest.approx(-2 * peak.poles[0].real)
+    assert found.width == pytest.approx(-2 * peak.poles[0].real)

@@ -125,7 +125,7 @@ def of_one_hit(
         moved, flags = 0.0, mode.flags
         if change is not None and abs(change.change) > max(SURE * change.std, NOTICED * -seen.real):
             # as for modes that move with the force: no one frequency holds
-            moved = 0.5 * abs(change.change) / (2 * np.pi)
+            moved = 0.5 * min(abs(change.change), change.width) / (2 * np.pi)
             flags = (*flags, _decay_words(change, abs(seen)))
         std = float(np.sqrt(mode.frequency_std_hz**2 + (repeatability * mode.frequency_hz) ** 2 + moved**2))
         modes.append(replace(mode, frequency_std_hz=std, flags=flags))

@@ -76,17 +76,24 @@ class DecayChange:
     pole : complex
         rad/s.
     change : float
-        Frequency at the start of the decay over that at its end, rad/s; at most twice the decay rate.
+        Frequency at the start of the decay over that at its end, rad/s.
     std : float
         From noise.
-    single : bool
-        False where one mode does not describe the decay: it would change by more than the width of its peak.
     """
 
     pole: complex
     change: float
     std: float
-    single: bool
+
+    @property
+    def width(self) -> float:
+        """Of the peak at half its power, rad/s: it is no narrower than what its frequency runs through."""
+        return -2 * self.pole.real
+
+    @property
+    def single(self) -> bool:
+        """False where one mode does not describe the decay: past the width the first order says nothing."""
+        return abs(self.change) <= self.width
 
 
 @dataclass(frozen=True)
@@ -162,9 +169,8 @@ def change_in_decay(
     left = curve - columns @ shares
     power = float(np.sum(np.abs(left) ** 2)) / (len(omega) - fit.free - 2)
     spread = np.sqrt(0.5 * power * np.linalg.inv(columns.conj().T @ columns)[0, 0].real)
-    # past a share of 1 the first order says nothing: a peak is no narrower than what its frequency runs through
-    twice, share = -2 * pole.real, -float(shares[0].imag)
-    return DecayChange(pole, float(twice * np.clip(share, -1, 1)), float(twice * spread), abs(share) <= 1)
+    twice = -2 * pole.real
+    return DecayChange(pole, float(-twice * shares[0].imag), float(twice * spread))
 
 
 def plain_pole(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> complex | None:
