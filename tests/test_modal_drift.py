@@ -100,6 +100,18 @@ def test_drift_from_point_to_point_is_no_mixture_of_modes(second: float, shared:
     assert (found.point_spread.max() > 5e-4) == (second < 0)
 
 
+def test_drift_from_point_to_point_is_known_from_as_many_values_as_points() -> None:
+    """Hits on a point move alike: five of them tell no more of the mean than one does."""
+    rng = np.random.default_rng(2)
+    drift, noise = 1e-3 * rng.standard_normal(8), np.full((40, 4), 2e-5)
+    stds = []
+    for point, common in ((np.repeat(np.arange(8), 5), np.repeat(drift, 5)), (np.arange(8), drift)):
+        shift = common[:, None] + noise[: len(point)] * rng.standard_normal((len(point), 4))
+        stds.append(movement(shift, noise[: len(point)], np.ones(shift.shape), point).mean_std)
+    assert stds[0] == pytest.approx(stds[1], rel=0.15)
+    assert stds[0] > drift.std(ddof=1) / np.sqrt(8)
+
+
 def test_drift_of_all_frequencies_makes_no_twins_and_is_in_the_intervals() -> None:
     found = identified(SYSTEM, 2, [0, 3, 5], drift=1.5e-3)
     modes = found.modal.modes
