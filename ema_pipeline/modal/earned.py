@@ -26,6 +26,9 @@ RISE_DB = 1.0
 SMOOTHING = 0.35
 """Most smoothing of the response for the peak of a pole, in its decay rate: noise makes narrower peaks."""
 
+FALL_DB = 3.0
+"""Half a decay rate off, the peak of a pole alone has fallen by 1 dB (less on a plateau), one half as wide by 3 dB."""
+
 NOISE_RISES = 6.0
 """Standard deviations from the lowest to the highest of the lines around a pole that noise may reach."""
 
@@ -92,13 +95,32 @@ def unearned(
 def has_peak(omega: Real, power: Real, pole: complex) -> bool:
     """True where the response rises to a peak within a half-power half-width of a pole.
 
-    The response is smoothed as far as its noise asks for: more would fill the dip between two peaks.
+    Smoothing by the width of the pole fills the dip between it and another mode. So the response is also looked at
+    smoothed only as far as its noise asks for; a peak then counts where it is about as wide as that of the pole, and
+    not the narrow one of another mode.
     """
     step = float(omega[1] - omega[0])
-    width = min(_lines_over_noise(omega, power, pole), -SMOOTHING * pole.real / step)
-    smooth = scipy.ndimage.gaussian_filter1d(power, max(width, 1.0), mode="nearest")
-    peaks, _ = prominent_peaks(_decibels(smooth), RISE_DB)
-    return bool(np.any(np.abs(omega[peaks] - pole.imag) < max(-pole.real, 2 * step)))
+    most = max(-SMOOTHING * pole.real / step, 1.0)
+    if len(_peaks_near(omega, _smoothed(power, most), pole)):
+        return True
+    least = max(min(_lines_over_noise(omega, power, pole), most), 1.0)
+    curve = _smoothed(power, least)
+    aside = max(round(-0.5 * pole.real / step), 1)
+    for peak in _peaks_near(omega, curve, pole):
+        beside = curve[np.clip([peak - aside, peak + aside], 0, len(curve) - 1)]
+        if RISE_DB <= curve[peak] - beside.mean() < FALL_DB:
+            return True
+    return False
+
+
+def _smoothed(power: Real, lines: float) -> Real:
+    """Response in decibels, smoothed."""
+    return _decibels(scipy.ndimage.gaussian_filter1d(power, lines, mode="nearest"))
+
+
+def _peaks_near(omega: Real, curve: Real, pole: complex) -> NDArray[np.int64]:
+    peaks, _ = prominent_peaks(curve, RISE_DB)
+    return peaks[np.abs(omega[peaks] - pole.imag) < max(-pole.real, 2 * float(omega[1] - omega[0]))]
 
 
 def _lines_over_noise(omega: Real, power: Real, pole: complex) -> float:
