@@ -225,6 +225,8 @@ def test_a_heavy_pole_without_a_peak_is_told_from_one_that_makes_a_peak() -> Non
     heavy, beside = complex(-0.05, 1.0) * 2 * np.pi * 50, complex(-0.02, 1.0) * 2 * np.pi * 46
     pair = np.abs(1 / (1j * omega - heavy) + 1 / (1j * omega - beside)) ** 2
     assert has_peak(omega, pair, heavy)  # smoothing by its width would fill the dip between the two
+    wave = 1 + 0.13 * np.cos(2 * np.pi * (omega - heavy.imag) / (-4 * heavy.real))  # 1.1 dB on a plateau
+    assert not has_peak(omega, wave, heavy)
     slope = 1 / (1 + (omega / omega[0]) ** 2)
     noise = np.random.default_rng(2).exponential(size=len(omega))
     assert not has_peak(omega, slope * (1 + 0.1 * noise), pole)
