@@ -222,8 +222,8 @@ def test_a_heavy_pole_without_a_peak_is_told_from_one_that_makes_a_peak() -> Non
     pole = complex(-0.04, 1.0) * 2 * np.pi * 50
     power = np.abs(1 / (1j * omega - pole)) ** 2
     assert has_peak(omega, power, pole)
-    heavy, beside = complex(-0.05, 1.0) * 2 * np.pi * 50, complex(-0.02, 1.0) * 2 * np.pi * 46
-    pair = np.abs(1 / (1j * omega - heavy) + 1 / (1j * omega - beside)) ** 2
+    heavy, beside = complex(-0.05, 1.0) * 2 * np.pi * 50, complex(-0.005, 1.0) * 2 * np.pi * 47
+    pair = np.abs(1 / (1j * omega - heavy) + 0.3 / (1j * omega - beside)) ** 2
     assert has_peak(omega, pair, heavy)  # smoothing by its width would fill the dip between the two
     wave = 1 + 0.13 * np.cos(2 * np.pi * (omega - heavy.imag) / (-4 * heavy.real))  # 1.1 dB on a plateau
     assert not has_peak(omega, wave, heavy)
