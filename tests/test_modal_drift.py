@@ -100,6 +100,18 @@ def test_drift_from_point_to_point_is_no_mixture_of_modes(second: float, shared:
     assert (found.point_spread.max() > 5e-4) == (second < 0)
 
 
+def test_drift_from_point_to_point_is_known_from_as_many_values_as_points() -> None:
+    """Hits on a point move alike: five of them tell no more of the mean than one does."""
+    rng = np.random.default_rng(2)
+    drift, noise = 1e-3 * rng.standard_normal(8), np.full((40, 4), 2e-5)
+    stds = []
+    for point, common in ((np.repeat(np.arange(8), 5), np.repeat(drift, 5)), (np.arange(8), drift)):
+        shift = common[:, None] + noise[: len(point)] * rng.standard_normal((len(point), 4))
+        stds.append(movement(shift, noise[: len(point)], np.ones(shift.shape), point).mean_std)
+    assert stds[0] == pytest.approx(stds[1], rel=0.15)
+    assert stds[0] > drift.std(ddof=1) / np.sqrt(8)
+
+
 def test_drift_of_all_frequencies_makes_no_twins_and_is_in_the_intervals() -> None:
     found = identified(SYSTEM, 2, [0, 3, 5], drift=1.5e-3)
     modes = found.modal.modes
@@ -210,6 +222,11 @@ def test_a_heavy_pole_without_a_peak_is_told_from_one_that_makes_a_peak() -> Non
     pole = complex(-0.04, 1.0) * 2 * np.pi * 50
     power = np.abs(1 / (1j * omega - pole)) ** 2
     assert has_peak(omega, power, pole)
+    heavy, beside = complex(-0.05, 1.0) * 2 * np.pi * 50, complex(-0.005, 1.0) * 2 * np.pi * 47
+    pair = np.abs(1 / (1j * omega - heavy) + 0.3 / (1j * omega - beside)) ** 2
+    assert has_peak(omega, pair, heavy)  # smoothing by its width would fill the dip between the two
+    wave = 1 + 0.13 * np.cos(2 * np.pi * (omega - heavy.imag) / (-4 * heavy.real))  # 1.1 dB on a plateau
+    assert not has_peak(omega, wave, heavy)
     slope = 1 / (1 + (omega / omega[0]) ** 2)
     noise = np.random.default_rng(2).exponential(size=len(omega))
     assert not has_peak(omega, slope * (1 + 0.1 * noise), pole)
@@ -254,3 +271,21 @@ def test_the_interval_of_one_hit_holds_what_it_cannot_show() -> None:
         assert mode.frequency_std_hz == pytest.approx(1e-3 * mode.frequency_hz, rel=0.1)
     several = identified(SYSTEM, 2, [0])
     assert not any("one hit cannot show" in note for note in several.modal.notes)
+
+
+def test_a_second_mode_under_a_peak_is_no_change_of_its_frequency() -> None:
+    rate, n = 512.0, 2048
+    time = np.arange(n) / rate
+    near, far = complex(-6, 2 * np.pi * 60), complex(-12, 2 * np.pi * 62)
+    decay = np.real(np.exp(near * time)) + 0.8 * np.imag(np.exp(far * time))
+    lines = np.arange(200, 281)
+    omega = 2 * np.pi * lines * rate / n
+    frf = (np.fft.rfft(decay) / rate)[None, None, lines]
+    window = PeakWindow(slice(200, 281), near, np.zeros(0, complex), np.array([0]))
+    peak = peak_poles(window, frf, omega, n / rate)
+    assert peak is not None
+    found = change_in_decay(window, frf[0], complex(peak.poles[0]), omega, n / rate)
+    assert found is not None
+    assert abs(found.change) > 3 * found.std
+    assert not found.single
+    assert found.width == pytest.approx(-2 * peak.poles[0].real)

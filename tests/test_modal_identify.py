@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter1d
 from simulate_modal import (
     TrueSystem,
     frf_set,
@@ -30,6 +31,7 @@ from ema_pipeline.modal import segment
 from ema_pipeline.modal.data import FitData, arrange
 from ema_pipeline.modal.fit import Estimate
 from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.noise import fit_law
 from ema_pipeline.modal.peaks import KnownPeaks
 from ema_pipeline.modal.polish import polish
 from ema_pipeline.modal.settings import ModalSettings
@@ -455,3 +457,25 @@ def test_progress_is_told_and_rises() -> None:
     identify(frfs, ModalSettings(), lambda share, text: seen.append(share))
     assert seen == sorted(seen)
     assert seen[-1] >= 0.9
+
+
+def test_noise_averaged_over_lines_is_not_taken_for_more_of_it_beside_a_narrow_peak() -> None:
+    """The variance from few hits is averaged over neighbouring lines: the law is fitted to it as to single lines."""
+    n_lines, wide = 1200, 17
+    x = np.arange(n_lines) - n_lines / 2
+    response = np.ones((3, 1, 1)) / (x / 1.5 + 1j)
+    square = np.abs(response) ** 2
+    true = 4e-4 * square + 1e-6
+    draws = np.random.default_rng(4).exponential(size=(40, *true.shape)).mean(axis=0)
+    averaged = uniform_filter1d(true * draws, wide, axis=-1, mode="nearest")
+    measured = np.ones((3, 1), dtype=bool)
+    laws = [
+        fit_law(averaged, response, measured, inputs_are_rows=False, averaged=lines)
+        for lines in (None, np.full((3, 1), wide))
+    ]
+    peak = slice(n_lines // 2 - 1, n_lines // 2 + 2)
+    flank = slice(n_lines // 2 + 10, n_lines // 2 + 60)
+    wrong, right = (law.at(response).variance / true for law in laws)
+    assert right[..., peak].mean() == pytest.approx(1, abs=0.1)
+    assert right[..., flank].mean() == pytest.approx(1, abs=0.1)
+    assert max(wrong[..., peak].mean(), wrong[..., flank].mean()) > 1.3

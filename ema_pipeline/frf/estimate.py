@@ -318,6 +318,10 @@ def _finish(
         sensor_mass_kg=np.array([total.masses[p] for p in outputs]),
         channels=tuple(total.channels[p] for p in outputs),
         hammer=total.hammer,
+        variance_lines=np.array(
+            [[_lines_of_variance(int(n), settings, frequency.size) for n in row] for row in hits],
+            dtype=np.int64,
+        ).reshape(hits.shape),
     )
 
 
@@ -344,7 +348,7 @@ def _finish_one(
     if n > 1:
         noise = (auto - explained).clip(min=0.0)
         noise *= 1.0 / (n - 1)
-        lines = min(2 * (-(-settings.variance_dof // (n - 1)) // 2) + 1, noise.size)
+        lines = _lines_of_variance(n, settings, noise.size)
         # Line 0 carries the sensors' offsets, which are no noise of its neighbours.
         noise[0] = noise[1]
         uniform_filter1d(noise, lines, output=noise, mode="nearest")
@@ -360,6 +364,13 @@ def _finish_one(
         variance *= gain**2
     if variance is not auto:
         auto[:] = coherence if n > 1 else np.nan
+
+
+def _lines_of_variance(n_hits: int, settings: FrfSettings, n_lines: int) -> int:
+    """Neighbouring lines that give the noise power of some hits its degrees of freedom, an odd number."""
+    if n_hits < 2:
+        return 1
+    return min(2 * (-(-settings.variance_dof // (n_hits - 1)) // 2) + 1, n_lines)
 
 
 def _within(band_hz: tuple[float, float], hit: HitSamples) -> tuple[float, float]:

@@ -71,7 +71,7 @@ def joined(parts: Mapping[str, FrfSet]) -> FrfSet:
     shape = (len(outputs), len(inputs), first.frequency_hz.size)
     frf = np.full(shape, complex(np.nan, np.nan))
     coherence, variance = np.full(shape, np.nan), np.full(shape, np.nan)
-    hits = np.zeros(shape[:2], dtype=np.int64)
+    hits, lines = np.zeros(shape[:2], dtype=np.int64), np.ones(shape[:2], dtype=np.int64)
     bands = []
     for o, output in enumerate(outputs):
         for i, point in enumerate(inputs):
@@ -81,6 +81,10 @@ def joined(parts: Mapping[str, FrfSet]) -> FrfSet:
                 continue
             frf[o, i], coherence[o, i], variance[o, i] = _averaged(list(of_pair.values()))
             hits[o, i] = sum(s.hits[row, column] for s, row, column in of_pair.values())
+            lines[o, i] = max(
+                1 if s.variance_lines is None else s.variance_lines[row, column]
+                for s, row, column in of_pair.values()
+            )
             bands.append(_covered({name: s.band_hz for name, (s, _, _) in of_pair.items()}, first))
     low, high = np.array(bands).T
     channels = [_channel(sets.values(), point) for point in outputs]
@@ -106,6 +110,7 @@ def joined(parts: Mapping[str, FrfSet]) -> FrfSet:
         ),
         channels=tuple(known) if len(known) == len(channels) else (),
         hammer=_hammer(sets.values()),
+        variance_lines=lines,
     )
 
 

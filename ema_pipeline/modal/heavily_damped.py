@@ -24,7 +24,16 @@ RISE_DB = 1.0
 """A peak rises by so much out of the response of all FRFs."""
 
 SMOOTHING = 0.35
-"""Smoothing of the response for the peak of a pole, in its decay rate: noise makes narrower peaks."""
+"""Most smoothing of the response for the peak of a pole, in its decay rate: noise makes narrower peaks."""
+
+FALL_DB = 3.0
+"""Half a decay rate off, the peak of a pole alone has fallen by 1 dB (less on a plateau), one half as wide by 3 dB."""
+
+NOISE_RISES = 6.0
+"""Standard deviations from the lowest to the highest of the lines around a pole that noise may reach."""
+
+FEWEST_LINES = 10
+"""Lines around a pole that tell the noise of the response there."""
 
 UNSEEN = 0.1
 """Share of model orders below which no order can be said to show a pole."""
@@ -84,12 +93,48 @@ def unearned(
 
 
 def has_peak(omega: Real, power: Real, pole: complex) -> bool:
-    """True where the response rises to a peak within a half-power half-width of a pole."""
+    """True where the response rises to a peak within a half-power half-width of a pole.
+
+    Smoothing by the width of the pole fills the dip between it and another mode. So the response is also looked at
+    smoothed only as far as its noise asks for; a peak then counts where it is about as wide as that of the pole, and
+    not the narrow one of another mode.
+    """
     step = float(omega[1] - omega[0])
-    smooth = scipy.ndimage.gaussian_filter1d(power, max(-SMOOTHING * pole.real / step, 1.0), mode="nearest")
-    curve = 10 * np.log10(np.maximum(smooth, 1e-300))
+    most = max(-SMOOTHING * pole.real / step, 1.0)
+    if len(_peaks_near(omega, _smoothed(power, most), pole)):
+        return True
+    least = max(min(_lines_over_noise(omega, power, pole), most), 1.0)
+    curve = _smoothed(power, least)
+    aside = max(round(-0.5 * pole.real / step), 1)
+    for peak in _peaks_near(omega, curve, pole):
+        beside = curve[np.clip([peak - aside, peak + aside], 0, len(curve) - 1)]
+        if RISE_DB <= curve[peak] - beside.mean() < FALL_DB:
+            return True
+    return False
+
+
+def _smoothed(power: Real, lines: float) -> Real:
+    """Response in decibels, smoothed."""
+    return _decibels(scipy.ndimage.gaussian_filter1d(power, lines, mode="nearest"))
+
+
+def _peaks_near(omega: Real, curve: Real, pole: complex) -> NDArray[np.int64]:
     peaks, _ = prominent_peaks(curve, RISE_DB)
-    return bool(np.any(np.abs(omega[peaks] - pole.imag) < max(-pole.real, 2 * step)))
+    return peaks[np.abs(omega[peaks] - pole.imag) < max(-pole.real, 2 * float(omega[1] - omega[0]))]
+
+
+def _lines_over_noise(omega: Real, power: Real, pole: complex) -> float:
+    """Standard deviation, in lines, of the Gaussian that leaves noise around a pole less than a peak rises by."""
+    near = np.abs(omega - pole.imag) < -2 * pole.real
+    if np.count_nonzero(near) < FEWEST_LINES:
+        return np.inf
+    noise = float(np.sqrt(np.mean(np.diff(_decibels(power[near]), n=2) ** 2) / 6))
+    # white noise smoothed over s lines keeps 1/√(2√π·s) of its standard deviation
+    return (NOISE_RISES * noise / RISE_DB) ** 2 / (2 * np.sqrt(np.pi))
+
+
+def _decibels(power: Real) -> Real:
+    return np.asarray(10 * np.log10(np.maximum(power, 1e-300)))
 
 
 def one_shape(data: FitData, weight: Real, estimate: Estimate) -> Real:

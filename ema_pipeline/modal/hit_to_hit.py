@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri, stdtr, stdtrit
+from scipy.special import stdtr
 
 from ema_pipeline.choices import ModeChoice
 from ema_pipeline.frf.estimate import estimate_frfs
@@ -16,6 +16,8 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.chosen import wanted
 from ema_pipeline.modal.data import analysis_band
 from ema_pipeline.modal.drift.align import NOTICED, Alignment, PeakMovement, align
+from ema_pipeline.modal.drift.local import DecayChange
+from ema_pipeline.modal.drift.shifts import wider
 from ema_pipeline.modal.drift.windows import Hits
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.serial import widening
@@ -29,9 +31,6 @@ Real = NDArray[np.float64]
 
 CHANCE = 0.01
 """Probability by chance of a trend with the force that is taken for one."""
-
-COVERED = 0.95
-"""Quantile at which the intervals of a mean of few hits are to hold as those of many."""
 
 FEWEST_HITS = 6
 """Hits without which a trend with the force is not looked for."""
@@ -124,10 +123,8 @@ def of_one_hit(
         moved, flags = 0.0, mode.flags
         if change is not None and abs(change.change) > max(SURE * change.std, NOTICED * -seen.real):
             # as for modes that move with the force: no one frequency holds
-            moved = 0.5 * abs(change.change) / (2 * np.pi)
-            way = "falls" if change.change > 0 else "rises"
-            share = 100 * abs(change.change) / abs(seen)
-            flags = (*flags, f"moves within the decay: {way} by {share:.2g} % as it gets weaker")
+            moved = 0.5 * min(abs(change.change), change.width) / (2 * np.pi)
+            flags = (*flags, _decay_words(change, abs(seen)))
         std = float(np.sqrt(mode.frequency_std_hz**2 + (repeatability * mode.frequency_hz) ** 2 + moved**2))
         modes.append(replace(mode, frequency_std_hz=std, flags=flags))
     note = (
@@ -135,6 +132,13 @@ def of_one_hit(
         "modal.identify.repeatability"
     )
     return replace(modal, modes=tuple(modes), notes=(*modal.notes, *([note] if repeatability else [])))
+
+
+def _decay_words(change: DecayChange, size: float) -> str:
+    if not change.single:
+        return "one mode does not describe its decay: another lies under the peak, or it is far from linear"
+    way = "falls" if change.change > 0 else "rises"
+    return f"moves within the decay: {way} by {100 * abs(change.change) / size:.2g} % as it gets weaker"
 
 
 def with_movement(modal: ModalModel, alignment: Alignment, decay_rad_s: float = 0.0) -> ModalModel:
@@ -157,11 +161,10 @@ def with_movement(modal: ModalModel, alignment: Alignment, decay_rad_s: float = 
 def _moving(mode: Mode, alignment: Alignment, decay_rad_s: float) -> Mode:
     peak = peak_of(mode, alignment, decay_rad_s)
     n = alignment.n_hits
-    common = alignment.common_spread
     own = peak.own_spread if peak is not None and peak.single else 0.0
     # drift was taken off each hit, so that all count alike; its own movement a mode shows in strong hits above all
     of_own = _mean_std(own, peak.hits, peak.shift - peak.common) if peak is not None else 0.0
-    mean_std = float(np.hypot(_mean_std(common, n, alignment.peaks[0].common), of_own)) * _of_few(n)
+    mean_std = float(np.hypot(alignment.common_std, of_own * _of_few(n)))
     trend = _with_force(peak) if peak is not None and own > 0 else 0.0
     if trend:
         # a mode that moves with the force has no one frequency: the interval holds what it moves by
@@ -216,8 +219,8 @@ def _of_few(n_hits: int) -> float:
 
     The spread is one of maximum likelihood, which leaves out that the mean was estimated too.
     """
-    unbiased = np.sqrt(n_hits / max(n_hits - 1, 1))
-    return float(unbiased * stdtrit(max(n_hits - 1, 1), COVERED) / ndtri(COVERED))
+    free = max(n_hits - 1, 1)
+    return float(np.sqrt(n_hits / free)) * wider(free)
 
 
 def _words(spread: float, trend: float) -> str:

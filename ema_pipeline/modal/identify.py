@@ -97,7 +97,7 @@ def _identify(
 ) -> ModalModel:
     band = analysis_band(frfs, settings)
     data = arrange(frfs, band)
-    window, level = _first_noise(data)
+    window, level = _first_noise(data, _averaged_lines(frfs, data.transposed))
     bands = split(data.omega, indicator(data, level))
     iterations = POLISH_ITERATIONS if settings.polish else 0
 
@@ -128,11 +128,21 @@ def _identify(
     return _model(frfs, settings, band, window, modes, cores, peaks, plain.joined(wanted))
 
 
-def _first_noise(data: FitData) -> tuple[Window, Real]:
+def _averaged_lines(frfs: FrfSet, transposed: bool) -> NDArray[np.int64]:
+    """Lines over which the variance of every FRF was averaged, (n_rows, n_references)."""
+    lines = (
+        np.ones(frfs.frf.shape[:2], dtype=np.int64) if frfs.variance_lines is None else frfs.variance_lines
+    )
+    return lines.T if transposed else lines
+
+
+def _first_noise(data: FitData, averaged: NDArray[np.int64]) -> tuple[Window, Real]:
     """Data with noise from hits or a first guess of it, and noise level of every FRF."""
     known = any(np.any(row > 0) for row in data.variance)
     if known:
-        hits = fit_law(data.variance, data.frf, data.measured, inputs_are_rows=data.transposed)
+        hits = fit_law(
+            data.variance, data.frf, data.measured, inputs_are_rows=data.transposed, averaged=averaged
+        )
         typical = hits.level * np.median(hits.shape @ hits.hats, axis=-1) + hits.floor
         return whole(data, hits, from_hits=True), np.where(data.measured, typical, 1.0)
     floor = np.array([np.mean(np.abs(row) ** 2, axis=-1) for row in data.frf])

@@ -18,7 +18,7 @@ from ema_pipeline.modal.assurance import mac, mpc
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, LinearSolution, newton_step, synthesis
 from ema_pipeline.modal.fit_covariance import evidence
-from ema_pipeline.modal.heavily_damped import unearned
+from ema_pipeline.modal.heavily_damped import has_peak, unearned
 from ema_pipeline.modal.missed import left_over
 from ema_pipeline.modal.noise import Noise
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
@@ -48,7 +48,7 @@ PLAIN = 2.0
 """A mode is plain where, at its frequency, its own response has this many times the power of all the rest."""
 
 PLAIN_DAMPING = 0.05
-"""Poles with more damping shape a background rather than a peak: they are only taken on votes."""
+"""Poles with more damping that have no peak shape a background: they are only taken on votes."""
 
 EXPLAINED = 1.5
 """Misfit around a mode over the scatter between hits, up to which nothing but noise is left over."""
@@ -140,7 +140,12 @@ def evident(data: FitData, estimate: Estimate, solution: LinearSolution, votes: 
 def _plainness(data: FitData, estimate: Estimate, solution: LinearSolution) -> Real:
     """Above 1 where the FRFs show a mode plainly; 0 for what only shapes a background."""
     zeta = -estimate.poles.real / np.abs(estimate.poles)
-    return np.where(zeta > PLAIN_DAMPING, 0.0, visibility(data, estimate, solution) / PLAIN)
+    out = visibility(data, estimate, solution) / PLAIN
+    heavy = np.flatnonzero(zeta > PLAIN_DAMPING)
+    if len(heavy):
+        power = np.sum(np.abs(data.frf) ** 2, axis=(0, 1))
+        out[[r for r in heavy if not has_peak(data.omega, power, estimate.poles[r])]] = 0.0
+    return np.asarray(out)
 
 
 def _incoherent(solution: LinearSolution) -> NDArray[np.bool_]:

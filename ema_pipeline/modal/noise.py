@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from ema_pipeline.modal.noise_kernel import quiet_lines, slopes
 from ema_pipeline.threads import over_rows
@@ -154,13 +155,26 @@ def fit_noise(power: Real, response: Complex, measured: NDArray[np.bool_], *, in
 
 
 def fit_law(
-    power: Real, response: Complex, measured: NDArray[np.bool_], *, inputs_are_rows: bool
+    power: Real,
+    response: Complex,
+    measured: NDArray[np.bool_],
+    *,
+    inputs_are_rows: bool,
+    averaged: NDArray[np.int64] | None = None,
 ) -> NoiseLaw:
-    """Fit the noise model to squared errors; `response` are the FRFs, the rest as for `fit_law_of_squares`."""
+    """Fit the noise model to squared errors; `response` are the FRFs, the rest as for `fit_law_of_squares`.
+
+    Where errors are averages over neighbouring lines, `averaged` tells over how many, (n_rows, n_references): beside a
+    narrow peak they hold the noise of the peak, which |H|² of these lines alone would not explain.
+    """
     square = np.empty(power.shape)
 
     def of_rows(rows: slice) -> None:
         square[rows] = squared(response[rows])
+        if averaged is not None:
+            for values, lines in zip(square[rows], averaged[rows], strict=True):
+                for one, n in zip(values, lines.tolist(), strict=True):
+                    uniform_filter1d(one, min(n, one.size), output=one, mode="nearest")
 
     with over_rows(len(power), power.size) as each:
         each(of_rows)

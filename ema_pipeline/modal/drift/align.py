@@ -92,6 +92,8 @@ class Alignment:
     ----------
     common_spread : float
         Standard deviation over hits of the factor that all frequencies share.
+    common_std : float
+        That of its mean over hits, widened so that normal intervals of few hits and points hold.
     n_hits : int
     peaks : tuple of PeakMovement
     shifts : callable or None
@@ -101,6 +103,7 @@ class Alignment:
     """
 
     common_spread: float
+    common_std: float
     n_hits: int
     peaks: tuple[PeakMovement, ...]
     shifts: Shifts | None = None
@@ -137,7 +140,7 @@ def align(hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float,
     band_hz : tuple of float
         Band in which peaks are looked at.
     """
-    nothing = Alignment(0.0, int(frfs.hits.max(axis=0, initial=0).sum()), ())
+    nothing = Alignment(0.0, 0.0, int(frfs.hits.max(axis=0, initial=0).sum()), ())
     windows = peak_windows(frfs, band_hz)
     if not windows:
         return nothing
@@ -158,13 +161,13 @@ def align(hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float,
     moved, looked_at = _movements(peaks, keys)
     warps = _warps(peaks, looked_at, moved, frfs.frequency_hz)
     if not warps:
-        return Alignment(moved.spread, len(keys), looked_at)
+        return Alignment(moved.spread, moved.mean_std, len(keys), looked_at)
     by_hit = {key.name: warps[k] for k, key in enumerate(keys)}
 
     def shift_of(hit: HitSamples) -> Real:
         return by_hit[hit.hit.file, hit.hit.number]
 
-    return Alignment(moved.spread, len(keys), looked_at, shift_of)
+    return Alignment(moved.spread, moved.mean_std, len(keys), looked_at, shift_of)
 
 
 def _movements(peaks: list[PeakPoles], keys: tuple[HitKey, ...]) -> tuple[Movement, tuple[PeakMovement, ...]]:

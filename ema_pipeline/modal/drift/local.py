@@ -85,6 +85,16 @@ class DecayChange:
     change: float
     std: float
 
+    @property
+    def width(self) -> float:
+        """Of the peak at half its power, rad/s: it is no narrower than what its frequency runs through."""
+        return -2 * self.pole.real
+
+    @property
+    def single(self) -> bool:
+        """False where one mode does not describe the decay: past the width the first order says nothing."""
+        return abs(self.change) <= self.width
+
 
 @dataclass(frozen=True)
 class _Fit:

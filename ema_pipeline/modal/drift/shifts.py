@@ -21,10 +21,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit
+
+from ema_pipeline.modal.serial import widening
 
 Real = NDArray[np.float64]
 
 ITERATIONS = 80
+
+COVERED = 0.95
+"""Quantile at which the intervals of a mean of few values are to hold as those of many."""
 
 TAIL = 4.0
 """Degrees of freedom of the t distribution that stands for errors: single hits may be far off."""
@@ -43,6 +49,9 @@ class Movement:
         Factor g + d of every hit, shrunk towards 0 by its own variance.
     spread : float
         Standard deviation of g + d.
+    mean_std : float
+        Standard deviation of the mean of g + d over hits, widened so that normal intervals of a mean of few hits and
+        points hold.
     own : ndarray, (n_hits, n_peaks)
         Movement x of single peaks beyond it, shrunk; 0 where a hit does not show the peak.
     own_spread : ndarray, (n_peaks,)
@@ -54,6 +63,7 @@ class Movement:
     common: Real
     common_std: Real
     spread: float
+    mean_std: float
     own: Real
     own_spread: Real
     point_spread: Real
@@ -121,6 +131,10 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
         common=found.mean[hits] + of_point @ found.mean[points],
         common_std=np.sqrt(found.variance[hits] + of_point @ found.variance[points]),
         spread=float(np.sqrt(common + (moving if n_points else 0.0))),
+        mean_std=_mean_std(
+            (np.sqrt(common), found.mean[hits], np.full(n_hits, 1 / n_hits)),
+            (np.sqrt(moving), found.mean[points], of_point.sum(axis=0) / n_hits),
+        ),
         own=single,
         own_spread=np.sqrt(own),
         point_spread=np.sqrt(np.where(np.isin(np.arange(n_peaks), groups), per_point, 0.0)),
@@ -174,6 +188,28 @@ def _own_variance(old: float, square: Real, noise: Real, weak: Real, tail: Real)
     total = noise / weak + old
     ratio = float(np.mean(tail * square / weak / total**2) / np.mean(1.0 / total))
     return max(old * np.sqrt(ratio), FLOOR)
+
+
+def _mean_std(*parts: tuple[float, Real, Real]) -> float:
+    """Standard deviation of a mean of parts, each with its spread, its values in order and their weights in the mean.
+
+    Where hits of few points share most of the movement, there are as many independent values as points.
+    """
+    variance, uncertainty = 0.0, 0.0
+    for spread, values, weights in parts:
+        if len(values):
+            free = max(len(values) - 1, 1)
+            # the spread is one of maximum likelihood, which leaves out that the mean was estimated too
+            part = spread**2 * float(np.sum(weights**2)) * widening(values) ** 2 * len(values) / free
+            variance, uncertainty = variance + part, uncertainty + part**2 / free
+    if not variance > 0:
+        return 0.0
+    return float(np.sqrt(variance) * wider(variance**2 / uncertainty))
+
+
+def wider(degrees: float) -> float:
+    """How much wider than a normal interval one is whose standard deviation has few degrees of freedom."""
+    return float(stdtrit(degrees, COVERED) / ndtri(COVERED))
 
 
 def _robust_variance(values: Real) -> float:
