@@ -365,6 +365,17 @@ def test_report_lists_the_candidates_with_size_probability_and_drop(run: RunResu
     assert "Where the misfit sits" not in text
 
 
+def test_an_adequate_model_with_a_likely_candidate_says_which_and_why_it_is_not_claimed() -> None:
+    best = ("spring@m2.x", "Not claimed: its size is within 2 standard deviations of zero.")
+    doubtful = sentences.summary("adequate", [], (1.2, 1.2), 0.04, best)
+    assert doubtful == (
+        "The model explains the data: error 1.20. Probability that nothing is missing: 4 %. The best candidate is "
+        "spring at m2.x. Not claimed: its size is within 2 standard deviations of zero."
+    )
+    assert "candidate" not in sentences.summary("adequate", [], (1.2, 1.2), 0.6, best)
+    assert "candidate" not in sentences.summary("adequate", [], (1.2, 1.2), 0.04)
+
+
 def test_the_sentence_on_what_is_missing_names_one_effect_or_several() -> None:
     crack, mass = (CRACK, "fraction 0.34 ± 0.01"), ("mass@sun", "mass 0.1 ± 0.01 kg")
     one, two = (sentences.summary("effect", named, (3.1, 1.02), 0.0) for named in ([crack], [crack, mass]))

@@ -90,6 +90,7 @@ def diagnose(
         names = [j.named.label for j in group]
         told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.label in names]
     nothing = found.rounds[0].probabilities[NOTHING]
+    best = next(((c.label, c.why) for c in candidates), ("", ""))
     scatter = learned_scatters(observations, found.final)
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
     remarks = list(notes)
@@ -97,7 +98,7 @@ def diagnose(
     remarks.insert(0, sentences.standing_out(outlying, found.final.posterior.scatters.get(PART_SCATTER, 0.0)))
     return Diagnosis(
         verdict=verdict,
-        summary=sentences.summary(verdict, told, (rungs[0].error, rungs[-1].error), nothing),
+        summary=sentences.summary(verdict, told, (rungs[0].error, rungs[-1].error), nothing, best),
         null_probability=nothing,
         candidates=candidates,
         indistinguishable=_groups(found, group, settings),

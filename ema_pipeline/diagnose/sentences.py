@@ -46,8 +46,16 @@ def _one_size(s: EffectSize) -> str:
     return f"{s.value:.4g} ± {s.std:.2g}{'' if s.unit in ('', '1') else ' ' + s.unit}"
 
 
+DOUBTFUL = 0.5
+"""Probability that nothing is missing, below which an adequate model has a candidate worth a word."""
+
+
 def summary(
-    verdict: VerdictWord, claimed: Sequence[tuple[str, str]], error: tuple[float, float], nothing: float
+    verdict: VerdictWord,
+    claimed: Sequence[tuple[str, str]],
+    error: tuple[float, float],
+    nothing: float,
+    best: tuple[str, str] = ("", ""),
 ) -> str:
     """One or two sentences.
 
@@ -60,6 +68,8 @@ def summary(
         Before and after.
     nothing : float
         Probability that nothing is missing.
+    best : (label, why), optional
+        The best candidate where none is claimed, and why it is not.
     """
     before, after = error
     named = "; ".join(f"{label_text(label)}, {size}" for label, size in claimed)
@@ -73,6 +83,9 @@ def summary(
         )
     if verdict == "adequate":
         odds = f"Probability that nothing is missing: {probability_text(nothing)}."
+        label, why = best
+        if label and nothing < DOUBTFUL:
+            odds += f" The best candidate is {label_text(label)}. {why}"
         return f"The model explains the data: error {before:.2f}. {odds}"
     if verdict == "unknown_effect":
         verb = "are" if len(claimed) > 1 else "is"

@@ -69,7 +69,7 @@ class FrfSet:
     input_coherence : ndarray, (n_inputs, n_inputs, n_lines), or None
         Ordinary coherence between the forces.
     noise_variance, distortion_variance : ndarray, (n_outputs, n_inputs, n_lines), or None
-        Of a multisine: variance of the FRF by noise, from its scatter over periods, and by nonlinear distortion, from
+        Of a multisine: variance of the FRF by noise, from its scatter over periods, and by nonlinear distortion,
         what its scatter over realisations has beyond that (E|H - E H|² of one realisation).
     detected_distortion : ndarray, (n_outputs, 2, n_lines), or None
         Response at lines that carry no force, over the typical force of a line that does, SI: distortion of odd and
