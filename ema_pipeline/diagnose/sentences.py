@@ -83,9 +83,8 @@ def summary(
         )
     if verdict == "adequate":
         odds = f"Probability that nothing is missing: {probability_text(nothing)}."
-        label, why = best
-        if label and nothing < DOUBTFUL:
-            odds += f" The best candidate is {label_text(label)}. {why}"
+        if best[0] and nothing < DOUBTFUL:
+            odds += f" The best candidate is {label_text(best[0])}. {best[1]}"
         return f"The model explains the data: error {before:.2f}. {odds}"
     if verdict == "unknown_effect":
         verb = "are" if len(claimed) > 1 else "is"
