@@ -88,9 +88,9 @@ def summary(
         return f"The model explains the data: error {before:.2f}. {odds}"
     if verdict == "unknown_effect":
         verb = "are" if len(claimed) > 1 else "is"
-        best = f" The closest {verb} {named}." if named else ""
+        closest = f" The closest {verb} {named}." if named else ""
         failed = f"The model does not explain the data (error {after:.2f})"
-        return f"{failed}, and no effect in the library corrects this.{best}"
+        return f"{failed}, and no effect in the library corrects this.{closest}"
     return "These data are not sufficient to show what is missing."
 
 
