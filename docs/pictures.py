@@ -63,7 +63,7 @@ def live(browser: Browser, results: Path) -> None:
         add.click()
         page.wait_for_selector("#progress:not([hidden])", timeout=30_000)
         frames.append(page.screenshot())
-        expect(page.locator("#band h2")).to_contain_text("In the model", timeout=120_000)
+        expect(page.locator("#page_top h2")).to_contain_text("In the model", timeout=120_000)
         page.wait_for_selector("#cancel", state="hidden", timeout=120_000)
         page.evaluate("window.scrollTo(0, 0)")
         page.wait_for_timeout(SETTLED_MS)

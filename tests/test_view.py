@@ -172,17 +172,17 @@ def test_click_on_the_effect_and_the_error_falls_in_every_tab(browser, page: Pag
     second = opened(context, page.origin)
     tab.wait_for_selector("[data-figure=frf][data-state=shown]", timeout=30_000)
     tab.locator(f'button.act.add[data-label="{CULPRIT}"]').click()
-    expect(tab.locator("#band h2")).to_contain_text("In the model: mass at b", timeout=60_000)
+    expect(tab.locator("#page_top h2")).to_contain_text("In the model: mass at b", timeout=60_000)
     before, after = errors_shown(tab)
     assert before > 5
     assert after < 1.5
-    expect(second.locator("#band h2")).to_contain_text("In the model: mass at b", timeout=20_000)
+    expect(second.locator("#page_top h2")).to_contain_text("In the model: mass at b", timeout=20_000)
     expect(tab.locator("#cancel")).to_be_hidden(timeout=60_000)
     expect(second.locator("#commands")).to_have_text(f"ema add {out} {CULPRIT}")
     assert existing_run(out).info.effects == (CULPRIT,)
 
     second.locator("#undo").click()
-    expect(tab.locator("#band h2")).to_contain_text("Missing: mass at b", timeout=20_000)
+    expect(tab.locator("#page_top h2")).to_contain_text("Missing: mass at b", timeout=20_000)
     assert existing_run(out).info.effects == ()
     expect(tab.locator("#undo")).to_be_disabled()
 
@@ -204,9 +204,9 @@ def test_refit_that_is_cancelled_leaves_the_folder_as_it_was(browser, page: Page
     tab.locator("#cancel").click(timeout=20_000)
     expect(tab.locator("#status")).to_contain_text("Cancelled", timeout=20_000)
     assert (out / "ema.h5").read_bytes() == before
-    expect(tab.locator("#band h2")).to_contain_text("Missing: mass at b")
+    expect(tab.locator("#page_top h2")).to_contain_text("Missing: mass at b")
     tab.locator(f'button.act.add[data-label="{CULPRIT}"]').click()  # a new worker does it
-    expect(tab.locator("#band h2")).to_contain_text("In the model", timeout=60_000)
+    expect(tab.locator("#page_top h2")).to_contain_text("In the model", timeout=60_000)
     context.close()
 
 
@@ -223,7 +223,7 @@ def test_mode_is_excluded_and_one_included_and_the_commands_repeat_it(
     expect(tab.locator("#moved")).to_contain_text("Modes 3 → 2", timeout=60_000)
     expect(tab.locator("#moved")).to_contain_text("gone")
     expect(tab.locator("button.pick")).to_have_count(2, timeout=20_000)
-    expect(tab.locator("#band h2")).to_contain_text("Other hits or modes than in the diagnosis")
+    expect(tab.locator("#page_top h2")).to_contain_text("Other hits or modes than in the diagnosis")
     expect(tab.locator("#status")).to_contain_text("Modes 3 → 2", timeout=60_000)
     chosen = existing_run(out).info.choices
     assert len(chosen.excluded_modes) == 1

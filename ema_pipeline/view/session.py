@@ -28,7 +28,7 @@ from ema_pipeline.stages.results import load_results
 from ema_pipeline.view.serving import Listeners
 from ema_pipeline.view.snapshots import Snapshots
 
-PARTS = ("band", "candidates", "loop_model", "model_details", "choices", "mode_rows", "moving_shapes")
+PARTS = ("page_top", "candidates", "loop_model", "model_details", "choices", "mode_rows", "moving_shapes")
 """Parts of the page that change with the model, by the names of their templates."""
 
 _LOOK_S = 1.0
