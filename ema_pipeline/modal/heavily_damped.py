@@ -23,6 +23,9 @@ HEAVY = 0.02
 RISE_DB = 1.0
 """A peak rises by so much out of the response of all FRFs."""
 
+PLAIN_RISE_DB = 2.0
+"""The same of a peak in a response that is smoothed less than its width: drift between hits makes waves of 1 dB."""
+
 SMOOTHING = 0.35
 """Most smoothing of the response for the peak of a pole, in its decay rate: noise makes narrower peaks."""
 
@@ -106,7 +109,7 @@ def has_peak(omega: Real, power: Real, pole: complex) -> bool:
     least = max(min(_lines_over_noise(omega, power, pole), most), 1.0)
     curve = _smoothed(power, least)
     aside = max(round(-0.5 * pole.real / step), 1)
-    for peak in _peaks_near(omega, curve, pole):
+    for peak in _peaks_near(omega, curve, pole, PLAIN_RISE_DB):
         beside = curve[np.clip([peak - aside, peak + aside], 0, len(curve) - 1)]
         if RISE_DB <= curve[peak] - beside.mean() < FALL_DB:
             return True
@@ -118,8 +121,8 @@ def _smoothed(power: Real, lines: float) -> Real:
     return _decibels(scipy.ndimage.gaussian_filter1d(power, lines, mode="nearest"))
 
 
-def _peaks_near(omega: Real, curve: Real, pole: complex) -> NDArray[np.int64]:
-    peaks, _ = prominent_peaks(curve, RISE_DB)
+def _peaks_near(omega: Real, curve: Real, pole: complex, rise_db: float = RISE_DB) -> NDArray[np.int64]:
+    peaks, _ = prominent_peaks(curve, rise_db)
     return peaks[np.abs(omega[peaks] - pole.imag) < max(-pole.real, 2 * float(omega[1] - omega[0]))]
 
 
