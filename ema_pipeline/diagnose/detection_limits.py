@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,12 +60,7 @@ def detection_limits(
     def least(hypothesis: Hypothesis) -> float | None:
         own = hypothesis.label in had
         model = fit.model if own else fit.model.plus(hypothesis.placed, hypothesis.scales)
-        gains = whole
-        if own:
-            gains = ExpectedGain(
-                fit.posterior, observations.scatters, Marginal(fit, without=hypothesis.label)
-            )
-        shown = _Shown.of(observations, fit, model, hypothesis, gains)
+        shown = _Shown.of(observations, fit, model, hypothesis, None if own else whole)
         if shown is None:
             return None
         sigmas = sigmas_asked(observations, hypothesis, settings)
@@ -118,17 +113,27 @@ class _Shown:
 
     @classmethod
     def of(
-        cls, observations: Observations, fit: Fit, model: Model, hypothesis: Hypothesis, gains: ExpectedGain
+        cls,
+        observations: Observations,
+        fit: Fit,
+        model: Model,
+        hypothesis: Hypothesis,
+        gains: ExpectedGain | None,
     ) -> _Shown | None:
-        """Of one hypothesis; None where these data carry no information on it."""
+        """Of one hypothesis; None where these data carry no information on it.
+
+        `gains` is None for an effect that the fit has already: its gain is that on top of the rig without it.
+        """
         problem, scatters = model.problem(observations), fit.posterior.scatters
         null = transferred(fit.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
         size = hypothesis.placed.effect.parameters[0].name
         at = problem.unknowns.index[hypothesis.placed.parameter_name(size)]
         null[at] = 0.0
         before = problem.residuals(null, scatters, matching=fit.posterior.residuals.matching)
-        if len(before.values) != gains.marginal.count or not np.all(np.isfinite(before.values)):
+        if len(before.values) != len(fit.posterior.residuals.values) or not np.all(np.isfinite(before.values)):
             return None
+        if gains is None:
+            gains = _without(observations, fit, hypothesis, null, before)
         linear, usual = hypothesis.placed.effect.linear, before.jacobian[:, at]
         if not linear:
             x = null.copy()
@@ -194,6 +199,23 @@ class _Shown:
             return first
         whole = self.gains.change(there.values - self.before.values)
         return min(first, whole, key=lambda c: c.total) if self.linear else whole
+
+
+def _without(
+    observations: Observations,
+    fit: Fit,
+    hypothesis: Hypothesis,
+    null: NDArray[np.float64],
+    before: Residuals,
+) -> ExpectedGain:
+    """Gains on top of the rig without an effect that the fit has.
+
+    What is uncertain is followed from there: how it moves modes that nearly coincide without the effect is another
+    matter than with it. What the data leave over is that of the fit.
+    """
+    residuals = replace(fit.posterior.residuals, jacobian=before.jacobian)
+    there = replace(fit, posterior=replace(fit.posterior, x=null, residuals=residuals))
+    return ExpectedGain(there.posterior, observations.scatters, Marginal(there, without=hypothesis.label))
 
 
 def _same_pairs(a: object, b: object) -> bool:
