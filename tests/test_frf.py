@@ -399,6 +399,17 @@ def test_blows_on_different_spots_show_in_coherence_and_repeatability() -> None:
     assert not all(checks(frfs, "repeatability"))
 
 
+@pytest.mark.parametrize(("share", "judged"), [(0.1, 1), (0.4, 2)])
+def test_repeatability_is_not_judged_by_what_oblique_blows_make(share: float, judged: int) -> None:
+    """A response across the blow changes with its direction; a large one is the structure's."""
+    across = share * np.array([1.0, 0.3, 0.5, 1.4, 1.8])
+    hits = [
+        replace(h, responses=np.stack([h.responses[0], a * h.responses[0]]))
+        for h, a in zip(clean_hits(5, 8192, outputs=2), across, strict=True)
+    ]
+    assert len(checks(estimate_frfs(hits), "repeatability")) == judged
+
+
 def test_records_of_the_same_channels_average_to_the_same_whatever_the_threads() -> None:
     hits = clean_hits(3, 2048, outputs=9, noise=0.1)
     one, two = (estimate_frfs(hits, FrfSettings(threads=t)) for t in (1, 2))

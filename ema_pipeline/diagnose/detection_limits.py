@@ -130,7 +130,9 @@ class _Shown:
         at = problem.unknowns.index[hypothesis.placed.parameter_name(size)]
         null[at] = 0.0
         before = problem.residuals(null, scatters, matching=fit.posterior.residuals.matching)
-        if len(before.values) != len(fit.posterior.residuals.values) or not np.all(np.isfinite(before.values)):
+        if len(before.values) != len(fit.posterior.residuals.values) or not np.all(
+            np.isfinite(before.values)
+        ):
             return None
         if gains is None:
             gains = _without(observations, fit, hypothesis, null, before)

@@ -33,9 +33,13 @@ PEAK_SHARE = 0.01
 NODE_LEVEL = 0.1
 """An FRF below this share of the strongest at its sensor is near a node: its noise tells little."""
 
+OBLIQUE_LEVEL = 0.2
+"""Oblique blows and transverse sensitivity make responses of up to this share of the largest one to the same blow. Such
+a response varies with the direction of every blow, and says nothing of how well the others repeat."""
+
 STRONG_LEVEL = 0.4
-"""Cross FRFs above this share of their driving points are ruled by the structure; oblique blows and transverse
-sensitivity make a tenth to a fifth, which may well differ by a factor or in sign with the direction."""
+"""Cross FRFs above this share of their driving points are ruled by the structure, not by oblique blows, whose part may
+well differ by a factor or in sign with the direction."""
 
 WEAK_LEVEL, OBVIOUS_FACTOR = 0.15, 7.0
 """From this share on such a test makes factors of up to five by itself: only larger ones speak of a sensitivity."""
@@ -89,6 +93,7 @@ def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[CheckRe
         ]
     verdicts = []
     peak = _peak_power(frfs, inside)
+    like = {q: [o for o, other in enumerate(frfs.quantities) if other == q] for q in frfs.quantities}
     for o, i in np.argwhere(frfs.hits > 1):
         n = int(frfs.hits[o, i])
         if peak[o, i] <= NODE_LEVEL**2 * np.nanmax(peak[o]):
@@ -109,6 +114,8 @@ def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[CheckRe
             judgement = replace(judgement, message=few)
         verdicts.append(judgement)
         if frfs.excitation:  # blocks and periods are no blows, whose place and direction could differ
+            continue
+        if peak[o, i] <= OBLIQUE_LEVEL**2 * np.nanmax(peak[like[frfs.quantities[o]], i]):
             continue
         # Variance of one hit's FRF, not of the mean over n. Noise is there at all lines, scatter of the blows
         # only where the structure answers. Lines count by their accuracy: the force fades towards the zeros of
