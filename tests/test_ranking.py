@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -281,6 +282,8 @@ def test_fits_begin_at_usual_sizes_and_once_with_parts_that_are_not_bent() -> No
     begin = np.array([0.4, 0.5, 0.0])
     starts = _starts(NO_DATA, problem, hypothesis("a"), begin)
     np.testing.assert_array_equal(starts, [[0.4, 0.5, 0.5], [0.4, 0.5, -0.5], [0.0, 0.5, 0.5]])
+    told = _starts(NO_DATA, problem, hypothesis("a"), begin, score(3.0, 0.07))
+    np.testing.assert_array_equal(told, [*starts, [0.4, 0.5, 0.07]])
 
 
 def test_an_effect_that_adds_modes_begins_at_the_best_of_a_grid() -> None:
@@ -316,7 +319,7 @@ def test_the_first_fit_begins_at_half_the_size_that_its_score_tells(
     found: Any = _first_fit(NO_DATA, base, {"a": model}, {"a": score(3.0, promised)}, hypothesis("a"))
     if begun is None:
         assert found == "annealed"
-        assert annealed == [(3, ranking.QUICK)]
+        assert annealed == [(4, ranking.QUICK)]  # usual sizes, and the one that the score tells
     else:
         assert found.x.tolist() == [0.4, begun]
         assert annealed == []
@@ -357,6 +360,7 @@ class Stages:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, bent: bool = False) -> None:
         self.asked: list[Any] = []
+        self.short = False
         labels = ("a", "b", "c", "d", "e", "f", "unseen")
         self.hypotheses = [hypothesis(k) for k in labels]
         stds = dict.fromkeys(labels, 9e5) | {"unseen": 1e6}
@@ -367,8 +371,9 @@ class Stages:
             ranking, "beyond_scatter", lambda posterior, parts, most: np.array([bent and most == 3.0])
         )
         monkeypatch.setattr(ranking, "_screened", self.screened)
-        monkeypatch.setattr(ranking, "_short_fits", lambda *given: {})
-        monkeypatch.setattr(ranking, "_first_fit", self.first_fit)
+        monkeypatch.setattr(ranking, "_short_fits", self.short_fits)
+        monkeypatch.setattr(ranking, "_first_fit", partial(self.first_fit, "first"))
+        monkeypatch.setattr(ranking, "_annealed_fit", partial(self.first_fit, "annealed"))
         monkeypatch.setattr(ranking, "_begun_again", self.begun_again)
         monkeypatch.setattr(ranking, "_bettered", self.bettered)
         monkeypatch.setattr(ranking, "_promising", self.promising)
@@ -384,8 +389,12 @@ class Stages:
         self.asked.append(("screened", [h.label for h in hypotheses], near))
         return hypotheses
 
-    def first_fit(self, o: object, base: object, models: Any, promise: Any, h: Any) -> Any:
-        self.asked.append(("first", h.label, len(promise)))
+    def short_fits(self, *given: object) -> dict[str, Any]:
+        self.short = True
+        return {}
+
+    def first_fit(self, how: str, o: object, base: object, models: Any, promise: Any, h: Any) -> Any:
+        self.asked.append((how, h.label, len(promise)))
         return SimpleNamespace(log_evidence=float("fedcba".index(h.label)))
 
     def begun_again(
@@ -437,5 +446,6 @@ def test_a_base_model_that_is_stuck_or_bent_is_begun_again_with_all(
     _, _, promising = stages.rank(stages.base, further=2, unpaired=unpaired)
     assert promising == []
     assert stages.asked[0][2] is False
-    assert stages.asked[1] == ("first", "a", 6 if bent else 0)  # of one that is stuck, scores tell no size
+    assert stages.asked[1] == ("first" if bent else "annealed", "a", 6)
+    assert stages.short is (error > 1.3)  # a few steps lead no mode to its partner
     assert stages.asked[7:] == [("again", 6, 5), ("freed", 12), ("again", 12, 12)]

@@ -129,13 +129,13 @@ class _Shown:
         size = hypothesis.placed.effect.parameters[0].name
         at = problem.unknowns.index[hypothesis.placed.parameter_name(size)]
         null[at] = 0.0
-        before = problem.residuals(null, scatters, matching=fit.posterior.residuals.matching)
-        if len(before.values) != len(fit.posterior.residuals.values) or not np.all(
-            np.isfinite(before.values)
-        ):
-            return None
         if gains is None:
+            before = problem.residuals(null, scatters)  # without the effect a mode may have no partner
             gains = _without(observations, fit, hypothesis, null, before)
+        else:
+            before = problem.residuals(null, scatters, matching=fit.posterior.residuals.matching)
+        if len(before.values) != gains.marginal.count or not np.all(np.isfinite(before.values)):
+            return None
         linear, usual = hypothesis.placed.effect.linear, before.jacobian[:, at]
         if not linear:
             x = null.copy()
@@ -210,13 +210,15 @@ def _without(
     null: NDArray[np.float64],
     before: Residuals,
 ) -> ExpectedGain:
-    """Gains on top of the rig without an effect that the fit has.
+    """Gains on top of the rig without an effect that the fit has, were it what was measured.
 
-    What is uncertain is followed from there: how it moves modes that nearly coincide without the effect is another
-    matter than with it. What the data leave over is that of the fit.
+    What is uncertain is followed from there: modes that nearly coincide without the effect move otherwise than with it.
+    The data would leave one standard deviation everywhere, less what the unknowns follow.
     """
-    residuals = replace(fit.posterior.residuals, jacobian=before.jacobian)
-    there = replace(fit, posterior=replace(fit.posterior, x=null, residuals=residuals))
+    exact = replace(before, values=np.zeros(len(before.values)))
+    followed = replace(fit.posterior, x=null, residuals=exact).expected_squares(weighted=False)
+    usual = replace(before, values=np.sqrt(np.maximum(1.0 - followed, 0.0)))
+    there = replace(fit, posterior=replace(fit.posterior, x=null, residuals=usual))
     return ExpectedGain(there.posterior, observations.scatters, Marginal(there, without=hypothesis.label))
 
 

@@ -46,8 +46,8 @@ _BEATEN = 200.0
 _SCREENED = 14
 """Hypotheses of one kind, generic or the rig's own, best first by their score, that are fitted in full."""
 _SHORT, _ANNEALED = 8, 16
-"""Steps of a short fit, and how many hypotheses, best first by it, are annealed where the base model fails. What led in
-the end was among the first eight of some sixty."""
+"""Steps of a short fit, and how many hypotheses, best first by it, are annealed where the base model fails though it
+has a partner for every mode. What led in the end was among the first eight of some sixty."""
 _UNPROMISING = 6
 """The same where the score promises nothing and the base model is near, so that a fit gains what its score says to some
 tenths: more than `FINALISTS`, so that the reader sees what comes next."""
@@ -140,13 +140,16 @@ def rank(
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
     promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models)}
     hypotheses = [h for h in hypotheses if h.label not in promise or promise[h.label].std < UNSEEN]
-    stuck = base.posterior.error > _EXPLAINED or base.posterior.residuals.penalty > unpaired
+    lost = base.posterior.residuals.penalty > unpaired
+    stuck = lost or base.posterior.error > _EXPLAINED
     settled = base if stuck else learned(observations, base)
     near = not stuck and not np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT))
     chosen = _screened(hypotheses, promise, near)
-    first = _short_fits(observations, base, models, promise, chosen, processes) if stuck else {}
+    # A few steps do not lead a mode to the measured one that no other model has: neither they nor scores tell of it.
+    short = stuck and not lost
+    first = _short_fits(observations, base, models, promise, chosen, processes) if short else {}
     asked = [h for h in chosen if h.label not in first]
-    job = partial(_first_fit, observations, base, models, {} if stuck else promise)
+    job = partial(_annealed_fit if stuck else _first_fit, observations, base, models, promise)
     for i, (hypothesis, posterior) in enumerate(zip(asked, spread(job, asked, processes), strict=True)):
         first[hypothesis.label] = posterior
         progress(0.6 * (i + 1) / len(asked), hypothesis.label)
@@ -222,22 +225,43 @@ def _first_fit(
     promise: Mapping[str, Score],
     hypothesis: Hypothesis,
 ) -> Posterior:
-    """The fit begun at the size that its score tells; annealed from several sizes where the base model fails."""
-    model = models[hypothesis.label]
-    problem = model.problem(observations)
-    unknowns = problem.unknowns
-    begin = transferred(base.posterior, unknowns, np.zeros(len(unknowns)))
-    begun = problem.begun(begin, base.posterior.scatters)
+    """The fit begun at half the size that its score tells; annealed where that makes matters worse."""
+    model, score = models[hypothesis.label], promise.get(hypothesis.label)
+    begun = _begun(observations, base, model)
     if begun is not None:
-        return refined(observations, model, begun).posterior
-    score = promise.get(hypothesis.label)
+        return begun
     if score is not None and len(score.size) == 1:
         fit = refined(observations, model, _at_score(observations, base, model, hypothesis, score))
         if fit.posterior.cost <= base.posterior.cost:
             return fit.posterior
+    return _annealed_fit(observations, base, models, promise, hypothesis)
+
+
+def _annealed_fit(
+    observations: Observations,
+    base: Fit,
+    models: Mapping[str, Model],
+    promise: Mapping[str, Score],
+    hypothesis: Hypothesis,
+) -> Posterior:
+    """The fit annealed from several sizes, or begun where the data themselves tell it to."""
+    model = models[hypothesis.label]
+    begun = _begun(observations, base, model)
+    if begun is not None:
+        return begun
     schedule = _UNHEATED if hypothesis.begun else _FROM_GRID if hypothesis.size_cannot_be_zero else QUICK
-    starts = _starts(observations, problem, hypothesis, begin)
+    problem = model.problem(observations)
+    begin = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+    starts = _starts(observations, problem, hypothesis, begin, promise.get(hypothesis.label))
     return annealed(observations, model, starts, schedule).posterior
+
+
+def _begun(observations: Observations, base: Fit, model: Model) -> Posterior | None:
+    """The fit begun where the data themselves tell it to; None where they do not."""
+    problem = model.problem(observations)
+    begin = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+    begun = problem.begun(begin, base.posterior.scatters)
+    return None if begun is None else refined(observations, model, begun).posterior
 
 
 def _starts(
@@ -245,10 +269,12 @@ def _starts(
     problem: EffectProblem,
     hypothesis: Hypothesis,
     begin: NDArray[np.float64],
+    score: Score | None = None,
 ) -> list[NDArray[np.float64]]:
     """Points from which a hypothesis is fitted.
 
-    A base model that fails has bent parts and channels to the data: a true effect is found from unbent ones.
+    A base model that fails has bent parts and channels to the data: a true effect is found from unbent ones. Usual
+    sizes may be ten times too large; the one that a score tells is about right where the effect is.
     """
     unbent = begin.copy()
     unbent[[bool(s) for s in problem.unknowns.scatter]] = 0.0
@@ -261,6 +287,9 @@ def _starts(
     else:
         plans = [(begin, start) for start in hypothesis.starts()]
         plans += [(unbent, start) for start in hypothesis.starts()[:1]]
+        if score is not None and len(score.size) == 1 and not hypothesis.begun:
+            size = hypothesis.placed.effect.parameters[0].name
+            plans.append((begin, {hypothesis.placed.parameter_name(size): float(score.size[0])}))
     found = []
     for x, sizes in plans:
         moved = x.copy()
