@@ -16,7 +16,7 @@ from ema_pipeline.diagnose.probability import needed
 from ema_pipeline.diagnose.score import UNSEEN, Marginal
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import DetectionLimit
-from ema_pipeline.inference import Residuals
+from ema_pipeline.inference import Posterior, Residuals
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import Fit, Model, transferred
 from ema_pipeline.observations.rig_model import SizeMap
@@ -29,6 +29,8 @@ _NEAR = 0.1
 """Relative accuracy of the gain at a limit."""
 _LARGEST_STEP, _LONGEST_STEP = 1.4, 4.0
 """Largest step in the logarithm of a limit from one trial to the next, of the same."""
+_SMOOTH = 30.0
+"""How much more a claimed effect may change the residuals to first order than it does, where it has a slope at all."""
 _SLOPES = (0.3, 5.0)
 """Least and largest power of the size with which the gain is taken to grow."""
 
@@ -129,11 +131,11 @@ class _Shown:
         size = hypothesis.placed.effect.parameters[0].name
         at = problem.unknowns.index[hypothesis.placed.parameter_name(size)]
         null[at] = 0.0
+        before = problem.residuals(null, scatters, matching=fit.posterior.residuals.matching)
         if gains is None:
-            before = problem.residuals(null, scatters)  # without the effect a mode may have no partner
+            if _not_there(before, fit.posterior, at):
+                before = problem.residuals(null, scatters)
             gains = _without(observations, fit, hypothesis, null, before)
-        else:
-            before = problem.residuals(null, scatters, matching=fit.posterior.residuals.matching)
         if len(before.values) != gains.marginal.count or not np.all(np.isfinite(before.values)):
             return None
         linear, usual = hypothesis.placed.effect.linear, before.jacobian[:, at]
@@ -203,6 +205,15 @@ class _Shown:
         return min(first, whole, key=lambda c: c.total) if self.linear else whole
 
 
+def _not_there(before: Residuals, fit: Posterior, at: int) -> bool:
+    """True where an effect that the fit has makes a mode of what is none without it, as a shaft's torsion does.
+
+    The logarithm of a frequency that begins at 0 Hz has no slope there.
+    """
+    change = float(np.max(np.abs(fit.residuals.values - before.values), initial=0.0))
+    return float(np.max(np.abs(before.jacobian[:, at] * fit.x[at]), initial=0.0)) > _SMOOTH * change
+
+
 def _without(
     observations: Observations,
     fit: Fit,
@@ -213,12 +224,16 @@ def _without(
     """Gains on top of the rig without an effect that the fit has, were it what was measured.
 
     What is uncertain is followed from there: modes that nearly coincide without the effect move otherwise than with it.
-    The data would leave one standard deviation everywhere, less what the unknowns follow.
+    The data would leave over what they leave of the fit; where modes have other partners, one standard deviation.
     """
-    exact = replace(before, values=np.zeros(len(before.values)))
-    followed = replace(fit.posterior, x=null, residuals=exact).expected_squares(weighted=False)
-    usual = replace(before, values=np.sqrt(np.maximum(1.0 - followed, 0.0)))
-    there = replace(fit, posterior=replace(fit.posterior, x=null, residuals=usual))
+    left = fit.posterior.residuals
+    if not _same_pairs(before.matching, left.matching):
+        exact = replace(before, values=np.zeros(len(before.values)))
+        followed = replace(fit.posterior, x=null, residuals=exact).expected_squares(weighted=False)
+        left = replace(before, values=np.sqrt(np.maximum(1.0 - followed, 0.0)))
+    there = replace(
+        fit, posterior=replace(fit.posterior, x=null, residuals=replace(left, jacobian=before.jacobian))
+    )
     return ExpectedGain(there.posterior, observations.scatters, Marginal(there, without=hypothesis.label))
 
 
