@@ -18,7 +18,9 @@ _MIXED_STD = 0.1
 _WHIRLS = 0.05
 """Share of its imaginary part in the sum of squares of a shape, from which it is compared as a complex one: MPC 0.8."""
 _DOUBLE = 0.9
-"""Share of a shape's squares that shapes of modes within a half-width explain, from which it is no mode of its own."""
+"""Share of a shape's squares that shapes of near modes explain, from which it is no mode of its own."""
+_NEAR = 2.0
+"""Half-widths within which modes are near: one that drifts from hit to hit has twins a little farther off than one."""
 _CLOSE = 3.0
 """Half-power bandwidths within which modes are close: further apart, one is below a sixth of its peak at another's."""
 _OVERLAP = 6.0
@@ -94,7 +96,7 @@ class ModeData:
 
     @cached_property
     def double(self) -> NDArray[np.bool_]:
-        """Mask of modes whose shape is a mix of those of modes within a half-width, (m,).
+        """Mask of modes whose shape is a mix of those of modes within two half-widths, (m,).
 
         Drift and hits off their mark split close modes into more than there are. What a structure adds has a shape that
         the others have not.
@@ -102,7 +104,7 @@ class ModeData:
         found = np.zeros(len(self), bool)
         width = np.nan_to_num(np.exp(self.log_damping))
         for i in range(len(self)):
-            near = np.abs(self.log_frequency - self.log_frequency[i]) < np.maximum(width, width[i])
+            near = np.abs(self.log_frequency - self.log_frequency[i]) < _NEAR * np.maximum(width, width[i])
             near[i] = False
             on = (self.seen[i] > 0) & np.all(self.seen[near] > 0, axis=0)
             if not np.any(near) or np.sum(on) < np.sum(near) + 2:
