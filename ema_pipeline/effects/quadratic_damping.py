@@ -25,9 +25,7 @@ EFFECT = Effect(
     id="quadratic_damping",
     title="damper whose force grows with the square of its rate",
     parameters=(
-        EffectParameter(
-            "coefficient", "N·s²/m²", 0.0, 1.0, 10.0, 0.0, 1e9, "factor of the rate times its size"
-        ),
+        EffectParameter("coefficient", "N·s²/m²", 0.0, 1.0, 10.0, 0.0, 1e9, "factor of rate × |rate|"),
     ),
     find_places=bodies_pairs_and_dofs,
     edit=_edit,

@@ -71,7 +71,7 @@ def identified_words(p: ParameterEstimate, fit: FitResult) -> str:
         return "identified by the data"
     if p.free:
         return "not identified by the data" + (f": {p.note}" if p.note else "")
-    return "not narrowed by the data: its tolerance decides"
+    return "not narrowed by the data: its tolerance determines it"
 
 
 def fails(fit: FitResult) -> bool:

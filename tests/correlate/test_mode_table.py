@@ -219,4 +219,4 @@ def test_eighteen_stiffnesses_are_not_identified_by_three_modes(test_data: Path,
     left = [p for p in stiffnesses.values() if not p.identified]
     assert len(left) >= 15
     assert all("tolerance determines it" in p.note for p in left)
-    assert "are not identified one by one" in " ".join(summary.findings(results(fit)))
+    assert "are not identified individually" in " ".join(summary.findings(results(fit)))

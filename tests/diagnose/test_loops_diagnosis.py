@@ -201,7 +201,7 @@ def test_friction_device_shows_hysteresis_and_the_report_says_what_is_missing(te
     assert len(model.scales) == 4
     words = " ".join(found.notes)
     assert "tensions" in words
-    assert "stick and slip" in words
+    assert "stick-slip" in words
     assert found.localisation
 
 

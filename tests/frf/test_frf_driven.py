@@ -78,7 +78,7 @@ def test_two_forces_at_once_give_the_matrix_and_a_variance_that_is_true(estimato
 def test_forces_that_are_one_signal_are_refused_and_correlated_ones_named() -> None:
     one = np.random.default_rng(4).standard_normal(40_000)
     force = np.stack([one, 0.5 * one])
-    with pytest.raises(EmaError, match="forces 'f0' and 'f1' are one and the same signal"):
+    with pytest.raises(EmaError, match="forces 'f0' and 'f1' are the same signal"):
         estimate_driven_frfs([_record(force, _responded(force))])
     force = np.stack([one, 0.5 * one + 0.3 * np.random.default_rng(5).standard_normal(40_000)])
     frfs = estimate_driven_frfs([_record(force, _responded(force))])

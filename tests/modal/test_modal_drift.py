@@ -14,7 +14,7 @@ from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.warp import WarpedTransform
 from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.records import HitSamples, cut_hit
-from ema_pipeline.modal.combine_estimates import Witness, pool
+from ema_pipeline.modal.combine_estimates import NamedEstimate, pool
 from ema_pipeline.modal.drift.align import _movements
 from ema_pipeline.modal.drift.local import PeakPoles, change_in_decay, peak_poles
 from ema_pipeline.modal.drift.shifts import movement
@@ -205,9 +205,9 @@ def test_points_at_which_modes_have_moved_do_not_take_the_others_with_them() -> 
 
 
 def test_estimates_that_disagree_widen_the_interval_and_two_of_them_move_the_value() -> None:
-    pole = Witness("all FRFs", 40.06, 0.01)
-    circle, hit = Witness("circles", 40.16, 0.01), Witness("single hits", 40.17, 0.01)
-    assert pool([pole, Witness("circles", 40.07, 0.01)], 0.0, "Hz", 1.0) == (40.06, 0.01, "")
+    pole = NamedEstimate("all FRFs", 40.06, 0.01)
+    circle, hit = NamedEstimate("circles", 40.16, 0.01), NamedEstimate("single hits", 40.17, 0.01)
+    assert pool([pole, NamedEstimate("circles", 40.07, 0.01)], 0.0, "Hz", 1.0) == (40.06, 0.01, "")
     value, std, said = pool([pole, circle], 0.0, "Hz", 1.0)
     assert value == pole.value
     assert std == pytest.approx(np.hypot(0.01, 0.05))

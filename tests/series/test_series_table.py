@@ -55,7 +55,7 @@ def _series(folder: Path, count: int = 20, step: float = 0.0) -> SeriesDatabase:
     random = np.random.default_rng(8)
     folder.mkdir(exist_ok=True)
     database = SeriesDatabase(folder)
-    database.tell("tree", "tree")
+    database.set_fact("tree", "tree")
     for i in range(count):
         first = 30.0 + 0.1 * random.standard_normal() + (step if i >= count // 2 else 0.0)
         second = 50.0 + 0.2 * random.standard_normal()
