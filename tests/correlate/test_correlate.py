@@ -194,6 +194,13 @@ def test_groups_chain_neighbours_and_part_distant_modes() -> None:
     assert len({int(groups[0]), int(groups[1]), int(groups[4])}) == 3
 
 
+def test_unless_set_otherwise_modes_within_two_per_cent_form_a_group() -> None:
+    width = PairingSettings().group_width
+    for second, alike in ((101.9, True), (102.1, False)):
+        groups = close_groups(np.array([100.0, second]), width)
+        assert (groups[0] == groups[1]) == alike
+
+
 def test_a_table_of_frequencies_is_sorted_and_none_may_be_zero() -> None:
     table = from_frequencies("no_ring", [100.0, 50.0])
     assert table.frequency_hz.tolist() == [50.0, 100.0]

@@ -48,6 +48,25 @@ def table(folder: Path, text: str, name: str = "modes.toml") -> Path:
     return path
 
 
+def test_a_dof_at_a_node_is_zero_in_all_shapes_but_no_shape_may_be_zero(tmp_path: Path) -> None:
+    text = TABLE.replace('["storey1.x", "-storey2.x"]', '["storey1.x", "storey2.x", "storey3.x"]')
+    node = text.replace("[0.5, 1.0]]", "[0.5, 1.0], [0.0, 0.0]]")
+    rig = load_rig("frame")
+    modes = read_mode_table(table(tmp_path, node), rig)["default"]
+    assert modes.shapes is not None
+    np.testing.assert_array_equal(modes.shapes[:, 2], 0)
+    empty = text.replace("[1.0, 0.4]", "[1.0, 0.0]").replace("[0.5, 1.0]]", "[0.5, 0.0], [0.2, 0.0]]")
+    with pytest.raises(EmaError, match="shape of a mode is all zero"):
+        read_mode_table(table(tmp_path, empty), rig)
+
+
+def test_the_band_of_a_table_is_kept_and_unknown_where_it_has_none(tmp_path: Path) -> None:
+    rig = load_rig("frame")
+    assert to_modal_model(read_mode_table(table(tmp_path, TABLE), rig)["default"]).band_hz == (1.0, 50.0)
+    without = TABLE.replace("band_hz = [1.0, 50.0]\n", "")
+    assert np.isnan(to_modal_model(read_mode_table(table(tmp_path, without), rig)["default"]).band_hz).all()
+
+
 def test_toml_table_is_read_in_ascending_order_with_signs_applied(tmp_path: Path) -> None:
     modes = read_mode_table(table(tmp_path, TABLE), load_rig("frame"))["default"]
     np.testing.assert_array_equal(modes.frequency_hz, [10.0, 30.0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -240,6 +241,24 @@ def test_the_reader_of_sdynpy_gives_the_same_frfs_shapes_and_lines(tmp_path: Pat
             if np.isfinite(value) and direction <= 3:
                 assert complex_.node_data_dictionary[node][direction - 1] == pytest.approx(value, rel=1e-6)
     assert len(found[82]) == 1
+
+
+def test_shapes_along_z_come_back_and_coherences_have_no_physical_type(tmp_path: Path) -> None:
+    dofs = tuple(Dof.parse(d) for d in ("sun.x", "sun.y", "sun.z", "planet1.z"))
+    modal = modal_model()
+    modes = tuple(
+        replace(m, shape=np.array([1.0, -2.0, 3.0, 0.5], complex), shape_std=np.zeros(4)) for m in modal.modes
+    )
+    path = tmp_path / "out.uff"
+    table = write_uff(path, frf_set(), replace(modal, dofs=dofs, outputs=dofs, modes=modes))
+    found = strict_datasets(path)
+    normal = strict_55(next(body for number, body in found if number == 55))
+    nodes = {d: table.dofs[d.point] for d in dofs}
+    assert {d.direction: n[1] for d, n in nodes.items()} == {"x": 1, "y": 2, "z": 3}
+    np.testing.assert_allclose(normal["nodes"][nodes[dofs[0]][0]], [1.0, -2.0, 3.0])
+    np.testing.assert_allclose(normal["nodes"][nodes[dofs[3]][0]], [0.0, 0.0, 0.5])
+    coherence = next(f for f in (strict_58(b) for n, b in found if n == 58) if f["type"] == 6)
+    assert coherence["kinds"] == [18, 0, 0, 0]  # frequency; the others unknown
 
 
 def test_unscaled_shapes_have_no_modal_mass(tmp_path: Path) -> None:

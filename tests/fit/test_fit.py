@@ -23,7 +23,8 @@ from ema_pipeline.mechanics.system import sensor_rows
 from ema_pipeline.observations.fitting import Model
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
-from ema_pipeline.rigs import load_rig
+from ema_pipeline.rigs import load_rig, model_modes
+from ema_pipeline.rigs.frame import frame
 from ema_pipeline.rigs.planetary import RING_PLANET, SUN_PLANET
 from ema_pipeline.rigs.types import Rig
 
@@ -166,6 +167,31 @@ def test_a_mesh_whose_configuration_was_not_tested_is_reported_as_not_measured()
     assert np.isnan(ring.std)
     assert (ring.low, ring.high) == (1e6, 1e9)
     assert ring.note.startswith("not measured")
+
+
+def test_a_measured_mode_that_the_model_lacks_is_named_alone() -> None:
+    rig = load_rig("frame")
+    known = [m.frequency_hz for m in model_modes(rig, "default")]
+    far = 3 * max(known)
+    found = fit(rig, {"default": from_frequencies("default", [*known, far])})
+    assert f"default: no model mode for {far:.1f} Hz" in found.notes
+    assert not any(
+        "no model mode" in n for n in fit(rig, {"default": from_frequencies("default", known)}).notes
+    )
+
+
+def test_the_depth_of_an_error_function_is_its_median_over_its_least() -> None:
+    """One storey, f = √(k/m)/2π, so that ε of two frequencies is known at every stiffness."""
+    measured = [200.0, 250.0]
+    sweep = error_sweep(frame(1), "default", "storey1_stiffness", measured, 2, FitSettings(sweep_points=301))
+    k = np.geomspace(1e6, 1e9, 301)
+    model = np.sqrt(k / 5.0) / (2 * np.pi)
+    epsilon = ((200.0 / model - 1) ** 2) + (250.0 / model - 1) ** 2
+    np.testing.assert_allclose(sweep.values, k)
+    np.testing.assert_allclose(sweep.error, epsilon, rtol=1e-9)
+    assert sweep.minimum == k[np.argmin(epsilon)]
+    assert sweep.relative_depth == pytest.approx(np.median(epsilon) / epsilon.min() - 1)
+    assert sweep.identified
 
 
 # --- shapes, both configurations ----------------------------------------------------------------------------

@@ -83,6 +83,24 @@ def test_a_time_column_in_milliseconds_gives_the_rate_in_hertz(tmp_path: Path) -
     check(path)
 
 
+@pytest.mark.parametrize(
+    ("line", "rate"),
+    [
+        ("Sampling interval (ms): 0.5", 2000.0),
+        ("Sampling interval [s]: 0.5e-3", 2000.0),
+        ("Delta t: 0.25", 4.0),
+        ("Sample rate: 2.5 kHz", 2500.0),
+        ("Sample rate: 2,5", 2.5),
+    ],
+)
+def test_rates_and_intervals_above_a_table_are_taken_in_their_units(
+    tmp_path: Path, line: str, rate: float
+) -> None:
+    path = tmp_path / "hit.txt"
+    path.write_text(f"{line}\n\nhammer\ttip\n" + "".join(f"{i % 7}.5\t{i % 5}.25\n" for i in range(50)))
+    assert read_raw(path).sample_rate_hz == pytest.approx(rate, rel=1e-12)
+
+
 def test_times_rounded_to_microseconds_still_give_the_whole_rate(tmp_path: Path) -> None:
     path = tmp_path / "hit.csv"
     rate = 25600

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ema_pipeline.mechanics.equivalent import Motions, settled_offsets
+from ema_pipeline.mechanics.equivalent import Motions, _phases, settled_offsets
 from ema_pipeline.mechanics.harmonic import describing_function
 from ema_pipeline.mechanics.laws import BoucWen, DryFriction, Nonlinear, PartingSpring, PolynomialSpring
 
@@ -68,3 +68,13 @@ def test_teeth_that_never_part_change_nothing() -> None:
     motion = Motions(np.array([[2e-5, 1e-5, 3e-6], [0.0, 0.0, 0.0]]), OMEGA)
     assert not np.any(settled_offsets([mesh], [motion], np.eye(1) * 1e-7))
     assert not np.any(motion.stiffness(mesh, np.zeros(2)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7, 30])
+def test_phases_have_exact_first_and_second_moments(count: int) -> None:
+    waves = np.exp(1j * _phases(count))
+    sets = waves.shape[1]
+    assert sets > 2 * count
+    np.testing.assert_allclose(waves.mean(axis=1), 0, atol=1e-12)
+    np.testing.assert_allclose(waves @ waves.conj().T / sets, np.eye(count), atol=1e-12)
+    np.testing.assert_allclose(waves @ waves.T / sets, 0, atol=1e-12)
