@@ -23,6 +23,7 @@ from ema_pipeline.inference import (
     joined,
     learn,
     lower_factor,
+    solve_lower,
     tails,
     widened,
 )
@@ -507,3 +508,10 @@ def test_a_precision_has_its_factor_however_large_it_is(scale: float) -> None:
 def test_a_precision_that_rounding_spoilt_has_the_factor_of_the_nearest_one() -> None:
     spoilt = np.diag([1.0, 1e20, -3e3])  # as differences of 1e20 leave a 1
     np.testing.assert_allclose(lower_factor(spoilt), np.diag([1.0, 1e10, 1.0]), rtol=1e-12)
+
+
+def test_a_triangular_solution_of_nothing_is_nothing() -> None:
+    assert solve_lower(np.zeros((0, 0)), np.zeros(0)).shape == (0,)
+    np.testing.assert_allclose(
+        solve_lower(np.array([[2.0, 9.0], [1.0, 4.0]]), np.array([4.0, 10.0])), [2.0, 2.0]
+    )
