@@ -399,7 +399,7 @@ def test_summary_speaks_of_agreement_only_where_the_error_is_about_one(run: RunR
     assert run.comparison is not None
     assert "more than the measurement's uncertainty explains" in " ".join(summary.findings(run))
     good = replace(run, comparison=replace(run.comparison, error=1.04))
-    assert "as well as the data can tell" in " ".join(summary.findings(good))
+    assert "to within their uncertainty" in " ".join(summary.findings(good))
 
 
 def test_misfit_is_the_first_caution_even_where_values_are_identified(run: RunResults) -> None:
