@@ -1,4 +1,4 @@
-"""What a verb shows: results on stdout, progress on stderr."""
+"""Output of the subcommands: results on stdout, progress on stderr."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``ema watch``: hits judged while one strikes."""
+"""``ema watch``: hits judged during the test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The teeth of a mesh part where the motion outgrows the preload."""
+"""The teeth of a mesh separate where the motion exceeds the preload."""
 
 from __future__ import annotations
 

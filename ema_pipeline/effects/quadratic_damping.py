@@ -1,4 +1,4 @@
-"""A damper whose force grows with the square of its rate, as that of a fluid which is displaced."""
+"""A damper whose force grows with the square of its rate, like that of a displaced fluid."""
 
 from __future__ import annotations
 

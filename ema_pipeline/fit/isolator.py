@@ -1,4 +1,4 @@
-"""The whole identification: the source's steps, then the posterior of its model on whole loops."""
+"""Identification of an isolator: the published steps, then the posterior of the published model on whole loops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fitted parameters, read from the posterior of everything uncertain, and the seed's error function beside them."""
+"""Fitted parameters, read from the posterior of everything uncertain, and the published error function beside them."""
 
 from __future__ import annotations
 

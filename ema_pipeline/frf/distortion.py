@@ -1,4 +1,4 @@
-"""Noise and nonlinear distortion of a periodic test, told apart.
+"""Noise and nonlinear distortion of a periodic test, separated.
 
 Noise differs from period to period. Distortion repeats with the period and differs from one realisation of the phases
 to the next. Where a multisine leaves lines without force, what the response has there is distortion: of even order at

@@ -1,4 +1,4 @@
-"""What to be careful about in a run, one sentence each, the gravest first."""
+"""What to be careful about in a run, one sentence each, the most serious first."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Weight(IntEnum):
 
 
 def cautions(results: RunResults, lightest: Weight = Weight.SWEEP) -> tuple[str, ...]:
-    """What to be careful about, one sentence each, the gravest first.
+    """What to be careful about, one sentence each, the most serious first.
 
     Parameters
     ----------

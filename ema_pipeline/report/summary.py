@@ -1,4 +1,4 @@
-"""The run in plain words: what was found, what was fitted, and what to be careful about."""
+"""The run in plain sentences: what was found, what was fitted, and what to be careful about."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Limits that tests are held against: written by hand, or learnt from a good lot as tolerance intervals."""
+"""Limits that tests are held against: written by hand, or learned from a good lot as tolerance intervals."""
 
 from __future__ import annotations
 

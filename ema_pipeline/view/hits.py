@@ -1,4 +1,4 @@
-"""The live page of a raw folder in the making: what ``ema watch`` says of each file, in a browser."""
+"""The live page of a raw folder during a test: what ``ema watch`` says of each file, in a browser."""
 
 from __future__ import annotations
 

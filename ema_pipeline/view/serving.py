@@ -1,4 +1,4 @@
-"""What every live page needs: a guarded server on the loopback, and its state told to all tabs."""
+"""What every live page needs: a guarded server on the loopback address that notifies all tabs."""
 
 from __future__ import annotations
 
