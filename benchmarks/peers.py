@@ -156,7 +156,12 @@ def accuracy(cases: int) -> Iterator[tuple[str, ...]]:
         theirs.add(system, seen, by_peer(frfs, system))
     what = f"{cases} systems of 4 to 15 modes, 1 to 5 % noise"
     yield f"damping error, median / 95 %, {what}, one reference; sdypy-EMA", *compared(alone, theirs)
-    yield "missed / spurious modes of the same, sdypy-EMA given the true frequencies", alone.misses(), theirs.misses(), ""
+    yield (
+        "missed / spurious modes of the same, sdypy-EMA given the true frequencies",
+        alone.misses(),
+        theirs.misses(),
+        "",
+    )
     yield "damping error of the same systems, all references", ours.errors(), "takes one reference", ""
     yield "missed / spurious modes of these", ours.misses(), "takes one reference", ""
 
