@@ -15,7 +15,7 @@ from hostile_files import SIGNAL, TRAPS
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.file_size_limits import ReadLimits
-from ema_pipeline.ingest.readers import apart, read_raw
+from ema_pipeline.ingest.readers import apart, helper, read_raw
 from ema_pipeline.ingest.readers.apart import read_apart
 
 SECONDS, MEGABYTES = 10.0, 500.0
@@ -25,7 +25,7 @@ READER = """
 import json, os, sys, time
 from pathlib import Path
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.readers import apart, read_raw
+from ema_pipeline.ingest.readers import apart, helper, read_raw
 
 def told(path):
     try:
@@ -111,3 +111,18 @@ def test_a_limit_is_a_setting(tmp_path: Path) -> None:
     assert read_raw(path, ReadLimits(unpack_ratio=2000)).channels["hammer"].samples.size == 10_000_000
     with pytest.raises(EmaError, match=r"--set ingest\.largest_mb"):
         read_raw(path, ReadLimits(largest_mb=0.01))
+
+
+def test_the_helper_may_use_what_it_has_its_spare_and_three_copies_of_the_samples(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    resource = pytest.importorskip("resource", reason="limits of a process exist on Unix only")
+    if not Path("/proc/self/statm").exists():
+        pytest.skip("the memory of a process is read from /proc")
+    limits: dict[int, int] = {}
+    monkeypatch.setattr(helper, "_lower", lambda what, limit: limits.update({what: limit}))
+    helper._restrain(1_000_000_000, 7.0)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    assert limits[resource.RLIMIT_AS] == pytest.approx(used + 256e6 + 3e9, abs=50e6)
+    spent = resource.getrusage(resource.RUSAGE_SELF)
+    assert limits[resource.RLIMIT_CPU] - (spent.ru_utime + spent.ru_stime) == pytest.approx(8, abs=1.1)
