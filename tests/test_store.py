@@ -149,6 +149,12 @@ def test_replacing_a_result_again_and_again_does_not_make_the_file_grow(tmp_path
     assert sizes[-1] < 2.5 * sizes[0]
 
 
+def test_the_file_states_the_number_of_its_layout(tmp_path: Path) -> None:
+    Store(tmp_path).save("hits", ALL, "key", "{}", 0.1, x=1.0)
+    with h5py.File(tmp_path / "ema.h5") as file:
+        assert file.attrs["format"] == 1
+
+
 def test_a_store_that_is_no_hdf5_file_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "ema.h5").write_bytes(b"not HDF5 at all")
     with pytest.raises(EmaError, match=r"ema\.h5: is not a readable HDF5 file"):

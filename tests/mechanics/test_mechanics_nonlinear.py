@@ -21,6 +21,7 @@ from ema_pipeline.mechanics.laws import (
     Nonlinear,
     PartingSpring,
     PolynomialSpring,
+    parting,
 )
 from ema_pipeline.mechanics.modes import normal_modes
 from ema_pipeline.mechanics.nonlinear import force_along, nonlinear_response, steady_deviation
@@ -301,3 +302,20 @@ def test_backlash_lowers_the_apparent_frequency_as_its_describing_function_says(
         if ratio >= 2:  # nearer to the gap one harmonic is too few
             described = np.sqrt(describing_function(mesh, ratio * b, 100.0, 4096).real / mass)
             assert measured == pytest.approx(described / (2 * np.pi), rel=0.025)
+
+
+@pytest.mark.parametrize(
+    ("stretch", "preload", "gap", "force", "slope"),
+    [
+        # stiffness 1e6 N/m, contact at stretch -preload, back contact a gap further; less the tangent in contact
+        (-3e-6, 2e-6, 5e-6, -2.0 + 3.0, -1e6),  # parted: the force is -2 N, not -3 N
+        (-9e-6, 2e-6, 5e-6, -4.0 + 9.0, 0.0),  # the back is reached at -7 µm: 2 µm of contact on top of -2 N
+        (1e-6, 2e-6, 5e-6, 0.0, 0.0),
+        (-9e-6, np.inf, 5e-6, 0.0, 0.0),  # teeth that nothing parts
+    ],
+)
+def test_forces_of_teeth_that_separate_are_those_of_their_gap(
+    stretch: float, preload: float, gap: float, force: float, slope: float
+) -> None:
+    found = parting(stretch, 0.0, 1e6, preload, gap)
+    np.testing.assert_allclose(found, (force, slope, 0.0), rtol=1e-12, atol=1e-12)
