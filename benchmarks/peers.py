@@ -94,7 +94,7 @@ def speed(turns: int) -> Iterator[tuple[str, ...]]:
         yield "its stable poles, largest relative distance to ours", f"{found.distance:.1e}", "", ""
     build, select = bench_lscf.chart(turns)
     yield times("poles of a chart, ours polyreference with 2 references, sdypy-EMA with 1", build)
-    yield times("selection from that chart, ours by itself, sdypy-EMA told where 12 modes are", select)
+    yield times("selection from that chart, ours by itself, sdypy-EMA given the 12 true frequencies", select)
 
 
 def times(what: str, found: Paired) -> tuple[str, ...]:
@@ -156,7 +156,12 @@ def accuracy(cases: int) -> Iterator[tuple[str, ...]]:
         theirs.add(system, seen, by_peer(frfs, system))
     what = f"{cases} systems of 4 to 15 modes, 1 to 5 % noise"
     yield f"damping error, median / 95 %, {what}, one reference; sdypy-EMA", *compared(alone, theirs)
-    yield "missed / spurious modes of the same, sdypy-EMA told where", alone.misses(), theirs.misses(), ""
+    yield (
+        "missed / spurious modes of the same, sdypy-EMA given the true frequencies",
+        alone.misses(),
+        theirs.misses(),
+        "",
+    )
     yield "damping error of the same systems, all references", ours.errors(), "takes one reference", ""
     yield "missed / spurious modes of these", ours.misses(), "takes one reference", ""
 
@@ -169,7 +174,7 @@ def accuracy(cases: int) -> Iterator[tuple[str, ...]]:
     what = f"{cases} pairs 0.5 % apart, 2 to 4 references, 0.5 to 2 % noise"
     yield f"damping error, median / 95 %, {what}; sdypy-EMA with one reference", *compared(ours, theirs)
     yield (
-        "missed members / spurious modes of the same, sdypy-EMA told where",
+        "missed members / spurious modes of the same, sdypy-EMA given the true frequencies",
         ours.misses(),
         theirs.misses(),
         "",

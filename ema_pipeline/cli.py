@@ -68,7 +68,7 @@ def main() -> None:
     except BrokenPipeError:
         os._exit(1)
     except MemoryError:
-        _stop("ema: the memory does not suffice; close other programs, or analyse fewer records at once", 1)
+        _stop("ema: there is not enough memory; close other programs, or analyse fewer records at once", 1)
     except OSError as error:
         if error.errno is None:
             _stop_for_crash(error)

@@ -33,7 +33,7 @@ from ema_pipeline.significance import holm
 from ema_pipeline.store import RESULTS_FILE
 
 TOLERANCE = 1e-3
-"""Relative 1 σ by which frequencies of one state differ from set-up to set-up: temperature, and sensors that moved."""
+"""Relative 1 σ by which frequencies of one state differ between set-ups: temperature, and sensors that moved."""
 
 LEVEL = 0.01
 """Chance to call any two parts of one state different."""
@@ -286,7 +286,7 @@ def _copy(part: Part, folder: Path) -> None:
 def _with_part(text: str, part: Part) -> str:
     """The description with the part's name and band in front of its other keys."""
     top, bracket, rest = re.split(r"(^[ \t]*\[)", text, maxsplit=1, flags=re.MULTILINE)
-    source = "stated" if part.test.band_hz is not None else "what its force spectrum carries"
+    source = "stated" if part.test.band_hz is not None else "the band of its force spectrum"
     low, high = part.band_hz
     own = f'part = "{part.name}"\nband_hz = [{low:.6g}, {high:.6g}]  # {source}\n'
     return own + _OWN_KEY.sub("", top) + bracket + rest

@@ -74,14 +74,14 @@ def _side_by_side(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | N
         one_store_of_memory()
 
         @contextmanager
-        def tell(label: str) -> Iterator[Progress]:
+        def show_stage(label: str) -> Iterator[Progress]:
             send((label, "begins"))
             yield lambda share, text: send((label, (share, text)))
             send((label, "ends"))
 
         for stage, c, key in todo:
             if c == configuration:
-                _run_one(stage, run, c, key, _label(stage, c), tell if show else None)
+                _run_one(stage, run, c, key, _label(stage, c), show_stage if show else None)
 
     with ExitStack() as open_shows:
         shown: dict[str, tuple[ExitStack, Progress]] = {}

@@ -155,7 +155,10 @@ def side_by_side(
                 try:
                     kind, content = connection.recv()
                 except EOFError:  # killed, for want of memory most likely
-                    kind, content = "failed", MemoryError(f"a worker ended before its time ({items[index]})")
+                    kind, content = (
+                        "failed",
+                        MemoryError(f"a worker process ended unexpectedly ({items[index]})"),
+                    )
                 if kind == "told":
                     hear(content)
                     continue

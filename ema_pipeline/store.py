@@ -1,4 +1,4 @@
-"""The results file ``ema.h5``: one group per stage and configuration, safe against a kill at any moment.
+"""The results file ``ema.h5``: one group per stage and configuration, safe against interruption at any moment.
 
 Every change is made to a copy that replaces the file in one step, so that the file on disk is always
 whole: either before the change or after it. So that the copy stays small, a large result is a file of its own in the

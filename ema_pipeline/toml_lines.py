@@ -1,4 +1,4 @@
-"""On which line of a TOML text each key stands: the standard reader does not tell, and users want to know."""
+"""The line of each key in a TOML text, for error messages: the standard reader does not report it."""
 
 from __future__ import annotations
 

@@ -178,7 +178,7 @@ def test_an_included_pole_becomes_a_flagged_mode(out: Path) -> None:
 
 
 def test_a_mode_of_the_list_is_not_included_twice(out: Path) -> None:
-    with pytest.raises(EmaError, match="stands for these poles already"):
+    with pytest.raises(EmaError, match="represents these poles already"):
         change_choices(out, including(modes=[f"{frequencies(out)[0]:.2f}"]))
     with pytest.raises(EmaError, match="no pole within 1 %"):
         change_choices(out, including(modes=["0.5"]))

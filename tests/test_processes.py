@@ -74,7 +74,7 @@ def test_a_worker_that_is_killed_is_an_error_and_no_hang() -> None:
     def job(item: int, send: Send) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
-    with pytest.raises(MemoryError, match="ended before its time"):
+    with pytest.raises(MemoryError, match="ended unexpectedly"):
         side_by_side(job, [1], 2, lambda message: None)
 
 

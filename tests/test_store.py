@@ -20,7 +20,7 @@ from numpy.testing import assert_array_equal
 from ema_pipeline import codec
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
-from ema_pipeline.store import ALL, Store
+from ema_pipeline.store import ALL, Store, _holder
 
 
 @dataclass(frozen=True)
@@ -149,6 +149,12 @@ def test_replacing_a_result_again_and_again_does_not_make_the_file_grow(tmp_path
     assert sizes[-1] < 2.5 * sizes[0]
 
 
+def test_the_file_states_the_number_of_its_layout(tmp_path: Path) -> None:
+    Store(tmp_path).save("hits", ALL, "key", "{}", 0.1, x=1.0)
+    with h5py.File(tmp_path / "ema.h5") as file:
+        assert file.attrs["format"] == 1
+
+
 def test_a_store_that_is_no_hdf5_file_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "ema.h5").write_bytes(b"not HDF5 at all")
     with pytest.raises(EmaError, match=r"ema\.h5: is not a readable HDF5 file"):
@@ -167,6 +173,24 @@ with Store(Path({str(tmp_path)!r})).lock():
     free = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "another ema process" in blocked.stderr
     assert free.stdout.strip() == "locked"
+
+
+@pytest.mark.parametrize(
+    ("content", "who"),
+    [
+        (b"123 lab-pc", "another ema process (number 123 on lab-pc)"),
+        (b"12345678901234567890 lab-pc", "another ema process (number 12345678901234567890 on lab-pc)"),
+        (b"123456789012345678901 lab-pc", "another ema process"),
+        (b"\x1b[2J", "another ema process"),
+        (b"\xff\xfe", "another ema process"),
+        (b"1 " + 100 * b"a", "another ema process (number 1 on " + 64 * "a" + ")"),
+    ],
+)
+def test_who_holds_the_lock_is_named_only_where_the_lock_file_says_so_plainly(
+    tmp_path: Path, content: bytes, who: str
+) -> None:
+    (tmp_path / "lock").write_bytes(content)
+    assert _holder(tmp_path / "lock") == who
 
 
 def test_workers_of_a_killed_process_die_and_leave_no_lock(tmp_path: Path) -> None:
@@ -345,6 +369,12 @@ def test_results_copied_from_another_store_need_it_no_more(tmp_path: Path) -> No
     assert_array_equal(other.load("hits", "part", "x", np.ndarray), np.arange(10.0))
     assert {*other.provenance()} == {("own", "default"), ("frf", "part"), ("hits", "part")}
     assert other.load("own", "default", "x", float) == 0.0
+    third = Store(tmp_path / "third")
+    third.folder.mkdir()
+    third.save("frf", "default", "other", "{}", 0.1, x=large(2))
+    other.copy_from(third, ["frf"], {"default": "second part"})  # beside the large results that are there
+    assert_array_equal(other.load("frf", "second part", "x", np.ndarray), large(2))
+    assert_array_equal(other.load("frf", "part", "x", np.ndarray), large(1))
 
 
 def test_files_of_replaced_and_of_never_linked_results_are_removed(tmp_path: Path) -> None:

@@ -1,1 +1,1 @@
-"""The verbs of the command ``ema``: each parses its words, calls one function, and shows what came of it."""
+"""Subcommands of ``ema``: each parses its options, calls one function, and prints the result."""

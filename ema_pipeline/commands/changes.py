@@ -58,8 +58,8 @@ def changes(
         if show_stage is None:
             found = compare_runs(run_a, run_b, repeat=repeats)
         else:
-            with show_stage("changes") as tell:
-                found = compare_runs(run_a, run_b, tell, repeats)
+            with show_stage("changes") as report_progress:
+                found = compare_runs(run_a, run_b, report_progress, repeats)
     folder.mkdir(parents=True, exist_ok=True)
     written = write_changes(found, folder)
     page = write_page(found, run_a, run_b, folder)

@@ -94,4 +94,4 @@ def _change(out: Path, change: Change, effect_files: list[str], quiet: bool, jso
         show(f"{unmoved} modes stayed within a twentieth of their uncertainty.")
     show(error_words(before, after) or "Nothing has changed.")
     if results.diagnosis_is_old:
-        show(f"The diagnosis was made before; renew it: {program()} diagnose {out}")
+        show(f"The diagnosis is older than this change; repeat it: {program()} diagnose {out}")

@@ -26,7 +26,7 @@ def merge(
         typer.Option(
             min=0,
             max=0.1,
-            help="1 σ by which frequencies of one state differ from set-up to set-up, relative.",
+            help="1 σ by which frequencies of one state differ between set-ups, relative.",
         ),
     ] = 1e-3,
     quiet: Quiet = False,
@@ -34,7 +34,7 @@ def merge(
 ) -> None:
     """Merge several set-ups of one state (soft and hard tip, roving sensors) into one raw folder.
 
-    Each part speaks for the band that its force spectrum carries; where bands overlap, FRFs are averaged with the
+    Each part is used in the band of its force spectrum; where bands overlap, FRFs are averaged with the
     inverse of their variances. Parts that are not of one state, or that contradict each other, are refused.
     """
     from ema_pipeline.merge import merge as merge_tests
@@ -57,7 +57,7 @@ def _table(merged: Merged) -> Screen:
     from ema_pipeline.report.numbers import plain
 
     table = Screen(box=box.SIMPLE)
-    for name in ("part", "speaks for, Hz", "points", "sensors", "modes"):
+    for name in ("part", "band, Hz", "points", "sensors", "modes"):
         table.add_column(name, justify="left" if name == "part" else "right")
     for p in merged.parts:
         low, high = (plain(v) for v in p.band_hz)
@@ -79,15 +79,18 @@ def _lines(merged: Merged) -> list[str]:
     if known:
         worst = min(known, key=lambda m: m.p)
         lines.append(
-            f"One state: {len(known)} modes in common, the most different at {worst.frequency_a:.5g} Hz "
+            f"Same state: {len(known)} modes in common, the most different at {worst.frequency_a:.5g} Hz "
             f"({format_percent(worst.change, worst.std)}, p = {worst.p:.2g})."
         )
     else:
-        lines.append("Whether it is one state could not be checked: no mode in common; make sure of it.")
+        lines.append(
+            "Whether the parts are of one state could not be checked, because they have no mode "
+            "in common; make sure of it."
+        )
     for (a, b), (value, std) in merged.gains.items():
         ratio = format_percent(math.expm1(-value), std)
         lines.append(
-            f"Where both measured the same, FRFs of '{b}' differ by {ratio} from '{a}'; the run takes it out."
+            f"Where both measured the same, FRFs of '{b}' differ by {ratio} from '{a}'; the run corrects this."
         )
     return lines
 

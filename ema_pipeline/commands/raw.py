@@ -13,7 +13,7 @@ from ema_pipeline.commands.screen import program, show, show_json
 
 
 def check(raw: Raw, set_: Overrides = None, json: Json = False) -> None:
-    """Judge every hit of a raw folder: value, limit and clause of each check; tell what records without hits hold.
+    """Judge every hit of a raw folder: value, limit and clause of each check. Other records: what they contain.
 
     The exit code is 1 where a point has no good hit left.
     """

@@ -210,7 +210,7 @@ def view(
     ] = None,
     hits: Annotated[int, typer.Option(min=1, help="Raw folder: good hits that a point needs.")] = 3,
     poll: Annotated[
-        bool, typer.Option("--poll", help="Raw folder: look again and again, for network shares.")
+        bool, typer.Option("--poll", help="Raw folder: check at intervals, for network shares.")
     ] = False,
 ) -> None:
     """Open the live page of OUT: add and remove effects and watch the error. It stops with Ctrl-C.

@@ -1,4 +1,4 @@
-"""What a verb shows: results on stdout, progress on stderr."""
+"""Output of the subcommands: results on stdout, progress on stderr."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def show(what: Any) -> None:
     from rich.segment import Segment, Segments
 
     console = Console(highlight=False, soft_wrap=False)
-    # Cleaned only once it is rendered: before, nobody can tell names from the colours that rich puts around them.
+    # Cleaned only once rendered: before, names cannot be distinguished from the colours that rich puts around them.
     rendered = [Segment(printable(s.text), s.style, s.control) for s in console.render(what)]
     console.print(Segments(rendered), end="")
 
@@ -86,18 +86,18 @@ def _shown(text: str) -> str:
 def _cleaned_stage(show_stage: ShowStage, label: str) -> Iterator[Progress]:
     with show_stage(_shown(label)) as bar:
 
-        def tell(done: float, text: str = "") -> None:
+        def report_progress(done: float, text: str = "") -> None:
             bar(done, _shown(text))
 
-        yield tell
+        yield report_progress
 
 
 @contextmanager
 def _stage_lines(label: str) -> Iterator[Progress]:
     start = time.perf_counter()
 
-    def tell(done: float, text: str = "") -> None:
+    def report_progress(done: float, text: str = "") -> None:
         """Show nothing until the stage is done."""
 
-    yield tell
+    yield report_progress
     typer.echo(f"{printable(label)}: {time.perf_counter() - start:.1f} s", err=True)

@@ -1,4 +1,4 @@
-"""``ema watch``: hits judged while one strikes."""
+"""``ema watch``: hits judged during the test."""
 
 from __future__ import annotations
 
@@ -19,19 +19,20 @@ if TYPE_CHECKING:
 
 def watch(
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Raw folder in the making, with a test.toml.")
+        Path,
+        typer.Argument(metavar="FOLDER", help="Raw folder that the analyser writes to, with a test.toml."),
     ],
     point: Annotated[
         list[str] | None,
         typer.Option("--point", metavar="DOF", help="Point to strike; in this order, once for each."),
     ] = None,
     hits: Annotated[int, typer.Option(min=1, help="Good hits that a point needs.")] = 3,
-    poll: Annotated[bool, typer.Option("--poll", help="Look again and again: for network shares.")] = False,
+    poll: Annotated[bool, typer.Option("--poll", help="Check at intervals, for network shares.")] = False,
     sound: Annotated[
-        bool, typer.Option("--sound", help="Ring once for a good hit, twice for a bad one.")
+        bool, typer.Option("--sound", help="Beep once for a good hit, twice for a bad one.")
     ] = False,
     idle: Annotated[
-        float, typer.Option(min=0, help="End after so many seconds without a new file; 0: never.")
+        float, typer.Option(min=0, help="Stop after this many seconds without a new file; 0: never.")
     ] = 0.0,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
 ) -> None:
@@ -55,7 +56,7 @@ def watch(
     for told in judged_files(session, poll):
         if told is not None:
             last = time.monotonic()
-            _tell(told, json)
+            _show_verdict(told, json)
             if sound:
                 typer.echo("\a" * (1 if told.good else 2), nl=False, err=True)
         elif idle and time.monotonic() - last > idle:
@@ -63,11 +64,11 @@ def watch(
     if not json:
         missing = session.missing()
         if missing:
-            show(f"Listed in test.toml, but not there: {', '.join(missing)}; remove them before the run.")
+            show(f"Listed in test.toml, but missing: {', '.join(missing)}; remove them before the run.")
         show(f"Next: {program()} run {folder}")
 
 
-def _tell(told: Told, json: bool) -> None:
+def _show_verdict(told: Told, json: bool) -> None:
     if not json:
         show(told.text)
         return

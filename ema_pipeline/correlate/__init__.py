@@ -1,0 +1,1 @@
+"""Measured modes, and their pairing with the modes of a model."""

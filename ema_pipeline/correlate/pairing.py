@@ -303,5 +303,5 @@ def _unseen(mode: ModelMode, system: LinearSystem, measured: MeasuredModes) -> s
     at = int(np.argmax(moving))
     points = {d.point for d in measured.dofs}
     if system.dofs[at] not in points:
-        return f"not measured: it lives at {system.dofs[at]}, which carries no sensor"
+        return f"not measured: it moves {system.dofs[at]} alone, which has no sensor"
     return "not excited: all sensors are at a node"

@@ -74,6 +74,6 @@ class CompareSettings(Settings):
         default=0.01,
         ge=0,
         description="Standard uncertainty of an FRF relative to the root-mean-square of all outputs in the "
-        "band: cross-axis sensitivity (1-3 % of the main axis) and modes beyond the band fill antiresonances "
-        "and whatever symmetry makes zero.",
+        "band: cross-axis sensitivity (1-3 % of the main axis) and modes beyond the band fill "
+        "antiresonances and FRFs that symmetry makes zero.",
     )

@@ -1,0 +1,1 @@
+"""Which physics a model is missing: hypotheses, ranking, claims, verdict and limits."""

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
-from ema_pipeline.inference import Bounded, Posterior, Residuals, descend, lower_factor
+from ema_pipeline.inference import Bounded, Posterior, Residuals, descend, lower_factor, solve_lower
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import PARTS, Fit, transferred
 
@@ -81,7 +80,7 @@ def _in_blocks(found: Residuals, covariance: NDArray[np.float64]) -> tuple[float
     """Sum of squares in which errors count, and -log density, each value predicted from those before it."""
     spread = np.eye(len(found.values)) + found.jacobian @ covariance @ found.jacobian.T
     factor = lower_factor(spread)
-    values = scipy.linalg.solve_triangular(factor, found.values, lower=True, check_finite=False)
+    values = solve_lower(factor, found.values)
     whitened = Residuals(values, np.zeros((0, len(covariance))), block=found.block)
     return whitened.squares, whitened.cost + float(np.sum(np.log(np.diag(factor))))
 
@@ -93,5 +92,5 @@ def _marginal(
     size, directions = np.linalg.eigh(covariance)
     reach = jacobian @ (directions * np.sqrt(np.maximum(size, 0.0)))
     factor = lower_factor(np.eye(len(size)) + reach.T @ reach)
-    taken = scipy.linalg.solve_triangular(factor, reach.T @ values, lower=True, check_finite=False)
+    taken = solve_lower(factor, reach.T @ values)
     return float(values @ values - taken @ taken), float(np.sum(np.log(np.diag(factor))))

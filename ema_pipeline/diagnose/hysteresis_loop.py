@@ -1,4 +1,4 @@
-"""What records tell of a Bouc-Wen element: its loop and the energy of a cycle, and which parameters they tell apart."""
+"""What records show of a Bouc-Wen element: its loop, the energy of a cycle, and the parameters that they determine."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def diagnose_loops(
             localisation=tuple(
                 Localisation(r.place, r.acts_like, r.size, r.squares) for r in places[:_LISTED]
             ),
-            summary=f"{found.summary} Most of what is left sits on the {places[0].place}, and acts there like "
+            summary=f"{found.summary} Most of the remaining misfit is on the {places[0].place}, and acts there like "
             f"{places[0].acts_like}.",
             next_measurement=_next_loop(observations),
         )

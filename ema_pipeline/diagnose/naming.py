@@ -1,4 +1,4 @@
-"""Which of several names of the same physics is said, and how large the effect is under that name."""
+"""Which of several names of the same physics is used, and how large the effect is under that name."""
 
 from __future__ import annotations
 

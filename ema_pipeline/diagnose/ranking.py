@@ -1,4 +1,4 @@
-"""Every hypothesis fitted on top of the model as it stands, and ranked by its evidence.
+"""Every hypothesis fitted on top of the current model, and ranked by its evidence.
 
 Most wrong names come from local optima: if the base fit is stuck in one, any hypothesis that escapes it appears to gain
 evidence. So fits are annealed, and the base and every hypothesis are begun again from the best values known of all
@@ -92,7 +92,7 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Ranking:
-    """The model as it stands, and all hypotheses by evidence.
+    """The current model, and all hypotheses by evidence.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ def rank(
     ----------
     observations : Observations
     base : Fit
-        The model as it stands, from `fit_base`.
+        The current model, from `fit_base`.
     hypotheses : sequence of Hypothesis
     processes : int
         Processes that share the fits, None for one per processor; the result does not depend on their number.

@@ -1,4 +1,4 @@
-"""The gain in evidence that is expected of an effect to first order: one step from the model as it stands."""
+"""The gain in evidence that is expected of an effect to first order: one step from the current model."""
 
 from __future__ import annotations
 

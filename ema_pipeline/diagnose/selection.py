@@ -23,7 +23,7 @@ _TIE = 0.1
 
 @dataclass(frozen=True)
 class Round:
-    """One question: what is missing on top of the model as it stands.
+    """One question: what is missing on top of the current model.
 
     Attributes
     ----------

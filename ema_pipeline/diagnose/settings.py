@@ -56,9 +56,10 @@ class DiagnoseSettings(Settings):
     linearised_sigmas: float = Field(
         default=3.0,
         gt=0,
-        description="The same for an effect that depends on the amplitude, in tests at several force levels. Those of "
-        "true effects are four or more: equivalent linearisation gives sizes to a fifth or a quarter. Motion that it "
-        "does not describe gains evidence with about two.",
+        description="The same for an effect that depends on the amplitude, in tests at several force "
+        "levels. True effects reach four or more, since equivalent linearisation gives sizes to "
+        "within a fifth or a quarter; motion that it does not describe gains evidence with sizes of "
+        "about two.",
     )
     alike: float = Field(
         default=3.0,

@@ -36,8 +36,8 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
 
 EFFECT = Effect(
     id="backlash",
-    title="free play: motion at no force where the force changes its sign",
-    parameters=(EffectParameter("gap", "m", 0.0, 1e-4, 1e-3, 0.0, 1.0, "whole way of the free play"),),
+    title="free play: motion without force where the force changes its sign",
+    parameters=(EffectParameter("gap", "m", 0.0, 1e-4, 1e-3, 0.0, 1.0, "total free play"),),
     find_places=_places,
     edit=_edit,
     signs="flat parts of the force loop at zero force after each reversal, of one length at all amplitudes",

@@ -34,7 +34,7 @@ def _edit_anywhere(assembly: Assembly, place: str, values: Mapping[str, float]) 
 
 ANYWHERE = Effect(
     id="hysteresis",
-    title="Bouc-Wen hysteresis: force that depends on the way that was gone",
+    title="Bouc-Wen hysteresis: force that depends on the path of the motion",
     parameters=(
         EffectParameter("stiffness", "N/m", 0.0, 1e4, 1e5, 0.0, 1e12, "stiffness at small motions"),
         EffectParameter("force", "N", float("inf"), 10.0, 1.0, 1e-15, 1e12, "scale of the force"),
@@ -58,7 +58,7 @@ EFFECT = Effect(
     id="hysteresis",
     title="Bouc-Wen hysteresis: loss that does not depend on frequency",
     parameters=(
-        EffectParameter("force", "N", 0.0, 130.0, 200.0, 0.0, 1e7, "k_w, the force that it tends to"),
+        EffectParameter("force", "N", 0.0, 130.0, 200.0, 0.0, 1e7, "k_w, the limit of its force"),
         EffectParameter(
             "rho", "1/m", 600.0, 600.0, 600.0, 1.0, 1e7, "k_w·rho is its stiffness at small motions"
         ),

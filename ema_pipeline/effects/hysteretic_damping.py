@@ -42,6 +42,6 @@ EFFECT = Effect(
     ),
     find_places=_places,
     edit=_edit,
-    signs="damping of the modes that strain these springs off, at all frequencies alike",
+    signs="damping of the modes that strain these springs differs, equally at all frequencies",
     reference="D. J. Ewins, Modal Testing, 2nd ed. (2000), section 2.4",
 )

@@ -1,4 +1,4 @@
-"""The teeth of a mesh part where the motion outgrows the preload."""
+"""The teeth of a mesh separate where the motion exceeds the preload."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
 
 EFFECT = Effect(
     id="mesh_backlash",
-    title="teeth that part where the motion outgrows the preload",
+    title="teeth that separate where the motion exceeds the preload",
     parameters=(
         EffectParameter(
             "preload",
@@ -47,10 +47,17 @@ EFFECT = Effect(
             1e-5,
             0.0,
             1e-2,
-            "deflection of the mesh under its preload, past which the teeth part",
+            "deflection of the mesh under its preload, beyond which the teeth separate",
         ),
         EffectParameter(
-            "gap", "m", float("inf"), 1e-4, 1e-4, 0.0, 1e-1, "way from parting to contact of the tooth backs"
+            "gap",
+            "m",
+            float("inf"),
+            1e-4,
+            1e-4,
+            0.0,
+            1e-1,
+            "travel from separation to contact of the tooth backs",
         ),
     ),
     find_places=_places,

@@ -33,6 +33,6 @@ EFFECT = Effect(
     ),
     find_places=_places,
     edit=_edit,
-    signs="mode pairs split and mesh modes fall; a mode leans to one planet",
+    signs="mode pairs split and mesh modes fall; a mode is concentrated on one planet",
     reference="F. Chaari et al., Eur. J. Mech. A/Solids 25 (2006) 325-340",
 )

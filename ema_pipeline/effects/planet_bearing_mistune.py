@@ -32,6 +32,6 @@ EFFECT = Effect(
     ),
     find_places=_places,
     edit=_edit,
-    signs="mode pairs split; a low planet mode leans to one planet",
+    signs="mode pairs split; a low planet mode is concentrated on one planet",
     reference="D. R. Kiracofe, R. G. Parker, J. Vib. Acoust. 129 (2007) 1-16",
 )

@@ -32,6 +32,6 @@ EFFECT = Effect(
     ),
     find_places=_places,
     edit=_edit,
-    signs="mode pairs split; a mode leans to one planet, more so at high frequency",
+    signs="mode pairs split; a mode is concentrated on one planet, more so at high frequency",
     reference="D. R. Kiracofe, R. G. Parker, J. Vib. Acoust. 129 (2007) 1-16",
 )

@@ -1,4 +1,4 @@
-"""A damper whose force grows with the square of its rate, as that of a fluid which is displaced."""
+"""A damper whose force grows with the square of its rate, like that of a displaced fluid."""
 
 from __future__ import annotations
 
@@ -25,9 +25,7 @@ EFFECT = Effect(
     id="quadratic_damping",
     title="damper whose force grows with the square of its rate",
     parameters=(
-        EffectParameter(
-            "coefficient", "N·s²/m²", 0.0, 1.0, 10.0, 0.0, 1e9, "factor of the rate times its size"
-        ),
+        EffectParameter("coefficient", "N·s²/m²", 0.0, 1.0, 10.0, 0.0, 1e9, "factor of rate × |rate|"),
     ),
     find_places=bodies_pairs_and_dofs,
     edit=_edit,

@@ -90,9 +90,7 @@ def suspected_sensitivities(
 
 def _verdict(where: str, s: _Suspicion) -> CheckResult:
     if s.factor < 0:
-        fault = (
-            f"{where}{s.what} points the wrong way against the model: turn the sign of its dof in test.toml"
-        )
+        fault = f"{where}{s.what} has the opposite sign to the model: change the sign of its dof in test.toml"
         return CheckResult(SENSITIVITY, -1.0, 0.0, "1", False, "", "warn", s.what, fault)
     fault = (
         f"{where}{s.what} reads {factor_words(s.factor)} against the model's masses and stiffnesses: "
@@ -189,7 +187,7 @@ def _common(logs: Real) -> float:
 
 
 def _reversed(frfs: FrfSet, cosine: Real) -> list[_Suspicion]:
-    """Channels and blows that point the wrong way."""
+    """Channels and blows of the wrong sign."""
     clear = np.abs(cosine) >= CLEAR
     rows, columns = _signs(cosine)
     if np.all(rows[clear.any(axis=1)] < 0) or np.all(columns[clear.any(axis=0)] < 0):

@@ -1,4 +1,4 @@
-"""The whole identification: the source's steps, then the posterior of its model on whole loops."""
+"""Identification of an isolator: the published steps, then the posterior of the published model on whole loops."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ HYSTERESIS_STIFFNESS = "hysteresis_stiffness"
 SOURCE_MODEL = ("quadratic_stiffness", "cubic_stiffness", "viscous_damping", "hysteresis")
 """Effects of the published model of a metal-mesh isolator."""
 
-ONE_FREQUENCY = "not fitted: tests at one frequency do not part viscous from hysteretic loss"
+ONE_FREQUENCY = "not fitted: tests at one frequency do not separate viscous from hysteretic loss"
 _ALONE_STEPS = 30
 _REASONS = {
-    DAMPING: "a negative damper cannot be: the loss falls with frequency (relaxation), or friction with rate",
-    RELAXATION: "a negative relaxation cannot be: the loss does not fall as a Maxwell branch's does",
+    DAMPING: "a damper cannot be negative: the loss falls with frequency (relaxation), or friction with velocity",
+    RELAXATION: "a relaxation cannot be negative: the loss does not fall like that of a Maxwell branch",
 }
 
 
@@ -58,9 +58,9 @@ def analyse_loops(
     EmaError
         Names file, channel or record and what is wrong with it.
     """
-    tell = progress or (lambda share, text: None)
+    report_progress = progress or (lambda share, text: None)
     loops = load_loops(test, settings)
-    tell(0.3, "the published model on all loops")
+    report_progress(0.3, "the published model on all loops")
     return identify_isolator(loops, settings)
 
 
@@ -265,7 +265,9 @@ def _giving(loops: Sequence[Loop], significance: float) -> list[str]:
     if not names:
         return []
     which = f"{len(names)} of {len(loops)} loops give" if len(names) > 1 else f"{names[0]} gives"
-    return [f"{which} energy out every cycle: it cannot be; check the sign of force or displacement"]
+    return [
+        f"{which} energy out in every cycle, which is impossible; check the sign of force or displacement"
+    ]
 
 
 def _impossible(parameters: Mapping[str, Estimate], significance: float) -> list[str]:

@@ -1,4 +1,4 @@
-"""Fitted parameters, read from the posterior of everything uncertain, and the seed's error function beside them."""
+"""Fitted parameters, read from the posterior of everything uncertain, and the published error function beside them."""
 
 from __future__ import annotations
 
@@ -245,7 +245,7 @@ def _notes(fitted: FittedModes) -> tuple[str, ...]:
     if left and not notes:
         notes.append(f"{left} measured modes have no model mode")
     if not any(d.shapes.shape[1] for d in fitted.observations.data):
-        notes.append("frequencies only: which measured mode is which model mode rests on nearness alone")
+        notes.append("frequencies only: measured and model modes are paired by frequency alone")
     return tuple(notes)
 
 

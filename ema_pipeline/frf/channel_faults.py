@@ -1,4 +1,4 @@
-"""Wrong sensitivities and reversed channels in words: what the factor suggests, and what to look up."""
+"""Sentences on wrong sensitivities and reversed channels: what the factor suggests, and what to check."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ def _scatter(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[CheckRe
         excess = (seen - _floor(variance, peaks)).clip(min=0.0)
         scatter = float(np.sqrt(n * np.sum(excess / seen) / np.sum(power / seen)))
         steady = scatter <= settings.repeatability
-        loose = f"single hits of {name} scatter by {scatter:.0%}: strike one spot, one way"
+        loose = f"single hits of {name} scatter by {scatter:.0%}: strike the same spot in the same direction"
         most = settings.repeatability
         verdicts.append(
             judged("repeatability", scatter, most, steady, REPEATABILITY, "warn", loose, channel=name)

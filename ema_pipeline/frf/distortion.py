@@ -1,4 +1,4 @@
-"""Noise and nonlinear distortion of a periodic test, told apart.
+"""Noise and nonlinear distortion of a periodic test, separated.
 
 Noise differs from period to period. Distortion repeats with the period and differs from one realisation of the phases
 to the next. Where a multisine leaves lines without force, what the response has there is distortion: of even order at
@@ -83,11 +83,11 @@ def distortion(records: Sequence[DrivenRecord], period: int) -> Distortion:
     m = len(means)
     noise = np.mean(noises, axis=0) if noises else unknown
     total = np.var(means, axis=0, ddof=1) if m > 1 else unknown
-    stray = np.maximum(total - np.nan_to_num(noise), 0.0) if m > 1 else unknown
+    distortion = np.maximum(total - np.nan_to_num(noise), 0.0) if m > 1 else unknown
     mean = total / m if m > 1 else noise
     return Distortion(
         noise=noise[:, None] / m,
-        distortion=stray[:, None],
+        distortion=distortion[:, None],
         total=np.asarray(mean)[:, None],
         detected=_detected(np.sqrt(np.mean(np.abs(responses) ** 2, axis=0)), powers.mean(axis=0), every),
         excited=excited,

@@ -271,16 +271,16 @@ def _check_inputs(
             shared = float(np.median(pairs[a, b, lines]))
             if shared >= settings.input_coherence:
                 raise EmaError(
-                    f"forces '{names[b]}' and '{names[a]}' are one and the same signal: their coherence is "
-                    f"{shared:.4f} (median over the band), so that no estimate tells what each of them does; drive "
-                    "them by sources of their own, or one after the other"
+                    f"forces '{names[b]}' and '{names[a]}' are the same signal: their coherence is "
+                    f"{shared:.4f} (median over the band), so that their effects cannot be separated; "
+                    "drive them from independent sources, or one after the other"
                 )
     for a, explained in enumerate(total.explained_by_others()):
         shared = float(np.median(explained[lines]))
         if shared >= settings.input_coherence:
             raise EmaError(
                 f"force '{names[a]}' is a sum of the others: they explain {shared:.4f} of it (median over the band); "
-                "drive them by sources of their own, or with more realisations"
+                "drive them from independent sources, or with more realisations"
             )
 
 

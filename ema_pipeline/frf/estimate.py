@@ -384,7 +384,7 @@ def _within(band_hz: tuple[float, float], hit: HitSamples) -> tuple[float, float
     low, high = max(band_hz[0], hit.band_hz[0]), min(band_hz[1], hit.band_hz[1])
     if not low < high:
         raise EmaError(
-            f"{hit.hit.file}: band_hz = [{hit.band_hz[0]:g}, {hit.band_hz[1]:g}] is stated, but the force carries "
+            f"{hit.hit.file}: band_hz = [{hit.band_hz[0]:g}, {hit.band_hz[1]:g}] is stated, but the force has "
             f"enough energy from {band_hz[0]:.4g} to {band_hz[1]:.4g} Hz only; correct band_hz or leave it out"
         )
     return low, high

@@ -232,7 +232,7 @@ def _covered(bands: Mapping[str, tuple[float, float]], frfs: FrfSet) -> tuple[fl
     for other, (start, end) in rest:
         if start > high + step:
             raise EmaError(
-                f"no part speaks for {high:.4g} to {start:.4g} Hz: '{name}' ends below, '{other}' begins above; widen "
+                f"no part covers {high:.4g} to {start:.4g} Hz: '{name}' ends below, '{other}' begins above; widen "
                 "band_hz of one, or strike with a tip in between"
             )
         if end > high:

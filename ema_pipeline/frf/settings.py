@@ -41,7 +41,7 @@ class FrfSettings(Settings):
         default=0.99,
         gt=0,
         lt=1,
-        description="Coherence between forces, or of one with all others, from which they count as one and the same",
+        description="Coherence between forces, or of one with all others, from which they count as the same signal",
     )
     threads: int = Field(default=2, ge=1, description="Number of threads, each with a block of channels")
     minimum_coherence: float = Field(

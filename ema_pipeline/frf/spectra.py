@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.errors import EmaError
-
 _TINY = 1e-300
 
 
@@ -109,17 +107,13 @@ def solved(total: Spectra, averages: float, excited: NDArray[np.bool_], estimato
     h1 = cross @ inverse
     explained = np.einsum("loi,loi->lo", h1, cross.conj()).real
     seen = np.clip(explained / np.maximum(responses, _TINY), 0.0, 1.0)
-    rest = np.maximum(responses - explained, 0.0) / max(averages - n_in, 1.0) * (averages / total.count)
+    rest = np.maximum(responses - explained, 0.0) / max(averages - n_in, 1.0)
     own = np.einsum("lii->li", inverse).real
     frf[on], multiple[on] = h1, seen
-    scale = total.count / averages  # sums are over blocks that overlap
-    spread = rest[:, :, None] * own[:, None, :] * scale
     if averages > n_in:
-        variance[on] = spread
+        variance[on] = rest[:, :, None] * own[:, None, :]
     coherence[on] = _partial(forces, cross, responses) if n_in > 1 else seen[:, :, None]
     if estimator == "H2":
-        if n_in > 1:
-            raise EmaError("H2 is not defined for several forces at once; take H1 or Hv")
         gain = np.divide(1.0, seen, out=np.zeros_like(seen), where=seen > 1e-12)[:, :, None]
         frf[on] *= gain
         variance[on] *= gain**2

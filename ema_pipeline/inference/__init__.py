@@ -5,7 +5,7 @@ everything else that a user sees is read from the `Posterior`.
 """
 
 from ema_pipeline.inference.bounded import Bounded, beyond_scatter
-from ema_pipeline.inference.factor import lower_factor
+from ema_pipeline.inference.factor import lower_factor, solve_lower
 from ema_pipeline.inference.maximise import anneal, descend
 from ema_pipeline.inference.posterior import Posterior
 from ema_pipeline.inference.problem import Problem, Residuals
@@ -25,5 +25,6 @@ __all__ = [
     "joined",
     "learn",
     "lower_factor",
+    "solve_lower",
     "widened",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 
@@ -24,3 +25,13 @@ def lower_factor(information: NDArray[np.float64]) -> NDArray[np.float64]:
         upper = np.linalg.qr((directions * np.sqrt(np.maximum(size, 1.0))).T)[1]
         sign = np.where(np.diag(upper) < 0, -1.0, 1.0)
         return np.asarray((sign[:, None] * upper).T)
+
+
+def solve_lower(factor: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    """L⁻¹·b of a lower-triangular L, (n, n), and b, (n,). Empty for n = 0.
+
+    SciPy before 1.14 refuses empty arrays, which arise where nothing was held out.
+    """
+    if not right.size:
+        return right
+    return np.asarray(scipy.linalg.solve_triangular(factor, right, lower=True, check_finite=False))

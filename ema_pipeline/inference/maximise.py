@@ -108,6 +108,8 @@ class _Step:
 
     def to(self, damping: float) -> NDArray[np.float64]:
         """The point that a step with this damping leads to."""
+        if not self.free.size:  # every unknown is held at a bound
+            return self.x
         h = self.hessian[np.ix_(self.free, self.free)]
         damped = h + damping * np.diag(np.diag(h))
         step = np.zeros_like(self.x)

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 import scipy.optimize
 
 from ema_pipeline.inference import tails
-from ema_pipeline.inference.factor import lower_factor
+from ema_pipeline.inference.factor import lower_factor, solve_lower
 from ema_pipeline.inference.maximise import descend
 from ema_pipeline.inference.posterior import Posterior
 from ema_pipeline.inference.problem import Problem, in_blocks
@@ -70,7 +69,7 @@ class LinearEvidence:
         """Log evidence with some scatters at other values; less a constant."""
         std = self.unknowns.prior_std({**self.scatters, **scatters})
         factor = lower_factor(np.eye(len(std)) + std[:, None] * self.curvature * std)
-        explained = scipy.linalg.solve_triangular(factor, std * self.pull, lower=True, check_finite=False)
+        explained = solve_lower(factor, std * self.pull)
         return 0.5 * float(explained @ explained) - float(np.sum(np.log(np.diag(factor))))
 
 

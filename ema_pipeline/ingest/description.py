@@ -145,12 +145,12 @@ class _TestFile(Settings):
     )
     band_hz: tuple[float, float] | None = Field(
         default=None,
-        description="Band in which its FRFs are used; left out: what its force spectrum carries",
+        description="Band in which its FRFs are used; if left out, the band of its force spectrum",
     )
     exponential_window_rad_s: float = Field(
         default=0.0,
         ge=0,
-        description="Decay rate σ of the window exp(-σt) that the analyser has put on the records already",
+        description="Decay rate σ of the window exp(-σt) that the analyser has already applied to the records",
     )
     channels: tuple[ChannelDescription, ...] = Field(description="Channels of the record files")
     records: tuple[RecordDescription, ...] = Field(description="Record files")

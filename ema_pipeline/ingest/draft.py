@@ -221,7 +221,7 @@ def _hammer_lines(channel: RawChannel, responses_calibrated: bool) -> list[str]:
                 'unit = "V"',
                 "uncalibrated = true",
                 "# CHECK: the hammer is in volts, its sensitivity is unknown: FRFs and shapes will be",
-                '# unscaled (frequencies and damping do not suffer). For scaled ones write unit = "N" and',
+                '# unscaled (frequencies and damping are not affected). For scaled ones write unit = "N" and',
                 "# sensitivity_mv = mV per N, from the hammer's data sheet, in place of the two lines above.",
             ]
         return [
@@ -258,7 +258,7 @@ def _unknown_unit(channel: RawChannel, example: str) -> list[str]:
         ]
     said = f" (the file says {_quoted(channel.unit)})" if channel.unit is not None else ""
     return [
-        f'unit = "?"    # CHECK: the file does not tell{said}; e.g. "{example}"',
+        f'unit = "?"    # CHECK: the file does not say{said}; e.g. "{example}"',
         f"# sensitivity_mv = 1.0    # CHECK: mV per {example}; only if the file holds volts",
     ]
 
@@ -320,7 +320,7 @@ def _record_lines(
             "# give the same one only to repeated blows on one point of the same, unchanged structure.",
         ]
     if len(placeholders) == 1 and len(found) > 1:
-        lines += ["# By their names these files repeat one measurement; if they do not, tell them apart."]
+        lines += ["# By their names these files repeat one measurement; if they do not, correct impact."]
     for record, (impact, is_known) in zip(found, impacts, strict=True):
         remark = "" if is_known else "    # CHECK"
         lines += ["[[records]]", f"file = {_quoted(record.file)}", f'impact = "{impact}"{remark}', ""]

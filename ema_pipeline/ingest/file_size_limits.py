@@ -25,7 +25,7 @@ class ReadLimits(Settings):
     unpack_ratio: float = Field(
         default=20.0,
         ge=1,
-        description=f"A packed file may hold so many times its own size, and {SMALL_MB:g} MB in any case",
+        description=f"A packed file may unpack to this many times its own size, and {SMALL_MB:g} MB in any case",
     )
     most_channels: int = Field(
         default=5000, ge=1, description="Most channels, datasets or variables of one record file"

@@ -308,7 +308,7 @@ def _dead_channel(
     passes = spans > 1.5 and not only_hum
     if only_hum:
         fault = (
-            f"{name} carries mains hum only ({hum:.1%} of its power) and no answer to the blow: cable open?"
+            f"{name} carries mains hum only ({hum:.1%} of its power) and no response to the blow: open cable?"
         )
     elif spans == 0:
         fault = f"{name} is constant at {samples[0]:.3g}: sensor or cable dead"

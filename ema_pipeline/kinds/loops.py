@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def diagnose(run: Run, progress: Progress) -> Results:
-    """What the isolator's model is missing, on top of the model as it stands."""
+    """What the isolator's model is missing, on top of the current model."""
     from ema_pipeline.diagnose.loops import diagnose_loops, loop_model, loop_models
     from ema_pipeline.threads import single_blas_thread
 
@@ -70,7 +70,7 @@ def loops_of(run: Run) -> tuple[Loop, ...]:
 
 
 def own_models(run: Run) -> tuple[LoopModel, ...]:
-    """The linear spring and every rung with the effects that the user added, the model as it stands last."""
+    """The linear spring and every rung with the effects that the user added, the current model last."""
     return run.store.load("ladder", ALL, "models", tuple[LoopModel, ...])
 
 

@@ -84,7 +84,7 @@ def linear_words(study: LevelStudy) -> str:
         "linear structure: FRFs averaged over all forces belong to none."
     )
     if study.products:
-        text += f" Not modes, but made by the nonlinearity in modes that move: {', '.join(study.products)}."
+        text += f" Not modes, but caused by the nonlinearity of modes that move: {', '.join(study.products)}."
     return text
 
 

@@ -191,5 +191,5 @@ def _only_hard(study: LevelStudy, mode: ModeLevels) -> str:
     if len(seen) and seen[0] == 0:
         return ""
     if not len(seen):
-        return "not found at any force level alone: likely made by mixing levels"
-    return f"not found in hits softer than {study.levels[seen[0]].label}: weak, or made by the nonlinearity"
+        return "not found at any force level alone: probably caused by mixing levels"
+    return f"not found in hits softer than {study.levels[seen[0]].label}: weak, or caused by the nonlinearity"

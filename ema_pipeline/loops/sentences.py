@@ -49,11 +49,11 @@ def failures(
     worst = int(np.argmax(energy))
     if energy[worst] > ENERGY:
         scaled = ", each loop with a force scale of its own," if own_scales else ""
-        device = "" if own_scales else "the loops do not come from one and the same device, or "
+        device = "" if own_scales else "the loops do not come from the same device, or "
         words.append(
             f"one set of parameters{scaled} misses the energy per cycle by up to {100 * energy[worst]:.2g} % "
-            f"({loops[worst].name}): {device}the loss depends on amplitude, frequency or setting in a way that "
-            "the model has not"
+            f"({loops[worst].name}): {device}the loss depends on amplitude, frequency or setting in a way "
+            "that the model does not describe"
         )
     words += _play(loops, alone, has_play)
     words += _sides(loops, alone) if has_play else []
@@ -80,12 +80,12 @@ def _play(loops: Sequence[Loop], alone: Sequence[LoopFit], has_play: bool) -> li
     span = f"{low:.2g}" if f"{low:.2g}" == f"{high:.2g}" else f"{low:.2g} to {high:.2g}"
     if has_play:
         return [
-            f"the play is not one and the same: after a reversal {len(found)} of {len(loops)} loops move {span} mm "
-            "further at hardly any force than the model does"
+            f"the play differs between loops: after a reversal {len(found)} of {len(loops)} loops move "
+            f"{span} mm further almost without force than the model does"
         ]
     return [
-        f"after a reversal the device moves {span} mm further at hardly any force than the fitted loop does "
-        f"({len(found)} of {len(loops)} loops): it has play (backlash), which a Bouc-Wen loop has not; "
+        f"after a reversal the device moves {span} mm further almost without force than the fitted loop does "
+        f"({len(found)} of {len(loops)} loops): it has play (backlash), which a Bouc-Wen loop does not have; "
         "the fit rounds it off into a softer unloading branch"
     ]
 
@@ -133,6 +133,6 @@ def _chatter(loops: Sequence[Loop], alone: Sequence[LoopFit]) -> list[str]:
         return []
     return [
         f"the force oscillates about the fitted loop, most at {frequency:.2g} Hz and by up to "
-        f"{100 * worst:.2g} % of its size: stick and slip, or a resonance of the test "
+        f"{100 * worst:.2g} % of its size: stick-slip, or a resonance of the test "
         "machine; the fit goes through its middle"
     ]

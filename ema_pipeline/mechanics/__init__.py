@@ -1,0 +1,1 @@
+"""Masses, springs, dampers and nonlinear elements: matrices, modes, FRFs and time responses. Knows no rig."""

@@ -240,7 +240,7 @@ class BoucWen(Nonlinear):
     Attributes
     ----------
     limit : float
-        k_w, the force that it tends to, N.
+        k_w, the limit of its force, N.
     rho : float
         1/m; limit·rho is the stiffness at small motions, which the linear system holds.
     sigma : float

@@ -1,0 +1,1 @@
+"""FRFs to modes: pole estimation, selection, refinement, circle fits and uncertainties."""

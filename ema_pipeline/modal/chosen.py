@@ -150,6 +150,6 @@ def pole_of_chart(modal: ModalModel, configuration: str, frequency_hz: float) ->
     for k, mode in enumerate(modal.modes):
         if abs(mode.frequency_hz - found.frequency_hz) <= SAME * mode.damping_ratio * mode.frequency_hz:
             raise EmaError(
-                f"{configuration}: mode {k + 1} at {mode.frequency_hz:.6g} Hz stands for these poles already"
+                f"{configuration}: mode {k + 1} at {mode.frequency_hz:.6g} Hz represents these poles already"
             )
     return found

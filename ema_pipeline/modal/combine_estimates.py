@@ -2,7 +2,7 @@
 
 The fit of all FRFs weighs hits and lines by what it leaves over. Where a structure is not quite linear, or not quite
 the same in all hits, what is left over is no noise, and the pole may go far from what the peak itself shows. Circles
-and the poles of single hits look at the peak alone. They serve as witnesses where no neighbour bends them and enough
+and the poles of single hits look at the peak alone. They are compared with it where no neighbour bends them and enough
 lines show the peak.
 
 References
@@ -33,8 +33,8 @@ DAMPING_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
-class Witness:
-    """One estimate of a number: its source in words, value, and standard deviation."""
+class NamedEstimate:
+    """One estimate of a number: its source, value, and standard deviation."""
 
     source: str
     value: float
@@ -76,21 +76,23 @@ def _stands_alone(modal: ModalModel, index: int) -> bool:
 
 
 def _weighed(mode: Mode, peak: PeakMovement | None, record_s: float, decay_rad_s: float) -> Mode:
-    """One mode against its witnesses."""
-    frequencies = [Witness("all FRFs", mode.frequency_hz, mode.frequency_std_hz)]
-    dampings = [Witness("all FRFs", mode.damping_ratio, mode.damping_std)]
+    """One mode against its other estimates."""
+    frequencies = [NamedEstimate("all FRFs", mode.frequency_hz, mode.frequency_std_hz)]
+    dampings = [NamedEstimate("all FRFs", mode.damping_ratio, mode.damping_std)]
     seen = mode.damping_ratio * mode.frequency_hz + decay_rad_s / (2 * np.pi)
     if mode.circles and 2 * seen * record_s >= FEW_LINES:
         circle = average(mode.circles)
-        frequencies.append(Witness("circles", circle.frequency_hz, circle.frequency_std_hz))
-        dampings.append(Witness("circles", circle.damping_ratio, circle.damping_std))
+        frequencies.append(NamedEstimate("circles", circle.frequency_hz, circle.frequency_std_hz))
+        dampings.append(NamedEstimate("circles", circle.damping_ratio, circle.damping_std))
     if peak is not None and ANCHORED not in mode.flags:
         pole = peak.pole + decay_rad_s
         few = float(np.sqrt(peak.hits))
         frequencies.append(
-            Witness("single hits", abs(pole) / (2 * np.pi), peak.spread[1] / (2 * np.pi * few))
+            NamedEstimate("single hits", abs(pole) / (2 * np.pi), peak.spread[1] / (2 * np.pi * few))
         )
-        dampings.append(Witness("single hits", -pole.real / abs(pole), peak.spread[0] / (abs(pole) * few)))
+        dampings.append(
+            NamedEstimate("single hits", -pole.real / abs(pole), peak.spread[0] / (abs(pole) * few))
+        )
     half_width = mode.damping_ratio * mode.frequency_hz
     f, f_std, f_text = pool(frequencies, FREQUENCY_TOLERANCE * half_width, "Hz", 1.0)
     z, z_std, z_text = pool(dampings, DAMPING_TOLERANCE * mode.damping_ratio, "%", 100.0)
@@ -109,10 +111,10 @@ def _weighed(mode: Mode, peak: PeakMovement | None, record_s: float, decay_rad_s
     )
 
 
-def pool(found: list[Witness], tolerance: float, unit: str, scale: float) -> tuple[float, float, str]:
+def pool(found: list[NamedEstimate], tolerance: float, unit: str, scale: float) -> tuple[float, float, str]:
     """Value, standard deviation and a word on the disagreement; the first estimate where there is none.
 
-    One witness alone only widens the interval; two that both contradict the first one move the value too.
+    One other estimate alone only widens the interval; two that both contradict the first one move the value too.
     """
     first, others = found[0], found[1:]
     against = [
@@ -128,7 +130,7 @@ def pool(found: list[Witness], tolerance: float, unit: str, scale: float) -> tup
     return value, max(std, float(np.std([w.value for w in found], ddof=1))), said
 
 
-def _random_effects(found: list[Witness]) -> tuple[float, float]:
+def _random_effects(found: list[NamedEstimate]) -> tuple[float, float]:
     """Mean of estimates that differ by more than their standard deviations, and its standard deviation."""
     value = np.array([w.value for w in found])
     variance = np.maximum(np.array([w.std for w in found]) ** 2, (1e-9 * np.abs(value)) ** 2)

@@ -128,15 +128,15 @@ def of_one_hit(
         std = float(np.sqrt(mode.frequency_std_hz**2 + (repeatability * mode.frequency_hz) ** 2 + moved**2))
         modes.append(replace(mode, frequency_std_hz=std, flags=flags))
     note = (
-        f"one hit cannot show how frequencies differ from hit to hit: {100 * repeatability:.2g} % (1 sigma) is taken, "
-        "modal.identify.repeatability"
+        f"one hit cannot show how frequencies differ from hit to hit: {100 * repeatability:.2g} % (1 "
+        "sigma) is assumed, modal.identify.repeatability"
     )
     return replace(modal, modes=tuple(modes), notes=(*modal.notes, *([note] if repeatability else [])))
 
 
 def _decay_words(change: DecayChange, size: float) -> str:
     if not change.single:
-        return "one mode does not describe its decay: another lies under the peak, or it is far from linear"
+        return "one mode does not describe its decay: another lies under the peak, or the structure is far from linear"
     way = "falls" if change.change > 0 else "rises"
     return f"moves within the decay: {way} by {100 * abs(change.change) / size:.2g} % as it gets weaker"
 
@@ -235,6 +235,6 @@ def _common_note(alignment: Alignment) -> str:
     if alignment.common_spread <= NOTICED * damping:
         return ""
     return (
-        f"all frequencies move together by {100 * alignment.common_spread:.2g} % (1 sigma) from hit to hit: hits "
-        "were aligned, and the intervals of frequencies hold it"
+        f"all frequencies move together by {100 * alignment.common_spread:.2g} % (1 sigma) from hit to "
+        "hit: hits were aligned, and the intervals of frequencies include it"
     )

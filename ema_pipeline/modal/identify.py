@@ -49,10 +49,10 @@ POLISH_ITERATIONS = 25
 RINGS_ON = 0.05
 """Share of a mode that may be left at the end of the record: three time constants have passed."""
 
-UNPOLISHED = "polish failed: pole as the model orders give it, with a wider uncertainty"
-AT_PEAK = "pole as its peak alone shows it: a fit with the other modes loses it"
-ANCHORED = "pole as single hits show it: a fit of all hits together leaves the peak"
-RESTLESS = "polish has not come to rest: what is left to go is in the uncertainty"
+UNPOLISHED = "polish failed: pole taken from the model orders, with a wider uncertainty"
+AT_PEAK = "pole from its peak alone: a fit together with the other modes loses it"
+ANCHORED = "pole from single hits: a fit of all hits together moves away from the peak"
+RESTLESS = "polish has not converged: the remaining step is included in the uncertainty"
 
 
 def identify(
@@ -85,15 +85,15 @@ def identify(
     EmaError
         Where the band is too narrow or nothing was measured.
     """
-    tell = progress or (lambda share, text: None)
+    report_progress = progress or (lambda share, text: None)
     with single_blas_thread():
-        found = _identify(frfs, settings, tell, peaks, wanted)
+        found = _identify(frfs, settings, report_progress, peaks, wanted)
     release_memory()
     return found
 
 
 def _identify(
-    frfs: FrfSet, settings: ModalSettings, tell: Progress, peaks: KnownPeaks, wanted: KnownPeaks
+    frfs: FrfSet, settings: ModalSettings, report_progress: Progress, peaks: KnownPeaks, wanted: KnownPeaks
 ) -> ModalModel:
     band = analysis_band(frfs, settings)
     data = arrange(frfs, band)
@@ -107,15 +107,17 @@ def _identify(
     charts: list[PoleSet] = []
     for chart in in_order(chart_of, bands):
         charts.append(chart)
-        tell(0.1 + 0.3 * len(charts) / len(bands), f"poles of sub-band {len(charts)} of {len(bands)}")
+        report_progress(
+            0.1 + 0.3 * len(charts) / len(bands), f"poles of sub-band {len(charts)} of {len(bands)}"
+        )
     release_memory()
     found = candidates(charts, bands, data.measured.shape[1])
     sure, weak = seeded(found.sure, found.weak, peaks, data)
     if len(bands) > 1:
-        tell(0.4, f"first fit of {len(sure.poles)} candidates")
+        report_progress(0.4, f"first fit of {len(sure.poles)} candidates")
         sure = first_guess(window, bands, sure, iterations)
     release_memory()
-    tell(0.6, f"refining {len(sure.poles)} modes, trying {len(weak.poles)} more")
+    report_progress(0.6, f"refining {len(sure.poles)} modes, trying {len(weak.poles)} more")
 
     def search(window: FitData, known: Noise) -> Estimate:
         return tracked(poles_of_all_orders(window, known.mean_log(), 2, settings))
@@ -123,7 +125,7 @@ def _identify(
     plain = plain_peaks(frfs, band)
     modes = refined(window, bands, charts, sure, weak, search, iterations, peaks, plain, wanted)
     release_memory()
-    tell(0.9, "shapes and synthesis")
+    report_progress(0.9, "shapes and synthesis")
     cores = [chart.take(between(chart.pole, b.low, b.high)) for chart, b in zip(charts, bands, strict=True)]
     return _model(frfs, settings, band, window, modes, cores, peaks, plain.joined(wanted))
 
@@ -334,6 +336,6 @@ def _notes(data: FitData, scaling: str) -> tuple[str, ...]:
     if data.measured.shape[1] == 1:
         notes.append(
             "one reference cannot show a multiplicity: modes of equal frequency appear as one; excite or "
-            "measure at a second point to tell them apart"
+            "measure at a second point to separate them"
         )
     return tuple(notes)

@@ -23,8 +23,8 @@ NEAR = 2.0
 MOST = 8
 """Named at most, peaks first."""
 
-NO_PEAK_MODE = "a plain peak of the FRFs, but with the other modes in the fit the FRFs do not need it"
-NO_COLUMN_MODE = "the fit of all FRFs drops it: noise, or what other modes leave over, explains it as well"
+NO_PEAK_MODE = "a clear peak of the FRFs, but the FRFs do not need it once the other modes are fitted"
+NO_COLUMN_MODE = "the fit of all FRFs drops it: noise, or the residual of other modes, explains it as well"
 
 
 def left_out(

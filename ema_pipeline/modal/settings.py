@@ -48,8 +48,8 @@ class ModalSettings(Settings):
         default=1e-3,
         ge=0,
         description="Relative standard deviation of natural frequencies from hit to hit that is included in the "
-        "intervals of a test with one hit, which cannot show it; several hits show their own. 0.1 % is what one "
-        "structure was seen to move by between two campaigns.",
+        "intervals of a test with one hit, which cannot show it; with several hits it is estimated. 0.1 % "
+        "is the change of one structure between two campaigns.",
     )
 
     @model_validator(mode="after")

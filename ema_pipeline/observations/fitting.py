@@ -64,7 +64,7 @@ class Model:
         return tuple(e.label for e in self.effects)
 
     def problem(self, observations: Observations) -> EffectProblem:
-        """The problem of fitting it to data; that of the last data is remembered, it takes as long as some steps."""
+        """The problem of fitting it to data; that of the last data is cached, since it takes as long as some steps."""
         if not self._known or self._known[0][0] is not observations:
             self._known[:] = [(observations, observations.problem(self.effects, self.scales))]
         return self._known[0][1]

@@ -127,7 +127,7 @@ class ModeObservations:
         return self.channels.get(sensor, ChannelQuality())
 
     def has(self, configuration: str, dof: Dof) -> bool:
-        """True where the rig can be measured at `dof`; asked for every model, so remembered."""
+        """True where the rig can be measured at `dof`; asked for every model, so cached."""
         key = (configuration, dof)
         if key not in self._has:
             self._has[key] = self.rig.knows(configuration, dof)
@@ -304,7 +304,7 @@ class ModeProblem(EffectProblem):
 
     def sensing(self, data: ModeData) -> Sensing:
         """What the sensors of one configuration's modes read."""
-        key = (data.configuration, id(data))  # what is remembered holds the data, so that their id stays
+        key = (data.configuration, id(data))  # the cache holds the data, so that their id stays
         if key not in self._sensing:
             self._sensing[key] = data, self._found_sensing(data)
         return self._sensing[key][1]

@@ -332,7 +332,7 @@ class RecordModel:
         return self._coded(x).driven(self.linear(x), np.vstack([rows, offset]))
 
     def _coded(self, x: NDArray[np.float64]) -> CodedElements:
-        """The nonlinear elements, which only some unknowns change; those of the last points are remembered."""
+        """The nonlinear elements, which only some unknowns change; those of the last points are cached."""
         shape = self._inner(x)[self.rig_model.shape_start :]
         key = shape.tobytes()
         if key not in self._known:

@@ -124,9 +124,9 @@ class RecordProblem(EffectProblem):
         """Lines of every record, with their derivatives where they are asked for; None where there is no motion.
 
         No scatter changes them. A fit begins where the one before it, at other scatters, has ended: the last ones with
-        derivatives are remembered.
+        derivatives are cached.
         """
-        known = self.observations.remembered
+        known = self.observations.last_prediction
         if derivatives and known is not None and known[0] is self and np.array_equal(known[1], x):
             return known[2]
         at = self.settled(x) if self.observations.finds_states else x
@@ -141,7 +141,7 @@ class RecordProblem(EffectProblem):
             found.append((lines, slopes))
             place += self._own(data)
         if derivatives:
-            self.observations.remembered = (self, x.copy(), found)
+            self.observations.last_prediction = (self, x.copy(), found)
         return found
 
     def motions(self, x: NDArray[np.float64], derivatives: bool = False) -> list[Motion] | None:

@@ -109,7 +109,7 @@ class RecordObservations:
         self.finds_states = (
             False  # True where states at the start are found from the first samples, not fitted
         )
-        self.remembered: tuple[RecordProblem, NDArray[np.float64], list[Lines]] | None = (
+        self.last_prediction: tuple[RecordProblem, NDArray[np.float64], list[Lines]] | None = (
             None  # what a problem of these records predicted last, with derivatives, and where
         )
 
@@ -135,7 +135,9 @@ class RecordObservations:
                 title = f"what no model explains at {dof.point}, {b * width:.4g} to {(b + 1) * width:.4g} Hz"
                 name = self.noise_name(o, b)
                 found[name] = Scatter(name, title, 1.0, 1.5, _WIDE, _MOST_NOISE)
-        title = "share of every line of a response that no model explains, as where noise is in the force, %"
+        title = (
+            "share of every line of a response that no model explains, e.g. because of noise in the force, %"
+        )
         found[SHARE] = Scatter(SHARE, title, _LITTLE, 1.5, 1.0, _MOST_NOISE)
         return found
 
@@ -190,8 +192,8 @@ class RecordObservations:
         if found is None:
             if self.modal:
                 raise EmaError(
-                    "the model that the identified modes make grows without bound; look at the FRFs: a sensor that "
-                    "drifts or has a wrong unit gives modes that are none. Leave it out, or give a rig file with --rig"
+                    "the response of the identified modes grows without bound; check the FRFs: a sensor that "
+                    "drifts or has a wrong unit produces spurious modes. Leave it out, or give a rig file with --rig"
                 )
             raise EmaError(f"rig '{self.rig.name}' without effects grows without bound; check its elements")
         return found.states.reshape(-1, system.size), model.linear(x).mass

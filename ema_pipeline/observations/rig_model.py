@@ -232,7 +232,7 @@ class RigModel:
     ) -> tuple[Matrices, EigenSolution | None]:
         """Matrices and modes of a configuration at `x`; no modes where a mass or a stiffness is not admissible.
 
-        Derivatives are mostly wanted where a trial step was found to lead, so the last modes are remembered.
+        Derivatives are mostly wanted where a trial step was found to lead, so the last modes are cached.
         """
         key, known = x.tobytes(), self._modes.get(configuration)
         if known is None or known[0] != key or (derivatives and not known[1]):

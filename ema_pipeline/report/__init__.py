@@ -1,0 +1,1 @@
+"""Tables, figures, pages and terminal output of a run."""

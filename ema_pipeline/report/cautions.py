@@ -1,4 +1,4 @@
-"""What to be careful about in a run, one sentence each, the gravest first."""
+"""What to be careful about in a run, one sentence each, the most serious first."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Weight(IntEnum):
 
 
 def cautions(results: RunResults, lightest: Weight = Weight.SWEEP) -> tuple[str, ...]:
-    """What to be careful about, one sentence each, the gravest first.
+    """What to be careful about, one sentence each, the most serious first.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def identified_words(p: ParameterEstimate, fit: FitResult) -> str:
         return "identified by the data"
     if p.free:
         return "not identified by the data" + (f": {p.note}" if p.note else "")
-    return "not narrowed by the data: its tolerance decides"
+    return "not narrowed by the data: its tolerance determines it"
 
 
 def fails(fit: FitResult) -> bool:

@@ -1,4 +1,4 @@
-"""The diagnosis and the ladder in words, for the report and for the terminal."""
+"""Sentences on the diagnosis and the ladder, for the report and for the terminal."""
 
 from __future__ import annotations
 

@@ -13,11 +13,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-Tell = Callable[[float, str], None]
+ReportProgress = Callable[[float, str], None]
 
 
 def effects_list(effects: Sequence[dict[str, Any]]) -> RenderableType:
-    """Every effect with what it is, where it can sit, its parameters and its tell-tale signs."""
+    """Every effect with what it is, where it can sit, its parameters and its characteristic signs."""
     parts: list[RenderableType] = []
     for effect in effects:
         parameters = "; ".join(
@@ -67,7 +67,7 @@ def model_table(configuration: str, modes: Sequence[dict[str, Any]]) -> Renderab
 
 
 @contextmanager
-def progress_bars() -> Iterator[Callable[[str], AbstractContextManager[Tell]]]:
+def progress_bars() -> Iterator[Callable[[str], AbstractContextManager[ReportProgress]]]:
     """Progress bars on stderr; the function handed out opens one bar."""
     columns = (
         TextColumn("{task.description:20s}"),
@@ -79,12 +79,12 @@ def progress_bars() -> Iterator[Callable[[str], AbstractContextManager[Tell]]]:
     with Progress(*columns, console=Console(stderr=True)) as bars:
 
         @contextmanager
-        def show(label: str) -> Iterator[Tell]:
+        def show(label: str) -> Iterator[ReportProgress]:
             task = bars.add_task(label, total=1.0, now="")
 
-            def tell(done: float, text: str = "") -> None:
+            def report_progress(done: float, text: str = "") -> None:
                 bars.update(task, completed=done, now=text[:30])
 
-            yield tell
+            yield report_progress
 
         yield show

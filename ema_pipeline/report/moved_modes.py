@@ -46,7 +46,7 @@ class Seen:
     hits : tuple of int
         Hits used, by configuration.
     error, heldout_error : float
-        Of the model as it stands; NaN where there is none.
+        Of the current model; NaN where there is none.
     """
 
     modes: tuple[SeenMode, ...]

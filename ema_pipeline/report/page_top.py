@@ -70,7 +70,7 @@ def page_top(results: RunResults) -> PageTop:
         commands = [*commands, f"ema diagnose {folder}", f"ema remove {folder} {results.added[-1]}"]
     known = PageTop("", "", _tiles(results), commands=tuple(commands), drawing=_drawing(results))
     if results.diagnosis_is_old:
-        told = "The diagnosis below was made before; make it anew to see what is still missing."
+        told = "The diagnosis below is older than this change; repeat it to see what is still missing."
         return replace(known, heading=_changed(results), summary=told)
     return replace(
         known,
@@ -131,7 +131,7 @@ def _tiles(results: RunResults) -> tuple[Tile, ...]:
             Tile(
                 "modes explained", f"{total - first.unexplained} of {total}",
                 f"{total - last.unexplained} of {total}" if more else "",
-                "measured modes with a counterpart in the model, and doubles of such",
+                "measured modes with a counterpart in the model, including duplicates",
             )
         )  # fmt: skip
     return tuple(tiles)

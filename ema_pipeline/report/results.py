@@ -41,7 +41,7 @@ class ConfigurationResults:
     system_after : LinearSystem or None
         The fitted model with the effects that the diagnosis found.
     like_parts : tuple of LinearSystem or None
-        The base model, the model as it stands and the one that the diagnosis proposes, all like parts being alike.
+        The base model, the current model and the one that the diagnosis proposes, all like parts being alike.
     levels : LevelStudy or None
         What moves with the force of the hits.
     """
@@ -94,14 +94,14 @@ class RunResults:
     configurations : tuple of ConfigurationResults
     fit : FitResult or None
     comparison : Comparison or None
-        Of the model as it stands.
+        Of the current model.
     comparison_base : Comparison or None
         Of the modes with the base model, where effects were added.
     comparison_after : Comparison or None
         Of the model with the effects that the diagnosis found, where it was made.
     diagnosis : Diagnosis or None
     deviations : tuple of dict of str to float
-        How far everything uncertain had to move from what is stated, in σ: of the base model, the model as it stands,
+        How far everything uncertain had to move from what is stated, in σ: of the base model, the current model,
         and the one that the diagnosis proposes.
     added : tuple of str
         Effects that the user added, ``id@place``.

@@ -1,4 +1,4 @@
-"""A run on one screen: verdict, modes, the gravest cautions, and what to type next."""
+"""A run on one screen: verdict, modes, the most serious cautions, and the next command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The run in plain words: what was found, what was fitted, and what to be careful about."""
+"""The run in plain sentences: what was found, what was fitted, and what to be careful about."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def findings(results: RunResults) -> tuple[str, ...]:
         if compared.error <= POOR_ERROR and verdict in ("effect", "ambiguous"):
             lines.append(
                 f"Model and measurement differ by {size} standard uncertainties (root mean square); "
-                "what would bring them nearer stands above."
+                "the diagnosis above says what would reduce this."
             )
         elif compared.error <= POOR_ERROR:
             lines.append(
                 f"Model and measurement differ by {size} standard uncertainties (root mean square): "
-                "the model explains the data about as well as the data can tell."
+                "the model explains the data to within their uncertainty."
             )
         else:
             lines.append(
@@ -74,10 +74,10 @@ def changed_words(results: RunResults) -> str:
     now = f"The model now includes {named}{error}" if named else f"The model now has no added effects{error}"
     if results.added == results.diagnosed_on:
         changed = f"Other hits or modes were chosen{error}"
-        return f"{changed}; the diagnosis was made before: 'ema diagnose' renews it."
+        return f"{changed}; the diagnosis is older: 'ema diagnose' repeats it."
     before = " and ".join(diagnosis.label_words(x) for x in results.diagnosed_on)
     of = f"the model with {before}" if before else "the base model"
-    return f"{now}; the diagnosis is of {of}: 'ema diagnose' renews it."
+    return f"{now}; the diagnosis is of {of}: 'ema diagnose' repeats it."
 
 
 def stiffnesses(fit: FitResult) -> tuple[ParameterEstimate, ...]:
@@ -94,12 +94,15 @@ def _narrowed(fit: FitResult) -> list[str]:
     told = sorted((p for p in known if p.identified), key=lambda p: p.std / p.prior_std)
     if not told:
         return [
-            f"The {len(known)} parameters are not identified one by one by these data: their tolerances decide."
+            f"The {len(known)} parameters are not identified individually by these data: their tolerances "
+            "determine them."
         ]
     named = ", ".join(f"{words(p.name)} {format_value(p.value, p.std, p.unit)}" for p in told[:TOLD])
     more = f" and {len(told) - TOLD} more" if len(told) > TOLD else ""
     left = len(known) - len(told)
-    rest = f"; the other {left} are not identified one by one, their tolerances decide" if left else ""
+    rest = (
+        f"; the other {left} are not identified individually, their tolerances determine them" if left else ""
+    )
     return [f"Of {len(known)} parameters with tolerances the data narrow {named}{more}{rest}."]
 
 

@@ -100,7 +100,7 @@ def levels_tables(study: LevelStudy, modal: ModalModel, title: str = "") -> Rend
         if sizes is not None:
             parts += [
                 _line(""),
-                text_table(sizes, "Size in the FRFs by force level, 1 where it is alike in all hits"),
+                text_table(sizes, "Size in the FRFs by force level, 1 where it is the same in all hits"),
             ]
         parts.append(_line("p: probability of a trend as clear as this where nothing depends on the force;"))
         parts.append(_line("–: not tested, or a size that changes by less than a tenth."))

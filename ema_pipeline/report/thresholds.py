@@ -1,4 +1,4 @@
-"""What a reader is told to look at: named limits, with their source."""
+"""Limits above which the report warns, each with its source."""
 
 from ema_pipeline.diagnose.settings import ERROR_LIMIT
 

@@ -1,4 +1,4 @@
-"""The tables and figures of the sources that this program grew from, computed anew beside what they print."""
+"""The tables and figures of the source papers, recomputed beside the printed values."""
 
 from ema_pipeline.reproduce.run import NAMES, reproduce, write_page
 from ema_pipeline.reproduce.text import markdown, terminal_text

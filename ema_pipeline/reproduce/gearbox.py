@@ -63,8 +63,8 @@ def reproduce_gearbox() -> Reproduction:
     captions = {
         "gearbox_frf": f"Healthy set and one with {100 * LOSS:.0f} % of the stiffness of one sun-planet "
         "mesh lost: "
-        "the crack lowers three modes and parts the pair at 1659 Hz, so that the planets no longer move alike",
-        "gearbox_backlash": f"Backlash: resonances fall as the force grows and the meshes of the sun part past "
+        "the crack lowers three modes and splits the pair at 1659 Hz, so that the planets no longer move alike",
+        "gearbox_backlash": f"Backlash: resonances fall as the force grows and the meshes of the sun separate beyond "
         f"{1e6 * PRELOAD_M:g} µm; crosses: the frequency that the describing function of the meshes gives at the "
         "largest deflection",
     }
@@ -83,7 +83,7 @@ def _modes_table(healthy: Rig, cracked: Rig) -> Table:
         "Natural frequencies (Eq. 7)",
         "",
         tuple(entries),
-        ("Planet modes come N - 1 times; a crack parts one from them and leaves the rest where they were.",),
+        ("Planet modes come N - 1 times; a crack splits one off and leaves the rest unchanged.",),
     )
 
 

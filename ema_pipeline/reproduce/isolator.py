@@ -26,10 +26,8 @@ from ema_pipeline.reproduce.types import Entry, Reproduction, Table
 
 SOURCE = (
     'F. Mezghani et al., "Experimental Characterization of Metal-Mesh Isolators Damping Capacity". Its '
-    "loops are "
-    "not at hand: what can be checked are its printed numbers against each other, and the identification "
-    "on loops "
-    "simulated with them (1 % noise)."
+    "loops are not available: what can be checked are its printed numbers against each other, and the "
+    "identification on loops simulated with them (1 % noise)."
 )
 ENERGY_HZ, ENERGY_J, ENERGY_M = (10.0, 12.0, 15.0), (4.67e-2, 4.57e-2, 4.30e-2), 1e-3
 FREQUENCIES_HZ, AMPLITUDES_M = (10.0, 12.0, 15.0), (1e-3, 1.5e-3, 2e-3)
@@ -103,10 +101,9 @@ def _energy_table() -> Table:
         "table of energies",
         tuple(entries),
         (
-            "A negative damper cannot be. Loss that falls with frequency is a relaxation (a Maxwell "
-            "branch), or "
-            "friction that falls with rate; the printed model has neither.",
-            "The printed parameters lose less than half of the printed energies, and more as frequency "
+            "A damper cannot be negative. Loss that falls with frequency is a relaxation (a Maxwell "
+            "branch), or friction that falls with velocity; the printed model has neither.",
+            "The printed parameters dissipate less than half of the printed energies, and more as frequency "
             "rises: they "
             "do not describe the loops that they were taken from.",
         ),
@@ -139,13 +136,12 @@ def _parameter_table(result: IsolatorResult) -> Table:
         (
             "Exponents as far as the text could be recovered; with K3 = -2.33e5 N/m³ the cubic force at 2 "
             "mm is "
-            "2 mN, which no test could see.",
+            "2 mN, which no test could resolve.",
             "The source's own steps (Eqs. 3-14) start from the middle line of the largest loop, which "
             "holds the "
             f"hysteresis too: they give K1 = {closed[STIFFNESS]:.3g} N/m, too large by about k_w·ρ, and "
             "leave no zero "
-            "crossing for the hysteresis steps. The posterior of whole loops parts "
-            "the two.",
+            "crossing for the hysteresis steps. The posterior of whole loops separates the two.",
         ),
     )
 

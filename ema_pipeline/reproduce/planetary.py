@@ -202,11 +202,11 @@ def _misprint_table(rig: Rig) -> Table:
         value = nominal * float(factors[best]) if met else float("nan")
         entries.append(Entry(name.replace("_", " "), nominal, value, unit, can))
     return Table(
-        "Which printed parameter cannot be meant? Predictions of case 2 taken as measurements",
+        "Which printed parameter is wrong? Predictions of case 2 taken as measurements",
         "Tables I and III",
         tuple(entries),
         (
-            "Only what case 1 does not know may change, so that its predictions stay. A ten times softer "
+            "Only parameters that do not affect case 1 may change, so that its predictions stay. A ten times softer "
             "ring "
             "bearing and a ten times heavier ring both give 98 Hz; the printed damping coefficient of "
             "53.22 N·s/m "

@@ -24,8 +24,8 @@ _MAKERS = {
 PAGE = """# What the sources print, and what comes out here
 
 This program began with three published tests. Every number and curve below was computed by it
-(`ema reproduce`) and stands beside the printed one. Where the two differ, the last column says why, as far as
-it can be told; where nobody can tell, the difference is simply shown.
+(`ema reproduce`) and is shown beside the printed one. Where the two differ, the last column gives the reason,
+if it is known.
 
 """
 

@@ -93,8 +93,8 @@ class NonlinearEntry(ElementEntry):
 
     law: Law = Field(description="what its force follows")
     velocity: float | str = Field(1e-3, description="friction: below it creeps, m/s")
-    preload: float | str | None = Field(None, description="contact: deflection past which it parts, m")
-    gap: float | str = Field(1e3, description="contact: way to its back, m")
+    preload: float | str | None = Field(None, description="contact: deflection beyond which it separates, m")
+    gap: float | str = Field(1e3, description="contact: gap to its back, m")
     rho: float | str | None = Field(None, description="hysteresis: 1/m")
     sigma: float | str | None = Field(None, description="hysteresis: shape of the unloading branch")
     exponent: float | str = Field(1.0, description="hysteresis: sharpness of the yield")

@@ -48,8 +48,9 @@ def factor_to(given: str, wanted: str) -> float | None:
         return 1.0
     if not _UNIT.fullmatch(given):
         return None
+    registry = _registry()
     try:
-        found = float(_registry().Quantity(1.0, _spelt(given)).to(_spelt(wanted)).magnitude)
+        found = float(registry.Quantity(1.0, _spelt(given)).to(_spelt(wanted)).magnitude)
     except Exception:  # pint has no common base for what it raises on texts that are no units
         return None
     return float(f"{found:.15g}")

@@ -1,4 +1,4 @@
-"""Limits that tests are held against: written by hand, or learnt from a good lot as tolerance intervals."""
+"""Limits that tests are held against: written by hand, or learned from a good lot as tolerance intervals."""
 
 from __future__ import annotations
 
@@ -82,12 +82,12 @@ class Limits(Settings):
     """The content of ``limits.toml``."""
 
     version: Literal[1] = Field(1, alias="schema", description="version of this file's layout")
-    learnt_from: str = Field("", description="what they were learnt from; empty where written by hand")
-    lot: int = Field(0, ge=0, description="tests that they were learnt from")
+    learnt_from: str = Field("", description="what they were learned from; empty where written by hand")
+    lot: int = Field(0, ge=0, description="tests that they were learned from")
     content: float = Field(0.0, ge=0, lt=1, description="share of good tests within all limits together")
     confidence: float = Field(0.0, ge=0, lt=1, description="confidence of that")
     effects: Literal["fail", "ignore"] = Field(
-        "fail", description="what a claimed physical effect makes of a test"
+        "fail", description="verdict on a test with a claimed physical effect"
     )
     modes: tuple[ModeLimits, ...] = Field((), description="limits of modes")
     parameters: tuple[ParameterLimits, ...] = Field((), description="limits of parameters")
@@ -174,7 +174,11 @@ def learn_limits(
     full = [f for f in learnable if features.values[f].notna().sum() >= LEAST_LOT]
     notes = [f"{f}: found in fewer than {LEAST_LOT} tests, no limit" for f in learnable if f not in full]
     told = [f for f in full if not _hidden(features, f)]
-    notes += [f"{f}: less certain in one test than the lot scatters, no limit" for f in full if f not in told]
+    notes += [
+        f"{f}: its uncertainty in one test exceeds the scatter of the lot, no limit"
+        for f in full
+        if f not in told
+    ]
     share = len(told) or 1
     ranges: dict[str, Range] = {}
     for name in told:
@@ -252,7 +256,7 @@ def _shape(modes: MeasuredModes, k: int) -> Shape | None:
 def write_limits(limits: Limits, path: Path, notes: Iterable[str] = ()) -> None:
     """Write ``limits.toml``."""
     document = tomlkit.document()
-    document.add(tomlkit.comment("Limits of 'ema series judge'. Leave out what shall not be judged."))
+    document.add(tomlkit.comment("Limits of 'ema series judge'. Remove what is not to be judged."))
     for text in notes:
         document.add(tomlkit.comment(text))
     for key, value in limits.model_dump(mode="json", by_alias=True, exclude_none=True).items():

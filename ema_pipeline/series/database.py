@@ -105,7 +105,7 @@ class SeriesDatabase:
         found = self._connection.execute("SELECT value FROM about WHERE name = ?", (name,)).fetchone()
         return "" if found is None else str(found[0])
 
-    def tell(self, name: str, value: str) -> None:
+    def set_fact(self, name: str, value: str) -> None:
         """Keep a fact about the series."""
         with _told(self.path), self._connection:
             self._connection.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", (name, value))

@@ -29,7 +29,7 @@ _PER_THREAD = 2
 _RETRIES = 2
 _ANSWERS_S = 10.0
 """Time that a scheduler is given to answer."""
-LOST = "its process ended without an answer, mostly for want of memory; run the series again with fewer jobs"
+LOST = "its process ended without a result, usually for lack of memory; run the series again with fewer jobs"
 
 
 def in_processes(tasks: Iterable[Task], jobs: int, work: Work = run_task) -> Iterator[TestRow]:

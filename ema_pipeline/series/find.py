@@ -1,4 +1,4 @@
-"""The tests of a tree of folders, and what their raw data are told by without reading them."""
+"""The tests of a tree of folders, and fingerprints of their raw data that need no reading of them."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def run_task(task: Task) -> TestRow:
     except EmaError as error:
         row = failed_row(task.name, task.raw, task.key, str(error))
     except MemoryError:
-        row = failed_row(task.name, task.raw, "", "the memory does not suffice", "lost")
+        row = failed_row(task.name, task.raw, "", "there is not enough memory", "lost")
     except OSError as error:
         row = failed_row(
             task.name, task.raw, "", f"{error.filename or task.out}: {error.strerror or error}", "lost"

@@ -162,7 +162,7 @@ def _check_tree(database: SeriesDatabase, tree: Path) -> None:
     before, now = database.about("tree"), str(tree.resolve())
     if before not in ("", now):
         raise EmaError(f"{database.folder}: holds the series of {before}; name another folder with --out")
-    database.tell("tree", now)
+    database.set_fact("tree", now)
 
 
 def _tasks(tests: Sequence[FoundTest], out: Path, same: Task) -> Iterator[Task]:

@@ -1,4 +1,4 @@
-"""Damping that differs from mode to mode without law, as a modal damping matrix of the true system."""
+"""Damping that differs from mode to mode at random, as a modal damping matrix of the true system."""
 
 from __future__ import annotations
 

@@ -18,5 +18,5 @@ def inputs(run: Run, configuration: str) -> str:
 
 
 def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
-    """Fit every effect of the library on top of the model as it stands, and judge what the data support."""
+    """Fit every effect of the library on top of the current model, and judge what the data support."""
     return require_judge(run, NAME).diagnose(run, progress) | {"choices": run.info.choices}

@@ -1,4 +1,4 @@
-"""The live page of a raw folder in the making: what ``ema watch`` says of each file, in a browser."""
+"""The live page of a raw folder during a test: what ``ema watch`` says of each file, in a browser."""
 
 from __future__ import annotations
 
@@ -61,21 +61,21 @@ class HitsPage:
     def _judge(self, loop: asyncio.AbstractEventLoop) -> None:
         rows: dict[str, dict[str, Any]] = {}
 
-        def tell(trouble: str = "") -> None:
+        def notify(trouble: str = "") -> None:
             self._state = self._shown(rows, trouble)
             with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(self.listeners.tell)
+                loop.call_soon_threadsafe(self.listeners.notify)
 
         try:
             for told in judged_files(self.session, self._poll, self._stop):
                 if told is not None:
                     rows.pop(told.file, None)  # the last one judged stands on top
                     rows[told.file] = _row(told)
-                    tell()
+                    notify()
         except KeyboardInterrupt:
             return
         except (EmaError, OSError) as error:
-            tell(f"The folder is no longer watched ({error}); start 'ema view' again.")
+            notify(f"The folder is no longer watched ({error}); start 'ema view' again.")
 
     def _shown(self, rows: dict[str, dict[str, Any]], trouble: str) -> dict[str, Any]:
         session = self.session

@@ -1,4 +1,4 @@
-"""What every live page needs: a guarded server on the loopback, and its state told to all tabs."""
+"""What every live page needs: a guarded server on the loopback address that notifies all tabs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Listeners:
     def __init__(self) -> None:
         self._queues: set[asyncio.Queue[None]] = set()
 
-    def tell(self) -> None:
+    def notify(self) -> None:
         """Say that the state has changed."""
         for queue in self._queues:
             with contextlib.suppress(asyncio.QueueFull):

@@ -158,7 +158,7 @@ class Session:
             raise EmaError(f"'{self.job.verb}' is under way; wait for it or cancel it")
         self.job = Job(verb, label)
         self.message, self.preview, self._cancelled = "", None, False
-        self.listeners.tell()
+        self.listeners.notify()
         self._running = asyncio.create_task(self._run_alone(self.job))
 
     async def cancel(self) -> None:
@@ -183,7 +183,7 @@ class Session:
             await asyncio.to_thread(self.load)
             self._log(before, self.results)
         self.message = "Undone."
-        self.listeners.tell()
+        self.listeners.notify()
 
     async def watch(self) -> None:
         """Keep a worker ready, and follow changes that are made on the command line."""
@@ -195,7 +195,7 @@ class Session:
                     await asyncio.to_thread(self.load)
                     self._snapshots.clear()
                     self.message = "The results were changed outside this page."
-                    self.listeners.tell()
+                    self.listeners.notify()
 
     async def close(self) -> None:
         """Stop what is under way, as `cancel` does, and remove the snapshots."""
@@ -238,7 +238,7 @@ class Session:
         except (EmaError, OSError) as error:
             self.message = str(error)
         self.job, self.preview = None, None
-        self.listeners.tell()
+        self.listeners.notify()
 
     async def _work(self, job: Job) -> dict[str, Any]:
         """Have the worker do it; its last message."""
@@ -256,7 +256,7 @@ class Session:
             await self._follow(job, told)
         await worker.wait()
         await self._start_worker()
-        return {"outcome": "failed", "why": "the refit has ended before its time; nothing was changed"}
+        return {"outcome": "failed", "why": "the refit ended unexpectedly; nothing was changed"}
 
     async def _follow(self, job: Job, told: dict[str, Any]) -> None:
         stage = str(told.get("finished", told.get("stage")))
@@ -274,7 +274,7 @@ class Session:
         else:
             job.stage, job.text = stage, str(told.get("text", ""))
             job.done = min(job.before + job.share(job.stage) * float(told["done"]), 1.0)
-        self.listeners.tell()
+        self.listeners.notify()
 
     def _error_before(self) -> dict[str, Any]:
         """The error of the model before an action, as a rung of the ladder shows it."""

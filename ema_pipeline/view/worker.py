@@ -22,7 +22,7 @@ from ema_pipeline.run.types import Progress
 VERBS = ("add", "remove", "diagnose", "exclude_hit", "exclude_mode", "include_hit", "include_mode")
 """What the page can ask for; the part after the underscore is the option of that verb on the command line."""
 
-Tell = Callable[[dict[str, Any]], None]
+Send = Callable[[dict[str, Any]], None]
 
 
 def act(folder: Path, effect_files: tuple[str, ...], verb: str, label: str, show: ShowStage) -> None:
@@ -50,18 +50,18 @@ def act(folder: Path, effect_files: tuple[str, ...], verb: str, label: str, show
         raise EmaError(f"'{verb}' is no verb of the live page")
 
 
-def showing(tell: Tell) -> ShowStage:
+def showing(send: Send) -> ShowStage:
     """Progress as messages: when a stage begins, goes on and ends."""
 
     @contextlib.contextmanager
     def show(label: str) -> Iterator[Progress]:
-        tell({"stage": label, "done": 0.0})
+        send({"stage": label, "done": 0.0})
 
         def progress(done: float, text: str = "") -> None:
-            tell({"stage": label, "done": min(max(done, 0.0), 1.0), "text": text})
+            send({"stage": label, "done": min(max(done, 0.0), 1.0), "text": text})
 
         yield progress
-        tell({"finished": label})
+        send({"finished": label})
 
     return show
 
@@ -78,20 +78,20 @@ def main() -> None:
     die_with_parent(os.getppid())
     folder, effect_files = Path(sys.argv[1]), tuple(sys.argv[2:])
 
-    def tell(message: dict[str, Any]) -> None:
+    def send(message: dict[str, Any]) -> None:
         sys.stdout.write(json.dumps(message) + "\n")
         sys.stdout.flush()
 
     for line in sys.stdin:
         command = json.loads(line)
         try:
-            act(folder, effect_files, command["verb"], command["label"], showing(tell))
-            tell({"outcome": "done"})
+            act(folder, effect_files, command["verb"], command["label"], showing(send))
+            send({"outcome": "done"})
         except EmaError as error:
-            tell({"outcome": "failed", "why": str(error)})
+            send({"outcome": "failed", "why": str(error)})
         except Exception as error:
             write_crash_report(error)
-            tell({"outcome": "failed", "why": f"a fault in ema itself ({type(error).__name__})"})
+            send({"outcome": "failed", "why": f"a fault in ema itself ({type(error).__name__})"})
 
 
 if __name__ == "__main__":

@@ -1,1 +1,1 @@
-"""Hits judged while one strikes: every record file as soon as it is complete, and what to strike next."""
+"""Hits judged during the test: every record file as soon as it is complete, and what to strike next."""

@@ -1,4 +1,4 @@
-"""One record of a test that is being made: its hits, and how they agree with those before on the same point."""
+"""One record of a test in progress: its hits, and how they agree with those before on the same point."""
 
 from __future__ import annotations
 

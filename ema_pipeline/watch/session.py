@@ -1,4 +1,4 @@
-"""A test that is being made: which points are done, what to strike next, and the test.toml that grows with it."""
+"""A test in progress: which points are done, what to strike next, and the test.toml that is completed on the way."""
 
 from __future__ import annotations
 

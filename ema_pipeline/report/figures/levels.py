@@ -1,4 +1,4 @@
-"""Does it depend on how hard you hit: every mode by level, and one sheet per mode that moves."""
+"""Dependence on the force: every mode by level, and one sheet per mode that moves."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@
     dots.setAttribute("aria-label", p.good + " of " + p.wanted + " good hits");
     e.append(dots);
     e.append(made("div", p.good + " of " + p.wanted + (p.coherence ? ", coherence " + p.coherence : ""), p.low ? "low" : "sub"));
-    if (p.coherence) { e.title = "The least median coherence over the band is that of " + p.channel; }
+    if (p.coherence) { e.title = "Lowest median coherence over the band: " + p.channel; }
     return e;
   }
   function file(f) {

@@ -1,0 +1,120 @@
+"""Wrong sensitivities and reversed channels, as a user meets them: the first caution names channel and factor."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from bench import ema, write_bench
+
+QUICK = 'stages=["ingest", "hits", "frf", "modal", "ladder", "fit", "correlate"]'
+"""Without diagnosis and report, which take longest."""
+
+CAUTION = re.compile(r"^! (\S.*(?:\n  .*)*)", re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A healthy test on the user's own rig in a usual laboratory: channels off by 4 %, blows by 8°."""
+    return write_bench(tmp_path_factory.mktemp("bench"), imperfection="normal", acceleration_noise=0.02)
+
+
+Change = Callable[[str], str]
+Told = Callable[..., list[str]]
+
+
+def edited(raw: Path, folder: Path, channel: str, change: Change) -> Path:
+    """A copy of a raw folder in which the entry of one channel is changed."""
+    copy = folder / "raw"
+    shutil.copytree(raw, copy)
+    (toml,) = copy.rglob("test.toml")
+    head, *entries = toml.read_text(encoding="utf-8").split("[[channels]]")
+    assert any(f'name = "{channel}"' in e for e in entries)
+    entries = [change(e) if f'name = "{channel}"' in e else e for e in entries]
+    toml.write_text("[[channels]]".join([head, *entries]), encoding="utf-8")
+    return copy
+
+
+def scaled(factor: float) -> Change:
+    """State a sensitivity that is wrong by a factor."""
+
+    def change(entry: str) -> str:
+        return re.sub(
+            r"sensitivity_mv = ([\d.]+)", lambda m: f"sensitivity_mv = {float(m[1]) * factor}", entry
+        )
+
+    return change
+
+
+@pytest.fixture
+def cautions(bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Told:
+    """Runs the test with one channel changed; returns the cautions on the screen."""
+
+    def told(channel: str = "", change: Change = str, model: bool = True) -> list[str]:
+        raw = edited(bench, tmp_path, channel, change) if channel else bench
+        if not model:
+            (raw / "rig.toml").unlink()
+        rig = ("--rig", bench.parent / "bench.toml") if model else ()
+        code, out, err = ema(capsys, "run", raw, *rig, "--out", tmp_path / "out", "--set", QUICK)
+        assert code == 0, err
+        return [re.sub(r"\s+", " ", found) for found in CAUTION.findall(out)]
+
+    return told
+
+
+@pytest.mark.parametrize(
+    ("channel", "stated", "reading"),
+    [
+        ("m2_x", 9.81, "times too low"),
+        ("m2_x", 0.1, "times too high"),
+        ("hammer", 10.0, "times too low"),
+        ("hammer", 4.448, "times too low"),
+    ],
+)
+def test_a_wrong_sensitivity_is_the_first_caution_with_channel_and_factor(
+    cautions: Told, channel: str, stated: float, reading: str
+) -> None:
+    first = cautions(channel, scaled(stated))[0]
+    assert f"channel '{channel}'" in first
+    assert reading in first
+    assert "look up sensitivity_mv and unit" in first
+    found = re.search(r"reads ([\d.]+) times", first)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(max(stated, 1 / stated), rel=0.2)
+
+
+def test_a_reversed_channel_is_the_first_caution(cautions: Told) -> None:
+    first = cautions("m2_x", lambda entry: entry.replace('dof = "m2.x"', 'dof = "-m2.x"'))[0]
+    assert "channel 'm2_x' at m2.x has the opposite sign" in first
+
+
+def test_channels_that_contradict_each_other_are_named_without_a_model(cautions: Told) -> None:
+    first = cautions("m3_x", scaled(9.81), model=False)[0]
+    assert "channels 'm1_x' and 'm3_x' contradict each other" in first
+    assert "mV/g" in first
+
+
+def test_a_force_that_no_hammer_makes_is_the_first_caution(cautions: Told) -> None:
+    first = cautions("hammer", scaled(1e-3), model=False)[0]
+    assert "channel 'hammer' peaks at" in first
+    assert "which no impact hammer makes" in first
+
+
+def test_a_usual_laboratory_raises_no_suspicion(cautions: Told) -> None:
+    assert not [c for c in cautions() if "sensitivity" in c or "opposite sign" in c]
+
+
+@pytest.mark.parametrize("folder", ["blind/p2", "imperfect/g1004", "imperfect/g1007"])
+def test_imperfect_rigs_raise_no_suspicion(
+    test_data: Path, folder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if not (test_data / folder).is_dir():
+        pytest.skip(f"{test_data / folder} is not there")
+    rig = () if "g1" in folder else ("--rig", "planetary")
+    out = tmp_path / "out"
+    code, text, err = ema(capsys, "run", test_data / folder, *rig, "--out", out, "--set", QUICK)
+    assert code == 0, err
+    assert "sensor is suspected" not in text
