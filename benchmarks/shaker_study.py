@@ -149,7 +149,7 @@ def _channels(described: list[tuple[str, str, str, str]]) -> str:
 def judged(rig: Rig, folder: Path) -> str:
     """Modes found of six, and the largest errors among them."""
     command = [sys.executable, "-c", "from ema_pipeline.cli import main; main()", "run", str(folder / "raw")]
-    command += ["--to", "modal", "--out", str(folder / "out"), "--quiet"]
+    command += ["--out", str(folder / "out"), "--quiet"]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         return done.stderr.strip()[:150]

@@ -58,7 +58,7 @@ def test_what_a_loose_value_of_the_rig_does_is_no_hypothesis(both: RecordObserva
     }
     one = next(h for h in found if h.label == "spring@b.x")
     assert one.names[0].label == "spring@b.x"
-    assert len(one.begun) == 2
+    assert len(one.begun) == 3
 
 
 def test_of_identified_modes_only_what_is_not_linear_is_sought_at_the_sensors(

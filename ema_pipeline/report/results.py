@@ -44,6 +44,8 @@ class ConfigurationResults:
         The base model, the model as it stands and the one that the diagnosis proposes, all like parts being alike.
     levels : LevelStudy or None
         What moves with the force of the hits.
+    driven : int
+        Records of continuous excitation.
     """
 
     name: str
@@ -57,6 +59,7 @@ class ConfigurationResults:
     base_system: LinearSystem | None = None
     system_after: LinearSystem | None = None
     like_parts: tuple[LinearSystem | None, ...] = (None, None, None)
+    driven: int = 0
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from ema_pipeline.modal.types import NO_SYNTHESIS, ModalModel
 from ema_pipeline.report.results import ConfigurationResults, LoopResults, RunResults
 from ema_pipeline.run.measured import level_study
 from ema_pipeline.run.models import diagnosed_choices, diagnosis_is_of_other_data
+from ema_pipeline.run.records import count_driven
 from ema_pipeline.run.types import Run
 from ema_pipeline.store import ALL
 
@@ -62,6 +63,7 @@ def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
                 ),
                 system_after=run.store.find("diagnose", ALL, f"system after {name}", LinearSystem),
                 levels=levels,
+                driven=count_driven(run.store, name),
             )
         )
     return RunResults(
