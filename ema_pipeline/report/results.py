@@ -122,6 +122,8 @@ class RunResults:
         Hits and modes that the user excluded or included: now, and when the diagnosis was made.
     simulation : tuple of RecordError
         Free-run errors in the records of a continuous test; empty where none were simulated.
+    not_diagnosed : str
+        Why nothing was diagnosed; empty where it was, or was not asked for.
     hysteresis : tuple of HysteresisLoop
         Loops of Bouc-Wen elements that records were simulated with.
     loops : LoopResults or None
@@ -149,6 +151,7 @@ class RunResults:
     diagnosed_choices: Choices = NO_CHOICES
     folder: str = ""
     simulation: tuple[RecordError, ...] = ()
+    not_diagnosed: str = ""
     hysteresis: tuple[HysteresisLoop, ...] = ()
     loops: LoopResults | None = None
 

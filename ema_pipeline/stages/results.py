@@ -15,6 +15,7 @@ from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit, Transducer
 from ema_pipeline.kinds import kind_of
+from ema_pipeline.kinds.continuous import NOT_DIAGNOSED
 from ema_pipeline.kinds.loops import loops_of, models_of
 from ema_pipeline.levels.linear import structure, structure_frfs
 from ema_pipeline.levels.sentences import flagged
@@ -76,6 +77,7 @@ def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
         comparison_after=run.store.find("diagnose", ALL, "comparison_after", Comparison),
         diagnosis=_diagnosis(run),
         ladder=_own_ladder(run),
+        not_diagnosed=run.store.find("diagnose", ALL, NOT_DIAGNOSED, str) or "",
         simulation=_of_records(run, "simulation", RecordError),
         hysteresis=_of_records(run, "hysteresis", HysteresisLoop),
         loops=_loops(run),
