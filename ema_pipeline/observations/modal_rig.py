@@ -73,7 +73,10 @@ def _unscaled(modal: ModalModel, frfs: FrfSet) -> str:
             "model with --rig FILE.toml"
         )
     if not modal.modes and not any(d in frfs.outputs for d in frfs.inputs):
-        return "no mode was identified and no response is measured where a force acts; give a model with --rig FILE.toml"
+        return (
+            "no mode was identified and no response is measured where a force acts; give a model "
+            "with --rig FILE.toml"
+        )
     return ""
 
 
