@@ -11,8 +11,6 @@ stated standard deviation.
 
 from __future__ import annotations
 
-import csv
-import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -22,6 +20,9 @@ import h5py
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
+
+import ema_pipeline as ema
+from ema_pipeline.errors import EmaError
 
 RATE, SAMPLES, NOISE = 512.0, 100_000, 0.01
 HITS, HIT_SAMPLES = 5, 8192
@@ -148,16 +149,12 @@ def _channels(described: list[tuple[str, str, str, str]]) -> str:
 
 def judged(rig: Rig, folder: Path) -> str:
     """Modes found of six, and the largest errors among them."""
-    command = [sys.executable, "-c", "from ema_pipeline.cli import main; main()", "run", str(folder / "raw")]
-    command += ["--to", "modal", "--out", str(folder / "out"), "--quiet"]
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode:
-        return done.stderr.strip()[:150]
-    with (folder / "out" / "modes.csv").open() as file:
-        found = [
-            [float(row[n]) for n in ("frequency_hz", "frequency_std_hz", "damping_ratio", "damping_std")]
-            for row in csv.DictReader(file)
-        ]
+    try:
+        table = ema.identify(ema.read(folder / "raw").frfs()).table()
+    except EmaError as e:
+        return str(e)[:150]
+    columns = ["frequency_hz", "frequency_std_hz", "damping_ratio", "damping_std"]
+    found = table[columns].to_numpy(dtype=np.float64)
     left = list(zip(rig.frequency_hz, rig.ratio, strict=True))
     errors = []
     for f, f_std, zeta, zeta_std in found:

@@ -47,7 +47,8 @@ def _driven_lines(test: TestDescription, settings: PipelineSettings) -> Iterator
     from ema_pipeline.ingest.driven import load_driven
 
     for r in load_driven(test, settings.ingest):
-        period = f", {r.n_samples // r.period} periods" if r.period else ""
+        periods = r.n_samples // r.period if r.period else 0
+        period = "" if not periods else ", 1 period" if periods == 1 else f", {periods} periods"
         level = ", ".join(f"{c.name} {np.std(f):.3g} N" for c, f in zip(r.forces, r.force, strict=True))
         yield (
             f"{r.name}: {r.n_samples} samples at {r.sample_rate_hz:.6g} Hz{period}, "

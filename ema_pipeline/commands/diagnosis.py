@@ -12,6 +12,7 @@ import typer
 from ema_pipeline.commands.interrupts import go_on_with
 from ema_pipeline.commands.options import EffectFiles, Json, Out, Overrides, Quiet
 from ema_pipeline.commands.screen import program, progress, show, show_summary
+from ema_pipeline.errors import EmaError
 
 if TYPE_CHECKING:
     from ema_pipeline.run.types import Run
@@ -38,6 +39,8 @@ def diagnose(
         run, _ = run_on(out, ["diagnose", "report"], set_ or [], show_stage, effect_file or [])
         require_judge(run, "diagnose").check_model(run)
         results = load_results(run)
+        if results.not_diagnosed:
+            raise EmaError(f"{out}: nothing was diagnosed: {results.not_diagnosed}")
         found = results.diagnosis
         assert found is not None  # the stage has just run
         supported = [x for x in found.ladder.rungs[-1].effects if x not in run.info.effects]

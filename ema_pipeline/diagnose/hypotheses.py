@@ -22,7 +22,10 @@ _MOST_STARTS = 4
 _LOG_STARTS = (-1.0, 0.4, 1.5)
 """Unknowns of yields, times and the like from which fits begin: a factor of about four apart."""
 _SIZE_STARTS = (0.1, 0.6)
-"""The same of sizes that have a sign, in units of their prior 1 σ."""
+"""The same of a single size that cannot be negative, in units of its prior 1 σ."""
+_SIGNED_STARTS = (0.1, 0.3, -0.3)
+"""The same of one that has a sign. The first is a twentieth of the measured force, from which a descent passes to the
+other sign as well."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +214,7 @@ def size_starts(placed: PlacedEffect) -> tuple[Mapping[str, float], ...]:
         if size.logarithmic and k < 2:
             starts = _LOG_STARTS
         elif not size.logarithmic and len(placed.effect.parameters) == 1:
-            starts = _SIZE_STARTS if low == 0.0 else (0.3, -0.3)
+            starts = _SIZE_STARTS if low == 0.0 else _SIGNED_STARTS
         elif k == 0:
             starts = (0.3,)
         name = placed.parameter_name(p.name)

@@ -273,11 +273,16 @@ def _starts(
 ) -> list[NDArray[np.float64]]:
     """Points from which a hypothesis is fitted.
 
-    A base model that fails has bent parts and channels to the data: a true effect is found from unbent ones. Usual
-    sizes may be ten times too large; the one that a score tells is about right where the effect is.
+    A base model that fails has bent parts and channels to the data: a true effect is found from unbent ones. In forces
+    in time it has bent everything, up to a fit that no true effect leads out of: there one fit begins where the base
+    model's did. Usual sizes may be ten times too large; the one that a score tells is about right where the effect is.
     """
     unbent = begin.copy()
     unbent[[bool(s) for s in problem.unknowns.scatter]] = 0.0
+    if hypothesis.begun:
+        sizes_known = [problem.unknowns.index[name] for name in problem.sizes]
+        unbent = problem.start()
+        unbent[sizes_known] = begin[sizes_known]
     if hypothesis.size_cannot_be_zero:
         plans = [
             (x, start)

@@ -37,6 +37,9 @@ from ema_pipeline.observations.records import RecordObservations
 SEARCHED = 2048
 """Samples of all responses together, in windows, on which hypotheses are compared: enough to give gains of hundreds
 in log evidence, quick enough for all."""
+_SETTLED = 4 * SEARCHED
+"""The same for sizes that are told of windows: a third of a short record gave one that was five standard deviations
+off."""
 _LOST = 3.0
 """Error in whole records, over that in windows, from which a simulation has drifted out of phase with the measured
 motion."""
@@ -254,30 +257,29 @@ def whole_ladder(
 ) -> Ladder:
     """The rungs of a ladder that was found on windows, fitted to whole records, shared among processes.
 
-    Where motion depends so much on its start that the model drifts out of phase in them, the fits to windows stay.
+    Where motion depends so much on its start that the model drifts out of phase in them, the rungs are fitted to more
+    windows than the search used.
     """
     whole = _refitted(observations, library, searched, processes)
     limit = _LOST * max(searched.rungs[-1].error, 1.0)
     if whole.rungs[-1].error < limit:
         return whole
-    windows = observations.in_windows(SEARCHED)
-    scatters = {s.name: s.learned for s in searched.scatters}
-    rungs = tuple(_with_calibration(windows, library, r, scatters) for r in searched.rungs)
+    windows = _refitted(observations.in_windows(_SETTLED), library, searched, processes)
     told = searched.note  # of a diagnosis, whose ladder may have come this way before
     if _OUT_OF_PHASE not in told:
         told = f"{told}; {_OUT_OF_PHASE}" if told else _OUT_OF_PHASE
-    return dataclasses.replace(searched, rungs=rungs, note=told)
+    return dataclasses.replace(windows, note=told)
 
 
 def _refitted(
     observations: RecordObservations, library: Mapping[str, Effect], searched: Ladder, processes: int | None
 ) -> Ladder:
-    """The rungs fitted to whole records.
+    """The rungs fitted to whole records, or to windows of them.
 
     The fit takes its reference channels as exact, which costs nothing. Uncertainties are those with all calibrations.
     """
     scatters = {s.name: s.learned for s in searched.scatters}
-    records = [d.record for d in observations.data]
+    records = [d if d.windowed else d.record for d in observations.data]
     fast = observations.with_records(records, observations.held_out, observations.basis.calibrated())
 
     def begun(rung: Rung) -> Fit:

@@ -256,10 +256,11 @@ def _check_inputs(
     if settings.estimator == "H2":
         raise EmaError("H2 is not defined for several forces at once; take --set frf.estimator=H1 or Hv")
     if averages < n_in + 1:
-        what = "periods of one realisation" if blocks.whole else "blocks"
+        piece = "period" if blocks.whole else "block"
+        what = f"1 {piece} does" if total.count == 1 else f"{total.count} {piece}s do"
         raise EmaError(
-            f"{total.count} {what} do not tell {n_in} forces apart ({', '.join(names)}); record at least "
-            f"{n_in + 1} with other forces each"
+            f"{what} not tell {n_in} forces apart ({', '.join(names)}); record at least "
+            f"{n_in + 1} {piece}s with other forces each"
         )
     if not lines.any():
         raise EmaError(
@@ -270,10 +271,16 @@ def _check_inputs(
         for b in range(a):
             shared = float(np.median(pairs[a, b, lines]))
             if shared >= settings.input_coherence:
+                both = f"forces '{names[b]}' and '{names[a]}'"
+                if first.period:
+                    raise EmaError(
+                        f"{both} repeat together: their coherence over all periods is {shared:.4f} (median over the "
+                        "band), so that no estimate tells what each of them does; record at least "
+                        f"{n_in} realisations with other phases, or drive one after the other"
+                    )
                 raise EmaError(
-                    f"forces '{names[b]}' and '{names[a]}' are the same signal: their coherence is "
-                    f"{shared:.4f} (median over the band), so that their effects cannot be separated; "
-                    "drive them from independent sources, or one after the other"
+                    f"{both} are the same signal: their coherence is {shared:.4f} (median over the band), so that their "
+                    "effects cannot be separated; drive them from independent sources, or one after the other"
                 )
     for a, explained in enumerate(total.explained_by_others()):
         shared = float(np.median(explained[lines]))

@@ -32,6 +32,13 @@ SAME_PERIOD = 0.1
 AT_LIMIT = 3
 """Samples in a row at the very limit of a record that no smooth or random signal has."""
 
+_PILED_UP, _OVER_NEXT = 10, 4
+"""Samples at the very limit, and how many times those of the next value below it, from which a record is clipped: of a
+steady vibration in steps of a converter they are 1.4 times those, of a random one fewer."""
+
+_NEAR_LIMIT = 0.9
+"""Share of the limit above which the next values are looked for."""
+
 CLIPPED_SHARE = 0.85
 """Share of samples near the top that lie at the very top: 0.5 for smooth peaks, 1 for clipped ones."""
 
@@ -242,7 +249,8 @@ def _check_channel(
             f"{where}: reaches its full scale of {full_scale:.4g} at sample {int(np.argmax(np.abs(samples)))}, so it "
             "is clipped; record again with a larger range"
         )
-    if flat_top_share(samples, noise_of(samples)) > CLIPPED_SHARE or _at_limits(samples) >= AT_LIMIT:
+    flat = flat_top_share(samples, noise_of(samples)) > CLIPPED_SHARE
+    if flat or _at_limits(samples) >= AT_LIMIT or _piled_up(samples):
         raise EmaError(
             f"{where}: is clipped at {top:.4g}: its tops are flat; record again with a larger range"
         )
@@ -256,6 +264,21 @@ def _at_limits(samples: NDArray[np.float64]) -> int:
         edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
         longest = max(longest, int(np.max(edges[1::2] - edges[::2])))
     return longest
+
+
+def _piled_up(samples: NDArray[np.float64]) -> bool:
+    """True where far more samples share the highest or lowest value than the next one.
+
+    A random signal with power up to half the sample rate is clipped for a sample or two at a time, so that no top of it
+    is flat.
+    """
+    middle = float(np.median(samples))
+    for signal in (samples - middle, middle - samples):
+        top = signal[signal >= _NEAR_LIMIT * np.max(signal)]
+        _, counts = np.unique(top, return_counts=True)
+        if counts[-1] >= _PILED_UP and len(counts) > 1 and counts[-1] > _OVER_NEXT * counts[-2]:
+            return True
+    return False
 
 
 def _check_whole(force: NDArray[np.float64], period: int, where: str) -> None:

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from ema_pipeline.observations.records import RecordObservations
 
 
+NOT_DIAGNOSED = "not_diagnosed"
+"""Name of the reason why nothing was diagnosed, among the results of the stage ``diagnose``."""
+
+
 def _read(run: Run, configuration: str, progress: Progress) -> Results:
     from ema_pipeline.ingest.driven import load_driven
 
@@ -76,6 +80,22 @@ def _of_elements(rig: str) -> bool:
     return "\n" in rig and "masses" in parse_toml(rig, "rig")
 
 
+def _without_model(run: Run) -> str:
+    """Why a run without a rig has no model to simulate either; empty where its modes make one."""
+    if run.rig is not None or run.info.effects:
+        return ""
+    from ema_pipeline.observations.modal_rig import why_no_rig
+    from ema_pipeline.observations.records import MOST_COORDINATES
+
+    return why_no_rig(*_identified(run), MOST_COORDINATES)
+
+
+def _identified(run: Run) -> tuple[ModalModel, FrfSet]:
+    configuration = run.info.configurations[0]
+    modal = run.store.load("modal", configuration, "modal", ModalModel)
+    return modal, run.store.load("frf", configuration, "frfs", FrfSet)
+
+
 def linear_rig(run: Run) -> Rig:
     """The run's rig, or the one that its modes make."""
     if run.rig is not None:
@@ -83,10 +103,7 @@ def linear_rig(run: Run) -> Rig:
     from ema_pipeline.observations.modal_rig import rig_of_modes
     from ema_pipeline.observations.records import MOST_COORDINATES
 
-    configuration = run.info.configurations[0]
-    modal = run.store.load("modal", configuration, "modal", ModalModel)
-    frfs = run.store.load("frf", configuration, "frfs", FrfSet)
-    return rig_of_modes(modal, frfs, configuration, MOST_COORDINATES)
+    return rig_of_modes(*_identified(run), run.info.configurations[0], MOST_COORDINATES)
 
 
 def _check_model(run: Run) -> None:
@@ -131,6 +148,8 @@ def diagnose(run: Run, progress: Progress) -> Results:
     from ema_pipeline.diagnose.records import diagnose_records
     from ema_pipeline.threads import single_blas_thread
 
+    if reason := _without_model(run):
+        return {NOT_DIAGNOSED: reason}
     with single_blas_thread():
         observations = record_observations(run)
         found = diagnose_records(observations, run.library, run.info.effects, run.settings.diagnose, progress)

@@ -17,6 +17,9 @@ from ema_pipeline.rigs.base import ParametricRig
 NAME = "identified modes"
 _RATIO = 0.03
 """Damping ratio of a peak that stands for a mode."""
+_HIGH = 0.1
+"""Height of a mode's peak, over the highest, from which the records need it: a tenth of a response is ten times what a
+linear model explains them to."""
 
 
 def rig_of_modes(modal: ModalModel, frfs: FrfSet, configuration: str, most: int) -> ParametricRig:
@@ -36,15 +39,11 @@ def rig_of_modes(modal: ModalModel, frfs: FrfSet, configuration: str, most: int)
     EmaError
         Without a driving point, which the masses follow from.
     """
+    if reason := _unscaled(modal, frfs):
+        raise EmaError(f"{configuration}: {reason}")
     if not modal.modes:
         return _rig_of_peak(frfs, configuration)
-    if not modal.scaled:
-        raise EmaError(
-            f"{configuration}: the modes have no scale ({modal.scaling_note}); measure the response where a force "
-            "acts, or give a model with --rig FILE.toml"
-        )
-    largest = sorted(modal.modes, key=lambda m: -float(np.nanmax(np.abs(m.shape)) ** 2 / abs(m.pole.real)))
-    kept = sorted(largest[:most], key=lambda m: m.frequency_hz)
+    kept = sorted(sorted(modal.modes, key=lambda m: -_peak(m))[:most], key=lambda m: m.frequency_hz)
     names = tuple(d.point for d in modal.dofs)
     numbers = tuple(
         (abs(m.pole) ** 2, -2 * m.pole.real, tuple(float(v) for v in _real_shape(m))) for m in kept
@@ -52,14 +51,43 @@ def rig_of_modes(modal: ModalModel, frfs: FrfSet, configuration: str, most: int)
     return ParametricRig(NAME, (configuration,), {}, partial(_build, names, numbers))
 
 
-def _rig_of_peak(frfs: FrfSet, configuration: str) -> ParametricRig:
-    """One mode at the largest response of a driving point, with a usual damping: the search goes on from there."""
-    driven = next((d for d in frfs.inputs if d in frfs.outputs), None)
-    if driven is None:
-        raise EmaError(
-            f"{configuration}: no mode was identified and no response is measured where a force acts; give a model "
+def why_no_rig(modal: ModalModel, frfs: FrfSet, most: int) -> str:
+    """Why the identified modes are no linear model of the records, and what helps; empty where they are.
+
+    Modes left out whose peaks are high would look like missing physics.
+    """
+    peaks = np.array([_peak(m) for m in modal.modes])
+    high = int(np.count_nonzero(peaks >= _HIGH * np.max(peaks, initial=0.0)))
+    if high > most:
+        return (
+            f"{high} modes take part in the response, and records are simulated with up to {most} coordinates; give a "
+            "model of so few with --rig FILE.toml"
+        )
+    return _unscaled(modal, frfs)
+
+
+def _unscaled(modal: ModalModel, frfs: FrfSet) -> str:
+    if modal.modes and not modal.scaled:
+        return (
+            f"the modes have no scale ({modal.scaling_note}); measure the response where a force acts, or give a "
+            "model with --rig FILE.toml"
+        )
+    if not modal.modes and not any(d in frfs.outputs for d in frfs.inputs):
+        return (
+            "no mode was identified and no response is measured where a force acts; give a model "
             "with --rig FILE.toml"
         )
+    return ""
+
+
+def _peak(mode: Mode) -> float:
+    """Height of a mode's highest peak, φ²/σ."""
+    return float(np.nanmax(np.abs(mode.shape)) ** 2 / abs(mode.pole.real))
+
+
+def _rig_of_peak(frfs: FrfSet, configuration: str) -> ParametricRig:
+    """One mode at the largest response of a driving point, with a usual damping: the search goes on from there."""
+    driven = next(d for d in frfs.inputs if d in frfs.outputs)
     low, high = np.searchsorted(frfs.frequency_hz, frfs.band_hz)
     inside = slice(max(int(low), 1), max(int(high), int(low) + 2))
     response = frfs.accelerance(inside)[:, frfs.inputs.index(driven)]

@@ -92,6 +92,8 @@ def _of_sensor(v: CheckResult) -> bool:
 def _all(results: RunResults) -> Iterator[tuple[Weight, str]]:
     for text in suspicions(results):
         yield Weight.SENSOR, text
+    if results.not_diagnosed:
+        yield Weight.MISFIT, f"Nothing was diagnosed: {results.not_diagnosed}"
     if results.fit is not None:
         found = None if results.diagnosis_is_old else results.diagnosis
         yield from _of_fit(results.fit, results.fit.error if found is None else found.error)

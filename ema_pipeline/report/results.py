@@ -44,6 +44,8 @@ class ConfigurationResults:
         The base model, the current model and the one that the diagnosis proposes, all like parts being alike.
     levels : LevelStudy or None
         What moves with the force of the hits.
+    driven : int
+        Records of continuous excitation.
     """
 
     name: str
@@ -57,6 +59,7 @@ class ConfigurationResults:
     base_system: LinearSystem | None = None
     system_after: LinearSystem | None = None
     like_parts: tuple[LinearSystem | None, ...] = (None, None, None)
+    driven: int = 0
 
 
 @dataclass(frozen=True)
@@ -119,6 +122,8 @@ class RunResults:
         Hits and modes that the user excluded or included: now, and when the diagnosis was made.
     simulation : tuple of RecordError
         Free-run errors in the records of a continuous test; empty where none were simulated.
+    not_diagnosed : str
+        Why nothing was diagnosed; empty where it was, or was not asked for.
     hysteresis : tuple of HysteresisLoop
         Loops of Bouc-Wen elements that records were simulated with.
     loops : LoopResults or None
@@ -146,6 +151,7 @@ class RunResults:
     diagnosed_choices: Choices = NO_CHOICES
     folder: str = ""
     simulation: tuple[RecordError, ...] = ()
+    not_diagnosed: str = ""
     hysteresis: tuple[HysteresisLoop, ...] = ()
     loops: LoopResults | None = None
 

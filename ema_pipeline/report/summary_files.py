@@ -236,8 +236,8 @@ def _configuration(c: ConfigurationResults) -> dict[str, Any]:
     if c.levels is not None:
         content["levels"] = levels.summary_of(c.levels)
     content["records"] = {
-        "used": len({h.file for h in c.hits if h.accepted}),
-        "found": len({h.file for h in c.hits}),
+        "used": len({h.file for h in c.hits if h.accepted}) + c.driven,
+        "found": len({h.file for h in c.hits}) + c.driven,
         "hits_used": sum(h.accepted for h in c.hits),
         "rejected": [{"file": h.file, "hit": h.number, "reason": h.reason} for h in c.hits if not h.accepted],
     }

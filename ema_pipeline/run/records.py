@@ -68,6 +68,12 @@ def driven_records(store: Store, configuration: str) -> tuple[DrivenRecord, ...]
     return store.load("ingest", configuration, DRIVEN, tuple[DrivenRecord, ...])
 
 
+def count_driven(store: Store, configuration: str) -> int:
+    """Number of records of a continuous test of one configuration; 0 of other tests."""
+    with store.group("ingest", configuration) as group:
+        return len(codec.member(group, DRIVEN)) if group is not None and DRIVEN in group else 0
+
+
 def shown(records: Iterator[R], count: int, progress: Progress) -> Iterator[R]:
     """The records, each named as it is read; with the last one ends the process that reads them."""
     try:

@@ -15,6 +15,7 @@ from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit, Transducer
 from ema_pipeline.kinds import kind_of
+from ema_pipeline.kinds.continuous import NOT_DIAGNOSED
 from ema_pipeline.kinds.loops import loops_of, models_of
 from ema_pipeline.levels.linear import structure, structure_frfs
 from ema_pipeline.levels.sentences import flagged
@@ -24,6 +25,7 @@ from ema_pipeline.modal.types import NO_SYNTHESIS, ModalModel
 from ema_pipeline.report.results import ConfigurationResults, LoopResults, RunResults
 from ema_pipeline.run.measured import level_study
 from ema_pipeline.run.models import diagnosed_choices, diagnosis_is_of_other_data
+from ema_pipeline.run.records import count_driven
 from ema_pipeline.run.types import Run
 from ema_pipeline.store import ALL
 
@@ -62,6 +64,7 @@ def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
                 ),
                 system_after=run.store.find("diagnose", ALL, f"system after {name}", LinearSystem),
                 levels=levels,
+                driven=count_driven(run.store, name),
             )
         )
     return RunResults(
@@ -74,6 +77,7 @@ def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
         comparison_after=run.store.find("diagnose", ALL, "comparison_after", Comparison),
         diagnosis=_diagnosis(run),
         ladder=_own_ladder(run),
+        not_diagnosed=run.store.find("diagnose", ALL, NOT_DIAGNOSED, str) or "",
         simulation=_of_records(run, "simulation", RecordError),
         hysteresis=_of_records(run, "hysteresis", HysteresisLoop),
         loops=_loops(run),

@@ -153,12 +153,12 @@ def test_fits_begin_at_a_few_usual_sizes() -> None:
         effect = replace(shipped_effects()["spring"], parameters=named)
         return [list(one.values()) for one in size_starts(PlacedEffect(effect, "m1"))]
 
-    assert begun(both) == [[0.3], [-0.3]]
+    assert begun(both) == [[0.1], [0.3], [-0.3]]
     assert begun(positive) == [[0.1], [0.6]]
     assert begun(yielding) == [[-1.0], [0.4], [1.5]]
     assert begun(both, both) == [[0.3, 0.0]]
     assert begun(positive, yielding, yielding) == [[0.3, v, 0.0] for v in (-1.0, 0.4, 1.5)]
-    assert begun(of_size(1.0, -0.2, 9.0)) == [[0.3], [-0.2]]
+    assert begun(of_size(1.0, -0.2, 9.0)) == [[0.1], [0.3], [-0.2]]
 
 
 @pytest.mark.parametrize(("bent", "told"), [(0.0, True), (1e-6, True), (1e-5, False)])

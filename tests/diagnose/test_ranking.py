@@ -213,6 +213,9 @@ class Parabola:
     def begun(self, x: np.ndarray, scatters: object) -> None:
         return None
 
+    def start(self) -> np.ndarray:
+        return self.at
+
 
 def with_model(name: str, problem: Parabola, x: list[float], log_evidence: float = 0.0) -> Fit:
     posterior: Any = SimpleNamespace(
@@ -284,6 +287,20 @@ def test_fits_begin_at_usual_sizes_and_once_with_parts_that_are_not_bent() -> No
     np.testing.assert_array_equal(starts, [[0.4, 0.5, 0.5], [0.4, 0.5, -0.5], [0.0, 0.5, 0.5]])
     told = _starts(NO_DATA, problem, hypothesis("a"), begin, score(3.0, 0.07))
     np.testing.assert_array_equal(told, [*starts, [0.4, 0.5, 0.07]])
+
+
+def test_where_sizes_are_given_one_fit_begins_where_that_of_the_base_model_did() -> None:
+    """With the sizes of effects that the model has already as the base model's fit has them."""
+    names = ("spring", "known.s1", "a.s1")
+    problem: Any = Parabola(names, names[1:], np.array([0.1, 0.2, 0.3]))
+    starts = _starts(NO_DATA, problem, _given(), np.array([0.4, 0.7, 0.0]))
+    np.testing.assert_array_equal(starts, [[0.4, 0.7, 0.5], [0.4, 0.7, -0.5], [0.1, 0.7, 0.5]])
+
+
+def _given() -> Any:
+    one = hypothesis("a")
+    one.begun = tuple(one.starts())
+    return one
 
 
 def test_an_effect_that_adds_modes_begins_at_the_best_of_a_grid() -> None:

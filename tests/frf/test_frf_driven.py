@@ -85,6 +85,15 @@ def test_forces_that_are_one_signal_are_refused_and_correlated_ones_named() -> N
     assert any(v.check == "inputs" and "f0 and f1" in v.message for v in frfs.verdicts)
 
 
+def test_forces_that_repeat_together_and_too_few_blocks_are_told_as_such() -> None:
+    force = np.tile(np.random.default_rng(9).standard_normal((2, 512)), 8)
+    record = _record(force, _responded(force), period=512)
+    with pytest.raises(EmaError, match=r"'f0' and 'f1' repeat together.*at least 2 realisations"):
+        estimate_driven_frfs([record])
+    with pytest.raises(EmaError, match=r"^1 period does not tell 2 forces apart"):
+        estimate_driven_frfs([_record(force[:, :512], _responded(force[:, :512]), period=512)])
+
+
 def test_h2_of_several_forces_is_refused() -> None:
     force = np.random.default_rng(6).standard_normal((2, 20_000))
     with pytest.raises(EmaError, match="H2 is not defined for several forces"):

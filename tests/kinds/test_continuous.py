@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 
 import ema_pipeline as ema
 from ema_pipeline.cli import app
+from ema_pipeline.ingest.driven import AT_LIMIT, _at_limits, _piled_up
 
 RUNNER = CliRunner()
 
@@ -56,6 +57,8 @@ def test_without_a_rig_the_modes_are_the_linear_model_and_a_linear_one_is_adequa
     assert found["simulation"]["records"]["two"]["relative"] < 0.008
     modes = found["configurations"]["default"]["modes"]
     assert len(modes) == 1
+    records = found["configurations"]["default"]["records"]
+    assert (records["used"], records["found"]) == (2, 2)
     assert abs(modes[0]["frequency_hz"] - np.sqrt(5e4 / 2.0) / (2 * np.pi)) < 0.2
 
 
@@ -129,6 +132,27 @@ def test_a_clipped_channel_is_refused(
         limit = share * np.max(np.abs(file[channel][:]))
         file[channel][:] = np.clip(file[channel][:], -limit, limit)
     _one_line(capsys, folder, f"channel '{channel}': is clipped at {limit:.3g}", "with a larger range")
+
+
+def test_noise_that_piles_up_at_a_limit_is_clipped(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With power up to half the sample rate it stays there for a sample or two at a time: no top of it is flat."""
+    folder = _folder(tmp_path, DESCRIPTION.replace("period_samples = 512", ""), samples=8192)
+    force = np.clip(np.random.default_rng(3).standard_normal(8192), -2.5, 2.5)
+    with h5py.File(tmp_path / "r.h5", "r+") as file:
+        file["f"][:] = force
+    assert _at_limits(force) < AT_LIMIT
+    _one_line(capsys, folder, "channel 'f': is clipped at 2.5", "with a larger range")
+
+
+@pytest.mark.parametrize("steps", [12, 200])
+def test_signals_in_steps_of_a_converter_are_not_clipped(steps: int) -> None:
+    sine = np.round(steps * np.sin(2 * np.pi * 0.4123 * np.arange(20_000)))
+    noise = np.round(steps / 4 * np.random.default_rng(4).standard_normal(20_000))
+    assert not _piled_up(sine)
+    assert not _piled_up(noise)
+    assert _piled_up(np.clip(sine, -np.inf, 0.6 * steps))
 
 
 def test_a_model_of_modes_that_grows_without_bound_says_what_to_look_at(

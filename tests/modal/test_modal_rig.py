@@ -10,7 +10,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.types import NO_SYNTHESIS, ModalModel, Mode, StabilisationChart
-from ema_pipeline.observations.modal_rig import rig_of_modes
+from ema_pipeline.observations.modal_rig import rig_of_modes, why_no_rig
 
 DOFS = tuple(Dof.parse(d) for d in ("a.x", "b.x", "c.x"))
 NO_CHART = StabilisationChart(*(np.zeros(0) for _ in range(4)), np.zeros(0, np.int64))  # type: ignore[arg-type]
@@ -73,6 +73,16 @@ def test_the_modes_that_move_most_are_kept_in_order_of_frequency() -> None:
     rig = rig_of_modes(modal_model(low, damped, small, high), NO_FRFS, "test", 2)
     stiffness = np.diag(rig.system("test").stiffness)
     np.testing.assert_allclose(np.sqrt(stiffness) / (2 * np.pi), [10.0, 40.0])
+
+
+def test_modes_that_would_be_missed_are_told_before_records_are_simulated_without_them() -> None:
+    """One below a tenth of the highest peak is none of these."""
+    high, low = mode(40.0, 0.0005, [0.2, 0.0, 0.0]), mode(10.0, 0.02, [0.0, -0.5, 0.1])
+    little, less = (mode(20.0, 0.02, [size, 0.0, 0.0]) for size in (0.29, 0.28))  # 0.21 and 0.196, of 2.0
+    assert why_no_rig(modal_model(low, less, high), NO_FRFS, 2) == ""
+    assert why_no_rig(modal_model(low, little, high), NO_FRFS, 3) == ""
+    assert "3 modes take part" in why_no_rig(modal_model(low, little, high), NO_FRFS, 2)
+    assert "no driving point" in why_no_rig(modal_model(low, scaled=False), NO_FRFS, 2)
 
 
 def test_where_no_mode_was_identified_the_largest_peak_of_the_driving_point_stands_for_one() -> None:
