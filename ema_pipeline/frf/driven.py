@@ -279,8 +279,8 @@ def _check_inputs(
                         f"{n_in} realisations with other phases, or drive one after the other"
                     )
                 raise EmaError(
-                    f"{both} are the same signal: their coherence is {shared:.4f} (median over the band), so that their "
-                    "effects cannot be separated; drive them from independent sources, or one after the other"
+                    f"{both} are the same signal: their coherence is {shared:.4f} (median over the band), so that "
+                    "their effects cannot be separated; drive them from independent sources, or one after the other"
                 )
     for a, explained in enumerate(total.explained_by_others()):
         shared = float(np.median(explained[lines]))
