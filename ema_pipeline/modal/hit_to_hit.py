@@ -20,6 +20,7 @@ from ema_pipeline.modal.drift.local import DecayChange
 from ema_pipeline.modal.drift.shifts import wider
 from ema_pipeline.modal.drift.windows import Hits
 from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.mains_hum import without_hum
 from ema_pipeline.modal.serial import widening
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel, Mode
@@ -106,6 +107,7 @@ def identify_hits(
     release_memory()
     asked = wanted(included, frfs.response_decay_rad_s)
     modal = identify(frfs, settings, progress, alignment.known_peaks(), asked)
+    modal = without_hum(modal, frfs, asked)
     decay = frfs.response_decay_rad_s
     if alignment.n_hits == 1:
         modal = within_decay(of_one_hit(modal, settings.repeatability), alignment, decay)
