@@ -209,7 +209,9 @@ def _double_hit(force: NDArray[np.float64], pulse: Pulse, rate: float, settings:
     second = find_second_impact(force, pulse, rate, settings.double_hit)
     passes = second.ratio < settings.double_hit
     when = "after" if second.delay_s > 0 else "before"
-    fault = f"second impact of {second.ratio:.0%} {abs(second.delay_s) * 1e3:.1f} ms {when} the peak"
+    apart = abs(second.delay_s)
+    span = f"{apart * 1e3:.1f} ms" if apart < 1 else f"{apart:.3g} s"
+    fault = f"second impact of {second.ratio:.0%}, {span} {when} the peak"
     return judged("double hit", second.ratio, settings.double_hit, passes, DOUBLE_HIT, "reject_hit", fault)
 
 

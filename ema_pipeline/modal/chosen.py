@@ -9,8 +9,9 @@ import numpy as np
 
 from ema_pipeline.choices import Choices, ModeChoice
 from ema_pipeline.errors import EmaError
+from ema_pipeline.modal.left_out import taken_out
 from ema_pipeline.modal.peaks import KnownPeaks
-from ema_pipeline.modal.types import LeftOut, ModalModel
+from ema_pipeline.modal.types import ModalModel
 
 REACH = 0.01
 """Relative distance in frequency within which a mode or a pole is the one that was named."""
@@ -53,29 +54,10 @@ def without(modal: ModalModel, excluded: Sequence[ModeChoice]) -> ModalModel:
             gone.append(left[at])
     if not excluded:
         return modal
-    kept = [k for k in range(len(modal.modes)) if k not in gone]
-    place = np.full(len(modal.modes) + 1, -1, dtype=np.int64)  # the last entry stands for poles of no mode
-    place[kept] = np.arange(len(kept))
     dropped = [modal.modes[k] for k in sorted(gone)]
-    return replace(
-        modal,
-        modes=tuple(modal.modes[k] for k in kept),
-        chart=replace(modal.chart, selected=place[modal.chart.selected]),
-        notes=(
-            *modal.notes,
-            *(f"the mode at {m.frequency_hz:.5g} Hz is {EXCLUDED}" for m in dropped),
-            *notes,
-        ),
-        left_out=tuple(
-            sorted(
-                (
-                    *modal.left_out,
-                    *(LeftOut(m.frequency_hz, m.damping_ratio, "mode", EXCLUDED) for m in dropped),
-                ),
-                key=lambda entry: entry.frequency_hz,
-            )
-        ),
-    )
+    fewer = taken_out(modal, gone, "mode", EXCLUDED)
+    said = (f"the mode at {m.frequency_hz:.5g} Hz is {EXCLUDED}" for m in dropped)
+    return replace(fewer, notes=(*fewer.notes, *said, *notes))
 
 
 def flagged_included(modal: ModalModel, included: Sequence[ModeChoice]) -> ModalModel:

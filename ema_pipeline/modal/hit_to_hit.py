@@ -20,6 +20,7 @@ from ema_pipeline.modal.drift.local import DecayChange
 from ema_pipeline.modal.drift.shifts import wider
 from ema_pipeline.modal.drift.windows import Hits
 from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.mains_hum import without_hum
 from ema_pipeline.modal.serial import widening
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel, Mode
@@ -37,6 +38,16 @@ FEWEST_HITS = 6
 
 SURE = 3.0
 """Standard deviations from which a change within the decay is believed."""
+
+OVERLAP = 2.0
+"""In the sum of the decay rates of two modes: nearer, one is part of what the other's peak shows."""
+
+BROADENING = 0.05
+"""Relative error of the decay rate of one pole fitted to a decay whose frequency changes, over the square of the change
+as it is measured, in decay rates: from simulated beams whose frequencies rise by 0.1 to 1 %."""
+
+MOST_DECAYS = 2.0
+"""Change in decay rates up to which it grows: the width of the peak."""
 
 WORTH_SAYING = 0.5
 """A mode is flagged for its movement where that makes up so much of its standard deviation."""
@@ -96,15 +107,37 @@ def identify_hits(
     release_memory()
     asked = wanted(included, frfs.response_decay_rad_s)
     modal = identify(frfs, settings, progress, alignment.known_peaks(), asked)
+    modal = without_hum(modal, frfs, asked)
+    decay = frfs.response_decay_rad_s
     if alignment.n_hits == 1:
-        modal = of_one_hit(modal, alignment, frfs.response_decay_rad_s, settings.repeatability)
-    return HitModes(with_movement(modal, alignment, frfs.response_decay_rad_s), frfs, alignment)
+        modal = within_decay(of_one_hit(modal, settings.repeatability), alignment, decay)
+    return HitModes(with_movement(modal, alignment, decay), frfs, alignment)
 
 
-def of_one_hit(
-    modal: ModalModel, alignment: Alignment, decay_rad_s: float, repeatability: float
-) -> ModalModel:
-    """The modes of one hit with intervals that hold what it cannot show, and what frequencies do within the decay.
+def of_one_hit(modal: ModalModel, repeatability: float) -> ModalModel:
+    """The modes of one hit with intervals that hold what it cannot show.
+
+    Parameters
+    ----------
+    modal : ModalModel
+    repeatability : float
+        Relative standard deviation of frequencies from hit to hit.
+    """
+    if not repeatability:
+        return modal
+    modes = tuple(
+        replace(m, frequency_std_hz=float(np.hypot(m.frequency_std_hz, repeatability * m.frequency_hz)))
+        for m in modal.modes
+    )
+    note = (
+        f"one hit cannot show how frequencies differ from hit to hit: {100 * repeatability:.2g} % (1 "
+        "sigma) is assumed, modal.identify.repeatability"
+    )
+    return replace(modal, modes=modes, notes=(*modal.notes, note))
+
+
+def within_decay(modal: ModalModel, alignment: Alignment, decay_rad_s: float) -> ModalModel:
+    """The modes of one hit with intervals that hold what their frequencies do within the decay.
 
     Parameters
     ----------
@@ -112,26 +145,61 @@ def of_one_hit(
     alignment : Alignment
     decay_rad_s : float
         Decay of the exponential window, which the peaks still hold.
-    repeatability : float
-        Relative standard deviation of frequencies from hit to hit.
     """
+    poles = np.array([m.pole - decay_rad_s for m in modal.modes])
+    changes = [_change_of(poles, k, alignment) for k in range(len(poles))]
     modes = []
-    for mode in modal.modes:
-        seen = mode.pole - decay_rad_s
-        near = [c for c in alignment.changes if abs(c.pole - seen) < -seen.real]
-        change = min(near, key=lambda c: abs(c.pole - seen), default=None)
-        moved, flags = 0.0, mode.flags
-        if change is not None and abs(change.change) > max(SURE * change.std, NOTICED * -seen.real):
-            # as for modes that move with the force: no one frequency holds
-            moved = 0.5 * min(abs(change.change), change.width) / (2 * np.pi)
-            flags = (*flags, _decay_words(change, abs(seen)))
-        std = float(np.sqrt(mode.frequency_std_hz**2 + (repeatability * mode.frequency_hz) ** 2 + moved**2))
-        modes.append(replace(mode, frequency_std_hz=std, flags=flags))
-    note = (
-        f"one hit cannot show how frequencies differ from hit to hit: {100 * repeatability:.2g} % (1 "
-        "sigma) is assumed, modal.identify.repeatability"
+    for k, mode in enumerate(modal.modes):
+        change = changes[k]
+        if change is not None:
+            modes.append(_changing(mode, change, abs(poles[k])))
+            continue
+        doubtful = [
+            (other, c)
+            for other, c, near in zip(modal.modes, changes, _overlaps(poles, k), strict=True)
+            if c is not None and near and not c.single
+        ]
+        modes.append(_beside(mode, *max(doubtful, key=lambda pair: pair[1].width)) if doubtful else mode)
+    return replace(modal, modes=tuple(modes))
+
+
+def _overlaps(poles: NDArray[np.complex128], k: int) -> NDArray[np.bool_]:
+    """True for modes that are part of what the peak of mode `k` shows, (n_modes,)."""
+    reach = -OVERLAP * (poles.real + poles.real[k])
+    return np.asarray((np.abs(poles - poles[k]) < reach) & (np.arange(len(poles)) != k))
+
+
+def _change_of(poles: NDArray[np.complex128], k: int, alignment: Alignment) -> DecayChange | None:
+    """What the frequency of a mode does within the decay; None where nothing is sure."""
+    seen = poles[k]
+    near = [c for c in alignment.changes if abs(c.pole - seen) < -seen.real]
+    change = min(near, key=lambda c: abs(c.pole - seen), default=None)
+    sure = change is not None and abs(change.change) > max(SURE * change.std, NOTICED * -seen.real)
+    return change if sure else None
+
+
+def _changing(mode: Mode, change: DecayChange, size: float) -> Mode:
+    """A mode whose frequency changes within the decay; as for modes that move with the force, no one value holds."""
+    moved = 0.5 * min(abs(change.change), change.width) / (2 * np.pi)
+    broader = BROADENING * min(abs(2 * change.change / change.width), MOST_DECAYS) ** 2
+    return replace(
+        mode,
+        frequency_std_hz=float(np.hypot(mode.frequency_std_hz, moved)),
+        damping_std=float(np.hypot(mode.damping_std, broader * mode.damping_ratio)),
+        flags=(*mode.flags, _decay_words(change, size)),
     )
-    return replace(modal, modes=tuple(modes), notes=(*modal.notes, *([note] if repeatability else [])))
+
+
+def _beside(mode: Mode, other: Mode, change: DecayChange) -> Mode:
+    """A mode in the flank of one whose decay no single pole describes: what the fit leaves of that one bends it."""
+    moved = 0.5 * change.width / (2 * np.pi)
+    words = f"lies in the flank of the mode at {other.frequency_hz:.5g} Hz, whose decay one mode does not describe"
+    return replace(
+        mode,
+        frequency_std_hz=float(np.hypot(mode.frequency_std_hz, moved)),
+        damping_std=float(np.hypot(mode.damping_std, BROADENING * MOST_DECAYS**2 * mode.damping_ratio)),
+        flags=(*mode.flags, words),
+    )
 
 
 def _decay_words(change: DecayChange, size: float) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from ema_pipeline.modal.mode_acceptance import PLAIN_DAMPING
 from ema_pipeline.modal.peaks import KnownPeaks
 from ema_pipeline.modal.pole_tracks import link
 from ema_pipeline.modal.poles import PoleSet
-from ema_pipeline.modal.types import LeftOut
+from ema_pipeline.modal.types import LeftOut, ModalModel
 
 STABLE = 0.8
 """Share of model orders from which a column of poles is named where it has no mode."""
@@ -21,7 +22,7 @@ NEAR = 2.0
 """Distance from a mode, in the larger of the decay rates, within which a column follows that mode."""
 
 MOST = 8
-"""Named at most, peaks first."""
+"""Sentences at most; the frequencies of further ones share one."""
 
 NO_PEAK_MODE = "a clear peak of the FRFs, but the FRFs do not need it once the other modes are fitted"
 NO_COLUMN_MODE = "the fit of all FRFs drops it: noise, or the residual of other modes, explains it as well"
@@ -57,12 +58,40 @@ def left_out(
     for share, pole in sorted(columns, key=lambda c: -c[0]):
         evidence = f"stable in {100 * min(share, 1.0):.0f} % of the model orders"
         found.append(_entry(pole, decay_rad_s, evidence, NO_COLUMN_MODE))
-    return tuple(sorted(found[:MOST], key=lambda entry: entry.frequency_hz))
+    return tuple(sorted(found, key=lambda entry: entry.frequency_hz))
+
+
+def taken_out(modal: ModalModel, gone: Collection[int], evidence: str, reason: str) -> ModalModel:
+    """The modes without some of them, which are named among what is left out.
+
+    Parameters
+    ----------
+    modal : ModalModel
+    gone : collection of int
+        Places of the modes in the list.
+    evidence, reason : str
+        As in `LeftOut`.
+    """
+    kept = [k for k in range(len(modal.modes)) if k not in gone]
+    place = np.full(len(modal.modes) + 1, -1, dtype=np.int64)  # the last entry stands for poles of no mode
+    place[kept] = np.arange(len(kept))
+    named = [
+        LeftOut(m.frequency_hz, m.damping_ratio, evidence, reason)
+        for m in (modal.modes[k] for k in sorted(gone))
+    ]
+    return replace(
+        modal,
+        modes=tuple(modal.modes[k] for k in kept),
+        chart=replace(modal.chart, selected=place[modal.chart.selected]),
+        left_out=tuple(sorted((*modal.left_out, *named), key=lambda entry: entry.frequency_hz)),
+    )
 
 
 def sentences(entries: tuple[LeftOut, ...]) -> list[str]:
-    """One sentence on each."""
-    return [f"{e.frequency_hz:.5g} Hz ({e.evidence}) has no mode: {e.reason}" for e in entries]
+    """One sentence on each of the first few, and one on the others."""
+    told = [f"{e.frequency_hz:.5g} Hz ({e.evidence}) has no mode: {e.reason}" for e in entries[:MOST]]
+    further = ", ".join(f"{e.frequency_hz:.5g}" for e in entries[MOST:])
+    return [*told, f"no modes either at {further} Hz, for like reasons"] if further else told
 
 
 def _alone(pole: complex, modes: NDArray[np.complex128]) -> bool:

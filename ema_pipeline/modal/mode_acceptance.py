@@ -65,10 +65,31 @@ SAME_RESPONSE = 0.9
 misfit is left over: its frequency drifts between hits, which splits it in two that look alike."""
 
 ONE_SHAPE = 0.97
-"""The same at six or more sensors for poles within a decay rate of each other, whatever the scatter between hits
-explains: hits on one point that differ in direction and frequency leave it room for twins."""
+"""Least MAC of the same, whatever the scatter between hits explains, for poles within `ONE_SHAPE_REACH`: a frequency
+that depends on the amplitude moves within the decay, which two or three poles of one shape follow as exactly as noise
+lets one see. So do twins of hits on one point that differ in direction and frequency."""
 
-MIN_SENSORS_FOR_SHAPE = 6
+ONE_SHAPE_REACH = 2.0
+"""In the larger of two decay rates: a frequency may move by several half-widths within the decay; the poles that follow
+it then decay several times as fast as the mode."""
+
+SHAPE_CHANCE = 0.002
+"""Probability by chance that two modes look as alike at few sensors as one does: raises `ONE_SHAPE` where these are
+two or three."""
+
+FEW_SENSORS = 2
+"""So many cannot tell shapes; decay rates and residues then tell a frequency that moves from two modes."""
+
+DECAY_RATIO = (2.0, 6.0)
+"""Decay rate of the second pole over that of the mode whose frequency it follows: three to first order, where the
+frequency depends on the square of the amplitude; a large change moves both poles."""
+
+FEW_REACH = 0.8
+"""Difference of their frequencies in the larger decay rate: farther off, a second pole makes a shoulder of its own."""
+
+QUADRATURE = 0.7
+"""Least sine of the phase between the residues of these two poles: a change of frequency turns the phase of the decay,
+so that it is 90°; residues of two modes with real shapes have a phase of 0 or 180°."""
 
 RANDOM_PHASE = 0.25
 """Modal phase collinearity below which the phases of a shape are random."""
@@ -129,7 +150,9 @@ def credible(
     weight = fit.noise.weight(data.measured)
     support = np.where(unearned(data, weight, estimate, solution, share, explained), 0.0, support)
     support = np.where(peaks.owners(estimate), np.maximum(support, 1.0), support)
-    return _next(np.minimum(_strength_over_noise(data, fit), support))
+    out = _next(np.minimum(_strength_over_noise(data, fit), support))
+    # one or two sensors tell little: they are asked last, of modes that all else speaks for
+    return out if out.any() else _smaller_of_pairs(estimate, solution, _followers(data, estimate, solution))
 
 
 def evident(data: FitData, estimate: Estimate, solution: LinearSolution, votes: Votes) -> NDArray[np.bool_]:
@@ -214,12 +237,7 @@ def _doubles(
     data: FitData, estimate: Estimate, solution: LinearSolution, explained: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
     """The weaker of two poles that are one mode: coinciding with one shape, or an echo of a stronger mode."""
-    rows, references = (
-        mac(solution.shapes.T, solution.shapes.T),
-        mac(estimate.participation, estimate.participation),
-    )
-    sensors = references if data.transposed else rows
-    n_sensors = data.measured.shape[1] if data.transposed else data.measured.shape[0]
+    sensors, n_sensors = _sensors(data, estimate, solution)
     decay = -estimate.poles.real
     distance = np.abs(estimate.poles[:, None] - estimate.poles[None])
     close = distance < COINCIDENT * np.maximum(decay[:, None], decay)
@@ -227,20 +245,77 @@ def _doubles(
     double = close & (_second_singular(estimate, solution, close) < least)
     if n_sensors > 2:
         double |= close & (sensors > SAME_RESPONSE) & ~explained[:, None]
-    if n_sensors >= MIN_SENSORS_FOR_SHAPE:
-        double |= (distance < np.maximum(decay[:, None], decay)) & (sensors > ONE_SHAPE)
+    double |= _one_shape(estimate.poles, sensors, n_sensors)
     if min(data.measured.shape) > 2:
-        double |= (distance < ECHO_REACH * decay) & (rows * references > ECHO_MAC) & ~explained[:, None]
+        both = mac(solution.shapes.T, solution.shapes.T) * mac(estimate.participation, estimate.participation)
+        double |= (distance < ECHO_REACH * decay) & (both > ECHO_MAC) & ~explained[:, None]
+    return _smaller_of_pairs(estimate, solution, double)
+
+
+def _smaller_of_pairs(
+    estimate: Estimate, solution: LinearSolution, double: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """The smaller mode of every pair, each mode in one pair at a time, (n_modes,)."""
     size = _size(estimate, solution)
     out = np.zeros(len(size), dtype=bool)
     touched = np.zeros(len(size), dtype=bool)
-    # smallest first, and each mode in one pair at a time: three poles on two modes mix their shapes
+    # smallest first: three poles on two modes mix their shapes
     for weak in np.argsort(size):
         partners = np.flatnonzero(double[weak] & (size > size[weak]) & ~touched)
         if len(partners) and not touched[weak]:
             out[weak] = True
             touched[partners] = touched[weak] = True
     return out
+
+
+def _one_shape(poles: NDArray[np.complex128], sensors: Real, n_sensors: int) -> NDArray[np.bool_]:
+    """Pairs of near poles that show one shape at several sensors, (n_modes, n_modes).
+
+    Parameters
+    ----------
+    poles : complex ndarray, (n_modes,)
+    sensors : ndarray, (n_modes, n_modes)
+        MAC at the sensors that measured together.
+    n_sensors : int
+    """
+    if n_sensors <= FEW_SENSORS:
+        return np.zeros(sensors.shape, dtype=bool)
+    # of random shapes at n sensors, 1 − MAC has a beta distribution
+    chance = 1 - scipy.special.betaincinv(0.5 * (n_sensors - 1), 0.5, SHAPE_CHANCE)
+    near = np.abs(poles[:, None] - poles) < ONE_SHAPE_REACH * _heavier(poles)
+    return np.asarray(near & (sensors > max(ONE_SHAPE, chance)))
+
+
+def _followers(data: FitData, estimate: Estimate, solution: LinearSolution) -> NDArray[np.bool_]:
+    """Pairs of poles that follow one moving frequency, as far as one or two sensors can tell, (n_modes, n_modes)."""
+    sensors, n_sensors = _sensors(data, estimate, solution)
+    if n_sensors > FEW_SENSORS:
+        return np.zeros(sensors.shape, dtype=bool)
+    poles = estimate.poles
+    heavier = _heavier(poles)
+    ratio = heavier**2 / (poles.real[:, None] * poles.real)
+    residues = (solution.shapes.conj().T @ solution.shapes) * (
+        estimate.participation.conj() @ estimate.participation.T
+    )
+    return np.asarray(
+        (np.abs(poles.imag[:, None] - poles.imag) < FEW_REACH * heavier)
+        & (ratio > DECAY_RATIO[0])
+        & (ratio < DECAY_RATIO[1])
+        & (np.abs(residues.imag) > QUADRATURE * np.abs(residues))
+        & (sensors > ONE_SHAPE)
+    )
+
+
+def _heavier(poles: NDArray[np.complex128]) -> Real:
+    """The larger decay rate of every pair, (n_modes, n_modes)."""
+    return np.maximum(-poles.real[:, None], -poles.real)
+
+
+def _sensors(data: FitData, estimate: Estimate, solution: LinearSolution) -> tuple[Real, int]:
+    """MAC of the modes at the sensors that measured together, (n_modes, n_modes), and the number of these."""
+    if data.transposed:
+        return mac(estimate.participation, estimate.participation), data.measured.shape[1]
+    return mac(solution.shapes.T, solution.shapes.T), data.measured.shape[0]
 
 
 def _second_singular(estimate: Estimate, solution: LinearSolution, pairs: NDArray[np.bool_]) -> Real:

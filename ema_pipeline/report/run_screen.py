@@ -14,6 +14,8 @@ from ema_pipeline.choices import Choices
 from ema_pipeline.correlate.types import percent_off
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import Diagnosis
+from ema_pipeline.modal.chosen import EXCLUDED
+from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import Weight, cautions, left_out, suspicions
 from ema_pipeline.report.levels import has_to_say
@@ -34,6 +36,9 @@ LEAST_MODES = 3
 
 _MOST_RECORDS = 4
 """Records whose errors a screen has room for."""
+
+_MOST_NAMED = 4
+"""Candidates left out that a line has room for."""
 
 
 class RunScreen:
@@ -159,12 +164,24 @@ def _data_words(c: ConfigurationResults, several: bool, choices: Choices) -> str
         parts.append(f"{sum(h.accepted for h in c.hits)} of {len(c.hits)} hits used{yours}{dropped}")
     if c.modal is not None:
         parts.append(_count(len(c.modal.modes), "mode") + _chosen_words(choices))
+        parts += _candidates_left_out(c.modal)
     if c.pairing is not None:
         weak = sum(p.mac < LOW_MAC for p in c.pairing.pairs)
         parts.append(f"{len(c.pairing.pairs)} paired" + (f", {weak} of these doubtfully" if weak else ""))
     if c.levels is not None and has_to_say(c.levels) and c.levels.level_dependent:
         parts.append("some move with the force")
     return (f"{c.name}: " if several else "") + (", ".join(parts) or "nothing analysed yet")
+
+
+def _candidates_left_out(modal: ModalModel) -> list[str]:
+    """Peaks, columns of stable poles and tones that are left out of the list; empty where none are."""
+    found = [entry.frequency_hz for entry in modal.left_out if entry.reason != EXCLUDED]
+    if not found:
+        return []
+    named = ", ".join(plain(f) for f in found[:_MOST_NAMED])
+    more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+    reasons = "reason" if len(found) == 1 else "reasons"
+    return [f"{_count(len(found), 'candidate')} left out: {named} Hz{more} ({reasons} in the report)"]
 
 
 def _chosen_words(choices: Choices) -> str:

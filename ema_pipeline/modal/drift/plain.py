@@ -27,7 +27,7 @@ def plain_peaks(frfs: FrfSet, band_hz: tuple[float, float]) -> KnownPeaks:
     """
     rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
     found = []
-    for window in peak_windows(frfs, band_hz):
+    for window in peak_windows(frfs, band_hz, most=None):
         frf = frfs.accelerance(window.lines)[window.outputs].swapaxes(0, 1)
         pole = plain_pole(window, frf, 2 * np.pi * frfs.frequency_hz[window.lines], rest_s)
         if pole is not None:

@@ -26,7 +26,7 @@ PROMINENCE_DB = 6.0
 """A peak rises by so much out of the response of all FRFs: lower ones tell little of single hits."""
 
 MAX_PEAKS = 24
-"""Peaks looked at, the most prominent first: more do not tell more of what moves."""
+"""Peaks followed from hit to hit, the most prominent first: more do not tell more of what moves."""
 
 REACH = 4.0
 """Lines on either side of a peak, in half-power half-widths."""
@@ -87,13 +87,17 @@ class HitKey:
         return self.file, self.number
 
 
-def peak_windows(frfs: FrfSet, band_hz: tuple[float, float]) -> tuple[PeakWindow, ...]:
+def peak_windows(
+    frfs: FrfSet, band_hz: tuple[float, float], most: int | None = MAX_PEAKS
+) -> tuple[PeakWindow, ...]:
     """The plain peaks of all FRFs together.
 
     Parameters
     ----------
     frfs : FrfSet
     band_hz : tuple of float
+    most : int, optional
+        Peaks at most, the most prominent ones; None for all.
     """
     level = np.array([[np.median(np.abs(frf[1:]) ** 2) for frf in row] for row in frfs.frf])
     curve = _response_curve(frfs, level)
@@ -102,7 +106,7 @@ def peak_windows(frfs: FrfSet, band_hz: tuple[float, float]) -> tuple[PeakWindow
     found, rise = prominent_peaks(smooth[: high + 1], PROMINENCE_DB)
     inside = found > max(low, 1)
     found, rise = found[inside], rise[inside]
-    kept = np.sort(found[np.argsort(-rise, kind="stable")[:MAX_PEAKS]])
+    kept = np.sort(found[np.argsort(-rise, kind="stable")[:most]])
     step = 2 * np.pi * float(frfs.frequency_hz[1])
     decay = np.array([max(_half_width(curve, k), 0.3) for k in kept]) * step
     poles = np.asarray(-decay + 1j * step * kept, dtype=np.complex128)

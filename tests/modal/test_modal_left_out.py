@@ -1,0 +1,116 @@
+"""What looks like a mode and is none: mains hum, and the sentences and the screen that name it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulate_modal import Hits, TrueSystem, records_of, simulate_hits, write_raw_folder
+from typer.testing import CliRunner
+
+from ema_pipeline import cli
+from ema_pipeline.frf.estimate import estimate_frfs
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.ingest.hit_checks import hits_of_test
+from ema_pipeline.ingest.records import Record, cut_hit
+from ema_pipeline.modal.drift.plain import plain_peaks
+from ema_pipeline.modal.drift.windows import MAX_PEAKS
+from ema_pipeline.modal.identify import identify
+from ema_pipeline.modal.left_out import MOST, sentences
+from ema_pipeline.modal.mains_hum import REASON, without_hum
+from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
+from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.modal.types import LeftOut, ModalModel
+
+SYSTEM = TrueSystem(np.array([82.0, 171.0, 263.0]), np.array([0.006, 0.005, 0.004]), np.ones((3, 1)))
+
+
+def with_hum(mains_hz: float, share: float = 0.06) -> list[Record]:
+    """Three hits with 50 or 60 Hz and its third harmonic on the response."""
+    rng = np.random.default_rng(2)
+    made = simulate_hits(
+        SYSTEM, [0], [0], f_max=400, record_s=4.0, n_hits=3, force_noise=2e-3, response_noise=2e-3, rng=rng
+    )
+    time = np.arange(made.force.shape[-1]) / made.sample_rate_hz
+    size = share * np.sqrt(np.mean(made.responses**2))
+    phase = rng.uniform(0, 6, (3, 2))
+    tones = np.array([[np.sin(2 * np.pi * mains_hz * k * time + p[k // 2]) for k in (1, 3)] for p in phase])
+    responses = made.responses + size * tones.sum(axis=1)[None, :, None]
+    return records_of(Hits(made.force, responses, *_rest(made)), [0], [0])
+
+
+def _rest(made: Hits) -> tuple[float, int, float, np.ndarray]:
+    return made.sample_rate_hz, made.pretrigger, made.force_noise, made.response_noise
+
+
+def measured(records: list[Record]) -> FrfSet:
+    by_file, found = {r.file: r for r in records}, [h for h in hits_of_test(records) if h.accepted]
+    return estimate_frfs(cut_hit(by_file[h.file], h) for h in found)
+
+
+def identified_hum() -> tuple[ModalModel, FrfSet]:
+    """A model with a pole that follows the hum at 150 Hz."""
+    frfs = measured(with_hum(50.0))
+    modal = identify(frfs, ModalSettings())
+    tone = replace(modal.modes[0], frequency_hz=150.01, pole=-0.1 + 2j * np.pi * 150.01)
+    return replace(modal, modes=(modal.modes[0], tone, *modal.modes[1:])), frfs
+
+
+def test_a_pole_that_follows_mains_hum_is_named_and_no_mode() -> None:
+    modal, frfs = identified_hum()
+    fewer = without_hum(modal, frfs, NO_PEAKS)
+    assert fewer.modes == (modal.modes[0], *modal.modes[2:])
+    assert [e.frequency_hz for e in fewer.left_out if e.reason == REASON] == [150.01]
+    assert any("hum" in note and "150.01 Hz" in note for note in fewer.notes)
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "decay"), [(150.01, 2.0), (151.0, 0.1)], ids=["decays", "beside the mains"]
+)
+def test_modes_that_decay_or_lie_elsewhere_are_no_hum(frequency_hz: float, decay: float) -> None:
+    modal, frfs = identified_hum()
+    mode = replace(modal.modes[1], frequency_hz=frequency_hz, pole=-decay + 2j * np.pi * frequency_hz)
+    kept = replace(modal, modes=(modal.modes[0], mode, *modal.modes[2:]))
+    assert without_hum(kept, frfs, NO_PEAKS) is kept
+
+
+def test_a_mode_that_the_user_includes_is_no_hum() -> None:
+    modal, frfs = identified_hum()
+    asked = KnownPeaks(np.array([modal.modes[1].pole]), np.array([1.0]), np.ones((1, 2)))
+    assert without_hum(modal, frfs, asked) is modal
+
+
+@pytest.mark.parametrize("mains_hz", [50.0, 60.0])
+def test_hum_makes_no_modes_and_the_screen_says_what_was_left_out(tmp_path: Path, mains_hz: float) -> None:
+    write_raw_folder(tmp_path / "raw", with_hum(mains_hz))
+    command = ["run", str(tmp_path / "raw"), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(cli.app, command)
+    assert done.exit_code == 0, done.output
+    text = " ".join(done.output.split())
+    assert "3 modes from 82" in text
+    assert "3 modes, 1 candidate left out" in text
+
+
+def test_what_is_left_out_is_named_to_the_last() -> None:
+    entries = tuple(LeftOut(100.0 + k, 0.01, "peak", "why") for k in range(MOST + 3))
+    told = sentences(entries)
+    assert len(told) == MOST + 1
+    for entry in entries:
+        assert any(f"{entry.frequency_hz:.5g}" in sentence for sentence in told)
+    assert len(sentences(entries[:MOST])) == MOST
+
+
+def test_every_plain_peak_is_held_against_the_list_however_many_there_are() -> None:
+    rng = np.random.default_rng(6)
+    n = MAX_PEAKS + 12
+    frequency = np.linspace(40, 760, n)
+    system = TrueSystem(frequency, np.full(n, 0.002), 1 + 0.5 * rng.uniform(size=(n, 2)))
+    made = simulate_hits(
+        system, [0, 1], [0], f_max=800, record_s=6.0, n_hits=1, force_noise=1e-3, response_noise=1e-3, rng=rng
+    )
+    frfs = measured(records_of(made, [0, 1], [0]))
+    found = np.sort(plain_peaks(frfs, (20.0, 780.0)).poles.imag) / (2 * np.pi)
+    assert len(found) > MAX_PEAKS
+    assert all(np.abs(frequency - f).min() < 0.3 for f in found)
