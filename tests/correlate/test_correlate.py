@@ -112,6 +112,23 @@ def test_equal_modes_are_compared_by_their_plane_however_they_are_turned() -> No
     assert pairing.pairs[2].group == -1
 
 
+def test_every_measured_shape_has_its_own_share_in_the_plane_of_a_group() -> None:
+    """Two model shapes span x and y; of four measured shapes 1, 1/2, 1/3 and 0 of the square lie in that plane."""
+    shapes = np.array([[1, 1, 0, 0], [1, 0, 1, 0], [1, 0, 1, 1], [0, 0, 1, 0]], complex)
+    places = tuple(Dof.parse(f"{b}.x") for b in "abcd")
+    measured = replace(from_frequencies("default", [10.0, 11.0, 12.0, 13.0]), shapes=shapes, dofs=places)
+    model = np.eye(3, 4, dtype=complex)
+    single, grouped = shape_agreement(measured, model, np.array([0, 0, 1]))
+    np.testing.assert_allclose(grouped[:, :2], np.array([[1, 1 / 2, 1 / 3, 0]] * 2).T, atol=1e-12)
+    np.testing.assert_allclose(grouped[:, 2], single[:, 2])
+    np.testing.assert_allclose(single[:, 0], [1 / 2, 1 / 2, 1 / 3, 0], atol=1e-12)
+    unread = replace(
+        measured, shapes=np.where(np.arange(4) == 3, np.nan, shapes)
+    )  # the fourth sensor is broken
+    _, grouped = shape_agreement(unread, model, np.array([0, 0, 1]))
+    np.testing.assert_allclose(grouped[:, 0], [1, 1 / 2, 1 / 2, 0], atol=1e-12)
+
+
 def test_two_sensors_do_not_tell_the_plane_of_two_equal_modes() -> None:
     """Two readings of two modes can be made up of them whatever they are: each is compared by itself."""
     two, model = np.array([[1.0, 0.5], [0.5, -1.0]], complex), np.eye(2, dtype=complex)

@@ -149,6 +149,16 @@ def test_semicolons_and_a_missing_configuration_are_understood(tmp_path: Path) -
     assert modes.shapes is None
 
 
+def test_rows_without_a_configuration_are_of_the_rigs_only_one(tmp_path: Path) -> None:
+    path = table(tmp_path, "frequency_hz\n10\n20\n", "modes.csv")
+    rig = tmp_path / "rig.toml"
+    rig.write_text(
+        'configurations = ["bench"]\n[[masses]]\nat = "a.x"\nvalue = 1.0\n[[springs]]\nat = "a.x"\nvalue = 1e4\n'
+    )
+    assert list(read_mode_table(path, load_rig(rig))) == ["bench"]
+    assert list(read_mode_table(path)) == ["default"]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -283,6 +283,11 @@ def test_geometry_comes_back_with_local_nodes_at_their_bodies(tmp_path: Path) ->
         table.nodes["planet1"]
     ] == pytest.approx(0.123456, rel=1e-6)
     assert list(peer[2]["nodes"]) == [table.nodes[b] for b in GEOMETRY.lines[0]]
+    assert columns(found[2][1][0], 10, 10, 10) == [
+        "         1",
+        "         3",
+        "         0",
+    ]  # line 1 of three nodes
 
 
 def test_lines_of_the_geometry_must_join_known_bodies(tmp_path: Path) -> None:
@@ -330,7 +335,9 @@ def test_tables_of_modes_and_shapes_come_back_from_csv(tmp_path: Path) -> None:
     assert rows[1]["configuration"] == "no_ring"
     assert rows[1]["flags"] == "a, b; c"
     with (tmp_path / "shapes.csv").open(encoding="utf-8") as file:
-        shape = next(csv.DictReader(file))
+        shapes = list(csv.DictReader(file))
+    assert [s["mode"] for s in shapes] == [r["mode"] for r in rows] == ["1", "2"]
+    shape = shapes[0]
     assert complex(float(shape["sun.x re"]), float(shape["sun.x im"])) == modal.modes[0].shape[0]
     assert shape["sun.y re"] == ""
 

@@ -94,6 +94,23 @@ def test_forces_that_repeat_together_and_too_few_blocks_are_told_as_such() -> No
         estimate_driven_frfs([_record(force[:, :512], _responded(force[:, :512]), period=512)])
 
 
+def test_half_overlapping_blocks_count_by_what_is_independent_in_them() -> None:
+    """19 Hann blocks of a tenth of the record are worth 18: neighbours correlate by 1/6 (Welch 1967)."""
+    force = np.random.default_rng(5).standard_normal((1, 10_240))
+    frfs = estimate_driven_frfs([_record(force, _responded(force))], FrfSettings(block_samples=1024))
+    assert frfs.hits.tolist() == [[18], [18]]
+    assert frfs.record_s == 1024 / RATE
+
+
+def test_several_random_forces_are_estimated_over_whole_records_unless_blocks_are_asked_for() -> None:
+    force = np.random.default_rng(5).standard_normal((2, 10_240))
+    record = _record(force, _responded(force))
+    assert estimate_driven_frfs([record]).record_s == 10_240 / RATE
+    assert estimate_driven_frfs([record], FrfSettings(block_samples=1024)).record_s == 1024 / RATE
+    one = _record(force[:1], _responded(force[:1]))
+    assert estimate_driven_frfs([one]).record_s < 10_240 / RATE
+
+
 def test_h2_of_several_forces_is_refused() -> None:
     force = np.random.default_rng(6).standard_normal((2, 20_000))
     with pytest.raises(EmaError, match="H2 is not defined for several forces"):

@@ -109,6 +109,28 @@ def test_an_uncalibrated_hammer_stays_in_volts_and_says_so(tmp_path: Path) -> No
     assert_allclose(record.force, DATA["hammer"], rtol=EXACT)
 
 
+@pytest.mark.parametrize(
+    ("stated", "remedy"),
+    [
+        ('unit = "N"\nsensitivity_mv = 10', "add full_scale_v, the volts at full scale$"),
+        ('unit = "V"\nuncalibrated = true', "add full_scale_v, the volts at full scale$"),
+        (
+            'unit = "N"',
+            r"add full_scale_v \(volts at full scale\) and sensitivity_mv, or full_scale \(in N\)$",
+        ),
+    ],
+)
+def test_what_a_wav_lacks_depends_on_what_its_channel_states(
+    tmp_path: Path, stated: str, remedy: str
+) -> None:
+    text = DESCRIPTION.replace('"hammer"', '"ch1"').replace('name = "tip"', 'name = "ch2"')
+    text = text.replace('unit = "N"', stated).replace('"m/s^2"', '"m/s^2"\nfull_scale = 200')
+    folder = make_test(tmp_path, text, file="hit.wav")
+    wavfile.write(folder / "hit.wav", int(RATE), np.zeros((100, 2), np.int32))
+    with pytest.raises(EmaError, match=remedy):
+        load(folder)
+
+
 def test_a_whole_number_wav_is_scaled_by_the_volts_at_full_scale(tmp_path: Path) -> None:
     text = DESCRIPTION.replace('"hammer"', '"ch1"').replace('name = "tip"', 'name = "ch2"')
     text = text.replace('unit = "N"', 'unit = "N"\nsensitivity_mv = 10\nfull_scale_v = 5')

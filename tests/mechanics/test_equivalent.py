@@ -78,3 +78,12 @@ def test_phases_have_exact_first_and_second_moments(count: int) -> None:
     np.testing.assert_allclose(waves.mean(axis=1), 0, atol=1e-12)
     np.testing.assert_allclose(waves @ waves.conj().T / sets, np.eye(count), atol=1e-12)
     np.testing.assert_allclose(waves @ waves.T / sets, 0, atol=1e-12)
+
+
+def test_frequencies_without_motion_change_nothing() -> None:
+    teeth = PartingSpring("teeth", ROW, 1e7, preload=1e-6, gap=1e-5)
+    alone = single(3e-6).stiffness(teeth, np.zeros(1))[0, 0]
+    beside = Motions(np.array([[3e-6, 0.0, 0.0]]), OMEGA).stiffness(teeth, np.zeros(1))[0]
+    assert beside[0] == pytest.approx(alone, rel=1e-6)
+    assert np.all(np.isfinite(beside))
+    assert beside[1:].tolist() == [0.0, 0.0]
