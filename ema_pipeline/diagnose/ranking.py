@@ -45,6 +45,10 @@ _BEATEN = 200.0
 """Log evidence behind the best hypothesis from which another one cannot catch up: it is not begun again."""
 _SCREENED = 14
 """Hypotheses of one kind, generic or the rig's own, best first by their score, that are fitted in full."""
+_SCREENED_LAWS = 24
+"""The same of nonlinear laws in forces in time, where the base model fails: their score is that of a small size on top
+of a model that is bent to the data, and put a cubic spring of a chain of three, which explained all, fifteenth. Such a
+chain has eighteen of one size."""
 _SHORT, _ANNEALED = 8, 16
 """Steps of a short fit, and how many hypotheses, best first by it, are annealed where the base model fails though it
 has a partner for every mode. What led in the end was among the first eight of some sixty."""
@@ -173,6 +177,10 @@ def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], ne
     """
     out: set[str] = set()
     scored = [h for h in hypotheses if len(h.placed.effect.parameters) == 1 and h.label in promise]
+    if not near:
+        laws = [h.label for h in scored if h.begun and not h.placed.effect.linear]
+        out |= set(sorted(laws, key=lambda label: -promise[label].gain)[_SCREENED_LAWS:])
+        scored = [h for h in scored if h.label not in laws]
     for generic in (True, False) if near else (True,):
         order = sorted((h for h in scored if h.generic is generic), key=lambda h: -promise[h.label].gain)
         out |= {h.label for h in order[_SCREENED:]}

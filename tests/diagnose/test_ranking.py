@@ -51,8 +51,24 @@ def hypothesis(label: str, generic: bool = False, sizes: int = 1, extends: bool 
     )
 
 
+def law(label: str) -> Any:
+    """A nonlinear effect that is sought in forces in time."""
+    one = hypothesis(label, generic=True)
+    one.placed.effect.linear = False
+    one.begun = tuple(one.starts())
+    return one
+
+
 def score(gain: float, size: float = 0.0) -> Any:
     return SimpleNamespace(gain=gain, size=np.array([size]), std=1.0)
+
+
+def test_where_the_base_model_fails_laws_in_time_are_screened_among_themselves() -> None:
+    linear = [hypothesis(f"linear{k}", generic=True) for k in range(14)]
+    laws = [law(f"law{k}") for k in range(26)]
+    promise = {h.label: score(30.0 - k) for k, h in enumerate([*linear, *laws])}
+    assert _screened([*linear, *laws], promise, near=False) == [*linear, *laws[:24]]
+    assert _screened([*linear, *laws], promise, near=True) == linear
 
 
 def test_of_many_hypotheses_those_of_each_kind_are_fitted_that_promise_most() -> None:
