@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.inference import Residuals, tails
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
 from ema_pipeline.mechanics.terms import Matrices
+from ema_pipeline.observations.coinciding import directions, hidden_partners
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_pairing import paired, turned
 from ema_pipeline.observations.parts import DAMPING_SCATTER
@@ -271,10 +272,11 @@ class Comparison:
         on, alone = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
         to = match[on]
         slopes = ModeDerivatives.of(matrices, solution, to) if derivatives else None
+        hidden = hidden_partners(solution, to, np.count_nonzero(self.data.seen[on], axis=1))
         rows: tuple[Rows, ...] = (
             self._frequencies(solution, on, to, slopes),
             self._damping(solution, matrices, on, to, slopes),
-            self._shapes(solution, predicted, on, to, slopes),
+            self._shapes(solution, predicted, on, to, hidden, slopes),
         )
         if np.any(self.data.whirling[on]):
             rows += (self._complex_shapes(solution, on, to, slopes),)
@@ -284,7 +286,9 @@ class Comparison:
             log_scale=self._usual(alone) if len(alone) else 0.0,
             penalty=UNEXPLAINED * len(alone) + UNSEEN * self._unseen(solution, to),
             unexplained=int(np.sum(~self.data.double[alone])),
-            projected=len(on) + int(np.sum(self.data.whirling[on])) if self.data.shapes.shape[1] else 0,
+            projected=len(on) + int(np.sum(self.data.whirling[on] | (hidden >= 0)))
+            if self.data.shapes.shape[1]
+            else 0,
         )
 
     def seen(self, solution: EigenSolution) -> NDArray[np.float64]:
@@ -384,9 +388,12 @@ class Comparison:
         predicted: NDArray[np.float64],
         on: NDArray[np.int64],
         to: NDArray[np.int64],
+        hidden: NDArray[np.int64],
         slopes: ModeDerivatives | None,
     ) -> Rows:
-        """Shapes with the factor projected out that fits them best; none of whirling modes."""
+        """Shapes with the factor projected out that fits them best, and what coinciding modes add; none of whirling
+        modes.
+        """
         d, real = self.data, np.flatnonzero(~self.data.whirling[on])
         on, to = on[real], to[real]
         p = predicted[:, to].T
@@ -412,12 +419,16 @@ class Comparison:
             for k, other, unknown in mixed:
                 along = d.known_shapes[other]
                 slope[k, :, unknown] += along - p[k] * (weighted[k] @ along) / squared[k]
-            slope = slope[seen]
-        difference = (y - scale[:, None] * p)[seen]
+        difference = y - scale[:, None] * p
+        for k, along in directions(hidden[real], predicted, p, weight):
+            difference[k] -= along * (weight[k] @ (along * difference[k]))
+            if slope is not None:
+                slope[k] -= along[:, None] * ((weight[k] * along) @ slope[k])
         mode, sensor = np.nonzero(seen)
+        slope = None if slope is None else slope[seen]
         return Rows(
-            difference, own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode], sensor, d.close[on[mode]],
-            slope, noise=SHAPE_NOISE,
+            difference[seen], own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode], sensor,
+            d.close[on[mode]], slope, noise=SHAPE_NOISE,
         )  # fmt: skip
 
     def _mixed(self, on: NDArray[np.int64]) -> list[tuple[int, int, int]]:

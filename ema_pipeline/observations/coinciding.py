@@ -1,0 +1,72 @@
+"""Modes of the model that coincide with a paired one and have no measured partner: the measured shape holds of both.
+
+Of two modes closer than a half-width a test with one reference shows one, whose shape is any mix of the two. So is the
+shape of a repeated mode. What the second one can explain is projected out of the differences.
+
+References
+----------
+L. Kaufman, A variable projection method for solving separable nonlinear least squares problems, BIT 15 (1975) 49-57:
+derivatives of what is left without those of the projection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
+
+_FEWEST_SENSORS = 4
+"""Sensors without which two shapes explain nearly any third one."""
+_ALONG = 1e-6
+"""Share of a shape's weighted squares that it must have of its own beside the paired one."""
+
+Real = NDArray[np.float64]
+
+
+def hidden_partners(
+    solution: EigenSolution, to: NDArray[np.int64], sensors: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Nearest mode without a partner within a half-width of each paired one, -1 for none, (k,).
+
+    Parameters
+    ----------
+    solution : EigenSolution
+    to : ndarray of int, (k,)
+        Modes of the model that have a measured partner.
+    sensors : ndarray of int, (k,)
+        At how many sensors the shapes of these partners were measured.
+    """
+    hz, width = solution.frequency_hz, solution.damping_ratio * solution.frequency_hz
+    distance = np.abs(hz[to, None] - hz)
+    distance[:, to] = np.inf
+    near = (distance < np.nan_to_num(width)[to, None]) & (sensors >= _FEWEST_SENSORS)[:, None]
+    distance[~near] = np.inf
+    nearest = np.argmin(distance, axis=1) if distance.size else np.zeros(len(to), np.int64)
+    return np.asarray(np.where(np.isfinite(distance[np.arange(len(to)), nearest]), nearest, -1), np.int64)
+
+
+def directions(
+    partners: NDArray[np.int64], predicted: Real, paired: Real, weight: Real
+) -> Iterator[tuple[int, Real]]:
+    """Place of every shape with a hidden partner, and what that adds to the paired one, (s,), of weighted length 1.
+
+    Parameters
+    ----------
+    partners : ndarray of int, (k,)
+    predicted : ndarray, (s, n)
+        What the sensors read of all modes.
+    paired : ndarray, (k, s)
+        The same of the paired ones.
+    weight : ndarray, (k, s)
+        One over the variance of each entry; 0 where not measured.
+    """
+    for k in np.flatnonzero(partners >= 0):
+        own, other = paired[k], predicted[:, partners[k]]
+        squares = float(weight[k] @ other**2)
+        across = other - own * (weight[k] @ (own * other)) / max(float(weight[k] @ own**2), 1e-300)
+        left = float(weight[k] @ across**2)
+        if left > _ALONG * squares > 0:
+            yield int(k), across / np.sqrt(left)

@@ -1,0 +1,88 @@
+"""Modes of the model that coincide with a paired one: one measured shape holds of both."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.dof import Dof
+from ema_pipeline.observations.coinciding import directions, hidden_partners
+from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.modes import ModeObservations
+from ema_pipeline.rigs import load_rig
+from ema_pipeline.rigs.types import Rig
+
+
+def solution(hz: list[float], ratio: float = 0.01) -> Any:
+    return SimpleNamespace(frequency_hz=np.array(hz), damping_ratio=np.full(len(hz), ratio))
+
+
+@pytest.mark.parametrize(
+    ("hz", "to", "sensors", "found"),
+    [
+        ([100.0, 100.9, 150.0], [0, 2], [6, 6], [1, -1]),  # within a half-width of 1 Hz
+        ([100.0, 101.1, 150.0], [0, 2], [6, 6], [-1, -1]),
+        ([100.0, 100.9, 150.0], [0, 1, 2], [6, 6, 6], [-1, -1, -1]),  # it has a partner of its own
+        ([100.0, 100.9, 99.5], [0], [6], [2]),  # the nearest
+        ([100.0, 100.9, 150.0], [0], [3], [-1]),  # two shapes explain any third one at three sensors
+        ([100.0], [], [], []),
+    ],
+)
+def test_a_hidden_partner_lies_within_a_half_width_and_has_no_measured_mode(
+    hz: list[float], to: list[int], sensors: list[int], found: list[int]
+) -> None:
+    got = hidden_partners(solution(hz), np.array(to, int), np.array(sensors, int))
+    assert got.tolist() == found
+
+
+def test_what_a_hidden_partner_adds_is_across_the_paired_shape_and_of_weighted_length_one() -> None:
+    random = np.random.default_rng(0)
+    predicted, weight = random.standard_normal((6, 3)), random.uniform(1, 4, (2, 6))
+    paired = predicted[:, [0, 2]].T
+    ((place, along),) = directions(np.array([1, -1]), predicted, paired, weight)
+    assert place == 0
+    assert weight[0] @ (along * paired[0]) == pytest.approx(0, abs=1e-12)
+    assert weight[0] @ along**2 == pytest.approx(1)
+    predicted[:, 1] = -2 * predicted[:, 0]  # the same shape adds nothing
+    assert not list(directions(np.array([1, -1]), predicted, paired, weight))
+
+
+def twin_beam(folder: Path) -> Rig:
+    """Three masses in a row that move in x and y nearly alike: every mode has a twin within a tenth of its width."""
+    lines = ['name = "twin"', "modal_damping_ratio = 0.01"]
+    for d, stiffness in (("x", 1e6), ("y", 1.002e6)):
+        for k in (1, 2, 3):
+            lines += ["[[masses]]", f'at = "m{k}.{d}"', "value = 1.0", "[[springs]]", f"value = {stiffness}"]
+            lines += [f'at = "m1.{d}"' if k == 1 else f'between = ["m{k - 1}.{d}", "m{k}.{d}"]']
+    (folder / "rig.toml").write_text("\n".join(lines), encoding="utf-8")
+    return load_rig(folder / "rig.toml")
+
+
+def test_the_one_measured_shape_of_two_modes_may_be_any_mix_of_them(tmp_path: Path) -> None:
+    rig = twin_beam(tmp_path)
+    (configuration,) = rig.configurations
+    dofs = tuple(Dof.parse(f"m{k}.{d}") for k in (1, 2, 3) for d in "xy")
+    beam = np.linalg.eigh(np.array([[2.0, -1, 0], [-1, 2, -1], [0, -1, 1]]))
+    f = np.sqrt(1e6 * beam.eigenvalues) / (2 * np.pi)
+    mixed = np.stack([0.8 * beam.eigenvectors.T, 0.6 * beam.eigenvectors.T], axis=-1).reshape(3, 6)
+    measured = MeasuredModes(
+        configuration, f, 1e-3 * f, np.full(3, 0.01), np.full(3, 1e-4), mixed.astype(complex),
+        np.full((3, 6), 1e-3), dofs, band_hz=(1.0, 500.0),
+    )  # fmt: skip
+    problem = ModeObservations(rig, [prepare(measured)]).problem((), {})
+    scatters = {n: s.default for n, s in problem.observations.scatters.items()}
+    found = problem.residuals(problem.start(), scatters)
+    assert found.unexplained == 0
+    assert found.projected == 6  # a factor and a share of the twin, of three shapes
+    assert np.max(found.blocks[0]) < 0.1
+    bent = mixed.copy()
+    bent[0, 0] += 0.3  # no mix of the two
+    wrong = replace(measured, shapes=bent.astype(complex))
+    left = ModeObservations(rig, [prepare(wrong)]).problem((), {}).residuals(problem.start(), scatters)
+    assert left.blocks[0][0] > 20
