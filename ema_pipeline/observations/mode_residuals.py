@@ -272,7 +272,9 @@ class Comparison:
         on, alone = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
         to = match[on]
         slopes = ModeDerivatives.of(matrices, solution, to) if derivatives else None
-        hidden = hidden_partners(solution, to, np.count_nonzero(self.data.seen[on], axis=1))
+        # what was held out has been measured: its neighbour's shape holds none of it
+        sensors = np.count_nonzero(self.data.seen[on], axis=1) * self.data.complete
+        hidden = hidden_partners(solution, to, sensors)
         rows: tuple[Rows, ...] = (
             self._frequencies(solution, on, to, slopes),
             self._damping(solution, matrices, on, to, slopes),
