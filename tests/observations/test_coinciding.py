@@ -82,7 +82,9 @@ def test_the_one_measured_shape_of_two_modes_may_be_any_mix_of_them(tmp_path: Pa
     assert found.projected == 6  # a factor and a share of the twin, of three shapes
     assert np.max(found.blocks[0]) < 0.1
     some = ModeObservations(rig, [prepare(replace(measured, band_hz=None))]).problem((), {})
-    assert some.residuals(some.start(), scatters).projected == 3  # a list that does not say that there are no others
+    assert (
+        some.residuals(some.start(), scatters).projected == 3
+    )  # a list that does not say that there are no others
     bent = mixed.copy()
     bent[0, 0] += 0.3  # no mix of the two
     wrong = replace(measured, shapes=bent.astype(complex))
