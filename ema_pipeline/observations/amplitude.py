@@ -22,12 +22,8 @@ from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
 from ema_pipeline.mechanics.laws import Nonlinear, Spring
 from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.observations.hit_modes import HitData, Linear, comparable, shifted_poles
-from ema_pipeline.observations.mode_residuals import (
-    FREQUENCY,
-    FREQUENCY_NOISE,
-    SHAPE,
-    stacked,
-)
+from ema_pipeline.observations.mode_residuals import FREQUENCY, FREQUENCY_NOISE, SHAPE
+from ema_pipeline.observations.mode_rows import stacked
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem, Paired
 from ema_pipeline.observations.parts import DAMPING_SCATTER, part_key
 from ema_pipeline.observations.rig_model import LOG_STD, RigModel, SizeMap

@@ -32,8 +32,8 @@ from ema_pipeline.observations.mode_residuals import (
     SHAPE_NOISE,
     Comparison,
     Sensing,
-    stacked,
 )
+from ema_pipeline.observations.mode_rows import stacked
 from ema_pipeline.observations.parts import (
     DAMPING_SCATTER,
     MASS_SCATTER,

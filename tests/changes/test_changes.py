@@ -16,7 +16,7 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.job import run_raw
 from ema_pipeline.observations.fitting import Model, fit_base
-from ema_pipeline.observations.mode_residuals import Rows
+from ema_pipeline.observations.mode_rows import Rows
 from ema_pipeline.observations.pair import _conditional
 
 TESTS = {"before": (1, ()), "again": (2, ()), "after": (3, ("mass@m2:mass=0.06",))}
