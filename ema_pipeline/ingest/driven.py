@@ -36,8 +36,9 @@ _PILED_UP, _OVER_NEXT = 10, 4
 """Samples at the very limit, and how many times those of the next value below it, from which a record is clipped: of a
 steady vibration in steps of a converter they are 1.4 times those, of a random one fewer."""
 
-_NEAR_LIMIT = 0.9
-"""Share of the limit above which the next values are looked for."""
+_NEAR_LIMIT, _JUST_BELOW = 0.9, 0.99
+"""Shares of the limit above which the next value is looked for, and above which other samples count as it does: a sine
+that was computed may reach its amplitude exactly many times, and nearly so a hundred times as often."""
 
 CLIPPED_SHARE = 0.85
 """Share of samples near the top that lie at the very top: 0.5 for smooth peaks, 1 for clipped ones."""
@@ -274,9 +275,10 @@ def _piled_up(samples: NDArray[np.float64]) -> bool:
     """
     middle = float(np.median(samples))
     for signal in (samples - middle, middle - samples):
-        top = signal[signal >= _NEAR_LIMIT * np.max(signal)]
-        _, counts = np.unique(top, return_counts=True)
-        if counts[-1] >= _PILED_UP and len(counts) > 1 and counts[-1] > _OVER_NEXT * counts[-2]:
+        limit = float(np.max(signal))
+        _, counts = np.unique(signal[signal >= _NEAR_LIMIT * limit], return_counts=True)
+        below = np.count_nonzero((signal >= _JUST_BELOW * limit) & (signal < limit))
+        if len(counts) > 1 and counts[-1] >= _PILED_UP and counts[-1] > _OVER_NEXT * max(counts[-2], below):
             return True
     return False
 

@@ -152,6 +152,9 @@ def test_signals_in_steps_of_a_converter_are_not_clipped(steps: int) -> None:
     noise = np.round(steps / 4 * np.random.default_rng(4).standard_normal(20_000))
     assert not _piled_up(sine)
     assert not _piled_up(noise)
+    computed = np.sin(np.random.default_rng(5).uniform(0, 2 * np.pi, 20_000))
+    computed[::700] = 1.0  # a sweep whose samples meet its amplitude exactly now and then
+    assert not _piled_up(computed)
     assert _piled_up(np.clip(sine, -np.inf, 0.6 * steps))
 
 
