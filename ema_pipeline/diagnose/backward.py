@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from ema_pipeline.diagnose.claims import Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.parallel import spread
@@ -116,7 +114,7 @@ def _fitted(
     """A model begun at a fit nearby, a rival at its own sizes; scatters learned."""
     model = _with(known, effects)
     problem = model.problem(observations)
-    x = transferred(near.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+    x = transferred(near.posterior, problem.unknowns)
     if rival is not None:
         sizes = rival.ranked.fit.posterior
         for p in rival.hypothesis.placed.effect.parameters:

@@ -127,7 +127,7 @@ class _Shown:
         `gains` is None for an effect that the fit has already: its gain is that on top of the rig without it.
         """
         problem, scatters = model.problem(observations), fit.posterior.scatters
-        null = transferred(fit.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+        null = transferred(fit.posterior, problem.unknowns)
         size = hypothesis.placed.effect.parameters[0].name
         at = problem.unknowns.index[hypothesis.placed.parameter_name(size)]
         null[at] = 0.0

@@ -55,7 +55,7 @@ def held_out(observations: Observations, fit: Fit) -> HeldOut:
 def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, int, float]:
     """Sum of squares, its number of terms, and log density of one part."""
     problem = fit.model.problem(out)
-    x = transferred(trained, problem.unknowns, np.zeros(len(problem.unknowns)))
+    x = transferred(trained, problem.unknowns)
     found = problem.residuals(x, trained.scatters)
     if not np.all(np.isfinite(found.values)):
         return 0.0, 0, -np.inf

@@ -149,7 +149,7 @@ def rank(
     settled = base if stuck else learned(observations, base)
     near = not stuck and not np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT))
     chosen = _screened(hypotheses, promise, near)
-    # A few steps do not lead a mode to the measured one that no other model has: neither they nor scores tell of it.
+    # A few steps do not lead a mode of the model to a measured one that has no partner yet.
     short = stuck and not lost
     first = _short_fits(observations, base, models, promise, chosen, processes) if short else {}
     asked = [h for h in chosen if h.label not in first]
@@ -219,7 +219,7 @@ def _at_score(
 ) -> NDArray[np.float64]:
     """The base model's fit with half of the size that the score tells, (n,)."""
     unknowns = model.problem(observations).unknowns
-    x = transferred(base.posterior, unknowns, np.zeros(len(unknowns)))
+    x = transferred(base.posterior, unknowns)
     placed = hypothesis.placed
     at = unknowns.index[placed.parameter_name(placed.effect.parameters[0].name)]
     x[at] = float(np.clip(0.5 * score.size[0], -1.0, 1.0))
@@ -259,7 +259,7 @@ def _annealed_fit(
         return begun
     schedule = _UNHEATED if hypothesis.begun else _FROM_GRID if hypothesis.size_cannot_be_zero else QUICK
     problem = model.problem(observations)
-    begin = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+    begin = transferred(base.posterior, problem.unknowns)
     starts = _starts(observations, problem, hypothesis, begin, promise.get(hypothesis.label))
     return annealed(observations, model, starts, schedule).posterior
 
@@ -267,7 +267,7 @@ def _annealed_fit(
 def _begun(observations: Observations, base: Fit, model: Model) -> Posterior | None:
     """The fit begun where the data themselves tell it to; None where they do not."""
     problem = model.problem(observations)
-    begin = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+    begin = transferred(base.posterior, problem.unknowns)
     begun = problem.begun(begin, base.posterior.scatters)
     return None if begun is None else refined(observations, model, begun).posterior
 
@@ -357,7 +357,7 @@ def _free(observations: Observations, fit: Fit) -> Posterior:
 def _on(observations: Observations, model: Model, source: Fit, sizes: Fit) -> np.ndarray:
     """Everything that `source` knows, and the effects' sizes of `sizes`."""
     problem = model.problem(observations)
-    x = transferred(sizes.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+    x = transferred(sizes.posterior, problem.unknowns)
     moved = transferred(source.posterior, problem.unknowns, x)
     for name in problem.sizes:
         i = problem.unknowns.index[name]
@@ -398,7 +398,7 @@ def _promising(
     for score in best[:count]:  # what the scatters took up promises little, and gains it back
         model = models[score.hypothesis.label]
         unknowns = model.problem(observations).unknowns
-        x = transferred(settled.posterior, unknowns, np.zeros(len(unknowns)))
+        x = transferred(settled.posterior, unknowns)
         placed = score.hypothesis.placed
         for parameter, size in zip(placed.effect.parameters, score.size, strict=True):
             x[unknowns.index[placed.parameter_name(parameter.name)]] = size

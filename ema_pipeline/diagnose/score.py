@@ -64,7 +64,7 @@ def scores(
         model = models[hypothesis.label] if models else base.model.plus(hypothesis.placed, hypothesis.scales)
         problem = model.problem(observations)
         names = [n for n in problem.unknowns.names if effect_of(n) == hypothesis.label]
-        start = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+        start = transferred(base.posterior, problem.unknowns)
         at = [problem.unknowns.index[n] for n in names]
         residuals = problem.residuals(
             start, base.posterior.scatters, matching=base.posterior.residuals.matching

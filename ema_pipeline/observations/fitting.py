@@ -121,10 +121,10 @@ class Fit:
 
 
 def transferred(
-    posterior: Posterior, unknowns: Unknowns, otherwise: NDArray[np.float64]
+    posterior: Posterior, unknowns: Unknowns, otherwise: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Values of unknowns that have the same names, `otherwise` for the rest, (n,)."""
-    x = otherwise.copy()
+    """Values of unknowns that have the same names, `otherwise` for the rest, or zero, (n,)."""
+    x = np.zeros(len(unknowns)) if otherwise is None else otherwise.copy()
     known = posterior.unknowns.index
     for i, name in enumerate(unknowns.names):
         if name in known:
