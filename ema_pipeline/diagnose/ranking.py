@@ -7,7 +7,7 @@ else.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -41,7 +41,7 @@ FINALISTS = 5
 _UNBENT = 3.0
 """Standard deviations of parts, as the scatter is learned, up to which the base model has not bent them to the data: on
 top of a bent part everything promises much."""
-_BEATEN = 200.0
+BEATEN = 200.0
 """Log evidence behind the best hypothesis from which another one cannot catch up: it is not begun again."""
 _SCREENED = 14
 """Hypotheses of one kind, generic or the rig's own, best first by their score, that are fitted in full."""
@@ -146,8 +146,8 @@ def rank(
     hypotheses = [h for h in hypotheses if h.label not in promise or promise[h.label].std < UNSEEN]
     lost = base.posterior.residuals.penalty > unpaired
     stuck = lost or base.posterior.error > _EXPLAINED
-    settled = base if stuck else learned(observations, base)
-    near = not stuck and not np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT))
+    settled = None if stuck else learned(observations, base)
+    near = settled is not None and not np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT))
     chosen = _screened(hypotheses, promise, near)
     # A few steps do not lead a mode of the model to a measured one that has no partner yet.
     short = stuck and not lost
@@ -159,14 +159,16 @@ def rank(
         progress(0.6 * (i + 1) / len(asked), hypothesis.label)
     found = {h.label: (h, Fit(models[h.label], first[h.label])) for h in chosen}
     if not near:
-        base, found = _begun_again(observations, base, found, processes, len(found), steps=5)
-    found = _bettered(found, CONTENDERS, partial(_free, observations), processes)
-    base, found = _begun_again(observations, base, found, processes, CONTENDERS, steps=12)
+        base, found = _begun_again(observations, base, found, processes, found, steps=5)
+    found = _bettered(found, _contenders(found), partial(_free, observations), processes)
+    base, found = _begun_again(observations, base, found, processes, _contenders(found), steps=12)
     progress(0.8, "scatter of parts and channels")
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     others = [h for h in hypotheses if h.label not in {best.label for best, _ in order[:FINALISTS]}]
-    promising = _promising(observations, settled, others, models, further) if near else []
-    return _finals(observations, base, order, promising, processes)
+    if settled is None or not near:
+        return _finals(observations, base, order, (), True, processes)
+    promising = _promising(observations, settled, others, models, further)
+    return _finals(observations, settled, order, promising, False, processes)
 
 
 def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], near: bool) -> list[Hypothesis]:
@@ -331,9 +333,14 @@ Found = dict[str, tuple[Hypothesis, Fit]]
 
 
 def _begun_again(
-    observations: Observations, base: Fit, found: Found, processes: int | None, contenders: int, steps: int
+    observations: Observations,
+    base: Fit,
+    found: Found,
+    processes: int | None,
+    contenders: Collection[str],
+    steps: int,
 ) -> tuple[Fit, Found]:
-    """The base model and the best hypotheses, begun at what the best of all knows of everything else."""
+    """The base model and some hypotheses, begun at what the best of all knows of everything else."""
     top = max((f for _, f in found.values()), key=lambda f: f.log_evidence, default=base)
     again = refined(observations, base.model, _on(observations, base.model, top, base), steps=20)
     if again.log_evidence > base.log_evidence:
@@ -342,9 +349,17 @@ def _begun_again(
     return base, _bettered(found, contenders, job, processes)
 
 
-def _bettered(found: Found, count: int, job: Callable[[Fit], Posterior], processes: int | None) -> Found:
-    """The hypotheses, the best `count` of them with what `job` makes of their fits."""
-    items = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)[:count]
+def _contenders(found: Found) -> list[str]:
+    """The best hypotheses, and none that is beaten."""
+    best = sorted(found, key=lambda label: -found[label][1].log_evidence)[:CONTENDERS]
+    return [h for h in best if found[h][1].log_evidence >= found[best[0]][1].log_evidence - BEATEN]
+
+
+def _bettered(
+    found: Found, contenders: Collection[str], job: Callable[[Fit], Posterior], processes: int | None
+) -> Found:
+    """The hypotheses, some of them with what `job` makes of their fits."""
+    items = [found[label] for label in contenders]
     better = _spread_fits(job, [fit for _, fit in items], processes)
     return found | {h.label: (h, fit) for (h, _), fit in zip(items, better, strict=True)}
 
@@ -412,16 +427,20 @@ def _finals(
     base: Fit,
     order: Sequence[tuple[Hypothesis, Fit]],
     promising: Sequence[tuple[Hypothesis, Fit]],
+    past_barriers: bool,
     processes: int | None,
 ) -> Ranking:
-    """Scatters learned for the base model and the best hypotheses, each from what the others know."""
+    """Scatters learned for the base model and the best hypotheses, each from what the others know.
+
+    Hypotheses that begin beside a base model that explains the data are past the barriers that it was led past.
+    """
     best, rest = order[:FINALISTS], order[FINALISTS:]
-    near = [pair for pair in best if pair[1].log_evidence >= best[0][1].log_evidence - _BEATEN]
+    near = [pair for pair in best if pair[1].log_evidence >= best[0][1].log_evidence - BEATEN]
     far = best[len(near) :]
     finalists = [*near, *promising]
-    fits = [base, *(fit for _, fit in (*finalists, *far))]
-    fits = _spread_fits(partial(_learned, observations), fits, processes)
-    first, beaten = fits[: 1 + len(finalists)], fits[1 + len(finalists) :]
+    fits = [base, *(fit for _, fit in finalists)]
+    first = _spread_fits(partial(_learned, observations, past_barriers), fits, processes)
+    beaten = _spread_fits(partial(_learned, observations, False), [fit for _, fit in far], processes)
     leaders = sorted(first[1:], key=lambda f: -f.log_evidence)
     job = partial(_crossed, observations, (first[0], *leaders[:2]))
     final_base, *again = _spread_fits(job, first, processes)
@@ -441,8 +460,8 @@ def _finals(
     return Ranking(final_base, (*finals, *others))
 
 
-def _learned(observations: Observations, fit: Fit) -> Posterior:
-    return learned(observations, fit).posterior
+def _learned(observations: Observations, past_barriers: bool, fit: Fit) -> Posterior:
+    return learned(observations, fit, past_barriers).posterior
 
 
 def _crossed(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:
@@ -457,6 +476,6 @@ def _crossed(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Po
         )
         here = refined(observations, fit.model, best.posterior.x, scatters, steps=4)
         if start.log_evidence > here.log_evidence + _BETTER:
-            again = learned(observations, start)
+            again = learned(observations, start, past_barriers=False)
             best = max(best, again, key=lambda f: f.log_evidence)
     return best.posterior

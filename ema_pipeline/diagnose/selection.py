@@ -10,7 +10,7 @@ from ema_pipeline.diagnose.backward import reconsidered
 from ema_pipeline.diagnose.claims import Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.probability import NOTHING, probabilities
-from ema_pipeline.diagnose.ranking import CONTENDERS, Ranking, rank
+from ema_pipeline.diagnose.ranking import BEATEN, CONTENDERS, Ranking, rank
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, fit_base
@@ -128,7 +128,8 @@ def select(
         added = next(j for j in near if j.claimed)  # a rival alone does not pass the conditions of a claim
         suited = observations.suited(added.ranked.fit.model.effects)
         if suited is not observations:
-            leading = [r.hypothesis for r in ranking.ranked[:CONTENDERS]]
+            best = ranking.ranked[0].gain
+            leading = [r.hypothesis for r in ranking.ranked[:CONTENDERS] if r.gain >= best - BEATEN]
             return select(suited, known, hypotheses, settings, progress, leading)
         claimed.append(added)
         rivals[added.hypothesis.label] = rounds[-1].judged

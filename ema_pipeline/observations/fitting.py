@@ -194,13 +194,15 @@ def freed(observations: Observations, fit: Fit) -> Fit:
     return fit
 
 
-def learned(observations: Observations, fit: Fit) -> Fit:
+def learned(observations: Observations, fit: Fit, past_barriers: bool = True) -> Fit:
     """The fit with scatters learned, beginning at the stated ones where none were learned before."""
     problem = fit.model.problem(observations)
     known = fit.posterior.scatters
     scatters = {n: s.default if known[n] == s.start else known[n] for n, s in observations.scatters.items()}
     start = descend(problem, scatters, fit.posterior.x, steps=10)
     found = replace(fit, posterior=learn(problem, start, observations.scatters))
+    if not past_barriers:
+        return found
     free = freed(observations, found)  # a barrier that was low while scatters were wide
     if free is found:
         return found
