@@ -124,14 +124,25 @@ class ModeDerivatives:
     damping_ratio : ndarray, (m, n)
     shapes : ndarray, (n_dofs, m, n)
         Complex where damping or an effect turns them; else those of the undamped ones.
+    reduced : ndarray, (m, m, n)
+        Of what the matrices are between modes of one group, whose diagonal holds their eigenvalues; 0 elsewhere. The
+        shapes of a group then stay in their place: between close modes a rotation is no linear function of anything,
+        while this matrix is.
     """
 
     log_frequency: NDArray[np.float64]
     damping_ratio: NDArray[np.float64]
     shapes: NDArray[np.float64] | NDArray[np.complex128]
+    reduced: NDArray[np.float64]
 
     @classmethod
-    def of(cls, matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64]) -> ModeDerivatives:
+    def of(
+        cls,
+        matrices: Matrices,
+        solution: EigenSolution,
+        modes: NDArray[np.int64],
+        group: NDArray[np.int64] | None = None,
+    ) -> ModeDerivatives:
         """Derivatives of the modes with these indices.
 
         Parameters
@@ -140,16 +151,22 @@ class ModeDerivatives:
         solution : EigenSolution
             Their modes.
         modes : ndarray of int, (m,)
+        group : ndarray of int, (m,), optional
+            Modes with the same number are of one group; those with -1 are of none, as all are where it is left out.
         """
+        group = np.full(len(modes), -1) if group is None else group
         if solution.damped is not None:
-            return cls._damped(matrices, solution, solution.damped, modes)
+            return cls._damped(matrices, solution, solution.damped, modes, group)
         if np.any(matrices.skew_by_shape):  # of no size yet, but shapes lag behind with it
             damped = DampedModes.uncoupled(solution.frequency_hz, solution.damping_ratio, solution.shapes)
-            return cls._damped(matrices, solution, damped, modes)
-        log_frequency, weight = _undamped(matrices, solution, modes)
+            return cls._damped(matrices, solution, damped, modes, group)
+        log_frequency, weight, reduced = _undamped(matrices, solution, modes, group)
         ratio = _damping(matrices, solution, modes, log_frequency, weight)
-        log_frequency, ratio, weight = _with_ratios(matrices, modes, log_frequency, ratio, weight)
-        return cls(log_frequency.T, ratio.T, (solution.shapes @ weight).transpose(1, 2, 0))
+        log_frequency, ratio, weight, reduced = _with_ratios(
+            matrices, modes, log_frequency, ratio, weight, reduced
+        )
+        shapes = (solution.shapes @ weight).transpose(1, 2, 0)
+        return cls(log_frequency.T, ratio.T, shapes, reduced.transpose(1, 2, 0))
 
     @classmethod
     def _damped(
@@ -158,9 +175,10 @@ class ModeDerivatives:
         solution: EigenSolution,
         damped: DampedModes,
         modes: NDArray[np.int64],
+        group: NDArray[np.int64],
     ) -> ModeDerivatives:
         omega, phi = np.sqrt(solution.eigenvalues), solution.shapes
-        bare, weight = _undamped(matrices, solution, modes)
+        bare, weight, reduced = _undamped(matrices, solution, modes, group)
         log_frequency, ratio = damped.derivatives(matrices, modes, bare, weight, omega)
         turned = [k for k, r in enumerate(modes.tolist()) if damped.turned(r)]
         skew = np.flatnonzero(np.any(matrices.skew_by_shape, axis=(1, 2)))
@@ -172,21 +190,25 @@ class ModeDerivatives:
             shapes[at + j] += (
                 phi @ damped.lag(phi.T @ matrices.skew_by_shape[j] @ phi, solution.eigenvalues)[:, modes]
             )
-        log_frequency, ratio, shapes = _with_ratios(matrices, modes, log_frequency, ratio, shapes)
+        log_frequency, ratio, shapes, reduced = _with_ratios(
+            matrices, modes, log_frequency, ratio, shapes, reduced
+        )
         if turned:
-            bare, weight = _undamped(matrices, solution, np.arange(len(omega)))
+            bare, weight, _ = _undamped(matrices, solution, np.arange(len(omega)), np.full(len(omega), -1))
             count = len(weight)
             order = [*range(at), *range(count, count + len(matrices.damping_log)), *range(at, count)]
             own = damped.derivatives_of(modes[turned], matrices, phi, omega, bare, weight)
             log_frequency[:, turned], ratio[:, turned] = own[0][:, order].T, own[1][:, order].T
             shapes[:, :, turned] = own[2][:, :, order].transpose(2, 1, 0)
-        return cls(log_frequency.T, ratio.T, shapes.transpose(1, 2, 0))
+        return cls(log_frequency.T, ratio.T, shapes.transpose(1, 2, 0), reduced.transpose(1, 2, 0))
 
 
 def _undamped(
-    matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Derivatives of ln f of undamped modes, (n_unknowns, m), and of shapes as shares of all, (n_unknowns, n, m)."""
+    matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64], group: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Derivatives of ln f of undamped modes, (n_unknowns, m), of shapes as shares of all, (n_unknowns, n, m), and of
+    the matrix between modes of a group, (n_unknowns, m, m).
+    """
     stiffness, mass = (_forms(matrices, solution, modes, kind) for kind in (STIFFNESS, MASS))
     values = solution.eigenvalues[modes]
     apart = values[None, :] - solution.eigenvalues[:, None]
@@ -195,7 +217,12 @@ def _undamped(
     here = np.arange(len(modes))
     own = stiffness[:, modes, here] - values * mass[:, modes, here]
     weight[:, modes, here] = -0.5 * mass[:, modes, here]
-    return own / (2 * values), weight
+    reduced = np.zeros((len(weight), len(modes), len(modes)))
+    a, b = np.nonzero((group[:, None] == group) & (group[:, None] >= 0))
+    between = mass[:, modes[a], b]
+    reduced[:, a, b] = stiffness[:, modes[a], b] - 0.5 * (values[a] + values[b]) * between
+    weight[:, modes[a], b] = -0.5 * between
+    return own / (2 * values), weight, reduced
 
 
 def _with_ratios(
@@ -204,11 +231,12 @@ def _with_ratios(
     log_frequency: NDArray[np.float64],
     ratio: NDArray[np.float64],
     shapes: NDArray[T],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[T]]:
+    reduced: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[T], NDArray[np.float64]]:
     """Derivatives, unknowns first, with those by the damping ratios of undamped modes, which come after the logs."""
     at, logs = matrices.terms.log.shape[1], matrices.damping_log
     if not len(logs):
-        return log_frequency, ratio, shapes
+        return log_frequency, ratio, shapes, reduced
 
     def inserted(array: NDArray[Any], rows: NDArray[np.float64] | float) -> NDArray[Any]:
         new = np.zeros((len(logs), *array.shape[1:]), array.dtype)
@@ -216,7 +244,7 @@ def _with_ratios(
         return np.concatenate([array[:at], new, array[at:]])
 
     own = logs[:, modes] * matrices.damping_ratio[modes]
-    return inserted(log_frequency, 0.0), inserted(ratio, own), inserted(shapes, 0.0)
+    return inserted(log_frequency, 0.0), inserted(ratio, own), inserted(shapes, 0.0), inserted(reduced, 0.0)
 
 
 def _forms(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -25,6 +26,13 @@ _CLOSE = 3.0
 """Half-power bandwidths within which modes are close: further apart, one is below a sixth of its peak at another's."""
 _OVERLAP = 6.0
 """Half-widths within which one mode's shape may hold some of another's."""
+
+_CHAIN = 0.03
+"""Difference of ln f up to which neighbours are of one group."""
+_MOST = 4
+"""Most modes of a group; a longer chain is cut at its widest gaps."""
+_SENSORS = 2
+"""Sensors per mode of a group that tell its shapes apart."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +148,20 @@ class ModeData:
                     pairs.append((int(a), int(b), float(1 / np.hypot(1.0, apart))))
         return tuple(pairs)
 
+    @cached_property
+    def group(self) -> NDArray[np.int64]:
+        """Number of the group of neighbours that every mode is compared in, -1 for one that is alone, (m,).
+
+        Modes without a real shape of their own are alone: `double` ones and those that whirl.
+        """
+        group = np.full(len(self), -1)
+        usable = np.flatnonzero(~self.double & ~self.whirling & np.any(self.seen > 0, axis=1))
+        order = usable[np.argsort(self.log_frequency[usable])]
+        for number, members in enumerate(_chains(order, self.log_frequency)):
+            if len(members) > 1 and np.all(np.sum(self.seen[members], axis=1) >= _SENSORS * len(members)):
+                group[members] = number
+        return group
+
     def shape_rows(self, modes: NDArray[np.int64]) -> int:
         """Number of values that the shapes of some modes are compared by: two per sensor of a whirling mode."""
         return int(np.sum(self.seen[modes] * (1 + self.whirling[modes, None])))
@@ -162,6 +184,17 @@ class ModeData:
         imaginary = None if self.imaginary is None else self.imaginary[keep]
         kept = {n: getattr(self, n)[keep] for n in names}
         return dataclasses.replace(self, complete=False, imaginary=imaginary, **kept)
+
+
+def _chains(order: NDArray[np.int64], log_frequency: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
+    """Modes in the order of their frequencies, cut where neighbours are far apart."""
+    gaps = np.diff(log_frequency[order])
+    widest = int(np.argmax(gaps)) if len(gaps) else 0
+    if len(gaps) and (gaps[widest] > _CHAIN or len(order) > _MOST):
+        yield from _chains(order[: widest + 1], log_frequency)
+        yield from _chains(order[widest + 1 :], log_frequency)
+    else:
+        yield order
 
 
 def _known_or(std: NDArray[np.float64], assumed: float) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.inference import Residuals, tails
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
 from ema_pipeline.mechanics.terms import Matrices
+from ema_pipeline.observations.close_modes import Group, Slopes, straightened
 from ema_pipeline.observations.coinciding import directions, hidden_partners
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_pairing import paired, turned
@@ -31,6 +32,8 @@ UNSEEN = 3.0
 
 _SHAPE_REACH = 0.3
 """Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
+_PREDICTED = 3e-4
+"""1 σ of ln f that no model predicts better: how two modes nearer than that mix is not known."""
 _DAMPING_STD = 0.02
 """1 σ of ln ζ that no model is better than, where each mode has a damping ratio of its own."""
 
@@ -59,6 +62,56 @@ class Sensing:
     transverse: NDArray[np.int64]
     drift: int
     mixing: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Measured shapes of modes that have a partner.
+
+    Attributes
+    ----------
+    on : ndarray of int, (k,)
+        Measured modes.
+    shapes, own, unit, weight : ndarray, (k, s)
+        What is compared, its 1 σ in the test, the unit of the scatter that adds to it, and one over the variance.
+    mixed : list of (int, int, int)
+        Place of a mode, another measured mode, and the unknown that says how much of that it holds.
+    """
+
+    on: NDArray[np.int64]
+    shapes: NDArray[np.float64]
+    own: NDArray[np.float64]
+    unit: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    mixed: list[tuple[int, int, int]]
+
+
+@dataclass(frozen=True)
+class _Predicted:
+    """What the model says of modes that have a partner, and the derivatives by all unknowns.
+
+    Attributes
+    ----------
+    log_frequency : ndarray, (k,)
+        ln of Hz, without drift.
+    shapes, turned : ndarray, (k, s)
+        What the sensors read, and what close modes hold of each other beside it; both up to one factor per mode.
+    log_frequency_slope, shapes_slope, turned_slope : ndarray, (k, n), (k, s, n), (k, s, n), optional
+    """
+
+    log_frequency: NDArray[np.float64]
+    shapes: NDArray[np.float64]
+    turned: NDArray[np.float64]
+    log_frequency_slope: NDArray[np.float64] | None = None
+    shapes_slope: NDArray[np.float64] | None = None
+    turned_slope: NDArray[np.float64] | None = None
+
+    def put(self, members: NDArray[np.int64], group: Group) -> None:
+        """Some modes as they are in their group."""
+        for name in ("log_frequency", "shapes", "turned"):
+            for of in (name, f"{name}_slope"):
+                if getattr(self, of) is not None:
+                    getattr(self, of)[members] = getattr(group, of)
 
 
 class Comparison:
@@ -111,14 +164,20 @@ class Comparison:
         match = matching if isinstance(matching, np.ndarray) else self.matched(solution)
         on, alone = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
         to = match[on]
-        slopes = ModeDerivatives.of(matrices, solution, to) if derivatives else None
+        known = self._known(on)
+        groups = self._groups(solution, predicted, known, to)
+        number = np.full(len(on), -1)
+        for g, members in enumerate(groups):
+            number[members] = g
+        slopes = ModeDerivatives.of(matrices, solution, to, number) if derivatives else None
         # what was held out has been measured: its neighbour's shape holds none of it
         sensors = np.count_nonzero(self.data.seen[on], axis=1) * self.data.complete
         hidden = hidden_partners(solution, to, sensors)
+        shapes = self._predicted(solution, predicted, known, to, groups, slopes)
         rows: tuple[Rows, ...] = (
-            self._frequencies(solution, on, to, slopes),
+            self._frequencies(shapes, on),
             self._damping(solution, matrices, on, to, slopes),
-            self._shapes(solution, predicted, on, to, hidden, slopes),
+            self._shapes(predicted, shapes, known, hidden),
         )
         if np.any(self.data.whirling[on]):
             rows += (self._complex_shapes(solution, on, to, slopes),)
@@ -175,22 +234,13 @@ class Comparison:
             total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
         return total
 
-    def _frequencies(
-        self,
-        solution: EigenSolution,
-        on: NDArray[np.int64],
-        to: NDArray[np.int64],
-        slopes: ModeDerivatives | None,
-    ) -> Rows:
+    def _frequencies(self, predicted: _Predicted, on: NDArray[np.int64]) -> Rows:
         d = self.data
-        model = np.log(np.maximum(solution.frequency_hz[to], 1e-6)) + self.x[self.sensing.drift]
-        slope = None
-        if slopes is not None:
-            slope = np.zeros((len(on), len(self.x)))
-            slope[:, : slopes.log_frequency.shape[1]] = slopes.log_frequency
+        slope = predicted.log_frequency_slope
+        if slope is not None:
             slope[:, self.sensing.drift] = 1.0
         return Rows(
-            d.log_frequency[on] - model,
+            d.log_frequency[on] - predicted.log_frequency - self.x[self.sensing.drift],
             d.log_frequency_std[on],
             np.ones(len(on)),
             FREQUENCY,
@@ -224,53 +274,137 @@ class Comparison:
             np.where(own, 0.0, 1.0), DAMPING_SCATTER, 1.0, modes, slope=slope, model=model,
         )  # fmt: skip
 
-    def _shapes(
-        self,
-        solution: EigenSolution,
-        predicted: NDArray[np.float64],
-        on: NDArray[np.int64],
-        to: NDArray[np.int64],
-        hidden: NDArray[np.int64],
-        slopes: ModeDerivatives | None,
-    ) -> Rows:
-        """Shapes with the factor projected out that fits them best, and what coinciding modes add; none of whirling
-        modes.
-        """
-        d, real = self.data, np.flatnonzero(~self.data.whirling[on])
-        on, to = on[real], to[real]
-        p = predicted[:, to].T
-        seen = d.seen[on] > 0
+    def _known(self, on: NDArray[np.int64]) -> _Known:
+        """Measured shapes of modes with a partner, less what their unknowns say they hold of others."""
+        d = self.data
         y, own = d.known_shapes[on], d.compared_std[on]
         unit = np.maximum(_SHAPE_REACH, np.abs(y))
         mixed = self._mixed(on)
         for k, other, unknown in mixed:
             y[k] -= self.x[unknown] * d.known_shapes[other]
-        weight = seen / (own**2 + (self.scatters[SHAPE] * unit) ** 2)
+        return _Known(on, y, own, unit, d.seen[on] / (own**2 + (self.scatters[SHAPE] * unit) ** 2), mixed)
+
+    def _groups(
+        self, solution: EigenSolution, predicted: NDArray[np.float64], known: _Known, to: NDArray[np.int64]
+    ) -> list[NDArray[np.int64]]:
+        """Places of close modes that are compared as a group, those whose shapes the sensors tell apart."""
+        number, damped = self.data.group[known.on], solution.damped
+        if damped is not None:
+            number = np.where([damped.turned(int(r)) for r in to], -1, number)
+        found = []
+        for g in np.unique(number[number >= 0]):
+            members = np.flatnonzero(number == g)
+            if len(members) > 1 and self._group(solution, predicted, known, to, members) is not None:
+                found.append(members)
+        return found
+
+    def _group(
+        self,
+        solution: EigenSolution,
+        predicted: NDArray[np.float64],
+        known: _Known,
+        to: NDArray[np.int64],
+        members: NDArray[np.int64],
+        slopes: Slopes | None = None,
+    ) -> Group | None:
+        on = known.on[members]
+        return straightened(
+            predicted[:, to[members]],
+            known.shapes[members],
+            known.weight[members],
+            solution.frequency_hz[to[members]],
+            np.exp(self.data.log_frequency[on]),
+            self.heat * np.hypot(self.data.log_frequency_std[on], _PREDICTED),
+            slopes,
+        )
+
+    def _predicted(
+        self,
+        solution: EigenSolution,
+        read: NDArray[np.float64],
+        known: _Known,
+        to: NDArray[np.int64],
+        groups: list[NDArray[np.int64]],
+        slopes: ModeDerivatives | None,
+    ) -> _Predicted:
+        """What the model says of the frequencies and shapes of modes with a partner, close ones as groups."""
+        n = len(self.x)
+        log = np.log(np.maximum(solution.frequency_hz[to], 1e-6))
+        shapes, turned = read[:, to].T, np.zeros((len(to), len(read)))
+        found = _Predicted(log, shapes, turned)
+        if slopes is not None:
+            log_slope = np.zeros((len(to), n))
+            log_slope[:, : slopes.log_frequency.shape[1]] = slopes.log_frequency
+            slope = self._shape_slopes(slopes.shapes, solution, to)
+            if solution.damped is not None and np.iscomplexobj(slope):
+                slope = _turned_slopes(self._read(solution)[:, to].T, slope)
+            found = _Predicted(log, shapes, turned, log_slope, np.real(slope), np.zeros((*shapes.shape, n)))
+        for members in groups:
+            given = None if slopes is None else self._group_slopes(found, slopes, known, members)
+            group = self._group(solution, read, known, to, members, given)
+            assert group is not None  # as asked in `_groups`
+            found.put(members, group)
+        return found
+
+    def _group_slopes(
+        self, found: _Predicted, slopes: ModeDerivatives, known: _Known, members: NDArray[np.int64]
+    ) -> Slopes:
+        """Derivatives of what the modes of a group are made of."""
+        assert found.shapes_slope is not None
+        read = found.shapes_slope[members]
+        reduced = np.zeros((len(members), len(members), len(self.x)))
+        reduced[:, :, : slopes.reduced.shape[2]] = slopes.reduced[np.ix_(members, members)]
+        measured, place = np.zeros(read.shape), {int(k): i for i, k in enumerate(members)}
+        for k, other, unknown in known.mixed:
+            if k in place:
+                measured[place[k], :, unknown] = -self.data.known_shapes[other]
+        return Slopes(read, reduced, measured)
+
+    def _shapes(
+        self,
+        predicted: NDArray[np.float64],
+        shapes: _Predicted,
+        known: _Known,
+        hidden: NDArray[np.int64],
+    ) -> Rows:
+        """Shapes with the factor projected out that fits them best, and what coinciding modes add; none of whirling
+        modes.
+        """
+        real = np.flatnonzero(~self.data.whirling[known.on])
+        on, hidden = known.on[real], hidden[real]
+        place = {int(k): i for i, k in enumerate(real)}
+        seen = self.data.seen[on] > 0
+        y, weight, p, turned = (
+            known.shapes[real],
+            known.weight[real],
+            shapes.shapes[real],
+            shapes.turned[real],
+        )
         weighted = weight * p
         squared = np.maximum(np.sum(weighted * p, axis=1), 1e-300)
         scale = np.sum(weighted * y, axis=1) / squared
         slope = None
-        if slopes is not None:
-            dp = self._shape_slopes(slopes.shapes[:, real], solution, to)
-            if solution.damped is not None and np.iscomplexobj(dp):
-                dp = _turned_slopes(self._read(solution)[:, to].T, dp)
-            dp = np.real(dp)
+        if shapes.shapes_slope is not None and shapes.turned_slope is not None:
+            dp = shapes.shapes_slope[real]
             towards = weight * (y - 2 * scale[:, None] * p) / squared[:, None]
-            factor = towards[:, None, :] @ dp
-            slope = scale[:, None, None] * dp + p[:, :, None] * factor
-            for k, other, unknown in mixed:
-                along = d.known_shapes[other]
-                slope[k, :, unknown] += along - p[k] * (weighted[k] @ along) / squared[k]
-        difference = y - scale[:, None] * p
-        for k, along in directions(hidden[real], predicted, p, weight):
+            scaled = (towards[:, None, :] @ dp)[:, 0]
+            slope = scale[:, None, None] * (dp + shapes.turned_slope[real])
+            for k, other, unknown in known.mixed:
+                if k in place:
+                    along = self.data.known_shapes[other]
+                    slope[place[k], :, unknown] += along
+                    scaled[place[k], unknown] -= weighted[place[k]] @ along / squared[place[k]]
+            slope += (p + turned)[:, :, None] * scaled[:, None, :]
+        difference = y - scale[:, None] * (p + turned)
+        for k, along in directions(hidden, predicted, p, weight):
             difference[k] -= along * (weight[k] @ (along * difference[k]))
             if slope is not None:
                 slope[k] -= along[:, None] * ((weight[k] * along) @ slope[k])
         mode, sensor = np.nonzero(seen)
         slope = None if slope is None else slope[seen]
         return Rows(
-            difference[seen], own[seen], unit[seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode], sensor,
-            d.close[on[mode]], slope, noise=SHAPE_NOISE,
+            difference[seen], known.own[real][seen], known.unit[real][seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode],
+            sensor, self.data.close[on[mode]], slope, noise=SHAPE_NOISE,
         )  # fmt: skip
 
     def _mixed(self, on: NDArray[np.int64]) -> list[tuple[int, int, int]]:
