@@ -29,6 +29,8 @@ class MeasuredModes:
         NaN where not measured; None where only frequencies are known.
     shape_std : ndarray, (n_modes, n_dofs), or None
         Standard deviation of each entry, per real or imaginary part.
+    shape_own_std : ndarray, (n_modes, n_dofs), or None
+        The same without what all entries of a mode have in common.
     dofs : tuple of Dof
     scaled : bool
         True where shapes are mass-normalised.
@@ -52,6 +54,7 @@ class MeasuredModes:
     band_hz: tuple[float, float] | None = None
     references: tuple[Dof, ...] = ()
     notes: tuple[str, ...] = ()
+    shape_own_std: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return int(self.frequency_hz.size)
@@ -115,6 +118,9 @@ def from_modal_model(model: ModalModel, configuration: str) -> MeasuredModes:
         scaled=model.scaled,
         band_hz=None if np.isnan(model.band_hz[0]) else model.band_hz,
         references=model.references,
+        shape_own_std=np.array([m.shape_own_std for m in modes], dtype=float).reshape(-1, n_dofs)
+        if n_dofs and all(len(m.shape_own_std) for m in modes)
+        else None,
     )
 
 

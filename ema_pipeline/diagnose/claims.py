@@ -87,7 +87,8 @@ def judge(
     before = after = NOTHING_HELD_OUT
     doubt = _weak(observations, ranked, gain, settings, nothing)
     if not doubt:
-        before, after = held_out(observations, base), held_out(observations, mended)
+        asked = observations.holding_out_explained(base.posterior.residuals)
+        before, after = held_out(asked, base), held_out(asked, mended)
         doubt = _contradicted(base, mended, before, after) or of_one_shape(base, mended, settings)
         name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, averaged(observations, mended)))
     return Judged(ranked, name, gain, base, mended, before, after, doubt, settings.claim)

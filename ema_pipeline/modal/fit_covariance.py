@@ -263,6 +263,32 @@ def shape_covariance(
     return np.asarray(out)
 
 
+def own_share(data: FitData, estimate: Estimate, noise: Noise) -> Real:
+    """Share of the variance of every row's shape entries that the row does not have in common with others.
+
+    What all outputs of one hit share changes the scale of a shape, and not its form. Rows that are struck points share
+    nothing: each has hits of its own.
+
+    Parameters
+    ----------
+    data, estimate, noise
+        As for `shape_covariance`.
+
+    Returns
+    -------
+    ndarray, (n_rows, M)
+    """
+    m = len(estimate.poles)
+    if data.transposed:
+        return np.ones((len(data.frf), m))
+    power = np.abs(1 / (1j * data.omega - estimate.poles[:, None])) ** 2
+    weight = noise.weight(data.measured)
+    taking_part = np.abs(estimate.participation.T) ** 2  # (n_references, M)
+    total = np.einsum("oil,ml,im->om", weight, power, taking_part, optimize=True)
+    own = np.einsum("oil,ml,im->om", weight**2 * noise.own, power, taking_part, optimize=True)
+    return np.asarray(np.where(total > 0, own / np.where(total > 0, total, 1.0), 1.0))
+
+
 def _meat_of_shapes(data: FitData, estimate: Estimate, noise: Noise) -> Real:
     """Covariance of the right-hand sides that give the shapes of each row, (n_rows, 2M, 2M)."""
     mix = mixing(estimate.participation)

@@ -25,7 +25,8 @@ class ScaledShapes:
     ----------
     dofs : tuple of Dof
     shapes : complex ndarray, (n_modes, n_dofs)
-    stds : ndarray, (n_modes, n_dofs)
+    stds, own_stds : ndarray, (n_modes, n_dofs)
+        The latter without what all entries of a mode have in common.
     scale_std : ndarray, (n_modes,)
         Relative standard deviation of the scale; NaN where unscaled.
     """
@@ -33,6 +34,7 @@ class ScaledShapes:
     dofs: tuple[Dof, ...]
     shapes: Complex
     stds: Real
+    own_stds: Real
     scale_std: Real
 
 
@@ -42,6 +44,7 @@ def scale_shapes(
     poles: Complex,
     shapes: Complex,
     shape_stds: Real,
+    shape_own: Real,
     participation: Complex,
     participation_stds: Real,
     *,
@@ -53,8 +56,8 @@ def scale_shapes(
     ----------
     rows, references : tuple of Dof
     poles : complex ndarray, (n_modes,)
-    shapes, shape_stds : (n_modes, n_rows)
-        NaN where not measured.
+    shapes, shape_stds, shape_own : (n_modes, n_rows)
+        NaN where not measured; the last one is the share of the variance that entries do not have in common.
     participation, participation_stds : (n_modes, n_references)
     calibrated : bool
         False for a force in volts: shapes over the union are then only normalised to 1.
@@ -68,16 +71,17 @@ def scale_shapes(
     dofs = (*rows, *(references[k] for k in extra))
     n_modes = len(poles)
     out = np.full((n_modes, len(dofs)), np.nan, dtype=np.complex128)
-    stds = np.full((n_modes, len(dofs)), np.nan)
+    stds, own_stds = (np.full((n_modes, len(dofs)), np.nan) for _ in range(2))
     scale_std = np.full(n_modes, np.nan)
     for r in range(n_modes):
         phi, std = shapes[r].copy(), shape_stds[r].copy()
+        own = std * np.sqrt(shape_own[r])
         if shared:
             factor = 2j * poles[r].imag / poles[r] ** 2
             kappa, relative = _row_scale(
                 shared, phi, std, factor * participation[r], np.abs(factor) * participation_stds[r]
             )
-            phi, std, scale_std[r] = phi * kappa, std * abs(kappa), relative
+            phi, std, own, scale_std[r] = phi * kappa, std * abs(kappa), own * abs(kappa), relative
             ref = factor * participation[r] / kappa
             ref_std = np.abs(factor / kappa) * participation_stds[r]
             std = np.hypot(std, np.abs(phi) * relative)
@@ -85,12 +89,14 @@ def scale_shapes(
                 std[o] = (
                     0.5 * np.hypot(shape_stds[r, o] * abs(kappa), ref_std[k]) if len(shared) == 1 else std[o]
                 )
+            own = np.concatenate([np.minimum(own, std), ref_std[extra]])
             phi = np.concatenate([phi, ref[extra]])
             std = np.concatenate([std, np.hypot(ref_std[extra], np.abs(ref[extra]) * relative)])
-        out[r], stds[r] = _normalised(phi, std, keep_scale=bool(shared) and calibrated)
+        both = _normalised(phi, np.stack([std, own]), keep_scale=bool(shared) and calibrated)
+        out[r], (stds[r], own_stds[r]) = both
     if not calibrated:
         scale_std[:] = np.nan
-    return ScaledShapes(dofs, out, stds, scale_std)
+    return ScaledShapes(dofs, out, stds, own_stds, scale_std)
 
 
 def _row_scale(
@@ -111,12 +117,12 @@ def _row_scale(
     return complex(np.sqrt(kappa2)), float(relative)
 
 
-def _normalised(phi: Complex, std: Real, *, keep_scale: bool) -> tuple[Complex, Real]:
-    """Sign by the largest entry; largest entry 1 where the scale is unknown."""
+def _normalised(phi: Complex, stds: Real, *, keep_scale: bool) -> tuple[Complex, Real]:
+    """Sign by the largest entry; largest entry 1 where the scale is unknown. `stds` may have several rows."""
     largest = phi[np.nanargmax(np.abs(phi))]
     if keep_scale:
-        return (phi if largest.real >= 0 else -phi), std
-    return phi / largest, std / abs(largest)
+        return (phi if largest.real >= 0 else -phi), stds
+    return phi / largest, stds / abs(largest)
 
 
 def scaling_note(has_shared: bool, calibrated: bool) -> str:

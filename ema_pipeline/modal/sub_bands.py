@@ -26,6 +26,7 @@ from ema_pipeline.modal.fit_covariance import (
     PointScores,
     left_to_go,
     of_all_blocks,
+    own_share,
     parameter_covariance,
     sandwich,
     scatter_of_scores,
@@ -89,7 +90,8 @@ class FittedModes:
     poles : complex ndarray, (n_modes,)
     pole_cov : ndarray, (n_modes, 2, 2)
         Covariance of (Re s, Im s).
-    shapes, shape_stds : (n_modes, n_rows)
+    shapes, shape_stds, shape_own : (n_modes, n_rows)
+        The last one is the share of the variance that entries of a shape do not have in common.
     participation, participation_stds : (n_modes, n_references)
     held : ndarray of bool, (n_modes,)
         True where the polish has found no place for a mode: its pole is the one that the model orders give.
@@ -103,6 +105,7 @@ class FittedModes:
     pole_cov: Real
     shapes: Complex
     shape_stds: Real
+    shape_own: Real
     participation: Complex
     participation_stds: Real
     held: NDArray[np.bool_]
@@ -221,6 +224,7 @@ def refined(
         np.zeros(0, complex),
         np.zeros((0, 2, 2)),
         np.zeros((0, n_rows), complex),
+        np.zeros((0, n_rows)),
         np.zeros((0, n_rows)),
         np.zeros((0, n_ref), complex),
         np.zeros((0, n_ref)),
@@ -408,7 +412,7 @@ def _of_all_rows(window: Window, fit: _Polished, part: SubBand, iterations: int)
         step = points.step
     else:
 
-        def of_rows(rows: slice) -> tuple[tuple[Complex, Real], PointScores]:
+        def of_rows(rows: slice) -> tuple[tuple[Complex, Real, Real], PointScores]:
             data, one = linear_fit(window.rows(rows), estimate)
             scores = scores_of_points(transposed, estimate, one.solution)
             return _shapes_and_stds(data, one, first), scores
@@ -417,8 +421,8 @@ def _of_all_rows(window: Window, fit: _Polished, part: SubBand, iterations: int)
         some = [shapes for shapes, _ in each]
         points = of_all_blocks([told for _, told in each], transposed)
         parameters = _widened(first, scatter_over_points(points))
-    shapes, stds = (np.concatenate(x) for x in zip(*some, strict=True))
-    return _core(part, estimate, (held, fit.away), (fit.step, step), parameters, (shapes, stds))
+    shapes, stds, own = (np.concatenate(x) for x in zip(*some, strict=True))
+    return _core(part, estimate, (held, fit.away), (fit.step, step), parameters, (shapes, stds, own))
 
 
 def _core(
@@ -427,7 +431,7 @@ def _core(
     kept: tuple[NDArray[np.bool_], Complex],
     steps: tuple[Step, Step],
     parameters: Real,
-    shapes: tuple[Complex, Real],
+    shapes: tuple[Complex, Real, Real],
 ) -> FittedModes:
     """The modes of a sub-band's core.
 
@@ -447,6 +451,7 @@ def _core(
         pole_cov=pole_cov + rest[:, :, None] * rest[:, None, :],
         shapes=shapes[0].T[core],
         shape_stds=shapes[1].T[core],
+        shape_own=shapes[2].T[core],
         participation=estimate.participation[core],
         participation_stds=_participation_stds(estimate, parameters)[core],
         held=held[core],
@@ -467,11 +472,14 @@ def _widened(covariance: Real, scatter: Real) -> Real:
     return np.asarray(covariance * factor[:, None] * factor)
 
 
-def _shapes_and_stds(data: FitData, fit: SegmentFit, parameters: Real) -> tuple[Complex, Real]:
-    """Shapes of some rows and their standard deviations, (n_rows, n_modes)."""
+def _shapes_and_stds(data: FitData, fit: SegmentFit, parameters: Real) -> tuple[Complex, Real, Real]:
+    """Shapes of some rows, their standard deviations, and the share of the variance that is their own, (n_rows,
+    n_modes).
+    """
     cov = shape_covariance(data, fit.estimate, fit.solution, fit.noise, parameters)
     diagonal = np.einsum("oaa->oa", cov)
-    return fit.solution.shapes, np.sqrt(0.5 * (diagonal[:, 0::2] + diagonal[:, 1::2]))
+    stds = np.sqrt(0.5 * (diagonal[:, 0::2] + diagonal[:, 1::2]))
+    return fit.solution.shapes, stds, own_share(data, fit.estimate, fit.noise)
 
 
 def _participation_stds(estimate: Estimate, parameters: Real) -> Real:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,9 @@ class Mode:
         largest entry is 1.
     shape_std : ndarray, (n_dofs,)
         Standard deviation of the modulus of each entry's error, per real or imaginary part.
+    shape_own_std : ndarray, (n_dofs,)
+        The same without what all entries have in common, which changes the scale and not the form; empty where not
+        known.
     mpc : float
         Modal phase collinearity, 0…1.
     method : str
@@ -95,6 +98,7 @@ class Mode:
     stability: float = 1.0
     flags: tuple[str, ...] = ()
     circles: tuple[CircleFit, ...] = ()
+    shape_own_std: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,10 @@ class AmplitudeObservations:
         """See `Observations`."""
         return AmplitudeProblem(self, effects, scales)
 
+    def holding_out_explained(self, found: Residuals) -> AmplitudeObservations:
+        """See `Observations`."""
+        return self
+
     def folds(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
         """Every force level held out in turn, with the nearest other level beside it that it is compared with."""
         return self._folds

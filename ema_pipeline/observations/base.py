@@ -72,3 +72,9 @@ class Observations(Protocol):
     def folds(self) -> Sequence[tuple[Observations, Observations]]:
         """Pairs of what is fitted and what is held out: a configuration, a hit point, a level, a share of modes."""
         ...
+
+    def holding_out_explained(self, found: Residuals) -> Observations:
+        """The same data, of which folds hold out nothing that has no partner in `found`: no fit to the rest could tell
+        of a mode that an effect adds. Often the same object.
+        """
+        ...

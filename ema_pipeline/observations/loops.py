@@ -194,6 +194,10 @@ class LoopObservations:
             whole=self,
         )
 
+    def holding_out_explained(self, found: Residuals) -> LoopObservations:
+        """See `Observations`."""
+        return self
+
     def folds(self) -> list[tuple[LoopObservations, LoopObservations]]:
         """Each amplitude held out in turn, each frequency, and each setting where there are several."""
         return self._folds

@@ -53,6 +53,8 @@ class ModeData:
         False where modes of the band were taken out on purpose: what the model has besides is then no contradiction.
     imaginary : ndarray, (m, s), optional
         Imaginary parts of plainly complex shapes, 0 for all others.
+    always : ndarray of bool, (m,), optional
+        Modes that are never held out.
     """
 
     configuration: str
@@ -66,6 +68,7 @@ class ModeData:
     band_hz: tuple[float, float]
     complete: bool = True
     imaginary: NDArray[np.float64] | None = None
+    always: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.log_frequency)
@@ -183,7 +186,7 @@ class ModeData:
         )
         imaginary = None if self.imaginary is None else self.imaginary[keep]
         kept = {n: getattr(self, n)[keep] for n in names}
-        return dataclasses.replace(self, complete=False, imaginary=imaginary, **kept)
+        return dataclasses.replace(self, complete=False, imaginary=imaginary, always=None, **kept)
 
 
 def _chains(order: NDArray[np.int64], log_frequency: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:
@@ -218,7 +221,9 @@ def prepare(measured: MeasuredModes, settings: AssumedSettings | None = None) ->
             shapes[r] = y.real / size
             if np.nansum(y.imag**2) > _WHIRLS * np.nansum(np.abs(y) ** 2):
                 imaginary[r] = np.nan_to_num(y.imag / size)
-            given = np.full(len(dofs), np.nan) if measured.shape_std is None else measured.shape_std[r]
+            # shapes are compared up to a factor: what all entries have in common is none of their difference
+            stds = measured.shape_std if measured.shape_own_std is None else measured.shape_own_std
+            given = np.full(len(dofs), np.nan) if stds is None else stds[r]
             std[r] = _known_or(given / size, settings.shape_std_assumed)
     with np.errstate(invalid="ignore", divide="ignore"):
         relative = _known_or(measured.frequency_std_hz / f, settings.frequency_std_assumed)

@@ -7,7 +7,7 @@ configurations share. Shapes are compared up to a factor, which is projected out
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -158,6 +158,14 @@ class ModeObservations:
             self.rig, data, self.channels, self.shared, self.sensors, self.test, own_damping
         )
 
+    def holding_out_explained(self, found: Residuals) -> ModeObservations:
+        """See `Observations`."""
+        if not isinstance(found.matching, tuple) or not any(np.any(m < 0) for m in found.matching):
+            return self
+        return self.with_data(
+            [replace(d, always=m < 0) for d, m in zip(self.data, found.matching, strict=True)]
+        )
+
     def folds(self, count: int = 4) -> list[tuple[ModeObservations, ModeObservations]]:
         """Every `count`-th mode held out in turn, over all configurations."""
         total = sum(len(d) for d in self.data)
@@ -166,6 +174,8 @@ class ModeObservations:
             kept, out, offset = [], [], 0
             for d in self.data:
                 held = (np.arange(len(d)) + offset) % count == k
+                if d.always is not None:
+                    held &= ~d.always
                 offset += len(d)
                 kept.append(d.only(~held))
                 out.append(d.only(held))

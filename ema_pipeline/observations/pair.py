@@ -110,6 +110,10 @@ class PairObservations:
             ModeProblem(self.b, RigModel(self.a.rig, effects, scales, self.a.shared)),
         )
 
+    def holding_out_explained(self, found: Residuals) -> PairObservations:
+        """See `Observations`."""
+        return self
+
     def folds(self, count: int = 4) -> list[tuple[PairObservations, PairObservations]]:
         """Every `count`-th mode of both tests held out in turn, over all configurations; pairs stay together."""
         fold_a, fold_b = self._folds(count)

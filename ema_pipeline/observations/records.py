@@ -20,7 +20,7 @@ from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.effects.generic import is_place, place_rows
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.inference import Scatter
+from ema_pipeline.inference import Residuals, Scatter
 from ema_pipeline.ingest.driven import DrivenRecord
 from ema_pipeline.mechanics.simulation import FINE, DrivenSystem, Sensors, Slopes, substeps_for
 from ema_pipeline.observations.linear_start import linear_start
@@ -296,6 +296,10 @@ class RecordObservations:
             self.rig, self.configuration, records, held_out, None, used, self.like or self, self.modal,
             phase or self.phase,
         )  # fmt: skip
+
+    def holding_out_explained(self, found: Residuals) -> RecordObservations:
+        """See `Observations`."""
+        return self
 
     def folds(self) -> Sequence[tuple[RecordObservations, RecordObservations]]:
         """The records that the test holds out; none where it holds out none."""
