@@ -13,7 +13,8 @@ the matrix there, are analytic where single shapes are not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,40 +26,16 @@ _INDEPENDENT = 0.05
 
 
 @dataclass(frozen=True)
-class Group:
-    """The model's modes of one group, seen in the basis of the measured shapes.
-
-    Attributes
-    ----------
-    log_frequency : ndarray, (c,)
-        ln of frequencies in Hz, of the diagonal.
-    shapes : ndarray, (c, s)
-        What the sensors read of the combination nearest to every measured shape.
-    turned : ndarray, (c, s)
-        What a rotation adds to it.
-    log_frequency_slope, shapes_slope, turned_slope : ndarray, (c, n), (c, s, n), (c, s, n), optional
-        Derivatives by all unknowns.
-    """
-
-    log_frequency: Real
-    shapes: Real
-    turned: Real
-    log_frequency_slope: Real | None = None
-    shapes_slope: Real | None = None
-    turned_slope: Real | None = None
-
-
-@dataclass(frozen=True)
 class Slopes:
-    """Derivatives of a group's modes by all unknowns.
+    """Derivatives of what groups of the same size are made of, by all unknowns.
 
     Attributes
     ----------
-    read : ndarray, (c, s, n)
+    read : ndarray, (g, c, s, n)
         Of what the sensors read of every mode, none turned into another one.
-    reduced : ndarray, (c, c, n)
+    reduced : ndarray, (g, c, c, n)
         Of the matrix between them.
-    measured : ndarray, (c, s, n)
+    measured : ndarray, (g, c, s, n)
         Of the shapes that are compared, as far as unknowns change them.
     """
 
@@ -67,95 +44,175 @@ class Slopes:
     measured: Real
 
 
-def straightened(
-    read: Real,
-    measured: Real,
-    weight: Real,
-    frequency_hz: Real,
-    measured_hz: Real,
-    uncertain: Real,
-    slopes: Slopes | None = None,
-) -> Group | None:
-    """A group of the model's modes in the basis of the measured shapes; None where sensors cannot tell them apart.
+@dataclass(frozen=True)
+class Turned:
+    """Derivatives of a `Groups`' attributes of the same names, with n added as the last axis."""
 
-    Parameters
+    log_frequency: Real
+    shapes: Real
+    turned: Real
+
+
+@dataclass(frozen=True)
+class Groups:
+    """Groups of c of the model's modes each, seen in the basis of the measured shapes.
+
+    Attributes
     ----------
-    read : ndarray, (s, c)
+    read : ndarray, (g, s, c)
         What the sensors read of the model's modes, mass-normalised.
-    measured, weight : ndarray, (c, s)
+    measured, weight : ndarray, (g, c, s)
         Measured shapes, and one over the variance of each entry; 0 where not measured.
-    frequency_hz, measured_hz : ndarray, (c,)
-    uncertain : ndarray, (c,)
+    frequency_hz, measured_hz : ndarray, (g, c)
+    uncertain : ndarray, (g, c)
         1 σ of ln f, measured and model.
-    slopes : Slopes, optional
     """
-    gram = np.einsum("ks,sa,sb->kab", weight, read, read)
-    size = np.sqrt(np.maximum(np.einsum("kaa->ka", gram), 1e-300))
-    if np.min(np.linalg.eigvalsh(gram / size[:, :, None] / size[:, None, :])) < _INDEPENDENT:
-        return None
-    inverse = np.linalg.inv(gram)
-    share = np.einsum(
-        "kab,sb,ks->ka", inverse, read, weight * measured
-    )  # of every model mode in a measured one
-    length = np.linalg.norm(share, axis=1)
-    if np.min(length) <= 0:
-        return None
-    left, spread, right = np.linalg.svd((share / length[:, None]).T)
-    if spread[-1] ** 2 < _INDEPENDENT:
-        return None
-    basis = left @ right  # orthonormal, (c model, c measured)
-    square = (2 * np.pi * frequency_hz) ** 2
-    matrix = basis.T @ (square[:, None] * basis)
-    own = np.diag(matrix)
-    turn = matrix.T * _inverse_distance(measured_hz, uncertain)
-    rotated = basis @ turn
-    shapes, turned = (read @ basis).T, (read @ rotated).T
-    log_frequency = 0.5 * np.log(own) - np.log(2 * np.pi)
-    if slopes is None:
-        return Group(log_frequency, shapes, turned)
 
-    # basis: the polar factor of the normalised shares
-    rest = weight * (measured - share @ read.T)
-    pulled = np.einsum("jsn,ks->kjn", slopes.read, rest)
-    moved = slopes.measured - np.einsum("kj,jsn->ksn", share, slopes.read)
-    pulled += np.einsum("sa,ks,ksn->kan", read, weight, moved)
-    share_slope = np.einsum("kab,kbn->kan", inverse, pulled)
-    unit = share / length[:, None]
-    unit_slope = share_slope - unit[:, :, None] * np.einsum("ka,kan->kn", unit, share_slope)[:, None]
-    unit_slope /= length[:, None, None]
-    along = np.einsum("ab,kan->bkn", basis, unit_slope)  # (c, c measured, n)
-    skew = along - along.transpose(1, 0, 2)
-    stretch = spread[:, None] + spread
-    inner = np.einsum("ab,bcn,dc->adn", right, skew, right) / stretch[:, :, None]
-    turning = np.einsum("ba,bcn,cd->adn", right, inner, right)
-    basis_slope = np.einsum("ab,bcn->acn", basis, turning)
+    read: Real
+    measured: Real
+    weight: Real
+    frequency_hz: Real
+    measured_hz: Real
+    uncertain: Real
 
-    changed = np.einsum("ab,acn,cd->bdn", basis, slopes.reduced, basis)
-    changed += np.einsum("ab,bcn->acn", matrix, turning) - np.einsum("abn,bc->acn", turning, matrix)
-    turn_slope = changed.transpose(1, 0, 2) * _inverse_distance(measured_hz, uncertain)[:, :, None]
-    rotated_slope = np.einsum("abn,bc->acn", basis_slope, turn) + np.einsum("ab,bcn->acn", basis, turn_slope)
+    def only(self, keep: NDArray[np.bool_]) -> Groups:
+        """Some of them, by a mask (g,)."""
+        return Groups(*(getattr(self, f.name)[keep] for f in fields(self)))
 
-    def of_shapes(combination: Real, change: Real) -> Real:
-        return np.asarray(
-            np.einsum("jk,jsn->ksn", combination, slopes.read) + np.einsum("sj,jkn->ksn", read, change)
+    @cached_property
+    def told_apart(self) -> NDArray[np.bool_]:
+        """True where the sensors tell the modes of a group apart, the model's and the measured ones, (g,)."""
+        size = np.sqrt(np.maximum(np.einsum("gkaa->gka", self._gram), 1e-300))
+        least = np.linalg.eigvalsh(self._gram / size[..., :, None] / size[..., None, :])[..., 0]
+        independent = np.min(least, axis=1) > _INDEPENDENT
+        found = np.zeros(len(independent), bool)
+        if np.any(independent):
+            some = self.only(independent)
+            found[independent] = (some._polar[1][:, -1] ** 2 > _INDEPENDENT) & np.all(
+                some._length > 0, axis=1
+            )
+        return found
+
+    @cached_property
+    def _weighed(self) -> Real:
+        """What the sensors read, weighed by those of every measured mode, (g, k, c, s)."""
+        return np.asarray(self.read.transpose(0, 2, 1)[:, None] * self.weight[:, :, None, :])
+
+    @cached_property
+    def _gram(self) -> Real:
+        return np.asarray(self._weighed @ self.read[:, None])
+
+    @cached_property
+    def _inverse(self) -> Real:
+        return np.linalg.inv(self._gram)
+
+    @cached_property
+    def _share(self) -> Real:
+        """How much of every model mode a measured one holds, (g, k, c)."""
+        return np.asarray((self._inverse @ (self._weighed @ self.measured[..., None]))[..., 0])
+
+    @cached_property
+    def _length(self) -> Real:
+        return np.linalg.norm(self._share, axis=2)
+
+    @cached_property
+    def _unit(self) -> Real:
+        return np.asarray(self._share / np.maximum(self._length, 1e-300)[..., None])
+
+    @cached_property
+    def _polar(self) -> tuple[Real, Real, Real]:
+        left, spread, right = np.linalg.svd(self._unit.transpose(0, 2, 1))
+        return left, spread, right
+
+    @cached_property
+    def basis(self) -> Real:
+        """The orthonormal basis nearest to the measured shapes: (g, model mode, measured mode)."""
+        return np.asarray(self._polar[0] @ self._polar[2])
+
+    @cached_property
+    def _matrix(self) -> Real:
+        square = (2 * np.pi * self.frequency_hz) ** 2
+        return np.asarray(self.basis.transpose(0, 2, 1) @ (square[..., None] * self.basis))
+
+    @cached_property
+    def _inverse_distance(self) -> Real:
+        """By how much of the other one a measured mode is turned per entry of the matrix between them: one over the
+        distance of their eigenvalues, less where that is uncertain; (g, other one, mode).
+        """
+        square, uncertain = (2 * np.pi * self.measured_hz) ** 2, self.uncertain
+        apart = square[:, None, :] - square[:, :, None]
+        blurred = (square[:, None, :] + square[:, :, None]) * np.hypot(
+            uncertain[:, None, :], uncertain[:, :, None]
+        )
+        return np.asarray(apart / np.maximum(apart**2 + blurred**2, 1e-300))
+
+    @cached_property
+    def _turn(self) -> Real:
+        return np.asarray(self._matrix * self._inverse_distance)
+
+    @cached_property
+    def log_frequency(self) -> Real:
+        """ln of frequencies in Hz, of the diagonal, (g, c)."""
+        return np.asarray(0.5 * np.log(np.einsum("gaa->ga", self._matrix)) - np.log(2 * np.pi))
+
+    @cached_property
+    def shapes(self) -> Real:
+        """What the sensors read of the combination nearest to every measured shape, (g, c, s)."""
+        return np.asarray((self.read @ self.basis).transpose(0, 2, 1))
+
+    @cached_property
+    def turned(self) -> Real:
+        """What a rotation adds to it, (g, c, s)."""
+        return np.asarray((self.read @ (self.basis @ self._turn)).transpose(0, 2, 1))
+
+    def slopes(self, by: Slopes) -> Turned:
+        """Derivatives by all unknowns."""
+        turning = self._turning(by)
+        basis_slope = _times(self.basis, turning)
+        back = self.basis.transpose(0, 2, 1)
+        changed = _times(back, _by(by.reduced, self.basis))
+        changed += _times(self._matrix, turning) - _by(turning, self._matrix)
+        own = np.einsum("gaa->ga", self._matrix)
+        turn_slope = changed * self._inverse_distance[..., None]
+        rotated_slope = _by(basis_slope, self._turn) + _times(self.basis, turn_slope)
+
+        def of_shapes(combination: Real, change: Real) -> Real:
+            moved = _times(combination.transpose(0, 2, 1), by.read)
+            moved += (
+                (self.read @ change.reshape(*change.shape[:2], -1))
+                .reshape(*self.read.shape[:2], *change.shape[2:])
+                .transpose(0, 2, 1, 3)
+            )
+            return np.asarray(moved)
+
+        return Turned(
+            0.5 * np.einsum("gaan->gan", changed) / own[..., None],
+            of_shapes(self.basis, basis_slope),
+            of_shapes(self.basis @ self._turn, rotated_slope),
         )
 
-    return Group(
-        log_frequency,
-        shapes,
-        turned,
-        0.5 * np.einsum("aan->an", changed) / own[:, None],
-        of_shapes(basis, basis_slope),
-        of_shapes(rotated, rotated_slope),
-    )
+    def _turning(self, by: Slopes) -> Real:
+        """Rotation of the basis, which is the polar factor of the normalised shares, (g, c, c, n)."""
+        rest = self.weight * (self.measured - self._share @ self.read.transpose(0, 2, 1))
+        pulled = (rest[:, None] @ by.read).transpose(0, 2, 1, 3)
+        pulled = pulled + self._weighed @ (by.measured - _times(self._share, by.read))
+        share_slope = self._inverse @ pulled
+        unit_slope = share_slope - self._unit[..., None] * (self._unit[..., None, :] @ share_slope)
+        unit_slope /= self._length[..., None, None]
+        along = (self.basis.transpose(0, 2, 1)[:, None] @ unit_slope).transpose(0, 2, 1, 3)
+        skew = along - along.transpose(0, 2, 1, 3)
+        _, spread, right = self._polar
+        back = right.transpose(0, 2, 1)
+        inner = _by(_times(right, skew), back) / (spread[:, :, None] + spread[:, None, :])[..., None]
+        return _by(_times(back, inner), right)
 
 
-def _inverse_distance(hz: Real, uncertain: Real) -> Real:
-    """One over the distance of the eigenvalues of two measured modes, row less column's; 0 for one and itself.
+def _times(matrix: Real, slope: Real) -> Real:
+    """Σ_b matrix_ab slope_b…, (g, a, …)."""
+    flat = matrix @ slope.reshape(*slope.shape[:2], -1)
+    return np.asarray(flat.reshape(*matrix.shape[:2], *slope.shape[2:]))
 
-    (other one, mode): by how much of the other one a mode is turned per entry of the matrix between them.
-    """
-    square = (2 * np.pi * hz) ** 2
-    apart = square[None, :] - square[:, None]
-    blurred = (square[None, :] + square[:, None]) * np.hypot(uncertain[None, :], uncertain[:, None])
-    return np.asarray(apart / np.maximum(apart**2 + blurred**2, 1e-300))
+
+def _by(slope: Real, matrix: Real) -> Real:
+    """Σ_b slope_ab… matrix_bc, (g, a, c, …)."""
+    return np.asarray(matrix.transpose(0, 2, 1)[:, None] @ slope)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.inference import Residuals, tails
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
 from ema_pipeline.mechanics.terms import Matrices
-from ema_pipeline.observations.close_modes import Group, Slopes, straightened
+from ema_pipeline.observations.close_modes import Groups, Slopes, Turned
 from ema_pipeline.observations.coinciding import directions, hidden_partners
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_pairing import paired, turned
@@ -89,9 +89,9 @@ class _Known:
     mixed: list[tuple[int, int, int]]
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Predicted:
-    """What the model says of modes that have a partner, and the derivatives by all unknowns.
+    """What the model says of modes that have a partner.
 
     Attributes
     ----------
@@ -99,22 +99,19 @@ class _Predicted:
         ln of Hz, without drift.
     shapes, turned : ndarray, (k, s)
         What the sensors read, and what close modes hold of each other beside it; both up to one factor per mode.
-    log_frequency_slope, shapes_slope, turned_slope : ndarray, (k, n), (k, s, n), (k, s, n), optional
+    slope : _Predicted, optional
+        Derivatives by all unknowns, with n as the last axis of each.
     """
 
     log_frequency: NDArray[np.float64]
     shapes: NDArray[np.float64]
     turned: NDArray[np.float64]
-    log_frequency_slope: NDArray[np.float64] | None = None
-    shapes_slope: NDArray[np.float64] | None = None
-    turned_slope: NDArray[np.float64] | None = None
+    slope: _Predicted | None = None
 
-    def put(self, members: NDArray[np.int64], group: Group) -> None:
-        """Some modes as they are in their group."""
-        for name in ("log_frequency", "shapes", "turned"):
-            for of in (name, f"{name}_slope"):
-                if getattr(self, of) is not None:
-                    getattr(self, of)[members] = getattr(group, of)
+    def put(self, members: NDArray[np.int64], of: Groups | Turned) -> None:
+        """Some modes as they are in their groups, (g, c)."""
+        self.log_frequency[members] = of.log_frequency
+        self.shapes[members], self.turned[members] = of.shapes, of.turned
 
 
 class Comparison:
@@ -170,8 +167,8 @@ class Comparison:
         known = self._known(on)
         groups = self._groups(solution, predicted, known, to)
         number = np.full(len(on), -1)
-        for g, members in enumerate(groups):
-            number[members] = g
+        for members, _ in groups:
+            number[members] = members[:, :1]
         slopes = ModeDerivatives.of(matrices, solution, to, number) if derivatives else None
         # what was held out has been measured: its neighbour's shape holds none of it
         sensors = np.count_nonzero(self.data.seen[on], axis=1) * self.data.complete
@@ -240,7 +237,7 @@ class Comparison:
 
     def _frequencies(self, predicted: _Predicted, on: NDArray[np.int64]) -> Rows:
         d = self.data
-        slope = predicted.log_frequency_slope
+        slope = None if predicted.slope is None else predicted.slope.log_frequency
         if slope is not None:
             slope[:, self.sensing.drift] = 1.0
         return Rows(
@@ -290,37 +287,31 @@ class Comparison:
 
     def _groups(
         self, solution: EigenSolution, predicted: NDArray[np.float64], known: _Known, to: NDArray[np.int64]
-    ) -> list[NDArray[np.int64]]:
-        """Places of close modes that are compared as a group, those whose shapes the sensors tell apart."""
+    ) -> list[tuple[NDArray[np.int64], Groups]]:
+        """Close modes that are compared as groups, those whose shapes the sensors tell apart.
+
+        Places of the modes, (g, c), and what they are, of every size c.
+        """
         number, damped = self.data.group[known.on], solution.damped
         if damped is not None:
             number = np.where([damped.turned(int(r)) for r in to], -1, number)
+        numbers, counts = np.unique(number[number >= 0], return_counts=True)
         found = []
-        for g in np.unique(number[number >= 0]):
-            members = np.flatnonzero(number == g)
-            if len(members) > 1 and self._group(solution, predicted, known, to, members) is not None:
-                found.append(members)
+        for count in np.unique(counts[counts > 1]):
+            members = np.array([np.flatnonzero(number == g) for g in numbers[counts == count]])
+            on, log_std = known.on[members], self.data.log_frequency_std
+            groups = Groups(
+                predicted[:, to[members]].transpose(1, 0, 2),
+                known.shapes[members],
+                known.weight[members],
+                solution.frequency_hz[to[members]],
+                np.exp(self.data.log_frequency[on]),
+                self.heat * np.hypot(log_std[on], _PREDICTED),
+            )
+            apart = groups.told_apart
+            if np.any(apart):
+                found.append((members[apart], groups if np.all(apart) else groups.only(apart)))
         return found
-
-    def _group(
-        self,
-        solution: EigenSolution,
-        predicted: NDArray[np.float64],
-        known: _Known,
-        to: NDArray[np.int64],
-        members: NDArray[np.int64],
-        slopes: Slopes | None = None,
-    ) -> Group | None:
-        on = known.on[members]
-        return straightened(
-            predicted[:, to[members]],
-            known.shapes[members],
-            known.weight[members],
-            solution.frequency_hz[to[members]],
-            np.exp(self.data.log_frequency[on]),
-            self.heat * np.hypot(self.data.log_frequency_std[on], _PREDICTED),
-            slopes,
-        )
 
     def _predicted(
         self,
@@ -328,40 +319,44 @@ class Comparison:
         read: NDArray[np.float64],
         known: _Known,
         to: NDArray[np.int64],
-        groups: list[NDArray[np.int64]],
+        groups: list[tuple[NDArray[np.int64], Groups]],
         slopes: ModeDerivatives | None,
     ) -> _Predicted:
         """What the model says of the frequencies and shapes of modes with a partner, close ones as groups."""
         n = len(self.x)
         log = np.log(np.maximum(solution.frequency_hz[to], 1e-6))
-        shapes, turned = read[:, to].T, np.zeros((len(to), len(read)))
-        found = _Predicted(log, shapes, turned)
+        found = _Predicted(log, read[:, to].T, np.zeros((len(to), len(read))))
         if slopes is not None:
             log_slope = np.zeros((len(to), n))
             log_slope[:, : slopes.log_frequency.shape[1]] = slopes.log_frequency
             slope = self._shape_slopes(slopes.shapes, solution, to)
             if solution.damped is not None and np.iscomplexobj(slope):
                 slope = _turned_slopes(self._read(solution)[:, to].T, slope)
-            found = _Predicted(log, shapes, turned, log_slope, np.real(slope), np.zeros((*shapes.shape, n)))
-        for members in groups:
-            given = None if slopes is None else self._group_slopes(found, slopes, known, members)
-            group = self._group(solution, read, known, to, members, given)
-            assert group is not None  # as asked in `_groups`
+            slope = np.real(slope)
+            found.slope = _Predicted(log_slope, slope, np.zeros(slope.shape))
+        for members, group in groups:
             found.put(members, group)
+            if found.slope is not None and slopes is not None:
+                by = self._group_slopes(found.slope.shapes[members], slopes, known, members)
+                found.slope.put(members, group.slopes(by))
         return found
 
     def _group_slopes(
-        self, found: _Predicted, slopes: ModeDerivatives, known: _Known, members: NDArray[np.int64]
+        self,
+        read: NDArray[np.float64],
+        slopes: ModeDerivatives,
+        known: _Known,
+        members: NDArray[np.int64],
     ) -> Slopes:
-        """Derivatives of what the modes of a group are made of."""
-        assert found.shapes_slope is not None
-        read = found.shapes_slope[members]
-        reduced = np.zeros((len(members), len(members), len(self.x)))
-        reduced[:, :, : slopes.reduced.shape[2]] = slopes.reduced[np.ix_(members, members)]
-        measured, place = np.zeros(read.shape), {int(k): i for i, k in enumerate(members)}
+        """Derivatives of what groups are made of, those of their modes' shapes `read` given."""
+        g, c = members.shape
+        reduced = np.zeros((g, c, c, len(self.x)))
+        reduced[..., : slopes.reduced.shape[2]] = slopes.reduced[members[:, :, None], members[:, None, :]]
+        measured = np.zeros(read.shape)
+        place = {int(k): (i, j) for (i, j), k in np.ndenumerate(members)}
         for k, other, unknown in known.mixed:
             if k in place:
-                measured[place[k], :, unknown] = -self.data.known_shapes[other]
+                measured[(*place[k], slice(None), unknown)] = -self.data.known_shapes[other]
         return Slopes(read, reduced, measured)
 
     def _shapes(
@@ -388,11 +383,11 @@ class Comparison:
         squared = np.maximum(np.sum(weighted * p, axis=1), 1e-300)
         scale = np.sum(weighted * y, axis=1) / squared
         slope = None
-        if shapes.shapes_slope is not None and shapes.turned_slope is not None:
-            dp = shapes.shapes_slope[real]
+        if shapes.slope is not None:
+            dp = shapes.slope.shapes[real]
             towards = weight * (y - 2 * scale[:, None] * p) / squared[:, None]
             scaled = (towards[:, None, :] @ dp)[:, 0]
-            slope = scale[:, None, None] * (dp + shapes.turned_slope[real])
+            slope = scale[:, None, None] * (dp + shapes.slope.turned[real])
             for k, other, unknown in known.mixed:
                 if k in place:
                     along = self.data.known_shapes[other]
