@@ -52,6 +52,10 @@ chain has eighteen of one size."""
 _SHORT, _ANNEALED = 8, 16
 """Steps of a short fit, and how many hypotheses, best first by it, are annealed where the base model fails though it
 has a partner for every mode. What led in the end was among the first eight of some sixty."""
+_FIRST = 24
+"""Hypotheses of one size that are annealed first where a measured mode has no partner."""
+_ALL = 0.5
+"""Error at wide scatters, which is 0.3 on rigs without fault, up to which a model explains all."""
 _UNPROMISING = 6
 """The same where the score promises nothing and the base model is near, so that a fit gains what its score says to some
 tenths: more than `FINALISTS`, so that the reader sees what comes next."""
@@ -151,14 +155,22 @@ def rank(
     chosen = _screened(hypotheses, promise, near)
     # A few steps do not lead a mode of the model to a measured one that has no partner yet.
     short = stuck and not lost
-    first = _short_fits(observations, base, models, promise, chosen, processes) if short else {}
-    asked = [h for h in chosen if h.label not in first]
+    first = _short_fits(observations, base, models, promise, chosen, processes)[_ANNEALED:] if short else []
+    known = {h.label: posterior for h, posterior in first}
     job = partial(_annealed_fit if stuck else _first_fit, observations, base, models, promise)
-    for i, (hypothesis, posterior) in enumerate(zip(asked, spread(job, asked, processes), strict=True)):
-        first[hypothesis.label] = posterior
-        progress(0.6 * (i + 1) / len(asked), hypothesis.label)
-    found = {h.label: (h, Fit(models[h.label], first[h.label])) for h in chosen}
-    if not near:
+    asked = [h for h in chosen if h.label not in known]
+    decided = False
+    for batch in _batches(asked, promise) if lost else [asked]:
+        if decided:
+            behind = _short_fits(observations, base, models, promise, batch, processes)
+            known |= {h.label: posterior for h, posterior in behind}
+            batch = [h for h in batch if h.label not in known]
+        for hypothesis, posterior in zip(batch, spread(job, batch, processes), strict=True):
+            known[hypothesis.label] = posterior
+            progress(0.6 * len(known) / len(chosen), hypothesis.label)
+        decided = any(_decides(p, base) for p in known.values())
+    found = {h.label: (h, Fit(models[h.label], known[h.label])) for h in chosen}
+    if not near and not (lost and decided):
         base, found = _begun_again(observations, base, found, processes, found, steps=5)
     found = _bettered(found, _contenders(found), partial(_free, observations), processes)
     base, found = _begun_again(observations, base, found, processes, _contenders(found), steps=12)
@@ -191,6 +203,18 @@ def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], ne
     return [h for h in hypotheses if h.label not in out]
 
 
+def _batches(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) -> list[list[Hypothesis]]:
+    """Those that promise most, or whose score says nothing, and the others."""
+    told = [h for h in hypotheses if h.label in promise and len(h.placed.effect.parameters) == 1]
+    later = sorted(told, key=lambda h: -promise[h.label].gain)[_FIRST:]
+    return [[h for h in hypotheses if h not in later], [h for h in hypotheses if h in later]]
+
+
+def _decides(found: Posterior, base: Fit) -> bool:
+    """True where one hypothesis explains all that the base model does not: no other one can lead it."""
+    return found.error < _ALL and found.log_evidence > base.log_evidence + BEATEN
+
+
 def _short_fits(
     observations: Observations,
     base: Fit,
@@ -198,8 +222,8 @@ def _short_fits(
     promise: Mapping[str, Score],
     hypotheses: Sequence[Hypothesis],
     processes: int | None,
-) -> dict[str, Posterior]:
-    """Fits of a few steps from the sizes that scores tell, of hypotheses too far behind by them to be annealed."""
+) -> list[tuple[Hypothesis, Posterior]]:
+    """Fits of a few steps from the sizes that scores tell, best first, of hypotheses of one size."""
     scored = [
         h
         for h in hypotheses
@@ -212,8 +236,7 @@ def _short_fits(
         return refined(observations, model, x, steps=_SHORT).posterior
 
     found = list(zip(scored, spread(fitted, scored, processes), strict=True))
-    found.sort(key=lambda pair: -pair[1].log_evidence)
-    return {h.label: posterior for h, posterior in found[_ANNEALED:]}
+    return sorted(found, key=lambda pair: -pair[1].log_evidence)
 
 
 def _at_score(
