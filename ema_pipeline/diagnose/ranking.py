@@ -153,24 +153,23 @@ def rank(
     settled = None if stuck else learned(observations, base)
     near = settled is not None and not np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT))
     chosen = _screened(hypotheses, promise, near)
-    # A few steps do not lead a mode of the model to a measured one that has no partner yet.
-    short = stuck and not lost
-    first = _short_fits(observations, base, models, promise, chosen, processes)[_ANNEALED:] if short else []
-    known = {h.label: posterior for h, posterior in first}
     job = partial(_annealed_fit if stuck else _first_fit, observations, base, models, promise)
-    asked = [h for h in chosen if h.label not in known]
+    short = partial(_short_fits, observations, base, models, promise)
+    known: dict[str, Posterior] = {}
+    # A few steps do not lead a mode of the model to a measured one that has no partner yet.
+    if stuck and not lost:
+        known |= {h.label: posterior for h, posterior in short(chosen, processes)[_ANNEALED:]}
     decided = False
-    for batch in _batches(asked, promise) if lost else [asked]:
+    for batch in _batches([h for h in chosen if h.label not in known], promise if lost else {}):
         if decided:
-            behind = _short_fits(observations, base, models, promise, batch, processes)
-            known |= {h.label: posterior for h, posterior in behind}
-            batch = [h for h in batch if h.label not in known]
-        for hypothesis, posterior in zip(batch, spread(job, batch, processes), strict=True):
+            known |= {h.label: posterior for h, posterior in short(batch, processes)}
+        asked = [h for h in batch if h.label not in known]
+        for hypothesis, posterior in zip(asked, spread(job, asked, processes), strict=True):
             known[hypothesis.label] = posterior
             progress(0.6 * len(known) / len(chosen), hypothesis.label)
-        decided = any(_decides(p, base) for p in known.values())
+        decided = lost and any(_decides(p, base) for p in known.values())
     found = {h.label: (h, Fit(models[h.label], known[h.label])) for h in chosen}
-    if not near and not (lost and decided):
+    if not near and not decided:
         base, found = _begun_again(observations, base, found, processes, found, steps=5)
     found = _bettered(found, _contenders(found), partial(_free, observations), processes)
     base, found = _begun_again(observations, base, found, processes, _contenders(found), steps=12)
@@ -178,9 +177,9 @@ def rank(
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     others = [h for h in hypotheses if h.label not in {best.label for best, _ in order[:FINALISTS]}]
     if settled is None or not near:
-        return _finals(observations, base, order, (), True, processes)
+        return _finals(observations, base, order, (), processes)
     promising = _promising(observations, settled, others, models, further)
-    return _finals(observations, settled, order, promising, False, processes)
+    return _finals(observations, base, order, promising, processes, settled)
 
 
 def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], near: bool) -> list[Hypothesis]:
@@ -450,19 +449,24 @@ def _finals(
     base: Fit,
     order: Sequence[tuple[Hypothesis, Fit]],
     promising: Sequence[tuple[Hypothesis, Fit]],
-    past_barriers: bool,
     processes: int | None,
+    settled: Fit | None = None,
 ) -> Ranking:
     """Scatters learned for the base model and the best hypotheses, each from what the others know.
 
-    Hypotheses that begin beside a base model that explains the data are past the barriers that it was led past.
+    `settled` is the base model with learned scatters where it explains the data: what begins beside it is past the
+    barriers that it was led past.
     """
     best, rest = order[:FINALISTS], order[FINALISTS:]
     near = [pair for pair in best if pair[1].log_evidence >= best[0][1].log_evidence - BEATEN]
     far = best[len(near) :]
     finalists = [*near, *promising]
-    fits = [base, *(fit for _, fit in finalists)]
-    first = _spread_fits(partial(_learned, observations, past_barriers), fits, processes)
+    job = partial(_learned, observations, settled is None)
+    fits = [fit for _, fit in finalists]
+    if settled is None:
+        first = _spread_fits(job, [base, *fits], processes)
+    else:
+        first = [settled, *_spread_fits(job, fits, processes)]
     beaten = _spread_fits(partial(_learned, observations, False), [fit for _, fit in far], processes)
     leaders = sorted(first[1:], key=lambda f: -f.log_evidence)
     job = partial(_crossed, observations, (first[0], *leaders[:2]))
