@@ -50,8 +50,8 @@ _SCREENED_LAWS = 24
 of a model that is bent to the data, and put a cubic spring of a chain of three, which explained all, fifteenth. Such a
 chain has eighteen of one size."""
 _SHORT, _ANNEALED = 8, 16
-"""Steps of a short fit, and how many hypotheses, best first by it, are annealed where the base model fails though it
-has a partner for every mode. What led in the end was among the first eight of some sixty."""
+"""Steps of a short fit, and how many hypotheses, best first by it, are fitted in full where the base model fails, or is
+bent to the data, though it has a partner for every mode. What led in the end was among the first eight of some sixty."""
 _FIRST = 24
 """Hypotheses of one size that are annealed first where a measured mode has no partner."""
 _ALL = 0.5
@@ -157,7 +157,7 @@ def rank(
     short = partial(_short_fits, observations, base, models, promise)
     known: dict[str, Posterior] = {}
     # A few steps do not lead a mode of the model to a measured one that has no partner yet.
-    if stuck and not lost:
+    if not near and not lost:
         known |= {h.label: posterior for h, posterior in short(chosen, processes)[_ANNEALED:]}
     decided = False
     for batch in _batches([h for h in chosen if h.label not in known], promise if lost else {}):
