@@ -14,11 +14,14 @@ from ema_pipeline.diagnose.ranking import (
     Found,
     Ranked,
     Ranking,
+    _batches,
     _begun_again,
     _best_of_grid,
     _better,
     _bettered,
+    _contenders,
     _crossed,
+    _decides,
     _finals,
     _first_fit,
     _on,
@@ -90,7 +93,7 @@ def test_of_many_hypotheses_those_of_each_kind_are_fitted_that_promise_most() ->
     assert len(_screened(everything, promise, near=True)) == 16 + 12
 
 
-def test_where_the_base_fails_only_those_that_lead_after_a_short_fit_are_annealed(
+def test_short_fits_begin_at_the_scores_of_what_has_one_size(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     everything = [hypothesis(f"h{k}") for k in range(20)]
@@ -113,8 +116,8 @@ def test_where_the_base_fails_only_those_that_lead_after_a_short_fit_are_anneale
     models = {h.label: h.label for h in [*everything, *others]}
     kept = _short_fits(NO_DATA, fit("base", 0.0), models, promise, [*others, *everything], 1)  # type: ignore[arg-type]
     assert asked == [(h.label, (h.label, promise[h.label]), 8) for h in everything]
-    assert {p.log_evidence for p in kept.values()} == {0.0, 1.0, 2.0, 3.0}  # type: ignore[attr-defined]
-    assert all(p.name == label for label, p in kept.items())  # type: ignore[attr-defined]
+    assert [p.log_evidence for _, p in kept] == list(range(19, -1, -1))  # type: ignore[attr-defined]
+    assert all(p.name == h.label for h, p in kept)  # type: ignore[attr-defined]
 
 
 # --- the order of fits ---------------------------------------------------------------------------------------------
@@ -131,12 +134,12 @@ def found_of(**values: float) -> Found:
 
 
 def test_finalists_are_learned_and_compared_with_the_learned_base(monkeypatch: pytest.MonkeyPatch) -> None:
-    learned: list[str] = []
+    learned: list[tuple[str, bool]] = []
     crossed: list[str] = []
     among: set[tuple[str, ...]] = set()
 
-    def learn(observations: object, one: Any) -> Any:
-        learned.append(one.model.name)
+    def learn(observations: object, past_barriers: bool, one: Any) -> Any:
+        learned.append((one.model.name, past_barriers))
         return SimpleNamespace(log_evidence=one.log_evidence + (30.0 if one.model.name == "b" else 3.0))
 
     def cross(observations: object, sources: Any, one: Any) -> Any:
@@ -149,7 +152,8 @@ def test_finalists_are_learned_and_compared_with_the_learned_base(monkeypatch: p
     found = found_of(a=60.0, b=50.0, c=-139.0, d=-140.0, e=-141.0, f=-150.0, g=-200.0)
     promising = [(hypothesis("g"), fit("g", 20.0))]
     told = _finals(NO_DATA, fit("base", 10.0), list(found.values()), promising, 1)
-    assert learned == ["base", "a", "b", "c", "d", "g", "e"]  # e can no longer catch up
+    asked = [(name, True) for name in ("base", "a", "b", "c", "d", "g")]
+    assert learned == [*asked, ("e", False)]  # e can no longer catch up
     assert crossed == ["base", "a", "b", "c", "d", "g"]
     assert among == {("base", "b", "a")}
     assert told.base.log_evidence == 14.0
@@ -166,6 +170,25 @@ def test_finalists_are_learned_and_compared_with_the_learned_base(monkeypatch: p
     assert _finals(NO_DATA, fit("base", 10.0), [], [], 1).ranked == ()
 
 
+def test_beside_a_base_model_that_explains_the_data_nothing_is_led_past_its_barriers_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    learned: list[tuple[str, bool]] = []
+
+    def learn(observations: object, past_barriers: bool, one: Any) -> Any:
+        learned.append((one.model.name, past_barriers))
+        return SimpleNamespace(log_evidence=one.log_evidence + 100.0)
+
+    monkeypatch.setattr(ranking, "_learned", learn)
+    monkeypatch.setattr(ranking, "_crossed", lambda o, sources, one: one.posterior)
+    order = list(found_of(a=12.0, b=11.9, c=11.8, d=11.7, e=11.6, f=11.5).values())
+    told = _finals(NO_DATA, fit("base", 10.0), order, [], 1, fit("settled", 111.0))
+    assert learned == [(name, False) for name in "abcde"]
+    assert told.base.log_evidence == 111.0
+    # what is no finalist is held against the base model at the same wide scatters
+    assert [round(r.gain, 1) for r in told.ranked] == [1.0, 0.9, 0.8, 0.7, 0.6, 0.6]
+
+
 def test_what_modes_without_a_partner_cost_is_the_least_over_all() -> None:
     def ranked(penalty: float) -> Ranked:
         residuals = SimpleNamespace(penalty=penalty)
@@ -177,9 +200,32 @@ def test_what_modes_without_a_partner_cost_is_the_least_over_all() -> None:
 
 def test_only_the_best_are_bettered() -> None:
     found = found_of(a=1.0, b=3.0, c=2.0)
-    told = _bettered(found, 2, lambda one: fit("x", one.log_evidence + 10.0).posterior, 1)
+    told = _bettered(found, ["b", "c"], lambda one: fit("x", one.log_evidence + 10.0).posterior, 1)
     assert {k: f.log_evidence for k, (_, f) in told.items()} == {"a": 1.0, "b": 13.0, "c": 12.0}
     assert [f.model.name for _, f in told.values()] == ["a", "b", "c"]  # type: ignore[attr-defined]
+
+
+def test_what_is_far_behind_is_no_contender() -> None:
+    far = {f"h{k}": 0.0 - k for k in range(20)} | {"best": 195.0}
+    assert _contenders(found_of(**far)) == ["best", *(f"h{k}" for k in range(6))]
+    assert _contenders(found_of(**{k: v - 100 for k, v in far.items() if k != "best"})) == [
+        f"h{k}" for k in range(12)
+    ]
+    assert _contenders({}) == []
+
+
+def test_what_promises_most_is_fitted_first_and_the_rest_in_a_few_steps_once_all_is_explained() -> None:
+    everything = [hypothesis(f"h{k}") for k in range(40)]
+    more = [hypothesis("two sizes", sizes=2), hypothesis("not scored")]
+    promise: Any = {h.label: score(float(k)) for k, h in enumerate(everything)} | {"two sizes": score(-9.0)}
+    first, rest = _batches([*everything, *more], promise)
+    assert [h.label for h in first] == [*(f"h{k}" for k in range(16, 40)), "two sizes", "not scored"]
+    assert [h.label for h in rest] == [f"h{k}" for k in range(16)]
+    assert _batches(everything, {}) == [everything, []]
+    base = fit("base", 0.0)
+    for evidence, error, decided in ((201.0, 0.49, True), (200.0, 0.49, False), (201.0, 0.5, False)):
+        found: Any = SimpleNamespace(log_evidence=evidence, error=error)
+        assert _decides(found, base) is decided
 
 
 def test_the_base_and_the_best_begin_again_at_what_the_best_of_all_knows(
@@ -203,12 +249,12 @@ def test_the_base_and_the_best_begin_again_at_what_the_best_of_all_knows(
             of=(*(s.model.name for s in sources), sources[0].log_evidence, steps),
         ),
     )
-    base, found = _begun_again(NO_DATA, fit("base", 10.0), found_of(a=1.0, b=3.0), 1, 1, steps=7)
+    base, found = _begun_again(NO_DATA, fit("base", 10.0), found_of(a=1.0, b=3.0), 1, ["b"], steps=7)
     assert starts == [("base", "base at b", 20)]
     assert base.log_evidence == 11.0
     assert {k: f.log_evidence for k, (_, f) in found.items()} == {"a": 1.0, "b": 4.0}
     assert found["b"][1].posterior.of == ("base", "b", 11.0, 7)  # type: ignore[attr-defined]
-    better, _ = _begun_again(NO_DATA, fit("base", 12.0), found_of(a=1.0), 1, 1, steps=7)
+    better, _ = _begun_again(NO_DATA, fit("base", 12.0), found_of(a=1.0), 1, ["a"], steps=7)
     assert better.log_evidence == 12.0
 
 
@@ -276,7 +322,8 @@ def test_scatters_are_learned_again_where_another_start_leads_further(
         reached = {(0.5, 10): 6.0, (0.7, 10): 6.04, (0.1, 4): 6.0}
         return with_model("a", Parabola(("part", "a.s"), ("a.s",)), x.tolist(), reached[x[0], steps])
 
-    def learned(observations: object, one: Fit) -> Fit:
+    def learned(observations: object, one: Fit, past_barriers: bool) -> Fit:
+        assert not past_barriers
         asked.append(float(one.posterior.x[0]))
         return with_model("a", Parabola(("part", "a.s"), ("a.s",)), one.posterior.x.tolist(), value)
 
@@ -397,7 +444,11 @@ class Stages:
         labels = ("a", "b", "c", "d", "e", "f", "unseen")
         self.hypotheses = [hypothesis(k) for k in labels]
         stds = dict.fromkeys(labels, 9e5) | {"unseen": 1e6}
-        told = [SimpleNamespace(hypothesis=h, std=stds[h.label]) for h in self.hypotheses if h.label != "f"]
+        told = [
+            SimpleNamespace(hypothesis=h, std=stds[h.label], gain=0.0)
+            for h in self.hypotheses
+            if h.label != "f"
+        ]
         monkeypatch.setattr(ranking, "scores", lambda *given: told)
         monkeypatch.setattr(ranking, "learned", lambda o, one: fit("learned", 0.0))
         monkeypatch.setattr(
@@ -411,7 +462,14 @@ class Stages:
         monkeypatch.setattr(ranking, "_bettered", self.bettered)
         monkeypatch.setattr(ranking, "_promising", self.promising)
         monkeypatch.setattr(
-            ranking, "_finals", lambda o, base, order, promising, processes: (base, order, promising)
+            ranking,
+            "_finals",
+            lambda o, base, order, promising, processes, settled=None: (
+                base,
+                order,
+                list(promising),
+                settled,
+            ),
         )
         for h in self.hypotheses:
             h.scales = {}
@@ -422,22 +480,22 @@ class Stages:
         self.asked.append(("screened", [h.label for h in hypotheses], near))
         return hypotheses
 
-    def short_fits(self, *given: object) -> dict[str, Any]:
+    def short_fits(self, *given: object) -> list[tuple[Any, Any]]:
         self.short = True
-        return {}
+        return []
 
     def first_fit(self, how: str, o: object, base: object, models: Any, promise: Any, h: Any) -> Any:
         self.asked.append((how, h.label, len(promise)))
-        return SimpleNamespace(log_evidence=float("fedcba".index(h.label)))
+        return SimpleNamespace(log_evidence=float("fedcba".index(h.label)), error=1.0)
 
     def begun_again(
-        self, o: object, base: Any, found: Any, processes: object, contenders: int, steps: int
+        self, o: object, base: Any, found: Any, processes: object, contenders: Any, steps: int
     ) -> Any:
-        self.asked.append(("again", contenders, steps))
+        self.asked.append(("again", len(contenders), steps))
         return base, found
 
-    def bettered(self, found: Any, count: int, job: Any, processes: object) -> Any:
-        self.asked.append(("freed", count))
+    def bettered(self, found: Any, contenders: Any, job: Any, processes: object) -> Any:
+        self.asked.append(("freed", len(contenders)))
         return found
 
     def promising(self, o: object, settled: Any, others: Any, models: Any, further: int) -> Any:
@@ -455,8 +513,9 @@ class Stages:
 
 def test_near_the_base_model_scores_tell_where_fits_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = Stages(monkeypatch)
-    base, order, promising = stages.rank(stages.base, further=2, unpaired=2.0)
+    base, order, promising, settled = stages.rank(stages.base, further=2, unpaired=2.0)
     assert base is stages.base
+    assert settled.model.name == "learned"
     assert [h.label for h, _ in order] == ["a", "b", "c", "d", "e", "f"]
     assert promising == ["more"]
     assert stages.asked[0] == (
@@ -465,7 +524,7 @@ def test_near_the_base_model_scores_tell_where_fits_begin(monkeypatch: pytest.Mo
         True,
     )  # what cannot be seen is left out
     assert stages.asked[1] == ("first", "a", 6)
-    assert stages.asked[7:] == [("freed", 12), ("again", 12, 12), ("promising", "learned", ["f"], 2)]
+    assert stages.asked[7:] == [("freed", 6), ("again", 6, 12), ("promising", "learned", ["f"], 2)]
 
 
 @pytest.mark.parametrize(
@@ -476,9 +535,10 @@ def test_a_base_model_that_is_stuck_or_bent_is_begun_again_with_all(
 ) -> None:
     stages = Stages(monkeypatch, bent)
     stages.base.posterior.error = error  # type: ignore[misc]
-    _, _, promising = stages.rank(stages.base, further=2, unpaired=unpaired)
+    _, _, promising, settled = stages.rank(stages.base, further=2, unpaired=unpaired)
     assert promising == []
+    assert settled is None
     assert stages.asked[0][2] is False
     assert stages.asked[1] == ("first" if bent else "annealed", "a", 6)
-    assert stages.short is (error > 1.3)  # a few steps lead no mode to its partner
-    assert stages.asked[7:] == [("again", 6, 5), ("freed", 12), ("again", 12, 12)]
+    assert stages.short is (unpaired == 2.0)  # a few steps lead no mode to its partner
+    assert stages.asked[7:] == [("again", 6, 5), ("freed", 6), ("again", 6, 12)]

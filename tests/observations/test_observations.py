@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from ema_pipeline.mechanics.modes import complex_modes
 from ema_pipeline.observations import fitting
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, model_with
 from ema_pipeline.observations.mode_data import prepare
-from ema_pipeline.observations.mode_residuals import UNEXPLAINED, UNSEEN
+from ema_pipeline.observations.mode_residuals import UNEXPLAINED, UNEXPLAINED_DOUBLE, UNSEEN
 from ema_pipeline.observations.modes import MIXING, ModeObservations, ModeProblem
 from ema_pipeline.observations.parts import (
     MASS_SCATTER,
@@ -493,6 +494,15 @@ def test_a_mode_that_the_model_lacks_and_one_that_was_not_measured_cost_what_the
     found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
     assert found.penalty == UNEXPLAINED
     assert [r.measured for r in problem.rows(found)] == [0, 1, 2, 3, 4]
+    assert twice.shapes is not None
+    split = replace(
+        twice,
+        frequency_hz=more(measured.frequency_hz, 1.0001 * measured.frequency_hz[-1]),
+        shapes=np.vstack([twice.shapes[:-1], twice.shapes[-2:-1]]),
+    )
+    problem = observed(chain(), {"all": split}).problem((), {})
+    found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
+    assert found.penalty == UNEXPLAINED_DOUBLE
 
 
 def test_rows_of_the_residuals_stand_by_their_mode_and_sensor() -> None:
@@ -530,6 +540,23 @@ def test_folds_hold_every_mode_out_once() -> None:
             for u in (kept.problem((), {}).unknowns, held.problem((), {}).unknowns)
         )
         assert one == other
+
+
+def test_what_has_no_partner_in_a_fit_is_not_held_out_where_that_is_asked() -> None:
+    rig = planetary()
+    observations = observed(rig, planetary_modes(rig, 8, GOOD))
+    matching = [np.arange(len(d)) for d in observations.data]
+    found: Any = SimpleNamespace(matching=tuple(matching))
+    assert observations.holding_out_explained(found) is observations
+    matching[0][3] = -1
+    lone = observations.data[0].log_frequency[3]
+    kept = observations.holding_out_explained(found)
+    assert isinstance(kept, ModeObservations)
+    for held, rest in ((o, k) for k, o in kept.folds()):
+        assert lone not in np.concatenate([d.log_frequency for d in held.data])
+        assert lone in rest.data[0].log_frequency
+    total = sum(len(d) for _, o in observations.folds() for d in o.data)
+    assert sum(len(d) for _, o in kept.folds() for d in o.data) == total - 1
 
 
 # --- data that lack something -----------------------------------------------------------------------------
