@@ -21,6 +21,11 @@ HELD_OUT_TIE = 1.0
 a small effect than without."""
 
 
+NO_LESS_ERROR = "adding it does not reduce the error"
+PREDICTED_WORSE = "held-out data are predicted worse when it is added"
+BETTER_CONTRADICTED = "an effect that explains the data better is contradicted by held-out data"
+
+
 @dataclass(frozen=True)
 class Judged:
     """One hypothesis and what supports it.
@@ -131,9 +136,9 @@ def _std_of_first(ranked: Ranked) -> float:
 
 def _contradicted(base: Fit, mended: Fit, before: HeldOut, after: HeldOut) -> str:
     if mended.posterior.error >= base.posterior.error:
-        return "adding it does not reduce the error"
+        return NO_LESS_ERROR
     if after.log_density < before.log_density - HELD_OUT_TIE:
-        return "held-out data are predicted worse when it is added"
+        return PREDICTED_WORSE
     return ""
 
 

@@ -51,7 +51,8 @@ of a model that is bent to the data, and put a cubic spring of a chain of three,
 chain has eighteen of one size."""
 _SHORT, _ANNEALED = 8, 16
 """Steps of a short fit, and how many hypotheses, best first by it, are fitted in full where the base model fails, or is
-bent to the data, though it has a partner for every mode. What led in the end was among the first eight of some sixty."""
+bent to the data, though it has a partner for every mode. What led in the end was among the first eight of some
+sixty."""
 _FIRST = 24
 """Hypotheses of one size that are annealed first where a measured mode has no partner."""
 _ALL = 0.5

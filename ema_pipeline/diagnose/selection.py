@@ -4,10 +4,18 @@ model."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from ema_pipeline.diagnose.backward import reconsidered
-from ema_pipeline.diagnose.claims import Judged, judge
+from ema_pipeline.diagnose.claims import (
+    BETTER_CONTRADICTED,
+    NO_LESS_ERROR,
+    PREDICTED_WORSE,
+    Judged,
+    judge,
+)
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.probability import NOTHING, probabilities
 from ema_pipeline.diagnose.ranking import BEATEN, CONTENDERS, Ranking, rank
@@ -156,4 +164,18 @@ def _round(
     told = probabilities(ranking, hypotheses, settings, found)
     finals = [r for r in ranking.ranked if r.final]
     judged = [judge(observations, ranking, r, settings, told[NOTHING]) for r in finals]
-    return Round(ranking, tuple(sorted(judged, key=lambda j: -j.gain)), told)
+    judged.sort(key=lambda j: -j.gain)
+    return Round(ranking, tuple(_none_past_a_better_one(judged, settings)), told)
+
+
+def _none_past_a_better_one(judged: Sequence[Judged], settings: DiagnoseSettings) -> list[Judged]:
+    """Best first: none is claimed that explains the data far worse than one that held-out data contradict.
+
+    What contradicts the better one speaks against its rivals as much, whose probability is a small share of its own.
+    """
+    contradicted = [j.gain for j in judged if j.doubt in (NO_LESS_ERROR, PREDICTED_WORSE)]
+    most = max(contradicted, default=-np.inf)
+    return [
+        replace(j, doubt=BETTER_CONTRADICTED) if j.claimed and j.gain < most - settings.alike else j
+        for j in judged
+    ]

@@ -104,7 +104,7 @@ class Groups:
 
     @cached_property
     def _inverse(self) -> Real:
-        return np.linalg.inv(self._gram)
+        return np.asarray(np.linalg.inv(self._gram), float)
 
     @cached_property
     def _share(self) -> Real:
@@ -113,7 +113,7 @@ class Groups:
 
     @cached_property
     def _length(self) -> Real:
-        return np.linalg.norm(self._share, axis=2)
+        return np.asarray(np.linalg.norm(self._share, axis=2), float)
 
     @cached_property
     def _unit(self) -> Real:

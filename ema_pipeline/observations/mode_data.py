@@ -20,7 +20,7 @@ _WHIRLS = 0.05
 """Share of its imaginary part in the sum of squares of a shape, from which it is compared as a complex one: MPC 0.8."""
 _DOUBLE = 0.9
 """Share of a shape's squares that shapes of near modes explain, from which it is no mode of its own."""
-_NEAR = 2.0
+_NEAR = 4.0
 """Half-widths within which modes are near: one that drifts from hit to hit has twins a little farther off than one."""
 _CLOSE = 3.0
 """Half-power bandwidths within which modes are close: further apart, one is below a sixth of its peak at another's."""
@@ -164,6 +164,13 @@ class ModeData:
             if len(members) > 1 and np.all(np.sum(self.seen[members], axis=1) >= _SENSORS * len(members)):
                 group[members] = number
         return group
+
+    @cached_property
+    def unit(self) -> NDArray[np.int64]:
+        """Number of what is held out together: a mode that is alone, or all of a group, (m,)."""
+        first = {g: r for r, g in reversed(list(enumerate(self.group.tolist()))) if g >= 0}
+        begins = [first.get(g, r) for r, g in enumerate(self.group.tolist())]
+        return np.asarray(np.unique(begins, return_inverse=True)[1], np.int64)
 
     def shape_rows(self, modes: NDArray[np.int64]) -> int:
         """Number of values that the shapes of some modes are compared by: two per sensor of a whirling mode."""

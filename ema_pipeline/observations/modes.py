@@ -167,16 +167,21 @@ class ModeObservations:
         )
 
     def folds(self, count: int = 4) -> list[tuple[ModeObservations, ModeObservations]]:
-        """Every `count`-th mode held out in turn, over all configurations."""
-        total = sum(len(d) for d in self.data)
+        """Every `count`-th mode held out in turn, over all configurations; close modes of one group go together.
+
+        How one of two close modes turns into the other is no linear function of what a fit to the other one tells.
+        """
+        total, units = 0, []
+        for d in self.data:
+            units.append(total + d.unit)
+            total = int(np.max(units[-1])) + 1
         pairs = []
         for k in range(min(count, total)):
-            kept, out, offset = [], [], 0
-            for d in self.data:
-                held = (np.arange(len(d)) + offset) % count == k
+            kept, out = [], []
+            for d, unit in zip(self.data, units, strict=True):
+                held = unit % count == k
                 if d.always is not None:
                     held &= ~d.always
-                offset += len(d)
                 kept.append(d.only(~held))
                 out.append(d.only(held))
             pairs.append((self.with_data(kept), self.with_data(out)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from ema_pipeline.diagnose import selection
+from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, NO_LESS_ERROR, PREDICTED_WORSE
 from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _groups
 from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.selection import Round, Selection, _beside, select
@@ -175,7 +177,9 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(
         selection,
         "judge",
-        lambda o, ranking, r, settings, nothing: SimpleNamespace(gain=r.gain, nothing=nothing),
+        lambda o, ranking, r, settings, nothing: SimpleNamespace(
+            gain=r.gain, nothing=nothing, doubt="", claimed=True
+        ),
     )
     given: Any = SimpleNamespace(ranked=ranked)
     data: Any = None
@@ -183,6 +187,39 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
     assert [(j.gain, j.nothing) for j in found.judged] == [(4.0, 0.7), (2.0, 0.7), (1.0, 0.7)]  # type: ignore[attr-defined]
     assert found.probabilities == told | {"n": 2}
     assert found.ranking is given
+
+
+@dataclass(frozen=True)
+class Told:
+    """What `_none_past_a_better_one` asks of a candidate."""
+
+    gain: float
+    doubt: str = ""
+
+    @property
+    def claimed(self) -> bool:
+        return not self.doubt
+
+
+@pytest.mark.parametrize(
+    ("doubt", "behind", "claimed"),
+    [
+        (PREDICTED_WORSE, 13.0, False),
+        (NO_LESS_ERROR, 13.0, False),
+        (PREDICTED_WORSE, 2.9, True),  # as good as the better one
+        ("the shape of one closely spaced mode", 13.0, True),  # which was no evidence
+    ],
+)
+def test_nothing_is_claimed_far_behind_what_held_out_data_contradict(
+    doubt: str, behind: float, claimed: bool
+) -> None:
+    better, worse = Told(17.0, doubt), Told(17.0 - behind)
+    judged: Any = [better, worse]
+    one, other = selection._none_past_a_better_one(judged, SETTINGS)
+    assert one is better  # type: ignore[comparison-overlap]
+    assert other.doubt == ("" if claimed else BETTER_CONTRADICTED)
+    ahead: Any = [Told(30.0), better]
+    assert selection._none_past_a_better_one(ahead, SETTINGS)[0].claimed
 
 
 def test_no_more_effects_are_added_than_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
