@@ -54,7 +54,8 @@ _SHORT, _ANNEALED = 8, 16
 bent to the data, though it has a partner for every mode. What led in the end was among the first eight of some
 sixty."""
 _FIRST = 24
-"""Hypotheses of one size that are annealed first where a measured mode has no partner."""
+"""Hypotheses of one size that are annealed first where a measured mode has no partner, and those that are begun again
+where the base model is bent to the data."""
 _ALL = 0.5
 """Error at wide scatters, which is 0.3 on rigs without fault, up to which a model explains all."""
 _UNPROMISING = 6
@@ -171,7 +172,8 @@ def rank(
         decided = lost and any(_decides(p, base) for p in known.values())
     found = {h.label: (h, Fit(models[h.label], known[h.label])) for h in chosen}
     if not near and not decided:
-        base, found = _begun_again(observations, base, found, processes, found, steps=5)
+        again = found if stuck else _contenders(found, _FIRST)
+        base, found = _begun_again(observations, base, found, processes, again, steps=5)
     found = _bettered(found, _contenders(found), partial(_free, observations), processes)
     base, found = _begun_again(observations, base, found, processes, _contenders(found), steps=12)
     progress(0.8, "scatter of parts and channels")
@@ -372,9 +374,9 @@ def _begun_again(
     return base, _bettered(found, contenders, job, processes)
 
 
-def _contenders(found: Found) -> list[str]:
+def _contenders(found: Found, most: int = CONTENDERS) -> list[str]:
     """The best hypotheses, and none that is beaten."""
-    best = sorted(found, key=lambda label: -found[label][1].log_evidence)[:CONTENDERS]
+    best = sorted(found, key=lambda label: -found[label][1].log_evidence)[:most]
     return [h for h in best if found[h][1].log_evidence >= found[best[0]][1].log_evidence - BEATEN]
 
 

@@ -83,11 +83,13 @@ class Groups:
     def told_apart(self) -> NDArray[np.bool_]:
         """True where the sensors tell the modes of a group apart, the model's and the measured ones, (g,)."""
         size = np.sqrt(np.maximum(np.einsum("gkaa->gka", self._gram), 1e-300))
-        least = np.linalg.eigvalsh(self._gram / size[..., :, None] / size[..., None, :])[..., 0]
+        alike = self._gram / size[..., :, None] / size[..., None, :]
+        pair = alike.shape[-1] == 2
+        least = 1 - np.abs(alike[..., 0, 1]) if pair else np.linalg.eigvalsh(alike)[..., 0]
         independent = np.min(least, axis=1) > _INDEPENDENT
         found = np.zeros(len(independent), bool)
         if np.any(independent):
-            some = self.only(independent)
+            some = self if np.all(independent) else self.only(independent)
             found[independent] = (some._polar[1][:, -1] ** 2 > _INDEPENDENT) & np.all(
                 some._length > 0, axis=1
             )
