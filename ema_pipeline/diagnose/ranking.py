@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,7 @@ from ema_pipeline.observations.fitting import (
     wide,
 )
 
+T = TypeVar("T")
 Progress = Callable[[float, str], None]
 Schedule = tuple[tuple[float, int], ...]
 
@@ -41,7 +43,7 @@ FINALISTS = 5
 _UNBENT = 3.0
 """Standard deviations of parts, as the scatter is learned, up to which the base model has not bent them to the data: on
 top of a bent part everything promises much."""
-BEATEN = 200.0
+_BEATEN = 200.0
 """Log evidence behind the best hypothesis from which another one cannot catch up: it is not begun again."""
 _SCREENED = 14
 """Hypotheses of one kind, generic or the rig's own, best first by their score, that are fitted in full."""
@@ -214,7 +216,7 @@ def _batches(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) -> 
 
 def _decides(found: Posterior, base: Fit) -> bool:
     """True where one hypothesis explains all that the base model does not: no other one can lead it."""
-    return found.error < _ALL and found.log_evidence > base.log_evidence + BEATEN
+    return found.error < _ALL and found.log_evidence > base.log_evidence + _BEATEN
 
 
 def _short_fits(
@@ -377,7 +379,12 @@ def _begun_again(
 def _contenders(found: Found, most: int = CONTENDERS) -> list[str]:
     """The best hypotheses, and none that is beaten."""
     best = sorted(found, key=lambda label: -found[label][1].log_evidence)[:most]
-    return [h for h in best if found[h][1].log_evidence >= found[best[0]][1].log_evidence - BEATEN]
+    return unbeaten(best, lambda label: found[label][1].log_evidence)
+
+
+def unbeaten(best_first: Sequence[T], evidence: Callable[[T], float]) -> list[T]:
+    """Those that can catch up with the first one."""
+    return [one for one in best_first if evidence(one) >= evidence(best_first[0]) - _BEATEN]
 
 
 def _bettered(
@@ -461,7 +468,7 @@ def _finals(
     barriers that it was led past.
     """
     best, rest = order[:FINALISTS], order[FINALISTS:]
-    near = [pair for pair in best if pair[1].log_evidence >= best[0][1].log_evidence - BEATEN]
+    near = unbeaten(best, lambda pair: pair[1].log_evidence)
     far = best[len(near) :]
     finalists = [*near, *promising]
     job = partial(_learned, observations, settled is None)

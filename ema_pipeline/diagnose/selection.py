@@ -18,7 +18,7 @@ from ema_pipeline.diagnose.claims import (
 )
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.probability import NOTHING, probabilities
-from ema_pipeline.diagnose.ranking import BEATEN, CONTENDERS, Ranking, rank
+from ema_pipeline.diagnose.ranking import CONTENDERS, Ranking, rank, unbeaten
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, fit_base
@@ -136,8 +136,7 @@ def select(
         added = next(j for j in near if j.claimed)  # a rival alone does not pass the conditions of a claim
         suited = observations.suited(added.ranked.fit.model.effects)
         if suited is not observations:
-            best = ranking.ranked[0].gain
-            leading = [r.hypothesis for r in ranking.ranked[:CONTENDERS] if r.gain >= best - BEATEN]
+            leading = [r.hypothesis for r in unbeaten(ranking.ranked[:CONTENDERS], lambda r: r.gain)]
             return select(suited, known, hypotheses, settings, progress, leading)
         claimed.append(added)
         rivals[added.hypothesis.label] = rounds[-1].judged

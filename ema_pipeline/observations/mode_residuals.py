@@ -35,7 +35,7 @@ UNSEEN = 3.0
 
 _SHAPE_REACH = 0.3
 """Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
-_PREDICTED = 3e-4
+_LEAST_FREQUENCY_STD = 3e-4
 """1 σ of ln f that no model predicts better: how two modes nearer than that mix is not known."""
 _DAMPING_STD = 0.02
 """1 σ of ln ζ that no model is better than, where each mode has a damping ratio of its own."""
@@ -306,7 +306,7 @@ class Comparison:
                 known.weight[members],
                 solution.frequency_hz[to[members]],
                 np.exp(self.data.log_frequency[on]),
-                self.heat * np.hypot(log_std[on], _PREDICTED),
+                self.heat * np.hypot(log_std[on], _LEAST_FREQUENCY_STD),
             )
             apart = groups.told_apart
             if np.any(apart):
