@@ -184,6 +184,8 @@ class ModeObservations:
                     held &= ~d.always
                 kept.append(d.only(~held))
                 out.append(d.only(held))
+            if not any(map(len, out)):  # all of it is never held out
+                continue
             pairs.append((self.with_data(kept), self.with_data(out)))
         return pairs
 

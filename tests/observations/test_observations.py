@@ -557,6 +557,8 @@ def test_what_has_no_partner_in_a_fit_is_not_held_out_where_that_is_asked() -> N
         assert lone in rest.data[0].log_frequency
     total = sum(len(d) for _, o in observations.folds() for d in o.data)
     assert sum(len(d) for _, o in kept.folds() for d in o.data) == total - 1
+    nothing: Any = SimpleNamespace(matching=tuple(np.full(len(d), -1) for d in observations.data))
+    assert observations.holding_out_explained(nothing).folds() == []
 
 
 # --- data that lack something -----------------------------------------------------------------------------
