@@ -7,7 +7,8 @@
 Every case draws a rig, hides none, one or two effects of random size at random places, simulates a test as a good or a
 normal laboratory makes it (parts, calibration, transverse sensitivity, aim, drift, damping; see
 docs/simulated_tests.md), states nothing of that, and takes the raw volts through the whole of `ema run`. With
-`--without` the library lacks the hidden effect's kind. A JSON line per case is appended to the results file; cases that
+`--without` the library lacks the hidden effect's kind; what the whole library says of the same data tells whether the
+effect is visible at all. A JSON line per case is appended to the results file; cases that
 the file holds are not run again, so a study can be broken off at any time.
 
 A case runs in a process of its own, so that neither a crash nor a changed library touches the next one.
@@ -45,9 +46,11 @@ def run(case: Case, overrides: list[str]) -> Line:
         try:
             made = make(case, raw)
             line |= _of_truth(made)
-            if case.without:
-                remove_from_library(made)
             middle = time.monotonic()
+            if case.without:
+                run_raw(raw, None, Path(folder) / "whole", overrides=overrides)
+                line["whole"] = told((Path(folder) / "whole" / "summary.json").read_text(encoding="utf-8"))
+                remove_from_library(made)
             run_raw(raw, None, out, overrides=overrides)
             line |= told((out / "summary.json").read_text(encoding="utf-8"))
         except Exception as error:  # a case that fails is a result

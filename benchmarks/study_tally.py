@@ -125,8 +125,16 @@ def outcome(line: Line) -> str:
         return "right" if set(found) == {"right"} else "group"
     if line["verdict"] == "unknown_effect":
         return "unknown"
+    if line["without"]:
+        return "missed above" if _seen_by_all(line) else "missed below"
     ratio = over_limit(line)
     return "missed below" if ratio is not None and ratio < CLEARLY else "missed above"
+
+
+def _seen_by_all(line: Line) -> bool:
+    """True where the whole library finds what is hidden: a library without it can only see what is there to be seen."""
+    whole = line.get("whole")
+    return whole is None or outcome(line | whole | {"without": False, "failed": None}) in ("right", "group")
 
 
 def sizes(lines: Iterable[Line]) -> list[float]:

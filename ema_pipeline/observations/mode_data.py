@@ -55,6 +55,10 @@ class ModeData:
         Imaginary parts of plainly complex shapes, 0 for all others.
     always : ndarray of bool, (m,), optional
         Modes that are never held out.
+    whole : ModeData, optional
+        What the modes were taken out of: what they are to each other does not change when one of them is held out.
+    kept : ndarray of bool, optional
+        Mask of them there.
     """
 
     configuration: str
@@ -69,6 +73,8 @@ class ModeData:
     complete: bool = True
     imaginary: NDArray[np.float64] | None = None
     always: NDArray[np.bool_] | None = None
+    whole: ModeData | None = None
+    kept: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.log_frequency)
@@ -112,6 +118,8 @@ class ModeData:
         Drift and hits off their mark split close modes into more than there are. What a structure adds has a shape that
         the others have not.
         """
+        if self.whole is not None:
+            return np.asarray(self.whole.double[self.kept])
         found = np.zeros(len(self), bool)
         width = np.nan_to_num(np.exp(self.log_damping))
         for i in range(len(self)):
@@ -128,10 +136,26 @@ class ModeData:
     @cached_property
     def close(self) -> NDArray[np.bool_]:
         """Mask of modes close to another, whose shapes drift, noise and hits off their mark mix, (m,)."""
+        if self.whole is not None:
+            return np.asarray(self.whole.close[self.kept])
         bandwidth = 2 * np.nan_to_num(np.exp(self.log_damping))
         apart = np.abs(self.log_frequency[:, None] - self.log_frequency)
         near = apart < _CLOSE * np.maximum(bandwidth[:, None], bandwidth)
         return np.asarray(np.sum(near, axis=1) > 1)
+
+    @cached_property
+    def may_hide_another(self) -> NDArray[np.bool_]:
+        """Mask of modes near which no further one was measured, (m,): another of the model may hide in them.
+
+        A list of modes of no stated band does not say that there are no others.
+        """
+        if self.whole is None:
+            return np.full(len(self), self.complete)
+        left_out = ~np.asarray(self.kept)
+        width = np.nan_to_num(np.exp(self.whole.log_damping))
+        apart = np.abs(self.log_frequency[:, None] - self.whole.log_frequency[left_out])
+        near = apart < _NEAR * np.maximum(width[self.kept][:, None], width[left_out])
+        return np.asarray(self.whole.may_hide_another[self.kept] & ~np.any(near, axis=1))
 
     @cached_property
     def mixes(self) -> tuple[tuple[int, int, float], ...]:
@@ -193,7 +217,9 @@ class ModeData:
         )
         imaginary = None if self.imaginary is None else self.imaginary[keep]
         kept = {n: getattr(self, n)[keep] for n in names}
-        return dataclasses.replace(self, complete=False, imaginary=imaginary, always=None, **kept)
+        return dataclasses.replace(
+            self, complete=False, imaginary=imaginary, always=None, whole=self, kept=keep, **kept
+        )
 
 
 def _chains(order: NDArray[np.int64], log_frequency: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:

@@ -37,6 +37,9 @@ _SHAPE_REACH = 0.3
 """Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
 _LEAST_FREQUENCY_STD = 3e-4
 """1 σ of ln f that no model predicts better: how two modes nearer than that mix is not known."""
+_FITTED_AS_ONE_STD = 0.3
+"""1 σ, in the largest entry, of what the shape of two modes that were fitted as one has that neither of them has: every
+sensor shows another mix of the two where hits differ."""
 _DAMPING_STD = 0.02
 """1 σ of ln ζ that no model is better than, where each mode has a damping ratio of its own."""
 
@@ -164,15 +167,14 @@ class Comparison:
         match = matching if isinstance(matching, np.ndarray) else self.matched(solution)
         on, alone = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
         to = match[on]
-        known = self._known(on)
+        sensors = np.count_nonzero(self.data.seen[on], axis=1) * self.data.may_hide_another[on]
+        hidden = hidden_partners(solution, to, sensors)
+        known = self._known(on, hidden)
         groups = self._groups(solution, predicted, known, to)
         number = np.full(len(on), -1)
         for members, _ in groups:
             number[members] = members[:, :1]
         slopes = ModeDerivatives.of(matrices, solution, to, number) if derivatives else None
-        # what was held out has been measured: its neighbour's shape holds none of it
-        sensors = np.count_nonzero(self.data.seen[on], axis=1) * self.data.complete
-        hidden = hidden_partners(solution, to, sensors)
         shapes = self._predicted(solution, predicted, known, to, groups, slopes)
         rows: tuple[Rows, ...] = (
             self._frequencies(shapes, on),
@@ -186,7 +188,7 @@ class Comparison:
             match=match,
             log_scale=self._usual(alone) if len(alone) else 0.0,
             penalty=float(np.sum(np.where(self.data.double[alone], UNEXPLAINED_DOUBLE, UNEXPLAINED)))
-            + UNSEEN * self._unseen(solution, to),
+            + UNSEEN * self._unseen(solution, np.concatenate([to, hidden[hidden >= 0]])),
             unexplained=int(np.sum(~self.data.double[alone])),
             projected=len(on) + int(np.sum(self.data.whirling[on] | (hidden >= 0)))
             if self.data.shapes.shape[1]
@@ -275,10 +277,10 @@ class Comparison:
             np.where(own, 0.0, 1.0), DAMPING_SCATTER, 1.0, modes, slope=slope, model=model,
         )  # fmt: skip
 
-    def _known(self, on: NDArray[np.int64]) -> _Known:
+    def _known(self, on: NDArray[np.int64], hidden: NDArray[np.int64]) -> _Known:
         """Measured shapes of modes with a partner, less what their unknowns say they hold of others."""
         d = self.data
-        y, own = d.known_shapes[on], d.compared_std[on]
+        y, own = d.known_shapes[on], np.hypot(d.compared_std[on], _FITTED_AS_ONE_STD * (hidden >= 0)[:, None])
         unit = np.maximum(_SHAPE_REACH, np.abs(y))
         mixed = self._mixed(on)
         for k, other, unknown in mixed:
@@ -446,13 +448,13 @@ class Comparison:
             1 + 0.1 * (self.heat - 1), np.tile(on[mode], 2), np.tile(sensor, 2), np.tile(d.close[on[mode]], 2), slope,
         )  # fmt: skip
 
-    def _unseen(self, solution: EigenSolution, to: NDArray[np.int64]) -> int:
-        """Model modes well inside the band that no measured mode is paired with."""
+    def _unseen(self, solution: EigenSolution, accounted: NDArray[np.int64]) -> int:
+        """Model modes well inside the band, without those that are accounted for: paired, or hidden in one that is."""
         if not self.data.complete:
             return 0
         low, high = self.data.band_hz
         inside = (solution.frequency_hz > 1.05 * low) & (solution.frequency_hz < 0.95 * high)
-        inside[to] = False
+        inside[accounted] = False
         return int(np.count_nonzero(inside))
 
     def _shape_slopes(

@@ -85,8 +85,12 @@ def test_the_one_measured_shape_of_two_modes_may_be_any_mix_of_them(tmp_path: Pa
     assert (
         some.residuals(some.start(), scatters).projected == 3
     )  # a list that does not say that there are no others
+    assert found.penalty == 0  # the twin is not a mode that should have been seen
+    assert some.residuals(some.start(), scatters).penalty == 0
     bent = mixed.copy()
-    bent[0, 0] += 0.3  # no mix of the two
+    bent[0, 0] += 1.5  # no mix of the two, but every sensor may show another one
     wrong = replace(measured, shapes=bent.astype(complex))
     left = ModeObservations(rig, [prepare(wrong)]).problem((), {}).residuals(problem.start(), scatters)
-    assert left.blocks[0][0] > 20
+    alone = ModeObservations(rig, [prepare(replace(wrong, band_hz=None))]).problem((), {})
+    assert 3 < left.blocks[0][0] < 12
+    assert alone.residuals(problem.start(), scatters).blocks[0][0] > 300

@@ -76,6 +76,28 @@ def test_a_mode_with_a_mix_of_close_shapes_is_a_double_and_one_with_a_shape_of_i
     assert not np.any(prepare(few).double)  # three sensors cannot tell three shapes apart
 
 
+def test_what_modes_are_to_each_other_stays_when_one_of_them_is_held_out() -> None:
+    f = np.array([100.0, 100.5, 140.0])
+    shapes = np.array([[1.0, 0, 0.5, 0.2], [1.0, 0.05, 0.5, 0.2], [0, 1.0, -0.5, 0.4]], complex)
+    measured = MeasuredModes(
+        "all", f, 1e-3 * f, np.full(3, 0.01), np.full(3, 1e-4), shapes, np.full((3, 4), 1e-3),
+        tuple(Dof.parse(f"m{k}.x") for k in range(4)), band_hz=(10.0, 200.0),
+    )  # fmt: skip
+    data = prepare(measured)
+    assert data.double.tolist() == [True, True, False]
+    assert data.may_hide_another.tolist() == [True, True, True]
+    kept = data.only(np.array([True, False, True]))
+    assert kept.double.tolist() == [True, False]
+    assert kept.close.tolist() == [True, False]
+    assert kept.compared_std[0, 0] > 0.09  # its neighbour still mixes into it
+    assert kept.may_hide_another.tolist() == [False, True]  # what is near it has been measured
+    twice = kept.only(np.array([True, False]))
+    assert (twice.double.tolist(), twice.may_hide_another.tolist()) == ([True], [False])
+    listed = prepare(replace(measured, band_hz=None))  # does not say that there are no others
+    assert not np.any(listed.may_hide_another)
+    assert not np.any(listed.only(np.array([True, False, True])).may_hide_another)
+
+
 def test_shapes_that_hold_some_of_each_other_are_told_from_a_model_that_is_wrong() -> None:
     """A share of 8 % that identification mixed in is found, and no part bends to it."""
     rig = planetary()
