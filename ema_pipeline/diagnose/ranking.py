@@ -10,33 +10,28 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ema_pipeline.diagnose.first_fits import annealed_fit, first_fit, short_fits
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.score import UNSEEN, Score, scores
 from ema_pipeline.inference import Posterior, beyond_scatter
-from ema_pipeline.observations.base import EffectProblem, Observations
+from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import (
     PARTS,
-    QUICK,
     Fit,
     Model,
-    annealed,
     freed,
     learned,
     refined,
     transferred,
-    wide,
 )
 
 T = TypeVar("T")
 Progress = Callable[[float, str], None]
-Schedule = tuple[tuple[float, int], ...]
 
 FINALISTS = 5
 """Hypotheses for which the scatters are learned."""
@@ -51,10 +46,9 @@ _SCREENED_LAWS = 24
 """The same of nonlinear laws in forces in time, where the base model fails: their score is that of a small size on top
 of a model that is bent to the data, and put a cubic spring of a chain of three, which explained all, fifteenth. Such a
 chain has eighteen of one size."""
-_SHORT, _ANNEALED = 8, 16
-"""Steps of a short fit, and how many hypotheses, best first by it, are fitted in full where the base model fails, or is
-bent to the data, though it has a partner for every mode. What led in the end was among the first eight of some
-sixty."""
+_ANNEALED = 16
+"""Hypotheses, best first by a short fit, that are fitted in full where the base model fails, or is bent to the data,
+though it has a partner for every mode. What led in the end was among the first eight of some sixty."""
 _FIRST = 24
 """Hypotheses of one size that are annealed first where a measured mode has no partner, and those that are begun again
 where the base model is bent to the data."""
@@ -65,15 +59,6 @@ _UNPROMISING = 6
 tenths: more than `FINALISTS`, so that the reader sees what comes next."""
 _PROMISING = 1.0
 """Log evidence that is something: a third of what a claim needs."""
-_GRID = tuple(np.linspace(-2.0, 2.0, 9))
-"""Unknowns of sizes, in units of their prior σ, at which an effect that adds modes is tried."""
-_GRID_STARTS = 2
-_GRID_HEAT = 30.0
-"""Factor on the uncertainties there: two neighbours of the grid differ by a third in the frequency of an added mode."""
-_FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
-_UNHEATED: Schedule = ((1.0, 6), (1.0, 14))
-"""Where starts are given. Heated, the data weigh less than the prior, which takes the first size to nothing, where the
-shape of a law (the yield of hysteresis) has no slope left."""
 CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
 _BETTER = 0.05
@@ -157,8 +142,8 @@ def rank(
     settled = None if stuck else learned(observations, base)
     near = settled is not None and not np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT))
     chosen = _screened(hypotheses, promise, near)
-    job = partial(_annealed_fit if stuck else _first_fit, observations, base, models, promise)
-    short = partial(_short_fits, observations, base, models, promise)
+    job = partial(annealed_fit if stuck else first_fit, observations, base, models, promise)
+    short = partial(short_fits, observations, base, models, promise)
     known: dict[str, Posterior] = {}
     # A few steps do not lead a mode of the model to a measured one that has no partner yet.
     if not near and not lost:
@@ -217,143 +202,6 @@ def _batches(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) -> 
 def _decides(found: Posterior, base: Fit) -> bool:
     """True where one hypothesis explains all that the base model does not: no other one can lead it."""
     return found.error < _ALL and found.log_evidence > base.log_evidence + _BEATEN
-
-
-def _short_fits(
-    observations: Observations,
-    base: Fit,
-    models: Mapping[str, Model],
-    promise: Mapping[str, Score],
-    hypotheses: Sequence[Hypothesis],
-    processes: int | None,
-) -> list[tuple[Hypothesis, Posterior]]:
-    """Fits of a few steps from the sizes that scores tell, best first, of hypotheses of one size."""
-    scored = [
-        h
-        for h in hypotheses
-        if h.label in promise and len(promise[h.label].size) == 1 and h.placed.effect.linear and not h.begun
-    ]
-
-    def fitted(hypothesis: Hypothesis) -> Posterior:
-        model = models[hypothesis.label]
-        x = _at_score(observations, base, model, hypothesis, promise[hypothesis.label])
-        return refined(observations, model, x, steps=_SHORT).posterior
-
-    found = list(zip(scored, spread(fitted, scored, processes), strict=True))
-    return sorted(found, key=lambda pair: -pair[1].log_evidence)
-
-
-def _at_score(
-    observations: Observations, base: Fit, model: Model, hypothesis: Hypothesis, score: Score
-) -> NDArray[np.float64]:
-    """The base model's fit with half of the size that the score tells, (n,)."""
-    unknowns = model.problem(observations).unknowns
-    x = transferred(base.posterior, unknowns)
-    placed = hypothesis.placed
-    at = unknowns.index[placed.parameter_name(placed.effect.parameters[0].name)]
-    x[at] = float(np.clip(0.5 * score.size[0], -1.0, 1.0))
-    return unknowns.clipped(x)
-
-
-def _first_fit(
-    observations: Observations,
-    base: Fit,
-    models: Mapping[str, Model],
-    promise: Mapping[str, Score],
-    hypothesis: Hypothesis,
-) -> Posterior:
-    """The fit begun at half the size that its score tells; annealed where that makes matters worse."""
-    model, score = models[hypothesis.label], promise.get(hypothesis.label)
-    begun = _begun(observations, base, model)
-    if begun is not None:
-        return begun
-    if score is not None and len(score.size) == 1:
-        fit = refined(observations, model, _at_score(observations, base, model, hypothesis, score))
-        if fit.posterior.cost <= base.posterior.cost:
-            return fit.posterior
-    return _annealed_fit(observations, base, models, promise, hypothesis)
-
-
-def _annealed_fit(
-    observations: Observations,
-    base: Fit,
-    models: Mapping[str, Model],
-    promise: Mapping[str, Score],
-    hypothesis: Hypothesis,
-) -> Posterior:
-    """The fit annealed from several sizes, or begun where the data themselves tell it to."""
-    model = models[hypothesis.label]
-    begun = _begun(observations, base, model)
-    if begun is not None:
-        return begun
-    schedule = _UNHEATED if hypothesis.begun else _FROM_GRID if hypothesis.size_cannot_be_zero else QUICK
-    problem = model.problem(observations)
-    begin = transferred(base.posterior, problem.unknowns)
-    starts = _starts(observations, problem, hypothesis, begin, promise.get(hypothesis.label))
-    return annealed(observations, model, starts, schedule).posterior
-
-
-def _begun(observations: Observations, base: Fit, model: Model) -> Posterior | None:
-    """The fit begun where the data themselves tell it to; None where they do not."""
-    problem = model.problem(observations)
-    begin = transferred(base.posterior, problem.unknowns)
-    begun = problem.begun(begin, base.posterior.scatters)
-    return None if begun is None else refined(observations, model, begun).posterior
-
-
-def _starts(
-    observations: Observations,
-    problem: EffectProblem,
-    hypothesis: Hypothesis,
-    begin: NDArray[np.float64],
-    score: Score | None = None,
-) -> list[NDArray[np.float64]]:
-    """Points from which a hypothesis is fitted.
-
-    A base model that fails has bent parts and channels to the data: a true effect is found from unbent ones. In forces
-    in time it has bent everything, up to a fit that no true effect leads out of: there one fit begins where the base
-    model's did. Usual sizes may be ten times too large; the one that a score tells is about right where the effect is.
-    """
-    unbent = begin.copy()
-    unbent[[bool(s) for s in problem.unknowns.scatter]] = 0.0
-    if hypothesis.begun:
-        sizes_known = [problem.unknowns.index[name] for name in problem.sizes]
-        unbent = problem.start()
-        unbent[sizes_known] = begin[sizes_known]
-    if hypothesis.size_cannot_be_zero:
-        plans = [
-            (x, start)
-            for x in (begin, unbent)
-            for start in _best_of_grid(observations, problem, x, hypothesis)
-        ]
-    else:
-        plans = [(begin, start) for start in hypothesis.starts()]
-        plans += [(unbent, start) for start in hypothesis.starts()[:1]]
-        if score is not None and len(score.size) == 1 and not hypothesis.begun:
-            size = hypothesis.placed.effect.parameters[0].name
-            plans.append((begin, {hypothesis.placed.parameter_name(size): float(score.size[0])}))
-    found = []
-    for x, sizes in plans:
-        moved = x.copy()
-        for name, value in sizes.items():
-            moved[problem.unknowns.index[name]] = value
-        found.append(problem.unknowns.clipped(moved))
-    return found
-
-
-def _best_of_grid(
-    observations: Observations, problem: EffectProblem, begin: NDArray[np.float64], hypothesis: Hypothesis
-) -> list[dict[str, float]]:
-    """Sizes, by their unknowns, at which the modes that the effect adds lie nearest to measured ones."""
-    names = [hypothesis.placed.parameter_name(p.name) for p in hypothesis.placed.effect.parameters]
-    scatters = wide(observations)
-    tried = []
-    for values in product(_GRID, repeat=len(names)):
-        x = begin.copy()
-        x[[problem.unknowns.index[n] for n in names]] = values
-        found = problem.residuals(problem.unknowns.clipped(x), scatters, heat=_GRID_HEAT, derivatives=False)
-        tried.append((found.cost, dict(zip(names, values, strict=True))))
-    return [start for _, start in sorted(tried, key=lambda pair: pair[0])[:_GRID_STARTS]]
 
 
 Found = dict[str, tuple[Hypothesis, Fit]]

@@ -16,54 +16,18 @@ from ema_pipeline.diagnose.ranking import (
     Ranking,
     _batches,
     _begun_again,
-    _best_of_grid,
     _better,
     _bettered,
     _contenders,
     _crossed,
     _decides,
     _finals,
-    _first_fit,
     _on,
     _promising,
     _screened,
-    _short_fits,
-    _starts,
 )
-from ema_pipeline.inference import Residuals, Unknowns
 from ema_pipeline.observations.fitting import Fit
-
-NO_DATA: Any = object()
-
-
-def hypothesis(label: str, generic: bool = False, sizes: int = 1, extends: bool = False) -> Any:
-    parameters = [SimpleNamespace(name=f"s{k + 1}") for k in range(sizes)]
-    placed = SimpleNamespace(
-        label=label,
-        effect=SimpleNamespace(parameters=parameters, linear=True),
-        parameter_name=lambda name: f"{label}.{name}",
-    )
-    starts = [{f"{label}.s1": 0.5}, {f"{label}.s1": -0.5}]
-    return SimpleNamespace(
-        label=label,
-        generic=generic,
-        placed=placed,
-        size_cannot_be_zero=extends,
-        begun=(),
-        starts=lambda: starts,
-    )
-
-
-def law(label: str) -> Any:
-    """A nonlinear effect that is sought in forces in time."""
-    one = hypothesis(label, generic=True)
-    one.placed.effect.linear = False
-    one.begun = tuple(one.starts())
-    return one
-
-
-def score(gain: float, size: float = 0.0) -> Any:
-    return SimpleNamespace(gain=gain, size=np.array([size]), std=1.0)
+from tests.support.written_fits import NO_DATA, Parabola, fit, hypothesis, law, score, with_model
 
 
 def test_where_the_base_model_fails_laws_in_time_are_screened_among_themselves() -> None:
@@ -93,40 +57,7 @@ def test_of_many_hypotheses_those_of_each_kind_are_fitted_that_promise_most() ->
     assert len(_screened(everything, promise, near=True)) == 16 + 12
 
 
-def test_short_fits_begin_at_the_scores_of_what_has_one_size(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    everything = [hypothesis(f"h{k}") for k in range(20)]
-    others = [hypothesis("two sizes", sizes=2), hypothesis("not scored"), hypothesis("by level")]
-    others[2].placed.effect.linear = False
-    promise = {h.label: score(0.0) for h in [*everything, *others]} | {
-        "two sizes": SimpleNamespace(size=np.zeros(2))
-    }
-    del promise["not scored"]
-    asked: list[tuple[str, Any, int]] = []
-
-    def refined(observations: object, model: str, x: Any, steps: int) -> Any:
-        asked.append((model, x, steps))
-        return SimpleNamespace(
-            posterior=SimpleNamespace(name=model, log_evidence=float(7 * int(model[1:]) % 20))
-        )
-
-    monkeypatch.setattr(ranking, "refined", refined)
-    monkeypatch.setattr(ranking, "_at_score", lambda o, base, model, h, told: (h.label, told))
-    models = {h.label: h.label for h in [*everything, *others]}
-    kept = _short_fits(NO_DATA, fit("base", 0.0), models, promise, [*others, *everything], 1)  # type: ignore[arg-type]
-    assert asked == [(h.label, (h.label, promise[h.label]), 8) for h in everything]
-    assert [p.log_evidence for _, p in kept] == list(range(19, -1, -1))  # type: ignore[attr-defined]
-    assert all(p.name == h.label for h, p in kept)  # type: ignore[attr-defined]
-
-
 # --- the order of fits ---------------------------------------------------------------------------------------------
-
-
-def fit(name: str, log_evidence: float, **more: Any) -> Fit:
-    posterior: Any = SimpleNamespace(log_evidence=log_evidence, scatters={}, x=np.zeros(1), **more)
-    model: Any = SimpleNamespace(name=name)
-    return Fit(model, posterior)
 
 
 def found_of(**values: float) -> Found:
@@ -258,35 +189,6 @@ def test_the_base_and_the_best_begin_again_at_what_the_best_of_all_knows(
     assert better.log_evidence == 12.0
 
 
-class Parabola:
-    """Problem of `ranking`: two unknowns and sizes, the residual their distance from a point."""
-
-    def __init__(self, names: tuple[str, ...], sizes: tuple[str, ...], at: np.ndarray | None = None) -> None:
-        scatter = tuple("part" if n.startswith("part") else "" for n in names)
-        n = len(names)
-        self.unknowns = Unknowns(names, np.ones(n), scatter, np.full(n, -1.9), np.full(n, 1.9))
-        self.sizes = dict.fromkeys(sizes)
-        self.at = np.zeros(n) if at is None else at
-
-    def residuals(self, x: np.ndarray, scatters: object, **how: Any) -> Residuals:
-        assert how == {"heat": 30.0, "derivatives": False}
-        return Residuals((x - self.at) / how["heat"], np.zeros((0, len(x))))
-
-    def begun(self, x: np.ndarray, scatters: object) -> None:
-        return None
-
-    def start(self) -> np.ndarray:
-        return self.at
-
-
-def with_model(name: str, problem: Parabola, x: list[float], log_evidence: float = 0.0) -> Fit:
-    posterior: Any = SimpleNamespace(
-        unknowns=problem.unknowns, x=np.array(x), log_evidence=log_evidence, scatters={"part": 1.0}, cost=5.0
-    )
-    model: Any = SimpleNamespace(name=name, problem=lambda observations: problem)
-    return Fit(model, posterior)
-
-
 def test_what_another_fit_knows_is_taken_over_but_for_the_sizes() -> None:
     mine = with_model("a", Parabola(("part", "common", "a.s"), ("a.s",)), [0.1, 0.2, 0.3])
     other = with_model("b", Parabola(("part", "a.s", "b.s"), ("a.s", "b.s")), [0.7, 0.8, 0.9])
@@ -340,73 +242,6 @@ def test_scatters_are_learned_again_where_another_start_leads_further(
     assert _crossed(NO_DATA, [elsewhere], mine) is mine.posterior
 
 
-# --- where fits begin ----------------------------------------------------------------------------------------------
-
-
-def test_fits_begin_at_usual_sizes_and_once_with_parts_that_are_not_bent() -> None:
-    problem: Any = Parabola(("part", "common", "a.s1"), ("a.s1",))
-    begin = np.array([0.4, 0.5, 0.0])
-    starts = _starts(NO_DATA, problem, hypothesis("a"), begin)
-    np.testing.assert_array_equal(starts, [[0.4, 0.5, 0.5], [0.4, 0.5, -0.5], [0.0, 0.5, 0.5]])
-    told = _starts(NO_DATA, problem, hypothesis("a"), begin, score(3.0, 0.07))
-    np.testing.assert_array_equal(told, [*starts, [0.4, 0.5, 0.07]])
-
-
-def test_where_sizes_are_given_one_fit_begins_where_that_of_the_base_model_did() -> None:
-    """With the sizes of effects that the model has already as the base model's fit has them."""
-    names = ("spring", "known.s1", "a.s1")
-    problem: Any = Parabola(names, names[1:], np.array([0.1, 0.2, 0.3]))
-    starts = _starts(NO_DATA, problem, _given(), np.array([0.4, 0.7, 0.0]))
-    np.testing.assert_array_equal(starts, [[0.4, 0.7, 0.5], [0.4, 0.7, -0.5], [0.1, 0.7, 0.5]])
-
-
-def _given() -> Any:
-    one = hypothesis("a")
-    one.begun = tuple(one.starts())
-    return one
-
-
-def test_an_effect_that_adds_modes_begins_at_the_best_of_a_grid() -> None:
-    names = ("part", "a.s1", "a.s2")
-    problem: Any = Parabola(names, names[1:], np.array([0.0, 0.55, -1.1]))
-    data: Any = SimpleNamespace(scatters={})
-    one = hypothesis("a", sizes=2, extends=True)
-    best = _best_of_grid(data, problem, np.array([0.4, 0.0, 0.0]), one)
-    assert best == [{"a.s1": 0.5, "a.s2": -1.0}, {"a.s1": 0.5, "a.s2": -1.5}]
-    starts = _starts(data, problem, one, np.array([0.4, 0.0, 0.0]))
-    np.testing.assert_array_equal(starts, [[k, 0.5, s] for k in (0.4, 0.0) for s in (-1.0, -1.5)])
-
-
-@pytest.mark.parametrize(("promised", "cost", "begun"), [(0.8, 5.0, 0.4), (4.0, 5.0, 1.0), (0.8, 5.1, None)])
-def test_the_first_fit_begins_at_half_the_size_that_its_score_tells(
-    monkeypatch: pytest.MonkeyPatch, promised: float, cost: float, begun: float | None
-) -> None:
-    """Where that makes matters worse, and where nothing is promised, it is annealed."""
-    base = with_model("base", Parabola(("part",), ()), [0.4])
-    problem = Parabola(("part", "a.s1"), ("a.s1",))
-    model = with_model("a", problem, [0.0, 0.0]).model
-    annealed: list[Any] = []
-
-    def refined(observations: object, model: Any, x: np.ndarray) -> Any:
-        return SimpleNamespace(posterior=SimpleNamespace(cost=cost, x=x))
-
-    def anneal(observations: object, model: Any, starts: Any, schedule: Any) -> Any:
-        annealed.append((len(starts), schedule))
-        return SimpleNamespace(posterior="annealed")
-
-    monkeypatch.setattr(ranking, "refined", refined)
-    monkeypatch.setattr(ranking, "annealed", anneal)
-    found: Any = _first_fit(NO_DATA, base, {"a": model}, {"a": score(3.0, promised)}, hypothesis("a"))
-    if begun is None:
-        assert found == "annealed"
-        assert annealed == [(4, ranking.QUICK)]  # usual sizes, and the one that the score tells
-    else:
-        assert found.x.tolist() == [0.4, begun]
-        assert annealed == []
-    without: Any = _first_fit(NO_DATA, base, {"a": model}, {}, hypothesis("a"))
-    assert without == "annealed"
-
-
 def test_what_promises_most_beside_learned_scatters_begins_at_its_size(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -455,9 +290,9 @@ class Stages:
             ranking, "beyond_scatter", lambda posterior, parts, most: np.array([bent and most == 3.0])
         )
         monkeypatch.setattr(ranking, "_screened", self.screened)
-        monkeypatch.setattr(ranking, "_short_fits", self.short_fits)
-        monkeypatch.setattr(ranking, "_first_fit", partial(self.first_fit, "first"))
-        monkeypatch.setattr(ranking, "_annealed_fit", partial(self.first_fit, "annealed"))
+        monkeypatch.setattr(ranking, "short_fits", self.short_fits)
+        monkeypatch.setattr(ranking, "first_fit", partial(self.first_fit, "first"))
+        monkeypatch.setattr(ranking, "annealed_fit", partial(self.first_fit, "annealed"))
         monkeypatch.setattr(ranking, "_begun_again", self.begun_again)
         monkeypatch.setattr(ranking, "_bettered", self.bettered)
         monkeypatch.setattr(ranking, "_promising", self.promising)

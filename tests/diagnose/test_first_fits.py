@@ -1,0 +1,104 @@
+"""Where the fits of hypotheses begin: on fits written down by hand."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ema_pipeline.diagnose import first_fits
+from ema_pipeline.diagnose.first_fits import _best_of_grid, _starts, first_fit, short_fits
+from tests.support.written_fits import NO_DATA, Parabola, fit, hypothesis, score, with_model
+
+
+def test_short_fits_begin_at_the_scores_of_what_has_one_size(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    everything = [hypothesis(f"h{k}") for k in range(20)]
+    others = [hypothesis("two sizes", sizes=2), hypothesis("not scored"), hypothesis("by level")]
+    others[2].placed.effect.linear = False
+    promise = {h.label: score(0.0) for h in [*everything, *others]} | {
+        "two sizes": SimpleNamespace(size=np.zeros(2))
+    }
+    del promise["not scored"]
+    asked: list[tuple[str, Any, int]] = []
+
+    def refined(observations: object, model: str, x: Any, steps: int) -> Any:
+        asked.append((model, x, steps))
+        return SimpleNamespace(
+            posterior=SimpleNamespace(name=model, log_evidence=float(7 * int(model[1:]) % 20))
+        )
+
+    monkeypatch.setattr(first_fits, "refined", refined)
+    monkeypatch.setattr(first_fits, "_at_score", lambda o, base, model, h, told: (h.label, told))
+    models = {h.label: h.label for h in [*everything, *others]}
+    kept = short_fits(NO_DATA, fit("base", 0.0), models, promise, [*others, *everything], 1)  # type: ignore[arg-type]
+    assert asked == [(h.label, (h.label, promise[h.label]), 8) for h in everything]
+    assert [p.log_evidence for _, p in kept] == list(range(19, -1, -1))  # type: ignore[attr-defined]
+    assert all(p.name == h.label for h, p in kept)  # type: ignore[attr-defined]
+
+
+def test_fits_begin_at_usual_sizes_and_once_with_parts_that_are_not_bent() -> None:
+    problem: Any = Parabola(("part", "common", "a.s1"), ("a.s1",))
+    begin = np.array([0.4, 0.5, 0.0])
+    starts = _starts(NO_DATA, problem, hypothesis("a"), begin)
+    np.testing.assert_array_equal(starts, [[0.4, 0.5, 0.5], [0.4, 0.5, -0.5], [0.0, 0.5, 0.5]])
+    told = _starts(NO_DATA, problem, hypothesis("a"), begin, score(3.0, 0.07))
+    np.testing.assert_array_equal(told, [*starts, [0.4, 0.5, 0.07]])
+
+
+def test_where_sizes_are_given_one_fit_begins_where_that_of_the_base_model_did() -> None:
+    """With the sizes of effects that the model has already as the base model's fit has them."""
+    names = ("spring", "known.s1", "a.s1")
+    problem: Any = Parabola(names, names[1:], np.array([0.1, 0.2, 0.3]))
+    starts = _starts(NO_DATA, problem, _given(), np.array([0.4, 0.7, 0.0]))
+    np.testing.assert_array_equal(starts, [[0.4, 0.7, 0.5], [0.4, 0.7, -0.5], [0.1, 0.7, 0.5]])
+
+
+def _given() -> Any:
+    one = hypothesis("a")
+    one.begun = tuple(one.starts())
+    return one
+
+
+def test_an_effect_that_adds_modes_begins_at_the_best_of_a_grid() -> None:
+    names = ("part", "a.s1", "a.s2")
+    problem: Any = Parabola(names, names[1:], np.array([0.0, 0.55, -1.1]))
+    data: Any = SimpleNamespace(scatters={})
+    one = hypothesis("a", sizes=2, extends=True)
+    best = _best_of_grid(data, problem, np.array([0.4, 0.0, 0.0]), one)
+    assert best == [{"a.s1": 0.5, "a.s2": -1.0}, {"a.s1": 0.5, "a.s2": -1.5}]
+    starts = _starts(data, problem, one, np.array([0.4, 0.0, 0.0]))
+    np.testing.assert_array_equal(starts, [[k, 0.5, s] for k in (0.4, 0.0) for s in (-1.0, -1.5)])
+
+
+@pytest.mark.parametrize(("promised", "cost", "begun"), [(0.8, 5.0, 0.4), (4.0, 5.0, 1.0), (0.8, 5.1, None)])
+def test_the_first_fit_begins_at_half_the_size_that_its_score_tells(
+    monkeypatch: pytest.MonkeyPatch, promised: float, cost: float, begun: float | None
+) -> None:
+    """Where that makes matters worse, and where nothing is promised, it is annealed."""
+    base = with_model("base", Parabola(("part",), ()), [0.4])
+    problem = Parabola(("part", "a.s1"), ("a.s1",))
+    model = with_model("a", problem, [0.0, 0.0]).model
+    annealed: list[Any] = []
+
+    def refined(observations: object, model: Any, x: np.ndarray) -> Any:
+        return SimpleNamespace(posterior=SimpleNamespace(cost=cost, x=x))
+
+    def anneal(observations: object, model: Any, starts: Any, schedule: Any) -> Any:
+        annealed.append((len(starts), schedule))
+        return SimpleNamespace(posterior="annealed")
+
+    monkeypatch.setattr(first_fits, "refined", refined)
+    monkeypatch.setattr(first_fits, "annealed", anneal)
+    found: Any = first_fit(NO_DATA, base, {"a": model}, {"a": score(3.0, promised)}, hypothesis("a"))
+    if begun is None:
+        assert found == "annealed"
+        assert annealed == [(4, first_fits.QUICK)]  # usual sizes, and the one that the score tells
+    else:
+        assert found.x.tolist() == [0.4, begun]
+        assert annealed == []
+    without: Any = first_fit(NO_DATA, base, {"a": model}, {}, hypothesis("a"))
+    assert without == "annealed"
