@@ -12,7 +12,7 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names
 from ema_pipeline.diagnose.next_test import next_measurement
-from ema_pipeline.diagnose.probability import NOTHING, against_nothing
+from ema_pipeline.diagnose.probability import NOTHING, against_nothing, of_failing_model
 from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
@@ -22,7 +22,6 @@ from ema_pipeline.diagnose.verdict import alike, explains, outlying_parts, verdi
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Model
-from ema_pipeline.observations.parts import PART_SCATTER
 from ema_pipeline.rigs.types import Rig
 
 
@@ -89,26 +88,28 @@ def diagnose(
     if verdict == "ambiguous":
         names = [j.named.label for j in group]
         told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.label in names]
-    nothing = found.rounds[0].probabilities[NOTHING]
+    probabilities = dict(found.rounds[0].probabilities)
+    if not (explained if start is found.final else explains(observations, start, settings)):
+        probabilities = of_failing_model(probabilities)
+    nothing = probabilities[NOTHING]
     best = next(((c.label, c.why) for c in candidates), ("", ""))
     scatter = learned_scatters(observations, found.final)
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
-    remarks = list(notes)
-    outlying = outlying_parts(found.final)
-    remarks.insert(0, sentences.standing_out(outlying, found.final.posterior.scatters.get(PART_SCATTER, 0.0)))
+    bent = sentences.standing_out(outlying_parts(observations, found.final))
+    errors = (rungs[0].error, rungs[-1].error)
     return Diagnosis(
         verdict=verdict,
-        summary=sentences.summary(verdict, told, (rungs[0].error, rungs[-1].error), nothing, best),
+        summary=sentences.summary(verdict, told, errors, nothing, best, bent),
         null_probability=nothing,
         candidates=candidates,
         indistinguishable=_groups(found, group, settings),
         next_measurement=next_measurement(observations, found, group, verdict),
         localisation=() if explained else localise(scores(observations, found.final, further)),
-        probabilities=dict(found.rounds[0].probabilities),
+        probabilities=probabilities,
         error=rungs[0].error,
         heldout_error=rungs[0].heldout_error,
         ladder=ladder,
-        notes=tuple(r for r in remarks if r),
+        notes=(*((bent,) if bent and verdict != "unknown_effect" else ()), *notes),
         detection_limits=detection_limits(observations, found.final, hypotheses, settings)
         if explained
         else (),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.score import Score
-from ema_pipeline.inference import Posterior
+from ema_pipeline.inference import Posterior, Unknowns
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import QUICK, Fit, Model, annealed, refined, transferred, wide
 
@@ -24,6 +25,8 @@ _GRID = tuple(np.linspace(-2.0, 2.0, 9))
 _GRID_STARTS = 2
 _GRID_HEAT = 30.0
 """Factor on the uncertainties there: two neighbours of the grid differ by a third in the frequency of an added mode."""
+_SIZES = (-15.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 15.0)
+"""The same for effects of one size where measured modes have no partner: a size that gives them one may be far out."""
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _UNHEATED: Schedule = ((1.0, 6), (1.0, 14))
 """Where starts are given. Heated, the data weigh less than the prior, which takes the first size to nothing, where the
@@ -54,6 +57,61 @@ def short_fits(
     return sorted(found, key=lambda pair: -pair[1].log_evidence)
 
 
+@dataclass(frozen=True)
+class Tried:
+    """The best of some sizes of an effect, tried on a model whose parts are not bent to the data.
+
+    Attributes
+    ----------
+    unknown : float
+        Of the size.
+    gain : float
+        By how much the cost falls, at wide uncertainties.
+    """
+
+    unknown: float
+    gain: float
+
+
+def tried_sizes(
+    observations: Observations,
+    base: Fit,
+    models: Mapping[str, Model],
+    hypotheses: Sequence[Hypothesis],
+    processes: int | None,
+) -> dict[str, Tried]:
+    """What gives modes without a partner one: the best size of every effect of one size that makes matters better."""
+    asked = [
+        h
+        for h in hypotheses
+        if len(h.placed.effect.parameters) == 1
+        and h.placed.effect.linear
+        and not h.size_cannot_be_zero
+        and not h.begun
+    ]
+    scatters = wide(observations)
+
+    def best(hypothesis: Hypothesis) -> Tried:
+        problem = models[hypothesis.label].problem(observations)
+        unknowns = problem.unknowns
+        begin = _unbent(unknowns, transferred(base.posterior, unknowns))
+        at = unknowns.index[hypothesis.placed.parameter_name(hypothesis.placed.effect.parameters[0].name)]
+
+        def cost(size: float) -> float:
+            x = begin.copy()
+            x[at] = size
+            if unknowns.clipped(x)[at] != size:
+                return np.inf
+            return problem.residuals(x, scatters, heat=_GRID_HEAT, derivatives=False).cost
+
+        costs = {size: cost(size) for size in _SIZES}
+        size = min(costs, key=lambda one: costs[one])
+        return Tried(size, cost(0.0) - costs[size])
+
+    found = zip(asked, spread(best, asked, processes), strict=True)
+    return {h.label: tried for h, tried in found if tried.gain > 0}
+
+
 def first_fit(
     observations: Observations,
     base: Fit,
@@ -70,7 +128,7 @@ def first_fit(
         fit = refined(observations, model, _at_score(observations, base, model, hypothesis, score))
         if fit.posterior.cost <= base.posterior.cost:
             return fit.posterior
-    return annealed_fit(observations, base, models, promise, hypothesis)
+    return annealed_fit(observations, base, models, promise, {}, hypothesis)
 
 
 def annealed_fit(
@@ -78,6 +136,7 @@ def annealed_fit(
     base: Fit,
     models: Mapping[str, Model],
     promise: Mapping[str, Score],
+    tried: Mapping[str, Tried],
     hypothesis: Hypothesis,
 ) -> Posterior:
     """The fit annealed from several sizes, or begun where the data themselves tell it to."""
@@ -88,7 +147,8 @@ def annealed_fit(
     schedule = _UNHEATED if hypothesis.begun else _FROM_GRID if hypothesis.size_cannot_be_zero else QUICK
     problem = model.problem(observations)
     begin = transferred(base.posterior, problem.unknowns)
-    starts = _starts(observations, problem, hypothesis, begin, promise.get(hypothesis.label))
+    label = hypothesis.label
+    starts = _starts(observations, problem, hypothesis, begin, promise.get(label), tried.get(label))
     return annealed(observations, model, starts, schedule).posterior
 
 
@@ -106,6 +166,7 @@ def _starts(
     hypothesis: Hypothesis,
     begin: NDArray[np.float64],
     score: Score | None = None,
+    tried: Tried | None = None,
 ) -> list[NDArray[np.float64]]:
     """Points from which a hypothesis is fitted.
 
@@ -113,8 +174,7 @@ def _starts(
     in time it has bent everything, up to a fit that no true effect leads out of: there one fit begins where the base
     model's did. Usual sizes may be ten times too large; the one that a score tells is about right where the effect is.
     """
-    unbent = begin.copy()
-    unbent[[bool(s) for s in problem.unknowns.scatter]] = 0.0
+    unbent = _unbent(problem.unknowns, begin)
     if hypothesis.begun:
         sizes_known = [problem.unknowns.index[name] for name in problem.sizes]
         unbent = problem.start()
@@ -131,6 +191,9 @@ def _starts(
         if score is not None and len(score.size) == 1 and not hypothesis.begun:
             size = hypothesis.placed.effect.parameters[0].name
             plans.append((begin, {hypothesis.placed.parameter_name(size): float(score.size[0])}))
+        if tried is not None:
+            size = hypothesis.placed.effect.parameters[0].name
+            plans.append((unbent, {hypothesis.placed.parameter_name(size): tried.unknown}))
     found = []
     for x, sizes in plans:
         moved = x.copy()
@@ -150,6 +213,11 @@ def _at_score(
     at = unknowns.index[placed.parameter_name(placed.effect.parameters[0].name)]
     x[at] = float(np.clip(0.5 * score.size[0], -1.0, 1.0))
     return unknowns.clipped(x)
+
+
+def _unbent(unknowns: Unknowns, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """With nothing that scatters bent to the data, (n,)."""
+    return np.where([bool(s) for s in unknowns.scatter], 0.0, x)
 
 
 def _best_of_grid(

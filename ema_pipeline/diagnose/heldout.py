@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.inference import Bounded, Posterior, Residuals, descend, lower_factor, solve_lower
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import PARTS, Fit, transferred
+from ema_pipeline.observations.fitting import Fit, part_reach, transferred
 
 _STEPS = 20
 
@@ -41,10 +41,11 @@ def held_out(observations: Observations, fit: Fit) -> HeldOut:
     effect and predict just as well.
     """
     squares, count, density = 0.0, 0, 0.0
+    most = part_reach(observations, fit.posterior)
     for kept, out in observations.folds():
         problem, scatters = fit.model.problem(kept), fit.posterior.scatters
         start = transferred(fit.posterior, problem.unknowns, problem.start())
-        trained = descend(Bounded(problem, scatters, PARTS), scatters, start, steps=_STEPS)
+        trained = descend(Bounded(problem, most), scatters, start, steps=_STEPS)
         part = _predicted(out, fit, trained)
         squares, count, density = squares + part[0], count + part[1], density + part[2]
     if not count:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.special import expit
@@ -13,6 +13,7 @@ from ema_pipeline.diagnose.ranking import Ranking
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 
 NOTHING = "nothing"
+UNKNOWN = "an effect that is not in the library"
 
 
 def weight(hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
@@ -57,6 +58,11 @@ def probabilities(
     shares /= np.sum(shares)
     told = {n.label: float(p) for n, p in zip(names, shares, strict=False)}
     return told | {NOTHING: float(shares[-1])}
+
+
+def of_failing_model(told: Mapping[str, float]) -> dict[str, float]:
+    """The same where the model does not explain the data: what nothing missing had goes to `UNKNOWN`."""
+    return {name: 0.0 if name == NOTHING else p for name, p in told.items()} | {UNKNOWN: told[NOTHING]}
 
 
 def against_nothing(

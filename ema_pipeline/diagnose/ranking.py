@@ -14,20 +14,20 @@ from typing import TypeVar
 
 import numpy as np
 
-from ema_pipeline.diagnose.first_fits import annealed_fit, first_fit, short_fits
+from ema_pipeline.diagnose.first_fits import Tried, annealed_fit, first_fit, short_fits, tried_sizes
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.score import UNSEEN, Score, scores
-from ema_pipeline.inference import Posterior, beyond_scatter
+from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import (
-    PARTS,
     Fit,
     Model,
     freed,
     learned,
     refined,
     transferred,
+    unbent,
 )
 
 T = TypeVar("T")
@@ -35,9 +35,6 @@ Progress = Callable[[float, str], None]
 
 FINALISTS = 5
 """Hypotheses for which the scatters are learned."""
-_UNBENT = 3.0
-"""Standard deviations of parts, as the scatter is learned, up to which the base model has not bent them to the data: on
-top of a bent part everything promises much."""
 _BEATEN = 200.0
 """Log evidence behind the best hypothesis from which another one cannot catch up: it is not begun again."""
 _SCREENED = 14
@@ -52,6 +49,8 @@ though it has a partner for every mode. What led in the end was among the first 
 _FIRST = 24
 """Hypotheses of one size that are annealed first where a measured mode has no partner, and those that are begun again
 where the base model is bent to the data."""
+_PAIRING = 8
+"""Hypotheses that are annealed since one of some sizes explains measured modes that have no partner."""
 _ALL = 0.5
 """Error at wide scatters, which is 0.3 on rigs without fault, up to which a model explains all."""
 _UNPROMISING = 6
@@ -136,20 +135,28 @@ def rank(
     """
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
     promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models)}
-    hypotheses = [h for h in hypotheses if h.label not in promise or promise[h.label].std < UNSEEN]
     lost = base.posterior.residuals.penalty > unpaired
+    tried = tried_sizes(observations, base, models, hypotheses, processes) if lost else {}
+    unseen = {label for label, score in promise.items() if score.std >= UNSEEN} - set(tried)
+    hypotheses = [h for h in hypotheses if h.label not in unseen]
     stuck = lost or base.posterior.error > _EXPLAINED
     settled = None if stuck else learned(observations, base)
-    near = settled is not None and not np.any(beyond_scatter(settled.posterior, PARTS, _UNBENT))
-    chosen = _screened(hypotheses, promise, near)
-    job = partial(annealed_fit if stuck else first_fit, observations, base, models, promise)
+    near = settled is not None and unbent(observations, settled)
+    pairing = _pairing(tried)
+    among = _screened(hypotheses, promise, near)
+    chosen = [h for h in hypotheses if h in among or h.label in pairing]
+    if stuck:
+        job = partial(annealed_fit, observations, base, models, promise, tried)
+    else:
+        job = partial(first_fit, observations, base, models, promise)
     short = partial(short_fits, observations, base, models, promise)
     known: dict[str, Posterior] = {}
     # A few steps do not lead a mode of the model to a measured one that has no partner yet.
     if not near and not lost:
         known |= {h.label: posterior for h, posterior in short(chosen, processes)[_ANNEALED:]}
     decided = False
-    for batch in _batches([h for h in chosen if h.label not in known], promise if lost else {}):
+    left = [h for h in chosen if h.label not in known]
+    for batch in _batches(left, promise if lost else {}, pairing):
         if decided:
             known |= {h.label: posterior for h, posterior in short(batch, processes)}
         asked = [h for h in batch if h.label not in known]
@@ -192,9 +199,20 @@ def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], ne
     return [h for h in hypotheses if h.label not in out]
 
 
-def _batches(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score]) -> list[list[Hypothesis]]:
-    """Those that promise most, or whose score says nothing, and the others."""
-    told = [h for h in hypotheses if h.label in promise and len(h.placed.effect.parameters) == 1]
+def _pairing(tried: Mapping[str, Tried]) -> set[str]:
+    """Hypotheses of which some size gives modes without a partner one, the best of them."""
+    return set(sorted(tried, key=lambda label: -tried[label].gain)[:_PAIRING])
+
+
+def _batches(
+    hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], first: Collection[str]
+) -> list[list[Hypothesis]]:
+    """Those that promise most, those of `first`, or those whose score says nothing; and the others."""
+    told = [
+        h
+        for h in hypotheses
+        if h.label in promise and h.label not in first and len(h.placed.effect.parameters) == 1
+    ]
     later = sorted(told, key=lambda h: -promise[h.label].gain)[_FIRST:]
     return [[h for h in hypotheses if h not in later], [h for h in hypotheses if h in later]]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from ema_pipeline.diagnose.types import NOT_DETERMINED, EffectSize, VerdictWord
+from ema_pipeline.diagnose.types import NOT_DETERMINED, EffectSize, OutlyingPart, VerdictWord
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
 
 _SHOWN = 3
@@ -56,8 +56,9 @@ def summary(
     error: tuple[float, float],
     nothing: float,
     best: tuple[str, str] = ("", ""),
+    bent: str = "",
 ) -> str:
-    """One or two sentences.
+    """One to three sentences.
 
     Parameters
     ----------
@@ -70,6 +71,8 @@ def summary(
         Probability that nothing is missing.
     best : (label, why), optional
         The best candidate where none is claimed, and why it is not.
+    bent : str, optional
+        What `standing_out` says of the model.
     """
     before, after = error
     named = "; ".join(f"{label_text(label)}, {size}" for label, size in claimed)
@@ -90,16 +93,19 @@ def summary(
         verb = "are" if len(claimed) > 1 else "is"
         closest = f" The closest {verb} {named}." if named else ""
         failed = f"The model does not explain the data (error {after:.2f})"
-        return f"{failed}, and no effect in the library corrects this.{closest}"
+        return " ".join(
+            filter(None, (f"{failed}, and no effect in the library corrects this.{closest}", bent))
+        )
     return "These data are not sufficient to show what is missing."
 
 
-def standing_out(parts: Mapping[str, float], scatter: float) -> str:
-    """Parts that deviate more than their scatter; empty without any."""
+def standing_out(parts: Sequence[OutlyingPart]) -> str:
+    """Parts that deviate more than similar ones scatter; empty without any."""
     if not parts:
         return ""
-    named = ", ".join(f"{name} {100 * value:+.0f} %" for name, value in list(parts.items())[:_SHOWN])
+    named = ", ".join(f"{p.name} {100 * p.deviation:+.0f} %" for p in parts[:_SHOWN])
+    scatter = 100 * max(p.others for p in parts[:_SHOWN])
     return (
-        f"Parts that deviate from similar parts by more than the scatter: {named}; all others scatter by "
-        f"{100 * scatter:.1f} % (1 σ)."
+        f"To follow the data the model must let parts deviate further than similar ones, which scatter by "
+        f"{scatter:.1f} % (1 σ): {named}."
     )

@@ -263,6 +263,22 @@ class DetectionLimit:
 
 
 @dataclass(frozen=True)
+class OutlyingPart:
+    """A part that deviates further from similar ones than these do.
+
+    Attributes
+    ----------
+    name : str
+    deviation, others : float
+        Its relative deviation, and the 1 σ by which the others scatter.
+    """
+
+    name: str
+    deviation: float
+    others: float
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """The answer to: which physics is the model missing?
 

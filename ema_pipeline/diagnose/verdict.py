@@ -7,10 +7,10 @@ import numpy as np
 from ema_pipeline.diagnose.claims import Judged
 from ema_pipeline.diagnose.selection import Selection
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import VerdictWord
-from ema_pipeline.inference import beyond_scatter
+from ema_pipeline.diagnose.types import OutlyingPart, VerdictWord
+from ema_pipeline.inference import beyond
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import PARTS, Fit, within_scatter
+from ema_pipeline.observations.fitting import Fit, part_reach, within_scatter
 from ema_pipeline.observations.parts import FREE_STD
 
 MOST_UNEXPLAINED = 1
@@ -23,14 +23,13 @@ def explains(observations: Observations, fit: Fit, settings: DiagnoseSettings) -
     return found.error <= settings.error_limit and found.residuals.unexplained <= MOST_UNEXPLAINED
 
 
-def outlying_parts(fit: Fit) -> dict[str, float]:
-    """Relative deviation of every part that lies further out than the scatter of parts reaches, furthest first."""
-    names = fit.posterior.unknowns.names
-    found = {
-        names[i]: float(np.expm1(fit.posterior.x[i]))
-        for i in np.flatnonzero(beyond_scatter(fit.posterior, PARTS))
-    }
-    return dict(sorted(found.items(), key=lambda pair: -abs(pair[1])))
+def outlying_parts(observations: Observations, fit: Fit) -> tuple[OutlyingPart, ...]:
+    """Every part that lies further out than parts scatter, furthest first."""
+    p = fit.posterior
+    one_sigma = part_reach(observations, p, furthest=1.0)
+    names = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, part_reach(observations, p)))]
+    found = [OutlyingPart(n, float(np.expm1(p.value(n))), one_sigma[n]) for n in names]
+    return tuple(sorted(found, key=lambda part: -abs(part.deviation) / part.others))
 
 
 def too_few(fit: Fit) -> bool:

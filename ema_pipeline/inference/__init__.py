@@ -4,7 +4,7 @@ Knows no rig, no mode and no effect. A problem hands over its unknowns and its r
 everything else that a user sees is read from the `Posterior`.
 """
 
-from ema_pipeline.inference.bounded import Bounded, beyond_scatter
+from ema_pipeline.inference.bounded import Bounded, beyond, reach
 from ema_pipeline.inference.factor import lower_factor, solve_lower
 from ema_pipeline.inference.maximise import anneal, descend
 from ema_pipeline.inference.posterior import Posterior
@@ -20,11 +20,12 @@ __all__ = [
     "Scatter",
     "Unknowns",
     "anneal",
-    "beyond_scatter",
+    "beyond",
     "descend",
     "joined",
     "learn",
     "lower_factor",
+    "reach",
     "solve_lower",
     "widened",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,33 +12,54 @@ from ema_pipeline.inference.posterior import Posterior
 from ema_pipeline.inference.problem import Problem
 
 FURTHEST = 4.0
-"""Standard deviations that scatter reaches: of 400 healthy rigs of 40 parts, one has a part further out."""
+"""How far one part may lie, in units of how far the others of its kind scatter: the furthest of 72 healthy rigs of 6 to
+40 parts lies at 3.5."""
+_DEFAULT_COUNT = 4.0
+"""Parts that the default of a scatter counts as, beside those that a rig has."""
 
 
 class Bounded:
-    """A problem with some of its scattering unknowns bound to `FURTHEST` standard deviations.
+    """A problem with some of its unknowns bound.
 
     Parameters
     ----------
     problem : Problem
-    scatters : dict of str to float
-        Hyper-parameters that the standard deviations follow.
-    bound : sequence of str
-        Scatters whose unknowns are bound.
+    most : dict of str to float
+        Largest size of these unknowns, by name.
     """
 
-    def __init__(self, problem: Problem, scatters: Mapping[str, float], bound: Sequence[str]) -> None:
+    def __init__(self, problem: Problem, most: Mapping[str, float]) -> None:
         u = problem.unknowns
-        most = np.where(_governed_by(u.scatter, bound), FURTHEST * u.prior_std(scatters), np.inf)
-        self.unknowns = replace(u, lower=np.maximum(u.lower, -most), upper=np.minimum(u.upper, most))
+        bound = np.array([most.get(name, np.inf) for name in u.names])
+        self.unknowns = replace(u, lower=np.maximum(u.lower, -bound), upper=np.minimum(u.upper, bound))
         self.residuals = problem.residuals
 
 
-def beyond_scatter(found: Posterior, bound: Sequence[str], reach: float = FURTHEST) -> NDArray[np.bool_]:
-    """Mask of the unknowns of some scatters that lie further out than `reach` standard deviations, (n,)."""
-    far = np.abs(found.x) > reach * found.prior_std
-    return np.asarray(far & _governed_by(found.unknowns.scatter, bound))
+def reach(found: Posterior, defaults: Mapping[str, float], furthest: float = FURTHEST) -> dict[str, float]:
+    """How far every unknown of some scatters may lie, by name: as far as the others of its kind tell.
+
+    A scatter that is learned with the one that stands out grows with it, until nothing stands out.
+
+    Parameters
+    ----------
+    found : Posterior
+    defaults : dict of str to float
+        Usual sizes of these scatters.
+    furthest : float
+    """
+    u = found.unknowns
+    limits: dict[str, float] = {}
+    for kind, default in defaults.items():
+        of_kind = np.flatnonzero([s == kind for s in u.scatter])
+        unit = u.std[of_kind]
+        squares = (found.x[of_kind] / unit) ** 2
+        others = np.sum(squares) - squares + _DEFAULT_COUNT * default**2
+        scatter = np.sqrt(others / (_DEFAULT_COUNT + len(of_kind) - 1))
+        limits |= {u.names[i]: furthest * float(s) for i, s in zip(of_kind, scatter * unit, strict=True)}
+    return limits
 
 
-def _governed_by(scatter: Sequence[str], names: Sequence[str]) -> NDArray[np.bool_]:
-    return np.array([s in names for s in scatter], bool)
+def beyond(found: Posterior, most: Mapping[str, float]) -> NDArray[np.bool_]:
+    """Mask of the unknowns that lie further out than they may, (n,)."""
+    bound = np.array([most.get(name, np.inf) for name in found.unknowns.names])
+    return np.asarray(np.abs(found.x) > bound)

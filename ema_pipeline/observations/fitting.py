@@ -16,11 +16,13 @@ from ema_pipeline.inference import (
     Posterior,
     Unknowns,
     anneal,
-    beyond_scatter,
+    beyond,
     descend,
     learn,
+    reach,
     widened,
 )
+from ema_pipeline.inference.bounded import FURTHEST
 from ema_pipeline.inference.maximise import ANNEALING
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.parts import MASS_SCATTER, PART_SCATTER
@@ -220,16 +222,33 @@ def averaged(observations: Observations, fit: Fit) -> Fit:
     return within_scatter(observations, wide)
 
 
-def within_scatter(observations: Observations, fit: Fit) -> Fit:
-    """The fit with no part further out than parts scatter; the same where none is.
+def part_reach(observations: Observations, found: Posterior, furthest: float = FURTHEST) -> dict[str, float]:
+    """How far every part may deviate from its like, by name, see `reach`."""
+    known = {n: observations.scatters[n].default for n in PARTS if n in observations.scatters}
+    return reach(found, known, furthest)
 
-    A model that bends one part ten standard deviations follows the data, but it is no longer the model that was meant.
+
+def unbent(observations: Observations, fit: Fit) -> bool:
+    """True where no part lies further out than parts scatter: on top of one that does, every effect promises much."""
+    return not np.any(beyond(fit.posterior, part_reach(observations, fit.posterior)))
+
+
+def within_scatter(observations: Observations, fit: Fit) -> Fit:
+    """The fit with no part further out than the others of its kind tell, and their scatter; the same where none is.
+
+    A model that bends one part ten times as far as the others follows the data, but it is no longer the one that was
+    meant.
     """
     p = fit.posterior
-    if not np.any(beyond_scatter(p, PARTS)):
+    most = part_reach(observations, p)
+    far = np.flatnonzero(beyond(p, most))
+    if not len(far):
         return fit
-    problem = Bounded(fit.model.problem(observations), p.scatters, PARTS)
-    return replace(fit, posterior=descend(problem, p.scatters, p.x))
+    scatters = dict(p.scatters)
+    for i in far:
+        kind, name = p.unknowns.scatter[i], p.unknowns.names[i]
+        scatters[kind] = min(scatters[kind], most[name] / (FURTHEST * p.unknowns.std[i]))
+    return replace(fit, posterior=descend(Bounded(fit.model.problem(observations), most), scatters, p.x))
 
 
 def fit_base(observations: Observations, model: Model, start: Fit | None = None) -> Fit:

@@ -18,7 +18,7 @@ from ema_pipeline.diagnose.claims import judge, of_one_shape
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.heldout import held_out
 from ema_pipeline.diagnose.hypotheses import list_hypotheses
-from ema_pipeline.diagnose.probability import NOTHING
+from ema_pipeline.diagnose.probability import NOTHING, UNKNOWN
 from ema_pipeline.diagnose.ranking import rank
 from ema_pipeline.diagnose.rungs import make_ladder
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -149,6 +149,18 @@ def test_an_effect_that_the_library_lacks_is_unknown_and_its_place_is_told() -> 
     assert found.verdict == "unknown_effect"
     assert found.detection_limits == ()
     assert "force levels" in found.next_measurement
+
+
+def test_a_mass_that_only_one_part_far_off_can_follow_is_unknown_to_a_library_without_masses() -> None:
+    only = {k: v for k, v in GENERIC.items() if k == "damper"}
+    found = of_chain(3, added(Mass, 0.5, {"m4.z": 1.0}), library=only)
+    assert found.verdict == "unknown_effect"
+    assert found.error > SETTINGS.error_limit
+    assert "mass 4 (mass) +" in found.summary
+    assert found.notes == ()
+    assert found.null_probability == found.probabilities[NOTHING] == 0.0
+    assert found.probabilities[UNKNOWN] > 0.5
+    assert sum(found.probabilities.values()) == pytest.approx(1)
 
 
 # --- the planetary rig ------------------------------------------------------------------------------------------

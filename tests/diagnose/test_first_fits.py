@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from ema_pipeline.diagnose import first_fits
-from ema_pipeline.diagnose.first_fits import _best_of_grid, _starts, first_fit, short_fits
+from ema_pipeline.diagnose.first_fits import Tried, _best_of_grid, _starts, first_fit, short_fits, tried_sizes
+from ema_pipeline.inference import Unknowns
 from tests.support.written_fits import NO_DATA, Parabola, fit, hypothesis, score, with_model
 
 
@@ -102,3 +103,43 @@ def test_the_first_fit_begins_at_half_the_size_that_its_score_tells(
         assert annealed == []
     without: Any = first_fit(NO_DATA, base, {"a": model}, {}, hypothesis("a"))
     assert without == "annealed"
+
+
+def test_sizes_far_out_are_tried_where_modes_have_no_partner() -> None:
+    """Of effects of one linear size, with parts that are not bent; the best that makes matters better is kept."""
+    base = with_model("base", Parabola(("part",), ()), [0.4])
+
+    def asked(label: str, at: float, **kind: Any) -> Any:
+        names = ("part", f"{label}.s1")
+        problem = Parabola(names, names[1:], np.array([0.0, at]))
+        problem.unknowns = Unknowns(names, np.ones(2), ("part", ""), np.full(2, -20.0), np.full(2, 9.0))
+        models[label] = with_model(label, problem, [0.0, 0.0]).model
+        return hypothesis(label, **kind)
+
+    models: dict[str, Any] = {}
+    law = asked("law", 8.0)
+    law.placed.effect.linear = False
+    everything = [
+        asked("far", 7.0),
+        asked("below", -14.0),
+        asked("beyond its range", 20.0),
+        asked("none", 0.1),
+        asked("two", 8.0, sizes=2),
+        asked("extends", 8.0, extends=True),
+        law,
+    ]
+    data: Any = SimpleNamespace(scatters={})
+    found = tried_sizes(data, base, models, everything, 1)
+    assert {label: one.unknown for label, one in found.items()} == {
+        "far": 8.0,
+        "below": -15.0,
+        "beyond its range": 8.0,
+    }
+    assert found["far"].gain == pytest.approx(0.5 * (7.0**2 - 1.0) / 30.0**2)
+
+
+def test_one_fit_begins_at_the_best_of_the_sizes_that_were_tried() -> None:
+    problem: Any = Parabola(("part", "a.s1"), ("a.s1",))
+    starts = _starts(NO_DATA, problem, hypothesis("a"), np.array([0.4, 0.0]), None, Tried(1.5, 9.0))
+    np.testing.assert_array_equal(starts[-1], [0.0, 1.5])
+    assert len(starts) == 4

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ema_pipeline.diagnose import ranking
+from ema_pipeline.diagnose.first_fits import Tried
 from ema_pipeline.diagnose.ranking import (
     Found,
     Ranked,
@@ -23,6 +24,7 @@ from ema_pipeline.diagnose.ranking import (
     _decides,
     _finals,
     _on,
+    _pairing,
     _promising,
     _screened,
 )
@@ -149,10 +151,20 @@ def test_what_promises_most_is_fitted_first_and_the_rest_in_a_few_steps_once_all
     everything = [hypothesis(f"h{k}") for k in range(40)]
     more = [hypothesis("two sizes", sizes=2), hypothesis("not scored")]
     promise: Any = {h.label: score(float(k)) for k, h in enumerate(everything)} | {"two sizes": score(-9.0)}
-    first, rest = _batches([*everything, *more], promise)
+    first, rest = _batches([*everything, *more], promise, ())
     assert [h.label for h in first] == [*(f"h{k}" for k in range(16, 40)), "two sizes", "not scored"]
     assert [h.label for h in rest] == [f"h{k}" for k in range(16)]
-    assert _batches(everything, {}) == [everything, []]
+    assert _batches(everything, {}, ()) == [everything, []]
+    first, _ = _batches(everything, promise, {"h3"})
+    assert [h.label for h in first] == ["h3", *(f"h{k}" for k in range(16, 40))]
+
+
+def test_what_gives_a_lost_mode_a_partner_is_fitted_though_its_score_promises_nothing() -> None:
+    tried = {f"h{k}": Tried(8.0, float(k)) for k in range(20)}
+    assert _pairing(tried) == {f"h{k}" for k in range(12, 20)}
+
+
+def test_the_search_ends_where_one_hypothesis_explains_all() -> None:
     base = fit("base", 0.0)
     for evidence, error, decided in ((201.0, 0.49, True), (200.0, 0.49, False), (201.0, 0.5, False)):
         found: Any = SimpleNamespace(log_evidence=evidence, error=error)
@@ -286,13 +298,18 @@ class Stages:
         ]
         monkeypatch.setattr(ranking, "scores", lambda *given: told)
         monkeypatch.setattr(ranking, "learned", lambda o, one: fit("learned", 0.0))
-        monkeypatch.setattr(
-            ranking, "beyond_scatter", lambda posterior, parts, most: np.array([bent and most == 3.0])
-        )
+        monkeypatch.setattr(ranking, "unbent", lambda o, one: not bent)
+        monkeypatch.setattr(ranking, "tried_sizes", self.tried_sizes)
         monkeypatch.setattr(ranking, "_screened", self.screened)
         monkeypatch.setattr(ranking, "short_fits", self.short_fits)
         monkeypatch.setattr(ranking, "first_fit", partial(self.first_fit, "first"))
-        monkeypatch.setattr(ranking, "annealed_fit", partial(self.first_fit, "annealed"))
+        monkeypatch.setattr(
+            ranking,
+            "annealed_fit",
+            lambda o, base, models, promise, tried, h: self.first_fit(
+                f"annealed{len(tried)}", o, base, models, promise, h
+            ),
+        )
         monkeypatch.setattr(ranking, "_begun_again", self.begun_again)
         monkeypatch.setattr(ranking, "_bettered", self.bettered)
         monkeypatch.setattr(ranking, "_promising", self.promising)
@@ -314,6 +331,10 @@ class Stages:
     def screened(self, hypotheses: Any, promise: Any, near: bool) -> Any:
         self.asked.append(("screened", [h.label for h in hypotheses], near))
         return hypotheses
+
+    def tried_sizes(self, o: object, base: Any, models: Any, hypotheses: Any, processes: object) -> Any:
+        assert [h.label for h in hypotheses] == [h.label for h in self.hypotheses]
+        return {"b": Tried(4.0, 9.0)}
 
     def short_fits(self, *given: object) -> list[tuple[Any, Any]]:
         self.short = True
@@ -374,6 +395,7 @@ def test_a_base_model_that_is_stuck_or_bent_is_begun_again_with_all(
     assert promising == []
     assert settled is None
     assert stages.asked[0][2] is False
-    assert stages.asked[1] == ("first" if bent else "annealed", "a", 6)
-    assert stages.short is (unpaired == 2.0)  # a few steps lead no mode to its partner
+    lost = unpaired < 2.0
+    assert stages.asked[1] == ("first" if bent else f"annealed{int(lost)}", "a", 6)
+    assert stages.short is not lost  # a few steps lead no mode to its partner
     assert stages.asked[7:] == [("again", 6, 5), ("freed", 6), ("again", 6, 12)]

@@ -13,16 +13,18 @@ import scipy.stats
 from numpy.typing import NDArray
 
 from ema_pipeline.inference import (
+    Bounded,
     Posterior,
     Residuals,
     Scatter,
     Unknowns,
     anneal,
-    beyond_scatter,
+    beyond,
     descend,
     joined,
     learn,
     lower_factor,
+    reach,
     solve_lower,
     tails,
     widened,
@@ -391,11 +393,29 @@ def test_a_scatter_is_widened_to_the_root_mean_square_of_its_exact_density() -> 
     assert widened(found, known)[PARTS] == found.scatters[PARTS]
 
 
-def test_parts_further_out_than_scatter_reaches_are_told_on_both_sides() -> None:
-    unknowns = joined(Unknowns.plain(("a", "b", "c"), 1.0, PARTS), Unknowns.plain(("gain",), 1.0, "gains"))
-    none = Residuals(np.zeros(0), np.zeros((0, 4)))
-    found = Posterior(unknowns, 0.02 * np.array([5.0, -5.0, 3.0, 9.0]), {PARTS: 0.02, "gains": 0.02}, none)
-    np.testing.assert_array_equal(beyond_scatter(found, [PARTS]), [True, True, False, False])
+def test_a_part_lies_too_far_out_where_the_others_do_not_scatter_so_far() -> None:
+    """The scatter as it is learned may have grown with the part itself."""
+    unknowns = joined(
+        Unknowns.plain([f"p{k}" for k in range(5)], 1.0, PARTS),
+        Unknowns.plain(("twice",), 2.0, PARTS),
+        Unknowns.plain(("gain",), 1.0, "gains"),
+    )
+    none = Residuals(np.zeros(0), np.zeros((0, 7)))
+    x = 0.02 * np.array([-10.0, 1.0, -1.0, 1.0, 1.0, 2.0, 90.0])
+    found = Posterior(unknowns, x, {PARTS: 0.1, "gains": 0.02}, none)
+    most = reach(found, {PARTS: 0.02})
+    assert most["p0"] == pytest.approx(4 * 0.02)  # four that the default counts as, and the five others
+    assert most["twice"] == pytest.approx(4 * 2 * 0.02 * np.sqrt(108 / 9))
+    assert set(most) == {*(f"p{k}" for k in range(5)), "twice"}
+    np.testing.assert_array_equal(beyond(found, most), [True, *[False] * 6])
+    assert reach(found, {PARTS: 0.02}, furthest=1.0)["p0"] == pytest.approx(0.02)
+
+
+def test_a_bound_problem_holds_what_is_bound_and_leaves_the_rest() -> None:
+    unknowns = Unknowns.plain(("a", "b"), 1.0)
+    problem = Bounded(Linear(unknowns, np.eye(2) / 1e-3, np.array([0.5, -0.5]) / 1e-3), {"a": 0.1, "c": 0.0})
+    found = descend(problem, {}, np.zeros(2))
+    np.testing.assert_allclose(found.x, [0.1, -0.5], rtol=1e-4)
 
 
 @pytest.mark.parametrize("count", [1, 5])
