@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.mechanics.assembly import Assembly
@@ -43,6 +43,10 @@ def _library_scales(assembly: Assembly, place: str) -> Mapping[str, float]:
     return {}
 
 
+def _any_size(assembly: Assembly, place: str) -> Mapping[str, float]:
+    return {}
+
+
 def _no_other_place(assembly: Assembly, place: str) -> bool:
     return False
 
@@ -76,6 +80,9 @@ class Effect:
     scales : callable
         ``scales(assembly, place) -> dict``: prior 1 σ of sizes that depend on the rig; the parameters' own where left
         out.
+    least : callable
+        ``least(assembly, place) -> dict``: smallest sizes that the rig leaves possible, where that is more than the
+        parameters' own range says: a spring that is not there cannot be lost.
     records_only : bool
         True for an effect that is sought in records of continuous excitation only.
     records_order : int, optional
@@ -97,6 +104,7 @@ class Effect:
     other_places: Callable[[Assembly, str], bool] = _no_other_place
     generic: bool = False
     scales: Callable[[Assembly, str], Mapping[str, float]] = _library_scales
+    least: Callable[[Assembly, str], Mapping[str, float]] = _any_size
     records_only: bool = False
     records_order: int | None = None
     elsewhere: Effect | None = None
@@ -114,6 +122,14 @@ class Effect:
         ):
             return self.elsewhere
         return self
+
+    def possible(self, assembly: Assembly, place: str) -> Effect:
+        """The effect with the range of sizes that the rig leaves possible at `place`."""
+        least = self.least(assembly, place)
+        if not least:
+            return self
+        narrowed = [replace(p, minimum=max(p.minimum, least.get(p.name, p.minimum))) for p in self.parameters]
+        return replace(self, parameters=tuple(narrowed))
 
     def fits(self, assembly: Assembly, place: str) -> bool:
         """True where the effect can sit at `place`."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -16,6 +16,8 @@ def bodies_and_dofs(assembly: Assembly) -> tuple[str, ...]:
     return (*assembly.bodies, *assembly.dofs)
 
 
+_PARALLEL = 1 - 1e-6
+"""Squared cosine of two rows that are one and the same motion."""
 _PLANE = ({"x", "y"}, {"zeta", "eta"})
 
 
@@ -72,6 +74,33 @@ def usual_stiffness(assembly: Assembly) -> float:
     """Half of the median stiffness of the model's springs, N/m."""
     known = [s.stiffness for s in assembly.springs() if s.stiffness > 0]
     return 0.5 * float(np.median(known)) if known else 1e5
+
+
+def least_stiffness(assembly: Assembly, place: str) -> Mapping[str, float]:
+    """Smallest size of an added spring, N/m: what stands there can be lost, and no more."""
+    springs = [(s.row, s.stiffness) for s in assembly.springs()]
+    return {"stiffness": 0.0 - _least_along(assembly, place, springs)}
+
+
+def least_mass(assembly: Assembly, place: str) -> Mapping[str, float]:
+    """Smallest size of an added mass, kg: what moves there can be lost, and no more."""
+    masses = [(e.row, e.value) for e in assembly.elements if isinstance(e, Mass)]
+    return {"mass": 0.0 - _least_along(assembly, place, masses)}
+
+
+def _least_along(assembly: Assembly, place: str, elements: Sequence[tuple[Row, float]]) -> float:
+    """Least, over the motions at a place, of the elements' values along that motion and no other."""
+    return min((_along(row, elements) for row in place_rows(assembly, place)), default=0.0)
+
+
+def _along(row: Row, elements: Sequence[tuple[Row, float]]) -> float:
+    total = 0.0
+    for other, value in elements:
+        dofs = [d for d in {**row, **other} if row.get(d) or other.get(d)]
+        a, b = (np.array([r.get(d, 0.0) for d in dofs]) for r in (row, other))
+        if (a @ b) ** 2 > _PARALLEL * (a @ a) * (b @ b) > 0:
+            total += value * float(b @ b) / float(a @ a)
+    return total
 
 
 def usual_mass(assembly: Assembly, place: str) -> float:

@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ema_pipeline.effects.base import Effect, EffectParameter
-from ema_pipeline.effects.generic import bodies_and_lone_dofs, is_place, mass_scale, place_rows
+from ema_pipeline.effects.generic import (
+    bodies_and_lone_dofs,
+    is_place,
+    least_mass,
+    mass_scale,
+    place_rows,
+)
 from ema_pipeline.mechanics.assembly import Assembly, Mass
 
 
@@ -24,5 +30,6 @@ EFFECT = Effect(
     other_places=is_place,
     generic=True,
     scales=mass_scale,
+    least=least_mass,
     records_order=70,
 )

@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ema_pipeline.effects.base import Effect, EffectParameter
-from ema_pipeline.effects.generic import bodies_pairs_and_dofs, is_place, place_rows, stiffness_scale
+from ema_pipeline.effects.generic import (
+    bodies_pairs_and_dofs,
+    is_place,
+    least_stiffness,
+    place_rows,
+    stiffness_scale,
+)
 from ema_pipeline.mechanics.assembly import Assembly, Spring
 
 
@@ -26,5 +32,6 @@ EFFECT = Effect(
     other_places=is_place,
     generic=True,
     scales=stiffness_scale,
+    least=least_stiffness,
     records_order=60,
 )

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ema_pipeline.effects.base import effect_of
+from ema_pipeline.effects.base import Effect, effect_of
 from ema_pipeline.effects.library import (
     effect_ids,
     effect_library,
@@ -15,9 +15,11 @@ from ema_pipeline.effects.library import (
     load_effect_file,
     parse_effect,
     parse_sized,
+    shipped_effects,
 )
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.errors import EmaError
+from ema_pipeline.mechanics.assembly import Assembly, Mass, Spring
 from ema_pipeline.mechanics.modes import complex_modes, normal_modes
 from ema_pipeline.rigs import load_rig, model_modes
 from ema_pipeline.rigs.frame import frame
@@ -312,3 +314,31 @@ def test_a_parameter_tells_which_effect_it_belongs_to() -> None:
         for parameter in placed.effect.parameters:
             assert effect_of(placed.parameter_name(parameter.name)) == label
     assert effect_of("sun_mass") == ""
+
+
+def test_no_more_can_be_lost_than_stands_at_a_place() -> None:
+    """A spring of 4 kN/m to ground, one of 9 kN/m to the next body, and masses of 2 and 3 kg."""
+    assembly = Assembly(
+        ("a.x", "b.x"),
+        (
+            Mass("a", {"a.x": 1.0}, 2.0),
+            Mass("b", {"b.x": 1.0}, 3.0),
+            Spring("ground", {"a.x": -2.0}, 1000.0),  # twice the motion: four times the stiffness
+            Spring("between", {"a.x": 1.0, "b.x": -1.0}, 9000.0),
+            Spring("both", {"a.x": 1.0, "b.x": 1.0}, 500.0),
+        ),
+        {},
+        0.01,
+    )
+    spring, mass = shipped_effects()["spring"], shipped_effects()["mass"]
+
+    def least(effect: Effect, place: str) -> float:
+        return effect.possible(assembly, place).parameters[0].minimum
+
+    assert least(spring, "a.x") == pytest.approx(-4000.0)
+    assert least(spring, "b.x") == 0.0
+    assert least(spring, "b.x-a.x") == pytest.approx(-9000.0)
+    assert least(mass, "b.x") == pytest.approx(-3.0)
+    assert least(mass, "a.x-b.x") == 0.0
+    damper = shipped_effects()["damper"]
+    assert damper.possible(assembly, "a.x") is damper
