@@ -136,7 +136,8 @@ def select(
         added = next(j for j in near if j.claimed)  # a rival alone does not pass the conditions of a claim
         suited = observations.suited(added.ranked.fit.model.effects)
         if suited is not observations:
-            leading = [r.hypothesis for r in unbeaten(ranking.ranked[:CONTENDERS], lambda r: r.gain)]
+            leading = [j.hypothesis for j in claimed]
+            leading += [r.hypothesis for r in unbeaten(ranking.ranked[:CONTENDERS], lambda r: r.gain)]
             return select(suited, known, hypotheses, settings, progress, leading)
         claimed.append(added)
         rivals[added.hypothesis.label] = rounds[-1].judged

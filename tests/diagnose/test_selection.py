@@ -115,6 +115,7 @@ class Steps:
         self, monkeypatch: pytest.MonkeyPatch, rounds: list[list[Any]], linearised: bool = False
     ) -> None:
         self.rounds, self.asked, self.begun, self.shares = rounds, [], [], []
+        self.ranked: dict[int, tuple[Any, ...]] = {}
         self.observations: Any = SimpleNamespace(
             linearised=linearised, suited=lambda effects: self.observations
         )
@@ -128,7 +129,7 @@ class Steps:
                 j.ranked.fit.model = SimpleNamespace(effects=(j.hypothesis.placed,), name=j.hypothesis.label)
 
     def reconsider(self, observations: Any, start: Any, claimed: Any, rivals: Any, settings: Any) -> Any:
-        assert start.at == 1
+        assert start.model.name == "base"
         self.reconsidered.append((labels(claimed), [*rivals]))
         return claimed
 
@@ -139,7 +140,8 @@ class Steps:
     def rank(self, observations, base, left, processes, progress, further, unpaired) -> Any:
         progress(0.5, "half")
         self.asked.append(([h.label for h in left], unpaired))
-        return SimpleNamespace(base=base, ranked=(), unpaired=10.0 * len(self.asked))
+        ranked = self.ranked.get(len(self.asked), ())
+        return SimpleNamespace(base=base, ranked=ranked, unpaired=10.0 * len(self.asked))
 
     def round(self, observations, ranking, among, settings, found) -> Round:
         self.shares.append((len(among), settings.claim, found))
@@ -166,6 +168,26 @@ def test_effects_are_added_one_by_one_until_nothing_more_is_claimed(monkeypatch:
     assert steps.shares == [(3, 3.5, 0), (2, 5.5, 1), (1, pytest.approx(5.5), 2)]
     assert told == pytest.approx([0.125, 0.375, 0.625])
     assert steps.reconsidered == [(["a@x", "b@x"], ["a@x", "b@x"])]  # one alone has nothing beside it
+
+
+def test_what_was_claimed_is_asked_about_again_with_unknowns_that_a_later_claim_calls_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    a, b, c = judged("a@x", 20.0), judged("b@x", 9.0), judged("c@x", 1.0, "weak")
+    steps = Steps(monkeypatch, [[a], [b], [c]])
+    more: Any = SimpleNamespace(linearised=False, suited=lambda effects: more)
+    steps.observations.suited = lambda effects: more if b.hypothesis.placed in effects else steps.observations
+    steps.ranked = {2: (b, c)}
+    found = steps.select([j.hypothesis for j in (a, b, c)], SETTINGS, [])
+    assert [asked for asked, _ in steps.asked] == [
+        ["a@x", "b@x", "c@x"],
+        ["b@x", "c@x"],
+        ["a@x", "b@x", "c@x"],  # what was claimed first, and what led when more unknowns were called for
+        ["b@x", "c@x"],
+        ["c@x"],
+    ]
+    assert found.claimed == (a, b)
+    assert found.observations is more
 
 
 def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
