@@ -173,8 +173,15 @@ def ranks(z: Sequence[float], bins: int = 10) -> list[int]:
     return [int(n) for n in np.histogram(norm.cdf(-np.asarray(z)), bins, (0, 1))[0]]
 
 
-def statements(lines: Iterable[Line]) -> list[tuple[float, bool]]:
-    """The most probable statement of each case, "nothing" among them: its probability, and whether it is true."""
+def statements(lines: Iterable[Line], of_effects: bool | None = None) -> list[tuple[float, bool]]:
+    """The most probable statement of each case, "nothing" among them: its probability, and whether it is true.
+
+    Parameters
+    ----------
+    lines : iterable of dict
+    of_effects : bool, optional
+        True for statements that name an effect, False for those that nothing is missing; all where left out.
+    """
     told = []
     for line in lines:
         if line.get("failed"):
@@ -182,7 +189,10 @@ def statements(lines: Iterable[Line]) -> list[tuple[float, bool]]:
         nothing = line["nothing"] or 0.0
         best = max(line["candidates"], key=lambda c: c["probability"] or 0.0, default=None)
         if best is None or nothing >= (best["probability"] or 0.0):
-            told.append((nothing, not line["truth"]))
+            if of_effects is not True:
+                told.append((nothing, not line["truth"]))
+            continue
+        if of_effects is False:
             continue
         group = _names(line, best["label"])
         p = sum(c["probability"] or 0.0 for c in line["candidates"] if c["label"] in group)
@@ -218,6 +228,7 @@ def table(lines: Sequence[Line]) -> str:
     out.append(_row("all", lines))
     inside = [line for line in lines if not line["without"]]
     z, own_z, told = sizes(inside), parameters(inside), statements(inside)
+    named, silent = statements(inside, True), statements(inside, False)
     clear = [x for x in inside if x["truth"] and not x.get("failed") and (over_limit(x) or 0) >= CLEARLY]
     found = sum(outcome(x) in ("right", "group") for x in clear)
     out += [
@@ -228,7 +239,9 @@ def table(lines: Sequence[Line]) -> str:
         f"- 90 % intervals of {len(z)} sizes hold {_percent(coverage(z))}; ranks {ranks(z)}.",
         f"- 90 % intervals of {len(own_z)} parameters of the model hold {_percent(coverage(own_z))}; "
         f"ranks {ranks(own_z)}.",
-        f"- Expected calibration error of {len(told)} probabilities: {calibration_error(told):.3f}.",
+        f"- Expected calibration error of {len(told)} probabilities: {calibration_error(told):.3f}; of the "
+        f"{len(named)} that name an effect {calibration_error(named):.3f}, of the {len(silent)} that "
+        f"nothing is missing {calibration_error(silent):.3f}.",
         "",
         *_not_right(lines),
     ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -20,6 +20,8 @@ Schedule = tuple[tuple[float, int], ...]
 
 _SHORT = 8
 """Steps of a short fit."""
+_CONTINUED = 20
+"""The same where the start is good but for unknowns that are new."""
 _GRID = tuple(np.linspace(-2.0, 2.0, 9))
 """Unknowns of sizes, in units of their prior σ, at which an effect that adds modes is tried."""
 _GRID_STARTS = 2
@@ -150,6 +152,22 @@ def annealed_fit(
     label = hypothesis.label
     starts = _starts(observations, problem, hypothesis, begin, promise.get(label), tried.get(label))
     return annealed(observations, model, starts, schedule).posterior
+
+
+def continued_fit(
+    observations: Observations,
+    base: Fit,
+    model: Model,
+    before: Posterior,
+    otherwise: Callable[[], Posterior],
+) -> Posterior:
+    """The fit begun where that to the same data with fewer unknowns ended; `otherwise` where that does not help."""
+    unknowns = model.problem(observations).unknowns
+    x = transferred(before, unknowns, transferred(base.posterior, unknowns))
+    found = refined(observations, model, x, steps=_CONTINUED).posterior
+    if found.log_evidence > base.log_evidence:
+        return found
+    return max(found, otherwise(), key=lambda p: p.log_evidence)
 
 
 def _begun(observations: Observations, base: Fit, model: Model) -> Posterior | None:

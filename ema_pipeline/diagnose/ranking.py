@@ -14,7 +14,14 @@ from typing import TypeVar
 
 import numpy as np
 
-from ema_pipeline.diagnose.first_fits import Tried, annealed_fit, first_fit, short_fits, tried_sizes
+from ema_pipeline.diagnose.first_fits import (
+    Tried,
+    annealed_fit,
+    continued_fit,
+    first_fit,
+    short_fits,
+    tried_sizes,
+)
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.score import UNSEEN, Score, scores
@@ -116,6 +123,7 @@ def rank(
     progress: Progress = lambda share, text: None,
     further: int = 0,
     unpaired: float = 0.0,
+    before: Mapping[str, Posterior] | None = None,
 ) -> Ranking:
     """Fit every hypothesis and rank it.
 
@@ -132,6 +140,8 @@ def rank(
         Finalists that promise most beside learned scatters, which may be far narrower than those begun with.
     unpaired : float
         What modes without a partner cost whatever was added in an earlier ranking: no reason to search further.
+    before : dict of str to Posterior, optional
+        Fits of hypotheses to the same data with fewer unknowns, from which theirs are begun.
     """
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
     promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models)}
@@ -145,10 +155,18 @@ def rank(
     pairing = _pairing(tried)
     among = _screened(hypotheses, promise, near)
     chosen = [h for h in hypotheses if h in among or h.label in pairing]
-    if stuck:
-        job = partial(annealed_fit, observations, base, models, promise, tried)
-    else:
-        job = partial(first_fit, observations, base, models, promise)
+    earlier = before or {}
+
+    def job(hypothesis: Hypothesis) -> Posterior:
+        if stuck:
+            anew = partial(annealed_fit, observations, base, models, promise, tried, hypothesis)
+        else:
+            anew = partial(first_fit, observations, base, models, promise, hypothesis)
+        label = hypothesis.label
+        if label not in earlier:
+            return anew()
+        return continued_fit(observations, base, models[label], earlier[label], anew)
+
     short = partial(short_fits, observations, base, models, promise)
     known: dict[str, Posterior] = {}
     # A few steps do not lead a mode of the model to a measured one that has no partner yet.

@@ -20,6 +20,7 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.probability import NOTHING, probabilities
 from ema_pipeline.diagnose.ranking import CONTENDERS, Ranking, rank, unbeaten
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, fit_base
 
@@ -96,6 +97,7 @@ def select(
     settings: DiagnoseSettings,
     progress: Progress = lambda share, text: None,
     first: Sequence[Hypothesis] = (),
+    before: Mapping[str, Posterior] | None = None,
 ) -> Selection:
     """Add effects one by one while the data support them, once more with unknowns that what was added calls for.
 
@@ -109,12 +111,15 @@ def select(
     progress : callable
     first : sequence of Hypothesis
         What is asked about at first, where it is known what leads; all where it is empty.
+    before : dict of str to Posterior, optional
+        Fits of hypotheses to the same data with fewer unknowns.
     """
     observations = observations.suited(known.effects)
     base = start = fit_base(observations, known)
     rounds: list[Round] = []
     claimed: list[Judged] = []
     rivals: dict[str, tuple[Judged, ...]] = {}
+    fitted: dict[str, Posterior] = {}
     left: Sequence[Hypothesis] = first or hypotheses
     while True:
         low = len(rounds) / (settings.most_effects + 1)
@@ -126,7 +131,9 @@ def select(
             lambda share, text, low=low: progress(low + share / (settings.most_effects + 1), text),  # type: ignore[misc]
             settings.further_finalists,
             rounds[-1].ranking.unpaired if rounds else 0.0,
+            before,
         )
+        fitted |= {r.hypothesis.label: r.fit.posterior for r in ranking.ranked}
         asked = _beside(settings, claimed) if observations.linearised else settings
         among = left if claimed else hypotheses
         rounds.append(_round(observations, ranking, among, asked, len(claimed)))
@@ -138,7 +145,7 @@ def select(
         if suited is not observations:
             leading = [j.hypothesis for j in claimed]
             leading += [r.hypothesis for r in unbeaten(ranking.ranked[:CONTENDERS], lambda r: r.gain)]
-            return select(suited, known, hypotheses, settings, progress, leading)
+            return select(suited, known, hypotheses, settings, progress, leading, fitted)
         claimed.append(added)
         rivals[added.hypothesis.label] = rounds[-1].judged
         if len(claimed) > 1:

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from ema_pipeline.diagnose import first_fits
-from ema_pipeline.diagnose.first_fits import Tried, _best_of_grid, _starts, first_fit, short_fits, tried_sizes
+from ema_pipeline.diagnose.first_fits import (
+    Tried,
+    _best_of_grid,
+    _starts,
+    continued_fit,
+    first_fit,
+    short_fits,
+    tried_sizes,
+)
 from ema_pipeline.inference import Unknowns
 from tests.support.written_fits import NO_DATA, Parabola, fit, hypothesis, score, with_model
 
@@ -143,3 +151,28 @@ def test_one_fit_begins_at_the_best_of_the_sizes_that_were_tried() -> None:
     starts = _starts(NO_DATA, problem, hypothesis("a"), np.array([0.4, 0.0]), None, Tried(1.5, 9.0))
     np.testing.assert_array_equal(starts[-1], [0.0, 1.5])
     assert len(starts) == 4
+
+
+@pytest.mark.parametrize(
+    ("continued", "kept"), [(1.0, "continued"), (-1.0, "otherwise"), (-0.2, "continued")]
+)
+def test_a_fit_goes_on_where_one_with_fewer_unknowns_ended(
+    monkeypatch: pytest.MonkeyPatch, continued: float, kept: str
+) -> None:
+    base = with_model("base", Parabola(("part", "new"), ()), [0.4, 0.7], 0.0)
+    model = with_model("a", Parabola(("part", "new", "a.s1"), ("a.s1",)), [0.0] * 3).model
+    before = with_model("a", Parabola(("part", "a.s1"), ("a.s1",)), [0.1, 0.9]).posterior
+    anew: list[str] = []
+
+    def refined(observations: object, model: Any, x: np.ndarray, steps: int) -> Any:
+        np.testing.assert_array_equal(x, [0.1, 0.7, 0.9])  # what is new as the base model has it
+        return SimpleNamespace(posterior=SimpleNamespace(log_evidence=continued, name="continued"))
+
+    def otherwise() -> Any:
+        anew.append("asked")
+        return SimpleNamespace(log_evidence=-0.5, name="otherwise")
+
+    monkeypatch.setattr(first_fits, "refined", refined)
+    found: Any = continued_fit(NO_DATA, base, model, before, otherwise)
+    assert found.name == kept
+    assert bool(anew) is (continued <= 0.0)

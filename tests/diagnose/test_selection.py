@@ -116,6 +116,7 @@ class Steps:
     ) -> None:
         self.rounds, self.asked, self.begun, self.shares = rounds, [], [], []
         self.ranked: dict[int, tuple[Any, ...]] = {}
+        self.before: list[Any] = []
         self.observations: Any = SimpleNamespace(
             linearised=linearised, suited=lambda effects: self.observations
         )
@@ -137,9 +138,10 @@ class Steps:
         self.begun.append((getattr(model, "name", "base"), start))
         return SimpleNamespace(model=model, at=len(self.begun))
 
-    def rank(self, observations, base, left, processes, progress, further, unpaired) -> Any:
+    def rank(self, observations, base, left, processes, progress, further, unpaired, before) -> Any:
         progress(0.5, "half")
         self.asked.append(([h.label for h in left], unpaired))
+        self.before.append(before)
         ranked = self.ranked.get(len(self.asked), ())
         return SimpleNamespace(base=base, ranked=ranked, unpaired=10.0 * len(self.asked))
 
@@ -177,7 +179,17 @@ def test_what_was_claimed_is_asked_about_again_with_unknowns_that_a_later_claim_
     steps = Steps(monkeypatch, [[a], [b], [c]])
     more: Any = SimpleNamespace(linearised=False, suited=lambda effects: more)
     steps.observations.suited = lambda effects: more if b.hypothesis.placed in effects else steps.observations
-    steps.ranked = {2: (b, c)}
+    steps.ranked = {
+        k: tuple(
+            SimpleNamespace(
+                hypothesis=j.hypothesis,
+                gain=j.gain,
+                fit=SimpleNamespace(posterior=f"{j.hypothesis.label} {k}"),
+            )
+            for j in of
+        )
+        for k, of in ((1, (a, b)), (2, (b, c)))
+    }
     found = steps.select([j.hypothesis for j in (a, b, c)], SETTINGS, [])
     assert [asked for asked, _ in steps.asked] == [
         ["a@x", "b@x", "c@x"],
@@ -188,6 +200,8 @@ def test_what_was_claimed_is_asked_about_again_with_unknowns_that_a_later_claim_
     ]
     assert found.claimed == (a, b)
     assert found.observations is more
+    fitted = {"a@x": "a@x 1", "b@x": "b@x 2", "c@x": "c@x 2"}  # where fits of the first pass ended
+    assert steps.before == [None, None, fitted, fitted, fitted]
 
 
 def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
