@@ -18,18 +18,21 @@ from numpy.typing import NDArray
 
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
 
+Real = NDArray[np.float64]
+
 _FEWEST_SENSORS = 4
 """Sensors without which two shapes explain nearly any third one."""
+_SEEN = 0.1
+"""Share of the paired mode's squares from which the sensors see another one: in what was measured as one mode the two
+have shares as their residues, and one that hardly moves a sensor explains no wrong shape."""
 _ALONG = 1e-6
 """Share of a shape's weighted squares that it must have of its own beside the paired one."""
 
-Real = NDArray[np.float64]
-
 
 def hidden_partners(
-    solution: EigenSolution, to: NDArray[np.int64], sensors: NDArray[np.int64]
+    solution: EigenSolution, to: NDArray[np.int64], sensors: NDArray[np.int64], read: Real
 ) -> NDArray[np.int64]:
-    """Nearest mode without a partner within a half-width of each paired one, -1 for none, (k,).
+    """Nearest mode without a partner that sensors see within a half-width of each paired one, -1 for none, (k,).
 
     Parameters
     ----------
@@ -38,10 +41,14 @@ def hidden_partners(
         Modes of the model that have a measured partner.
     sensors : ndarray of int, (k,)
         At how many sensors the shapes of these partners were measured.
+    read : ndarray, (s, n)
+        What the sensors read of all modes, in their modal scale.
     """
+    strength = np.sum(np.abs(read) ** 2, axis=0)
     hz, width = solution.frequency_hz, solution.damping_ratio * solution.frequency_hz
     distance = np.abs(hz[to, None] - hz)
     distance[:, to] = np.inf
+    distance[strength < _SEEN * strength[to, None]] = np.inf
     near = (distance < np.nan_to_num(width)[to, None]) & (sensors >= _FEWEST_SENSORS)[:, None]
     distance[~near] = np.inf
     nearest = np.argmin(distance, axis=1) if distance.size else np.zeros(len(to), np.int64)

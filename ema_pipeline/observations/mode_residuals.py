@@ -168,7 +168,7 @@ class Comparison:
         on, alone = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
         to = match[on]
         sensors = np.count_nonzero(self.data.seen[on], axis=1) * self.data.may_hide_another[on]
-        hidden = hidden_partners(solution, to, sensors)
+        hidden = hidden_partners(solution, to, sensors, predicted)
         known = self._known(on, hidden)
         groups = self._groups(solution, predicted, known, to)
         number = np.full(len(on), -1)

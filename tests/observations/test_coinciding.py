@@ -37,8 +37,18 @@ def solution(hz: list[float], ratio: float = 0.01) -> Any:
 def test_a_hidden_partner_lies_within_a_half_width_and_has_no_measured_mode(
     hz: list[float], to: list[int], sensors: list[int], found: list[int]
 ) -> None:
-    got = hidden_partners(solution(hz), np.array(to, int), np.array(sensors, int))
+    got = hidden_partners(solution(hz), np.array(to, int), np.array(sensors, int), np.ones((6, len(hz))))
     assert got.tolist() == found
+
+
+def test_a_mode_that_hardly_moves_a_sensor_hides_in_no_other() -> None:
+    """Such a mode would excuse any wrong shape: a support whose mass moves alone, at the frequency of another mode."""
+    read = np.ones((6, 3))
+    read[:, 1] = 0.31
+    to, sensors = np.array([0]), np.array([6])
+    assert hidden_partners(solution([100.0, 99.9, 99.5]), to, sensors, read).tolist() == [2]
+    read[:, 1] = 0.32
+    assert hidden_partners(solution([100.0, 99.9, 99.5]), to, sensors, read).tolist() == [1]
 
 
 def test_what_a_hidden_partner_adds_is_across_the_paired_shape_and_of_weighted_length_one() -> None:
