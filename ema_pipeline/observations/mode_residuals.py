@@ -78,8 +78,9 @@ class _Known:
     ----------
     on : ndarray of int, (k,)
         Measured modes.
-    shapes, own, unit, weight : ndarray, (k, s)
-        What is compared, its 1 σ in the test, the unit of the scatter that adds to it, and one over the variance.
+    shapes, own, unit, blur, weight : ndarray, (k, s)
+        What is compared, its 1 σ in the test, the unit of the scatter that adds to it, the 1 σ of what a hidden mode
+        adds, and one over the variance.
     mixed : list of (int, int, int)
         Place of a mode, another measured mode, and the unknown that says how much of that it holds.
     """
@@ -88,6 +89,7 @@ class _Known:
     shapes: NDArray[np.float64]
     own: NDArray[np.float64]
     unit: NDArray[np.float64]
+    blur: NDArray[np.float64]
     weight: NDArray[np.float64]
     mixed: list[tuple[int, int, int]]
 
@@ -280,12 +282,14 @@ class Comparison:
     def _known(self, on: NDArray[np.int64], hidden: NDArray[np.int64]) -> _Known:
         """Measured shapes of modes with a partner, less what their unknowns say they hold of others."""
         d = self.data
-        y, own = d.known_shapes[on], np.hypot(d.compared_std[on], _FITTED_AS_ONE_STD * (hidden >= 0)[:, None])
+        y, own = d.known_shapes[on], d.compared_std[on]
         unit = np.maximum(_SHAPE_REACH, np.abs(y))
         mixed = self._mixed(on)
         for k, other, unknown in mixed:
             y[k] -= self.x[unknown] * d.known_shapes[other]
-        return _Known(on, y, own, unit, d.seen[on] / (own**2 + (self.scatters[SHAPE] * unit) ** 2), mixed)
+        blur = np.tile(np.where(hidden >= 0, _FITTED_AS_ONE_STD, 0.0)[:, None], y.shape[1])
+        variance = own**2 + (self.scatters[SHAPE] * unit) ** 2 + blur**2
+        return _Known(on, y, own, unit, blur, d.seen[on] / variance, mixed)
 
     def _groups(
         self, solution: EigenSolution, predicted: NDArray[np.float64], known: _Known, to: NDArray[np.int64]
@@ -405,7 +409,7 @@ class Comparison:
         slope = None if slope is None else slope[seen]
         return Rows(
             difference[seen], known.own[real][seen], known.unit[real][seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode],
-            sensor, self.data.close[on[mode]], slope, noise=SHAPE_NOISE,
+            sensor, self.data.close[on[mode]], slope, noise=SHAPE_NOISE, blur=known.blur[real][seen],
         )  # fmt: skip
 
     def _mixed(self, on: NDArray[np.int64]) -> list[tuple[int, int, int]]:

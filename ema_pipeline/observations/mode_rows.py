@@ -74,6 +74,9 @@ class Rows:
         The model's values, of damping: ln ζ.
     noise : str
         Name of the factor on the test's own 1 σ where that is learned too.
+    blur : ndarray, (k,), optional
+        1 σ of what the measurement holds beside what it is compared with. It makes a difference count less, and its
+        size is no evidence for a model or against it.
     """
 
     difference: NDArray[np.float64]
@@ -87,6 +90,7 @@ class Rows:
     slope: NDArray[np.float64] | None = None
     model: NDArray[np.float64] | None = None
     noise: str = ""
+    blur: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.difference)
@@ -143,6 +147,8 @@ def whitened(
         variance = own + added
         usual = (r.noise_at(defaults) * r.own) ** 2 + (defaults[r.scatter] * r.unit) ** 2
         log_scale += 0.5 * float(np.log(variance / usual).sum())
+        if r.blur is not None:
+            variance = variance + r.blur**2
         sigma = np.sqrt(variance) * r.heat
         values[here] = r.difference / sigma
         if r.sensor is not None:  # a shape may be wrong as a whole

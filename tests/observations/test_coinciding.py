@@ -12,8 +12,10 @@ import pytest
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
+from ema_pipeline.inference import Residuals
 from ema_pipeline.observations.coinciding import directions, hidden_partners
 from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.mode_rows import Compared, Rows, whitened
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs import load_rig
 from ema_pipeline.rigs.types import Rig
@@ -104,3 +106,29 @@ def test_the_one_measured_shape_of_two_modes_may_be_any_mix_of_them(tmp_path: Pa
     alone = ModeObservations(rig, [prepare(replace(wrong, band_hz=None))]).problem((), {})
     assert 3 < left.blocks[0][0] < 12
     assert alone.residuals(problem.start(), scatters).blocks[0][0] > 300
+
+
+def test_what_a_hidden_mode_adds_makes_a_difference_count_less_and_is_no_evidence() -> None:
+    """A model must not gain by shapes that it need not explain, however small the learned uncertainty of the others."""
+    own, none = np.full(4, 0.01), np.zeros((4, 0))
+    rows = Rows(
+        np.full(4, 0.3),
+        own,
+        np.ones(4),
+        "shape",
+        1.0,
+        np.zeros(4, int),
+        np.arange(4),
+        slope=none,
+        noise="noise",
+    )
+    scatters, usual = {"shape": 0.0005, "noise": 0.1}, {"shape": 0.015, "noise": 1.0}
+
+    def seen(one: Rows) -> Residuals:
+        return whitened(Compared((one,), np.zeros(1, int), 0.0, 0.0, 0, 1), scatters, usual, 0)
+
+    sharp, blurred = seen(rows), seen(replace(rows, blur=np.full(4, 0.3)))
+    assert blurred.log_scale == sharp.log_scale < 0
+    np.testing.assert_allclose(blurred.values, 1.0, rtol=1e-3)
+    assert sharp.values[0] > 200
+    assert blurred.share["shape"][0] < 1e-4  # what is learned of the scatter comes from the other shapes
