@@ -55,6 +55,7 @@ def reach(found: Posterior, defaults: Mapping[str, float], furthest: float = FUR
         squares = (found.x[of_kind] / unit) ** 2
         others = np.sum(squares) - squares + _DEFAULT_COUNT * default**2
         scatter = np.sqrt(others / (_DEFAULT_COUNT + len(of_kind) - 1))
+        scatter = np.minimum(scatter, found.scatters.get(kind, np.inf))  # several may stand out at once
         limits |= {u.names[i]: furthest * float(s) for i, s in zip(of_kind, scatter * unit, strict=True)}
     return limits
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -402,13 +402,15 @@ def test_a_part_lies_too_far_out_where_the_others_do_not_scatter_so_far() -> Non
     )
     none = Residuals(np.zeros(0), np.zeros((0, 7)))
     x = 0.02 * np.array([-10.0, 1.0, -1.0, 1.0, 1.0, 2.0, 90.0])
-    found = Posterior(unknowns, x, {PARTS: 0.1, "gains": 0.02}, none)
+    found = Posterior(unknowns, x, {PARTS: 0.2, "gains": 0.02}, none)
     most = reach(found, {PARTS: 0.02})
     assert most["p0"] == pytest.approx(4 * 0.02)  # four that the default counts as, and the five others
     assert most["twice"] == pytest.approx(4 * 2 * 0.02 * np.sqrt(108 / 9))
     assert set(most) == {*(f"p{k}" for k in range(5)), "twice"}
     np.testing.assert_array_equal(beyond(found, most), [True, *[False] * 6])
     assert reach(found, {PARTS: 0.02}, furthest=1.0)["p0"] == pytest.approx(0.02)
+    several = reach(replace(found, scatters={PARTS: 0.03}), {PARTS: 0.02})  # no further than is learned
+    assert several["p1"] == several["twice"] / 2 == pytest.approx(4 * 0.03)
 
 
 def test_a_bound_problem_holds_what_is_bound_and_leaves_the_rest() -> None:
