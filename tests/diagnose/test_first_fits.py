@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from written_fits import NO_DATA, Parabola, fit, hypothesis, score, with_model
 
 from ema_pipeline.diagnose import first_fits
 from ema_pipeline.diagnose.first_fits import (
@@ -19,7 +20,6 @@ from ema_pipeline.diagnose.first_fits import (
     tried_sizes,
 )
 from ema_pipeline.inference import Unknowns
-from tests.support.written_fits import NO_DATA, Parabola, fit, hypothesis, score, with_model
 
 
 def test_short_fits_begin_at_the_scores_of_what_has_one_size(

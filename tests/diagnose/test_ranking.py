@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from written_fits import NO_DATA, Parabola, fit, hypothesis, law, score, with_model
 
 from ema_pipeline.diagnose import ranking
 from ema_pipeline.diagnose.first_fits import Tried
@@ -29,7 +30,6 @@ from ema_pipeline.diagnose.ranking import (
     _screened,
 )
 from ema_pipeline.observations.fitting import Fit
-from tests.support.written_fits import NO_DATA, Parabola, fit, hypothesis, law, score, with_model
 
 
 def test_where_the_base_model_fails_laws_in_time_are_screened_among_themselves() -> None:
