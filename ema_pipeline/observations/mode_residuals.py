@@ -487,6 +487,7 @@ class Comparison:
 def _turned_slopes(read: NDArray[np.complex128], slope: NDArray[np.complex128]) -> NDArray[np.float64]:
     """Derivatives of `turned` shapes from those (k, s, n) of the complex ones (k, s), which turn the angle, too."""
     square = np.sum(read**2, axis=1)
+    square = np.where(square == 0, 1.0, square)  # no sensor reads the mode: nothing turns
     back = np.exp(-0.5j * np.angle(square))[:, None]
     angle = np.imag(np.einsum("ks,ksn->kn", read, slope) / square[:, None])
     return np.asarray(np.real(back[..., None] * slope) + np.imag(back * read)[..., None] * angle[:, None, :])
