@@ -97,7 +97,7 @@ def tried_sizes(
         problem = models[hypothesis.label].problem(observations)
         unknowns = problem.unknowns
         begin = _unbent(unknowns, transferred(base.posterior, unknowns))
-        at = unknowns.index[hypothesis.placed.parameter_name(hypothesis.placed.effect.parameters[0].name)]
+        at = unknowns.index[_first_size(hypothesis)]
 
         def cost(size: float) -> float:
             x = begin.copy()
@@ -192,11 +192,12 @@ def _starts(
     in time it has bent everything, up to a fit that no true effect leads out of: there one fit begins where the base
     model's did. Usual sizes may be ten times too large; the one that a score tells is about right where the effect is.
     """
-    unbent = _unbent(problem.unknowns, begin)
     if hypothesis.begun:
         sizes_known = [problem.unknowns.index[name] for name in problem.sizes]
         unbent = problem.start()
         unbent[sizes_known] = begin[sizes_known]
+    else:
+        unbent = _unbent(problem.unknowns, begin)
     if hypothesis.size_cannot_be_zero:
         plans = [
             (x, start)
@@ -207,11 +208,9 @@ def _starts(
         plans = [(begin, start) for start in hypothesis.starts()]
         plans += [(unbent, start) for start in hypothesis.starts()[:1]]
         if score is not None and len(score.size) == 1 and not hypothesis.begun:
-            size = hypothesis.placed.effect.parameters[0].name
-            plans.append((begin, {hypothesis.placed.parameter_name(size): float(score.size[0])}))
+            plans.append((begin, {_first_size(hypothesis): float(score.size[0])}))
         if tried is not None:
-            size = hypothesis.placed.effect.parameters[0].name
-            plans.append((unbent, {hypothesis.placed.parameter_name(size): tried.unknown}))
+            plans.append((unbent, {_first_size(hypothesis): tried.unknown}))
     found = []
     for x, sizes in plans:
         moved = x.copy()
@@ -227,10 +226,13 @@ def _at_score(
     """The base model's fit with half of the size that the score tells, (n,)."""
     unknowns = model.problem(observations).unknowns
     x = transferred(base.posterior, unknowns)
-    placed = hypothesis.placed
-    at = unknowns.index[placed.parameter_name(placed.effect.parameters[0].name)]
-    x[at] = float(np.clip(0.5 * score.size[0], -1.0, 1.0))
+    x[unknowns.index[_first_size(hypothesis)]] = float(np.clip(0.5 * score.size[0], -1.0, 1.0))
     return unknowns.clipped(x)
+
+
+def _first_size(hypothesis: Hypothesis) -> str:
+    """Name of the unknown of its first size, of most effects the only one."""
+    return hypothesis.placed.parameter_name(hypothesis.placed.effect.parameters[0].name)
 
 
 def _unbent(unknowns: Unknowns, x: NDArray[np.float64]) -> NDArray[np.float64]:
