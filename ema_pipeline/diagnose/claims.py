@@ -18,8 +18,7 @@ from ema_pipeline.observations.fitting import Fit, at_scatters, averaged, within
 
 HELD_OUT_TIE = 1.0
 """Log density of data held out by which a claim may be behind: few modes predict no better with
-a small effect than without."""
-
+a small effect than without. What equivalent linearisation leaves out comes on top."""
 
 NO_LESS_ERROR = "adding it does not reduce the error"
 PREDICTED_WORSE = "held-out data are predicted worse when it is added"
@@ -66,6 +65,11 @@ class Judged:
         """True where everything supports it."""
         return not self.doubt
 
+    @property
+    def contradicted(self) -> bool:
+        """True where error or held-out data speak against what the evidence supports."""
+        return self.doubt in (NO_LESS_ERROR, PREDICTED_WORSE)
+
 
 def judge(
     observations: Observations,
@@ -94,7 +98,10 @@ def judge(
     if not doubt:
         asked = observations.holding_out_explained(base.posterior.residuals)
         before, after = held_out(asked, base), held_out(asked, mended)
-        doubt = _contradicted(base, mended, before, after) or of_one_shape(base, mended, settings)
+        tie = HELD_OUT_TIE + (
+            settings.linearised * gain if _linearised(observations, ranked.hypothesis) else 0.0
+        )
+        doubt = _contradicted(base, mended, before, after, tie) or of_one_shape(base, mended, settings)
         name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, averaged(observations, mended)))
     return Judged(ranked, name, gain, base, mended, before, after, doubt, settings.claim)
 
@@ -121,9 +128,12 @@ def _weak(
 
 def sigmas_asked(observations: Observations, hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
     """Distance from nothing that a claim asks of a size, in its standard deviations."""
-    if observations.linearised and not hypothesis.placed.effect.linear:
-        return settings.linearised_sigmas
-    return settings.sigmas
+    return settings.linearised_sigmas if _linearised(observations, hypothesis) else settings.sigmas
+
+
+def _linearised(observations: Observations, hypothesis: Hypothesis) -> bool:
+    """True where equivalent linearisation alone tells what the effect does."""
+    return observations.linearised and not hypothesis.placed.effect.linear
 
 
 def _std_of_first(ranked: Ranked) -> float:
@@ -134,10 +144,10 @@ def _std_of_first(ranked: Ranked) -> float:
     return float(1 / np.sqrt(max(np.linalg.pinv(own)[0, 0], 1e-300)))
 
 
-def _contradicted(base: Fit, mended: Fit, before: HeldOut, after: HeldOut) -> str:
+def _contradicted(base: Fit, mended: Fit, before: HeldOut, after: HeldOut, tie: float) -> str:
     if mended.posterior.error >= base.posterior.error:
         return NO_LESS_ERROR
-    if after.log_density < before.log_density - HELD_OUT_TIE:
+    if after.log_density < before.log_density - tie:
         return PREDICTED_WORSE
     return ""
 

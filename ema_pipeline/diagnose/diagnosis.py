@@ -18,7 +18,7 @@ from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder
-from ema_pipeline.diagnose.verdict import alike, explains, outlying_parts, verdict_of
+from ema_pipeline.diagnose.verdict import alike, explains, outlying_parts, stands_still, verdict_of
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Model
@@ -96,10 +96,13 @@ def diagnose(
     scatter = learned_scatters(observations, found.final)
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
     bent = sentences.standing_out(outlying_parts(observations, found.final))
+    reasons = " ".join(
+        filter(None, (sentences.STANDING_STILL if stands_still(observations, found.final) else "", bent))
+    )
     errors = (rungs[0].error, rungs[-1].error)
     return Diagnosis(
         verdict=verdict,
-        summary=sentences.summary(verdict, told, errors, nothing, best, bent),
+        summary=sentences.summary(verdict, told, errors, nothing, best, reasons),
         null_probability=nothing,
         candidates=candidates,
         indistinguishable=_groups(found, group, settings),

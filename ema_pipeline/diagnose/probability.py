@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from scipy.special import expit
@@ -35,7 +35,12 @@ def prior(
 
 
 def probabilities(
-    ranking: Ranking, hypotheses: Sequence[Hypothesis], settings: DiagnoseSettings, found: int
+    ranking: Ranking,
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+    found: int,
+    contradicted: Collection[str] = (),
+    least: float = -np.inf,
 ) -> dict[str, float]:
     """Probability of every ranked hypothesis by the name that is said, and of `NOTHING`; adds up to 1.
 
@@ -47,10 +52,18 @@ def probabilities(
     settings : DiagnoseSettings
     found : int
         Effects that were found before.
+    contradicted : collection of str, optional
+        Names that error or held-out data speak against: what the evidence has for them does not count.
+    least : float, optional
+        Gain below which it does not count for the others either.
     """
     names = [named(r.hypothesis, r.fit) for r in ranking.ranked]
+
+    def believed(gain: float, label: str) -> float:
+        return min(gain, 0.0) if label in contradicted or gain < least else gain
+
     logs = [
-        r.gain + n.advantage + np.log(prior(r.hypothesis, hypotheses, settings, found))
+        believed(r.gain + n.advantage, n.label) + np.log(prior(r.hypothesis, hypotheses, settings, found))
         for r, n in zip(ranking.ranked, names, strict=True)
     ]
     everything = np.array([*logs, np.log(null_prior(settings, found))])

@@ -9,13 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ema_pipeline.diagnose.backward import reconsidered
-from ema_pipeline.diagnose.claims import (
-    BETTER_CONTRADICTED,
-    NO_LESS_ERROR,
-    PREDICTED_WORSE,
-    Judged,
-    judge,
-)
+from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.probability import NOTHING, probabilities
 from ema_pipeline.diagnose.ranking import CONTENDERS, Ranking, rank, unbeaten
@@ -172,17 +166,17 @@ def _round(
     finals = [r for r in ranking.ranked if r.final]
     judged = [judge(observations, ranking, r, settings, told[NOTHING]) for r in finals]
     judged.sort(key=lambda j: -j.gain)
-    return Round(ranking, tuple(_none_past_a_better_one(judged, settings)), told)
+    least = _least_believed(judged, settings)
+    if least > 0:
+        contradicted = [j.named.label for j in judged if j.contradicted]
+        told = probabilities(ranking, hypotheses, settings, found, contradicted, least)
+    judged = [replace(j, doubt=BETTER_CONTRADICTED) if j.claimed and j.gain < least else j for j in judged]
+    return Round(ranking, tuple(judged), told)
 
 
-def _none_past_a_better_one(judged: Sequence[Judged], settings: DiagnoseSettings) -> list[Judged]:
-    """Best first: none is claimed that explains the data far worse than one that held-out data contradict.
+def _least_believed(judged: Sequence[Judged], settings: DiagnoseSettings) -> float:
+    """Gain below which none is believed: far below one that error or held-out data contradict.
 
     What contradicts the better one speaks against its rivals as much, whose probability is a small share of its own.
     """
-    contradicted = [j.gain for j in judged if j.doubt in (NO_LESS_ERROR, PREDICTED_WORSE)]
-    most = max(contradicted, default=-np.inf)
-    return [
-        replace(j, doubt=BETTER_CONTRADICTED) if j.claimed and j.gain < most - settings.alike else j
-        for j in judged
-    ]
+    return max((j.gain for j in judged if j.contradicted), default=-np.inf) - settings.alike

@@ -56,7 +56,7 @@ def summary(
     error: tuple[float, float],
     nothing: float,
     best: tuple[str, str] = ("", ""),
-    bent: str = "",
+    reasons: str = "",
 ) -> str:
     """One to three sentences.
 
@@ -71,8 +71,8 @@ def summary(
         Probability that nothing is missing.
     best : (label, why), optional
         The best candidate where none is claimed, and why it is not.
-    bent : str, optional
-        What `standing_out` says of the model.
+    reasons : str, optional
+        Why the model does not explain the data, beside its error.
     """
     before, after = error
     named = "; ".join(f"{label_text(label)}, {size}" for label, size in claimed)
@@ -94,9 +94,14 @@ def summary(
         closest = f" The closest {verb} {named}." if named else ""
         failed = f"The model does not explain the data (error {after:.2f})"
         return " ".join(
-            filter(None, (f"{failed}, and no effect in the library corrects this.{closest}", bent))
+            filter(None, (f"{failed}, and no effect in the library corrects this.{closest}", reasons))
         )
     return "These data are not sufficient to show what is missing."
+
+
+STANDING_STILL = (
+    "Modes move with the force of the hits, and no effect that moves them is supported by these data."
+)
 
 
 def standing_out(parts: Sequence[OutlyingPart]) -> str:

@@ -20,7 +20,19 @@ MOST_UNEXPLAINED = 1
 def explains(observations: Observations, fit: Fit, settings: DiagnoseSettings) -> bool:
     """True where the model explains the data, all measured modes but one, no part further out than parts scatter."""
     found = within_scatter(observations, fit).posterior
-    return found.error <= settings.error_limit and found.residuals.unexplained <= MOST_UNEXPLAINED
+    return (
+        found.error <= settings.error_limit
+        and found.residuals.unexplained <= MOST_UNEXPLAINED
+        and not stands_still(observations, fit)
+    )
+
+
+def stands_still(observations: Observations, fit: Fit) -> bool:
+    """True where modes are seen to move with the force, and nothing in the model moves them.
+
+    Few modes that move weigh little in the error of all.
+    """
+    return observations.level_dependent and all(e.effect.linear for e in fit.model.effects)
 
 
 def outlying_parts(observations: Observations, fit: Fit) -> tuple[OutlyingPart, ...]:

@@ -79,6 +79,9 @@ class AmplitudeObservations:
 
     def __init__(self, modes: ModeObservations, hits: Sequence[HitData]) -> None:
         self.modes, self.hits = modes, tuple(hits)
+        self.level_dependent = any(
+            h.level_dependent and not modes.rig.assembly(h.configuration).nonlinear for h in hits
+        )
         shape = dataclasses.replace(modes.scatters[SHAPE], least=_LEAST_SHAPE)
         self.scatters = {**modes.scatters, SHAPE: shape, **hit_scatters()}
 

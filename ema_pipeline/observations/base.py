@@ -61,6 +61,11 @@ class Observations(Protocol):
         """True where effects that depend on the amplitude are known to first order, whose rest looks like another."""
         ...
 
+    @property
+    def level_dependent(self) -> bool:
+        """True where modes are seen to move with the force of the hits, which no linear model does."""
+        ...
+
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> EffectProblem:
         """The problem of fitting the rig with `effects`, whose sizes have these prior 1 σ, to the data."""
         ...

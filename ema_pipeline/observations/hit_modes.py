@@ -84,6 +84,8 @@ class HitData:
         Their distance.
     reference_level : int or None
         Force level whose hits gave `reference`; None for all.
+    level_dependent : bool
+        True where there is no doubt that the structure is not linear.
     """
 
     reference: ModeData
@@ -103,6 +105,7 @@ class HitData:
     band_hz: Real
     line_hz: float
     reference_level: int | None = None
+    level_dependent: bool = False
 
     @property
     def configuration(self) -> str:
@@ -269,6 +272,7 @@ def prepare_hits(
     modal: ModalModel,
     force_n: Sequence[float],
     reference_level: int | None = None,
+    level_dependent: bool = False,
 ) -> HitData | None:
     """What single hits tell, prepared; None where no sheet was struck at several levels.
 
@@ -282,6 +286,8 @@ def prepare_hits(
         Of each level.
     reference_level : int, optional
         Level that `modal` is of; all hits where left out.
+    level_dependent : bool, optional
+        What the study of the levels leaves no doubt of.
     """
     data = HitData(
         prepare(from_modal_model(modal, configuration)),
@@ -301,6 +307,7 @@ def prepare_hits(
         hits.band_hz,
         hits.line_hz,
         reference_level,
+        level_dependent,
     )
     return data if comparable(data) else None
 

@@ -83,6 +83,7 @@ class LoopObservations:
     """
 
     linearised = False
+    level_dependent = False
 
     def __init__(
         self,

@@ -103,6 +103,7 @@ class ModeObservations:
     """
 
     linearised = False
+    level_dependent = False
 
     def __init__(
         self,

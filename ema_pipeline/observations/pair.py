@@ -82,6 +82,7 @@ class PairObservations:
     """
 
     linearised = False
+    level_dependent = False
 
     def __init__(
         self,

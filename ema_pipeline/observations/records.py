@@ -86,6 +86,7 @@ class RecordObservations:
     """
 
     linearised = False
+    level_dependent = False
 
     def __init__(
         self,

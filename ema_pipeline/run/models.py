@@ -62,7 +62,9 @@ def amplitude_observations(run: Run) -> AmplitudeObservations | None:
             continue
         modal = modes_of_structure(run, name)
         forces = [level.force_n for level in study.levels]
-        data = prepare_hits(name, study.hit_modes, modal, forces, study.linear_level)
+        data = prepare_hits(
+            name, study.hit_modes, modal, forces, study.linear_level, study.clearly_level_dependent
+        )
         if data is not None:
             hits.append(data)
     return AmplitudeObservations(mode_observations(run), hits) if hits else None

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ema_pipeline.diagnose import selection
-from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, NO_LESS_ERROR, PREDICTED_WORSE
+from ema_pipeline.diagnose import probability, selection
+from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, NO_LESS_ERROR, PREDICTED_WORSE, Judged
 from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _groups
 from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.selection import Round, Selection, _beside, select
@@ -214,7 +213,7 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
         selection,
         "judge",
         lambda o, ranking, r, settings, nothing: SimpleNamespace(
-            gain=r.gain, nothing=nothing, doubt="", claimed=True
+            gain=r.gain, nothing=nothing, doubt="", claimed=True, contradicted=False
         ),
     )
     given: Any = SimpleNamespace(ranked=ranked)
@@ -223,18 +222,6 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
     assert [(j.gain, j.nothing) for j in found.judged] == [(4.0, 0.7), (2.0, 0.7), (1.0, 0.7)]  # type: ignore[attr-defined]
     assert found.probabilities == told | {"n": 2}
     assert found.ranking is given
-
-
-@dataclass(frozen=True)
-class Told:
-    """What `_none_past_a_better_one` asks of a candidate."""
-
-    gain: float
-    doubt: str = ""
-
-    @property
-    def claimed(self) -> bool:
-        return not self.doubt
 
 
 @pytest.mark.parametrize(
@@ -247,15 +234,66 @@ class Told:
     ],
 )
 def test_nothing_is_claimed_far_behind_what_held_out_data_contradict(
-    doubt: str, behind: float, claimed: bool
+    monkeypatch: pytest.MonkeyPatch, doubt: str, behind: float, claimed: bool
 ) -> None:
-    better, worse = Told(17.0, doubt), Told(17.0 - behind)
-    judged: Any = [better, worse]
-    one, other = selection._none_past_a_better_one(judged, SETTINGS)
-    assert one is better  # type: ignore[comparison-overlap]
+    one, other = judged_round(monkeypatch, [("better@x", 17.0, doubt), ("worse@x", 17.0 - behind, "")]).judged
+    assert (one.gain, one.doubt) == (17.0, doubt)
     assert other.doubt == ("" if claimed else BETTER_CONTRADICTED)
-    ahead: Any = [Told(30.0), better]
-    assert selection._none_past_a_better_one(ahead, SETTINGS)[0].claimed
+    ahead = judged_round(monkeypatch, [("ahead@x", 30.0, ""), ("better@x", 17.0, doubt)])
+    assert ahead.judged[0].claimed
+
+
+def judged_round(monkeypatch: pytest.MonkeyPatch, found: list[tuple[str, float, str]]) -> Round:
+    """A round of hypotheses with what they gain and what speaks against them."""
+    doubts = {label: doubt for label, _, doubt in found}
+    names = {label: SimpleNamespace(label=label, advantage=0.0) for label, _, _ in found}
+    told: Any = [
+        SimpleNamespace(hypothesis=SimpleNamespace(label=n, generic=False), gain=g, final=True, fit=None)
+        for n, g, _ in found
+    ]
+    fit: Any = None
+    monkeypatch.setattr(probability, "named", lambda hypothesis, fit: names[hypothesis.label])
+    monkeypatch.setattr(
+        selection,
+        "judge",
+        lambda o, ranking, r, settings, nothing: Judged(
+            r,
+            names[r.hypothesis.label],
+            r.gain,
+            fit,
+            fit,
+            fit,
+            fit,
+            doubts[r.hypothesis.label],
+            3.5,  # type: ignore[arg-type]
+        ),
+    )
+    data: Any = None
+    ranking: Any = SimpleNamespace(ranked=told)
+    return selection._round(data, ranking, [t.hypothesis for t in told], SETTINGS, 0)
+
+
+@pytest.mark.parametrize("doubt", [PREDICTED_WORSE, NO_LESS_ERROR])
+def test_what_is_contradicted_is_not_probable_and_neither_is_what_lies_far_behind_it(
+    monkeypatch: pytest.MonkeyPatch, doubt: str
+) -> None:
+    found = [("support@sun", 60.0, doubt), ("support@ring", 50.0, ""), ("mass@sun", -2.0, "weak")]
+    told = judged_round(monkeypatch, found).probabilities
+    prior = 0.7 / 3
+    assert sum(told.values()) == pytest.approx(1.0)
+    total = 0.3 + prior * (2 + np.exp(-2.0))
+    assert told[NOTHING] == pytest.approx(0.3 / total)
+    assert told["support@sun"] == told["support@ring"] == pytest.approx(prior / total)
+    assert told["mass@sun"] == pytest.approx(prior * np.exp(-2.0) / total)
+
+
+def test_what_is_contradicted_takes_nothing_from_what_is_ahead_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [("mass@sun", 30.0, ""), ("support@sun", 20.0, PREDICTED_WORSE)]
+    told = judged_round(monkeypatch, found).probabilities
+    assert told["mass@sun"] > 0.999
+    found = [("support@sun", 21.0, PREDICTED_WORSE), ("mass@sun", 20.0, "")]  # as good
+    told = judged_round(monkeypatch, found).probabilities
+    assert told["mass@sun"] > 0.999
 
 
 def test_no_more_effects_are_added_than_may_be(monkeypatch: pytest.MonkeyPatch) -> None:

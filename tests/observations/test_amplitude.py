@@ -10,9 +10,15 @@ import pytest
 from simulate_amplitude import COORDINATES, LEVELS, RIG, STRUCK, observed, simulated_hits, true_assembly
 
 from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.diagnose import claims
 from ema_pipeline.diagnose.detection_limits import detection_limits
+from ema_pipeline.diagnose.diagnosis import diagnose
+from ema_pipeline.diagnose.heldout import HeldOut
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
+from ema_pipeline.diagnose.ranking import rank
+from ema_pipeline.diagnose.sentences import STANDING_STILL
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.verdict import explains
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.inference import Posterior
@@ -150,6 +156,51 @@ def test_nothing_is_claimed_where_only_drift_moves_the_modes() -> None:
     for label in CASES:
         _, found = fitted(observations, base, label)
         assert found.log_evidence - base.log_evidence < 5
+
+
+def test_modes_that_move_with_the_force_are_not_explained_by_a_model_that_moves_none() -> None:
+    settings = DiagnoseSettings(processes=1)
+    quiet = synthetic()  # far below the error limit: what moves is not seen in it
+    moving = AmplitudeObservations(quiet.modes, [replace(h, level_dependent=True) for h in quiet.hits])
+    assert not quiet.level_dependent
+    assert moving.level_dependent
+    assert explains(quiet, base_fit(quiet), settings)
+    base = base_fit(moving)
+    assert not explains(moving, base, settings)
+
+    def with_effect(label: str) -> Fit:
+        model = base.model.plus(parse_effect(label, RIG), {})
+        problem = moving.problem(model.effects, model.scales)
+        start = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
+        return refined(moving, model, start, base.posterior.scatters)
+
+    assert not explains(moving, with_effect("local_damper@hub"), settings)
+    assert explains(moving, with_effect("bearing_cubic@hub"), settings)
+    told = diagnose(moving, RIG, {}, settings=settings, hypotheses=())
+    assert told.verdict == "unknown_effect"
+    assert STANDING_STILL in told.summary
+    assert told.null_probability == 0.0
+    assert told.detection_limits == ()
+    assert diagnose(quiet, RIG, {}, settings=settings, hypotheses=()).verdict == "adequate"
+
+
+@pytest.mark.parametrize(("linearised", "behind"), [(True, 1.0), (False, 0.0)])
+def test_levels_held_out_may_speak_against_a_linearised_effect_by_a_share_of_its_gain(
+    monkeypatch: pytest.MonkeyPatch, linearised: bool, behind: float
+) -> None:
+    observations = synthetic(CASES["bearing_cubic@hub"][0])
+    hypothesis = Hypothesis((Name(parse_effect("bearing_cubic@hub", RIG), {}),))
+    settings = DiagnoseSettings(processes=1)
+    ranking = rank(observations, base_fit(observations), [hypothesis], 1)
+    (found,) = ranking.ranked
+    most = claims.HELD_OUT_TIE + behind * settings.linearised * found.gain
+    monkeypatch.setattr(observations, "linearised", linearised)
+    for further, doubt in ((-0.1, ""), (0.1, claims.PREDICTED_WORSE)):
+        densities = iter([HeldOut(1.0, 0.0), HeldOut(1.0, -most - further)])
+        monkeypatch.setattr(claims, "held_out", lambda observations, fit, d=densities: next(d))
+        judged = claims.judge(observations, ranking, found, settings)
+        assert judged.doubt == doubt
+        assert judged.contradicted is bool(doubt)
 
 
 def test_derivatives_by_sizes_are_those_of_small_differences() -> None:

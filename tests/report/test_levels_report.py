@@ -85,6 +85,14 @@ def test_flags_say_how_far_a_mode_moves_and_which_modes_only_hard_hits_show(resu
     assert "not found in hits softer than 300 N" in modal.modes[1].flags[0]
 
 
+def test_only_what_leaves_no_doubt_is_called_clear(results: RunResults) -> None:
+    study = results.configurations[0].levels
+    assert study is not None
+    assert study.clearly_level_dependent
+    assert not replace(study, p_value=1e-3).clearly_level_dependent
+    assert not replace(study, level_dependent=False).clearly_level_dependent
+
+
 def test_the_summary_file_holds_every_mode_at_every_level(results: RunResults) -> None:
     content = summary_json(results)["configurations"]["c"]
     assert content["levels"]["forces_n"] == [30.0, 300.0]
