@@ -16,7 +16,8 @@ SUSPECT_FACTOR = 3.0
 common laboratory stay within 1.4, hidden effects within 2; mV/lbf for mV/N is 4.4, mV/g for mV/(m/s²) 9.8."""
 
 RECIPROCAL_FACTOR = 1.5
-"""The same between two channels by reciprocity, which no model takes part in."""
+"""The same between two channels by reciprocity, which no model takes part in, where their FRF is as strong as those of
+the driving points: what oblique blows and transverse sensitivity add to it weighs the more the weaker it is."""
 
 SAME_FACTOR = 1.3
 """Factors within this of each other are taken for the same."""
@@ -66,13 +67,17 @@ def channels_words(names: Sequence[str]) -> str:
     return f"channels {', '.join(quoted[:-1])} and {quoted[-1]}"
 
 
-def reciprocal_factor(one: NDArray[np.complex128], other: NDArray[np.complex128]) -> float:
+def reciprocal_factor(
+    one: NDArray[np.complex128], other: NDArray[np.complex128], least: float = RECIPROCAL_FACTOR
+) -> float:
     """The real constant between two reciprocal FRFs, 1 where a constant does not explain their difference.
 
     Parameters
     ----------
     one, other : complex ndarray, (n_lines,)
         Accelerances H_ij and H_ji where they are large.
+    least : float
+        Factor from which on it is far from 1.
 
     Returns
     -------
@@ -87,7 +92,7 @@ def reciprocal_factor(one: NDArray[np.complex128], other: NDArray[np.complex128]
         np.maximum(np.abs(one), np.finfo(float).tiny) / np.maximum(np.abs(other), np.finfo(float).tiny)
     )
     low, middle, high = np.percentile(ratio, (25, 50, 75))
-    far = abs(middle) > math.log(RECIPROCAL_FACTOR) and high - low < abs(middle)
+    far = abs(middle) > math.log(least) and high - low < abs(middle)
     factor = math.exp(middle) if far else 1.0
     return -factor if cosine < 0 else factor
 

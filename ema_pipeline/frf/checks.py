@@ -209,11 +209,12 @@ def _reciprocity(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Che
             one, other = one[seen], other[seen]
             level = (peak[o1, i2] * peak[o2, i1] / (peak[o1, i1] * peak[o2, i2])) ** 0.25
             apart = _sensor(frfs, o1) != _sensor(frfs, o2)
-            factor = reciprocal_factor(one, other) if apart and level > WEAK_LEVEL else 1.0
+            least = RECIPROCAL_FACTOR ** (1 / min(max(level, STRONG_LEVEL), 1.0))
+            factor = reciprocal_factor(one, other, least) if apart and level > WEAK_LEVEL else 1.0
             if level <= STRONG_LEVEL and factor < OBVIOUS_FACTOR and 1 / factor < OBVIOUS_FACTOR:
                 factor = 1.0
             if factor != 1.0:
-                verdicts.append(_contradiction(frfs, o1, o2, factor))
+                verdicts.append(_contradiction(frfs, o1, o2, factor, least))
                 continue
             size = 0.5 * (np.linalg.norm(one) + np.linalg.norm(other))
             noise = np.nan_to_num(_noise(frfs, o1, i2, inside) + _noise(frfs, o2, i1, inside))[seen]
@@ -229,7 +230,7 @@ def _reciprocity(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[Che
     return verdicts
 
 
-def _contradiction(frfs: FrfSet, one: int, other: int, factor: float) -> CheckResult:
+def _contradiction(frfs: FrfSet, one: int, other: int, factor: float, least: float) -> CheckResult:
     """Two channels whose reciprocal FRFs differ by one constant: a sensitivity or a sign is wrong."""
     sensors = channels_words([_sensor(frfs, one), _sensor(frfs, other)])
     what = ["their signs"] if factor < 0 else []
@@ -239,9 +240,7 @@ def _contradiction(frfs: FrfSet, one: int, other: int, factor: float) -> CheckRe
         what.append(f"sensitivity_mv and unit: {sides}{likely_cause(size, frfs.quantities[one])}")
     fault = f"{sensors} contradict each other (reciprocity of their FRFs): look up {', and '.join(what)}"
     channel = f"{frfs.outputs[one]} and {frfs.outputs[other]}"
-    return CheckResult(
-        SENSITIVITY, factor, RECIPROCAL_FACTOR, "1", False, RECIPROCITY, "warn", channel, fault
-    )
+    return CheckResult(SENSITIVITY, factor, least, "1", False, RECIPROCITY, "warn", channel, fault)
 
 
 def _sensor(frfs: FrfSet, output: int) -> str:

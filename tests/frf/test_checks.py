@@ -89,7 +89,13 @@ def test_a_constant_factor_is_a_sensitivity_of_two_sensors_and_none_of_one_that_
 @pytest.mark.parametrize(
     ("size", "factor", "check"),
     [
-        (0.5, 3.0, "sensitivity"),  # strong FRFs: a factor of 1.5 and more counts
+        (0.9, 1.7, "sensitivity"),  # as strong as the driving points: a factor of 1.5 and more counts
+        (
+            0.5,
+            1.7,
+            "reciprocity",
+        ),  # half as strong: of 1.5 squared, since the same oblique blow makes twice the error
+        (0.5, 3.0, "sensitivity"),
         (0.15, 3.0, "reciprocity"),  # weak beside the driving points: only one of 7 and more
         (0.15, 8.0, "sensitivity"),
     ],
