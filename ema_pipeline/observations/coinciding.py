@@ -44,14 +44,15 @@ def hidden_partners(
     read : ndarray, (s, n)
         What the sensors read of all modes, in their modal scale.
     """
-    strength = np.sum(np.abs(read) ** 2, axis=0)
     hz, width = solution.frequency_hz, solution.damping_ratio * solution.frequency_hz
     distance = np.abs(hz[to, None] - hz)
     distance[:, to] = np.inf
-    distance[strength < _SEEN * strength[to, None]] = np.inf
     near = (distance < np.nan_to_num(width)[to, None]) & (sensors >= _FEWEST_SENSORS)[:, None]
-    distance[~near] = np.inf
-    nearest = np.argmin(distance, axis=1) if distance.size else np.zeros(len(to), np.int64)
+    if not np.any(near):
+        return np.full(len(to), -1)
+    strength = np.sum(np.abs(read) ** 2, axis=0)
+    distance[~near | (strength < _SEEN * strength[to, None])] = np.inf
+    nearest = np.argmin(distance, axis=1)
     return np.asarray(np.where(np.isfinite(distance[np.arange(len(to)), nearest]), nearest, -1), np.int64)
 
 

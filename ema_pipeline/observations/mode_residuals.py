@@ -375,9 +375,11 @@ class Comparison:
         """Shapes with the factor projected out that fits them best, and what coinciding modes add; none of whirling
         modes.
         """
-        real = np.flatnonzero(~self.data.whirling[known.on])
+        whirling = self.data.whirling[known.on]
+        places = np.flatnonzero(~whirling)
+        real = places if np.any(whirling) else slice(None)  # most rigs have none, and need no copies
         on, hidden = known.on[real], hidden[real]
-        place = {int(k): i for i, k in enumerate(real)}
+        place = {int(k): i for i, k in enumerate(places)}
         seen = self.data.seen[on] > 0
         y, weight, p, turned = (
             known.shapes[real],
@@ -393,7 +395,8 @@ class Comparison:
             dp = shapes.slope.shapes[real]
             towards = weight * (y - 2 * scale[:, None] * p) / squared[:, None]
             scaled = (towards[:, None, :] @ dp)[:, 0]
-            slope = scale[:, None, None] * (dp + shapes.slope.turned[real])
+            slope = dp + shapes.slope.turned[real]
+            slope *= scale[:, None, None]
             for k, other, unknown in known.mixed:
                 if k in place:
                     along = self.data.known_shapes[other]
@@ -406,7 +409,8 @@ class Comparison:
             if slope is not None:
                 slope[k] -= along[:, None] * ((weight[k] * along) @ slope[k])
         mode, sensor = np.nonzero(seen)
-        slope = None if slope is None else slope[seen]
+        if slope is not None:
+            slope = slope.reshape(-1, slope.shape[2]) if np.all(seen) else slope[seen]
         return Rows(
             difference[seen], known.own[real][seen], known.unit[real][seen], SHAPE, 1 + 0.1 * (self.heat - 1), on[mode],
             sensor, self.data.close[on[mode]], slope, noise=SHAPE_NOISE, blur=known.blur[real][seen],
