@@ -92,7 +92,14 @@ def diagnose(
     if not (explained if start is found.final else explains(observations, start, settings)):
         probabilities = of_failing_model(probabilities)
     nothing = probabilities[NOTHING]
-    best = next(((c.label, c.why) for c in candidates), ("", ""))
+    best = next(
+        (
+            (c.label, c.why)
+            for c in candidates[:1]
+            if not c.claimed and (explained or c.error_after <= settings.error_limit)
+        ),
+        ("", ""),
+    )
     scatter = learned_scatters(observations, found.final)
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
     bent = sentences.standing_out(outlying_parts(observations, found.final))

@@ -70,7 +70,8 @@ def summary(
     nothing : float
         Probability that nothing is missing.
     best : (label, why), optional
-        The best candidate where none is claimed, and why it is not.
+        The best candidate where none is claimed, and why it is not; of a model that does not explain the data, one that
+        would.
     reasons : str, optional
         Why the model does not explain the data, beside its error.
     """
@@ -87,16 +88,20 @@ def summary(
     if verdict == "adequate":
         odds = f"Probability that nothing is missing: {probability_text(nothing)}."
         if best[0] and nothing < DOUBTFUL:
-            odds += f" The best candidate is {label_text(best[0])}. {best[1]}"
+            odds += f" {_candidate(best)}"
         return f"The model explains the data: error {before:.2f}. {odds}"
     if verdict == "unknown_effect":
         verb = "are" if len(claimed) > 1 else "is"
         closest = f" The closest {verb} {named}." if named else ""
         failed = f"The model does not explain the data (error {after:.2f})"
-        return " ".join(
-            filter(None, (f"{failed}, and no effect in the library corrects this.{closest}", reasons))
-        )
+        how = "is supported enough to be claimed" if best[0] else "corrects this"
+        told = f"{failed}, and no effect in the library {how}.{closest}"
+        return " ".join(filter(None, (told, _candidate(best), reasons)))
     return "These data are not sufficient to show what is missing."
+
+
+def _candidate(best: tuple[str, str]) -> str:
+    return f"The best candidate is {label_text(best[0])}. {best[1]}" if best[0] else ""
 
 
 STANDING_STILL = (

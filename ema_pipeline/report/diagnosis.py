@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 
 from ema_pipeline.diagnose.sentences import label_text, probability_text
+from ema_pipeline.diagnose.settings import ERROR_LIMIT
 from ema_pipeline.diagnose.types import (
     NOT_DETERMINED,
     OUT_OF_TOLERANCE,
@@ -31,11 +32,18 @@ def heading(found: Diagnosis) -> str:
     if found.verdict == "ambiguous":
         count = len(found.indistinguishable[0]) if found.indistinguishable else 2
         return f"{_COUNTS.get(count, str(count))} effects explain the data equally well"
+    if found.verdict == "unknown_effect" and _may_be_known(found):
+        return "Something is missing, and no effect is supported enough to be named"
     return {
         "adequate": "Nothing is missing as far as these data can tell",
         "unknown_effect": "Something is missing that is not in the library",
         "not_enough_data": "Not enough data to show what is missing",
     }[found.verdict]
+
+
+def _may_be_known(found: Diagnosis) -> bool:
+    """True where the model with the best candidate, which is not claimed, would explain the data."""
+    return any(not c.claimed and c.error_after <= ERROR_LIMIT for c in found.candidates[:1])
 
 
 def label_words(label: str) -> str:

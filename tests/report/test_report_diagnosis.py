@@ -158,6 +158,27 @@ def test_every_verdict_has_its_plain_heading(verdict: VerdictWord, expected: str
     assert diagnosis.heading(found(verdict)) == expected
 
 
+def test_what_is_missing_may_be_in_the_library_where_the_best_candidate_would_explain_the_data() -> None:
+    told = found("unknown_effect")
+    near = replace(told, candidates=(replace(told.candidates[0], claimed=False, error_after=1.1),))
+    expected = "Something is missing, and no effect is supported enough to be named"
+    assert diagnosis.heading(near) == expected
+    far = replace(told, candidates=(replace(near.candidates[0], error_after=2.0),))
+    assert diagnosis.heading(far) == diagnosis.heading(told) != expected
+    best = ("mass@m1", "Not claimed: its gain in log evidence, 3.4, is below 3.5.")
+    told_of_best = sentences.summary("unknown_effect", [], (2.1, 2.1), 0.0, best, "Parts deviate.")
+    assert told_of_best == (
+        "The model does not explain the data (error 2.10), and no effect in the library is supported enough to be "
+        "claimed. The best candidate is mass at m1. Not claimed: its gain in log evidence, 3.4, is below 3.5. "
+        "Parts deviate."
+    )
+    without = sentences.summary("unknown_effect", [], (2.1, 2.1), 0.0)
+    assert (
+        without
+        == "The model does not explain the data (error 2.10), and no effect in the library corrects this."
+    )
+
+
 def test_three_that_fit_alike_are_counted_in_the_heading() -> None:
     three = replace(found("ambiguous"), indistinguishable=((CRACK, OTHER, SUPPORT),))
     assert diagnosis.heading(three) == "Three effects explain the data equally well"
