@@ -18,10 +18,13 @@ from ema_pipeline.observations.fitting import QUICK, Fit, Model, annealed, refin
 
 Schedule = tuple[tuple[float, int], ...]
 
-_SHORT = 8
-"""Steps of a short fit."""
+_STEPS, _SHORT = 12, 8
+"""Steps of a fit from a good start, and of a short one."""
 _CONTINUED = 20
 """The same where the start is good but for unknowns that are new."""
+_HALF, _LITTLE = 1.0, 0.05
+"""Largest unknown of a size, in units of its prior σ, from which a fit begins where half of what its score tells is
+larger."""
 _GRID = tuple(np.linspace(-2.0, 2.0, 9))
 """Unknowns of sizes, in units of their prior σ, at which an effect that adds modes is tried."""
 _GRID_STARTS = 2
@@ -51,9 +54,8 @@ def short_fits(
     ]
 
     def fitted(hypothesis: Hypothesis) -> Posterior:
-        model = models[hypothesis.label]
-        x = _at_score(observations, base, model, hypothesis, promise[hypothesis.label])
-        return refined(observations, model, x, steps=_SHORT).posterior
+        score = promise[hypothesis.label]
+        return _from_score(observations, base, models[hypothesis.label], hypothesis, score, _SHORT)
 
     found = list(zip(scored, spread(fitted, scored, processes), strict=True))
     return sorted(found, key=lambda pair: -pair[1].log_evidence)
@@ -121,16 +123,18 @@ def first_fit(
     promise: Mapping[str, Score],
     hypothesis: Hypothesis,
 ) -> Posterior:
-    """The fit begun at half the size that its score tells; annealed where that makes matters worse."""
+    """The fit begun at the size that its score tells; annealed where that makes matters worse."""
     model, score = models[hypothesis.label], promise.get(hypothesis.label)
     begun = _begun(observations, base, model)
     if begun is not None:
         return begun
+    found = []
     if score is not None and len(score.size) == 1:
-        fit = refined(observations, model, _at_score(observations, base, model, hypothesis, score))
-        if fit.posterior.cost <= base.posterior.cost:
-            return fit.posterior
-    return annealed_fit(observations, base, models, promise, {}, hypothesis)
+        found.append(_from_score(observations, base, model, hypothesis, score))
+        if found[0].cost <= base.posterior.cost:
+            return found[0]
+    found.append(annealed_fit(observations, base, models, promise, {}, hypothesis))
+    return max(found, key=lambda p: p.log_evidence)
 
 
 def annealed_fit(
@@ -220,14 +224,27 @@ def _starts(
     return found
 
 
-def _at_score(
-    observations: Observations, base: Fit, model: Model, hypothesis: Hypothesis, score: Score
-) -> NDArray[np.float64]:
-    """The base model's fit with half of the size that the score tells, (n,)."""
+def _from_score(
+    observations: Observations,
+    base: Fit,
+    model: Model,
+    hypothesis: Hypothesis,
+    score: Score,
+    steps: int = _STEPS,
+) -> Posterior:
+    """The fit begun at half of the size that the score tells, or at a little where that makes matters worse.
+
+    Where the base model has bent the very part that the effect changes, half of the size on top of it goes too far.
+    """
     unknowns = model.problem(observations).unknowns
-    x = transferred(base.posterior, unknowns)
-    x[unknowns.index[_first_size(hypothesis)]] = float(np.clip(0.5 * score.size[0], -1.0, 1.0))
-    return unknowns.clipped(x)
+    found = []
+    for largest in (_HALF, _LITTLE):
+        x = transferred(base.posterior, unknowns)
+        x[unknowns.index[_first_size(hypothesis)]] = float(np.clip(0.5 * score.size[0], -largest, largest))
+        found.append(refined(observations, model, unknowns.clipped(x), steps=steps).posterior)
+        if found[-1].cost <= base.posterior.cost:
+            break
+    return max(found, key=lambda p: p.log_evidence)
 
 
 def _first_size(hypothesis: Hypothesis) -> str:
