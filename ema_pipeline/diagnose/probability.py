@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.special import expit
@@ -39,7 +39,7 @@ def probabilities(
     hypotheses: Sequence[Hypothesis],
     settings: DiagnoseSettings,
     found: int,
-    contradicted: Collection[str] = (),
+    believed: Mapping[str, float] | None = None,
     least: float = -np.inf,
 ) -> dict[str, float]:
     """Probability of every ranked hypothesis by the name that is said, and of `NOTHING`; adds up to 1.
@@ -52,18 +52,19 @@ def probabilities(
     settings : DiagnoseSettings
     found : int
         Effects that were found before.
-    contradicted : collection of str, optional
-        Names that error or held-out data speak against: what the evidence has for them does not count.
+    believed : dict of str to float, optional
+        What counts of the gain of some, by their names.
     least : float, optional
-        Gain below which it does not count for the others either.
+        Gain of the others below which it does not count.
     """
     names = [named(r.hypothesis, r.fit) for r in ranking.ranked]
 
-    def believed(gain: float, label: str) -> float:
-        return min(gain, 0.0) if label in contradicted or gain < least else gain
+    def counted(gain: float, label: str) -> float:
+        known = (believed or {}).get(label)
+        return min(gain, 0.0 if gain < least else gain) if known is None else known
 
     logs = [
-        believed(r.gain + n.advantage, n.label) + np.log(prior(r.hypothesis, hypotheses, settings, found))
+        counted(r.gain + n.advantage, n.label) + np.log(prior(r.hypothesis, hypotheses, settings, found))
         for r, n in zip(ranking.ranked, names, strict=True)
     ]
     everything = np.array([*logs, np.log(null_prior(settings, found))])

@@ -167,9 +167,9 @@ def _round(
     judged = [judge(observations, ranking, r, settings, told[NOTHING]) for r in finals]
     judged.sort(key=lambda j: -j.gain)
     least = _least_believed(judged, settings)
-    if least > 0:
-        contradicted = [j.named.label for j in judged if j.contradicted]
-        told = probabilities(ranking, hypotheses, settings, found, contradicted, least)
+    believed = {j.named.label: j.believed for j in judged if j.believed < j.gain}
+    if believed:
+        told = probabilities(ranking, hypotheses, settings, found, believed, least)
     judged = [replace(j, doubt=BETTER_CONTRADICTED) if j.claimed and j.gain < least else j for j in judged]
     return Round(ranking, tuple(judged), told)
 

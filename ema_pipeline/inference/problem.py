@@ -32,6 +32,8 @@ class Residuals:
         Further cost, in units of the log posterior: measured modes that the model does not explain.
     unexplained : int
         Number of measured modes among them, doubles of others left out.
+    doubles : int
+        Number of these doubles.
     projected : int
         Number of values that were spent on factors of no interest (one per shape).
     relative : ndarray, (m,), optional
@@ -40,6 +42,10 @@ class Residuals:
         Number of the block of values that may be wrong together, -1 for values on their own; see `tails`.
     mixed : ndarray of bool, (m,), optional
         True for values of shapes that identification may have mixed with another's.
+    mode : ndarray of int, (m,), optional
+        Measured mode that each value belongs to, numbered through all data; -1 for none.
+    blurred : ndarray of bool, (m,), optional
+        True for values of shapes that hold more than what they are compared with, by a mode without a partner.
     matching : object
         Whatever the problem wants to have back to evaluate the same assignment of data to model again.
     """
@@ -51,10 +57,13 @@ class Residuals:
     penalty: float = 0.0
     matching: object = None
     unexplained: int = 0
+    doubles: int = 0
     projected: int = 0
     relative: NDArray[np.float64] | None = None
     block: NDArray[np.int64] | None = None
     mixed: NDArray[np.bool_] | None = None
+    mode: NDArray[np.int64] | None = None
+    blurred: NDArray[np.bool_] | None = None
 
     @property
     def stated(self) -> NDArray[np.float64]:
@@ -69,9 +78,27 @@ class Residuals:
     @property
     def mixed_blocks(self) -> NDArray[np.bool_]:
         """Mask of the blocks that hold `mixed` values, (n_blocks,)."""
-        if self.mixed is None:
+        return self._blocks_of(self.mixed)
+
+    @property
+    def blurred_blocks(self) -> NDArray[np.bool_]:
+        """Mask of the blocks that hold `blurred` values, (n_blocks,)."""
+        return self._blocks_of(self.blurred)
+
+    @property
+    def mode_of_block(self) -> NDArray[np.int64]:
+        """Measured mode of every block, (n_blocks,); their own numbers where values belong to no mode."""
+        if self.mode is None or self.block is None:
+            return np.arange(len(self.blocks[0]))
+        inside = self.block >= 0
+        found = np.zeros(len(self.blocks[0]), np.int64)
+        found[self.block[inside]] = self.mode[inside]
+        return found
+
+    def _blocks_of(self, values: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+        if values is None:
             return np.zeros(len(self.blocks[0]), bool)
-        return np.asarray(in_blocks(self.mixed.astype(float), self.block)[0] > 0)
+        return np.asarray(in_blocks(values.astype(float), self.block)[0] > 0)
 
     @cached_property
     def weight(self) -> NDArray[np.float64]:

@@ -192,6 +192,7 @@ class Comparison:
             penalty=float(np.sum(np.where(self.data.double[alone], UNEXPLAINED_DOUBLE, UNEXPLAINED)))
             + UNSEEN * self._unseen(solution, np.concatenate([to, hidden[hidden >= 0]])),
             unexplained=int(np.sum(~self.data.double[alone])),
+            doubles=int(np.sum(self.data.double[alone])),
             projected=len(on) + int(np.sum(self.data.whirling[on] | (hidden >= 0)))
             if self.data.shapes.shape[1]
             else 0,

@@ -8,7 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.inference import Residuals
+from ema_pipeline.inference import Residuals, tails
+
+_SPENT = 2.0
+"""Values of a blurred shape that are spent on its factor and on how much of a hidden mode it holds."""
 
 
 def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
@@ -22,28 +25,51 @@ def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
         penalty=sum(p.penalty for p in parts),
         matching=tuple(p.matching for p in parts),
         unexplained=sum(p.unexplained for p in parts),
+        doubles=sum(p.doubles for p in parts),
         projected=sum(p.projected for p in parts),
-        block=_blocks(parts),
-        mixed=_mixed(parts),
+        block=_numbered_through([p.block for p in parts], parts),
+        mixed=_masks([p.mixed for p in parts], parts),
+        mode=_numbered_through([p.mode for p in parts], parts, [_modes(p) for p in parts]),
+        blurred=_masks([p.blurred for p in parts], parts),
     )
 
 
-def _blocks(parts: Sequence[Residuals]) -> NDArray[np.int64] | None:
-    """Blocks of all parts, numbered through."""
-    if all(p.block is None for p in parts):
+def _numbered_through(
+    numbers: Sequence[NDArray[np.int64] | None], parts: Sequence[Residuals], counts: Sequence[int] = ()
+) -> NDArray[np.int64] | None:
+    """Blocks or modes of all parts, numbered through; `counts` of each part, where the last ones may have no value."""
+    if all(n is None for n in numbers):
         return None
-    numbered, count = [], 0
-    for p in parts:
-        block = np.full(len(p.values), -1) if p.block is None else p.block
-        numbered.append(np.where(block >= 0, block + count, -1))
-        count += int(np.max(block, initial=-1)) + 1
-    return np.concatenate(numbered)
+    found, first = [], 0
+    for k, (given, p) in enumerate(zip(numbers, parts, strict=True)):
+        own = np.full(len(p.values), -1) if given is None else given
+        found.append(np.where(own >= 0, own + first, -1))
+        first += counts[k] if counts else int(np.max(own, initial=-1)) + 1
+    return np.concatenate(found)
 
 
-def _mixed(parts: Sequence[Residuals]) -> NDArray[np.bool_] | None:
-    if all(p.mixed is None for p in parts):
+def _usual_of_blurred(rows: Rows, heated: bool) -> float:
+    """What shapes that are blurred would cost on average where they are not: to be blurred must not pay."""
+    assert rows.blur is not None
+    counts = np.bincount(rows.mode[rows.blur > 0]).astype(float)
+    n = counts[counts > 0]
+    left = np.maximum(n - _SPENT, 0.0)
+    return float(np.sum(0.5 * left if heated else tails.cost(left, n) - tails.cost(np.zeros(len(n)), n)))
+
+
+def _modes(part: Residuals) -> int:
+    """Number of measured modes."""
+    if isinstance(part.matching, np.ndarray):
+        return len(part.matching)
+    return 0 if part.mode is None else int(np.max(part.mode, initial=-1)) + 1
+
+
+def _masks(masks: Sequence[NDArray[np.bool_] | None], parts: Sequence[Residuals]) -> NDArray[np.bool_] | None:
+    if all(m is None for m in masks):
         return None
-    return np.concatenate([np.zeros(len(p.values), bool) if p.mixed is None else p.mixed for p in parts])
+    return np.concatenate(
+        [np.zeros(len(p.values), bool) if m is None else m for m, p in zip(masks, parts, strict=True)]
+    )
 
 
 @dataclass(frozen=True)
@@ -75,8 +101,8 @@ class Rows:
     noise : str
         Name of the factor on the test's own 1 σ where that is learned too.
     blur : ndarray, (k,), optional
-        1 σ of what the measurement holds beside what it is compared with. It makes a difference count less, and its
-        size is no evidence for a model or against it.
+        1 σ of what the measurement holds beside what it is compared with. It makes a difference count less, and what is
+        left costs what it would on average: it is no evidence for a model or against it.
     """
 
     difference: NDArray[np.float64]
@@ -112,7 +138,7 @@ class Compared:
         Model mode of every measured one, -1 for none.
     log_scale, penalty : float
         As in `Residuals`, of modes without a partner.
-    unexplained, projected : int
+    unexplained, doubles, projected : int
     """
 
     rows: tuple[Rows, ...]
@@ -120,6 +146,7 @@ class Compared:
     log_scale: float
     penalty: float
     unexplained: int
+    doubles: int
     projected: int
 
     @property
@@ -142,7 +169,8 @@ def whitened(
     """Differences in units of their standard uncertainties, `n` unknowns."""
     total = sum(len(r) for r in found.rows)
     derivatives = all(r.slope is not None for r in found.rows)
-    values, block, mixed = np.empty(total), np.full(total, -1), np.zeros(total, bool)
+    values, block, mode = np.empty(total), np.full(total, -1), np.full(total, -1)
+    mixed, blurred = np.zeros(total, bool), np.zeros(total, bool)
     share: dict[str, NDArray[np.float64]] = {}
     jacobian = np.zeros((total if derivatives else 0, n))
     log_scale, at, blocks = 0.0, 0, 0
@@ -155,8 +183,11 @@ def whitened(
         variance = own + added
         usual = (r.noise_at(defaults) * r.own) ** 2 + (defaults[r.scatter] * r.unit) ** 2
         log_scale += 0.5 * float(np.log(variance / usual).sum())
-        if r.blur is not None:
+        mode[here] = r.mode
+        if r.blur is not None and np.any(r.blur > 0):
+            blurred[here] = r.blur > 0
             variance = variance + r.blur**2
+            log_scale += _usual_of_blurred(r, found.heated)
         sigma = np.sqrt(variance) * r.heat
         values[here] = r.difference / sigma
         if r.sensor is not None:  # a shape may be wrong as a whole
@@ -180,7 +211,10 @@ def whitened(
         penalty=found.penalty,
         matching=found.match,
         unexplained=found.unexplained,
+        doubles=found.doubles,
         projected=found.projected,
         block=None if found.heated else block,  # far off everything is on the tail
         mixed=mixed,
+        mode=mode,
+        blurred=blurred,
     )

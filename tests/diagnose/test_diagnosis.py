@@ -14,7 +14,7 @@ from imperfect_modes import GOOD, NORMAL, Hidden, Lab, chain, chain_modes, plane
 
 from ema_pipeline import codec
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
-from ema_pipeline.diagnose.claims import judge, of_one_shape
+from ema_pipeline.diagnose.claims import judge, left_of_close_modes
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.heldout import held_out
 from ema_pipeline.diagnose.hypotheses import list_hypotheses
@@ -122,8 +122,45 @@ def test_no_effect_is_claimed_for_the_shape_of_one_close_mode_alone(
         residuals = Residuals(values, np.zeros((24, 1)), block=block, mixed=np.isin(block, close))
         return Fit(Model(), Posterior(unknowns, np.zeros(1), {}, residuals))
 
-    doubt = of_one_shape(fit(wrong), fit(()), SETTINGS)
-    assert bool(doubt) is doubted
+    left = left_of_close_modes(fit(wrong), fit(()))
+    assert (left < SETTINGS.claim) is doubted
+
+
+def test_evidence_that_rests_on_modes_that_tests_split_or_merge_does_not_count() -> None:
+    """Of measured modes 3 and 7 without a partner, and of shapes that an added mode is said to hide in."""
+
+    def fit(
+        modes: tuple[int, ...], off: tuple[int, ...], hides: tuple[int, ...] = (), doubles: int = 0
+    ) -> Fit:
+        mode = np.repeat(modes, 6)
+        values = np.where(np.isin(mode, off), 20.0, 0.5)
+        residuals = Residuals(
+            values,
+            np.zeros((len(mode), 1)),
+            block=np.repeat(np.arange(len(modes)), 6),
+            mode=mode,
+            blurred=np.isin(mode, hides),
+            doubles=doubles,
+            penalty=12.0 * doubles,
+        )
+        return Fit(Model(), Posterior(Unknowns.plain(("a",), 1.0), np.zeros(1), {}, residuals))
+
+    def gained(base: Fit, mended: Fit) -> float:
+        return base.posterior.residuals.cost - mended.posterior.residuals.cost
+
+    base = fit((1, 2, 5), off=(5,))
+    honest, hiding = fit((1, 2, 5), ()), fit((1, 2, 5), (), hides=(5,))
+    assert left_of_close_modes(base, honest) == pytest.approx(gained(base, honest))
+    left = left_of_close_modes(base, hiding)
+    usual = Residuals(np.ones(6), np.zeros((6, 1)), block=np.zeros(6, int)).cost
+    assert left == pytest.approx(usual - fit((5,), ()).posterior.residuals.cost)
+    assert left < 3 < gained(base, hiding)
+    hidden_before = fit((1, 2, 5), off=(5,), hides=(5,))
+    assert left_of_close_modes(hidden_before, hiding) == pytest.approx(gained(hidden_before, hiding))
+    other = fit((1, 2, 5, 7), ())  # a mode that had no partner moves the blocks of none
+    assert left_of_close_modes(base, other) == pytest.approx(gained(base, other))
+    split = fit((1, 2, 5), off=(5,), doubles=1)
+    assert left_of_close_modes(split, other) == pytest.approx(gained(split, other) - 12.0)
 
 
 def test_two_hidden_effects_are_found_one_after_the_other() -> None:

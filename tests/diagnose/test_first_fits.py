@@ -36,12 +36,12 @@ def test_short_fits_begin_at_the_scores_of_what_has_one_size(
 
     def refined(observations: object, model: str, x: Any, steps: int) -> Any:
         asked.append((model, x, steps))
-        return SimpleNamespace(
-            posterior=SimpleNamespace(name=model, log_evidence=float(7 * int(model[1:]) % 20))
-        )
+        return SimpleNamespace(name=model, log_evidence=float(7 * int(model[1:]) % 20))
 
-    monkeypatch.setattr(first_fits, "refined", refined)
-    monkeypatch.setattr(first_fits, "_at_score", lambda o, base, model, h, told: (h.label, told))
+    def from_score(o: object, base: object, model: str, h: Any, told: Any, steps: int) -> Any:
+        return refined(o, model, (h.label, told), steps)
+
+    monkeypatch.setattr(first_fits, "_from_score", from_score)
     models = {h.label: h.label for h in [*everything, *others]}
     kept = short_fits(NO_DATA, fit("base", 0.0), models, promise, [*others, *everything], 1)  # type: ignore[arg-type]
     assert asked == [(h.label, (h.label, promise[h.label]), 8) for h in everything]
@@ -83,34 +83,48 @@ def test_an_effect_that_adds_modes_begins_at_the_best_of_a_grid() -> None:
     np.testing.assert_array_equal(starts, [[k, 0.5, s] for k in (0.4, 0.0) for s in (-1.0, -1.5)])
 
 
-@pytest.mark.parametrize(("promised", "cost", "begun"), [(0.8, 5.0, 0.4), (4.0, 5.0, 1.0), (0.8, 5.1, None)])
+@pytest.mark.parametrize(
+    ("promised", "costs", "begun"),
+    [
+        (0.8, (5.0,), 0.4),
+        (4.0, (5.0,), 1.0),
+        (0.8, (5.1, 4.9), 0.05),
+        (-0.8, (5.1, 4.9), -0.05),
+        (0.8, (5.1, 5.1), None),
+    ],
+)
 def test_the_first_fit_begins_at_half_the_size_that_its_score_tells(
-    monkeypatch: pytest.MonkeyPatch, promised: float, cost: float, begun: float | None
+    monkeypatch: pytest.MonkeyPatch, promised: float, costs: tuple[float, ...], begun: float | None
 ) -> None:
-    """Where that makes matters worse, and where nothing is promised, it is annealed."""
+    """At little of it where that makes matters worse; where that does, too, or nothing is promised, it is annealed."""
     base = with_model("base", Parabola(("part",), ()), [0.4])
     problem = Parabola(("part", "a.s1"), ("a.s1",))
     model = with_model("a", problem, [0.0, 0.0]).model
     annealed: list[Any] = []
+    left = list(costs)
 
-    def refined(observations: object, model: Any, x: np.ndarray) -> Any:
-        return SimpleNamespace(posterior=SimpleNamespace(cost=cost, x=x))
+    def refined(observations: object, model: Any, x: np.ndarray, steps: int) -> Any:
+        cost = left.pop(0)
+        return SimpleNamespace(posterior=SimpleNamespace(cost=cost, log_evidence=-cost, x=x))
+
+    best = SimpleNamespace(log_evidence=-5.05, name="annealed")
 
     def anneal(observations: object, model: Any, starts: Any, schedule: Any) -> Any:
         annealed.append((len(starts), schedule))
-        return SimpleNamespace(posterior="annealed")
+        return SimpleNamespace(posterior=best)
 
     monkeypatch.setattr(first_fits, "refined", refined)
     monkeypatch.setattr(first_fits, "annealed", anneal)
     found: Any = first_fit(NO_DATA, base, {"a": model}, {"a": score(3.0, promised)}, hypothesis("a"))
+    assert not left
     if begun is None:
-        assert found == "annealed"
+        assert found is best  # worse than the base model, yet better than where the fit of the score ended
         assert annealed == [(4, first_fits.QUICK)]  # usual sizes, and the one that the score tells
     else:
         assert found.x.tolist() == [0.4, begun]
         assert annealed == []
     without: Any = first_fit(NO_DATA, base, {"a": model}, {}, hypothesis("a"))
-    assert without == "annealed"
+    assert without is best
 
 
 def test_sizes_far_out_are_tried_where_modes_have_no_partner() -> None:

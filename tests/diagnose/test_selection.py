@@ -213,7 +213,13 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
         selection,
         "judge",
         lambda o, ranking, r, settings, nothing: SimpleNamespace(
-            gain=r.gain, nothing=nothing, doubt="", claimed=True, contradicted=False
+            gain=r.gain,
+            nothing=nothing,
+            doubt="",
+            claimed=True,
+            contradicted=False,
+            believed=r.gain,
+            named=SimpleNamespace(label=""),
         ),
     )
     given: Any = SimpleNamespace(ranked=ranked)

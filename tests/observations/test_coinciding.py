@@ -12,7 +12,7 @@ import pytest
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
-from ema_pipeline.inference import Residuals
+from ema_pipeline.inference import Residuals, tails
 from ema_pipeline.observations.coinciding import directions, hidden_partners
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.mode_rows import Compared, Rows, whitened
@@ -125,10 +125,19 @@ def test_what_a_hidden_mode_adds_makes_a_difference_count_less_and_is_no_evidenc
     scatters, usual = {"shape": 0.0005, "noise": 0.1}, {"shape": 0.015, "noise": 1.0}
 
     def seen(one: Rows) -> Residuals:
-        return whitened(Compared((one,), np.zeros(1, int), 0.0, 0.0, 0, 1), scatters, usual, 0)
+        return whitened(Compared((one,), np.zeros(1, int), 0.0, 0.0, 0, 0, 1), scatters, usual, 0)
 
     sharp, blurred = seen(rows), seen(replace(rows, blur=np.full(4, 0.3)))
-    assert blurred.log_scale == sharp.log_scale < 0
+    usual_squares, none_left = (
+        tails.cost(np.full(1, 2.0), np.full(1, 4.0)),
+        tails.cost(np.zeros(1), np.full(1, 4.0)),
+    )
+    assert sharp.log_scale < 0  # two values are spent on the factor and on the hidden mode, two are left
+    assert blurred.log_scale == pytest.approx(sharp.log_scale + float((usual_squares - none_left)[0]))
+    heated = seen(replace(rows, blur=np.full(4, 0.3), heat=5.0))
+    assert heated.log_scale == pytest.approx(sharp.log_scale + 1.0)  # half a square for each
+    assert list(blurred.blurred_blocks) == [True]
+    assert list(sharp.blurred_blocks) == [False]
     np.testing.assert_allclose(blurred.values, 1.0, rtol=1e-3)
     assert sharp.values[0] > 200
     assert blurred.share["shape"][0] < 1e-4  # what is learned of the scatter comes from the other shapes
