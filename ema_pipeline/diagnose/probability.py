@@ -55,13 +55,13 @@ def probabilities(
     believed : dict of str to float, optional
         What counts of the gain of some, by their names.
     least : float, optional
-        Gain of the others below which it does not count.
+        Gain below which nothing of it counts.
     """
     names = [named(r.hypothesis, r.fit) for r in ranking.ranked]
 
     def counted(gain: float, label: str) -> float:
-        known = (believed or {}).get(label)
-        return min(gain, 0.0 if gain < least else gain) if known is None else known
+        value = (believed or {}).get(label, gain)
+        return min(value, 0.0) if gain < least else value
 
     logs = [
         counted(r.gain + n.advantage, n.label) + np.log(prior(r.hypothesis, hypotheses, settings, found))
