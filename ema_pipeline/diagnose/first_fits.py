@@ -30,8 +30,9 @@ _GRID = tuple(np.linspace(-2.0, 2.0, 9))
 _GRID_STARTS = 2
 _GRID_HEAT = 30.0
 """Factor on the uncertainties there: two neighbours of the grid differ by a third in the frequency of an added mode."""
-_SIZES = (-15.0, -8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0, 15.0)
-"""The same for effects of one size where measured modes have no partner: a size that gives them one may be far out."""
+_SIZES = (-15.0, -8.0, -4.0, -2.0, -1.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 15.0)
+"""The same for effects of one size where measured modes have no partner: a size that gives them one may be far out, or
+small where it lifts a mode from 0 Hz."""
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _UNHEATED: Schedule = ((1.0, 6), (1.0, 14))
 """Where starts are given. Heated, the data weigh less than the prior, which takes the first size to nothing, where the

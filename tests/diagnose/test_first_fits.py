@@ -127,7 +127,7 @@ def test_the_first_fit_begins_at_half_the_size_that_its_score_tells(
     assert without is best
 
 
-def test_sizes_far_out_are_tried_where_modes_have_no_partner() -> None:
+def test_sizes_far_out_and_small_ones_are_tried_where_modes_have_no_partner() -> None:
     """Of effects of one linear size, with parts that are not bent; the best that makes matters better is kept."""
     base = with_model("base", Parabola(("part",), ()), [0.4])
 
@@ -145,7 +145,8 @@ def test_sizes_far_out_are_tried_where_modes_have_no_partner() -> None:
         asked("far", 7.0),
         asked("below", -14.0),
         asked("beyond its range", 20.0),
-        asked("none", 0.1),
+        asked("none", 0.001),
+        asked("small", 0.025),
         asked("two", 8.0, sizes=2),
         asked("extends", 8.0, extends=True),
         law,
@@ -154,6 +155,7 @@ def test_sizes_far_out_are_tried_where_modes_have_no_partner() -> None:
     found = tried_sizes(data, base, models, everything, 1)
     assert {label: one.unknown for label, one in found.items()} == {
         "far": 8.0,
+        "small": 0.03,
         "below": -15.0,
         "beyond its range": 8.0,
     }
