@@ -96,7 +96,7 @@ def diagnose(
         (
             (c.label, c.why)
             for c in candidates[:1]
-            if not c.claimed and (explained or c.error_after <= settings.error_limit)
+            if (explained and not c.claimed) or c.would_explain(settings.error_limit)
         ),
         ("", ""),
     )

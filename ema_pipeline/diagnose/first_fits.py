@@ -14,12 +14,12 @@ from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.score import Score
 from ema_pipeline.inference import Posterior, Unknowns
 from ema_pipeline.observations.base import EffectProblem, Observations
-from ema_pipeline.observations.fitting import QUICK, Fit, Model, annealed, refined, transferred, wide
+from ema_pipeline.observations.fitting import QUICK, REFINED, Fit, Model, annealed, refined, transferred, wide
 
 Schedule = tuple[tuple[float, int], ...]
 
-_STEPS, _SHORT = 12, 8
-"""Steps of a fit from a good start, and of a short one."""
+_SHORT = 8
+"""Steps of a short fit."""
 _CONTINUED = 20
 """The same where the start is good but for unknowns that are new."""
 _HALF, _LITTLE = 1.0, 0.05
@@ -231,7 +231,7 @@ def _from_score(
     model: Model,
     hypothesis: Hypothesis,
     score: Score,
-    steps: int = _STEPS,
+    steps: int = REFINED,
 ) -> Posterior:
     """The fit begun at half of the size that the score tells, or at a little where that makes matters worse.
 

@@ -89,6 +89,10 @@ class Candidate:
         """``id@place``."""
         return f"{self.effect}@{self.at}"
 
+    def would_explain(self, error_limit: float) -> bool:
+        """True where it is not claimed, yet gains evidence and brings the error within a limit."""
+        return not self.claimed and self.log_evidence > 0 and self.error_after <= error_limit
+
 
 @dataclass(frozen=True)
 class Rung:

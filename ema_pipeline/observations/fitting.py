@@ -36,6 +36,9 @@ _MOST_ESCAPES = 4
 QUICK = ((30.0, 5), (5.0, 5), (1.0, 8))
 """Annealing of a hypothesis that begins at the base model's fit."""
 
+REFINED = 12
+"""Steps of a fit from a good start."""
+
 _RACED = 2
 """Starts that are annealed to the end."""
 _MET = 0.05
@@ -171,7 +174,7 @@ def refined(
     model: Model,
     start: NDArray[np.float64],
     scatters: Mapping[str, float] | None = None,
-    steps: int = 12,
+    steps: int = REFINED,
 ) -> Fit:
     """A fit from a good start."""
     problem = model.problem(observations)

@@ -32,18 +32,14 @@ def heading(found: Diagnosis) -> str:
     if found.verdict == "ambiguous":
         count = len(found.indistinguishable[0]) if found.indistinguishable else 2
         return f"{_COUNTS.get(count, str(count))} effects explain the data equally well"
-    if found.verdict == "unknown_effect" and _may_be_known(found):
+    near = any(c.would_explain(ERROR_LIMIT) for c in found.candidates[:1])
+    if found.verdict == "unknown_effect" and near:
         return "Something is missing, and no effect is supported enough to be named"
     return {
         "adequate": "Nothing is missing as far as these data can tell",
         "unknown_effect": "Something is missing that is not in the library",
         "not_enough_data": "Not enough data to show what is missing",
     }[found.verdict]
-
-
-def _may_be_known(found: Diagnosis) -> bool:
-    """True where the model with the best candidate, which is not claimed, would explain the data."""
-    return any(not c.claimed and c.error_after <= ERROR_LIMIT for c in found.candidates[:1])
 
 
 def label_words(label: str) -> str:

@@ -165,6 +165,8 @@ def test_what_is_missing_may_be_in_the_library_where_the_best_candidate_would_ex
     assert diagnosis.heading(near) == expected
     far = replace(told, candidates=(replace(near.candidates[0], error_after=2.0),))
     assert diagnosis.heading(far) == diagnosis.heading(told) != expected
+    nothing_gained = replace(told, candidates=(replace(near.candidates[0], log_evidence=-2.3),))
+    assert diagnosis.heading(nothing_gained) == diagnosis.heading(told)
     best = ("mass@m1", "Not claimed: its gain in log evidence, 3.4, is below 3.5.")
     told_of_best = sentences.summary("unknown_effect", [], (2.1, 2.1), 0.0, best, "Parts deviate.")
     assert told_of_best == (
