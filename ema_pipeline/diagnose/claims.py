@@ -15,7 +15,6 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import tails
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, averaged, within_scatter
-from ema_pipeline.observations.mode_residuals import UNEXPLAINED_DOUBLE
 
 HELD_OUT_TIE = 1.0
 """Log density of data held out by which a claim may be behind: few modes predict no better with
@@ -177,7 +176,7 @@ def left_of_close_modes(base: Fit, mended: Fit) -> float:
     # at the same scatters, whose cost is no difference
     evidence = [fit.log_evidence + fit.posterior.scatter_cost for fit in (base, mended)]
     before, after = (fit.posterior.residuals for fit in (base, mended))
-    left = evidence[1] - evidence[0] - UNEXPLAINED_DOUBLE * max(before.doubles - after.doubles, 0)
+    left = evidence[1] - evidence[0] - max(before.split - after.split, 0.0)
     of_before, of_after = before.mode_of_block, after.mode_of_block
     if before.mode is None and len(of_before) != len(of_after):  # which modes have partners is not known
         return left

@@ -32,8 +32,8 @@ class Residuals:
         Further cost, in units of the log posterior: measured modes that the model does not explain.
     unexplained : int
         Number of measured modes among them, doubles of others left out.
-    doubles : int
-        Number of these doubles.
+    split : float
+        Part of the penalty that is for these doubles.
     projected : int
         Number of values that were spent on factors of no interest (one per shape).
     relative : ndarray, (m,), optional
@@ -57,7 +57,7 @@ class Residuals:
     penalty: float = 0.0
     matching: object = None
     unexplained: int = 0
-    doubles: int = 0
+    split: float = 0.0
     projected: int = 0
     relative: NDArray[np.float64] | None = None
     block: NDArray[np.int64] | None = None

@@ -185,14 +185,17 @@ class Comparison:
         )
         if np.any(self.data.whirling[on]):
             rows += (self._complex_shapes(solution, on, to, slopes),)
+        unexplained = int(np.sum(~self.data.double[alone]))
+        split = UNEXPLAINED_DOUBLE * (len(alone) - unexplained)
         return Compared(
             rows=rows,
             match=match,
             log_scale=self._usual(alone) if len(alone) else 0.0,
-            penalty=float(np.sum(np.where(self.data.double[alone], UNEXPLAINED_DOUBLE, UNEXPLAINED)))
+            penalty=UNEXPLAINED * unexplained
+            + split
             + UNSEEN * self._unseen(solution, np.concatenate([to, hidden[hidden >= 0]])),
-            unexplained=int(np.sum(~self.data.double[alone])),
-            doubles=int(np.sum(self.data.double[alone])),
+            split=split,
+            unexplained=unexplained,
             projected=len(on) + int(np.sum(self.data.whirling[on] | (hidden >= 0)))
             if self.data.shapes.shape[1]
             else 0,

@@ -25,7 +25,7 @@ def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
         penalty=sum(p.penalty for p in parts),
         matching=tuple(p.matching for p in parts),
         unexplained=sum(p.unexplained for p in parts),
-        doubles=sum(p.doubles for p in parts),
+        split=sum(p.split for p in parts),
         projected=sum(p.projected for p in parts),
         block=_numbered_through([p.block for p in parts], parts),
         mixed=_masks([p.mixed for p in parts], parts),
@@ -136,17 +136,17 @@ class Compared:
         Frequencies, damping ratios, shapes; complex ones, where there are any, apart.
     match : ndarray of int, (m,)
         Model mode of every measured one, -1 for none.
-    log_scale, penalty : float
+    log_scale, penalty, split : float
         As in `Residuals`, of modes without a partner.
-    unexplained, doubles, projected : int
+    unexplained, projected : int
     """
 
     rows: tuple[Rows, ...]
     match: NDArray[np.int64]
     log_scale: float
     penalty: float
+    split: float
     unexplained: int
-    doubles: int
     projected: int
 
     @property
@@ -211,7 +211,7 @@ def whitened(
         penalty=found.penalty,
         matching=found.match,
         unexplained=found.unexplained,
-        doubles=found.doubles,
+        split=found.split,
         projected=found.projected,
         block=None if found.heated else block,  # far off everything is on the tail
         mixed=mixed,

@@ -140,7 +140,7 @@ def test_evidence_that_rests_on_modes_that_tests_split_or_merge_does_not_count()
             block=np.repeat(np.arange(len(modes)), 6),
             mode=mode,
             blurred=np.isin(mode, hides),
-            doubles=doubles,
+            split=12.0 * doubles,
             penalty=12.0 * doubles,
         )
         return Fit(Model(), Posterior(Unknowns.plain(("a",), 1.0), np.zeros(1), {}, residuals))
