@@ -13,12 +13,14 @@ from ema_pipeline.diagnose.ranking import Ranked, Ranking
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import tails
+from ema_pipeline.observations.amplitude import AMPLITUDE
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, averaged, within_scatter
 
-HELD_OUT_TIE = 1.0
-"""Log density of data held out by which a claim may be behind: few modes predict no better with
-a small effect than without. What equivalent linearisation leaves out comes on top."""
+HELD_OUT_TIE, HELD_OUT_SHARE = 1.0, 0.05
+"""Log density of data held out by which a claim may be behind, and that share of its gain: few modes predict no better
+with a small effect than without, and modes that have no partner without the effect, of which most of a large gain may
+come, are never held out. What equivalent linearisation leaves out makes the share larger."""
 
 NO_LESS_ERROR = "adding it does not reduce the error"
 PREDICTED_WORSE = "held-out data are predicted worse when it is added"
@@ -70,6 +72,11 @@ class Judged:
         return not self.doubt
 
     @property
+    def predicts_worse(self) -> bool:
+        """True where held-out data alone speak against it."""
+        return self.doubt == PREDICTED_WORSE
+
+    @property
     def contradicted(self) -> bool:
         """True where error or held-out data speak against what the evidence supports."""
         return self.doubt in (NO_LESS_ERROR, PREDICTED_WORSE)
@@ -107,11 +114,10 @@ def judge(
     if not doubt:
         asked = observations.holding_out_explained(base.posterior.residuals)
         before, after = held_out(asked, base), held_out(asked, mended)
-        tie = HELD_OUT_TIE + (
-            settings.linearised * gain if _linearised(observations, ranked.hypothesis) else 0.0
-        )
-        doubt = _contradicted(base, mended, before, after, tie)
         left = left_of_close_modes(base, mended)
+        share = settings.linearised if _linearised(observations, ranked.hypothesis) else HELD_OUT_SHARE
+        tie = HELD_OUT_TIE + share * max(min(gain, left), 0.0)
+        doubt = _contradicted(base, mended, before, after, tie)
         if not doubt and left < settings.claim:
             doubt = (
                 f"its gain in log evidence drops to {left:.1f}, below {settings.claim:g}, without what tests often "
@@ -152,9 +158,14 @@ def _linearised(observations: Observations, hypothesis: Hypothesis) -> bool:
 
 
 def _std_of_first(ranked: Ranked) -> float:
-    """1 σ of the first size, the effect's other sizes held: a size and a shape that only show together are no doubt."""
+    """1 σ of the first size, its other sizes and the scale of all amplitudes held.
+
+    A size and a shape that only show together are no doubt of either, and no scale of amplitudes takes a size to zero.
+    """
     posterior, placed = ranked.fit.posterior, ranked.hypothesis.placed
-    at = [posterior.unknowns.index[placed.parameter_name(p.name)] for p in placed.effect.parameters]
+    index = posterior.unknowns.index
+    at = [index[placed.parameter_name(p.name)] for p in placed.effect.parameters]
+    at += [index[AMPLITUDE]] if AMPLITUDE in index else []
     own = posterior.covariance[np.ix_(at, at)]
     return float(1 / np.sqrt(max(np.linalg.pinv(own)[0, 0], 1e-300)))
 

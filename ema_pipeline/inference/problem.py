@@ -31,9 +31,9 @@ class Residuals:
     penalty : float
         Further cost, in units of the log posterior: measured modes that the model does not explain.
     unexplained : int
-        Number of measured modes among them, doubles of others left out.
+        Number of measured modes among them, without those that may be none of the structure.
     split : float
-        Part of the penalty that is for these doubles.
+        Part of the penalty that is for these others: doubles, and what a nonlinearity may have made.
     projected : int
         Number of values that were spent on factors of no interest (one per shape).
     relative : ndarray, (m,), optional

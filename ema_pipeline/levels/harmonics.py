@@ -51,6 +51,12 @@ def product_of(mode: Mode, parents: Sequence[Mode]) -> str:
     return words
 
 
+def may_be_products(modes: Sequence[Mode]) -> NDArray[np.bool_]:
+    """Mask of the modes that lie at a multiple or sum of others' frequencies, (m,)."""
+    others = ([m for m in modes if m is not one] for one in modes)
+    return np.array([bool(product_of(one, rest)) for one, rest in zip(modes, others, strict=True)], bool)
+
+
 def without_products(
     levels: Sequence[ForceLevel], modes: Sequence[ModeLevels], modal: ModalModel
 ) -> tuple[tuple[ForceLevel, ...], tuple[str, ...]]:

@@ -32,6 +32,8 @@ DRIFT = "drift"
 HIT_FREQUENCY = "hit_frequency_scatter"
 HIT_DAMPING = "hit_damping_scatter"
 LINEARISATION = "linearisation"
+AMPLITUDE = "amplitude of all modes"
+"""Unknown by whose exponential all amplitudes are multiplied."""
 AMPLITUDE_STD = 0.02
 """1 σ of the logarithm of all amplitudes: the sensors' calibration, less what their number averages out."""
 FAR_AMPLITUDE_STD, _FAR = 0.35, 0.3
@@ -73,12 +75,14 @@ class AmplitudeObservations:
         Of the level nearest to the linear structure, of every configuration.
     hits : sequence of HitData
         Of the configurations that were struck at several levels.
+    of_modes : bool
+        True where the hits tell only how far the modes of their level lie from those of the linear structure.
     """
 
     linearised = True
 
-    def __init__(self, modes: ModeObservations, hits: Sequence[HitData]) -> None:
-        self.modes, self.hits = modes, tuple(hits)
+    def __init__(self, modes: ModeObservations, hits: Sequence[HitData], of_modes: bool = False) -> None:
+        self.modes, self.hits, self.of_modes = modes, tuple(hits), of_modes
         self.level_dependent = any(
             h.level_dependent and not modes.rig.assembly(h.configuration).nonlinear for h in hits
         )
@@ -95,14 +99,24 @@ class AmplitudeObservations:
 
     def holding_out_explained(self, found: Residuals) -> AmplitudeObservations:
         """See `Observations`."""
-        return self
+        assert isinstance(found.matching, tuple)
+        modes = self.modes.holding_out_explained(dataclasses.replace(found, matching=found.matching[0]))
+        return self if modes is self.modes else AmplitudeObservations(modes, self.hits)
 
     def folds(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
-        """Every force level held out in turn, with the nearest other level beside it that it is compared with."""
+        """Every fourth mode held out in turn, then every force level."""
         return self._folds
 
     @cached_property
     def _folds(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
+        of_modes = [
+            (AmplitudeObservations(kept, self.hits), AmplitudeObservations(out, self.hits, of_modes=True))
+            for kept, out in self.modes.folds()
+        ]
+        return of_modes + self._levels_in_turn()
+
+    def _levels_in_turn(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
+        """Every force level held out, with the nearest other level beside it that it is compared with."""
         levels = sorted({int(k) for h in self.hits for k in h.level})
         pairs = []
         for k in levels if len(levels) > 2 else []:
@@ -174,7 +188,7 @@ class AmplitudeProblem:
         beyond = [1 + _BEYOND * h.reach(s) for h, s in sheets]
         return joined(
             self.modes.unknowns,
-            Unknowns.plain(("amplitude of all modes",), self._amplitude_std),
+            Unknowns.plain((AMPLITUDE,), self._amplitude_std),
             Unknowns.plain(drift, 1.0, DRIFT),
             Unknowns.plain(
                 left, np.concatenate([*beyond, np.zeros(0)]), LINEARISATION, lower=-1.5, upper=1.5
@@ -254,7 +268,10 @@ class AmplitudeProblem:
                 continue
             hits = _Hits(self, data, paired, x, scatters, heat)
             hits.shift_reference(parts[0], derivatives)
-            parts.append(hits.residuals(derivatives))
+            if self.observations.of_modes:
+                parts.append(Residuals(np.zeros(0), np.zeros((0, len(x))), matching=paired.match))
+            else:
+                parts.append(hits.residuals(derivatives))
         return dataclasses.replace(
             stacked(parts, len(x)), matching=(modes.matching, tuple(p.matching for p in parts[1:]))
         )
@@ -290,7 +307,7 @@ class _Hits:
     ) -> None:
         self.problem, self.data, self.paired, self.x = problem, data, paired, x
         self.scatters, self.heat = scatters, heat
-        self.scale = problem.unknowns.index["amplitude of all modes"]
+        self.scale = problem.unknowns.index[AMPLITUDE]
         self.drift, self.left = problem.positions(data)
 
     def residuals(self, derivatives: bool) -> Residuals:
@@ -359,8 +376,10 @@ class _Hits:
         for data, match in zip(self.problem.modes.observations.data, modes.matching, strict=True):
             on = np.flatnonzero(match >= 0)
             damped = on[np.isfinite(data.log_damping[on])]
-            if data.configuration == self.data.configuration and len(data) == len(self.data.reference):
-                mine = {int(r): k for k, r in enumerate(self.data.modes)}
+            whole = data if data.whole is None else data.whole
+            if data.configuration == self.data.configuration and len(whole) == len(self.data.reference):
+                of_hits = {int(r): k for k, r in enumerate(self.data.modes)}
+                mine = {r: of_hits[int(p)] for r, p in enumerate(data.places) if int(p) in of_hits}
                 found = []
                 for rows, start, own, scatter, heat in (
                     (on, at, scatters[FREQUENCY_NOISE] * data.log_frequency_std, FREQUENCY, self.heat),
@@ -444,6 +463,7 @@ class _Hits:
         noise = own.ravel() ** 2
         variance, default = noise + added, noise + usual
         group = sheet * (int(mode.max(initial=0)) + 1) + mode
+        block = np.tile(np.unique(group, return_inverse=True)[1], 2)
         group = np.unique(np.concatenate([group, group + group.max(initial=0) + 1]), return_inverse=True)[1]
         sigma = np.sqrt(variance) * self.heat
         r = _without_mean(values.ravel() / sigma, 1 / sigma, group)
@@ -458,7 +478,7 @@ class _Hits:
         share = {HIT_FREQUENCY: np.where(first, added / variance, 0.0)}
         share[HIT_DAMPING] = np.where(first, 0.0, added / variance)
         groups = int(group.max(initial=-1)) + 1
-        return Residuals(r, j, share, scale, matching=self.paired.match, projected=groups)
+        return Residuals(r, j, share, scale, matching=self.paired.match, projected=groups, block=block)
 
 
 def _without_mean(

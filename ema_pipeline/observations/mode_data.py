@@ -59,6 +59,8 @@ class ModeData:
         What the modes were taken out of: what they are to each other does not change when one of them is held out.
     kept : ndarray of bool, optional
         Mask of them there.
+    product : ndarray of bool, optional
+        True for what a structure that is not linear may have made of other modes; none where left out.
     """
 
     configuration: str
@@ -75,9 +77,20 @@ class ModeData:
     always: NDArray[np.bool_] | None = None
     whole: ModeData | None = None
     kept: NDArray[np.bool_] | None = None
+    product: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.log_frequency)
+
+    @property
+    def places(self) -> NDArray[np.int64]:
+        """Place of every mode in the whole that these are of, (m,)."""
+        return np.arange(len(self)) if self.kept is None else np.flatnonzero(self.kept)
+
+    @cached_property
+    def doubtful(self) -> NDArray[np.bool_]:
+        """Mask of modes that may be none of the structure: `double` ones and products, (m,)."""
+        return self.double if self.product is None else self.double | self.product
 
     @cached_property
     def known_shapes(self) -> NDArray[np.float64]:
@@ -215,10 +228,17 @@ class ModeData:
             "shapes",
             "shape_std",
         )
-        imaginary = None if self.imaginary is None else self.imaginary[keep]
+        imaginary, product = (None if a is None else a[keep] for a in (self.imaginary, self.product))
         kept = {n: getattr(self, n)[keep] for n in names}
         return dataclasses.replace(
-            self, complete=False, imaginary=imaginary, always=None, whole=self, kept=keep, **kept
+            self,
+            complete=False,
+            imaginary=imaginary,
+            product=product,
+            always=None,
+            whole=self,
+            kept=keep,
+            **kept,
         )
 
 

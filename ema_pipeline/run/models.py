@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.choices import NO_CHOICES, Choices
@@ -53,10 +54,11 @@ def _mode_observations(run: Run, rig: Rig) -> ModeObservations:
 
 def amplitude_observations(run: Run) -> AmplitudeObservations | None:
     """Modes and hits of all configurations; None where none was struck at several levels."""
+    from ema_pipeline.levels.harmonics import may_be_products
     from ema_pipeline.observations.amplitude import AmplitudeObservations
     from ema_pipeline.observations.hit_modes import prepare_hits
 
-    hits = []
+    hits, products = [], {}
     for name, study in level_studies(run).items():
         if study.hit_modes is None:
             continue
@@ -67,7 +69,12 @@ def amplitude_observations(run: Run) -> AmplitudeObservations | None:
         )
         if data is not None:
             hits.append(data)
-    return AmplitudeObservations(mode_observations(run), hits) if hits else None
+            products[name] = may_be_products(modal.modes)
+    if not hits:
+        return None
+    modes = mode_observations(run)
+    marked = [replace(d, product=products.get(d.configuration)) for d in modes.data]
+    return AmplitudeObservations(modes.with_data(marked), hits)
 
 
 def known_model(run: Run, with_hits: bool = False) -> Model:

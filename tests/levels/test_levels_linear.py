@@ -14,7 +14,7 @@ from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels import LevelSettings, LevelStudy, study_levels
-from ema_pipeline.levels.harmonics import growth, product_of, without, without_products
+from ema_pipeline.levels.harmonics import growth, may_be_products, product_of, without, without_products
 from ema_pipeline.levels.linear import structure
 from ema_pipeline.levels.study import with_circles
 from ema_pipeline.modal.circle.settings import CircleSettings
@@ -151,6 +151,8 @@ def test_products_of_two_modes_are_told_by_their_frequencies(
     assert product_of(at(200.3, a), [a, b]) == "2 × 100 Hz"
     assert product_of(at(270.2, a), [a, b]) == "100 + 170 Hz"
     assert product_of(at(270.2, a), [a]) == ""
+    made, apart = at(510.3, a), at(800.0, a)
+    assert list(may_be_products([a, b, made, apart])) == [False, False, True, False]
 
 
 def test_a_mode_grows_in_proportion_to_the_force_and_a_third_harmonic_with_its_cube(

@@ -21,7 +21,12 @@ from ema_pipeline.mechanics.modes import complex_modes
 from ema_pipeline.observations import fitting
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, model_with
 from ema_pipeline.observations.mode_data import prepare
-from ema_pipeline.observations.mode_residuals import UNEXPLAINED, UNEXPLAINED_DOUBLE, UNSEEN
+from ema_pipeline.observations.mode_residuals import (
+    UNEXPLAINED,
+    UNEXPLAINED_DOUBLE,
+    UNEXPLAINED_PRODUCT,
+    UNSEEN,
+)
 from ema_pipeline.observations.modes import MIXING, ModeObservations, ModeProblem
 from ema_pipeline.observations.parts import (
     MASS_SCATTER,
@@ -514,8 +519,13 @@ def test_a_mode_that_the_model_lacks_and_one_that_was_not_measured_cost_what_the
     )
     problem = observed(chain(), {"all": twice}).problem((), {})
     found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
-    assert found.penalty == UNEXPLAINED
+    assert (found.penalty, found.unexplained, found.split) == (UNEXPLAINED, 1, 0.0)
     assert [r.measured for r in problem.rows(found)] == [0, 1, 2, 3, 4]
+    marked = [replace(d, product=np.arange(len(d)) == 5) for d in problem.observations.data]
+    of_levels = problem.observations.with_data(marked).problem((), {})
+    found = of_levels.residuals(np.zeros(len(of_levels.unknowns)), scatters)
+    assert (found.penalty, found.unexplained, found.split) == (UNEXPLAINED_PRODUCT, 0, UNEXPLAINED_PRODUCT)
+    assert list(marked[0].only(np.arange(6) > 3).product) == [False, True]
     assert twice.shapes is not None
     split = replace(
         twice,
