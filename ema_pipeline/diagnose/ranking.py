@@ -51,8 +51,9 @@ _SCREENED_LAWS = 24
 of a model that is bent to the data, and put a cubic spring of a chain of three, which explained all, fifteenth. Such a
 chain has eighteen of one size."""
 _ANNEALED = 16
-"""Hypotheses, best first by a short fit, that are fitted in full where the base model fails, or is bent to the data,
-though it has a partner for every mode. What led in the end was among the first eight of some sixty."""
+"""Hypotheses, best first by a short fit, that are fitted in full where the base model fails, or is bent to the data;
+beside them those of which some size gives modes without a partner one. What led in the end was among the first eight of
+some sixty, or among these."""
 _FIRST = 24
 """Hypotheses of one size that are annealed first where a measured mode has no partner, and those that are begun again
 where the base model is bent to the data."""
@@ -103,8 +104,6 @@ class Ranking:
         With learned scatters.
     ranked : tuple of Ranked
         Best first.
-    unpaired : float
-        Smallest penalty for unpaired modes over all hypotheses.
     """
 
     base: Fit
@@ -112,6 +111,7 @@ class Ranking:
 
     @property
     def unpaired(self) -> float:
+        """Least that modes without a partner cost, over all hypotheses."""
         return min((r.fit.posterior.residuals.penalty for r in self.ranked), default=0.0)
 
 
@@ -169,9 +169,11 @@ def rank(
 
     short = partial(short_fits, observations, base, models, promise)
     known: dict[str, Posterior] = {}
-    # A few steps do not lead a mode of the model to a measured one that has no partner yet.
-    if not near and not lost:
-        known |= {h.label: posterior for h, posterior in short(chosen, processes)[_ANNEALED:]}
+    if not near:
+        # A few steps do not lead a mode of the model to a measured one that has no partner yet.
+        leads = {label for label, one in tried.items() if one.gain > _PROMISING}
+        behind = short(chosen, processes)[_ANNEALED:]
+        known |= {h.label: posterior for h, posterior in behind if h.label not in leads}
     decided = False
     left = [h for h in chosen if h.label not in known]
     for batch in _batches(left, promise if lost else {}, pairing):

@@ -114,45 +114,82 @@ def select(
     claimed: list[Judged] = []
     rivals: dict[str, tuple[Judged, ...]] = {}
     fitted: dict[str, Posterior] = {}
-    left: Sequence[Hypothesis] = first or hypotheses
-    while True:
-        low = len(rounds) / (settings.most_effects + 1)
+
+    def ask(base: Fit, claimed: Sequence[Judged], rounds: Sequence[Round]) -> Round:
+        taken = {j.hypothesis.label for j in claimed}
+        left = [h for h in hypotheses if h.label not in taken]
+        done, part = len(rounds) / (settings.most_effects + 1), 1 / (settings.most_effects + 1)
         ranking = rank(
             observations,
             base,
-            left,
+            left if claimed or not first else first,
             settings.processes,
-            lambda share, text, low=low: progress(low + share / (settings.most_effects + 1), text),  # type: ignore[misc]
+            lambda share, text: progress(done + share * part, text),
             settings.further_finalists,
             rounds[-1].ranking.unpaired if rounds else 0.0,
             before,
         )
-        fitted |= {r.hypothesis.label: r.fit.posterior for r in ranking.ranked}
+        fitted.update({r.hypothesis.label: r.fit.posterior for r in ranking.ranked})
         asked = _beside(settings, claimed) if observations.linearised else settings
-        among = left if claimed else hypotheses
-        rounds.append(_round(observations, ranking, among, asked, len(claimed)))
-        near = rounds[-1].alike(settings)
+        return _round(observations, ranking, left, asked, len(claimed))
+
+    ahead: Round | None = None
+    while True:
+        found, ahead = ahead or ask(base, claimed, rounds), None
+        leader = found.judged[0] if found.judged and found.best is None else None
+        if leader is not None and leader.predicts_worse and len(claimed) + 1 < settings.most_effects:
+            base = fit_base(observations, leader.ranked.fit.model, leader.ranked.fit)
+            further = ask(base, [*claimed, leader], [*rounds, found])
+            if _holds_with(observations, found, further, settings):
+                found, ahead = _acquitted(found, hypotheses, settings, len(claimed)), further
+        rounds.append(found)
+        near = found.alike(settings)
         if not near or len(claimed) == settings.most_effects:
-            return Selection(tuple(rounds), tuple(claimed), ranking.base, observations)
+            return Selection(tuple(rounds), tuple(claimed), found.ranking.base, observations)
         added = next(j for j in near if j.claimed)  # a rival alone does not pass the conditions of a claim
         suited = observations.suited(added.ranked.fit.model.effects)
         if suited is not observations:
             leading = [j.hypothesis for j in claimed]
-            leading += [r.hypothesis for r in unbeaten(ranking.ranked[:CONTENDERS], lambda r: r.gain)]
+            leading += [r.hypothesis for r in unbeaten(found.ranking.ranked[:CONTENDERS], lambda r: r.gain)]
             return select(suited, known, hypotheses, settings, progress, leading, fitted)
         claimed.append(added)
-        rivals[added.hypothesis.label] = rounds[-1].judged
+        rivals[added.hypothesis.label] = found.judged
         if len(claimed) > 1:
-            claimed = reconsidered(observations, start, claimed, rivals, settings)
-        taken = {j.hypothesis.label for j in claimed}
-        left = [h for h in hypotheses if h.label not in taken]
-        base = fit_base(observations, claimed[-1].ranked.fit.model, claimed[-1].ranked.fit)
+            now = reconsidered(observations, start, claimed, rivals, settings)
+            ahead = ahead if now == claimed else None
+            claimed = now
+        if ahead is None:
+            base = fit_base(observations, claimed[-1].ranked.fit.model, claimed[-1].ranked.fit)
 
 
 def _beside(settings: DiagnoseSettings, claimed: Sequence[Judged]) -> DiagnoseSettings:
     """What is asked of a further effect beside those that are claimed."""
     gained = sum(j.gain for j in claimed if not j.hypothesis.placed.effect.linear)
     return settings.model_copy(update={"claim": settings.claim + settings.linearised * gained})
+
+
+def _holds_with(observations: Observations, found: Round, further: Round, settings: DiagnoseSettings) -> bool:
+    """True where the leader of `found`, which alone predicts data held out worse, is right beside a second effect.
+
+    The fit with one of two missing effects bends parts for the other one. The second is asked all that a claim is
+    asked, on top of the first; and both together are asked the same on top of the model without either.
+    """
+    second = further.best
+    if second is None:
+        return False
+    gain = second.ranked.fit.log_evidence - found.ranking.base.log_evidence
+    both = replace(second.ranked, gain=gain)
+    return judge(observations, found.ranking, both, settings).claimed
+
+
+def _acquitted(
+    found: Round, hypotheses: Sequence[Hypothesis], settings: DiagnoseSettings, known: int
+) -> Round:
+    """The round with its leader claimed, and nothing held against others for its sake."""
+    leader, *others = found.judged
+    judged = [replace(leader, doubt="")]
+    judged += [replace(j, doubt="") if j.doubt == BETTER_CONTRADICTED else j for j in others]
+    return _weighed(found.ranking, judged, hypotheses, settings, known)
 
 
 def _round(
@@ -162,14 +199,23 @@ def _round(
     settings: DiagnoseSettings,
     found: int,
 ) -> Round:
-    told = probabilities(ranking, hypotheses, settings, found)
+    nothing = probabilities(ranking, hypotheses, settings, found)[NOTHING]
     finals = [r for r in ranking.ranked if r.final]
-    judged = [judge(observations, ranking, r, settings, told[NOTHING]) for r in finals]
-    judged.sort(key=lambda j: -j.gain)
+    judged = [judge(observations, ranking, r, settings, nothing) for r in finals]
+    return _weighed(ranking, sorted(judged, key=lambda j: -j.gain), hypotheses, settings, found)
+
+
+def _weighed(
+    ranking: Ranking,
+    judged: Sequence[Judged],
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+    found: int,
+) -> Round:
+    """The round in which nothing is claimed that is far behind what is contradicted."""
     least = _least_believed(judged, settings)
     believed = {j.named.label: j.believed for j in judged if j.believed < j.gain}
-    if believed:
-        told = probabilities(ranking, hypotheses, settings, found, believed, least)
+    told = probabilities(ranking, hypotheses, settings, found, believed, least)
     judged = [replace(j, doubt=BETTER_CONTRADICTED) if j.claimed and j.gain < least else j for j in judged]
     return Round(ranking, tuple(judged), told)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 from typing import Any
 
@@ -46,6 +47,7 @@ def judged(
         needed=3.5,
         doubt=doubt,
         claimed=not doubt,
+        predicts_worse=doubt == PREDICTED_WORSE,
         base=SimpleNamespace(posterior=SimpleNamespace(error=2.0)),
         after=SimpleNamespace(posterior=SimpleNamespace(error=1.0)),
         held_before=SimpleNamespace(error=3.0),
@@ -203,11 +205,60 @@ def test_what_was_claimed_is_asked_about_again_with_unknowns_that_a_later_claim_
     assert steps.before == [None, None, fitted, fitted, fitted]
 
 
+def as_judged(label: str, gain: float, doubt: str) -> Judged:
+    like = judged(label, gain)
+    like.ranked.fit.log_evidence = 100.0 + gain
+    return Judged(
+        like.ranked, like.named, gain, like.base, like.after, like.held_before, like.held_after, doubt, 3.5
+    )
+
+
+@pytest.mark.parametrize(("second_doubt", "holds"), [("", True), ("", False), ("weak", False)])
+def test_an_effect_that_alone_predicts_worse_is_claimed_where_it_holds_with_a_second_one(
+    monkeypatch: pytest.MonkeyPatch, second_doubt: str, holds: bool
+) -> None:
+    a, rival = as_judged("a@x", 29.0, PREDICTED_WORSE), as_judged("r@x", 20.0, BETTER_CONTRADICTED)
+    b, c = as_judged("b@x", 21.0, second_doubt), as_judged("c@x", 1.0, "weak")
+    steps = Steps(monkeypatch, [[a, rival], [b], [c]])
+    asked: list[float] = []
+
+    def judge(observations: Any, ranking: Any, ranked: Any, settings: Any) -> Any:
+        asked.append(ranked.gain)  # of both, on top of the model without either
+        return SimpleNamespace(claimed=holds)
+
+    monkeypatch.setattr(selection, "judge", judge)
+    monkeypatch.setattr(selection, "replace", replaced)
+    monkeypatch.setattr(selection, "_weighed", lambda ranking, found, *rest: Round(ranking, tuple(found), {}))
+    monkeypatch.setattr(
+        steps, "fit_base", lambda o, m, start=None: SimpleNamespace(model=m, log_evidence=100.0)
+    )
+    monkeypatch.setattr(selection, "fit_base", steps.fit_base)
+    found = steps.select([j.hypothesis for j in (a, rival, b, c)], SETTINGS, [])
+    assert asked == ([] if second_doubt else [21.0])
+    assert [j.hypothesis.label for j in found.claimed] == (["a@x", "b@x"] if holds else [])
+    # what was asked ahead is not asked again
+    assert [len(left) for left, _ in steps.asked] == ([4, 3, 2] if holds else [4, 3])
+    if holds:
+        first = found.rounds[0].judged
+        assert [j.doubt for j in first] == ["", ""]
+    else:
+        assert found.rounds[-1].judged == (a, rival)
+
+
+def replaced(one: Any, **changes: Any) -> Any:
+    """`replace` for what stands for a dataclass, too."""
+    if isinstance(one, SimpleNamespace):
+        return SimpleNamespace(**(vars(one) | changes))
+    return dataclasses.replace(one, **changes)
+
+
 def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
     ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (1.0, 9.0, 4.0, 2.0)]
     told = {NOTHING: 0.7}
     monkeypatch.setattr(
-        selection, "probabilities", lambda ranking, hypotheses, settings, found: told | {"n": found}
+        selection,
+        "probabilities",
+        lambda ranking, hypotheses, settings, found, *believed: told | {"n": found},
     )
     monkeypatch.setattr(
         selection,
