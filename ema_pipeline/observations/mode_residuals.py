@@ -196,6 +196,7 @@ class Comparison:
             match=match,
             log_scale=self._usual(alone) if len(alone) else 0.0,
             penalty=UNEXPLAINED * unexplained
+            + (self._unshared(alone) if unexplained else 0.0)
             + split
             + UNSEEN * self._unseen(solution, np.concatenate([to, hidden[hidden >= 0]])),
             split=split,
@@ -246,6 +247,19 @@ class Comparison:
             )
             total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
         return total
+
+    def _unshared(self, alone: NDArray[np.int64]) -> float:
+        """What `_usual` credits modes without a partner with because the shapes of others agree better than usual.
+
+        Those that no effect of the library can lead to are close ones, whose shapes are seldom as good.
+        """
+        d = self.data
+        sure = alone[~d.doubtful[alone]]
+        own, unit = d.compared_std[sure], np.maximum(_SHAPE_REACH, np.abs(d.complex_shapes[sure]))
+        now, usual = (
+            (at[SHAPE_NOISE] * own) ** 2 + (at[SHAPE] * unit) ** 2 for at in (self.scatters, self.defaults)
+        )
+        return float(np.sum(np.maximum(0.5 * np.log(usual / now), 0.0)[np.isfinite(d.shapes[sure])]))
 
     def _frequencies(self, predicted: _Predicted, on: NDArray[np.int64]) -> Rows:
         d = self.data

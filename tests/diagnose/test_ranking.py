@@ -367,6 +367,20 @@ class Stages:
         return found
 
 
+@pytest.mark.parametrize(("unpaired", "annealed"), [(2.0, "ef"), (1.9, "bef")])
+def test_those_behind_in_short_fits_are_annealed_where_a_size_leads_modes_to_partners(
+    monkeypatch: pytest.MonkeyPatch, unpaired: float, annealed: str
+) -> None:
+    """A few steps do not."""
+    stages = Stages(monkeypatch)
+    stages.base.posterior.error = 1.31  # type: ignore[misc]
+    best_first = [(h, SimpleNamespace(log_evidence=0.0, error=1.0)) for h in stages.hypotheses[-2::-1]]
+    monkeypatch.setattr(ranking, "short_fits", lambda *given: best_first)
+    monkeypatch.setattr(ranking, "_ANNEALED", 2)
+    ranking.rank(NO_DATA, stages.base, stages.hypotheses, unpaired=unpaired)
+    assert [asked[1] for asked in stages.asked if asked[0].startswith("annealed")] == list(annealed)
+
+
 def test_near_the_base_model_scores_tell_where_fits_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = Stages(monkeypatch)
     base, order, promising, settled = stages.rank(stages.base, further=2, unpaired=2.0)
@@ -397,5 +411,5 @@ def test_a_base_model_that_is_stuck_or_bent_is_begun_again_with_all(
     assert stages.asked[0][2] is False
     lost = unpaired < 2.0
     assert stages.asked[1] == ("first" if bent else f"annealed{int(lost)}", "a", 6)
-    assert stages.short is not lost  # a few steps lead no mode to its partner
+    assert stages.short
     assert stages.asked[7:] == [("again", 6, 5), ("freed", 6), ("again", 6, 12)]

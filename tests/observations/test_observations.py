@@ -22,6 +22,8 @@ from ema_pipeline.observations import fitting
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, model_with
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.mode_residuals import (
+    SHAPE,
+    SHAPE_NOISE,
     UNEXPLAINED,
     UNEXPLAINED_DOUBLE,
     UNEXPLAINED_PRODUCT,
@@ -533,8 +535,31 @@ def test_a_mode_that_the_model_lacks_and_one_that_was_not_measured_cost_what_the
         shapes=np.vstack([twice.shapes[:-1], twice.shapes[-2:-1]]),
     )
     problem = observed(chain(), {"all": split}).problem((), {})
-    found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
-    assert found.penalty == UNEXPLAINED_DOUBLE
+    for narrow in (1.0, 0.1):
+        found = problem.residuals(
+            np.zeros(len(problem.unknowns)), scatters | {SHAPE: narrow * scatters[SHAPE]}
+        )
+        assert found.penalty == UNEXPLAINED_DOUBLE
+
+
+def test_a_mode_without_a_partner_is_not_credited_with_how_well_the_shapes_of_others_agree() -> None:
+    """Shapes that agree ten times better than usual would lower its cost by ln 10 per entry; that much is added."""
+    measured = chain_modes(7, GOOD)["all"]
+    observations = observed(chain(), {"all": measured})
+    scatters = {n: s.default for n, s in observations.scatters.items()}
+    problem = observations.problem((), {})
+    x = np.zeros(len(problem.unknowns))
+    (match,) = problem.residuals(x, scatters).matching  # type: ignore[misc]
+    without = match.copy()
+    without[4] = -1
+    narrow = scatters | {SHAPE: 0.1 * scatters[SHAPE], SHAPE_NOISE: 1e-6}
+    usual, now = (problem.residuals(x, s, matching=(without,)) for s in (scatters, narrow))
+    own, unit = observations.data[0].compared_std[4], np.maximum(0.3, np.abs(observations.data[0].shapes[4]))
+    widths = [np.hypot(s[SHAPE_NOISE] * own, s[SHAPE] * unit) for s in (scatters, narrow)]
+    assert now.penalty - usual.penalty == pytest.approx(float(np.sum(np.log(widths[0] / widths[1]))))
+    assert now.penalty - usual.penalty > 5 * np.log(9)
+    wide = scatters | {SHAPE: 3.0 * scatters[SHAPE]}
+    assert problem.residuals(x, wide, matching=(without,)).penalty == usual.penalty
 
 
 def test_rows_of_the_residuals_stand_by_their_mode_and_sensor() -> None:
