@@ -13,9 +13,9 @@ from ema_pipeline.diagnose.ranking import Ranked, Ranking
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import tails
-from ema_pipeline.observations.amplitude import AMPLITUDE
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, averaged, within_scatter
+from ema_pipeline.observations.hit_residuals import AMPLITUDE
 
 HELD_OUT_TIE, HELD_OUT_SHARE = 1.0, 0.05
 """Log density of data held out by which a claim may be behind, and that share of its gain: few modes predict no better

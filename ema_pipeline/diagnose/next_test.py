@@ -18,7 +18,7 @@ from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
 from ema_pipeline.mechanics.system import LinearSystem, sensor_row
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit
-from ema_pipeline.observations.mode_residuals import FREQUENCY, SHAPE
+from ema_pipeline.observations.mode_rows import FREQUENCY, SHAPE
 from ema_pipeline.observations.modes import ModeObservations
 
 _ADDED_SHARE = 0.1

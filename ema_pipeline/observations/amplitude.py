@@ -14,26 +14,22 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect, effect_of
-from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
-from ema_pipeline.mechanics.laws import Nonlinear, Spring
-from ema_pipeline.mechanics.marching import element_rows
-from ema_pipeline.observations.hit_modes import HitData, Linear, comparable, shifted_poles
-from ema_pipeline.observations.mode_residuals import FREQUENCY, FREQUENCY_NOISE, SHAPE
-from ema_pipeline.observations.mode_rows import stacked
-from ema_pipeline.observations.modes import ModeObservations, ModeProblem, Paired
-from ema_pipeline.observations.parts import DAMPING_SCATTER, part_key
+from ema_pipeline.inference import Residuals, Unknowns, joined
+from ema_pipeline.observations.hit_modes import HitData, comparable
+from ema_pipeline.observations.hit_residuals import (
+    AMPLITUDE,
+    DRIFT,
+    LINEARISATION,
+    HitResiduals,
+    hit_scatters,
+)
+from ema_pipeline.observations.mode_rows import SHAPE, stacked
+from ema_pipeline.observations.modes import ModeObservations, ModeProblem
 from ema_pipeline.observations.rig_model import LOG_STD, RigModel, SizeMap
 
-DRIFT = "drift"
-HIT_FREQUENCY = "hit_frequency_scatter"
-HIT_DAMPING = "hit_damping_scatter"
-LINEARISATION = "linearisation"
-AMPLITUDE = "amplitude of all modes"
-"""Unknown by whose exponential all amplitudes are multiplied."""
 AMPLITUDE_STD = 0.02
 """1 σ of the logarithm of all amplitudes: the sensors' calibration, less what their number averages out."""
 FAR_AMPLITUDE_STD, _FAR = 0.35, 0.3
@@ -46,24 +42,9 @@ and a smaller one bends calibrations to them.
 """
 _BEYOND = 3.0
 """Growth of what linearisation leaves out per decay rate by which a pole moves: it is of first order in that."""
-_REMEMBERED = 16
-"""Last points at which the shifts are kept: a step is tried without derivatives, then taken with them."""
-_STEP = 1e-3
-"""Step of the differences by sizes, in units of their prior σ."""
 _DECADES = 6.0
 _ALONG, _ACROSS = 19, 3
 """Sizes that are tried to begin with: their range, and their number for an effect's first size and the others."""
-
-
-def hit_scatters() -> dict[str, Scatter]:
-    """The hyper-parameters that single hits add to those of measured modes."""
-    known = (
-        Scatter(DRIFT, "ln f of all modes from hit to hit", 1e-4, 1.0, 1e-4, 20.0),
-        Scatter(HIT_FREQUENCY, "ln f of one mode from hit to hit", 3e-5, 1.0, 3e-5, 5.0),
-        Scatter(HIT_DAMPING, "ln ζ of one mode from hit to hit", 5e-3, 1.0, 5e-3, 15.0),
-        Scatter(LINEARISATION, "equivalent linearisation", 0.15, 0.3, 0.15, 2.0),
-    )
-    return {s.name: s for s in known}
 
 
 class AmplitudeObservations:
@@ -266,7 +247,7 @@ class AmplitudeProblem:
             if paired is None:
                 parts.append(Residuals(np.full(1, np.inf), np.zeros((1, len(x)))))
                 continue
-            hits = _Hits(self, data, paired, x, scatters, heat)
+            hits = HitResiduals(self, data, paired, x, scatters, heat)
             hits.shift_reference(parts[0], derivatives)
             if self.observations.of_modes:
                 parts.append(Residuals(np.zeros(0), np.zeros((0, len(x))), matching=paired.match))
@@ -291,202 +272,3 @@ def _grid(size: SizeMap, points: int) -> NDArray[np.float64]:
 
 def _left_name(data: HitData, sheet: int, mode: int) -> str:
     return f"linearisation of {data.configuration} mode {data.modes[mode] + 1} at point {sheet + 1}"
-
-
-class _Hits:
-    """Residuals of one configuration's hits at one point of the unknowns."""
-
-    def __init__(
-        self,
-        problem: AmplitudeProblem,
-        data: HitData,
-        paired: Paired,
-        x: NDArray[np.float64],
-        scatters: Mapping[str, float],
-        heat: float,
-    ) -> None:
-        self.problem, self.data, self.paired, self.x = problem, data, paired, x
-        self.scatters, self.heat = scatters, heat
-        self.scale = problem.unknowns.index[AMPLITUDE]
-        self.drift, self.left = problem.positions(data)
-
-    def residuals(self, derivatives: bool) -> Residuals:
-        """Frequencies, then damping ratios, each without its mean over a sheet's hits."""
-        data, x = self.data, self.x
-        used = data.used  # whether the model has the mode or not: to leave it out must not pay
-        hit, mode = np.nonzero(used)
-        predicted = self.predicted
-        jacobian = np.zeros((2 * len(hit) if derivatives else 0, len(x)))
-        if derivatives:
-            for i, change in self.changes.items():
-                jacobian[:, i] = -change[:, hit, mode].ravel()
-            rows = np.arange(2 * len(hit))
-            jacobian[rows[: len(hit)], self.drift[hit]] = -1.0
-            jacobian[rows, np.tile(self.left[hit, mode], 2)] = -predicted[:, hit, mode].ravel()
-        difference = np.stack([data.log_frequency, np.log(np.where(used, data.damping, 1.0))])
-        difference = difference - predicted
-        difference[0] -= x[self.drift][:, None]
-        values = difference[:, hit, mode]
-        own = np.stack([data.log_frequency_std, data.damping_std / np.where(used, data.damping, 1.0)])
-        own = np.hypot(own, np.stack([data.linearised_std * data.usual_damping, data.linearised_std]))
-        return self._whitened(values, own[:, hit, mode], jacobian, data.sheet[hit], mode)
-
-    @cached_property
-    def predicted(self) -> NDArray[np.float64]:
-        """Changes of ln f and of ln ζ of every hit and mode, (2, h, m)."""
-        return self._read(np.exp(self.x[self.left]) * self._moved(self.x))
-
-    @cached_property
-    def changes(self) -> dict[int, NDArray[np.float64]]:
-        """Derivatives of `predicted` by sizes and by the scale of amplitudes, by their position."""
-        x, moved, left = self.x, self._moved(self.x), np.exp(self.x[self.left])
-        found = {}
-        for i in (*self.problem.nonlinear_sizes, self.scale):
-            if i == self.scale and not np.any(moved):
-                continue
-            ahead = x.copy()
-            ahead[i] += _STEP if ahead[i] + _STEP <= self.problem.unknowns.upper[i] else -_STEP
-            found[i] = self._read(left * (self._moved(ahead) - moved) / (ahead[i] - x[i]))
-        return found
-
-    def shift_reference(self, modes: Residuals, derivatives: bool) -> None:
-        """Move the model's values behind the residuals of the level's modes to where its hits find them.
-
-        Even the hits nearest to the linear structure lock friction, or part teeth.
-        """
-        if not np.any(self.predicted):
-            return
-        weight = self.data.reference_weights
-        for kind, (row, mode, sigma) in enumerate(self._rows_of_reference(modes)):
-            modes.values[row] -= np.sum(weight * self.predicted[kind], axis=0)[mode] / sigma
-            if not derivatives:
-                continue
-            for i, change in self.changes.items():
-                modes.jacobian[row, i] -= np.sum(weight * change[kind], axis=0)[mode] / sigma
-            for h in range(len(weight)):
-                share = (weight[h] * self.predicted[kind, h])[mode] / sigma
-                modes.jacobian[row, self.left[h, mode]] -= share
-
-    def _rows_of_reference(
-        self, modes: Residuals
-    ) -> list[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
-        """Rows of frequencies and of damping ratios of the hits' modes, their place among these, and 1 σ."""
-        at, scatters = 0, self.scatters
-        assert isinstance(modes.matching, tuple)
-        for data, match in zip(self.problem.modes.observations.data, modes.matching, strict=True):
-            on = np.flatnonzero(match >= 0)
-            damped = on[np.isfinite(data.log_damping[on])]
-            whole = data if data.whole is None else data.whole
-            if data.configuration == self.data.configuration and len(whole) == len(self.data.reference):
-                of_hits = {int(r): k for k, r in enumerate(self.data.modes)}
-                mine = {r: of_hits[int(p)] for r, p in enumerate(data.places) if int(p) in of_hits}
-                found = []
-                for rows, start, own, scatter, heat in (
-                    (on, at, scatters[FREQUENCY_NOISE] * data.log_frequency_std, FREQUENCY, self.heat),
-                    (damped, at + len(on), data.log_damping_std, DAMPING_SCATTER, 1.0),
-                ):
-                    kept = [(start + i, mine[int(r)], int(r)) for i, r in enumerate(rows) if int(r) in mine]
-                    row, mode, measured = np.array(kept, int).reshape(-1, 3).T
-                    found.append((row, mode, np.hypot(own[measured], scatters[scatter]) * heat))
-                return found
-            at += len(on) + len(damped) + data.shape_rows(on)
-        return []
-
-    def _read(self, moved: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Changes of ln f and of ln ζ that changes of poles (h, m) make, (2, h, m)."""
-        usual, omega = self.data.usual_damping, self.data.omega
-        frequency = moved.imag / omega
-        damping = -moved.real / omega - usual * frequency
-        return np.stack([frequency, damping / usual])
-
-    def _moved(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Change of every mode's pole in every hit, 1/s, (h, m)."""
-        own = x[: self.problem.modes.offset]
-        key = (self.data.configuration, own.tobytes(), float(x[self.scale]), self.paired.match.tobytes())
-        known = self.problem.moved
-        if key not in known:
-            if len(known) >= _REMEMBERED:
-                known.clear()
-            known[key] = self._found_moved(x)
-        return known[key]
-
-    def _found_moved(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
-        data, model = self.data, self.problem.model
-        own = x[: self.problem.modes.offset]
-        assembly = model.assembly(data.configuration, own[model.shape_start :])
-        elements = assembly.nonlinear
-        total = np.zeros(data.log_frequency.shape, complex)
-        match = self.paired.match[data.modes]
-        on = np.flatnonzero(match >= 0)
-        if not elements or not len(on):
-            return total
-        rows = element_rows(assembly, elements)
-        solution = self.paired.solution
-        stretch = rows @ solution.shapes[: rows.shape[1]]
-        linear = Linear.of(data, stretch, match, solution.eigenvalues, self._displacement(x, match, on))
-        return shifted_poles(data, [self._scaled(e, x) for e in elements], linear)
-
-    def _displacement(
-        self, x: NDArray[np.float64], match: NDArray[np.int64], on: NDArray[np.int64]
-    ) -> NDArray[np.complex128]:
-        """Amplitude of each modal coordinate just after each blow, as the sensors saw it, (h, m)."""
-        data = self.data
-        reading = self.problem.model.sensor_rows(data.configuration, data.dofs)
-        seen = reading @ self.paired.solution.shapes[: reading.shape[1], match[on]]
-        factor = np.einsum("om,mo->m", seen, data.shapes[on]) / np.maximum(np.sum(seen**2, axis=0), 1e-300)
-        result = np.zeros(data.motion.shape, complex)
-        result[:, on] = np.nan_to_num(data.motion[:, on]) * factor * np.exp(x[self.scale])
-        return result
-
-    def _scaled(self, element: Nonlinear, x: NDArray[np.float64]) -> Nonlinear:
-        """An element that replaces a spring, with the stiffness that the spring has at these unknowns."""
-        model = self.problem.model
-        row = model.dependence.elements[self.data.configuration].get(part_key(element))
-        if row is None or not isinstance(element, Spring):
-            return element
-        factor = float(np.exp(row @ x[: len(row)]))
-        return dataclasses.replace(element, stiffness=element.stiffness * factor)
-
-    def _whitened(
-        self,
-        values: NDArray[np.float64],
-        own: NDArray[np.float64],
-        jacobian: NDArray[np.float64],
-        sheet: NDArray[np.int64],
-        mode: NDArray[np.int64],
-    ) -> Residuals:
-        """Rows at unit σ, without what all hits of a sheet share: its mean has no prior."""
-        count = values.shape[1]
-        defaults = self.problem.observations.scatters
-        added = np.repeat([self.scatters[HIT_FREQUENCY], self.scatters[HIT_DAMPING]], count) ** 2
-        usual = np.repeat([defaults[HIT_FREQUENCY].default, defaults[HIT_DAMPING].default], count) ** 2
-        noise = own.ravel() ** 2
-        variance, default = noise + added, noise + usual
-        group = sheet * (int(mode.max(initial=0)) + 1) + mode
-        block = np.tile(np.unique(group, return_inverse=True)[1], 2)
-        group = np.unique(np.concatenate([group, group + group.max(initial=0) + 1]), return_inverse=True)[1]
-        sigma = np.sqrt(variance) * self.heat
-        r = _without_mean(values.ravel() / sigma, 1 / sigma, group)
-        j = jacobian
-        if len(jacobian):
-            j = _without_mean(jacobian / sigma[:, None], 1 / sigma, group)
-        scale = 0.5 * float(np.sum(np.log(variance / default)))
-        scale += 0.5 * float(
-            np.sum(np.log(np.bincount(group, 1 / variance) / np.bincount(group, 1 / default)))
-        )
-        first = np.arange(2 * count) < count
-        share = {HIT_FREQUENCY: np.where(first, added / variance, 0.0)}
-        share[HIT_DAMPING] = np.where(first, 0.0, added / variance)
-        groups = int(group.max(initial=-1)) + 1
-        return Residuals(r, j, share, scale, matching=self.paired.match, projected=groups, block=block)
-
-
-def _without_mean(
-    rows: NDArray[np.float64], weight: NDArray[np.float64], group: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Whitened rows less their weighted mean in every group."""
-    norm = np.bincount(group, weight**2)
-    flat = rows.reshape(len(rows), -1)
-    summed = scipy.sparse.csr_array((weight, (group, np.arange(len(rows)))), shape=(len(norm), len(rows)))
-    total = np.asarray(summed.dot(flat))
-    return np.asarray((flat - weight[:, None] * (total / norm[:, None])[group]).reshape(rows.shape))

@@ -228,7 +228,8 @@ class ModeData:
             "shapes",
             "shape_std",
         )
-        imaginary, product = (None if a is None else a[keep] for a in (self.imaginary, self.product))
+        imaginary = None if self.imaginary is None else self.imaginary[keep]
+        product = None if self.product is None else self.product[keep]
         kept = {n: getattr(self, n)[keep] for n in names}
         return dataclasses.replace(
             self,

@@ -9,35 +9,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.inference import Residuals, tails
+from ema_pipeline.inference import Residuals
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, ModeDerivatives
 from ema_pipeline.mechanics.terms import Matrices
 from ema_pipeline.observations.close_modes import Groups, Slopes, Turned
 from ema_pipeline.observations.coinciding import directions, hidden_partners
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_pairing import paired, turned
-from ema_pipeline.observations.mode_rows import Compared, Rows, whitened
+from ema_pipeline.observations.mode_rows import (
+    FREQUENCY,
+    FREQUENCY_NOISE,
+    SHAPE,
+    SHAPE_NOISE,
+    Compared,
+    Rows,
+    shape_unit,
+    whitened,
+)
 from ema_pipeline.observations.parts import DAMPING_SCATTER
 from ema_pipeline.observations.rig_model import RigModel
+from ema_pipeline.observations.without_partner import Alone, unseen
 
-FREQUENCY = "frequency_scatter"
-SHAPE = "shape_scatter"
-FREQUENCY_NOISE = "frequency_noise"
-SHAPE_NOISE = "shape_noise"
-
-UNEXPLAINED = 18.0
-"""Cost, in the log posterior, of a measured mode without a model mode: of some 1,400 that were identified in studies of
-simulated tests none was invented."""
-UNEXPLAINED_DOUBLE = 12.0
-"""The same of one whose shape is a mix of its neighbours': drift may have split it off."""
-UNEXPLAINED_PRODUCT = 5.0
-"""The same of one at a multiple or sum of others' frequencies, in tests at several force levels: of some 340 modes in
-24 of them, two that passed were third and second harmonics."""
-UNSEEN = 3.0
-"""Cost of a model mode in the band that was not measured: it may lie on a node of every sensor or hit point."""
-
-_SHAPE_REACH = 0.3
-"""Entries below this share of the largest have its uncertainty: they are differences of larger motions."""
 _LEAST_FREQUENCY_STD = 3e-4
 """1 σ of ln f that no model predicts better: how two modes nearer than that mix is not known."""
 _FITTED_AS_ONE_STD = 0.3
@@ -188,19 +180,15 @@ class Comparison:
         )
         if np.any(self.data.whirling[on]):
             rows += (self._complex_shapes(solution, on, to, slopes),)
-        unexplained = int(np.sum(~self.data.doubtful[alone]))
-        doubles = int(np.sum(self.data.double[alone]))
-        split = UNEXPLAINED_DOUBLE * doubles + UNEXPLAINED_PRODUCT * (len(alone) - unexplained - doubles)
+        left = Alone.of(self.data, alone, self.scatters, self.defaults)
+        accounted = np.concatenate([to, hidden[hidden >= 0]])
         return Compared(
             rows=rows,
             match=match,
-            log_scale=self._usual(alone) if len(alone) else 0.0,
-            penalty=UNEXPLAINED * unexplained
-            + (self._unshared(alone) if unexplained else 0.0)
-            + split
-            + UNSEEN * self._unseen(solution, np.concatenate([to, hidden[hidden >= 0]])),
-            split=split,
-            unexplained=unexplained,
+            log_scale=left.usual,
+            penalty=left.penalty + unseen(self.data, solution.frequency_hz, accounted),
+            split=left.split,
+            unexplained=left.unexplained,
             projected=len(on) + int(np.sum(self.data.whirling[on] | (hidden >= 0)))
             if self.data.shapes.shape[1]
             else 0,
@@ -218,48 +206,6 @@ class Comparison:
     def matched(self, solution: EigenSolution) -> NDArray[np.int64]:
         """Index of the model mode of every measured one, -1 for none, (m,)."""
         return paired(self.data, solution.frequency_hz, self._read(solution), self.heat)
-
-    def _usual(self, alone: NDArray[np.int64]) -> float:
-        """What modes without a partner would cost on average if they were explained.
-
-        Without it, leaving a mode out would gain what its rows cost, and no effect would ever bring it back.
-        """
-        d = self.data
-        seen, whirl = np.isfinite(d.shapes[alone]), d.whirling[alone]
-        real, both = seen & ~whirl[:, None], seen & whirl[:, None]
-        reach = np.maximum(_SHAPE_REACH, np.abs(d.complex_shapes[alone]))
-        std = d.compared_std[alone]
-        damped = alone[np.isfinite(d.log_damping[alone])]
-        parts = 1 + whirl  # real and imaginary
-        count = np.sum(seen, axis=1, dtype=float) * parts
-        total = -0.5 * float(np.sum(parts[np.any(seen, axis=1)])) + float(
-            np.sum(tails.cost(count, count) - 0.5 * count)
-        )
-        for own, unit, name, noise in (
-            (d.log_frequency_std[alone], 1.0, FREQUENCY, FREQUENCY_NOISE),
-            (d.log_damping_std[damped], 1.0, DAMPING_SCATTER, ""),
-            (std[real], reach[real], SHAPE, SHAPE_NOISE),
-            (np.tile(std[both], 2), np.tile(reach[both], 2), SHAPE, ""),
-        ):
-            now, usual = (
-                (at.get(noise, 1.0) * own) ** 2 + (at[name] * unit) ** 2
-                for at in (self.scatters, self.defaults)
-            )
-            total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
-        return total
-
-    def _unshared(self, alone: NDArray[np.int64]) -> float:
-        """What `_usual` credits modes without a partner with because the shapes of others agree better than usual.
-
-        Those that no effect of the library can lead to are close ones, whose shapes are seldom as good.
-        """
-        d = self.data
-        sure = alone[~d.doubtful[alone]]
-        own, unit = d.compared_std[sure], np.maximum(_SHAPE_REACH, np.abs(d.complex_shapes[sure]))
-        now, usual = (
-            (at[SHAPE_NOISE] * own) ** 2 + (at[SHAPE] * unit) ** 2 for at in (self.scatters, self.defaults)
-        )
-        return float(np.sum(np.maximum(0.5 * np.log(usual / now), 0.0)[np.isfinite(d.shapes[sure])]))
 
     def _frequencies(self, predicted: _Predicted, on: NDArray[np.int64]) -> Rows:
         d = self.data
@@ -305,7 +251,7 @@ class Comparison:
         """Measured shapes of modes with a partner, less what their unknowns say they hold of others."""
         d = self.data
         y, own = d.known_shapes[on], d.compared_std[on]
-        unit = np.maximum(_SHAPE_REACH, np.abs(y))
+        unit = shape_unit(y)
         mixed = self._mixed(on)
         for k, other, unknown in mixed:
             y[k] -= self.x[unknown] * d.known_shapes[other]
@@ -459,7 +405,7 @@ class Comparison:
         on, to = on[whirl], to[whirl]
         p, y, seen = self._read(solution)[:, to].T.astype(complex), d.complex_shapes[on], d.seen[on] > 0
         own = d.compared_std[on]
-        unit = np.maximum(_SHAPE_REACH, np.abs(y))
+        unit = shape_unit(y)
         weight = seen / (own**2 + (self.scatters[SHAPE] * unit) ** 2)
         squared = np.maximum(np.sum(weight * np.abs(p) ** 2, axis=1), 1e-300)
         factor = np.sum(weight * np.conj(p) * y, axis=1) / squared
@@ -477,15 +423,6 @@ class Comparison:
             np.concatenate([left.real, left.imag]), np.tile(own[seen], 2), np.tile(unit[seen], 2), SHAPE,
             1 + 0.1 * (self.heat - 1), np.tile(on[mode], 2), np.tile(sensor, 2), np.tile(d.close[on[mode]], 2), slope,
         )  # fmt: skip
-
-    def _unseen(self, solution: EigenSolution, accounted: NDArray[np.int64]) -> int:
-        """Model modes well inside the band, without those that are accounted for: paired, or hidden in one that is."""
-        if not self.data.complete:
-            return 0
-        low, high = self.data.band_hz
-        inside = (solution.frequency_hz > 1.05 * low) & (solution.frequency_hz < 0.95 * high)
-        inside[accounted] = False
-        return int(np.count_nonzero(inside))
 
     def _shape_slopes(
         self,

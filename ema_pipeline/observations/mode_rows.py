@@ -10,8 +10,19 @@ from numpy.typing import NDArray
 
 from ema_pipeline.inference import Residuals, tails
 
+FREQUENCY = "frequency_scatter"
+SHAPE = "shape_scatter"
+FREQUENCY_NOISE = "frequency_noise"
+SHAPE_NOISE = "shape_noise"
+
+_SHAPE_REACH = 0.3
 _SPENT = 2.0
 """Values of a blurred shape that are spent on its factor and on how much of a hidden mode it holds."""
+
+
+def shape_unit(shapes: NDArray[np.float64] | NDArray[np.complex128]) -> NDArray[np.float64]:
+    """What the scatter of shapes multiplies: entries below 0.3 of the largest are differences of larger motions."""
+    return np.asarray(np.maximum(_SHAPE_REACH, np.abs(shapes)), dtype=np.float64)
 
 
 def stacked(parts: Sequence[Residuals], n: int) -> Residuals:

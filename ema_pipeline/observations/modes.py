@@ -25,15 +25,8 @@ from ema_pipeline.modal.assurance import mac
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_pairing import OwnDamping
-from ema_pipeline.observations.mode_residuals import (
-    FREQUENCY,
-    FREQUENCY_NOISE,
-    SHAPE,
-    SHAPE_NOISE,
-    Comparison,
-    Sensing,
-)
-from ema_pipeline.observations.mode_rows import stacked
+from ema_pipeline.observations.mode_residuals import Comparison, Sensing
+from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, stacked
 from ema_pipeline.observations.parts import (
     DAMPING_SCATTER,
     MASS_SCATTER,

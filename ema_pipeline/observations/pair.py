@@ -21,8 +21,7 @@ from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Residuals, Scatter, Unknowns
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
-from ema_pipeline.observations.mode_residuals import FREQUENCY, SHAPE
-from ema_pipeline.observations.mode_rows import Compared, Rows, stacked
+from ema_pipeline.observations.mode_rows import FREQUENCY, SHAPE, Compared, Rows, stacked
 from ema_pipeline.observations.modes import ModeObservations, ModeProblem
 from ema_pipeline.observations.parts import DAMPING_SCATTER
 from ema_pipeline.observations.rig_model import RigModel, SizeMap

@@ -22,7 +22,7 @@ from ema_pipeline.mechanics.modes import normal_modes
 from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
 from ema_pipeline.observations.fitting import Fit, Model
 from ema_pipeline.observations.mode_data import prepare
-from ema_pipeline.observations.mode_residuals import FREQUENCY_NOISE, SHAPE_NOISE
+from ema_pipeline.observations.mode_rows import FREQUENCY_NOISE, SHAPE_NOISE
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs import load_rig
 from ema_pipeline.rigs.types import ModelMode

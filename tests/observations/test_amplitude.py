@@ -27,9 +27,10 @@ from ema_pipeline.mechanics.laws import DryFriction, Nonlinear, PartingSpring, P
 from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.observations import amplitude
-from ema_pipeline.observations.amplitude import AMPLITUDE, AmplitudeObservations, AmplitudeProblem, _grid
+from ema_pipeline.observations.amplitude import AmplitudeObservations, AmplitudeProblem, _grid
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, refined, transferred
 from ema_pipeline.observations.hit_modes import HitData, Linear, _fit_weights, comparable, shifted_poles
+from ema_pipeline.observations.hit_residuals import AMPLITUDE
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.rig_model import LOG_STD, SizeMap

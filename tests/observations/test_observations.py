@@ -21,14 +21,7 @@ from ema_pipeline.mechanics.modes import complex_modes
 from ema_pipeline.observations import fitting
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, model_with
 from ema_pipeline.observations.mode_data import prepare
-from ema_pipeline.observations.mode_residuals import (
-    SHAPE,
-    SHAPE_NOISE,
-    UNEXPLAINED,
-    UNEXPLAINED_DOUBLE,
-    UNEXPLAINED_PRODUCT,
-    UNSEEN,
-)
+from ema_pipeline.observations.mode_rows import SHAPE, SHAPE_NOISE
 from ema_pipeline.observations.modes import MIXING, ModeObservations, ModeProblem
 from ema_pipeline.observations.parts import (
     MASS_SCATTER,
@@ -40,6 +33,12 @@ from ema_pipeline.observations.parts import (
     value_of,
 )
 from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.observations.without_partner import (
+    UNEXPLAINED,
+    UNEXPLAINED_DOUBLE,
+    UNEXPLAINED_PRODUCT,
+    UNSEEN,
+)
 from ema_pipeline.rigs import load_rig
 from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.planetary import planetary
