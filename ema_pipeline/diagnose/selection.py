@@ -16,7 +16,7 @@ from ema_pipeline.diagnose.ranking import CONTENDERS, Ranking, rank, unbeaten
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, Model, fit_base
+from ema_pipeline.observations.fitting import Fit, Model, fit_base, within_scatter
 
 Progress = Callable[[float, str], None]
 
@@ -136,12 +136,13 @@ def select(
     ahead: Round | None = None
     while True:
         found, ahead = ahead or ask(base, claimed, rounds), None
-        leader = found.judged[0] if found.judged and found.best is None else None
-        if leader is not None and leader.predicts_worse and len(claimed) + 1 < settings.most_effects:
+        leader = _tentative(observations, found, settings)
+        if leader is not None and len(claimed) + 1 < settings.most_effects:
             base = fit_base(observations, leader.ranked.fit.model, leader.ranked.fit)
             further = ask(base, [*claimed, leader], [*rounds, found])
-            if _holds_with(observations, found, further, settings):
-                found, ahead = _acquitted(found, hypotheses, settings, len(claimed)), further
+            both = _both(observations, found, further, settings)
+            if both is not None:
+                found, ahead = _acquitted(found, leader, both, hypotheses, settings, len(claimed)), further
         rounds.append(found)
         near = found.alike(settings)
         if not near or len(claimed) == settings.most_effects:
@@ -168,28 +169,56 @@ def _beside(settings: DiagnoseSettings, claimed: Sequence[Judged]) -> DiagnoseSe
     return settings.model_copy(update={"claim": settings.claim + settings.linearised * gained})
 
 
-def _holds_with(observations: Observations, found: Round, further: Round, settings: DiagnoseSettings) -> bool:
-    """True where the leader of `found`, which alone predicts data held out worse, is right beside a second effect.
+def _tentative(observations: Observations, found: Round, settings: DiagnoseSettings) -> Judged | None:
+    """What cannot be claimed alone and may be right beside a second effect; None where there is nothing.
 
-    The fit with one of two missing effects bends parts for the other one. The second is asked all that a claim is
-    asked, on top of the first; and both together are asked the same on top of the model without either.
+    The fit with one of two missing effects bends parts for the other one. So what leads may predict data held out
+    worse, and where the base model fails, what reduces its error most may gain nothing.
+    """
+    if found.best is not None or not found.judged:
+        return None
+    if found.judged[0].predicts_worse:
+        return found.judged[0]
+    least = min(found.judged, key=lambda j: j.after.posterior.error)
+    if observations.linearised or least.after.posterior.error >= least.base.posterior.error:
+        return None
+    base = within_scatter(observations, found.ranking.base)
+    return least if base.posterior.error > settings.error_limit else None
+
+
+def _both(
+    observations: Observations, found: Round, further: Round, settings: DiagnoseSettings
+) -> Judged | None:
+    """The tentative effect and the best one on top of it, judged together; None where that supports no claim.
+
+    The second is asked all that a claim is asked, on top of the first; and both together are asked the same on top of
+    the model without either.
     """
     second = further.best
     if second is None:
-        return False
+        return None
     gain = second.ranked.fit.log_evidence - found.ranking.base.log_evidence
-    both = replace(second.ranked, gain=gain)
-    return judge(observations, found.ranking, both, settings).claimed
+    both = judge(observations, found.ranking, replace(second.ranked, gain=gain), settings)
+    return both if both.claimed else None
 
 
 def _acquitted(
-    found: Round, hypotheses: Sequence[Hypothesis], settings: DiagnoseSettings, known: int
+    found: Round,
+    leader: Judged,
+    both: Judged,
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+    known: int,
 ) -> Round:
-    """The round with its leader claimed, and nothing held against others for its sake."""
-    leader, *others = found.judged
-    judged = [replace(leader, doubt="")]
-    judged += [replace(j, doubt="") if j.doubt == BETTER_CONTRADICTED else j for j in others]
-    return _weighed(found.ranking, judged, hypotheses, settings, known)
+    """The round with `leader` claimed, and nothing held against others for its sake.
+
+    Where others gained more alone, it counts with what both gain.
+    """
+    leads = leader is found.judged[0]
+    acquitted = replace(leader, doubt="", gain=leader.gain if leads else both.gain)
+    others = [j for j in found.judged if j is not leader]
+    others = [replace(j, doubt="") if j.doubt == BETTER_CONTRADICTED else j for j in others]
+    return _weighed(found.ranking, [acquitted, *others], hypotheses, settings, known)
 
 
 def _round(
@@ -214,7 +243,7 @@ def _weighed(
 ) -> Round:
     """The round in which nothing is claimed that is far behind what is contradicted."""
     least = _least_believed(judged, settings)
-    believed = {j.named.label: j.believed for j in judged if j.believed < j.gain}
+    believed = {j.named.label: j.believed for j in judged}
     told = probabilities(ranking, hypotheses, settings, found, believed, least)
     judged = [replace(j, doubt=BETTER_CONTRADICTED) if j.claimed and j.gain < least else j for j in judged]
     return Round(ranking, tuple(judged), told)

@@ -109,6 +109,10 @@ def test_a_further_effect_must_gain_a_share_of_what_those_gained_that_are_linear
     assert _beside(SETTINGS, claimed).alike == SETTINGS.alike
 
 
+def posterior_of(error: float) -> Any:
+    return SimpleNamespace(posterior=SimpleNamespace(error=error))
+
+
 class Steps:
     """Stands for all that `select` asks: rounds as they are written down."""
 
@@ -124,6 +128,8 @@ class Steps:
         monkeypatch.setattr(selection, "fit_base", self.fit_base)
         monkeypatch.setattr(selection, "rank", self.rank)
         monkeypatch.setattr(selection, "_round", self.round)
+        self.error = 1.0
+        monkeypatch.setattr(selection, "within_scatter", lambda o, fit: posterior_of(self.error))
         self.reconsidered: list[tuple[list[str], list[str]]] = []
         monkeypatch.setattr(selection, "reconsidered", self.reconsider)
         for found in rounds:
@@ -214,35 +220,52 @@ def as_judged(label: str, gain: float, doubt: str) -> Judged:
 
 
 @pytest.mark.parametrize(("second_doubt", "holds"), [("", True), ("", False), ("weak", False)])
-def test_an_effect_that_alone_predicts_worse_is_claimed_where_it_holds_with_a_second_one(
-    monkeypatch: pytest.MonkeyPatch, second_doubt: str, holds: bool
+@pytest.mark.parametrize("doubt", [PREDICTED_WORSE, "its gain is too small"])
+def test_an_effect_that_cannot_be_claimed_alone_is_claimed_where_it_holds_with_a_second_one(
+    monkeypatch: pytest.MonkeyPatch, doubt: str, second_doubt: str, holds: bool
 ) -> None:
-    a, rival = as_judged("a@x", 29.0, PREDICTED_WORSE), as_judged("r@x", 20.0, BETTER_CONTRADICTED)
+    leads = doubt == PREDICTED_WORSE
+    a, rival = as_judged("a@x", 29.0 if leads else -11.0, doubt), as_judged("r@x", 20.0, BETTER_CONTRADICTED)
     b, c = as_judged("b@x", 21.0, second_doubt), as_judged("c@x", 1.0, "weak")
-    steps = Steps(monkeypatch, [[a, rival], [b], [c]])
+    a = dataclasses.replace(a, after=posterior_of(0.9))  # reduces the error most
+    steps = Steps(monkeypatch, [[a, rival] if leads else [rival, a], [b], [c]])
+    steps.error = 1.0 if leads else 1.51
     asked: list[float] = []
 
     def judge(observations: Any, ranking: Any, ranked: Any, settings: Any) -> Any:
         asked.append(ranked.gain)  # of both, on top of the model without either
-        return SimpleNamespace(claimed=holds)
+        return SimpleNamespace(claimed=holds, gain=40.0)
 
     monkeypatch.setattr(selection, "judge", judge)
     monkeypatch.setattr(selection, "replace", replaced)
     monkeypatch.setattr(selection, "_weighed", lambda ranking, found, *rest: Round(ranking, tuple(found), {}))
     monkeypatch.setattr(
-        steps, "fit_base", lambda o, m, start=None: SimpleNamespace(model=m, log_evidence=100.0)
+        selection, "fit_base", lambda o, m, start=None: SimpleNamespace(model=m, log_evidence=100.0)
     )
-    monkeypatch.setattr(selection, "fit_base", steps.fit_base)
     found = steps.select([j.hypothesis for j in (a, rival, b, c)], SETTINGS, [])
     assert asked == ([] if second_doubt else [21.0])
     assert [j.hypothesis.label for j in found.claimed] == (["a@x", "b@x"] if holds else [])
     # what was asked ahead is not asked again
     assert [len(left) for left, _ in steps.asked] == ([4, 3, 2] if holds else [4, 3])
+    first = found.rounds[0].judged
     if holds:
-        first = found.rounds[0].judged
-        assert [j.doubt for j in first] == ["", ""]
+        assert [(j.hypothesis.label, j.gain, j.doubt) for j in first] == [
+            ("a@x", 29.0 if leads else 40.0, ""),
+            ("r@x", 20.0, ""),
+        ]
     else:
-        assert found.rounds[-1].judged == (a, rival)
+        assert first == ((a, rival) if leads else (rival, a))
+
+
+@pytest.mark.parametrize(("error", "linearised"), [(1.5, False), (1.51, True)])
+def test_a_model_that_explains_the_data_or_is_linearised_calls_for_no_pairs(
+    monkeypatch: pytest.MonkeyPatch, error: float, linearised: bool
+) -> None:
+    a = as_judged("a@x", 1.0, "weak")
+    steps = Steps(monkeypatch, [[a]], linearised)
+    steps.error = error
+    assert steps.select([a.hypothesis], SETTINGS, []).claimed == ()
+    assert len(steps.asked) == 1
 
 
 def replaced(one: Any, **changes: Any) -> Any:
