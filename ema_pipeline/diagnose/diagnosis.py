@@ -114,7 +114,9 @@ def diagnose(
         candidates=candidates,
         indistinguishable=_groups(found, group, settings),
         next_measurement=next_measurement(observations, found, group, verdict),
-        localisation=() if explained else localise(scores(observations, found.final, further)),
+        localisation=()
+        if explained
+        else localise(scores(observations, found.final, further, processes=settings.processes)),
         probabilities=probabilities,
         error=rungs[0].error,
         heldout_error=rungs[0].heldout_error,

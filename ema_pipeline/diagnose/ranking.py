@@ -144,7 +144,7 @@ def rank(
         Fits of hypotheses to the same data with fewer unknowns, from which theirs are begun.
     """
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
-    promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models)}
+    promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models, processes)}
     lost = base.posterior.residuals.penalty > unpaired
     tried = tried_sizes(observations, base, models, hypotheses, processes) if lost else {}
     unseen = {label for label, score in promise.items() if score.std >= UNSEEN} - set(tried)
@@ -195,7 +195,7 @@ def rank(
     others = [h for h in hypotheses if h.label not in {best.label for best, _ in order[:FINALISTS]}]
     if settled is None or not near:
         return _finals(observations, base, order, (), processes)
-    promising = _promising(observations, settled, others, models, further)
+    promising = _promising(observations, settled, others, models, further, processes)
     return _finals(observations, base, order, promising, processes, settled)
 
 
@@ -322,12 +322,13 @@ def _promising(
     hypotheses: Sequence[Hypothesis],
     models: Mapping[str, Model],
     count: int,
+    processes: int | None,
 ) -> list[tuple[Hypothesis, Fit]]:
     """What promises most on top of the base model with learned scatters, begun at the size of its score."""
     if not count:
         return []
     found = []
-    best = sorted(scores(observations, settled, hypotheses, models), key=lambda s: -s.gain)
+    best = sorted(scores(observations, settled, hypotheses, models, processes), key=lambda s: -s.gain)
     for score in best[:count]:  # what the scatters took up promises little, and gains it back
         model = models[score.hypothesis.label]
         unknowns = model.problem(observations).unknowns

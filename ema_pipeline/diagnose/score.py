@@ -10,6 +10,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.effects.base import effect_of
 from ema_pipeline.inference import lower_factor
 from ema_pipeline.observations.base import Observations
@@ -17,6 +18,8 @@ from ema_pipeline.observations.fitting import Fit, Model, transferred
 
 UNSEEN = 1e6
 """1 σ of a size, in units of its prior, above which the data carry no information on it."""
+_WORTH = 40
+"""Hypotheses from which processes are worth it: each takes some milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,7 @@ def scores(
     base: Fit,
     hypotheses: Sequence[Hypothesis],
     models: Mapping[str, Model] | None = None,
+    processes: int | None = 1,
 ) -> list[Score]:
     """Scores of hypotheses on top of a fitted model; those whose size cannot be zero are left out.
 
@@ -55,12 +59,13 @@ def scores(
     hypotheses : sequence of Hypothesis
     models : dict of str to Model, optional
         The base model with each hypothesis, by its label, where they are at hand.
+    processes : int or None
+        Processes that share the hypotheses, None for one per processor.
     """
-    found = []
-    factor = Marginal(base)
-    for hypothesis in hypotheses:
-        if hypothesis.size_cannot_be_zero:
-            continue
+    marginal = Marginal(base)
+
+    def told(hypothesis: Hypothesis) -> tuple[NDArray[np.float64], float, float] | None:
+        """Size, σ and gain; None where the effect changes what is compared."""
         model = models[hypothesis.label] if models else base.model.plus(hypothesis.placed, hypothesis.scales)
         problem = model.problem(observations)
         names = [n for n in problem.unknowns.names if effect_of(n) == hypothesis.label]
@@ -69,11 +74,14 @@ def scores(
         residuals = problem.residuals(
             start, base.posterior.scatters, matching=base.posterior.residuals.matching
         )
-        if residuals.jacobian.shape[0] != factor.count:
-            continue
-        columns = residuals.jacobian[:, at] * factor.weight[:, None]
-        found.append(factor.score(hypothesis, columns, problem.unknowns.lower[at]))
-    return found
+        if residuals.jacobian.shape[0] != marginal.count:
+            return None
+        columns = residuals.jacobian[:, at] * marginal.weight[:, None]
+        return marginal.score(columns, problem.unknowns.lower[at])
+
+    asked = [h for h in hypotheses if not h.size_cannot_be_zero]
+    found = zip(asked, spread(told, asked, processes, _WORTH), strict=True)
+    return [Score(h, *one) for h, one in found if one is not None]
 
 
 class Marginal:
@@ -119,9 +127,9 @@ class Marginal:
         return weighted + self.whitened @ moved, moved
 
     def score(
-        self, hypothesis: Hypothesis, columns: NDArray[np.float64], lower: NDArray[np.float64]
-    ) -> Score:
-        """From the base model's maximum, to first order."""
+        self, columns: NDArray[np.float64], lower: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], float, float]:
+        """Size, σ and gain of an effect, from the base model's maximum, to first order; see `Score`."""
         information = self.information(columns)
         precision = information + np.eye(len(information))
         slope = -columns.T @ self.at_maximum
@@ -130,4 +138,4 @@ class Marginal:
             size = np.zeros_like(size)
         gain = 0.5 * float(slope @ size) - 0.5 * float(np.linalg.slogdet(precision)[1])
         std = float(1 / np.sqrt(max(information[0, 0], 1e-300)))
-        return Score(hypothesis, np.asarray(size, float), std, gain)
+        return np.asarray(size, float), std, gain

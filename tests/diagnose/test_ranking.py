@@ -262,7 +262,9 @@ def test_what_promises_most_beside_learned_scatters_begins_at_its_size(
     models = {k: with_model(k, Parabola(("part", *names[k]), names[k]), [0.0, 0.0]).model for k in "abc"}
     told = {"a": (1.0, 0.1), "b": (3.0, 0.2), "c": (2.0, 9.0)}
 
-    def scores(observations: object, fit: object, hypotheses: Any, models: object) -> list[Any]:
+    def scores(
+        observations: object, fit: object, hypotheses: Any, models: object, processes: int
+    ) -> list[Any]:
         return [
             SimpleNamespace(hypothesis=h, gain=told[h.label][0], size=np.array([told[h.label][1]]))
             for h in hypotheses
@@ -271,12 +273,12 @@ def test_what_promises_most_beside_learned_scatters_begins_at_its_size(
     monkeypatch.setattr(ranking, "scores", scores)
     monkeypatch.setattr(ranking, "refined", lambda o, model, x, scatters: (model.name, x.tolist(), scatters))
     asked = [hypothesis(k) for k in "abc"]
-    found: Any = _promising(NO_DATA, settled, asked, models, 2)
+    found: Any = _promising(NO_DATA, settled, asked, models, 2, 1)
     assert [(h.label, f) for h, f in found] == [
         ("b", ("b", [0.4, 0.2], {"part": 1.0})),
         ("c", ("c", [0.4, 1.9], {"part": 1.0})),
     ]
-    assert _promising(NO_DATA, settled, asked, models, 0) == []
+    assert _promising(NO_DATA, settled, asked, models, 0, 1) == []
 
 
 # --- all of it -----------------------------------------------------------------------------------------------------
@@ -354,7 +356,9 @@ class Stages:
         self.asked.append(("freed", len(contenders)))
         return found
 
-    def promising(self, o: object, settled: Any, others: Any, models: Any, further: int) -> Any:
+    def promising(
+        self, o: object, settled: Any, others: Any, models: Any, further: int, processes: object
+    ) -> Any:
         self.asked.append(("promising", settled.model.name, [h.label for h in others], further))
         return ["more"]
 
