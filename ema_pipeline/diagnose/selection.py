@@ -12,7 +12,7 @@ from ema_pipeline.diagnose.backward import reconsidered
 from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.probability import NOTHING, probabilities
-from ema_pipeline.diagnose.ranking import CONTENDERS, Ranking, rank, unbeaten
+from ema_pipeline.diagnose.ranking import CONTENDERS, Ranked, Ranking, rank, unbeaten
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
@@ -228,10 +228,33 @@ def _round(
     settings: DiagnoseSettings,
     found: int,
 ) -> Round:
+    ranking = _with_relief(observations, ranking, settings)
     nothing = probabilities(ranking, hypotheses, settings, found)[NOTHING]
     finals = [r for r in ranking.ranked if r.final]
     judged = [judge(observations, ranking, r, settings, nothing) for r in finals]
     return _weighed(ranking, sorted(judged, key=lambda j: -j.gain), hypotheses, settings, found)
+
+
+def _with_relief(observations: Observations, ranking: Ranking, settings: DiagnoseSettings) -> Ranking:
+    """The ranking in which a base model that fails once no part stands out has the evidence of that fit.
+
+    Left alone, the scatter of a few parts grows until none stands out, and the evidence of a base model that bends
+    one part is hardly behind that of the model with what is missing there. An effect is helped to the difference that
+    explains the data with no part that stands out.
+    """
+    p = ranking.base.posterior
+    bounded = within_scatter(observations, ranking.base).posterior
+    if bounded is p or bounded.error <= settings.error_limit:
+        return ranking
+    relief = p.log_evidence + p.scatter_cost - bounded.log_evidence - bounded.scatter_cost
+
+    def relieved(one: Ranked) -> Ranked:
+        found = within_scatter(observations, one.fit)
+        explains = found is one.fit and found.posterior.error <= settings.error_limit
+        return replace(one, gain=one.gain + relief) if explains and relief > 0 else one
+
+    ranked = [relieved(r) if r.final else r for r in ranking.ranked]
+    return replace(ranking, ranked=tuple(sorted(ranked, key=lambda r: -r.gain)))
 
 
 def _weighed(

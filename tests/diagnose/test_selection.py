@@ -13,6 +13,7 @@ from ema_pipeline.diagnose import probability, selection
 from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, NO_LESS_ERROR, PREDICTED_WORSE, Judged
 from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _groups
 from ema_pipeline.diagnose.probability import NOTHING
+from ema_pipeline.diagnose.ranking import Ranked, Ranking
 from ema_pipeline.diagnose.selection import Round, Selection, _beside, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import EffectSize
@@ -268,6 +269,38 @@ def test_a_model_that_explains_the_data_or_is_linearised_calls_for_no_pairs(
     assert len(steps.asked) == 1
 
 
+@pytest.mark.parametrize(("error", "relief"), [(1.51, 40.0), (1.5, 0.0)])
+def test_a_base_model_that_fails_once_no_part_stands_out_counts_with_that_fit(
+    monkeypatch: pytest.MonkeyPatch, error: float, relief: float
+) -> None:
+    """What explains the data with no part that stands out is helped to the difference, and nothing else is."""
+
+    def fit(log_evidence: float, error: float, bounded: Any = None) -> Any:
+        posterior = SimpleNamespace(log_evidence=log_evidence, scatter_cost=1.0, error=error)
+        return SimpleNamespace(posterior=posterior, bounded=bounded)
+
+    def ranked(label: str, gain: float, of: Any, final: bool = True) -> Ranked:
+        return Ranked(SimpleNamespace(label=label), of, gain, final)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(selection, "within_scatter", lambda o, one: one.bounded or one)
+    base = fit(60.0, 1.0, fit(20.0, error))
+    given = Ranking(
+        base,
+        (
+            ranked("bends a part", 9.0, fit(69.0, 1.0, fit(30.0, 1.2))),
+            ranked("explains", 3.0, fit(63.0, 1.5)),
+            ranked("fails", 2.0, fit(62.0, 1.51)),
+            ranked("no finalist", 1.0, fit(61.0, 1.0), final=False),
+        ),
+    )
+    data: Any = None
+    found = selection._with_relief(data, given, SETTINGS)
+    expected = [("bends a part", 9.0), ("explains", 3.0 + relief), ("fails", 2.0), ("no finalist", 1.0)]
+    expected.sort(key=lambda one: -one[1])
+    assert [(r.hypothesis.label, r.gain) for r in found.ranked] == expected
+    assert found.base is base
+
+
 def replaced(one: Any, **changes: Any) -> Any:
     """`replace` for what stands for a dataclass, too."""
     if isinstance(one, SimpleNamespace):
@@ -278,6 +311,7 @@ def replaced(one: Any, **changes: Any) -> Any:
 def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
     ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (1.0, 9.0, 4.0, 2.0)]
     told = {NOTHING: 0.7}
+    monkeypatch.setattr(selection, "_with_relief", lambda o, ranking, settings: ranking)
     monkeypatch.setattr(
         selection,
         "probabilities",
@@ -332,6 +366,7 @@ def judged_round(monkeypatch: pytest.MonkeyPatch, found: list[tuple[str, float, 
         for n, g, _ in found
     ]
     fit: Any = None
+    monkeypatch.setattr(selection, "_with_relief", lambda o, ranking, settings: ranking)
     monkeypatch.setattr(probability, "named", lambda hypothesis, fit: names[hypothesis.label])
     monkeypatch.setattr(
         selection,
