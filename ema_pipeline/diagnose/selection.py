@@ -14,12 +14,14 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.probability import NOTHING, probabilities
 from ema_pipeline.diagnose.ranking import CONTENDERS, Ranked, Ranking, rank, unbeaten
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.inference import Posterior
+from ema_pipeline.inference import Posterior, beyond
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, Model, fit_base, within_scatter
+from ema_pipeline.observations.fitting import Fit, Model, fit_base, part_reach, within_scatter
 
 Progress = Callable[[float, str], None]
 
+_PARALLEL = 0.95
+"""Cosine of what an effect and what a part change from which they are the same place."""
 _TIE = 0.1
 """Difference of log evidence within which the order of two effects is that of their names."""
 
@@ -239,22 +241,34 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
     """The ranking in which a base model that fails once no part stands out has the evidence of that fit.
 
     Left alone, the scatter of a few parts grows until none stands out, and the evidence of a base model that bends
-    one part is hardly behind that of the model with what is missing there. An effect is helped to the difference that
-    explains the data with no part that stands out.
+    one part is hardly behind that of the model with what is missing there. An effect that changes just what a part
+    that stands out changes is helped to the difference, if it explains the data with none that does.
     """
     p = ranking.base.posterior
     bounded = within_scatter(observations, ranking.base).posterior
     if bounded is p or bounded.error <= settings.error_limit:
         return ranking
     relief = p.log_evidence + p.scatter_cost - bounded.log_evidence - bounded.scatter_cost
+    parts = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, part_reach(observations, p)))]
 
     def relieved(one: Ranked) -> Ranked:
         found = within_scatter(observations, one.fit)
         explains = found is one.fit and found.posterior.error <= settings.error_limit
-        return replace(one, gain=one.gain + relief) if explains and relief > 0 else one
+        return replace(one, gain=one.gain + max(relief, 0.0)) if explains and _changes(one, parts) else one
 
     ranked = [relieved(r) if r.final else r for r in ranking.ranked]
     return replace(ranking, ranked=tuple(sorted(ranked, key=lambda r: -r.gain)))
+
+
+def _changes(one: Ranked, parts: Sequence[str]) -> bool:
+    """True where an effect changes the predictions as one of these parts does."""
+    posterior, placed = one.fit.posterior, one.hypothesis.placed
+    _, jacobian = posterior.residuals.weighted
+    index = posterior.unknowns.index
+    by_size = jacobian[:, index[placed.parameter_name(placed.effect.parameters[0].name)]]
+    by_part = jacobian[:, [index[name] for name in parts if name in index]]
+    size = np.linalg.norm(by_size) * np.linalg.norm(by_part, axis=0)
+    return bool(np.any(np.abs(by_size @ by_part) > _PARALLEL * size))
 
 
 def _weighed(

@@ -273,30 +273,40 @@ def test_a_model_that_explains_the_data_or_is_linearised_calls_for_no_pairs(
 def test_a_base_model_that_fails_once_no_part_stands_out_counts_with_that_fit(
     monkeypatch: pytest.MonkeyPatch, error: float, relief: float
 ) -> None:
-    """What explains the data with no part that stands out is helped to the difference, and nothing else is."""
+    """What changes just that part, and explains the data with none that stands out, is helped to the difference."""
 
-    def fit(log_evidence: float, error: float, bounded: Any = None) -> Any:
-        posterior = SimpleNamespace(log_evidence=log_evidence, scatter_cost=1.0, error=error)
+    def fit(log_evidence: float, error: float, bounded: Any = None, cosine: float = 0.96) -> Any:
+        jacobian = np.array([[1.0, cosine], [0.0, np.sqrt(1 - cosine**2)]])
+        posterior = SimpleNamespace(
+            log_evidence=log_evidence, scatter_cost=1.0, error=error,
+            residuals=SimpleNamespace(weighted=(None, jacobian)),
+            unknowns=SimpleNamespace(names=("m1", "mass@m1.mass"), index={"m1": 0, "mass@m1.mass": 1}),
+        )  # fmt: skip
         return SimpleNamespace(posterior=posterior, bounded=bounded)
 
     def ranked(label: str, gain: float, of: Any, final: bool = True) -> Ranked:
-        return Ranked(SimpleNamespace(label=label), of, gain, final)  # type: ignore[arg-type]
+        effect = SimpleNamespace(parameters=(SimpleNamespace(name="mass"),))
+        placed = SimpleNamespace(effect=effect, parameter_name=lambda name: f"mass@m1.{name}")
+        return Ranked(SimpleNamespace(label=label, placed=placed), of, gain, final)  # type: ignore[arg-type]
 
     monkeypatch.setattr(selection, "within_scatter", lambda o, one: one.bounded or one)
+    monkeypatch.setattr(selection, "part_reach", lambda o, p: {"m1": 0.1})
+    monkeypatch.setattr(selection, "beyond", lambda p, most: np.array([True, False]))
     base = fit(60.0, 1.0, fit(20.0, error))
     given = Ranking(
         base,
         (
             ranked("bends a part", 9.0, fit(69.0, 1.0, fit(30.0, 1.2))),
             ranked("explains", 3.0, fit(63.0, 1.5)),
+            ranked("at another part", 2.5, fit(62.5, 1.0, cosine=0.94)),
             ranked("fails", 2.0, fit(62.0, 1.51)),
             ranked("no finalist", 1.0, fit(61.0, 1.0), final=False),
         ),
     )
     data: Any = None
     found = selection._with_relief(data, given, SETTINGS)
-    expected = [("bends a part", 9.0), ("explains", 3.0 + relief), ("fails", 2.0), ("no finalist", 1.0)]
-    expected.sort(key=lambda one: -one[1])
+    expected = [("bends a part", 9.0), ("explains", 3.0 + relief), ("at another part", 2.5), ("fails", 2.0)]
+    expected = sorted([*expected, ("no finalist", 1.0)], key=lambda one: -one[1])
     assert [(r.hypothesis.label, r.gain) for r in found.ranked] == expected
     assert found.base is base
 
