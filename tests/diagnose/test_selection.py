@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ema_pipeline.diagnose import probability, selection
+from ema_pipeline.diagnose import probability, rounds, selection
 from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, NO_LESS_ERROR, PREDICTED_WORSE, Judged
 from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _groups
 from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.ranking import Ranked, Ranking
-from ema_pipeline.diagnose.selection import Round, Selection, _beside, select
+from ema_pipeline.diagnose.rounds import Round
+from ema_pipeline.diagnose.selection import Selection, _beside, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import EffectSize
 
@@ -128,7 +129,7 @@ class Steps:
         )
         monkeypatch.setattr(selection, "fit_base", self.fit_base)
         monkeypatch.setattr(selection, "rank", self.rank)
-        monkeypatch.setattr(selection, "_round", self.round)
+        monkeypatch.setattr(selection, "round_of", self.round)
         self.error = 1.0
         monkeypatch.setattr(selection, "within_scatter", lambda o, fit: posterior_of(self.error))
         self.reconsidered: list[tuple[list[str], list[str]]] = []
@@ -239,7 +240,7 @@ def test_an_effect_that_cannot_be_claimed_alone_is_claimed_where_it_holds_with_a
 
     monkeypatch.setattr(selection, "judge", judge)
     monkeypatch.setattr(selection, "replace", replaced)
-    monkeypatch.setattr(selection, "_weighed", lambda ranking, found, *rest: Round(ranking, tuple(found), {}))
+    monkeypatch.setattr(selection, "weighed", lambda ranking, found, *rest: Round(ranking, tuple(found), {}))
     monkeypatch.setattr(
         selection, "fit_base", lambda o, m, start=None: SimpleNamespace(model=m, log_evidence=100.0)
     )
@@ -289,9 +290,9 @@ def test_a_base_model_that_fails_once_no_part_stands_out_counts_with_that_fit(
         placed = SimpleNamespace(effect=effect, parameter_name=lambda name: f"mass@m1.{name}")
         return Ranked(SimpleNamespace(label=label, placed=placed), of, gain, final)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(selection, "within_scatter", lambda o, one: one.bounded or one)
-    monkeypatch.setattr(selection, "part_reach", lambda o, p: {"m1": 0.1})
-    monkeypatch.setattr(selection, "beyond", lambda p, most: np.array([True, False]))
+    monkeypatch.setattr(rounds, "within_scatter", lambda o, one: one.bounded or one)
+    monkeypatch.setattr(rounds, "part_reach", lambda o, p: {"m1": 0.1})
+    monkeypatch.setattr(rounds, "beyond", lambda p, most: np.array([True, False]))
     base = fit(60.0, 1.0, fit(20.0, error))
     given = Ranking(
         base,
@@ -304,7 +305,7 @@ def test_a_base_model_that_fails_once_no_part_stands_out_counts_with_that_fit(
         ),
     )
     data: Any = None
-    found = selection._with_relief(data, given, SETTINGS)
+    found = rounds._with_relief(data, given, SETTINGS)
     expected = [("bends a part", 9.0), ("explains", 3.0 + relief), ("at another part", 2.5), ("fails", 2.0)]
     expected = sorted([*expected, ("no finalist", 1.0)], key=lambda one: -one[1])
     assert [(r.hypothesis.label, r.gain) for r in found.ranked] == expected
@@ -321,14 +322,14 @@ def replaced(one: Any, **changes: Any) -> Any:
 def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
     ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (1.0, 9.0, 4.0, 2.0)]
     told = {NOTHING: 0.7}
-    monkeypatch.setattr(selection, "_with_relief", lambda o, ranking, settings: ranking)
+    monkeypatch.setattr(rounds, "_with_relief", lambda o, ranking, settings: ranking)
     monkeypatch.setattr(
-        selection,
+        rounds,
         "probabilities",
         lambda ranking, hypotheses, settings, found, *believed: told | {"n": found},
     )
     monkeypatch.setattr(
-        selection,
+        rounds,
         "judge",
         lambda o, ranking, r, settings, nothing: SimpleNamespace(
             gain=r.gain,
@@ -342,7 +343,7 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
     )
     given: Any = SimpleNamespace(ranked=ranked)
     data: Any = None
-    found = selection._round(data, given, [], SETTINGS, 2)
+    found = rounds.round_of(data, given, [], SETTINGS, 2)
     assert [(j.gain, j.nothing) for j in found.judged] == [(4.0, 0.7), (2.0, 0.7), (1.0, 0.7)]  # type: ignore[attr-defined]
     assert found.probabilities == told | {"n": 2}
     assert found.ranking is given
@@ -376,10 +377,10 @@ def judged_round(monkeypatch: pytest.MonkeyPatch, found: list[tuple[str, float, 
         for n, g, _ in found
     ]
     fit: Any = None
-    monkeypatch.setattr(selection, "_with_relief", lambda o, ranking, settings: ranking)
+    monkeypatch.setattr(rounds, "_with_relief", lambda o, ranking, settings: ranking)
     monkeypatch.setattr(probability, "named", lambda hypothesis, fit: names[hypothesis.label])
     monkeypatch.setattr(
-        selection,
+        rounds,
         "judge",
         lambda o, ranking, r, settings, nothing: Judged(
             r,
@@ -395,7 +396,7 @@ def judged_round(monkeypatch: pytest.MonkeyPatch, found: list[tuple[str, float, 
     )
     data: Any = None
     ranking: Any = SimpleNamespace(ranked=told)
-    return selection._round(data, ranking, [t.hypothesis for t in told], SETTINGS, 0)
+    return rounds.round_of(data, ranking, [t.hypothesis for t in told], SETTINGS, 0)
 
 
 @pytest.mark.parametrize("doubt", [PREDICTED_WORSE, NO_LESS_ERROR])

@@ -1,0 +1,133 @@
+"""One round of the selection: what is missing on top of the current model, judged and weighed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, Judged, judge
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.probability import NOTHING, probabilities
+from ema_pipeline.diagnose.ranking import Ranked, Ranking
+from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.inference import beyond
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import part_reach, within_scatter
+
+_PARALLEL = 0.95
+"""Cosine of what an effect and what a part change from which they are the same place."""
+_TIE = 0.1
+"""Difference of log evidence within which the order of two effects is that of their names."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """One question: what is missing on top of the current model.
+
+    Attributes
+    ----------
+    ranking : Ranking
+    judged : tuple of Judged
+        Finalists, best first.
+    probabilities : dict of str to float
+        Of every hypothesis by the name that is said, and of `NOTHING`; adds up to 1.
+    """
+
+    ranking: Ranking
+    judged: tuple[Judged, ...]
+    probabilities: Mapping[str, float]
+
+    @property
+    def best(self) -> Judged | None:
+        """The best supported hypothesis that is claimed."""
+        return next((j for j in self.judged if j.claimed), None)
+
+    def alike(self, settings: DiagnoseSettings) -> tuple[Judged, ...]:
+        """The best claimed hypothesis and all that explain the data as well; the rig's own before generic ones.
+
+        Rivals need not pass the threshold of a claim themselves: what the best one has, they nearly have.
+        """
+        best = self.best
+        if best is None:
+            return ()
+        near = [j for j in self.judged if j is best or (j.gain > 0 and best.gain - j.gain < settings.alike)]
+
+        def order(j: Judged) -> tuple[bool, float, str]:
+            behind = best.gain - j.gain
+            return j.hypothesis.generic, behind if behind > _TIE else 0.0, j.hypothesis.label
+
+        return tuple(sorted(near, key=order))
+
+
+def round_of(
+    observations: Observations,
+    ranking: Ranking,
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+    found: int,
+) -> Round:
+    """Judge the finalists of a ranking, beside `found` effects."""
+    ranking = _with_relief(observations, ranking, settings)
+    nothing = probabilities(ranking, hypotheses, settings, found)[NOTHING]
+    finals = [r for r in ranking.ranked if r.final]
+    judged = [judge(observations, ranking, r, settings, nothing) for r in finals]
+    return weighed(ranking, sorted(judged, key=lambda j: -j.gain), hypotheses, settings, found)
+
+
+def _with_relief(observations: Observations, ranking: Ranking, settings: DiagnoseSettings) -> Ranking:
+    """The ranking in which a base model that fails once no part stands out has the evidence of that fit.
+
+    Left alone, the scatter of a few parts grows until none stands out, and the evidence of a base model that bends
+    one part is hardly behind that of the model with what is missing there. An effect that changes just what a part
+    that stands out changes is helped to the difference, if it explains the data with none that does.
+    """
+    p = ranking.base.posterior
+    bounded = within_scatter(observations, ranking.base).posterior
+    if bounded is p or bounded.error <= settings.error_limit:
+        return ranking
+    relief = p.log_evidence + p.scatter_cost - bounded.log_evidence - bounded.scatter_cost
+    parts = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, part_reach(observations, p)))]
+
+    def relieved(one: Ranked) -> Ranked:
+        found = within_scatter(observations, one.fit)
+        explains = found is one.fit and found.posterior.error <= settings.error_limit
+        return replace(one, gain=one.gain + max(relief, 0.0)) if explains and _changes(one, parts) else one
+
+    ranked = [relieved(r) if r.final else r for r in ranking.ranked]
+    return replace(ranking, ranked=tuple(sorted(ranked, key=lambda r: -r.gain)))
+
+
+def _changes(one: Ranked, parts: Sequence[str]) -> bool:
+    """True where an effect changes the predictions as one of these parts does."""
+    posterior, placed = one.fit.posterior, one.hypothesis.placed
+    _, jacobian = posterior.residuals.weighted
+    index = posterior.unknowns.index
+    by_size = jacobian[:, index[placed.parameter_name(placed.effect.parameters[0].name)]]
+    by_part = jacobian[:, [index[name] for name in parts if name in index]]
+    size = np.linalg.norm(by_size) * np.linalg.norm(by_part, axis=0)
+    return bool(np.any(np.abs(by_size @ by_part) > _PARALLEL * size))
+
+
+def weighed(
+    ranking: Ranking,
+    judged: Sequence[Judged],
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+    found: int,
+) -> Round:
+    """The round in which nothing is claimed that is far behind what is contradicted."""
+    least = _least_believed(judged, settings)
+    believed = {j.named.label: j.believed for j in judged}
+    told = probabilities(ranking, hypotheses, settings, found, believed, least)
+    judged = [replace(j, doubt=BETTER_CONTRADICTED) if j.claimed and j.gain < least else j for j in judged]
+    return Round(ranking, tuple(judged), told)
+
+
+def _least_believed(judged: Sequence[Judged], settings: DiagnoseSettings) -> float:
+    """Gain below which none is believed: far below one that error or held-out data contradict.
+
+    What contradicts the better one speaks against its rivals as much, whose probability is a small share of its own.
+    """
+    return max((j.gain for j in judged if j.contradicted), default=-np.inf) - settings.alike
