@@ -113,7 +113,7 @@ def judge(
     doubt = _weak(observations, ranked, gain, settings, nothing)
     if not doubt:
         asked = observations.holding_out_explained(base.posterior.residuals)
-        before, after = held_out(asked, base), held_out(asked, mended)
+        before, after = (held_out(asked, fit, settings.processes) for fit in (base, mended))
         left = left_of_close_modes(base, mended)
         share = settings.linearised if _linearised(observations, ranked.hypothesis) else HELD_OUT_SHARE
         tie = HELD_OUT_TIE + share * max(min(gain, left), 0.0)

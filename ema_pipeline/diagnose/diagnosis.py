@@ -79,7 +79,8 @@ def diagnose(
     if found.claimed:
         fits[-1] = found.final
     said = [(j.hypothesis, j.named.name) for j in found.claimed]
-    rungs = rungs_of(observations, [in_said_names(observations, f, said) for f in fits])
+    named = [in_said_names(observations, f, said) for f in fits]
+    rungs = rungs_of(observations, named, settings.processes)
     in_model = set(found.final.model.labels)
     further = [h for h in hypotheses if h.label not in in_model]
     group = alike(found, settings)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.inference import Bounded, Posterior, Residuals, descend, lower_factor, solve_lower
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, part_reach, transferred
@@ -34,20 +35,22 @@ class HeldOut:
 NOTHING_HELD_OUT = HeldOut(float("nan"), float("nan"))
 
 
-def held_out(observations: Observations, fit: Fit) -> HeldOut:
+def held_out(observations: Observations, fit: Fit, processes: int | None = 1) -> HeldOut:
     """Fit to all but one part, predict that part, in turn; scatters as they are in `fit`.
 
     No part may lie further out than parts scatter: otherwise a part moved far from its prior would stand in for the
-    effect and predict just as well.
+    effect and predict just as well. `processes` share the parts, None for one per processor.
     """
-    squares, count, density = 0.0, 0, 0.0
     most = part_reach(observations, fit.posterior)
-    for kept, out in observations.folds():
+
+    def told(fold: tuple[Observations, Observations]) -> tuple[float, int, float]:
+        kept, out = fold
         problem, scatters = fit.model.problem(kept), fit.posterior.scatters
         start = transferred(fit.posterior, problem.unknowns, problem.start())
-        trained = descend(Bounded(problem, most), scatters, start, steps=_STEPS)
-        part = _predicted(out, fit, trained)
-        squares, count, density = squares + part[0], count + part[1], density + part[2]
+        return _predicted(out, fit, descend(Bounded(problem, most), scatters, start, steps=_STEPS))
+
+    parts = list(spread(told, observations.folds(), processes))
+    squares, count, density = (sum(of) for of in zip(*parts, strict=True)) if parts else (0.0, 0, 0.0)
     if not count:
         return NOTHING_HELD_OUT
     return HeldOut(float(np.sqrt(squares / count)), density)

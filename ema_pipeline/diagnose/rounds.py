@@ -91,12 +91,14 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
     parts = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, part_reach(observations, p)))]
 
     def relieved(one: Ranked) -> Ranked:
+        if not one.final or not _changes(one, parts):
+            return one
         found = within_scatter(observations, one.fit)
         explains = found is one.fit and found.posterior.error <= settings.error_limit
-        return replace(one, gain=one.gain + max(relief, 0.0)) if explains and _changes(one, parts) else one
+        return replace(one, gain=one.gain + max(relief, 0.0)) if explains else one
 
-    ranked = [relieved(r) if r.final else r for r in ranking.ranked]
-    return replace(ranking, ranked=tuple(sorted(ranked, key=lambda r: -r.gain)))
+    ranked = sorted(map(relieved, ranking.ranked), key=lambda r: -r.gain)
+    return replace(ranking, ranked=tuple(ranked))
 
 
 def _changes(one: Ranked, parts: Sequence[str]) -> bool:

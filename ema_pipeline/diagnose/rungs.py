@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ema_pipeline.diagnose.heldout import held_out
+from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.types import EffectSize, Ladder, LearnedScatter, Rung
 from ema_pipeline.inference import Posterior
 from ema_pipeline.inference.maximise import ANNEALING, anneal
@@ -26,10 +27,14 @@ from ema_pipeline.observations.fitting import (
 )
 
 
-def rungs_of(observations: Observations, fits: Sequence[Fit]) -> tuple[Rung, ...]:
-    """Every fit as a rung, at the scatters of the last one."""
+def rungs_of(observations: Observations, fits: Sequence[Fit], processes: int | None = 1) -> tuple[Rung, ...]:
+    """Every fit as a rung, at the scatters of the last one; `processes` share them, None for one per processor."""
     scatters = fits[-1].posterior.scatters
-    return with_gains([rung_at(observations, f, scatters) for f in fits])
+
+    def at(fit: Fit) -> Rung:
+        return rung_at(observations, fit, scatters)
+
+    return with_gains(list(spread(at, fits, processes, least=2)))
 
 
 def with_gains(rungs: Sequence[Rung]) -> tuple[Rung, ...]:
