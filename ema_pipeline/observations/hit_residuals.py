@@ -219,7 +219,6 @@ class HitResiduals:
         noise = own.ravel() ** 2
         variance, default = noise + added, noise + usual
         group = sheet * (int(mode.max(initial=0)) + 1) + mode
-        block = np.tile(np.unique(group, return_inverse=True)[1], 2)
         group = np.unique(np.concatenate([group, group + group.max(initial=0) + 1]), return_inverse=True)[1]
         sigma = np.sqrt(variance) * self.heat
         r = _without_mean(values.ravel() / sigma, 1 / sigma, group)
@@ -234,7 +233,7 @@ class HitResiduals:
         share = {HIT_FREQUENCY: np.where(first, added / variance, 0.0)}
         share[HIT_DAMPING] = np.where(first, 0.0, added / variance)
         groups = int(group.max(initial=-1)) + 1
-        return Residuals(r, j, share, scale, matching=self.paired.match, projected=groups, block=block)
+        return Residuals(r, j, share, scale, matching=self.paired.match, projected=groups)
 
 
 def _without_mean(
