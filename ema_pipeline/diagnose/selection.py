@@ -78,7 +78,7 @@ def select(
         ranking = rank(
             observations,
             base,
-            left if claimed or not first else first,
+            first if first and not claimed else left,
             settings.processes,
             lambda share, text: progress(done + share * part, text),
             settings.further_finalists,

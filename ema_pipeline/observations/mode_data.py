@@ -220,27 +220,17 @@ class ModeData:
 
     def only(self, keep: NDArray[np.bool_]) -> ModeData:
         """The modes of a mask, (m,)."""
-        names = (
+        names = [
             "log_frequency",
             "log_frequency_std",
             "log_damping",
             "log_damping_std",
             "shapes",
             "shape_std",
-        )
-        imaginary = None if self.imaginary is None else self.imaginary[keep]
-        product = None if self.product is None else self.product[keep]
+        ]
+        names += [n for n in ("imaginary", "product") if getattr(self, n) is not None]
         kept = {n: getattr(self, n)[keep] for n in names}
-        return dataclasses.replace(
-            self,
-            complete=False,
-            imaginary=imaginary,
-            product=product,
-            always=None,
-            whole=self,
-            kept=keep,
-            **kept,
-        )
+        return dataclasses.replace(self, complete=False, always=None, whole=self, kept=keep, **kept)
 
 
 def _chains(order: NDArray[np.int64], log_frequency: NDArray[np.float64]) -> Iterator[NDArray[np.int64]]:

@@ -58,12 +58,11 @@ class Alone:
         """From their numbers among the measured modes, (k,), and the scatters as they are tried and stated."""
         if not len(alone):
             return cls()
-        unexplained = int(np.sum(~data.doubtful[alone]))
+        sure = alone[~data.doubtful[alone]]
         doubles = int(np.sum(data.double[alone]))
-        split = UNEXPLAINED_DOUBLE * doubles + UNEXPLAINED_PRODUCT * (len(alone) - unexplained - doubles)
-        penalty = UNEXPLAINED * unexplained + split
-        penalty += _credited(data, alone[~data.doubtful[alone]], scatters, defaults)
-        return cls(unexplained, split, penalty, _usual(data, alone, scatters, defaults))
+        split = UNEXPLAINED_DOUBLE * doubles + UNEXPLAINED_PRODUCT * (len(alone) - len(sure) - doubles)
+        penalty = UNEXPLAINED * len(sure) + split + _credited(data, sure, scatters, defaults)
+        return cls(len(sure), split, penalty, _usual(data, alone, scatters, defaults))
 
 
 def unseen(data: ModeData, frequency_hz: NDArray[np.float64], accounted: NDArray[np.int64]) -> float:
