@@ -48,6 +48,8 @@ class Judged:
     left : float
         What is left of `gain` without that which rests on close modes, see `left_of_close_modes`; infinite where it was
         not asked for.
+    linearisation : float
+        Log evidence that does not count, since what equivalent linearisation leaves out may gain as much.
     """
 
     ranked: Ranked
@@ -60,6 +62,7 @@ class Judged:
     doubt: str
     needed: float
     left: float = np.inf
+    linearisation: float = 0.0
 
     @property
     def hypothesis(self) -> Hypothesis:
@@ -84,7 +87,8 @@ class Judged:
     @property
     def believed(self) -> float:
         """Log evidence that counts for its probability."""
-        return min(self.gain, self.left, 0.0 if self.contradicted else np.inf)
+        counted = min(self.gain, self.left) - self.linearisation
+        return min(counted, 0.0) if self.contradicted else counted
 
 
 def judge(
@@ -110,7 +114,9 @@ def judge(
     base = at_scatters(observations, ranking.base, ranked.fit.posterior.scatters)
     base, mended = within_scatter(observations, base), within_scatter(observations, ranked.fit)
     before, after, left = NOTHING_HELD_OUT, NOTHING_HELD_OUT, np.inf
-    doubt = _weak(observations, ranked, gain, settings, nothing)
+    linearisation = doubtful_evidence(observations, ranked.hypothesis, settings)
+    asked_gain = settings.claim + linearisation
+    doubt = _weak(observations, ranked, gain, asked_gain, settings, nothing)
     if not doubt:
         asked = observations.holding_out_explained(base.posterior.residuals)
         before, after = (held_out(asked, fit, settings.processes) for fit in (base, mended))
@@ -118,20 +124,25 @@ def judge(
         share = settings.linearised if _linearised(observations, ranked.hypothesis) else HELD_OUT_SHARE
         tie = HELD_OUT_TIE + share * max(min(gain, left), 0.0)
         doubt = _contradicted(base, mended, before, after, tie)
-        if not doubt and left < settings.claim:
+        if not doubt and left < asked_gain:
             doubt = (
-                f"its gain in log evidence drops to {left:.1f}, below {settings.claim:g}, without what tests often "
+                f"its gain in log evidence drops to {left:.1f}, below {asked_gain:g}, without what tests often "
                 "make of closely spaced modes: a wrong shape, one mode found twice, or two found as one"
             )
         name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, averaged(observations, mended)))
-    return Judged(ranked, name, gain, base, mended, before, after, doubt, settings.claim, left)
+    return Judged(ranked, name, gain, base, mended, before, after, doubt, asked_gain, left, linearisation)
 
 
 def _weak(
-    observations: Observations, ranked: Ranked, gain: float, settings: DiagnoseSettings, nothing: float
+    observations: Observations,
+    ranked: Ranked,
+    gain: float,
+    asked: float,
+    settings: DiagnoseSettings,
+    nothing: float,
 ) -> str:
-    if gain < settings.claim:
-        return f"its gain in log evidence, {gain:.1f}, is below {settings.claim:g}"
+    if gain < asked:
+        return f"its gain in log evidence, {gain:.1f}, is below {asked:g}"
     if nothing > settings.doubt:
         return (
             f"the probability that nothing is missing, {probability_text(nothing)}, is above "
@@ -150,6 +161,13 @@ def _weak(
 def sigmas_asked(observations: Observations, hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
     """Distance from nothing that a claim asks of a size, in its standard deviations."""
     return settings.linearised_sigmas if _linearised(observations, hypothesis) else settings.sigmas
+
+
+def doubtful_evidence(
+    observations: Observations, hypothesis: Hypothesis, settings: DiagnoseSettings
+) -> float:
+    """Log evidence that an effect may gain from what equivalent linearisation leaves out."""
+    return settings.linearised_claim if _linearised(observations, hypothesis) else 0.0
 
 
 def _linearised(observations: Observations, hypothesis: Hypothesis) -> bool:

@@ -48,6 +48,13 @@ class DiagnoseSettings(Settings):
         description="Once amplitude-dependent effects are claimed, a further effect must gain this share of their log "
         "evidence in addition: the residual error of equivalent linearisation can look like a second effect.",
     )
+    linearised_claim: float = Field(
+        default=17.0,
+        ge=0,
+        description="Log evidence that an effect that depends on the amplitude must gain in addition to `claim`, in "
+        "tests at several force levels: wrong ones gained up to 17 from what equivalent linearisation leaves out, "
+        "true ones clearly above their limits more than 100.",
+    )
     sigmas: float = Field(
         default=2.0,
         gt=0,

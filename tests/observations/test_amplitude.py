@@ -149,7 +149,7 @@ def test_effects_twice_their_limit_are_claimed_and_those_of_half_of_it_are_not(l
             observations = synthetic(element(factor * limit.size), seed)
             base = base_fit(observations)
             gains.append(fitted(observations, base, label)[1].log_evidence - base.log_evidence)
-        assert all((g > settings.claim) is claimed for g in gains), gains
+        assert all((g > settings.claim + settings.linearised_claim) is claimed for g in gains), gains
 
 
 def test_nothing_is_claimed_where_only_drift_moves_the_modes() -> None:
@@ -209,6 +209,24 @@ def test_data_held_out_may_speak_against_an_effect_by_a_share_of_its_gain(
         assert judged.contradicted is bool(doubt)
 
 
+@pytest.mark.parametrize(("linearised", "more"), [(True, SETTINGS.linearised_claim), (False, 0.0)])
+def test_what_linearisation_leaves_out_may_gain_evidence_that_does_not_count(
+    monkeypatch: pytest.MonkeyPatch, linearised: bool, more: float
+) -> None:
+    observations = synthetic(CASES["bearing_cubic@hub"][0])
+    hypothesis = Hypothesis((Name(parse_effect("bearing_cubic@hub", RIG), {}),))
+    ranking = rank(observations, base_fit(observations), [hypothesis], 1)
+    (found,) = ranking.ranked
+    monkeypatch.setattr(observations, "linearised", linearised)
+    needed = SETTINGS.claim + more
+    assert found.gain > needed
+    for gain, claimed in ((needed + 0.1, True), (needed - 0.1, False)):
+        judged = claims.judge(observations, ranking, replace(found, gain=gain), SETTINGS)
+        assert (judged.claimed, judged.needed) == (claimed, needed)
+        assert judged.believed == pytest.approx(gain - more)
+        assert claimed or judged.doubt == f"its gain in log evidence, {gain:.1f}, is below {needed:g}"
+
+
 def test_a_scale_of_amplitudes_that_is_hardly_known_does_not_take_a_size_to_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -221,7 +239,7 @@ def test_a_scale_of_amplitudes_that_is_hardly_known_does_not_take_a_size_to_noth
     posterior = found.fit.posterior
     i = posterior.unknowns.index["bearing_cubic@hub.stiffness"]
     assert abs(posterior.x[i]) < 1.5 * np.sqrt(posterior.covariance[i, i])
-    assert claims._weak(observations, found, found.gain, settings, 0.0) == ""
+    assert claims._weak(observations, found, found.gain, settings.claim, settings, 0.0) == ""
     assert abs(posterior.x[i]) > 5.0 * claims._std_of_first(found)
 
 
