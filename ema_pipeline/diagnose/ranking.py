@@ -104,10 +104,13 @@ class Ranking:
         With learned scatters.
     ranked : tuple of Ranked
         Best first.
+    linearised : bool
+        True where equivalent linearisation alone tells what effects do that depend on the amplitude.
     """
 
     base: Fit
     ranked: tuple[Ranked, ...]
+    linearised: bool = False
 
     @property
     def unpaired(self) -> float:
@@ -381,7 +384,7 @@ def _finals(
         for hypothesis, fit in rest
         if hypothesis.label not in taken
     ]
-    return Ranking(final_base, (*finals, *others))
+    return Ranking(final_base, (*finals, *others), observations.linearised)
 
 
 def _learned(observations: Observations, past_barriers: bool, fit: Fit) -> Posterior:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.naming import named
 from ema_pipeline.diagnose.probability import NOTHING, probabilities
 from ema_pipeline.diagnose.ranking import Ranked, Ranking
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -121,10 +122,20 @@ def weighed(
 ) -> Round:
     """The round in which nothing is claimed that is far behind what is contradicted."""
     least = _least_believed(judged, settings)
-    believed = {j.named.label: j.believed for j in judged}
+    believed = _without_linearisation(ranking, settings) | {j.named.label: j.believed for j in judged}
     told = probabilities(ranking, hypotheses, settings, found, believed, least)
     judged = [replace(j, doubt=BETTER_CONTRADICTED) if j.claimed and j.gain < least else j for j in judged]
     return Round(ranking, tuple(judged), told)
+
+
+def _without_linearisation(ranking: Ranking, settings: DiagnoseSettings) -> dict[str, float]:
+    """What counts of the gains of effects that equivalent linearisation alone describes, by the name that is said."""
+    doubtful = [r for r in ranking.ranked if ranking.linearised and not r.hypothesis.placed.effect.linear]
+    names = [named(r.hypothesis, r.fit) for r in doubtful]
+    return {
+        n.label: r.gain + n.advantage - settings.linearised_claim
+        for r, n in zip(doubtful, names, strict=True)
+    }
 
 
 def _least_believed(judged: Sequence[Judged], settings: DiagnoseSettings) -> float:

@@ -58,7 +58,7 @@ def judged(
 
 
 def a_round(*found: Any, told: dict[str, float] | None = None) -> Round:
-    ranking: Any = SimpleNamespace(ranked=(), base=None, unpaired=0.0)
+    ranking: Any = SimpleNamespace(ranked=(), base=None, unpaired=0.0, linearised=False)
     return Round(ranking, tuple(found), told or {})
 
 
@@ -341,7 +341,7 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
             named=SimpleNamespace(label=""),
         ),
     )
-    given: Any = SimpleNamespace(ranked=ranked)
+    given: Any = SimpleNamespace(ranked=ranked, linearised=False)
     data: Any = None
     found = rounds.round_of(data, given, [], SETTINGS, 2)
     assert [(j.gain, j.nothing) for j in found.judged] == [(4.0, 0.7), (2.0, 0.7), (1.0, 0.7)]  # type: ignore[attr-defined]
@@ -395,7 +395,7 @@ def judged_round(monkeypatch: pytest.MonkeyPatch, found: list[tuple[str, float, 
         ),
     )
     data: Any = None
-    ranking: Any = SimpleNamespace(ranked=told)
+    ranking: Any = SimpleNamespace(ranked=told, linearised=False)
     return rounds.round_of(data, ranking, [t.hypothesis for t in told], SETTINGS, 0)
 
 

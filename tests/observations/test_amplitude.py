@@ -10,7 +10,7 @@ import pytest
 from simulate_amplitude import COORDINATES, LEVELS, RIG, STRUCK, observed, simulated_hits, true_assembly
 
 from ema_pipeline.correlate.measured import MeasuredModes
-from ema_pipeline.diagnose import claims
+from ema_pipeline.diagnose import claims, rounds
 from ema_pipeline.diagnose.detection_limits import detection_limits
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.heldout import HeldOut
@@ -220,6 +220,9 @@ def test_what_linearisation_leaves_out_may_gain_evidence_that_does_not_count(
     monkeypatch.setattr(observations, "linearised", linearised)
     needed = SETTINGS.claim + more
     assert found.gain > needed
+    assert ranking.linearised
+    unjudged = rounds._without_linearisation(replace(ranking, linearised=linearised), SETTINGS)
+    assert unjudged == ({"bearing_cubic@hub": pytest.approx(found.gain - more)} if linearised else {})
     for gain, claimed in ((needed + 0.1, True), (needed - 0.1, False)):
         judged = claims.judge(observations, ranking, replace(found, gain=gain), SETTINGS)
         assert (judged.claimed, judged.needed) == (claimed, needed)

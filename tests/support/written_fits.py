@@ -10,7 +10,7 @@ import numpy as np
 from ema_pipeline.inference import Residuals, Unknowns
 from ema_pipeline.observations.fitting import Fit
 
-NO_DATA: Any = object()
+NO_DATA: Any = SimpleNamespace(linearised=False)
 
 
 def hypothesis(label: str, generic: bool = False, sizes: int = 1, extends: bool = False) -> Any:
