@@ -25,6 +25,7 @@ from ema_pipeline.diagnose.first_fits import (
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.score import UNSEEN, Score, scores
+from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import (
@@ -142,13 +143,15 @@ def rank(
     further : int
         Finalists that promise most beside learned scatters, which may be far narrower than those begun with.
     unpaired : float
-        What modes without a partner cost whatever was added in an earlier ranking: no reason to search further.
+        What modes without a partner cost whatever was added in an earlier ranking: no reason to search further, unless
+        they are so many that the model does not explain the data.
     before : dict of str to Posterior, optional
         Fits of hypotheses to the same data with fewer unknowns, from which theirs are begun.
     """
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
     promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models, processes)}
-    lost = base.posterior.residuals.penalty > unpaired
+    residuals = base.posterior.residuals
+    lost = residuals.penalty > (unpaired if residuals.unexplained <= MOST_UNEXPLAINED else 0.0)
     tried = tried_sizes(observations, base, models, hypotheses, processes) if lost else {}
     unseen = {label for label, score in promise.items() if score.std >= UNSEEN} - set(tried)
     hypotheses = [h for h in hypotheses if h.label not in unseen]

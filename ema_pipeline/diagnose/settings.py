@@ -8,6 +8,8 @@ from ema_pipeline.settings import Settings
 
 ERROR_LIMIT = 1.5
 """Error above which a model does not explain the data."""
+MOST_UNEXPLAINED = 1
+"""Measured modes without a partner in a model that explains the data: one may be invented, or of the floor."""
 
 
 class DiagnoseSettings(Settings):

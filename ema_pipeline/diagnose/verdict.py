@@ -6,15 +6,12 @@ import numpy as np
 
 from ema_pipeline.diagnose.claims import Judged
 from ema_pipeline.diagnose.selection import Selection
-from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED, DiagnoseSettings
 from ema_pipeline.diagnose.types import OutlyingPart, VerdictWord
 from ema_pipeline.inference import beyond
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, part_reach, within_scatter
 from ema_pipeline.observations.parts import FREE_STD
-
-MOST_UNEXPLAINED = 1
-"""Measured modes without a partner in a model that explains the data: one may be invented, or of the floor."""
 
 
 def explains(observations: Observations, fit: Fit, settings: DiagnoseSettings) -> bool:

@@ -327,7 +327,7 @@ class Stages:
         )
         for h in self.hypotheses:
             h.scales = {}
-        self.base = fit("base", 0.0, error=1.3, residuals=SimpleNamespace(penalty=2.0))
+        self.base = fit("base", 0.0, error=1.3, residuals=SimpleNamespace(penalty=2.0, unexplained=1))
         self.base.model.plus = lambda placed, scales: placed.label  # type: ignore[attr-defined]
 
     def screened(self, hypotheses: Any, promise: Any, near: bool) -> Any:
@@ -371,12 +371,15 @@ class Stages:
         return found
 
 
-@pytest.mark.parametrize(("unpaired", "annealed"), [(2.0, "ef"), (1.9, "bef")])
+@pytest.mark.parametrize(
+    ("unpaired", "unexplained", "annealed"), [(2.0, 1, "ef"), (1.9, 1, "bef"), (2.0, 2, "bef")]
+)
 def test_those_behind_in_short_fits_are_annealed_where_a_size_leads_modes_to_partners(
-    monkeypatch: pytest.MonkeyPatch, unpaired: float, annealed: str
+    monkeypatch: pytest.MonkeyPatch, unpaired: float, unexplained: int, annealed: str
 ) -> None:
-    """A few steps do not."""
+    """A few steps do not. Modes that had no partner in an earlier round are looked for where they are several."""
     stages = Stages(monkeypatch)
+    stages.base.posterior.residuals.unexplained = unexplained  # type: ignore[misc]
     stages.base.posterior.error = 1.31  # type: ignore[misc]
     best_first = [(h, SimpleNamespace(log_evidence=0.0, error=1.0)) for h in stages.hypotheses[-2::-1]]
     monkeypatch.setattr(ranking, "short_fits", lambda *given: best_first)
