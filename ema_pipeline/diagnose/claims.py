@@ -115,8 +115,8 @@ def judge(
     base, mended = within_scatter(observations, base), within_scatter(observations, ranked.fit)
     before, after, left = NOTHING_HELD_OUT, NOTHING_HELD_OUT, np.inf
     linearisation = doubtful_evidence(observations, ranked.hypothesis, settings)
-    asked_gain = settings.claim + linearisation
-    doubt = _weak(observations, ranked, gain, asked_gain, settings, nothing)
+    needed = settings.claim + linearisation
+    doubt = _weak(observations, ranked, gain, needed, settings, nothing)
     if not doubt:
         asked = observations.holding_out_explained(base.posterior.residuals)
         before, after = (held_out(asked, fit, settings.processes) for fit in (base, mended))
@@ -124,25 +124,25 @@ def judge(
         share = settings.linearised if _linearised(observations, ranked.hypothesis) else HELD_OUT_SHARE
         tie = HELD_OUT_TIE + share * max(min(gain, left), 0.0)
         doubt = _contradicted(base, mended, before, after, tie)
-        if not doubt and left < asked_gain:
+        if not doubt and left < needed:
             doubt = (
-                f"its gain in log evidence drops to {left:.1f}, below {asked_gain:g}, without what tests often "
+                f"its gain in log evidence drops to {left:.1f}, below {needed:g}, without what tests often "
                 "make of closely spaced modes: a wrong shape, one mode found twice, or two found as one"
             )
         name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, averaged(observations, mended)))
-    return Judged(ranked, name, gain, base, mended, before, after, doubt, asked_gain, left, linearisation)
+    return Judged(ranked, name, gain, base, mended, before, after, doubt, needed, left, linearisation)
 
 
 def _weak(
     observations: Observations,
     ranked: Ranked,
     gain: float,
-    asked: float,
+    needed: float,
     settings: DiagnoseSettings,
     nothing: float,
 ) -> str:
-    if gain < asked:
-        return f"its gain in log evidence, {gain:.1f}, is below {asked:g}"
+    if gain < needed:
+        return f"its gain in log evidence, {gain:.1f}, is below {needed:g}"
     if nothing > settings.doubt:
         return (
             f"the probability that nothing is missing, {probability_text(nothing)}, is above "
@@ -164,15 +164,15 @@ def sigmas_asked(observations: Observations, hypothesis: Hypothesis, settings: D
 
 
 def doubtful_evidence(
-    observations: Observations, hypothesis: Hypothesis, settings: DiagnoseSettings
+    of: Observations | Ranking, hypothesis: Hypothesis, settings: DiagnoseSettings
 ) -> float:
     """Log evidence that an effect may gain from what equivalent linearisation leaves out."""
-    return settings.linearised_claim if _linearised(observations, hypothesis) else 0.0
+    return settings.linearised_claim if _linearised(of, hypothesis) else 0.0
 
 
-def _linearised(observations: Observations, hypothesis: Hypothesis) -> bool:
+def _linearised(of: Observations | Ranking, hypothesis: Hypothesis) -> bool:
     """True where equivalent linearisation alone tells what the effect does."""
-    return observations.linearised and not hypothesis.placed.effect.linear
+    return of.linearised and not hypothesis.placed.effect.linear
 
 
 def _std_of_first(ranked: Ranked) -> float:

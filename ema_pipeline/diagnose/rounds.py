@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, Judged, judge
+from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, Judged, doubtful_evidence, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import named
 from ema_pipeline.diagnose.probability import NOTHING, probabilities
@@ -129,12 +129,12 @@ def weighed(
 
 
 def _without_linearisation(ranking: Ranking, settings: DiagnoseSettings) -> dict[str, float]:
-    """What counts of the gains of effects that equivalent linearisation alone describes, by the name that is said."""
-    doubtful = [r for r in ranking.ranked if ranking.linearised and not r.hypothesis.placed.effect.linear]
-    names = [named(r.hypothesis, r.fit) for r in doubtful]
+    """What counts of all gains where equivalent linearisation alone tells what some effects do, by the name said."""
+    ranked = ranking.ranked if ranking.linearised else ()
+    names = [named(r.hypothesis, r.fit) for r in ranked]
     return {
-        n.label: r.gain + n.advantage - settings.linearised_claim
-        for r, n in zip(doubtful, names, strict=True)
+        n.label: r.gain + n.advantage - doubtful_evidence(ranking, r.hypothesis, settings)
+        for r, n in zip(ranked, names, strict=True)
     }
 
 

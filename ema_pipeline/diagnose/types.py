@@ -59,8 +59,8 @@ class Candidate:
         Log evidence gained (natural logarithm of a Bayes factor) over the model without it: the model as it stood, with
         the effects that were added before this one.
     threshold : float
-        Log evidence that a claim needed: the setting `claim`, more for a further effect beside those that depend on the
-        amplitude.
+        Log evidence that a claim needed: the setting `claim`, more in tests at several force levels for an effect that
+        depends on the amplitude, and for a further effect beside one.
     claimed : bool
         True where probability, gain and held-out data all support it.
     why : str
