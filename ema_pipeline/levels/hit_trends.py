@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.levels.single import HitPoles, excitation
 from ema_pipeline.levels.sizes import plain, relative_sizes, sizes_at_levels, unknown
-from ema_pipeline.levels.trend import Samples, Trend, combined, samples, trends
+from ema_pipeline.levels.trend import Samples, Trend, combined, samples, scattered_by_sheet, trends
 
 Real = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -66,7 +66,8 @@ def hit_trends(found: HitPoles, level: Integers, far: NDArray[np.bool_]) -> HitT
         given(found.frequency_hz, found.frequency_std_hz) + given(found.damping_ratio, found.damping_std)
     )
     values, std, mean = relative_sizes(found)
-    sizes = trends(given(values, std))  # by themselves: an unsteady hand scatters them more than the poles
+    # by themselves: an unsteady hand scatters sizes more than poles, most where oblique hits alone excite
+    sizes = trends([scattered_by_sheet(s) for s in given(values, std)])
     at_levels = tuple(
         sizes_at_levels(values[:, r], std[:, r], mean[:, r], level, test.extra_std)
         for r, test in enumerate(sizes)

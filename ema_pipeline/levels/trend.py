@@ -7,7 +7,7 @@ is known; what hits scatter beyond it about smooth curves over the force is esti
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ Integers = NDArray[np.int64]
 
 PRIOR_DOF = 4.0
 """Degrees of freedom that the noise known from the FRFs counts for in the scatter of few hits of a level."""
+
+SHEET_DOF = 1.0
+"""Degrees of freedom that the scatter of all sheets counts for in that of one: few, as sheets differ by far."""
 
 LARGEST = 0.99
 """Larger p values count as this: a single one near 1 would undo all others in the Cauchy combination."""
@@ -37,6 +40,8 @@ class Samples:
         Hits of one sheet have a common mean; those of one cell, too, about the same force.
     log_force, amplitude : ndarray, (n_hits,)
         ln(force), and the square of the mode's amplitude over the largest one.
+    sheet_dof : ndarray, (n_sheets,), or None
+        Degrees of freedom of a variance that one sheet's own hits tell; infinite for the others.
     """
 
     values: Real
@@ -45,6 +50,7 @@ class Samples:
     cell: Integers
     log_force: Real
     amplitude: Real
+    sheet_dof: Real | None = None
 
     @property
     def square(self) -> Real:
@@ -55,6 +61,18 @@ class Samples:
     def repeated(self) -> bool:
         """True where some hits share point and force."""
         return len(self.values) > int(self.cell.max(initial=-1)) + 1
+
+    def of_sheet(self, sheet: int) -> Samples:
+        """Those of one sheet."""
+        on = self.sheet == sheet
+        return Samples(
+            self.values[on],
+            self.variance[on],
+            np.zeros(int(on.sum()), dtype=np.int64),
+            np.unique(self.cell[on], return_inverse=True)[1],
+            self.log_force[on],
+            self.amplitude[on],
+        )
 
 
 @dataclass(frozen=True)
@@ -108,6 +126,29 @@ def samples(
         np.log(force_n[use]),
         squares[use] / max(float(squares.max(initial=0.0)), 1e-300),
     )
+
+
+def scattered_by_sheet(given: Samples) -> Samples:
+    """The samples with variances that hold what the hits of each sheet scatter more than those of all sheets do.
+
+    `trends` takes all hits of a mode to scatter alike. A sheet that scatters much more would show a trend by chance.
+    """
+    whole = _scatters(given)
+    if whole is None:
+        return given
+    usual = whole[0].extra(NOTHING_USUAL)
+    variance, dof = given.variance.copy(), np.full(int(given.sheet.max()) + 1, np.inf)
+    for s in np.unique(given.sheet):
+        on = given.sheet == s
+        own = given.of_sheet(int(s))
+        alone = _scatters(replace(own, variance=own.variance + usual))
+        if alone is not None and not alone[0].shared:
+            extra = alone[0].extra(Usual(1.0, SHEET_DOF))
+            variance[on] += extra
+            if extra > 0:
+                share = extra / (extra + usual + float(np.median(own.variance)))
+                dof[s] = (alone[0].dof + SHEET_DOF) / share**2
+    return replace(given, variance=variance, sheet_dof=dof)
 
 
 def trends(modes: Sequence[Samples]) -> tuple[Trend, ...]:
@@ -187,6 +228,9 @@ def _slope(given: Samples, regressor: Real, extra: float, dof: float) -> tuple[f
     beta = float(np.sum(weight * across * given.values)) / strength
     force = _centred(given.log_force, weight, given.sheet)
     per_log = beta * float(np.sum(weight * across * force) / np.sum(weight * force**2))
+    if given.sheet_dof is not None:  # Welch and Satterthwaite
+        share = np.bincount(given.sheet, weight * across**2) / strength
+        dof = min(dof, 1 / max(float(np.sum(share**2 / given.sheet_dof)), 1e-300))
     return 2 * float(stdtr(dof, -abs(beta) * np.sqrt(strength))), per_log
 
 
@@ -199,6 +243,8 @@ def _own_slopes(given: Samples, regressor: Real, extra: float, dof: float) -> fl
     told = strength > 0
     if not told.any():
         return float("nan")
+    if given.sheet_dof is not None:
+        dof = min(dof, float(given.sheet_dof[told].min()))
     return float(fdtrc(int(told.sum()), dof, np.mean(moved[told] ** 2 / strength[told])))
 
 

@@ -20,7 +20,16 @@ from ema_pipeline.levels import LevelSettings, LevelStudy, study_levels
 from ema_pipeline.levels.sentences import flagged
 from ema_pipeline.levels.single import single_hits
 from ema_pipeline.levels.sizes import relative_sizes, sizes_at_levels
-from ema_pipeline.levels.trend import Samples, clearest, combined, holm, samples, shifts, trends
+from ema_pipeline.levels.trend import (
+    Samples,
+    clearest,
+    combined,
+    holm,
+    samples,
+    scattered_by_sheet,
+    shifts,
+    trends,
+)
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.types import ModalModel
@@ -150,6 +159,36 @@ def test_the_trend_test_keeps_its_false_alarm_rate_with_few_hits_and_an_unsteady
             p = holm(np.array([t.p for t in trends(modes)]))
             wrong += bool(np.nanmin(p) < 0.05)
         assert wrong <= 9  # 3 expected at most; 10 by chance once in 700
+
+
+def test_a_sheet_that_scatters_by_itself_shows_no_trend() -> None:
+    """A mode that oblique hits alone excite at one point: 1.5 of scatter there, hardly any elsewhere."""
+    rng = np.random.default_rng(17)
+    sheet, level = np.repeat(np.arange(5), 6), np.tile(np.repeat(np.arange(3), 2), 5)
+    wrong = {True: 0, False: 0}
+    for _ in range(60):
+        force = 30 * 3.0**level * np.exp(0.12 * rng.normal(size=30))
+        std = 1.0 / force
+        scatter = np.where(sheet == 2, 1.5, 0.01)
+        modes = [
+            samples(scatter * rng.normal(size=30), std, sheet, level, force, np.ones(30)) for _ in range(4)
+        ]
+        for by_sheet in wrong:
+            given = [scattered_by_sheet(s) for s in modes] if by_sheet else modes
+            wrong[by_sheet] += bool(min(t.p for t in trends(given)) < 1e-3)
+    assert wrong[True] <= 2
+    assert wrong[False] >= 5
+
+
+def test_sizes_that_grow_with_the_force_stay_clear_by_sheets() -> None:
+    rng = np.random.default_rng(18)
+    sheet, level = np.repeat([0, 1, 2], 6), np.tile(np.repeat([0, 1, 2], 2), 3)
+    force = 30 * 3.0**level * np.exp(0.1 * rng.normal(size=18))
+    std = np.full(18, 0.1)
+    values = np.array([1.0, 0.5, 0.2])[sheet] * (force / 270) + std * rng.normal(size=18)
+    given = samples(values, std, sheet, level, force, np.ones(18))
+    (found,) = trends([scattered_by_sheet(given)])
+    assert found.p < 1e-4
 
 
 def test_the_trend_test_finds_what_moves_and_tells_how_far() -> None:
