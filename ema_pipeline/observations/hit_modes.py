@@ -51,6 +51,10 @@ _FAR, _FAR_STD = 0.5, 0.5
 a shift read from a decay has against one of first order; and that error of far ones, 1 σ."""
 _HEARD = 0.1
 """Motion of a mode over that of the largest that moves in step with it, below which a hit does not tell its pole."""
+_FASTER = 1.5
+"""Most by which a mode's motion decays faster or slower in one hit than in most. The weight of each instant is that of
+the median decay; a hit read with nine times that would leave, next to a mode that moves in step, no motion to refer to.
+"""
 _FINE = 400
 """Instants at which the weight of a mode's fit is found before it is put together to few."""
 
@@ -388,7 +392,8 @@ def shifted_poles(data: HitData, elements: Sequence[Nonlinear], linear: Linear) 
     group_of = np.zeros(len(omega), np.int64)
     for k, g in enumerate(data.groups):
         group_of[g] = k
-    turning = data.poles - 1j * centre[group_of]
+    decay = np.clip(-data.poles.real, data.decay / _FASTER, data.decay * _FASTER)
+    turning = 1j * (data.poles.imag - centre[group_of]) - decay
     z = linear.displacement[:, None] * np.exp(turning[:, None] * instants[:, None])  # (h, t, m)
     paths = [np.stack([z[..., g] @ v[g] for g in data.groups], axis=-1) for v in linear.along]
     motions = [Motions(np.abs(p).reshape(-1, len(centre)), centre) for p in paths]

@@ -313,6 +313,29 @@ def test_a_spring_that_parts_is_as_stiff_as_the_spring_that_it_replaces() -> Non
     np.testing.assert_allclose(found[0], found[1], rtol=1e-6, atol=1e-6)
 
 
+def test_a_hit_read_with_nine_times_the_damping_leaves_no_motion_to_divide_by() -> None:
+    """Beside a mode that moves in step and rings on: friction of 1 N moved its pole by 1e23 decay rates."""
+    (hits,) = synthetic(drift=0.0).hits
+    assembly = true_assembly()
+    values, shapes = eigen_solution(assembly.system())
+    heavy = np.where(np.arange(len(hits.modes)) == 0, 12.0, 1.0)
+    hits = replace(hits, motion=np.full(hits.motion.shape, 1e-5 + 0j))
+    reference = replace(hits.reference, log_damping=hits.reference.log_damping + np.log(heavy))
+    usual = replace(hits, reference=reference, damping=hits.damping * heavy)
+    assert any(0 in g and len(g) > 1 for g in usual.groups)
+    wild = replace(
+        usual, damping=usual.damping * np.where(np.arange(len(usual.names))[:, None] == 0, 9.0, 1.0)
+    )
+    friction = DryFriction("fx", {"hub.x": 1.0}, 0.02)
+    moved = []
+    for data in (usual, wild):
+        linear = Linear.of(
+            data, element_rows(assembly, [friction]) @ shapes, np.arange(len(values)), values, data.motion
+        )
+        moved.append(abs(shifted_poles(data, [friction], linear)[0, 0]))
+    assert moved[1] < 20 * moved[0]
+
+
 def test_the_scale_of_amplitudes_is_known_less_well_the_further_poles_move() -> None:
     observations = synthetic(drift=0.0)
     still = AmplitudeObservations(observations.modes, [])
