@@ -166,8 +166,13 @@ def sigmas_asked(observations: Observations, hypothesis: Hypothesis, settings: D
 def doubtful_evidence(
     of: Observations | Ranking, hypothesis: Hypothesis, settings: DiagnoseSettings
 ) -> float:
-    """Log evidence that an effect may gain from what equivalent linearisation leaves out."""
-    return settings.linearised_claim if _linearised(of, hypothesis) else 0.0
+    """Log evidence that an effect may gain from what equivalent linearisation leaves out.
+
+    Twice as much of a generic one: of springs between any two bodies some fit what is left.
+    """
+    if not _linearised(of, hypothesis):
+        return 0.0
+    return (2 if hypothesis.generic else 1) * settings.linearised_claim
 
 
 def _linearised(of: Observations | Ranking, hypothesis: Hypothesis) -> bool:

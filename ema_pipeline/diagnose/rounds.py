@@ -124,8 +124,24 @@ def weighed(
     least = _least_believed(judged, settings)
     believed = _without_linearisation(ranking, settings) | {j.named.label: j.believed for j in judged}
     told = probabilities(ranking, hypotheses, settings, found, believed, least)
-    judged = [replace(j, doubt=BETTER_CONTRADICTED) if j.claimed and j.gain < least else j for j in judged]
+    judged = [
+        replace(j, doubt=BETTER_CONTRADICTED)
+        if j.claimed and (j.gain < least or _one_of_many(j, judged))
+        else j
+        for j in judged
+    ]
     return Round(ranking, tuple(judged), told)
+
+
+def _one_of_many(one: Judged, judged: Sequence[Judged]) -> bool:
+    """True where equivalent linearisation alone tells what an effect does, and such effects that gain more are doubted.
+
+    Among springs anywhere that fit what is left about as well, one or the other passes by chance.
+    """
+    if not one.linearisation:
+        return False
+    better = (j for j in judged if j.linearisation and j.gain > max(one.gain, j.needed))
+    return any(not j.claimed for j in better)
 
 
 def _without_linearisation(ranking: Ranking, settings: DiagnoseSettings) -> dict[str, float]:

@@ -319,6 +319,23 @@ def replaced(one: Any, **changes: Any) -> Any:
     return dataclasses.replace(one, **changes)
 
 
+@pytest.mark.parametrize(
+    ("linearisation", "doubt", "needed", "passes_by_chance"),
+    [
+        (17.0, PREDICTED_WORSE, 20.5, True),
+        (17.0, "its gain is below 37.5", 37.5, False),
+        (17.0, "", 20.5, False),
+        (0.0, PREDICTED_WORSE, 20.5, False),
+    ],
+)
+def test_a_linearised_effect_is_one_of_many_where_a_better_one_is_doubted(
+    linearisation: float, doubt: str, needed: float, passes_by_chance: bool
+) -> None:
+    better, one = judged("cubic_spring@a", 31.0, doubt), judged("cubic_spring@b", 30.0)
+    better.linearisation, better.needed, one.linearisation = 17.0, needed, linearisation
+    assert rounds._one_of_many(one, [better, one]) is passes_by_chance
+
+
 def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
     ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (1.0, 9.0, 4.0, 2.0)]
     told = {NOTHING: 0.7}
@@ -338,6 +355,7 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
             claimed=True,
             contradicted=False,
             believed=r.gain,
+            linearisation=0.0,
             named=SimpleNamespace(label=""),
         ),
     )

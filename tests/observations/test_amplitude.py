@@ -230,6 +230,18 @@ def test_what_linearisation_leaves_out_may_gain_evidence_that_does_not_count(
         assert claimed or judged.doubt == f"its gain in log evidence, {gain:.1f}, is below {needed:g}"
 
 
+def test_a_generic_effect_is_asked_twice_the_evidence_that_linearisation_may_leave() -> None:
+    observations = synthetic()
+    own, generic = (
+        Hypothesis((Name(parse_effect(label, RIG), {}),))
+        for label in ("bearing_cubic@hub", "cubic_spring@hub.x")
+    )
+    assert claims.doubtful_evidence(observations, own, SETTINGS) == SETTINGS.linearised_claim
+    assert claims.doubtful_evidence(observations, generic, SETTINGS) == 2 * SETTINGS.linearised_claim
+    linear = Hypothesis((Name(parse_effect("spring@hub.x", RIG), {}),))
+    assert claims.doubtful_evidence(observations, linear, SETTINGS) == 0.0
+
+
 def test_a_scale_of_amplitudes_that_is_hardly_known_does_not_take_a_size_to_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
