@@ -121,8 +121,9 @@ def select(
 
 def _beside(settings: DiagnoseSettings, claimed: Sequence[Judged]) -> DiagnoseSettings:
     """What is asked of a further effect beside those that are claimed."""
-    gained = sum(j.gain for j in claimed if not j.hypothesis.placed.effect.linear)
-    return settings.model_copy(update={"claim": settings.claim + settings.linearised * gained})
+    gains = [j.gain for j in claimed if not j.hypothesis.placed.effect.linear]
+    left = settings.linearised * sum(gains) + (settings.linearised_claim if gains else 0.0)
+    return settings.model_copy(update={"claim": settings.claim + left})
 
 
 def _tentative(observations: Observations, found: Round, settings: DiagnoseSettings) -> Judged | None:

@@ -48,7 +48,8 @@ class DiagnoseSettings(Settings):
         ge=0,
         lt=1,
         description="Once amplitude-dependent effects are claimed, a further effect must gain this share of their log "
-        "evidence in addition: the residual error of equivalent linearisation can look like a second effect.",
+        "evidence in addition, and `linearised_claim`: the residual error of equivalent linearisation can look like a "
+        "second effect.",
     )
     linearised_claim: float = Field(
         default=17.0,

@@ -106,7 +106,7 @@ def test_a_further_effect_must_gain_a_share_of_what_those_gained_that_are_linear
         judged("mass@a", 1e3),
         judged("friction@b", 20.0, linear=False),
     ]
-    assert _beside(SETTINGS, claimed).claim == pytest.approx(3.5 + 0.1 * 70.0)
+    assert _beside(SETTINGS, claimed).claim == pytest.approx(3.5 + 0.1 * 70.0 + SETTINGS.linearised_claim)
     assert _beside(SETTINGS, claimed[1:2]).claim == 3.5
     assert _beside(SETTINGS, claimed).alike == SETTINGS.alike
 
@@ -176,7 +176,8 @@ def test_effects_are_added_one_by_one_until_nothing_more_is_claimed(monkeypatch:
     assert steps.begun[1][1] is a.ranked.fit
     assert found.final is found.rounds[-1].ranking.base
     assert found.final.at == 3  # type: ignore[attr-defined]
-    assert steps.shares == [(3, 3.5, 0), (2, 5.5, 1), (1, pytest.approx(5.5), 2)]
+    more = pytest.approx(5.5 + SETTINGS.linearised_claim)
+    assert steps.shares == [(3, 3.5, 0), (2, more, 1), (1, more, 2)]
     assert told == pytest.approx([0.125, 0.375, 0.625])
     assert steps.reconsidered == [(["a@x", "b@x"], ["a@x", "b@x"])]  # one alone has nothing beside it
 
