@@ -25,6 +25,9 @@ come, are never held out. What equivalent linearisation leaves out makes the sha
 NO_LESS_ERROR = "adding it does not reduce the error"
 PREDICTED_WORSE = "held-out data are predicted worse when it is added"
 BETTER_CONTRADICTED = "an effect that explains the data better is contradicted by held-out data"
+BETTER_DOUBTED = "a similar effect that gains more evidence cannot be claimed"
+BY_OTHERS = (BETTER_CONTRADICTED, BETTER_DOUBTED)
+"""What is held against an effect for the sake of others alone."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +118,7 @@ def judge(
     base, mended = within_scatter(observations, base), within_scatter(observations, ranked.fit)
     before, after, left = NOTHING_HELD_OUT, NOTHING_HELD_OUT, np.inf
     linearisation = doubtful_evidence(observations, ranked.hypothesis, settings)
-    needed = settings.claim + linearisation
+    needed = settings.claim + evidence_beyond(observations, ranked.hypothesis, settings)
     doubt = _weak(observations, ranked, gain, needed, settings, nothing)
     if not doubt:
         asked = observations.holding_out_explained(base.posterior.residuals)
@@ -166,13 +169,17 @@ def sigmas_asked(observations: Observations, hypothesis: Hypothesis, settings: D
 def doubtful_evidence(
     of: Observations | Ranking, hypothesis: Hypothesis, settings: DiagnoseSettings
 ) -> float:
-    """Log evidence that an effect may gain from what equivalent linearisation leaves out.
+    """Log evidence that an effect may gain from what equivalent linearisation leaves out."""
+    return settings.linearised_claim if _linearised(of, hypothesis) else 0.0
 
-    Twice as much of a generic one: of springs between any two bodies some fit what is left.
+
+def evidence_beyond(observations: Observations, hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
+    """Log evidence that a claim needs in addition for the sake of it.
+
+    Twice as much of a generic effect: of springs between any two bodies some fit what is left. It is no less probable
+    for that than the rig's own effect with the same signs.
     """
-    if not _linearised(of, hypothesis):
-        return 0.0
-    return (2 if hypothesis.generic else 1) * settings.linearised_claim
+    return (2 if hypothesis.generic else 1) * doubtful_evidence(observations, hypothesis, settings)
 
 
 def _linearised(of: Observations | Ranking, hypothesis: Hypothesis) -> bool:

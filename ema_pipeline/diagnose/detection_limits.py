@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.diagnose.claims import doubtful_evidence, sigmas_asked
+from ema_pipeline.diagnose.claims import evidence_beyond, sigmas_asked
 from ema_pipeline.diagnose.expected_gain import Change, ExpectedGain
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
 from ema_pipeline.diagnose.parallel import spread
@@ -67,7 +67,7 @@ def detection_limits(
             return None
         sigmas = sigmas_asked(observations, hypothesis, settings)
         evidence = needed(hypothesis, hypotheses, settings, found=0)
-        return shown.least(evidence + doubtful_evidence(observations, hypothesis, settings), sigmas)
+        return shown.least(evidence + evidence_beyond(observations, hypothesis, settings), sigmas)
 
     asked = [h for h in hypotheses if not h.size_cannot_be_zero]
     found = zip(asked, spread(least, asked, settings.processes), strict=True)

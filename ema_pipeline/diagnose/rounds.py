@@ -7,7 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, Judged, doubtful_evidence, judge
+from ema_pipeline.diagnose.claims import (
+    BETTER_CONTRADICTED,
+    BETTER_DOUBTED,
+    Judged,
+    doubtful_evidence,
+    judge,
+)
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import named
 from ema_pipeline.diagnose.probability import NOTHING, probabilities
@@ -120,17 +126,20 @@ def weighed(
     settings: DiagnoseSettings,
     found: int,
 ) -> Round:
-    """The round in which nothing is claimed that is far behind what is contradicted."""
+    """The round in which nothing is claimed that others speak against, see `_against`."""
     least = _least_believed(judged, settings)
     believed = _without_linearisation(ranking, settings) | {j.named.label: j.believed for j in judged}
     told = probabilities(ranking, hypotheses, settings, found, believed, least)
-    judged = [
-        replace(j, doubt=BETTER_CONTRADICTED)
-        if j.claimed and (j.gain < least or _one_of_many(j, judged))
-        else j
-        for j in judged
-    ]
+    doubts = [_against(j, judged, least) if j.claimed else "" for j in judged]
+    judged = [replace(j, doubt=doubt) if doubt else j for j, doubt in zip(judged, doubts, strict=True)]
     return Round(ranking, tuple(judged), told)
+
+
+def _against(one: Judged, judged: Sequence[Judged], least: float) -> str:
+    """What others say against a claim: it is far behind what is contradicted, or one of many; empty for nothing."""
+    if one.gain < least:
+        return BETTER_CONTRADICTED
+    return BETTER_DOUBTED if _one_of_many(one, judged) else ""
 
 
 def _one_of_many(one: Judged, judged: Sequence[Judged]) -> bool:

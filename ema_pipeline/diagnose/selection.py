@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from ema_pipeline.diagnose.backward import reconsidered
-from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, Judged, judge
+from ema_pipeline.diagnose.claims import BY_OTHERS, Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.ranking import CONTENDERS, rank, unbeaten
 from ema_pipeline.diagnose.rounds import Round, round_of, weighed
@@ -174,5 +174,5 @@ def _acquitted(
     leads = leader is found.judged[0]
     acquitted = replace(leader, doubt="", gain=leader.gain if leads else both.gain)
     others = [j for j in found.judged if j is not leader]
-    others = [replace(j, doubt="") if j.doubt == BETTER_CONTRADICTED else j for j in others]
+    others = [replace(j, doubt="") if j.doubt in BY_OTHERS else j for j in others]
     return weighed(found.ranking, [acquitted, *others], hypotheses, settings, known)

@@ -56,7 +56,7 @@ class DiagnoseSettings(Settings):
         ge=0,
         description="Log evidence that an effect that depends on the amplitude must gain in addition to `claim`, in "
         "tests at several force levels: wrong ones gained up to 17 from what equivalent linearisation leaves out, "
-        "true ones clearly above their limits more than 100. Of generic effects twice as much is asked.",
+        "true ones clearly above their limits mostly more than 100. Of generic effects twice as much is asked.",
     )
     sigmas: float = Field(
         default=2.0,

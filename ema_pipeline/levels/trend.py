@@ -40,8 +40,8 @@ class Samples:
         Hits of one sheet have a common mean; those of one cell, too, about the same force.
     log_force, amplitude : ndarray, (n_hits,)
         ln(force), and the square of the mode's amplitude over the largest one.
-    sheet_dof : ndarray, (n_sheets,), or None
-        Degrees of freedom of a variance that one sheet's own hits tell; infinite for the others.
+    sheet_dof : ndarray, (n_sheets,), or float
+        Degrees of freedom of a variance that a sheet's own hits tell; infinite where it is known.
     """
 
     values: Real
@@ -50,7 +50,7 @@ class Samples:
     cell: Integers
     log_force: Real
     amplitude: Real
-    sheet_dof: Real | None = None
+    sheet_dof: Real | float = np.inf
 
     @property
     def square(self) -> Real:
@@ -68,7 +68,7 @@ class Samples:
         return Samples(
             self.values[on],
             self.variance[on],
-            np.zeros(int(on.sum()), dtype=np.int64),
+            np.zeros(np.count_nonzero(on), dtype=np.int64),
             np.unique(self.cell[on], return_inverse=True)[1],
             self.log_force[on],
             self.amplitude[on],
@@ -136,17 +136,17 @@ def scattered_by_sheet(given: Samples) -> Samples:
     whole = _scatters(given)
     if whole is None:
         return given
-    usual = whole[0].extra(NOTHING_USUAL)
+    of_all = whole[0].extra(NOTHING_USUAL)
     variance, dof = given.variance.copy(), np.full(int(given.sheet.max()) + 1, np.inf)
     for s in np.unique(given.sheet):
         on = given.sheet == s
         own = given.of_sheet(int(s))
-        alone = _scatters(replace(own, variance=own.variance + usual))
+        alone = _scatters(replace(own, variance=own.variance + of_all))
         if alone is not None and not alone[0].shared:
             extra = alone[0].extra(Usual(1.0, SHEET_DOF))
             variance[on] += extra
             if extra > 0:
-                share = extra / (extra + usual + float(np.median(own.variance)))
+                share = extra / (extra + of_all + float(np.median(own.variance)))
                 dof[s] = (alone[0].dof + SHEET_DOF) / share**2
     return replace(given, variance=variance, sheet_dof=dof)
 
@@ -228,9 +228,8 @@ def _slope(given: Samples, regressor: Real, extra: float, dof: float) -> tuple[f
     beta = float(np.sum(weight * across * given.values)) / strength
     force = _centred(given.log_force, weight, given.sheet)
     per_log = beta * float(np.sum(weight * across * force) / np.sum(weight * force**2))
-    if given.sheet_dof is not None:  # Welch and Satterthwaite
-        share = np.bincount(given.sheet, weight * across**2) / strength
-        dof = min(dof, 1 / max(float(np.sum(share**2 / given.sheet_dof)), 1e-300))
+    share = np.bincount(given.sheet, weight * across**2) / strength
+    dof = min(dof, 1 / max(float(np.sum(share**2 / given.sheet_dof)), 1e-300))  # Welch and Satterthwaite
     return 2 * float(stdtr(dof, -abs(beta) * np.sqrt(strength))), per_log
 
 
@@ -243,8 +242,7 @@ def _own_slopes(given: Samples, regressor: Real, extra: float, dof: float) -> fl
     told = strength > 0
     if not told.any():
         return float("nan")
-    if given.sheet_dof is not None:
-        dof = min(dof, float(given.sheet_dof[told].min()))
+    dof = min(dof, float(np.min(np.where(told, given.sheet_dof, np.inf))))
     return float(fdtrc(int(told.sum()), dof, np.mean(moved[told] ** 2 / strength[told])))
 
 

@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from ema_pipeline.diagnose import probability, rounds, selection
-from ema_pipeline.diagnose.claims import BETTER_CONTRADICTED, NO_LESS_ERROR, PREDICTED_WORSE, Judged
+from ema_pipeline.diagnose.claims import (
+    BETTER_CONTRADICTED,
+    BETTER_DOUBTED,
+    NO_LESS_ERROR,
+    PREDICTED_WORSE,
+    Judged,
+)
 from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _groups
 from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.ranking import Ranked, Ranking
@@ -335,6 +341,8 @@ def test_a_linearised_effect_is_one_of_many_where_a_better_one_is_doubted(
     better, one = judged("cubic_spring@a", 31.0, doubt), judged("cubic_spring@b", 30.0)
     better.linearisation, better.needed, one.linearisation = 17.0, needed, linearisation
     assert rounds._one_of_many(one, [better, one]) is passes_by_chance
+    assert rounds._against(one, [better, one], -np.inf) == (BETTER_DOUBTED if passes_by_chance else "")
+    assert rounds._against(one, [better, one], 31.0) == BETTER_CONTRADICTED
 
 
 def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
