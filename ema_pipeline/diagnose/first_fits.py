@@ -14,7 +14,17 @@ from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.score import Score
 from ema_pipeline.inference import Posterior, Unknowns
 from ema_pipeline.observations.base import EffectProblem, Observations
-from ema_pipeline.observations.fitting import QUICK, REFINED, Fit, Model, annealed, refined, transferred, wide
+from ema_pipeline.observations.fitting import (
+    QUICK,
+    REFINED,
+    Fit,
+    Model,
+    annealed,
+    best_refined,
+    refined,
+    transferred,
+    wide,
+)
 
 Schedule = tuple[tuple[float, int], ...]
 
@@ -180,7 +190,7 @@ def _begun(observations: Observations, base: Fit, model: Model) -> Posterior | N
     problem = model.problem(observations)
     begin = transferred(base.posterior, problem.unknowns)
     begun = problem.begun(begin, base.posterior.scatters)
-    return None if begun is None else refined(observations, model, begun).posterior
+    return best_refined(observations, model, begun).posterior if begun else None
 
 
 def _starts(

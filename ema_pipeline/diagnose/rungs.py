@@ -18,10 +18,10 @@ from ema_pipeline.observations.fitting import (
     Model,
     at_scatters,
     averaged,
+    best_refined,
     fit_base,
     learned,
     made_up_of,
-    refined,
     transferred,
     within_scatter,
 )
@@ -125,8 +125,8 @@ def _best_of(observations: Observations, model: Model, before: Fit) -> Fit:
     new = [n for n in problem.sizes if n not in before.posterior.unknowns.index]
     scatters = before.posterior.scatters
     begun = problem.begun(transferred(before.posterior, problem.unknowns, problem.start()), scatters)
-    if begun is not None:
-        return refined(observations, model, begun, scatters)
+    if begun:
+        return best_refined(observations, model, begun, scatters)
     fits = []
     for factor in (1.0, 0.3, -0.5):
         x = transferred(before.posterior, problem.unknowns, problem.start())

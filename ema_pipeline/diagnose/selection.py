@@ -66,6 +66,7 @@ def select(
     """
     observations = observations.suited(known.effects)
     base = start = fit_base(observations, known)
+    observations = observations.about(known.effects, base.posterior)
     rounds: list[Round] = []
     claimed: list[Judged] = []
     rivals: dict[str, tuple[Judged, ...]] = {}

@@ -47,6 +47,34 @@ def force_window(force: NDArray[np.float64], peak: int) -> NDArray[np.float64]:
     return np.asarray(0.5 * (1 + np.cos(np.pi * outside / taper)))
 
 
+def pulse_alone(force: NDArray[np.float64], peak: int) -> tuple[int, NDArray[np.float64]]:
+    """The force of a blow without what the hammer reads before and after it.
+
+    Parameters
+    ----------
+    force : ndarray, (n_samples,)
+    peak : int
+        Sample of the peak.
+
+    Returns
+    -------
+    first : int
+        Sample of the record that it begins at.
+    pulse : ndarray
+    """
+    window = force_window(force, peak)
+    first, last = np.flatnonzero(window)[[0, -1]]
+    cut = slice(int(first), int(last) + 1)
+    return int(first), (force[cut] - _offset(force, find_pulse(force, peak).start)) * window[cut]
+
+
+def _offset(samples: NDArray[np.float64], rest: int) -> NDArray[np.float64]:
+    """Mean of the first `rest` samples, or the median of all where these are few; the last axis is kept."""
+    if rest >= MINIMUM_REST:
+        return np.asarray(samples[..., :rest].mean(axis=-1, keepdims=True))
+    return np.asarray(np.median(samples, axis=-1, keepdims=True))
+
+
 class Windows:
     """The windows of one hit.
 
@@ -80,7 +108,7 @@ class Windows:
         """The windowed force; the samples themselves without windows."""
         if not self.active:
             return samples
-        windowed = samples - self._offset(samples)
+        windowed = samples - _offset(samples, self._rest)
         if self._shape is not None:
             windowed *= self._shape
         return windowed if self._decay is None else windowed * self._decay
@@ -88,10 +116,5 @@ class Windows:
     def responses(self, block: NDArray[np.float64]) -> NDArray[np.float64]:
         """The windowed responses (n_channels, n_samples); the block itself without an exponential window."""
         if self._decay is None:
-            return block - self._offset(block) if self._offsets else block
-        return np.asarray((block - self._offset(block)) * self._decay)
-
-    def _offset(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
-        if self._rest >= MINIMUM_REST:
-            return np.asarray(samples[..., : self._rest].mean(axis=-1, keepdims=True))
-        return np.asarray(np.median(samples, axis=-1, keepdims=True))
+            return block - _offset(block, self._rest) if self._offsets else block
+        return np.asarray((block - _offset(block, self._rest)) * self._decay)

@@ -8,7 +8,8 @@ cancels, and what is left over is noise, whose size it tells.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,12 +17,14 @@ from numpy.typing import NDArray
 from scipy.fft import rfft
 from scipy.ndimage import uniform_filter1d
 
+from ema_pipeline.dof import Dof
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.frf.windows import Windows
+from ema_pipeline.frf.windows import Windows, decay_rate, pulse_alone
 from ema_pipeline.ingest.records import HitSamples
 from ema_pipeline.levels.differences import DEAF, UNKNOWN, participations, solve
+from ema_pipeline.levels.types import Pulses
 from ema_pipeline.modal.types import ModalModel
 
 Real = NDArray[np.float64]
@@ -67,6 +70,8 @@ class HitPoles:
         Participation: the residues over the shape, which a linear mode has alike in all hits of a point.
     size_std : ndarray, (n_hits, n_modes)
         From noise alone, of real and imaginary part; ``inf`` where a hit tells nothing.
+    pulses : Pulses or None
+        None for an uncalibrated hammer, and where hits were sampled at different rates.
     """
 
     names: tuple[str, ...]
@@ -81,6 +86,7 @@ class HitPoles:
     amplitude_m: Real
     size: Complex
     size_std: Real
+    pulses: Pulses | None = None
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,8 @@ class Window:
 @dataclass(frozen=True)
 class _Hit:
     """What is kept of one hit: accelerance and power of the force in each window; at each mode, the force and
-    whether it is clear of the hammer's noise. The force's phase counts from the blow.
+    whether it is clear of the hammer's noise. The force's phase counts from the blow. The pulse as recorded, and its
+    samples before the peak.
     """
 
     name: str
@@ -105,6 +112,10 @@ class _Hit:
     impulse: Complex
     heard: NDArray[np.bool_]
     calibrated: bool
+    struck: Dof
+    rate_hz: float
+    before_peak: int
+    pulse: Real
 
 
 def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSettings) -> HitPoles:
@@ -133,6 +144,7 @@ def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSe
         count += 1
     shape = (count, len(poles))
     names, force = [""] * count, np.zeros(count)
+    in_order = [h for _, h in sorted(itertools.chain(*sheets.values()), key=lambda found: found[0])]
     point, sheet = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
     pole, std = np.tile(poles, (count, 1)), np.full(shape, np.inf)
     amplitude, motion = np.full(shape, np.nan), np.full(shape, np.nan, dtype=np.complex128)
@@ -169,7 +181,21 @@ def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSe
         tuple(names), point, sheet, force,
         np.abs(physical) / (2 * np.pi), std / (2 * np.pi),
         -physical.real / np.abs(physical), std / np.abs(physical), motion, amplitude, size, size_std,
+        _pulses(in_order),
     )  # fmt: skip
+
+
+def _pulses(hits: Sequence[_Hit]) -> Pulses | None:
+    """The pulses of all hits, their peaks at one sample."""
+    if not all(h.calibrated and h.rate_hz == hits[0].rate_hz for h in hits):
+        return None
+    before = max((h.before_peak for h in hits), default=0)
+    after = max((len(h.pulse) - h.before_peak for h in hits), default=0)
+    force = np.zeros((len(hits), before + after))
+    for row, h in zip(force, hits, strict=True):
+        start = before - h.before_peak
+        row[start : start + len(h.pulse)] = h.pulse
+    return Pulses(tuple(h.struck for h in hits), force, before, hits[0].rate_hz if hits else 0.0)
 
 
 def windows_about(poles: Complex, frequency_hz: Real) -> tuple[Window, ...]:
@@ -237,13 +263,20 @@ def _spectra(
     heard = power[line] > clear
     power = np.where(power > clear, power, DEAF)
     acc = one.accelerance()[:, 0]
+    window_decay = decay_rate(settings, one.record_s)
+    peak = hit.hit.peak - hit.hit.start
+    first, pulse = pulse_alone(hit.force, peak)
     return _Hit(
         f"{hit.hit.file}#{hit.hit.number}",
         abs(hit.hit.peak_force),
         max(one.record_s - float(one.delay_s[0]), 0.5 * one.record_s),
         tuple(acc[:, w.lines].copy() for w in windows),
         tuple(power[w.lines] for w in windows),
-        force[line] * np.exp(2j * np.pi * frequency_hz * float(one.delay_s[0])),
+        force[line] * np.exp((2j * np.pi * frequency_hz + window_decay) * float(one.delay_s[0])),
         heard,
         hit.force_calibrated,
+        hit.hit.impact,
+        hit.sample_rate_hz,
+        peak - first,
+        pulse,
     )

@@ -295,9 +295,12 @@ def _hit_modes(found: HitPoles, base: Integers, level: Integers, modal: ModalMod
         found.damping_ratio,
         found.damping_std,
         found.motion_m,
+        found.size,
+        found.size_std,
         frfs.response_decay_rad_s,
         band,
         float(axis[1] - axis[0]),
+        found.pulses,
     )
 
 

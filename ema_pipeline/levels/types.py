@@ -142,6 +142,32 @@ class DecayCurve:
 
 
 @dataclass(frozen=True)
+class Pulses:
+    """What struck the structure, hit by hit.
+
+    Attributes
+    ----------
+    struck : tuple of Dof
+        Where and which way the force is positive.
+    force_n : ndarray, (n_hits, n_samples)
+        0 outside the blow.
+    peak : int
+        Sample at which every hit's force is largest.
+    sample_rate_hz : float
+    """
+
+    struck: tuple[Dof, ...]
+    force_n: NDArray[np.float64]
+    peak: int
+    sample_rate_hz: float
+
+    def only(self, keep: NDArray[np.bool_]) -> Pulses:
+        """Of some of the hits."""
+        struck = tuple(d for d, k in zip(self.struck, keep, strict=True) if k)
+        return Pulses(struck, self.force_n[keep], self.peak, self.sample_rate_hz)
+
+
+@dataclass(frozen=True)
 class HitModes:
     """Modes of a configuration in every single hit at several force levels.
 
@@ -160,12 +186,17 @@ class HitModes:
         Standard deviations from noise alone; ``inf`` where a hit tells nothing of the mode.
     motion_m : complex ndarray, (n_hits, n_modes)
         Displacement amplitude just after the hit where the shape is 1; NaN for an uncalibrated hammer.
+    size, size_std : complex and real ndarray, (n_hits, n_modes)
+        Participation in the FRFs: alike in all hits of a sheet where the structure is linear and they are aimed alike.
+        Standard deviation of either part.
     window_decay_rad_s : float
         Of the exponential window on the responses.
     band_hz : ndarray, (n_modes, 2)
         Lines from which each mode was read.
     line_hz : float
         Their distance.
+    pulses : Pulses or None
+        None for an uncalibrated hammer, and where hits were sampled at different rates.
     """
 
     modes: NDArray[np.int64]
@@ -179,9 +210,12 @@ class HitModes:
     damping_ratio: NDArray[np.float64]
     damping_std: NDArray[np.float64]
     motion_m: NDArray[np.complex128]
+    size: NDArray[np.complex128]
+    size_std: NDArray[np.float64]
     window_decay_rad_s: float
     band_hz: NDArray[np.float64]
     line_hz: float
+    pulses: Pulses | None = None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect, effect_of
-from ema_pipeline.inference import Residuals, Unknowns, joined
+from ema_pipeline.inference import Posterior, Residuals, Unknowns, joined
+from ema_pipeline.observations.hit_lattice import SPACING, MarchedHits
 from ema_pipeline.observations.hit_modes import HitData, comparable
 from ema_pipeline.observations.hit_residuals import (
     AMPLITUDE,
@@ -43,8 +44,11 @@ and a smaller one bends calibrations to them.
 _BEYOND = 3.0
 """Growth of what linearisation leaves out per decay rate by which a pole moves: it is of first order in that."""
 _DECADES = 6.0
-_ALONG, _ACROSS = 19, 3
-"""Sizes that are tried to begin with: their range, and their number for an effect's first size and the others."""
+_ALONG, _ACROSS, _FINE = 19, 3, 41
+"""Sizes that are tried to begin with: their range, and their number for an effect's first size and the others; of teeth
+for their preload alone."""
+_LOWEST = 4
+"""Most of them that fits begin at."""
 
 
 class AmplitudeObservations:
@@ -58,12 +62,20 @@ class AmplitudeObservations:
         Of the configurations that were struck at several levels.
     of_modes : bool
         True where the hits tell only how far the modes of their level lie from those of the linear structure.
+    marched : MarchedHits, optional
+        Of the fit whose structure stands for all where hits are marched; each structure its own where left out.
     """
 
     linearised = True
 
-    def __init__(self, modes: ModeObservations, hits: Sequence[HitData], of_modes: bool = False) -> None:
-        self.modes, self.hits, self.of_modes = modes, tuple(hits), of_modes
+    def __init__(
+        self,
+        modes: ModeObservations,
+        hits: Sequence[HitData],
+        of_modes: bool = False,
+        marched: MarchedHits | None = None,
+    ) -> None:
+        self.modes, self.hits, self.of_modes, self.marched = modes, tuple(hits), of_modes, marched
         self.level_dependent = any(
             h.level_dependent and not modes.rig.assembly(h.configuration).nonlinear for h in hits
         )
@@ -74,6 +86,11 @@ class AmplitudeObservations:
         """See `Observations`."""
         return self
 
+    def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> AmplitudeObservations:
+        """See `Observations`: hits are marched about the structure of this fit."""
+        plain = AmplitudeObservations(self.modes, self.hits, self.of_modes)
+        return AmplitudeObservations(self.modes, self.hits, self.of_modes, MarchedHits(plain, effects, found))
+
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> AmplitudeProblem:
         """See `Observations`."""
         return AmplitudeProblem(self, effects, scales)
@@ -82,7 +99,7 @@ class AmplitudeObservations:
         """See `Observations`."""
         assert isinstance(found.matching, tuple)
         modes = self.modes.holding_out_explained(dataclasses.replace(found, matching=found.matching[0]))
-        return self if modes is self.modes else AmplitudeObservations(modes, self.hits)
+        return self if modes is self.modes else AmplitudeObservations(modes, self.hits, marched=self.marched)
 
     def folds(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
         """Every fourth mode held out in turn, then every force level."""
@@ -91,7 +108,10 @@ class AmplitudeObservations:
     @cached_property
     def _folds(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
         of_modes = [
-            (AmplitudeObservations(kept, self.hits), AmplitudeObservations(out, self.hits, of_modes=True))
+            (
+                AmplitudeObservations(kept, self.hits, marched=self.marched),
+                AmplitudeObservations(out, self.hits, True, self.marched),
+            )
             for kept, out in self.modes.folds()
         ]
         return of_modes + self._levels_in_turn()
@@ -107,8 +127,12 @@ class AmplitudeObservations:
             without_modes = self.modes.with_data(())
             pairs.append(
                 (
-                    AmplitudeObservations(self.modes, [h for h in kept if comparable(h)]),
-                    AmplitudeObservations(without_modes, [h for h in out if comparable(h)]),
+                    AmplitudeObservations(
+                        self.modes, [h for h in kept if comparable(h)], marched=self.marched
+                    ),
+                    AmplitudeObservations(
+                        without_modes, [h for h in out if comparable(h)], marched=self.marched
+                    ),
                 )
             )
         return pairs
@@ -123,7 +147,7 @@ class AmplitudeProblem:
         effects: Sequence[PlacedEffect],
         scales: Mapping[str, float],
     ) -> None:
-        self.observations = observations
+        self.observations, self.effects, self.scales = observations, tuple(effects), scales
         self.modes: ModeProblem = observations.modes.problem(effects, scales)
         self._nonlinear = tuple(e.label for e in effects if not e.effect.linear)
         self._positions: dict[str, tuple[HitData, NDArray[np.int64], NDArray[np.int64]]] = {}
@@ -200,28 +224,49 @@ class AmplitudeProblem:
         names = [n for n in self.sizes if effect_of(n) in self._nonlinear]
         return tuple(self.unknowns.index[n] for n in names)
 
-    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
-        """`x` with the sizes of the effect added last at the best of a grid; None where it is linear.
+    @cached_property
+    def marched_sizes(self) -> tuple[int, ...]:
+        """Positions of the sizes of effects all of whose sizes are lengths: teeth that part. Their hits are marched."""
+        if any(h.pulses is None for h in self.observations.hits):
+            return ()
+        lengths = {
+            e.label
+            for e in self.effects
+            if not e.effect.linear and all(p.unit == "m" for p in e.effect.parameters)
+        }
+        return tuple(self.unknowns.index[n] for n in self.sizes if effect_of(n) in lengths)
+
+    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> list[NDArray[np.float64]]:
+        """`x` with the sizes of the effect added last at the best of a grid; nothing where it is linear.
 
         From far off there is often no slope that leads to the right size: teeth that never part, friction that locks,
-        and a quadratic spring of no size change nothing.
+        and a quadratic spring of no size change nothing. Rows far off count by their logarithm: what other unknowns
+        will take up must not outweigh what most rows say. Of teeth, whose rows go up and down with the size, several
+        lowest points count.
         """
         last = self.model.effects[-1] if self.model.effects else None
         if last is None or last.effect.linear or not self.observations.hits:
-            return None
+            return []
         names = [last.parameter_name(p.name) for p in last.effect.parameters]
         at = [self.unknowns.index[n] for n in names]
-        grids = [_grid(self.sizes[n], _ALONG if i == 0 else _ACROSS) for i, n in enumerate(names)]
+        marched = set(at) <= set(self.marched_sizes)
+        counts = (_FINE, *[1] * (len(names) - 1)) if marched else (_ALONG, *[_ACROSS] * (len(names) - 1))
+        grids = [_grid(self.sizes[n], count) for n, count in zip(names, counts, strict=True)]
+        if marched:
+            grids = [np.rint(g / SPACING) * SPACING for g in grids]
         matching = self.residuals(x, scatters, derivatives=False).matching
-        best, least = x, np.inf
+        trials, costs = [], []
         for values in itertools.product(*grids):
             trial = x.copy()
             trial[at] = values
             found = self.residuals(trial, scatters, matching=matching, derivatives=False)
-            cost = found.cost + 0.5 * float(np.sum(np.square(values)))
-            if cost < least:
-                best, least = trial, cost
-        return best
+            trials.append(trial)
+            costs.append(0.5 * float(np.sum(np.log1p(found.values**2)) + np.sum(np.square(values))))
+        if not marched:
+            return [trials[int(np.argmin(costs))]] if np.isfinite(min(costs)) else [x]
+        around = np.concatenate([[np.inf], costs, [np.inf]])
+        lowest = np.flatnonzero((around[1:-1] < around[:-2]) & (around[1:-1] < around[2:]))
+        return [trials[i] for i in sorted(lowest, key=lambda i: costs[i])[:_LOWEST]] or [x]
 
     def residuals(
         self,

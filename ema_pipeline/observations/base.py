@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect
-from ema_pipeline.inference import Problem, Residuals, Scatter
+from ema_pipeline.inference import Posterior, Problem, Residuals, Scatter
 from ema_pipeline.observations.rig_model import SizeMap
 
 
@@ -33,9 +33,9 @@ class EffectProblem(Problem, Protocol):
         """Nominal values with the effects at `sizes`, or at their start values, (n,)."""
         ...
 
-    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64] | None:
-        """`x` with the sizes of the effect added last where a descent finds its way; None where it does anyway."""
-        return None
+    def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> list[NDArray[np.float64]]:
+        """`x` with the sizes of the effect added last where a descent may find its way; none where it does anyway."""
+        return []
 
     def escapes(
         self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
@@ -72,6 +72,10 @@ class Observations(Protocol):
 
     def suited(self, effects: Sequence[PlacedEffect]) -> Observations:
         """The same data for models with these effects: with unknowns that only they need. Often the same object."""
+        ...
+
+    def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> Observations:
+        """The same data, with what takes long found about a fit with these effects. Often the same object."""
         ...
 
     def folds(self) -> Sequence[tuple[Observations, Observations]]:

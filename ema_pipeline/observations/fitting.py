@@ -41,6 +41,8 @@ REFINED = 12
 
 _RACED = 2
 """Starts that are annealed to the end."""
+_RACE_STEPS = 8
+"""Steps from each of several good starts, after which the best goes on."""
 _MET = 0.05
 """Distance, in units of the prior 1 σ, below which two fits have met while they are still hot."""
 
@@ -179,6 +181,20 @@ def refined(
     """A fit from a good start."""
     problem = model.problem(observations)
     return Fit(model, descend(problem, scatters or wide(observations), start, steps=steps))
+
+
+def best_refined(
+    observations: Observations,
+    model: Model,
+    starts: Sequence[NDArray[np.float64]],
+    scatters: Mapping[str, float] | None = None,
+) -> Fit:
+    """A fit from the best of some starts, after some steps from each."""
+    if len(starts) == 1:
+        return refined(observations, model, starts[0], scatters)
+    short = [refined(observations, model, x, scatters, _RACE_STEPS) for x in starts]
+    best = max(short, key=lambda f: f.log_evidence)
+    return refined(observations, model, best.posterior.x, scatters)
 
 
 def freed(observations: Observations, fit: Fit) -> Fit:

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import from_modal_model
 from ema_pipeline.dof import Dof
-from ema_pipeline.levels.differences import smooth_terms
-from ema_pipeline.levels.types import HitModes
+from ema_pipeline.levels.types import HitModes, Pulses
 from ema_pipeline.mechanics.equivalent import Motions, settled_offsets
-from ema_pipeline.mechanics.laws import Nonlinear
+from ema_pipeline.mechanics.laws import POLYNOMIAL, Nonlinear
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.observations.hit_reading import LAST, drive_gains, momentary_weights
 from ema_pipeline.observations.mode_data import ModeData, prepare
 
 Real = NDArray[np.float64]
@@ -33,9 +33,11 @@ IN_STEP = 4.0
 """Distance of poles, in decay rates, within which modes move in step while they are observed: at this distance the
 weight of one mode's force in the other's pole, 1/|1 - jΔω/2σ|², is 0.2."""
 
-_FIRST, _LAST = 0.03, 8.0
-"""First and last instant, in units of 1/2σ of the fastest and the slowest mode; 99.7 % of the weight is between."""
+_FIRST = 0.03
+"""First instant, in units of 1/2σ of the fastest mode."""
 _PER_EFOLD = 1.1
+_TOLD = 0.15
+"""1 σ of a change of a size that a model tells, over that change: it knows neither every hit's aim nor all modes."""
 _STILL = 1e-300
 _QUASI_STATIC = 0.5
 """Modes below the lowest measured frequency times this take no part in static flexibility: they are slower than the
@@ -55,8 +57,6 @@ _FASTER = 1.5
 """Most by which a mode's motion decays faster or slower in one hit than in most. The weight of each instant is that of
 the median decay; a hit read with nine times that would leave, next to a mode that moves in step, no motion to refer to.
 """
-_FINE = 400
-"""Instants at which the weight of a mode's fit is found before it is put together to few."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,8 @@ class HitData:
         Infinite standard deviations where a hit tells nothing.
     motion : complex ndarray, (h, m)
         Displacement amplitude just after the hit, m.
+    size, size_std : complex and real ndarray, (h, m)
+        Participation in the FRFs, and the standard deviation of either part.
     window_decay : float
         Of the exponential window, 1/s.
     band_hz : ndarray, (m, 2)
@@ -90,6 +92,8 @@ class HitData:
         Force level whose hits gave `reference`; None for all.
     level_dependent : bool
         True where there is no doubt that the structure is not linear.
+    pulses : Pulses or None
+        What struck the structure.
     """
 
     reference: ModeData
@@ -105,11 +109,14 @@ class HitData:
     damping: Real
     damping_std: Real
     motion: Complex
+    size: Complex
+    size_std: Real
     window_decay: float
     band_hz: Real
     line_hz: float
     reference_level: int | None = None
     level_dependent: bool = False
+    pulses: Pulses | None = None
 
     @property
     def configuration(self) -> str:
@@ -146,10 +153,12 @@ class HitData:
     def only(self, keep: NDArray[np.bool_]) -> HitData:
         """Some of the hits."""
         of_hits = (
-            "level", "sheet", "log_frequency", "log_frequency_std", "damping", "damping_std", "motion",
+            "level", "sheet", "log_frequency", "log_frequency_std", "damping", "damping_std", "motion", "size",
+            "size_std",
         )  # fmt: skip
         names = tuple(n for n, k in zip(self.names, keep, strict=True) if k)
-        return replace(self, names=names, **{n: getattr(self, n)[keep] for n in of_hits})
+        pulses = self.pulses and self.pulses.only(keep)
+        return replace(self, names=names, pulses=pulses, **{n: getattr(self, n)[keep] for n in of_hits})
 
     @cached_property
     def poles(self) -> Complex:
@@ -237,37 +246,72 @@ class HitData:
         return float((weight * self._moved).sum() / total) if total else 0.0, total
 
     @cached_property
+    def relative_size(self) -> Complex:
+        """Size of every mode in every hit over the mean of its sheet, (h, m); 1 for a linear mode, well aimed."""
+        return np.asarray(np.where(self.used, self.size, self._mean_size) / self._mean_size)
+
+    @cached_property
+    def quadrature_std(self) -> Real:
+        """1 σ of the imaginary part of `relative_size` from noise and from what a model has wrong of it, (h, m)."""
+        noise = np.where(self.used, self.size_std, np.inf) / np.abs(self._mean_size)
+        return np.asarray(np.hypot(noise, _TOLD * self.relative_size.imag))
+
+    @cached_property
+    def otherwise(self) -> Real:
+        """How far the size of every mode in every hit lies from the mean of its sheet in phase, over that mean, (h, m).
+
+        Mostly by the aim of the hit: what is read then of a mode is the more a neighbour's.
+        """
+        return np.asarray(np.abs(self.relative_size.real - 1))
+
+    @cached_property
+    def _mean_size(self) -> Complex:
+        """Mean of every hit's sheet, (h, m); 1 where no hit tells."""
+        mean = np.ones(self.size.shape, complex)
+        weight = np.where(self.used, np.where(self.used, self.size_std, 1.0) ** -2.0, 0.0)
+        weighted = weight * np.where(self.used, self.size, 0.0)
+        for s in np.unique(self.sheet):
+            of = self.sheet == s
+            total, summed = weight[of].sum(axis=0), weighted[of].sum(axis=0)
+            mean[of] = np.divide(summed, total, out=np.ones_like(summed), where=np.abs(summed) > 0)
+        return mean
+
+    @cached_property
     def weights(self) -> tuple[Real, Complex]:
-        """Instants after the blow, (t,), and the weight of each in the pole that is read of every mode, (t, m)."""
+        """Instants after the blow, (t,), and the weight of each in what is read of every mode, (2, t, m).
+
+        See `hit_reading.momentary_weights`.
+        """
         decay = self.decay + self.window_decay
-        first, last = np.log(0.5 * _FIRST / decay.max()), np.log(0.5 * _LAST / decay.min())
+        first, last = np.log(0.5 * _FIRST / decay.max()), np.log(0.5 * LAST / decay.min())
         instants = np.exp(np.linspace(first, last, int(_PER_EFOLD * (last - first)) + 2))
         columns = [
-            _fit_weights(instants, complex(-s, w), np.arange(low, high, self.line_hz))
+            momentary_weights(instants, complex(-s, w), np.arange(low, high, self.line_hz))
             for s, w, (low, high) in zip(decay, self.omega, self.band_hz.tolist(), strict=True)
         ]
-        return instants, np.stack(columns, axis=1)
+        return instants, np.stack(columns, axis=2)
 
+    @cached_property
+    def product_gains(self) -> Complex:
+        """What is read of every mode where the product of two motions drives it, (2, m, 2m, 2m).
 
-def _fit_weights(instants: Real, pole: complex, lines_hz: Real) -> Complex:
-    """Weight of the momentary change of a pole at each instant in what a fit of differences of spectra reads.
+        By the exponents of the two among `exponents`; see `hit_reading.drive_gains`.
+        """
+        together = self.exponents[:, None] + self.exponents - self.window_decay
+        poles = self.exponents[: len(self.modes)] - self.window_decay
+        return np.stack(
+            [
+                drive_gains(together, pole, np.arange(low, high, self.line_hz))
+                for pole, (low, high) in zip(poles, self.band_hz.tolist(), strict=True)
+            ],
+            axis=1,
+        )
 
-    The fit is that of `levels.differences`: derivatives of the mode's line by its pole and by its size, and smooth
-    terms. A change at the instant τ alone adds exp(λt) from then on.
-    """
-    s = 2j * np.pi * lines_hz - pole
-    columns = np.stack([s**-2, 1 / s, *smooth_terms(len(s))], axis=1)
-    size = np.linalg.norm(columns, axis=0)
-    reads = np.linalg.pinv(columns / size)[0] / size[0]
-    fine = np.linspace(0.0, 0.5 * _LAST / -pole.real, _FINE)
-    weight = (np.exp(-np.outer(fine, s)) / s) @ reads * (fine[1] - fine[0])
-    place = np.interp(fine, instants, np.arange(len(instants), dtype=float))
-    low = np.minimum(place.astype(int), len(instants) - 2)
-    share = place - low
-    total = np.zeros(len(instants), complex)
-    np.add.at(total, low, (1 - share) * weight)
-    np.add.at(total, low + 1, share * weight)
-    return total
+    @cached_property
+    def exponents(self) -> Complex:
+        """Poles of all modes, then their conjugates, 1/s, (2m,)."""
+        pole = 1j * self.omega - self.decay
+        return np.concatenate([pole, pole.conj()])
 
 
 def prepare_hits(
@@ -307,11 +351,14 @@ def prepare_hits(
         hits.damping_ratio,
         hits.damping_std,
         hits.motion_m,
+        hits.size,
+        hits.size_std,
         hits.window_decay_rad_s,
         hits.band_hz,
         hits.line_hz,
         reference_level,
         level_dependent,
+        hits.pulses,
     )
     return data if comparable(data) else None
 
@@ -375,16 +422,19 @@ class Linear:
         return cls(along, (stretch * flexible) @ stretch.T, elsewhere, displacement)
 
 
-def shifted_poles(data: HitData, elements: Sequence[Nonlinear], linear: Linear) -> Complex:
-    """Change of every mode's pole in every hit that nonlinear elements make, 1/s, (h, m).
+def changed_modes(data: HitData, elements: Sequence[Nonlinear], linear: Linear) -> Complex:
+    """What nonlinear elements change of every mode in every hit: its pole, 1/s, and ln of its size, (2, h, m).
 
     Notes
     -----
     A force G·e^{jωt} along v changes the envelope of the mass-normalised coordinate z by (j/2ω)(v·φ)G per second. What
     the force moves of all other modes changes the stretch at once: a spring of stiffness N in a place that gives
     way by S per force stretches by 1/(1 + NS) of what it did.
+
+    A force with the square of the stretch has the sums and differences of all frequencies. It moves poles in second
+    order only, but it sets every mode in motion from the blow on, and that changes sizes in first order.
     """
-    total = np.zeros(linear.displacement.shape, complex)
+    total = np.zeros((2, *linear.displacement.shape), complex)
     if not elements:
         return total
     (instants, weight), omega = data.weights, data.omega
@@ -403,8 +453,21 @@ def shifted_poles(data: HitData, elements: Sequence[Nonlinear], linear: Linear) 
         stiffness = _settled_stiffness(element, motion, offsets[i], linear.elsewhere[i])
         force = (stiffness.reshape(paths[i].shape) * paths[i])[..., group_of]
         ratio = np.where(still, 0.0, force / np.where(still, 1.0, z))
-        total += 0.5j * linear.along[i] / omega * np.einsum("htm,tm->hm", ratio, weight)
+        total += 0.5j * linear.along[i] / omega * np.einsum("htm,ktm->khm", ratio, weight)
+        total += _of_products(data, element, linear.along[i], linear.displacement)
     return total
+
+
+def _of_products(data: HitData, element: Nonlinear, along: Real, displacement: Complex) -> Complex:
+    """What the square of an element's stretch changes of every mode in every hit, (2, h, m)."""
+    if element.law is None or element.law[0] != POLYNOMIAL or not element.law[1]:
+        return np.zeros((2, *displacement.shape), complex)
+    stretch = 0.5 * along * displacement
+    both = np.concatenate([stretch, stretch.conj()], axis=1)
+    driven = np.einsum("ha,krab,hb->khr", both, data.product_gains, both, optimize=True)
+    still = np.abs(displacement) < _STILL
+    relative = np.where(still, 0.0, driven / np.where(still, 1.0, displacement))
+    return np.asarray(1j * element.law[1] * along / data.omega * relative, np.complex128)
 
 
 def _settled_stiffness(element: Nonlinear, motion: Motions, offset: Real, elsewhere: Real) -> Complex:

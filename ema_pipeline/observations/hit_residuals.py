@@ -7,7 +7,7 @@ modes at the measured amplitudes comes from `observations.hit_modes`.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -16,9 +16,11 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from ema_pipeline.inference import Residuals, Scatter
+from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.laws import Nonlinear, Spring
 from ema_pipeline.mechanics.marching import element_rows
-from ema_pipeline.observations.hit_modes import HitData, Linear, shifted_poles
+from ema_pipeline.observations.hit_march import Driven, marched_modes, parts
+from ema_pipeline.observations.hit_modes import HitData, Linear, changed_modes
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE
 from ema_pipeline.observations.modes import Paired
 from ema_pipeline.observations.parts import DAMPING_SCATTER, part_key
@@ -29,13 +31,15 @@ if TYPE_CHECKING:
 DRIFT = "drift"
 HIT_FREQUENCY = "hit_frequency_scatter"
 HIT_DAMPING = "hit_damping_scatter"
+HIT_QUADRATURE = "hit_quadrature_scatter"
+HIT_AIM = "hit_aim_scatter"
 LINEARISATION = "linearisation"
 AMPLITUDE = "amplitude of all modes"
 """Unknown by whose exponential all amplitudes are multiplied."""
 _REMEMBERED = 16
 """Last points at which the shifts are kept: a step is tried without derivatives, then taken with them."""
-_STEP = 1e-3
-"""Step of the differences by sizes, in units of their prior σ."""
+_STEP, _MARCHED_STEP = 1e-3, 1e-2
+"""Steps of the differences by sizes, in units of their prior σ; of what is marched finer ones show its own steps."""
 
 
 def hit_scatters() -> dict[str, Scatter]:
@@ -44,6 +48,8 @@ def hit_scatters() -> dict[str, Scatter]:
         Scatter(DRIFT, "ln f of all modes from hit to hit", 1e-4, 1.0, 1e-4, 20.0),
         Scatter(HIT_FREQUENCY, "ln f of one mode from hit to hit", 3e-5, 1.0, 3e-5, 5.0),
         Scatter(HIT_DAMPING, "ln ζ of one mode from hit to hit", 5e-3, 1.0, 5e-3, 15.0),
+        Scatter(HIT_QUADRATURE, "imaginary part of one mode's size from hit to hit", 3e-3, 1.0, 1e-2, 15.0),
+        Scatter(HIT_AIM, "what is read of a mode over how its size differs", 0.1, 1.0, 0.2, 5.0),
         Scatter(LINEARISATION, "equivalent linearisation", 0.15, 0.3, 0.15, 2.0),
     )
     return {s.name: s for s in known}
@@ -67,42 +73,52 @@ class HitResiduals:
         self.drift, self.left = problem.positions(data)
 
     def residuals(self, derivatives: bool) -> Residuals:
-        """Frequencies, then damping ratios, each without its mean over a sheet's hits."""
+        """Frequencies, damping ratios, then sizes in quadrature, each without its mean over a sheet's hits.
+
+        Of a size only the imaginary part counts, over the mean of the sheet: a hit that is aimed otherwise than the
+        others changes the real one.
+        """
         data, x = self.data, self.x
         used = data.used  # whether the model has the mode or not: to leave it out must not pay
         hit, mode = np.nonzero(used)
         predicted = self.predicted
-        jacobian = np.zeros((2 * len(hit) if derivatives else 0, len(x)))
+        jacobian = np.zeros((3 * len(hit) if derivatives else 0, len(x)))
         if derivatives:
             for i, change in self.changes.items():
                 jacobian[:, i] = -change[:, hit, mode].ravel()
-            rows = np.arange(2 * len(hit))
+            rows = np.arange(3 * len(hit))
             jacobian[rows[: len(hit)], self.drift[hit]] = -1.0
-            jacobian[rows, np.tile(self.left[hit, mode], 2)] = -predicted[:, hit, mode].ravel()
-        difference = np.stack([data.log_frequency, np.log(np.where(used, data.damping, 1.0))])
-        difference = difference - predicted
+            jacobian[rows, np.tile(self.left[hit, mode], 3)] = -predicted[:, hit, mode].ravel()
+        log_damping = np.log(np.where(used, data.damping, 1.0))
+        difference = np.stack([data.log_frequency, log_damping, data.relative_size.imag]) - predicted
         difference[0] -= x[self.drift][:, None]
         values = difference[:, hit, mode]
-        own = np.stack([data.log_frequency_std, data.damping_std / np.where(used, data.damping, 1.0)])
-        own = np.hypot(own, np.stack([data.linearised_std * data.usual_damping, data.linearised_std]))
-        return self._whitened(values, own[:, hit, mode], jacobian, data.sheet[hit], mode)
+        damping_std = data.damping_std / np.where(used, data.damping, 1.0)
+        own = np.stack([data.log_frequency_std, damping_std, data.quadrature_std])
+        in_decay_rates = np.stack([data.usual_damping, *np.ones((2, len(data.modes)))])[:, None]
+        own = np.hypot(own, data.linearised_std * in_decay_rates)
+        otherwise = data.otherwise * in_decay_rates
+        return self._whitened(
+            values, own[:, hit, mode], otherwise[:, hit, mode], jacobian, data.sheet[hit], mode
+        )
 
     @cached_property
     def predicted(self) -> NDArray[np.float64]:
-        """Changes of ln f and of ln ζ of every hit and mode, (2, h, m)."""
-        return self._read(np.exp(self.x[self.left]) * self._moved(self.x))
+        """Changes of ln f, of ln ζ and of the size in quadrature of every hit and mode, (3, h, m)."""
+        return self._read(np.exp(self.x[self.left]) * self.moved(self.x))
 
     @cached_property
     def changes(self) -> dict[int, NDArray[np.float64]]:
         """Derivatives of `predicted` by sizes and by the scale of amplitudes, by their position."""
-        x, moved, left = self.x, self._moved(self.x), np.exp(self.x[self.left])
+        x, moved, left = self.x, self.moved(self.x), np.exp(self.x[self.left])
         found = {}
         for i in (*self.problem.nonlinear_sizes, self.scale):
             if i == self.scale and not np.any(moved):
                 continue
             ahead = x.copy()
-            ahead[i] += _STEP if ahead[i] + _STEP <= self.problem.unknowns.upper[i] else -_STEP
-            found[i] = self._read(left * (self._moved(ahead) - moved) / (ahead[i] - x[i]))
+            step = _MARCHED_STEP if i in self.problem.marched_sizes else _STEP
+            ahead[i] += step if ahead[i] + step <= self.problem.unknowns.upper[i] else -step
+            found[i] = self._read(left * (self.moved(ahead) - moved) / (ahead[i] - x[i]))
         return found
 
     def shift_reference(self, modes: Residuals, derivatives: bool) -> None:
@@ -113,7 +129,9 @@ class HitResiduals:
         if not np.any(self.predicted):
             return
         weight = self.data.reference_weights
-        for kind, (row, mode, sigma) in enumerate(self._rows_of_reference(modes)):
+        for kind, (row, mode, sigma) in enumerate(
+            self._rows_of_reference(modes)
+        ):  # of frequencies and damping
             modes.values[row] -= np.sum(weight * self.predicted[kind], axis=0)[mode] / sigma
             if not derivatives:
                 continue
@@ -149,14 +167,15 @@ class HitResiduals:
         return []
 
     def _read(self, moved: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Changes of ln f and of ln ζ that changes of poles (h, m) make, (2, h, m)."""
+        """Changes of ln f, of ln ζ and of the size in quadrature that changes of poles and ln sizes make, (3, h, m)."""
         usual, omega = self.data.usual_damping, self.data.omega
-        frequency = moved.imag / omega
-        damping = -moved.real / omega - usual * frequency
-        return np.stack([frequency, damping / usual])
+        pole, size = moved
+        frequency = pole.imag / omega
+        damping = -pole.real / omega - usual * frequency
+        return np.stack([frequency, damping / usual, (size * self.data.relative_size).imag])
 
-    def _moved(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Change of every mode's pole in every hit, 1/s, (h, m)."""
+    def moved(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Change of every mode's pole, 1/s, and of ln of its size in every hit, (2, h, m)."""
         own = x[: self.problem.modes.offset]
         key = (self.data.configuration, own.tobytes(), float(x[self.scale]), self.paired.match.tobytes())
         known = self.problem.moved
@@ -167,11 +186,10 @@ class HitResiduals:
         return known[key]
 
     def _found_moved(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
-        data, model = self.data, self.problem.model
-        own = x[: self.problem.modes.offset]
-        assembly = model.assembly(data.configuration, own[model.shape_start :])
+        data = self.data
+        assembly = self._assembly(x)
         elements = assembly.nonlinear
-        total = np.zeros(data.log_frequency.shape, complex)
+        total = np.zeros((2, *data.log_frequency.shape), complex)
         match = self.paired.match[data.modes]
         on = np.flatnonzero(match >= 0)
         if not elements or not len(on):
@@ -179,8 +197,39 @@ class HitResiduals:
         rows = element_rows(assembly, elements)
         solution = self.paired.solution
         stretch = rows @ solution.shapes[: rows.shape[1]]
-        linear = Linear.of(data, stretch, match, solution.eigenvalues, self._displacement(x, match, on))
-        return shifted_poles(data, [self._scaled(e, x) for e in elements], linear)
+        displacement = self._displacement(x, match, on)
+        scaled = [self._scaled(e, x) for e in elements]
+        apart = np.array([self.problem.marched_sizes != () and parts(e) for e in scaled])
+        if np.any(apart) and data.pulses is not None:
+            marched = self._marched(x, [e for e in scaled if parts(e)], stretch[apart], match, displacement)
+            if marched is not None:
+                scaled, stretch = [e for e in scaled if not parts(e)], stretch[~apart]
+                total += marched
+        linear = Linear.of(data, stretch, match, solution.eigenvalues, displacement)
+        return total + changed_modes(data, scaled, linear)
+
+    def _marched(
+        self,
+        x: NDArray[np.float64],
+        elements: Sequence[Nonlinear],
+        stretch: NDArray[np.float64],
+        match: NDArray[np.int64],
+        displacement: NDArray[np.complex128],
+    ) -> NDArray[np.complex128] | None:
+        """What elements that part change, by marching the hits; None where their motion has no bound."""
+        data, lattice = self.data, self.problem.observations.marched
+        if lattice is not None:
+            return lattice.changes(data, self.problem, x)
+        assert data.pulses is not None
+        rows = self.problem.model.sensor_rows(data.configuration, data.pulses.struck)
+        struck = rows @ self.paired.solution.shapes[: rows.shape[1]]
+        scale = float(np.exp(x[self.scale]))
+        driven = Driven.of(data, stretch, struck, match, self.paired.solution.eigenvalues, scale)
+        return marched_modes(data, elements, driven, displacement)
+
+    def _assembly(self, x: NDArray[np.float64]) -> Assembly:
+        model = self.problem.model
+        return model.assembly(self.data.configuration, x[model.shape_start : self.problem.modes.offset])
 
     def _displacement(
         self, x: NDArray[np.float64], match: NDArray[np.int64], on: NDArray[np.int64]
@@ -207,19 +256,28 @@ class HitResiduals:
         self,
         values: NDArray[np.float64],
         own: NDArray[np.float64],
+        otherwise: NDArray[np.float64],
         jacobian: NDArray[np.float64],
         sheet: NDArray[np.int64],
         mode: NDArray[np.int64],
     ) -> Residuals:
         """Rows at unit σ, without what all hits of a sheet share: its mean has no prior."""
         count = values.shape[1]
-        defaults = self.problem.observations.scatters
-        added = np.repeat([self.scatters[HIT_FREQUENCY], self.scatters[HIT_DAMPING]], count) ** 2
-        usual = np.repeat([defaults[HIT_FREQUENCY].default, defaults[HIT_DAMPING].default], count) ** 2
+        kinds = HIT_FREQUENCY, HIT_DAMPING, HIT_QUADRATURE
+        of = np.repeat(np.arange(len(kinds)), count)
+        aimed = otherwise.ravel()
+
+        def added(sizes: Mapping[str, float]) -> dict[str, NDArray[np.float64]]:
+            own_kind = {k: np.where(of == i, sizes[k], 0.0) ** 2 for i, k in enumerate(kinds)}
+            return {**own_kind, HIT_AIM: (sizes[HIT_AIM] * aimed) ** 2}
+
+        now = added(self.scatters)
+        usual = added({k: s.default for k, s in self.problem.observations.scatters.items()})
         noise = own.ravel() ** 2
-        variance, default = noise + added, noise + usual
+        variance, default = noise + sum(now.values()), noise + sum(usual.values())
         group = sheet * (int(mode.max(initial=0)) + 1) + mode
-        group = np.unique(np.concatenate([group, group + group.max(initial=0) + 1]), return_inverse=True)[1]
+        of_kind = np.arange(len(kinds))[:, None] * (group.max(initial=0) + 1)
+        group = np.unique(of_kind + group, return_inverse=True)[1].ravel()
         sigma = np.sqrt(variance) * self.heat
         r = _without_mean(values.ravel() / sigma, 1 / sigma, group)
         j = jacobian
@@ -229,9 +287,7 @@ class HitResiduals:
         scale += 0.5 * float(
             np.sum(np.log(np.bincount(group, 1 / variance) / np.bincount(group, 1 / default)))
         )
-        first = np.arange(2 * count) < count
-        share = {HIT_FREQUENCY: np.where(first, added / variance, 0.0)}
-        share[HIT_DAMPING] = np.where(first, 0.0, added / variance)
+        share = {k: v / variance for k, v in now.items()}
         groups = int(group.max(initial=-1)) + 1
         return Residuals(r, j, share, scale, matching=self.paired.match, projected=groups)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
-from ema_pipeline.inference import Residuals, Scatter, Unknowns, descend, joined
+from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns, descend, joined
 from ema_pipeline.ingest.defaults import CALIBRATION_STD
 from ema_pipeline.loops.types import Loop
 from ema_pipeline.mechanics.assembly import Spring
@@ -165,6 +165,10 @@ class LoopObservations:
         return self.typical.scaled(effect)
 
     def suited(self, effects: Sequence[PlacedEffect]) -> LoopObservations:
+        """See `Observations`."""
+        return self
+
+    def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> LoopObservations:
         """See `Observations`."""
         return self
 

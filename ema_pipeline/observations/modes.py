@@ -18,7 +18,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import ChannelQuality
-from ema_pipeline.inference import Residuals, Scatter, Unknowns, joined
+from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns, joined
 from ema_pipeline.ingest.defaults import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
 from ema_pipeline.modal.assurance import mac
@@ -126,6 +126,10 @@ class ModeObservations:
         if key not in self._has:
             self._has[key] = self.rig.knows(configuration, dof)
         return self._has[key]
+
+    def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> ModeObservations:
+        """See `Observations`."""
+        return self
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> ModeProblem:
         """See `Observations`."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from ema_pipeline.effects.base import PlacedEffect
-from ema_pipeline.inference import Residuals, Scatter, Unknowns
+from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_rows import FREQUENCY, SHAPE, Compared, Rows, stacked
@@ -98,6 +98,10 @@ class PairObservations:
         self.scatters = {**a.scatters, **{s.name: s for s in self.repeat.values()}}
 
     def suited(self, effects: Sequence[PlacedEffect]) -> PairObservations:
+        """See `Observations`."""
+        return self
+
+    def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> PairObservations:
         """See `Observations`."""
         return self
 

@@ -20,7 +20,7 @@ from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.effects.generic import is_place, place_rows
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.inference import Residuals, Scatter
+from ema_pipeline.inference import Posterior, Residuals, Scatter
 from ema_pipeline.ingest.driven import DrivenRecord
 from ema_pipeline.mechanics.simulation import FINE, DrivenSystem, Sensors, Slopes, substeps_for
 from ema_pipeline.observations.linear_start import linear_start
@@ -277,6 +277,10 @@ class RecordObservations:
         return simulated(data, self.substeps, self.slowest_rad_s, self.sensors, system, begin, slopes)
 
     def suited(self, effects: Sequence[PlacedEffect]) -> RecordObservations:
+        """See `Observations`."""
+        return self
+
+    def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> RecordObservations:
         """See `Observations`."""
         return self
 

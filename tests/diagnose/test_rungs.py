@@ -132,16 +132,16 @@ def test_a_ladder_is_measured_at_given_scatters_as_far_as_they_are_known(
 class Problem:
     """Of `_best_of`: one unknown that is known and two sizes, of which one starts at nought."""
 
-    def __init__(self, begun: np.ndarray | None = None) -> None:
+    def __init__(self, *begun: np.ndarray) -> None:
         self.unknowns = Unknowns.plain(("known", "a@x.s", "a@x.t"), 1.0, "", -0.5, 0.7)
         self.sizes, self._begun = dict.fromkeys(self.unknowns.names[1:]), begun
 
     def start(self) -> np.ndarray:
         return np.array([0.0, 0.6, 0.0])
 
-    def begun(self, x: np.ndarray, scatters: object) -> np.ndarray | None:
+    def begun(self, x: np.ndarray, scatters: object) -> list[np.ndarray]:
         assert x.tolist() == [0.25, 0.6, 0.0]
-        return self._begun
+        return list(self._begun)
 
 
 def test_a_further_effect_begins_at_several_sizes_and_the_best_is_kept(
@@ -164,8 +164,12 @@ def test_a_further_effect_begins_at_several_sizes_and_the_best_is_kept(
     np.testing.assert_allclose(tried, [[0.25, 0.6, 0.3], [0.25, 0.18, 0.09], [0.25, -0.3, -0.15]])
     assert best.log_evidence == 9.0
     led: Any = SimpleNamespace(problem=lambda data: Problem(np.array([1.0, 2.0, 3.0])))
-    monkeypatch.setattr(rungs, "refined", lambda data, model, x, scatters: (model, x.tolist(), scatters))
-    assert _best_of(NO_DATA, led, before) == (led, [1.0, 2.0, 3.0], {"s": 1.0})  # type: ignore[comparison-overlap]
+    monkeypatch.setattr(
+        rungs,
+        "best_refined",
+        lambda data, model, starts, scatters: (model, [x.tolist() for x in starts], scatters),
+    )
+    assert _best_of(NO_DATA, led, before) == (led, [[1.0, 2.0, 3.0]], {"s": 1.0})  # type: ignore[comparison-overlap]
     assert len(tried) == 3
 
 

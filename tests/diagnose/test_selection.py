@@ -131,7 +131,9 @@ class Steps:
         self.ranked: dict[int, tuple[Any, ...]] = {}
         self.before: list[Any] = []
         self.observations: Any = SimpleNamespace(
-            linearised=linearised, suited=lambda effects: self.observations
+            linearised=linearised,
+            suited=lambda effects: self.observations,
+            about=lambda effects, found: self.observations,
         )
         monkeypatch.setattr(selection, "fit_base", self.fit_base)
         monkeypatch.setattr(selection, "rank", self.rank)
@@ -151,7 +153,7 @@ class Steps:
 
     def fit_base(self, observations: Any, model: Any, start: Any = None) -> Any:
         self.begun.append((getattr(model, "name", "base"), start))
-        return SimpleNamespace(model=model, at=len(self.begun))
+        return SimpleNamespace(model=model, at=len(self.begun), posterior=None)
 
     def rank(self, observations, base, left, processes, progress, further, unpaired, before) -> Any:
         progress(0.5, "half")
@@ -193,7 +195,9 @@ def test_what_was_claimed_is_asked_about_again_with_unknowns_that_a_later_claim_
 ) -> None:
     a, b, c = judged("a@x", 20.0), judged("b@x", 9.0), judged("c@x", 1.0, "weak")
     steps = Steps(monkeypatch, [[a], [b], [c]])
-    more: Any = SimpleNamespace(linearised=False, suited=lambda effects: more)
+    more: Any = SimpleNamespace(
+        linearised=False, suited=lambda effects: more, about=lambda effects, found: more
+    )
     steps.observations.suited = lambda effects: more if b.hypothesis.placed in effects else steps.observations
     steps.ranked = {
         k: tuple(
@@ -249,7 +253,9 @@ def test_an_effect_that_cannot_be_claimed_alone_is_claimed_where_it_holds_with_a
     monkeypatch.setattr(selection, "replace", replaced)
     monkeypatch.setattr(selection, "weighed", lambda ranking, found, *rest: Round(ranking, tuple(found), {}))
     monkeypatch.setattr(
-        selection, "fit_base", lambda o, m, start=None: SimpleNamespace(model=m, log_evidence=100.0)
+        selection,
+        "fit_base",
+        lambda o, m, start=None: SimpleNamespace(model=m, log_evidence=100.0, posterior=None),
     )
     found = steps.select([j.hypothesis for j in (a, rival, b, c)], SETTINGS, [])
     assert asked == ([] if second_doubt else [21.0])

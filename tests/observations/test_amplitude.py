@@ -28,8 +28,17 @@ from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.observations import amplitude
 from ema_pipeline.observations.amplitude import AmplitudeObservations, AmplitudeProblem, _grid
-from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, refined, transferred
-from ema_pipeline.observations.hit_modes import HitData, Linear, _fit_weights, comparable, shifted_poles
+from ema_pipeline.observations.fitting import (
+    Fit,
+    Model,
+    best_refined,
+    fit_base,
+    learned,
+    refined,
+    transferred,
+)
+from ema_pipeline.observations.hit_modes import HitData, Linear, changed_modes, comparable
+from ema_pipeline.observations.hit_reading import momentary_weights
 from ema_pipeline.observations.hit_residuals import AMPLITUDE
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
@@ -68,23 +77,27 @@ def synthetic(
     clean = HitData(
         prepare(measured), np.arange(m), dofs, shapes.T.astype(complex), tuple(f"h{i}" for i in range(count)),
         np.array(level), np.array(sheet), np.array(LEVELS), np.tile(np.log(omega / (2 * np.pi)), (count, 1)), std,
-        np.full((count, m), RATIO), 1e-5 * np.ones((count, m)), np.array(motion, complex), 0.0,
+        np.full((count, m), RATIO), 1e-5 * np.ones((count, m)), np.array(motion, complex),
+        np.ones((count, m), complex), np.full((count, m), 1e-3), 0.0,
         np.stack([omega / (2 * np.pi) - 8.0, omega / (2 * np.pi) + 8.0], axis=1), LINE_HZ,
         reference_level=0,
     )  # fmt: skip
     stretch = element_rows(assembly, list(elements)) @ shapes
     linear = Linear.of(clean, stretch, np.arange(m), values, clean.motion)
-    moved = shifted_poles(clean, elements, linear)
+    moved, grown = changed_modes(clean, elements, linear)
     frequency = clean.log_frequency + moved.imag / omega + 1e-5 * random.standard_normal((count, m))
     frequency += drift * random.standard_normal((count, 1))
     damping = RATIO - moved.real / omega + 1e-5 * random.standard_normal((count, m))
+    size = np.exp(grown) + 1e-3 * (
+        random.standard_normal((count, m)) + 1j * random.standard_normal((count, m))
+    )
     weight = clean.reference_weights  # the softest hits, too, move a little
     reference = replace(
         clean.reference,
         log_frequency=clean.reference.log_frequency + np.sum(weight * moved.imag / omega, axis=0),
         log_damping=clean.reference.log_damping + np.sum(weight * -moved.real / omega / RATIO, axis=0),
     )
-    hits = replace(clean, reference=reference, log_frequency=frequency, damping=damping)
+    hits = replace(clean, reference=reference, log_frequency=frequency, damping=damping, size=size)
     return AmplitudeObservations(ModeObservations(RIG, [hits.reference]), [hits])
 
 
@@ -99,7 +112,8 @@ def fitted(observations: AmplitudeObservations, base: Fit, label: str) -> tuple[
     model = base.model.plus(parse_effect(label, RIG), {})
     problem = observations.problem(model.effects, model.scales)
     x = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
-    fit = refined(observations, model, problem.begun(x, base.posterior.scatters), base.posterior.scatters)
+    scatters = base.posterior.scatters
+    fit = best_refined(observations, model, problem.begun(x, scatters), scatters)
     return problem, learned(observations, fit).posterior
 
 
@@ -347,7 +361,7 @@ def test_a_hit_read_with_nine_times_the_damping_leaves_no_motion_to_divide_by() 
         linear = Linear.of(
             data, element_rows(assembly, [friction]) @ shapes, np.arange(len(values)), values, data.motion
         )
-        moved.append(abs(shifted_poles(data, [friction], linear)[0, 0]))
+        moved.append(abs(changed_modes(data, [friction], linear)[0, 0, 0]))
     assert moved[1] < 20 * moved[0]
 
 
@@ -551,7 +565,7 @@ def test_what_a_fit_reads_of_a_pole_that_drifts_back_has_a_closed_form(fading: f
     """A change exp(-μt) of the pole adds 1/(s'(s' + μ)) to its line, s' = s - λ; a lasting one is read as it is."""
     pole, lines = complex(-3.0, 2 * np.pi * 50.0), np.arange(45.0, 55.0, 0.25)
     instants = np.geomspace(1e-3, 3.0, 40)
-    found = _fit_weights(instants, pole, lines) @ np.exp(-fading * instants)
+    found = momentary_weights(instants, pole, lines)[0] @ np.exp(-fading * instants)
     s = 2j * np.pi * lines - pole
     columns = np.stack([s**-2, 1 / s, *smooth_terms(len(s))], axis=1)
     expected = np.linalg.lstsq(columns, 1 / (s * (s + fading)), rcond=1e-12)[0][0]

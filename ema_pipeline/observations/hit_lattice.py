@@ -1,0 +1,97 @@
+"""Marched hits about one fit of the model: at sizes on a lattice, and straight in between.
+
+Fits of a hundred hypotheses beside teeth that part ask for the same hits at thousands of points, at which the linear
+structure hardly differs: it is that of one fit for all. So every hit is marched once for each size that is asked for,
+and the answer depends on no order in which that happens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.effects.base import PlacedEffect, effect_of
+from ema_pipeline.inference import Posterior
+from ema_pipeline.observations.fitting import transferred
+from ema_pipeline.observations.hit_modes import HitData
+from ema_pipeline.observations.hit_residuals import AMPLITUDE, HitResiduals
+from ema_pipeline.observations.rig_model import LOG_STD
+
+if TYPE_CHECKING:
+    from ema_pipeline.observations.amplitude import AmplitudeObservations, AmplitudeProblem
+
+Complex = NDArray[np.complex128]
+Integers = NDArray[np.int64]
+
+SPACING = 0.05
+"""Of the lattice, in the unknowns of sizes, of which one is the prior σ."""
+_ON = 1e-6
+
+
+class MarchedHits:
+    """What effects change of the modes in single hits whose sizes are lengths.
+
+    Parameters
+    ----------
+    observations : AmplitudeObservations
+    effects : sequence of PlacedEffect
+    found : Posterior
+        Fit with these effects, whose structure stands for all.
+    """
+
+    def __init__(
+        self, observations: AmplitudeObservations, effects: Sequence[PlacedEffect], found: Posterior
+    ) -> None:
+        self._observations, self._effects, self._found = observations, tuple(effects), found
+        self._problems: dict[tuple[str, ...], AmplitudeProblem] = {}
+        self._nodes: dict[tuple[object, ...], Complex] = {}
+
+    def changes(self, data: HitData, problem: AmplitudeProblem, x: NDArray[np.float64]) -> Complex:
+        """What effects change whose sizes are lengths, as `HitResiduals.moved` has it, of all or some hits."""
+        names, at = self._place(problem, x)
+        low = np.floor(at + _ON).astype(np.int64)
+        first = self._node(data, problem, names, low)
+        result = first.copy()
+        for i in np.flatnonzero(at - low > _ON):
+            ahead = low + (np.arange(len(low)) == i)
+            result += (at[i] - low[i]) * (self._node(data, problem, names, ahead) - first)
+        whole = self._whole(data)
+        if len(data.names) == len(whole.names):
+            return result
+        place = {n: k for k, n in enumerate(whole.names)}
+        return result[:, [place[n] for n in data.names]]
+
+    @staticmethod
+    def _place(problem: AmplitudeProblem, x: NDArray[np.float64]) -> tuple[list[str], NDArray[np.float64]]:
+        """Unknowns that span the lattice, and where `x` lies in it: larger motions are as smaller lengths."""
+        names = [problem.unknowns.names[i] for i in problem.marched_sizes]
+        at, scale = x[list(problem.marched_sizes)], x[problem.unknowns.index[AMPLITUDE]]
+        logarithmic = np.array([problem.sizes[n].logarithmic for n in names])
+        return names, np.where(logarithmic, at - scale / LOG_STD, at * np.exp(-scale)) / SPACING
+
+    def _whole(self, data: HitData) -> HitData:
+        return next(h for h in self._observations.hits if h.configuration == data.configuration)
+
+    def _node(self, data: HitData, problem: AmplitudeProblem, names: list[str], at: Integers) -> Complex:
+        own = {e.label for e in self._effects if e.effect.linear} | {effect_of(n) for n in names}
+        effects = [e for e in problem.effects if e.label in own]
+        labels = tuple(e.label for e in effects)
+        key = (labels, data.configuration, *at.tolist())
+        if key not in self._nodes:
+            if labels not in self._problems:
+                self._problems[labels] = self._observations.problem(effects, problem.scales)
+            self._nodes[key] = self._marched(self._whole(data), self._problems[labels], names, at)
+        return self._nodes[key]
+
+    def _marched(self, data: HitData, problem: AmplitudeProblem, names: list[str], at: Integers) -> Complex:
+        posterior, unknowns = self._found, problem.unknowns
+        x = transferred(posterior, unknowns, problem.start())
+        x[[unknowns.index[n] for n in names]] = at * SPACING
+        x = unknowns.clipped(x)
+        paired = problem.modes.paired(data.reference, x[: len(problem.modes.unknowns)], None)
+        if paired is None:
+            return np.zeros((2, *data.log_frequency.shape), complex)
+        return HitResiduals(problem, data, paired, x, posterior.scatters, 1.0).moved(x)

@@ -1,0 +1,234 @@
+"""What teeth that part change of the modes in single hits, by marching every hit through time.
+
+Teeth part for some hundredths of a second after a blow and are a spring again thereafter: of a mode's decay only the
+begin is other than linear, and with it the sizes of all modes that the teeth move. No equivalent stiffness tells that,
+so the hits themselves are marched, from the recorded force on, in the modes of the linear model. What the elements'
+forces add to each mode is then read as the fit of a single hit reads it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import rfft
+
+from ema_pipeline.levels.differences import smooth_terms
+from ema_pipeline.mechanics.batch import fine_force
+from ema_pipeline.mechanics.laws import PARTING, Nonlinear
+from ema_pipeline.observations.hit_modes import HitData
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Integers = NDArray[np.int64]
+
+_PHASE = 0.4
+"""Phase, in rad, by which the highest mode may turn in one step."""
+_SLOWEST = 2 * np.pi * 1e-2
+"""Rigid-body modes are held by springs so soft that no record sees them, rad/s."""
+_BLOW_S, _LONGER = 0.01, 3.0
+"""Time that is marched at least, s, and factor by which it is extended until no force is left at its end."""
+_STEPS = 3
+
+
+def parts(element: Nonlinear) -> bool:
+    """True for teeth that part, and for all that is loose."""
+    return element.law is not None and element.law[0] == PARTING
+
+
+@dataclass(frozen=True)
+class Driven:
+    """The linear model that blows and elements drive.
+
+    Attributes
+    ----------
+    omega, decay : ndarray, (n,)
+        Of all modes of the model, rad/s and 1/s.
+    stretch : ndarray, (n_elements, n)
+        Of every element in each mass-normalised shape.
+    struck : ndarray, (h, n)
+        Motion of each hit's point along the blow in each shape.
+    match : ndarray of int, (m,)
+        Mode of the model that each hit mode is; -1 for none.
+    scale : float
+        Factor on all forces.
+    """
+
+    omega: Real
+    decay: Real
+    stretch: Real
+    struck: Real
+    match: Integers
+    scale: float
+
+    @classmethod
+    def of(
+        cls, data: HitData, stretch: Real, struck: Real, match: Integers, eigenvalues: Real, scale: float
+    ) -> Driven:
+        """With the poles that were measured where the hits tell them, and the usual damping elsewhere.
+
+        Parameters
+        ----------
+        data : HitData
+        stretch : ndarray, (n_elements, n)
+        struck : ndarray, (h, n)
+        match : ndarray of int, (m,)
+        eigenvalues : ndarray, (n,)
+            (rad/s)².
+        scale : float
+        """
+        omega = np.maximum(np.sqrt(np.maximum(eigenvalues, 0.0)), _SLOWEST)
+        decay = omega * np.median(data.usual_damping)
+        on = match >= 0
+        omega[match[on]], decay[match[on]] = data.omega[on], data.decay[on]
+        return cls(omega, decay, stretch, struck, match, scale)
+
+
+def marched_modes(
+    data: HitData, elements: Sequence[Nonlinear], driven: Driven, displacement: Complex
+) -> Complex | None:
+    """What nonlinear elements change of every mode in every hit: its pole, 1/s, and ln of its size, (2, h, m).
+
+    Parameters
+    ----------
+    data : HitData
+        With `pulses`.
+    elements : sequence of Nonlinear
+    driven : Driven
+    displacement : complex ndarray, (h, m)
+        Amplitude of each modal coordinate just after the blow, as measured.
+
+    Returns
+    -------
+    complex ndarray or None
+        None where the motion grows without bound.
+
+    Notes
+    -----
+    In the envelope z of a mode with pole λ a force f along v adds (j/ω)(v·φ)∫f(τ)exp(-λτ)dτ. Its spectrum is that of
+    the force over jω - λ.
+    """
+    forces, step = _forces(data, elements, driven)
+    if forces is None:
+        return None
+    result = np.zeros((2, *displacement.shape), complex)
+    if not np.any(forces):
+        return result
+    spectra = _spectra(data, forces, step)
+    for r in np.flatnonzero(driven.match >= 0):
+        low, high = data.band_hz[r].tolist()
+        lines = np.arange(low, high, data.line_hz)
+        own = spectra[:, :, np.rint(lines / data.line_hz).astype(int)]
+        drive = 1j / data.omega[r] * np.einsum("j,hjl->hl", driven.stretch[:, driven.match[r]], own)
+        s = 2j * np.pi * lines + data.window_decay - complex(-data.decay[r], data.omega[r])
+        pole, size = _read(s, drive, displacement[:, r], data.decay[r])
+        result[0, :, r], result[1, :, r] = pole, size
+    return result
+
+
+def _forces(data: HitData, elements: Sequence[Nonlinear], driven: Driven) -> tuple[Real | None, float]:
+    """Forces of the elements beside their tangents', (h, n_elements, n_steps), until there are none; step, s."""
+    from ema_pipeline.mechanics.kernel import march  # compiles at its first use
+
+    pulses = data.pulses
+    assert pulses is not None
+    rate = pulses.sample_rate_hz
+    substeps = max(1, int(np.ceil(driven.omega.max() / rate / _PHASE)))
+    poles = np.asarray(1j * driven.omega - driven.decay, np.complex128)
+    moved = driven.stretch / (1j * driven.omega)
+    rows = np.concatenate([moved, moved * poles])[None]
+    laws = np.array([[e.law for e in elements]], dtype=float)
+    nothing = np.zeros((1, 0, len(poles)), complex), np.zeros((1, 0, len(elements)))
+    hits, whole = len(pulses.force_n), int(rate / data.line_hz)
+    found: Real = np.zeros((hits, len(elements), 0))
+    left, count = np.arange(hits), pulses.force_n.shape[1] + int(_BLOW_S * rate)
+    while len(left):
+        count = min(count, whole)
+        force = np.zeros((len(left), count))
+        cut = min(count, pulses.force_n.shape[1])
+        force[:, :cut] = driven.scale * pulses.force_n[left, :cut]
+        inputs = np.concatenate([driven.struck[left], -driven.stretch])[None].astype(complex)
+        straight = fine_force(force, substeps)[1]
+        marched = march(
+            laws,
+            poles[None],
+            inputs,
+            rows,
+            *nothing,
+            straight,
+            1 / (rate * substeps),
+            substeps,
+            trace=True,
+        )
+        if marched.failed.any():
+            return None, 0.0
+        forces = marched.forces[0]
+        found = np.pad(found, ((0, 0), (0, 0), (0, forces.shape[2] - found.shape[2])))
+        found[left] = forces
+        late = np.any(forces[:, :, forces.shape[2] * 2 // 3 :], axis=(1, 2))
+        left = left[late] if count < whole else left[:0]
+        count = int(_LONGER * count)
+    return found, 1 / (rate * substeps)
+
+
+def _spectra(data: HitData, forces: Real, step: float) -> Complex:
+    """Of forces at steps, under the exponential window, at the lines of the FRFs; time counts from the peak."""
+    pulses = data.pulses
+    assert pulses is not None
+    substeps = round(1 / (pulses.sample_rate_hz * step))
+    samples = -(-forces.shape[2] // substeps)
+    padded = np.pad(forces, ((0, 0), (0, 0), (0, samples * substeps - forces.shape[2])))
+    means = padded.reshape(*forces.shape[:2], samples, substeps).mean(axis=3)
+    time = (np.arange(samples) + 0.5 * (substeps - 1) / substeps - pulses.peak) / pulses.sample_rate_hz
+    whole = round(pulses.sample_rate_hz / data.line_hz)
+    spectra = (
+        np.asarray(rfft(means * np.exp(-data.window_decay * time), whole, axis=2)) / pulses.sample_rate_hz
+    )
+    lines = np.arange(spectra.shape[2]) * data.line_hz
+    return np.asarray(spectra * np.exp(-2j * np.pi * lines * time[0]))
+
+
+def _read(s: Complex, drive: Complex, displacement: Complex, decay: float) -> tuple[Complex, Complex]:
+    """Change of the pole, 1/s, and of ln of the size that a fit reads of driven lines, each (h,).
+
+    Parameters
+    ----------
+    s : complex ndarray, (n_lines,)
+        jω - λ.
+    drive : complex ndarray, (h, n_lines)
+        Spectrum of what drives the envelope.
+    displacement : complex ndarray, (h,)
+        Size that was read with the drive.
+    decay : float
+    """
+    smooth = smooth_terms(len(s))
+    still = np.abs(displacement) < 1e-300
+    size = np.where(still, 1.0, displacement)
+    driven = np.where(still[:, None], 0.0, drive) / s / size[:, None]
+    pole, grown = _step(s[None], driven, smooth)
+    begun = 1.0 - grown  # what was there without the drive, over what was read
+    lines = begun[:, None] / s + driven
+    pole = np.where(np.abs(pole) < decay, pole, pole / np.maximum(np.abs(pole), 1e-300) * decay)
+    now = np.ones(len(size), complex)
+    for _ in range(_STEPS):
+        apart = s - pole[:, None]
+        moved, more = _step(apart, lines - now[:, None] / apart, smooth)
+        near = (np.abs(moved) <= decay) & (np.abs(now + more) > 0.1)
+        pole, now = (
+            pole + np.where(near, moved / np.where(near, now, 1.0), 0.0),
+            now + np.where(near, more, 0.0),
+        )
+    return pole, now - begun
+
+
+def _step(s: Complex, lines: Complex, smooth: Real) -> tuple[Complex, Complex]:
+    """Coefficients of 1/s² and 1/s in lines, smooth terms beside them, each (h,)."""
+    one, two = (c - (c @ smooth.T) @ smooth for c in (s**-2, 1 / s))
+    rest = lines - (lines @ smooth.T) @ smooth
+    a, d = (np.sum(np.abs(c) ** 2, axis=1) for c in (one, two))
+    b = np.sum(one.conj() * two, axis=1)
+    right = [np.sum(c.conj() * rest, axis=1) for c in (one, two)]
+    determinant = a * d - np.abs(b) ** 2
+    return (d * right[0] - b * right[1]) / determinant, (a * right[1] - b.conj() * right[0]) / determinant
