@@ -8,7 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.levels.single import HitPoles, excitation
-from ema_pipeline.levels.sizes import plain, relative_sizes, sizes_at_levels, unknown
+from ema_pipeline.levels.sizes import (
+    MISREAD,
+    not_of_aim,
+    plain,
+    relative_sizes,
+    sizes_at_levels,
+    unknown,
+)
 from ema_pipeline.levels.trend import Samples, Trend, combined, samples, scattered_by_sheet, trends
 
 Real = NDArray[np.float64]
@@ -62,18 +69,31 @@ def hit_trends(found: HitPoles, level: Integers, far: NDArray[np.bool_]) -> HitT
             for r in range(n_modes)
         ]
 
-    poles = trends(
-        given(found.frequency_hz, found.frequency_std_hz) + given(found.damping_ratio, found.damping_std)
-    )
     values, std, mean = relative_sizes(found)
+    misread = MISREAD * np.abs(values.real - mean) / np.maximum(mean, 1e-300)
+    decay = np.median(found.damping_ratio, axis=0)
+    poles = trends(
+        given(found.frequency_hz, np.hypot(found.frequency_std_hz, misread * decay * found.frequency_hz))
+        + given(found.damping_ratio, np.hypot(found.damping_std, misread * decay))
+    )
+
     # by themselves: an unsteady hand scatters sizes more than poles, most where oblique hits alone excite
-    sizes = trends([scattered_by_sheet(s) for s in given(values, std)])
+    def of_sizes(part: Real, std: Real) -> tuple[Trend, ...]:
+        return trends([scattered_by_sheet(s) for s in given(part, std)])
+
+    sizes, quadratures = of_sizes(values.real, std), of_sizes(values.imag, std)
+    elsewhere = [
+        of_sizes(values.real, np.where((found.sheet == s)[:, None], np.inf, std))
+        for s in np.unique(found.sheet)
+    ]
     at_levels = tuple(
-        sizes_at_levels(values[:, r], std[:, r], mean[:, r], level, test.extra_std)
+        sizes_at_levels(values.real[:, r], std[:, r], mean[:, r], level, test.extra_std)
         for r, test in enumerate(sizes)
     )
     told = tuple(
-        unknown(test) if gone else plain(test, size)
-        for test, (size, _), gone in zip(sizes, at_levels, far, strict=True)
+        unknown(test) if gone else plain(not_of_aim(test, turned, others), size)
+        for test, turned, others, (size, _), gone in zip(
+            sizes, quadratures, zip(*elsewhere, strict=True), at_levels, far, strict=True
+        )
     )
     return HitTrends(poles[:n_modes], poles[n_modes:], told, at_levels)

@@ -7,6 +7,8 @@ that locks leaves poles that fade as the force grows. The frequencies of the mod
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,6 +16,7 @@ from ema_pipeline.levels.single import HitPoles
 from ema_pipeline.levels.trend import Trend
 
 Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
 PLAIN_SIZE = 0.1
@@ -21,12 +24,18 @@ PLAIN_SIZE = 0.1
 hammer whose reading bends, or a hand that aims otherwise when it strikes harder, changes sizes by some per cent."""
 
 
+MISREAD = 0.2
+"""Change of a mode's pole, in decay rates, that is read of a hit whose size differs from the mean of its sheet by all
+of it: aimed otherwise, it shows more of the neighbours."""
+
 NO_TREND = 0.5
 """P value of a change that is not plain: one that speaks neither for nor against any other test's."""
 
 
-def relative_sizes(found: HitPoles) -> tuple[Real, Real, Real]:
+def relative_sizes(found: HitPoles) -> tuple[Complex, Real, Real]:
     """Every hit's participation along the mean of its sheet, over the largest mean of any sheet.
+
+    A hit that is aimed otherwise than the others of its sheet changes the real part alone: shapes are nearly real.
 
     Parameters
     ----------
@@ -34,8 +43,8 @@ def relative_sizes(found: HitPoles) -> tuple[Real, Real, Real]:
 
     Returns
     -------
-    values, std : ndarray, (n_hits, n_modes)
-        The standard deviation is ``inf`` where a hit tells nothing.
+    values, std : complex and real ndarray, (n_hits, n_modes)
+        The standard deviation of either part is ``inf`` where a hit tells nothing.
     mean : ndarray, (n_hits, n_modes)
         What a linear mode would have there: the mean of the hit's sheet, at most 1.
 
@@ -52,7 +61,7 @@ def relative_sizes(found: HitPoles) -> tuple[Real, Real, Real]:
         mean[of] = np.sum(weight[of] * found.size[of], axis=0) / total
     length = np.abs(mean)
     largest = np.maximum(length.max(axis=0), 1e-300)
-    values = np.real(found.size * mean.conj()) / np.maximum(length, 1e-300) / largest
+    values = found.size * mean.conj() / np.maximum(length, 1e-300) / largest
     known = (length > 0) & np.isfinite(found.size_std)
     return values, np.where(known, found.size_std / largest, np.inf), length / largest
 
@@ -86,6 +95,24 @@ def plain(trend: Trend, size: Real) -> Trend:
     """The test's result, without significance where the size changes by too little to tell of the structure."""
     known = size[np.isfinite(size)]
     return trend if known.size and np.ptp(known) >= PLAIN_SIZE else unknown(trend)
+
+
+def not_of_aim(trend: Trend, quadrature: Trend, elsewhere: Sequence[Trend]) -> Trend:
+    """The test's result, where aim cannot have caused it.
+
+    Hits that are aimed otherwise at one level change the real part of sizes at one point. So either the imaginary part
+    has to change as well, or the real part without any one of the points.
+
+    Parameters
+    ----------
+    trend, quadrature : Trend
+        Of the real and the imaginary part.
+    elsewhere : sequence of Trend
+        Of the real part without each sheet in turn.
+    """
+    others = max((t.p if np.isfinite(t.p) else 1.0 for t in elsewhere), default=trend.p)
+    least = trend.p if len(elsewhere) < 2 else min(quadrature.p, others)
+    return Trend(max(trend.p, least), trend.slope, trend.extra_std)
 
 
 def unknown(trend: Trend) -> Trend:

@@ -113,6 +113,7 @@ def test_sizes_of_single_hits_scatter_as_their_standard_deviations_say() -> None
     frfs = estimate_frfs(hits)
     found = single_hits(lambda: hits, identify(frfs, ModalSettings()), frfs, FrfSettings())
     values, std, mean = relative_sizes(found)
+    values = values.real
     assert mean.max(axis=0) == pytest.approx(np.ones(3))
     z = (values - mean) / std
     for soft in (found.force_n < 35, found.force_n > 100):
