@@ -47,8 +47,10 @@ _DECADES = 6.0
 _ALONG, _ACROSS, _FINE = 19, 3, 41
 """Sizes that are tried to begin with: their range, and their number for an effect's first size and the others; of teeth
 for their preload alone."""
-_LOWEST = 4
+_LOWEST = 3
 """Most of them that fits begin at."""
+_BESIDE = (-2, -1, 1, 2)
+"""Places of the lattice about these that are tried, too: between two sizes of the grid others may fit far better."""
 
 
 class AmplitudeObservations:
@@ -241,8 +243,8 @@ class AmplitudeProblem:
 
         From far off there is often no slope that leads to the right size: teeth that never part, friction that locks,
         and a quadratic spring of no size change nothing. Rows far off count by their logarithm: what other unknowns
-        will take up must not outweigh what most rows say. Of teeth, whose rows go up and down with the size, several
-        lowest points count.
+        will take up must not outweigh what most rows say. Of teeth, whose rows go up and down with the size, some
+        lowest points count, once what is known least has followed.
         """
         last = self.model.effects[-1] if self.model.effects else None
         if last is None or last.effect.linear or not self.observations.hits:
@@ -255,18 +257,36 @@ class AmplitudeProblem:
         if marched:
             grids = [np.rint(g / SPACING) * SPACING for g in grids]
         matching = self.residuals(x, scatters, derivatives=False).matching
-        trials, costs = [], []
-        for values in itertools.product(*grids):
+
+        def tried(values: Sequence[float]) -> tuple[float, NDArray[np.float64]]:
             trial = x.copy()
             trial[at] = values
-            found = self.residuals(trial, scatters, matching=matching, derivatives=False)
-            trials.append(trial)
-            costs.append(0.5 * float(np.sum(np.log1p(found.values**2)) + np.sum(np.square(values))))
+            found = self.residuals(trial, scatters, matching=matching, derivatives=marched, by_sizes=False)
+            cost = self._followed(found, scatters) if marched else float(np.sum(np.log1p(found.values**2)))
+            return 0.5 * (cost + float(np.sum(np.square(values)))), trial
+
+        places = list(itertools.product(*grids))
+        tries = [tried(values) for values in places]
+        costs = np.array([cost for cost, _ in tries])
         if not marched:
-            return [trials[int(np.argmin(costs))]] if np.isfinite(min(costs)) else [x]
+            return [tries[int(np.argmin(costs))][1]] if np.isfinite(min(costs)) else [x]
         around = np.concatenate([[np.inf], costs, [np.inf]])
         lowest = np.flatnonzero((around[1:-1] < around[:-2]) & (around[1:-1] < around[2:]))
-        return [trials[i] for i in sorted(lowest, key=lambda i: costs[i])[:_LOWEST]] or [x]
+        best = []
+        for i in sorted(lowest, key=lambda i: costs[i])[:_LOWEST]:
+            near = [(places[i][0] + k * SPACING, *places[i][1:]) for k in _BESIDE]
+            best.append(min([tries[i], *map(tried, near)], key=lambda one: one[0]))
+        return [trial for _, trial in sorted(best, key=lambda one: one[0])] or [x]
+
+    def _followed(self, found: Residuals, scatters: Mapping[str, float]) -> float:
+        """Sum of squares once every hit's drift and what the calculation leaves out have followed in one step."""
+        prior = self.unknowns.prior_std(scatters)
+        kinds = (DRIFT, LINEARISATION)
+        columns = np.flatnonzero([self.unknowns.scatter[i] in kinds for i in range(len(self.unknowns))])
+        jacobian = found.jacobian[:, columns] * prior[columns]
+        normal = jacobian.T @ jacobian + np.eye(len(columns))
+        right = jacobian.T @ found.values
+        return float(found.values @ found.values - right @ np.linalg.solve(normal, right))
 
     def residuals(
         self,
@@ -276,8 +296,9 @@ class AmplitudeProblem:
         heat: float = 1.0,
         matching: object = None,
         derivatives: bool = True,
+        by_sizes: bool = True,
     ) -> Residuals:
-        """See `Problem`."""
+        """See `Problem`; without `by_sizes` derivatives by sizes that depend on the amplitude are left at zero."""
         given = matching if isinstance(matching, tuple) and len(matching) == 2 else (None, None)
         count = len(self.modes.unknowns)
         modes = self.modes.residuals(
@@ -293,11 +314,11 @@ class AmplitudeProblem:
                 parts.append(Residuals(np.full(1, np.inf), np.zeros((1, len(x)))))
                 continue
             hits = HitResiduals(self, data, paired, x, scatters, heat)
-            hits.shift_reference(parts[0], derivatives)
+            hits.shift_reference(parts[0], derivatives and by_sizes)
             if self.observations.of_modes:
                 parts.append(Residuals(np.zeros(0), np.zeros((0, len(x))), matching=paired.match))
             else:
-                parts.append(hits.residuals(derivatives))
+                parts.append(hits.residuals(derivatives, by_sizes))
         return dataclasses.replace(
             stacked(parts, len(x)), matching=(modes.matching, tuple(p.matching for p in parts[1:]))
         )

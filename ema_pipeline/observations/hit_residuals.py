@@ -72,7 +72,7 @@ class HitResiduals:
         self.scale = problem.unknowns.index[AMPLITUDE]
         self.drift, self.left = problem.positions(data)
 
-    def residuals(self, derivatives: bool) -> Residuals:
+    def residuals(self, derivatives: bool, by_sizes: bool = True) -> Residuals:
         """Frequencies, damping ratios, then sizes in quadrature, each without its mean over a sheet's hits.
 
         Of a size only the imaginary part counts, over the mean of the sheet: a hit that is aimed otherwise than the
@@ -84,7 +84,7 @@ class HitResiduals:
         predicted = self.predicted
         jacobian = np.zeros((3 * len(hit) if derivatives else 0, len(x)))
         if derivatives:
-            for i, change in self.changes.items():
+            for i, change in self.changes.items() if by_sizes else ():
                 jacobian[:, i] = -change[:, hit, mode].ravel()
             rows = np.arange(3 * len(hit))
             jacobian[rows[: len(hit)], self.drift[hit]] = -1.0
