@@ -17,7 +17,7 @@ from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, averaged, within_scatter
 from ema_pipeline.observations.hit_residuals import AMPLITUDE
 
-HELD_OUT_TIE, HELD_OUT_SHARE = 1.0, 0.05
+HELD_OUT_TIE, HELD_OUT_SHARE, LINEARISED_SHARE = 1.0, 0.05, 0.1
 """Log density of data held out by which a claim may be behind, and that share of its gain: few modes predict no better
 with a small effect than without, and modes that have no partner without the effect, of which most of a large gain may
 come, are never held out. What equivalent linearisation leaves out makes the share larger."""
@@ -124,7 +124,7 @@ def judge(
         asked = observations.holding_out_explained(base.posterior.residuals)
         before, after = (held_out(asked, fit, settings.processes) for fit in (base, mended))
         left = left_of_close_modes(base, mended)
-        share = settings.linearised if _linearised(observations, ranked.hypothesis) else HELD_OUT_SHARE
+        share = LINEARISED_SHARE if _linearised(observations, ranked.hypothesis) else HELD_OUT_SHARE
         tie = HELD_OUT_TIE + share * max(min(gain, left), 0.0)
         doubt = _contradicted(base, mended, before, after, tie)
         if not doubt and left < needed:

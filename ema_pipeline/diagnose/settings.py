@@ -44,7 +44,7 @@ class DiagnoseSettings(Settings):
         "evidence after Kass and Raftery (1995).",
     )
     linearised: float = Field(
-        default=0.1,
+        default=0.25,
         ge=0,
         lt=1,
         description="Once amplitude-dependent effects are claimed, a further effect must gain this share of their log "

@@ -202,7 +202,7 @@ def test_modes_that_move_with_the_force_are_not_explained_by_a_model_that_moves_
 
 
 @pytest.mark.parametrize(
-    ("linearised", "share"), [(True, SETTINGS.linearised), (False, claims.HELD_OUT_SHARE)]
+    ("linearised", "share"), [(True, claims.LINEARISED_SHARE), (False, claims.HELD_OUT_SHARE)]
 )
 def test_data_held_out_may_speak_against_an_effect_by_a_share_of_its_gain(
     monkeypatch: pytest.MonkeyPatch, linearised: bool, share: float
