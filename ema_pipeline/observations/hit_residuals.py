@@ -76,28 +76,34 @@ class HitResiduals:
         """Frequencies, damping ratios, then sizes in quadrature, each without its mean over a sheet's hits.
 
         Of a size only the imaginary part counts, over the mean of the sheet: a hit that is aimed otherwise than the
-        others changes the real one.
+        others changes the real one. Its arc tangent counts: how far a weak mode is driven beyond what it was at first
+        no calculation tells well.
         """
         data, x = self.data, self.x
         used = data.used  # whether the model has the mode or not: to leave it out must not pay
         hit, mode = np.nonzero(used)
         predicted = self.predicted
+        told, slope = np.arctan(predicted[2]), np.ones_like(predicted)
+        slope[2] = 1 / (1 + predicted[2] ** 2)
         jacobian = np.zeros((3 * len(hit) if derivatives else 0, len(x)))
         if derivatives:
             for i, change in self.changes.items() if by_sizes else ():
-                jacobian[:, i] = -change[:, hit, mode].ravel()
+                jacobian[:, i] = -(slope * change)[:, hit, mode].ravel()
             rows = np.arange(3 * len(hit))
             jacobian[rows[: len(hit)], self.drift[hit]] = -1.0
-            jacobian[rows, np.tile(self.left[hit, mode], 3)] = -predicted[:, hit, mode].ravel()
+            jacobian[rows, np.tile(self.left[hit, mode], 3)] = -(slope * predicted)[:, hit, mode].ravel()
         log_damping = np.log(np.where(used, data.damping, 1.0))
-        difference = np.stack([data.log_frequency, log_damping, data.relative_size.imag]) - predicted
+        turned = data.relative_size.imag
+        difference = np.stack([data.log_frequency, log_damping, np.arctan(turned)])
+        difference -= np.stack([*predicted[:2], told])
         difference[0] -= x[self.drift][:, None]
         values = difference[:, hit, mode]
         damping_std = data.damping_std / np.where(used, data.damping, 1.0)
-        own = np.stack([data.log_frequency_std, damping_std, data.quadrature_std])
+        bent = 1 / (1 + turned**2)
+        own = np.stack([data.log_frequency_std, damping_std, data.quadrature_std * bent])
         in_decay_rates = np.stack([data.usual_damping, *np.ones((2, len(data.modes)))])[:, None]
         own = np.hypot(own, data.linearised_std * in_decay_rates)
-        otherwise = data.otherwise * in_decay_rates
+        otherwise = np.stack([np.ones_like(bent), np.ones_like(bent), bent]) * data.otherwise * in_decay_rates
         return self._whitened(
             values, own[:, hit, mode], otherwise[:, hit, mode], jacobian, data.sheet[hit], mode
         )
