@@ -90,6 +90,7 @@ class MarchedHits:
         posterior, unknowns = self._found, problem.unknowns
         x = transferred(posterior, unknowns, problem.start())
         x[[unknowns.index[n] for n in names]] = at * SPACING
+        x[unknowns.index[AMPLITUDE]] = 0.0
         x = unknowns.clipped(x)
         paired = problem.modes.paired(data.reference, x[: len(problem.modes.unknowns)], None)
         if paired is None:
