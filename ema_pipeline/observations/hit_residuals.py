@@ -103,7 +103,8 @@ class HitResiduals:
         own = np.stack([data.log_frequency_std, damping_std, data.quadrature_std * bent])
         in_decay_rates = np.stack([data.usual_damping, *np.ones((2, len(data.modes)))])[:, None]
         own = np.hypot(own, data.linearised_std * in_decay_rates)
-        otherwise = np.stack([np.ones_like(bent), np.ones_like(bent), bent]) * data.otherwise * in_decay_rates
+        # not bent by the arc tangent: where aim alone excites a mode, its phase is anything
+        otherwise = data.otherwise * in_decay_rates
         return self._whitened(
             values, own[:, hit, mode], otherwise[:, hit, mode], jacobian, data.sheet[hit], mode
         )

@@ -173,3 +173,19 @@ def test_how_far_a_hit_is_aimed_otherwise_is_noise_of_what_is_read() -> None:
         drift = problem.unknowns.index[f"drift of test {data.names[4]}"]
         told.append(np.linalg.norm(problem.residuals(problem.start(), scatters).jacobian[:, drift]))
     assert told[1] < 0.5 * told[0]
+
+
+def test_a_mode_that_aim_alone_excites_tells_nothing_by_its_phase() -> None:
+    """Over a mean of nearly nothing sizes were ±70 with any phase, and friction of 1 mN explained it."""
+    (data,) = simulated("teeth").hits
+    mode = int(np.flatnonzero(data.used.all(axis=0) | data.used[:6].all(axis=0))[0])
+    astray = data.size.copy()
+    mean = data._mean_size[0, mode]
+    astray[:6, mode] = mean * (1 + 70 * np.array([1.0, -1.0, 0.9, -0.8, 0.7, -0.8]) * np.exp(0.5j))
+    costs = []
+    for hits in (data, replace(data, size=astray)):
+        observations = AmplitudeObservations(simulated("teeth").modes, [hits])
+        problem = observations.problem((), {})
+        scatters = {n: s.default for n, s in observations.scatters.items()}
+        costs.append(problem.residuals(problem.start(), scatters).cost)
+    assert costs[1] < costs[0] + 10
