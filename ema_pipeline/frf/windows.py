@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.frf.settings import FrfSettings
-from ema_pipeline.ingest.pulse import find_pulse
+from ema_pipeline.ingest.pulse import Pulse, find_pulse
 from ema_pipeline.ingest.records import HitSamples
 
 AUTO_END = 0.01
@@ -38,11 +38,15 @@ def force_window(force: NDArray[np.float64], peak: int) -> NDArray[np.float64]:
     -------
     ndarray, (n_samples,)
     """
-    pulse = find_pulse(force, peak)
+    return _window_about(find_pulse(force, peak), force.size)
+
+
+def _window_about(pulse: Pulse, count: int) -> NDArray[np.float64]:
+    """`force_window` of a pulse that was found, (count,)."""
     # The anti-alias filter's ringing belongs to the pulse: it shapes force and response alike.
     margin = int(2 * pulse.width) + 8
     taper = 2 * margin
-    place = np.arange(force.size)
+    place = np.arange(count)
     outside = np.maximum(pulse.start - margin - place, place - (pulse.stop - 1 + margin)).clip(0, taper)
     return np.asarray(0.5 * (1 + np.cos(np.pi * outside / taper)))
 
@@ -62,10 +66,11 @@ def pulse_alone(force: NDArray[np.float64], peak: int) -> tuple[int, NDArray[np.
         Sample of the record that it begins at.
     pulse : ndarray
     """
-    window = force_window(force, peak)
+    found = find_pulse(force, peak)
+    window = _window_about(found, force.size)
     first, last = np.flatnonzero(window)[[0, -1]]
     cut = slice(int(first), int(last) + 1)
-    return int(first), (force[cut] - _offset(force, find_pulse(force, peak).start)) * window[cut]
+    return int(first), (force[cut] - _offset(force, found.start)) * window[cut]
 
 
 def _offset(samples: NDArray[np.float64], rest: int) -> NDArray[np.float64]:

@@ -77,8 +77,8 @@ def hit_trends(found: HitPoles, level: Integers, far: NDArray[np.bool_]) -> HitT
         + given(found.damping_ratio, np.hypot(found.damping_std, misread * decay))
     )
 
-    # by themselves: an unsteady hand scatters sizes more than poles, most where oblique hits alone excite
     def of_sizes(part: Real, std: Real) -> tuple[Trend, ...]:
+        # by themselves: an unsteady hand scatters sizes more than poles, most where oblique hits alone excite
         return trends([scattered_by_sheet(s) for s in given(part, std)])
 
     sizes, quadratures = of_sizes(values.real, std), of_sizes(values.imag, std)

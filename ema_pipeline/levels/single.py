@@ -8,7 +8,6 @@ cancels, and what is left over is noise, whose size it tells.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -136,15 +135,15 @@ def single_hits(hits: Hits, modal: ModalModel, frfs: FrfSet, frf_settings: FrfSe
     windows = windows_about(poles, frfs.frequency_hz)
     frequency = np.abs(poles) / (2 * np.pi)
     sheets: dict[tuple[str, tuple[str, ...]], list[tuple[int, _Hit]]] = {}
-    count = 0
+    in_order: list[_Hit] = []
     for hit in hits():
         one = estimate_frfs([hit], frf_settings)
         key = (one.inputs[0].point, tuple(d.point for d in one.outputs))
-        sheets.setdefault(key, []).append((count, _spectra(hit, one, windows, frequency, frf_settings)))
-        count += 1
+        in_order.append(_spectra(hit, one, windows, frequency, frf_settings))
+        sheets.setdefault(key, []).append((len(in_order) - 1, in_order[-1]))
+    count = len(in_order)
     shape = (count, len(poles))
     names, force = [""] * count, np.zeros(count)
-    in_order = [h for _, h in sorted(itertools.chain(*sheets.values()), key=lambda found: found[0])]
     point, sheet = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
     pole, std = np.tile(poles, (count, 1)), np.full(shape, np.inf)
     amplitude, motion = np.full(shape, np.nan), np.full(shape, np.nan, dtype=np.complex128)

@@ -53,17 +53,23 @@ def relative_sizes(found: HitPoles) -> tuple[Complex, Real, Real]:
     The mean holds the hit's own noise. That shifts all hits of a sheet by the same amount, since the mean is
     weighted with the noise, and only their differences are looked at.
     """
-    weight = found.size_std**-2.0
-    mean = np.zeros_like(found.size)
-    for s in np.unique(found.sheet):
-        of = found.sheet == s
-        total = np.maximum(weight[of].sum(axis=0), 1e-300)
-        mean[of] = np.sum(weight[of] * found.size[of], axis=0) / total
+    mean = means_of_sheets(found.size, found.size_std, found.sheet)
     length = np.abs(mean)
     largest = np.maximum(length.max(axis=0), 1e-300)
     values = found.size * mean.conj() / np.maximum(length, 1e-300) / largest
     known = (length > 0) & np.isfinite(found.size_std)
     return values, np.where(known, found.size_std / largest, np.inf), length / largest
+
+
+def means_of_sheets(size: Complex, std: Real, sheet: Integers) -> Complex:
+    """Weighted mean over every hit's sheet, (n_hits, n_modes); 0 where no hit tells: all ``std`` are ``inf`` there."""
+    weight = std**-2.0
+    mean = np.zeros_like(size)
+    for s in np.unique(sheet):
+        of = sheet == s
+        total = np.maximum(weight[of].sum(axis=0), 1e-300)
+        mean[of] = np.sum(weight[of] * size[of], axis=0) / total
+    return mean
 
 
 def sizes_at_levels(

@@ -30,7 +30,9 @@ _SLOWEST = 2 * np.pi * 1e-2
 """Rigid-body modes are held by springs so soft that no record sees them, rad/s."""
 _BLOW_S, _LONGER = 0.01, 3.0
 """Time that is marched at least, s, and factor by which it is extended until no force is left at its end."""
-_STEPS = 3
+_STEPS, _LEFT = 3, 0.1
+"""Steps of the fit that reads a mode anew about what it found, and least share of its size that a step may leave."""
+_STILL = 1e-300
 
 
 def parts(element: Nonlinear) -> bool:
@@ -204,18 +206,18 @@ def _read(s: Complex, drive: Complex, displacement: Complex, decay: float) -> tu
     decay : float
     """
     smooth = smooth_terms(len(s))
-    still = np.abs(displacement) < 1e-300
+    still = np.abs(displacement) < _STILL
     size = np.where(still, 1.0, displacement)
     driven = np.where(still[:, None], 0.0, drive) / s / size[:, None]
     pole, grown = _step(s[None], driven, smooth)
     begun = 1.0 - grown  # what was there without the drive, over what was read
     lines = begun[:, None] / s + driven
-    pole = np.where(np.abs(pole) < decay, pole, pole / np.maximum(np.abs(pole), 1e-300) * decay)
+    pole = np.where(np.abs(pole) < decay, pole, pole / np.maximum(np.abs(pole), _STILL) * decay)
     now = np.ones(len(size), complex)
     for _ in range(_STEPS):
         apart = s - pole[:, None]
         moved, more = _step(apart, lines - now[:, None] / apart, smooth)
-        near = (np.abs(moved) <= decay) & (np.abs(now + more) > 0.1)
+        near = (np.abs(moved) <= decay) & (np.abs(now + more) > _LEFT)
         pole, now = (
             pole + np.where(near, moved / np.where(near, now, 1.0), 0.0),
             now + np.where(near, more, 0.0),

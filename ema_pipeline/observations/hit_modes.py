@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import from_modal_model
 from ema_pipeline.dof import Dof
+from ema_pipeline.levels.sizes import means_of_sheets
 from ema_pipeline.levels.types import HitModes, Pulses
 from ema_pipeline.mechanics.equivalent import Motions, settled_offsets
 from ema_pipeline.mechanics.laws import POLYNOMIAL, Nonlinear
@@ -267,14 +268,9 @@ class HitData:
     @cached_property
     def _mean_size(self) -> Complex:
         """Mean of every hit's sheet, (h, m); 1 where no hit tells."""
-        mean = np.ones(self.size.shape, complex)
-        weight = np.where(self.used, np.where(self.used, self.size_std, 1.0) ** -2.0, 0.0)
-        weighted = weight * np.where(self.used, self.size, 0.0)
-        for s in np.unique(self.sheet):
-            of = self.sheet == s
-            total, summed = weight[of].sum(axis=0), weighted[of].sum(axis=0)
-            mean[of] = np.divide(summed, total, out=np.ones_like(summed), where=np.abs(summed) > 0)
-        return mean
+        size, std = np.where(self.used, self.size, 0.0), np.where(self.used, self.size_std, np.inf)
+        mean = means_of_sheets(size, std, self.sheet)
+        return np.where(mean == 0, 1.0, mean)
 
     @cached_property
     def weights(self) -> tuple[Real, Complex]:

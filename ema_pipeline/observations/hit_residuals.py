@@ -136,9 +136,7 @@ class HitResiduals:
         if not np.any(self.predicted):
             return
         weight = self.data.reference_weights
-        for kind, (row, mode, sigma) in enumerate(
-            self._rows_of_reference(modes)
-        ):  # of frequencies and damping
+        for kind, (row, mode, sigma) in enumerate(self._rows_of_reference(modes)):
             modes.values[row] -= np.sum(weight * self.predicted[kind], axis=0)[mode] / sigma
             if not derivatives:
                 continue
@@ -206,12 +204,15 @@ class HitResiduals:
         stretch = rows @ solution.shapes[: rows.shape[1]]
         displacement = self._displacement(x, match, on)
         scaled = [self._scaled(e, x) for e in elements]
-        apart = np.array([self.problem.marched_sizes != () and parts(e) for e in scaled])
-        if np.any(apart) and data.pulses is not None:
-            marched = self._marched(x, [e for e in scaled if parts(e)], stretch[apart], match, displacement)
+        apart = [e for e in scaled if parts(e)] if self.problem.marched_sizes else []
+        if apart:
+            of_apart = np.array([parts(e) for e in scaled])
+            marched = self._marched(x, apart, stretch[of_apart], match, displacement)
             if marched is not None:
-                scaled, stretch = [e for e in scaled if not parts(e)], stretch[~apart]
+                scaled, stretch = [e for e in scaled if not parts(e)], stretch[~of_apart]
                 total += marched
+        if not scaled:
+            return total
         linear = Linear.of(data, stretch, match, solution.eigenvalues, displacement)
         return total + changed_modes(data, scaled, linear)
 
