@@ -86,7 +86,7 @@ def summary(
             f"{before:.2f} to {after:.2f}."
         )
     if verdict == "adequate":
-        odds = f"Probability that nothing is missing: {probability_text(nothing)}."
+        odds = f"Probability that nothing is missing that these data could show: {probability_text(nothing)}."
         if best[0] and nothing < DOUBTFUL:
             odds += f" {_candidate(best)}"
         return f"The model explains the data: error {before:.2f}. {odds}"

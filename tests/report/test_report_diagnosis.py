@@ -392,8 +392,8 @@ def test_an_adequate_model_with_a_likely_candidate_says_which_and_why_it_is_not_
     best = ("spring@m2.x", "Not claimed: its size is within 2 standard deviations of zero.")
     doubtful = sentences.summary("adequate", [], (1.2, 1.2), 0.04, best)
     assert doubtful == (
-        "The model explains the data: error 1.20. Probability that nothing is missing: 4.0 %. The best candidate is "
-        "spring at m2.x. Not claimed: its size is within 2 standard deviations of zero."
+        "The model explains the data: error 1.20. Probability that nothing is missing that these data could show: "
+        "4.0 %. The best candidate is spring at m2.x. Not claimed: its size is within 2 standard deviations of zero."
     )
     assert "candidate" not in sentences.summary("adequate", [], (1.2, 1.2), 0.6, best)
     assert "candidate" not in sentences.summary("adequate", [], (1.2, 1.2), 0.04)
