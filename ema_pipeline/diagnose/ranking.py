@@ -67,6 +67,8 @@ _UNPROMISING = 6
 tenths: more than `FINALISTS`, so that the reader sees what comes next."""
 _PROMISING = 1.0
 """Log evidence that is something: a third of what a claim needs."""
+_FURTHER = 3
+"""Finalists beside these that promise something at learned scatters."""
 CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
 _BETTER = 0.05
@@ -330,12 +332,15 @@ def _promising(
     count: int,
     processes: int | None,
 ) -> list[tuple[Hypothesis, Fit]]:
-    """What promises most on top of the base model with learned scatters, begun at the size of its score."""
-    if not count:
-        return []
+    """What promises most on top of the base model with learned scatters, begun at the size of its score.
+
+    At wide scatters an effect that moves frequencies by a permille gains nothing.
+    """
     found = []
     best = sorted(scores(observations, settled, hypotheses, models, processes), key=lambda s: -s.gain)
-    for score in best[:count]:  # what the scatters took up promises little, and gains it back
+    chosen = best[:count]  # what the scatters took up promises little, and gains it back
+    chosen += [score for score in best[count:_FURTHER] if score.gain > _PROMISING]
+    for score in chosen:
         model = models[score.hypothesis.label]
         unknowns = model.problem(observations).unknowns
         x = transferred(settled.posterior, unknowns)

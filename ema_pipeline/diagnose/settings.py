@@ -90,8 +90,9 @@ class DiagnoseSettings(Settings):
         default=0,
         ge=0,
         le=10,
-        description="Extra finalists, chosen by expected gain at the learned scatters; two tests of one rig, which "
-        "repeat far better than is stated, have 2 in any case, continuous records 3.",
+        description="Extra finalists, chosen by expected gain at the learned scatters, whatever they promise; up to "
+        "three that promise a gain are added in any case. Two tests of one rig, which repeat far better than is "
+        "stated, have 2 at least, continuous records 3.",
     )
     candidates: int = Field(default=5, ge=1, description="Number of candidates that are reported.")
     processes: int | None = Field(

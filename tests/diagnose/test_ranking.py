@@ -278,7 +278,16 @@ def test_what_promises_most_beside_learned_scatters_begins_at_its_size(
         ("b", ("b", [0.4, 0.2], {"part": 1.0})),
         ("c", ("c", [0.4, 1.9], {"part": 1.0})),
     ]
-    assert _promising(NO_DATA, settled, asked, models, 0, 1) == []
+    told = {"a": (1.0, 0.1), "b": (1.1, 0.2), "c": (-2.0, 9.0)}
+    promised = [h.label for h, _ in _promising(NO_DATA, settled, asked, models, 0, 1)]
+    assert promised == ["b"]  # a promises no more than what is next to nothing
+    assert [h.label for h, _ in _promising(NO_DATA, settled, asked, models, 2, 1)] == ["b", "a"]
+    told = dict.fromkeys("abcde", (5.0, 0.1))
+    names |= {k: (f"{k}.s1",) for k in "de"}
+    models |= {k: with_model(k, Parabola(("part", *names[k]), names[k]), [0.0, 0.0]).model for k in "de"}
+    everything = [hypothesis(k) for k in "abcde"]
+    assert len(_promising(NO_DATA, settled, everything, models, 0, 1)) == 3
+    assert len(_promising(NO_DATA, settled, everything, models, 4, 1)) == 4
 
 
 # --- all of it -----------------------------------------------------------------------------------------------------
