@@ -119,7 +119,7 @@ def tried_sizes(
                 return np.inf
             return problem.residuals(x, scatters, heat=_GRID_HEAT, derivatives=False).cost
 
-        costs = {size: cost(size) for size in _SIZES}
+        costs = {size: cost(size) for size in (*_SIZES, *problem.tuned(begin, unknowns.names[at]))}
         size = min(costs, key=lambda one: costs[one])
         return Tried(size, cost(0.0) - costs[size])
 

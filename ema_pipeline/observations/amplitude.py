@@ -176,6 +176,10 @@ class AmplitudeProblem:
         """See `EffectProblem`: none."""
         return []
 
+    def tuned(self, x: NDArray[np.float64], name: str) -> list[float]:
+        """See `EffectProblem`."""
+        return self.modes.tuned(x[: len(self.modes.unknowns)], name)
+
     @property
     def sole_parts(self) -> Mapping[str, tuple[str, float]]:
         """See `EffectProblem`."""

@@ -43,6 +43,10 @@ class EffectProblem(Problem, Protocol):
         """Points beyond a barrier that no descent passes, where the fit at `x` looks stuck before one."""
         return []
 
+    def tuned(self, x: NDArray[np.float64], name: str) -> list[float]:
+        """Unknowns of the size `name` at which a mode comes to where one was measured that has no partner at `x`."""
+        return []
+
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """Values of the rig's parameters and of the effects' sizes."""
         ...

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.settings import AssumedSettings
 from ema_pipeline.dof import Dof
+from ema_pipeline.modal.assurance import mac
 
 _MIXED_STD = 0.1
 """1 σ, in the largest entry, of shapes that identification may have mixed."""
@@ -20,6 +21,10 @@ _WHIRLS = 0.05
 """Share of its imaginary part in the sum of squares of a shape, from which it is compared as a complex one: MPC 0.8."""
 _DOUBLE = 0.9
 """Share of a shape's squares that shapes of near modes explain, from which it is no mode of its own."""
+_BETTER_KNOWN = 2.0
+"""Factor by which a near mode's frequency is known better, from which one that it may share is no mode of its own."""
+_ORTHOGONAL = 0.2
+"""Modal assurance criterion up to which two modes are orthogonal, as far as sensors without masses tell."""
 _NEAR = 4.0
 """Half-widths within which modes are near: one that drifts from hit to hit has twins a little farther off than one."""
 _CLOSE = 3.0
@@ -126,7 +131,7 @@ class ModeData:
 
     @cached_property
     def double(self) -> NDArray[np.bool_]:
-        """Mask of modes whose shape is a mix of those of modes within two half-widths, (m,).
+        """Mask of modes whose shape is a mix of those of near modes, or whose frequency is not told from one's, (m,).
 
         Drift and hits off their mark split close modes into more than there are. What a structure adds has a shape that
         the others have not.
@@ -143,8 +148,19 @@ class ModeData:
                 continue
             others, own = self.shapes[near][:, on].T, self.shapes[i, on]
             left = own - others @ np.linalg.lstsq(others, own, rcond=None)[0]
-            found[i] = left @ left < (1 - _DOUBLE) * (own @ own)
+            mix = left @ left < (1 - _DOUBLE) * (own @ own)
+            found[i] = mix or np.any(near & self._within_uncertainty(i))
         return found
+
+    def _within_uncertainty(self, i: int) -> NDArray[np.bool_]:
+        """Mask of modes at a frequency that mode `i` may have as well, known much better and somewhat alike, (m,).
+
+        True modes at one frequency are orthogonal.
+        """
+        std = self.log_frequency_std
+        apart = np.abs(self.log_frequency - self.log_frequency[i])
+        alike = mac(self.shapes[i], self.shapes)[0] > _ORTHOGONAL
+        return (apart < std[i]) & (_BETTER_KNOWN * std < std[i]) & alike
 
     @cached_property
     def close(self) -> NDArray[np.bool_]:

@@ -15,6 +15,8 @@ _FREQUENCY_REACH = 0.1
 _FREQUENCY_REACH_ALONE = 0.3
 _LEAVE = 0.3
 """Cost above the best at which an assignment leaves a measured mode without a partner."""
+_LEAVE_DOUBLE = -0.5
+"""The same of a `double` one: its shape must speak for a partner, and not only the lack of a nearer one."""
 
 
 def paired(
@@ -50,7 +52,8 @@ def paired(
         # convex, so that close modes keep their order: two crossed pairs would cost as much as two straight ones
         cost = np.minimum(apart * (1 + apart) / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
     m = len(data)
-    padded = np.hstack([cost, np.full((m, m), _LEAVE)])
+    leave = np.where(data.double, _LEAVE_DOUBLE, _LEAVE)
+    padded = np.hstack([cost, np.tile(leave[:, None], m)])
     column = scipy.optimize.linear_sum_assignment(padded)[1]
     return np.where(column < cost.shape[1], column, -1)
 

@@ -21,6 +21,8 @@ from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns, joined
 from ema_pipeline.ingest.defaults import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
+from ema_pipeline.mechanics.terms import MASS, STIFFNESS
+from ema_pipeline.mechanics.tuned import tuned_sizes
 from ema_pipeline.modal.assurance import mac
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
@@ -48,6 +50,8 @@ _CLOSE_PAIR = 0.2
 """Difference of ln f within which two modes may have changed places."""
 _WRONG = 4.0
 """σ from which a shape is another one."""
+_MOST_TUNED = 2
+"""Sizes of an effect that are tried for one measured mode without a partner, best first by the shape."""
 _TWIN = 0.8
 """Modal assurance criterion of two measured modes from which one may be the other's twin."""
 
@@ -381,6 +385,33 @@ class ModeProblem(EffectProblem):
                 f"{configuration}: the model has no modes at the fitted values; check the rig's masses"
             )
         return solution
+
+    def tuned(self, x: NDArray[np.float64], name: str) -> list[float]:
+        """See `EffectProblem`: of every measured mode without a partner the sizes that give it one of its shape."""
+        at, found = self.unknowns.index[name], list[float]()
+        step = min(1.0, float(self.unknowns.upper[at]))
+        without, changed = x.copy(), x.copy()
+        without[at], changed[at] = 0.0, step
+        for data in self.observations.data:
+            pair = self.paired(data, without)
+            if pair is None or np.all(pair.match >= 0):
+                continue
+            dense, moved = (
+                self.model.matrices(data.configuration, y[: self.offset], derivatives=False).dense
+                for y in (without, changed)
+            )
+            if dense.shape != moved.shape:
+                continue
+            change = (moved - dense) / step
+            along = self.sensing(data).along
+            for r in np.flatnonzero(pair.match < 0):
+                hz = float(np.exp(data.log_frequency[r]))
+                sizes, shapes = tuned_sizes(
+                    dense[MASS], dense[STIFFNESS], change[MASS], change[STIFFNESS], hz
+                )
+                like = mac(data.shapes[r], (along @ shapes).T)[0]
+                found += [float(sizes[k]) for k in np.argsort(-like)[:_MOST_TUNED]]
+        return found
 
     def escapes(
         self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals

@@ -162,6 +162,25 @@ def test_sizes_far_out_and_small_ones_are_tried_where_modes_have_no_partner() ->
     assert found["far"].gain == pytest.approx(0.5 * (7.0**2 - 1.0) / 30.0**2)
 
 
+def test_sizes_that_give_modes_a_partner_are_tried_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    base = with_model("base", Parabola(("part",), ()), [0.4])
+    names = ("part", "a.s1")
+    problem = Parabola(names, names[1:], np.array([0.0, 5.8]))
+    problem.unknowns = Unknowns(names, np.ones(2), ("part", ""), np.full(2, -20.0), np.full(2, 9.0))
+    asked: list[Any] = []
+
+    def tuned(x: np.ndarray, name: str) -> list[float]:
+        asked.append((x.tolist(), name))
+        return [-20.0, 5.7]
+
+    monkeypatch.setattr(problem, "tuned", tuned)
+    model = with_model("a", problem, [0.0, 0.0]).model
+    data: Any = SimpleNamespace(scatters={})
+    found = tried_sizes(data, base, {"a": model}, [hypothesis("a")], 1)
+    assert found["a"].unknown == 5.7
+    assert asked == [([0.0, 0.0], "a.s1")]
+
+
 def test_one_fit_begins_at_the_best_of_the_sizes_that_were_tried() -> None:
     problem: Any = Parabola(("part", "a.s1"), ("a.s1",))
     starts = _starts(NO_DATA, problem, hypothesis("a"), np.array([0.4, 0.0]), None, Tried(1.5, 9.0))

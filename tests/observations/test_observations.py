@@ -18,6 +18,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Scatter, Unknowns, descend
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Gyroscopic, Mass, Spring
 from ema_pipeline.mechanics.modes import complex_modes
+from ema_pipeline.modal.assurance import mac
 from ema_pipeline.observations import fitting
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, model_with
 from ema_pipeline.observations.mode_data import prepare
@@ -80,6 +81,65 @@ def test_a_mode_with_a_mix_of_close_shapes_is_a_double_and_one_with_a_shape_of_i
         measured, shapes=measured.shapes[:, :3], shape_std=np.full((5, 3), 1e-2), dofs=measured.dofs[:3]
     )
     assert not np.any(prepare(few).double)  # three sensors cannot tell three shapes apart
+
+
+def test_a_mode_that_may_be_at_the_frequency_of_one_known_better_is_a_double_and_needs_the_shape_of_a_partner() -> (
+    None
+):
+    measured = chain_modes(6, EXACT)["all"]
+    f, shapes = measured.frequency_hz, measured.shapes
+    assert shapes is not None
+    assert measured.shape_std is not None
+    assert measured.damping_ratio is not None
+    third = shapes[2].real
+    other = np.array([0.5, 1.0, -0.5, 0.5, 1.0])
+    other -= third * (other @ third) / (third @ third)
+    odd = third / np.linalg.norm(third) + other / np.linalg.norm(other)  # half of the third mode's
+    assert mac(odd, third)[0, 0] == pytest.approx(0.5)
+
+    def with_one(apart: float, std: float, shape: np.ndarray) -> MeasuredModes:
+        """One mode more, beside the third."""
+        return replace(
+            measured,
+            frequency_hz=np.append(f, f[2] + apart),
+            frequency_std_hz=np.append(measured.frequency_std_hz, std),
+            damping_ratio=np.append(measured.damping_ratio, measured.damping_ratio[2]),
+            damping_std=np.append(measured.damping_std, measured.damping_std[2]),
+            shapes=np.vstack([shapes, shape]),
+            shape_std=np.vstack([measured.shape_std, np.full(5, 0.05)]),
+        )
+
+    width = float(measured.damping_ratio[2] * f[2])
+    own = float(measured.frequency_std_hz[2])
+    assert prepare(with_one(0.3 * width, 0.4 * width, odd)).double.tolist() == [False] * 5 + [True]
+    assert not np.any(prepare(with_one(0.3 * width, 0.2 * width, odd)).double)  # told apart
+    assert not np.any(prepare(with_one(0.9 * own, 1.9 * own, odd)).double)  # known as well as the other
+    assert not np.any(
+        prepare(with_one(0.3 * width, 0.4 * width, other)).double
+    )  # as modes at one frequency are
+    problem = observed(chain(), {"all": with_one(0.3 * width, 0.4 * width, odd)}).problem((), {})
+    scatters = {n: s.default for n, s in problem.observations.scatters.items()}
+    found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
+    assert [r.measured for r in problem.rows(found)] == [0, 1, 2, 3, 4]
+    assert (found.penalty, found.unexplained) == (UNEXPLAINED_DOUBLE, 0)
+
+
+def test_a_size_gives_a_mode_without_a_partner_one_of_its_frequency_and_shape() -> None:
+    rig = chain()
+    placed = parse_effect("spring@m3.z", rig)
+    name = placed.parameter_name("stiffness")
+    hidden = Hidden(added=(Spring("hidden", {"m3.z": 1.0}, 7e5),))
+    measured = chain_modes(6, EXACT, hidden)["all"]
+    observations = observed(rig, {"all": measured})
+    problem = observations.problem((placed,), {})
+    x = problem.start({name: 0.0})
+    match = problem.residuals(x, {n: s.default for n, s in observations.scatters.items()}).matching
+    assert isinstance(match, tuple)
+    assert np.any(match[0] < 0)
+    sizes = [problem.sizes[name].value(u) for u in problem.tuned(x, name)]
+    assert any(size == pytest.approx(7e5, rel=1e-3) for size in sizes)
+    assert len(sizes) <= 2 * int(np.sum(match[0] < 0))
+    assert observed(rig, chain_modes(6, EXACT)).problem((placed,), {}).tuned(x, name) == []
 
 
 def test_what_modes_are_to_each_other_stays_when_one_of_them_is_held_out() -> None:

@@ -66,6 +66,9 @@ class Parabola:
     def begun(self, x: np.ndarray, scatters: object) -> list[np.ndarray]:
         return []
 
+    def tuned(self, x: np.ndarray, name: str) -> list[float]:
+        return []
+
     def start(self) -> np.ndarray:
         return self.at
 
