@@ -103,9 +103,11 @@ def over_limit(line: Line) -> float | None:
         ]
         if not own:
             return None
-        limit = own[0]["size"]  # none: not to be seen, whatever its size
-        ratio = abs(t["size"]) / limit if limit else 0.0
-        ratios.append(1 / ratio if t["label"].partition("@")[0] in DECIDED_BY_LESS else ratio)
+        limit, size = own[0]["size"], abs(t["size"])  # none: not to be seen, whatever its size
+        if t["label"].partition("@")[0] in DECIDED_BY_LESS:
+            ratios.append((limit or 0.0) / size)
+        else:
+            ratios.append(size / limit if limit else 0.0)
     return min(ratios) if ratios else None
 
 

@@ -1,4 +1,7 @@
-"""What these data would have shown: the least size of every effect that would be claimed in nine tests of ten."""
+"""What these data would have shown: the least size of every effect that would be claimed in nine tests of ten.
+
+Of an effect that shows the more the smaller its size is, it is the largest one.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from ema_pipeline.diagnose.types import DetectionLimit
 from ema_pipeline.inference import Posterior, Residuals
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import Fit, Model, transferred
-from ema_pipeline.observations.rig_model import SizeMap
+from ema_pipeline.observations.rig_model import LOG_STD, SizeMap
 
 _NINE_OF_TEN = 1.2816
 """Quantile of the normal distribution: in nine tests of ten the estimate is no further than this below the truth."""
@@ -33,6 +36,10 @@ _SMOOTH = 30.0
 """How much more a claimed effect may change the residuals to first order than it does, where it has a slope at all."""
 _SLOPES = (0.3, 5.0)
 """Least and largest power of the size with which the gain is taken to grow."""
+_DECADES = 4
+"""Of sizes, about the usual one, among which the largest is sought that shows."""
+_HALVINGS = 3
+"""Of the last step of that search, from one size to half of it."""
 
 
 def detection_limits(
@@ -59,7 +66,7 @@ def detection_limits(
     had = set(fit.model.labels)
     whole = ExpectedGain(fit.posterior, observations.scatters, Marginal(fit))
 
-    def least(hypothesis: Hypothesis) -> float | None:
+    def limit(hypothesis: Hypothesis) -> float | None:
         own = hypothesis.label in had
         model = fit.model if own else fit.model.plus(hypothesis.placed, hypothesis.scales)
         shown = _Shown.of(observations, fit, model, hypothesis, None if own else whole)
@@ -67,10 +74,11 @@ def detection_limits(
             return None
         sigmas = sigmas_asked(observations, hypothesis, settings)
         evidence = needed(hypothesis, hypotheses, settings, found=0)
-        return shown.least(evidence + evidence_beyond(observations, hypothesis, settings), sigmas)
+        evidence += evidence_beyond(observations, hypothesis, settings)
+        return shown.largest(evidence) if hypothesis.shown_by_less else shown.least(evidence, sigmas)
 
-    asked = [h for h in hypotheses if not h.size_cannot_be_zero]
-    found = zip(asked, spread(least, asked, settings.processes), strict=True)
+    asked = [h for h in hypotheses if h.shown_by_less or not h.size_cannot_be_zero]
+    found = zip(asked, spread(limit, asked, settings.processes), strict=True)
     return tuple(_under(name, h, size) for h, size in found if size is not None for name in h.names)
 
 
@@ -78,6 +86,9 @@ def _under(name: Name, hypothesis: Hypothesis, unknown: float) -> DetectionLimit
     """The limit as a size of one name."""
     own = name.placed.effect.parameters[0]
     size = SizeMap.of(own, name.scales.get(own.name, own.scale))
+    if hypothesis.shown_by_less:
+        most = size.value(unknown) if np.isfinite(unknown) else 0.0
+        return DetectionLimit(name.label, own.name, most, own.unit, largest=True)
     least = abs(size.slope(0.0)) * unknown * hypothesis.representative.relative / name.relative
     seen = least <= own.maximum - own.null
     return DetectionLimit(name.label, own.name, least if seen else float("inf"), own.unit)
@@ -131,7 +142,7 @@ class _Shown:
         null = transferred(fit.posterior, problem.unknowns)
         size = hypothesis.placed.effect.parameters[0].name
         at = problem.unknowns.index[hypothesis.placed.parameter_name(size)]
-        null[at] = 0.0
+        null[at] = problem.unknowns.upper[at] if hypothesis.shown_by_less else 0.0
         before = problem.residuals(null, scatters, matching=fit.posterior.residuals.matching)
         if gains is None:
             if _not_there(before, fit.posterior, at):
@@ -139,6 +150,8 @@ class _Shown:
             gains = _without(observations, fit, hypothesis, null, before)
         if len(before.values) != gains.marginal.count or not np.all(np.isfinite(before.values)):
             return None
+        if hypothesis.shown_by_less:
+            return cls(problem, null, at, scatters, before, gains, 1.0, linear=False)
         linear, usual = hypothesis.placed.effect.linear, before.jacobian[:, at]
         if not linear:
             x = null.copy()
@@ -172,17 +185,35 @@ class _Shown:
                 unknown = float(np.sqrt(low * high))
         return unknown if unknown < most or off >= 0 else float("inf")
 
+    def largest(self, gain: float) -> float:
+        """Unknown of the largest size that gains so much in nine tests of ten; -infinite where none does."""
+
+        def shows(unknown: float) -> bool:
+            gained, distance = self._gained(unknown)
+            return gained >= self._wanted(gain, 0.0, distance)
+
+        half = float(np.log(2) / LOG_STD)
+        reach = 0.5 * _DECADES * np.log(10) / LOG_STD
+        for unknown in np.arange(reach, -reach, -half):
+            if shows(float(unknown)):
+                low, high = float(unknown), float(unknown) + half
+                for _ in range(_HALVINGS):
+                    middle = 0.5 * (low + high)
+                    low, high = (middle, high) if shows(middle) else (low, middle)
+                return low
+        return -float("inf")
+
     def _above(self, unknown: float, gain: float, sigmas: float) -> float:
         """Logarithm of what a size gains in nine tests of ten, over what is asked of it."""
-        gained, known = self._gained(unknown)
+        gained, distance = self._gained(unknown)
+        known = 1 / self.std if self.linear else distance / unknown
         return float(np.log(max(gained, 1e-9) / self._wanted(gain, sigmas, known)))
 
     def _gained(self, unknown: float) -> tuple[float, float]:
-        """Log evidence that a size gains in nine tests of ten, and how many times better than its prior it is known."""
+        """Log evidence that a size gains in nine tests of ten, and how far it moves the predictions, in σ."""
         change = self._moved(unknown)
         distance = float(np.sqrt(max(change.total, 1e-300)))
-        gained = self.gains.of(change, max(1 - _NINE_OF_TEN / distance, 0.0) ** 2)
-        return gained, 1 / self.std if self.linear else distance / unknown
+        return self.gains.of(change, max(1 - _NINE_OF_TEN / distance, 0.0) ** 2), distance
 
     @staticmethod
     def _wanted(gain: float, sigmas: float, known: float) -> float:

@@ -88,6 +88,11 @@ class Hypothesis:
         """True where the effect is absent at the end of its range only, as a support that is infinitely stiff."""
         return any(SizeMap.of(p, p.scale).logarithmic for p in self.placed.effect.parameters[:1])
 
+    @property
+    def shown_by_less(self) -> bool:
+        """See `Effect`."""
+        return self.placed.effect.shown_by_less
+
     def starts(self) -> list[dict[str, float]]:
         """Unknowns of the sizes, by ``id@place.name``, from which a fit is begun."""
         if self.begun:

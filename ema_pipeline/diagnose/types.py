@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -247,7 +248,7 @@ class Localisation:
 
 @dataclass(frozen=True)
 class DetectionLimit:
-    """The least size of an effect that these data would show nine times in ten.
+    """The least size of an effect that these data would show nine times in ten, or the largest.
 
     Attributes
     ----------
@@ -258,12 +259,21 @@ class DetectionLimit:
         Distance from null; infinite where no allowed size would be seen. Relative to the nominal value for a
         parameter out of tolerance.
     unit : str
+    largest : bool
+        True for an effect that shows the more the smaller its size is (the preload of teeth): `size` is the largest
+        one that would be seen, 0 where none would.
     """
 
     label: str
     parameter: str
     size: float
     unit: str
+    largest: bool = False
+
+    @property
+    def seen(self) -> bool:
+        """True where some allowed size would be seen."""
+        return self.size > 0 if self.largest else math.isfinite(self.size)
 
 
 @dataclass(frozen=True)

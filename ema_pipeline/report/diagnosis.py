@@ -118,9 +118,9 @@ def _also_called(c: Candidate) -> str:
 def detection_words(found: Diagnosis) -> str:
     """What these data would show, in one sentence; empty where that is not known."""
     shown = [
-        f"{words(effect)} ≥ {limit_words(sizes[0])}"
+        f"{words(effect)} {'≤' if sizes[0].largest else '≥'} {limit_words(sizes[0])}"
         for effect, sizes in limits_by_effect(found).items()
-        if effect != OUT_OF_TOLERANCE and math.isfinite(sizes[0].size)
+        if effect != OUT_OF_TOLERANCE and sizes[0].seen
     ]
     if not shown:
         return ""
@@ -128,17 +128,20 @@ def detection_words(found: Diagnosis) -> str:
 
 
 def limits_by_effect(found: Diagnosis) -> dict[str, list[DetectionLimit]]:
-    """Limits of each effect, the smallest first."""
+    """Limits of each effect, that of the best place first: the smallest, or the largest of what shows the less."""
     grouped: dict[str, list[DetectionLimit]] = {}
     for limit in found.detection_limits:
         effect = limit.label.rpartition(" + ")[2].partition("@")[0]
         grouped.setdefault(effect, []).append(limit)
-    return {effect: sorted(limits, key=lambda x: x.size) for effect, limits in grouped.items()}
+    return {
+        effect: sorted(limits, key=lambda x: -x.size if x.largest else x.size)
+        for effect, limits in grouped.items()
+    }
 
 
 def limit_words(limit: DetectionLimit) -> str:
     """The size of a detection limit: in percent, or with its unit."""
-    if not math.isfinite(limit.size):
+    if not limit.seen:
         return "no size"
     if limit.unit in ("", "1"):
         return f"{plain(100 * limit.size, 2)} %"

@@ -132,7 +132,7 @@ def ladder_table(ladder: Ladder) -> Table:
 
 
 def detection_table(found: Diagnosis) -> Table:
-    """Least size of every effect that these data would show, at the best and at the worst place."""
+    """Least size of every effect that these data would show, or the largest, at the best and at the worst place."""
     rows = []
     for effect, limits in limits_by_effect(found).items():
         best, worst = limits[0], limits[-1]
@@ -141,14 +141,20 @@ def detection_table(found: Diagnosis) -> Table:
                 (
                     words(effect),
                     words(best.parameter) if effect != OUT_OF_TOLERANCE else "deviation",
-                    f"{limit_words(best)} ({_place(best)})",
-                    f"{limit_words(worst)} ({_place(worst)})" if len(limits) > 1 else "",
+                    _seen(best),
+                    _seen(worst) if len(limits) > 1 else "",
                 )
             )
         )
     return Table(
         ("effect", "size", "seen from (best place)", "seen from (worst place)"), tuple(rows), frozenset()
     )
+
+
+def _seen(limit: DetectionLimit) -> str:
+    """Size and place; of what is seen up to a size it says so."""
+    up_to = "up to " if limit.largest and limit.seen else ""
+    return f"{up_to}{limit_words(limit)} ({_place(limit)})"
 
 
 def _place(limit: DetectionLimit) -> str:

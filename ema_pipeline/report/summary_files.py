@@ -141,7 +141,13 @@ def _diagnosis(found: Diagnosis) -> dict[str, Any]:
         "localisation": [asdict(place) for place in found.localisation],
         "notes": list(found.notes),
         "detection_limits": [
-            {"effect": x.label, "parameter": x.parameter, "size": x.size, "unit": x.unit}
+            {
+                "effect": x.label,
+                "parameter": x.parameter,
+                "size": x.size,
+                "unit": x.unit,
+                "largest": x.largest,
+            }
             for x in found.detection_limits
         ],
         "scatter": {

@@ -542,6 +542,15 @@ def test_detection_limits_are_told_by_effect_with_best_and_worst_place() -> None
     rows = [r.cells for r in diagnosis_tables.detection_table(d).rows]
     assert rows[0] == ("mesh stiffness loss", "fraction", "2.1 % (sun-planet1)", "no size (ring-planet1)")
     assert rows[2] == ("out of tolerance", "deviation", "7.0 % (sun mass)", "")
+    teeth = (
+        DetectionLimit("mesh_backlash@ring-planet1", "preload", 0.0, "m", largest=True),
+        DetectionLimit("mesh_backlash@sun-planet1", "preload", 4.8e-6, "m", largest=True),
+    )
+    of_teeth = replace(found("adequate"), detection_limits=teeth)
+    assert diagnosis.detection_words(of_teeth).endswith("at the best place: mesh backlash ≤ 4.8 µm.")
+    (row,) = diagnosis_tables.detection_table(of_teeth).rows
+    assert row.cells == ("mesh backlash", "preload", "up to 4.8 µm (sun-planet1)", "no size (ring-planet1)")
+    assert diagnosis.detection_words(replace(of_teeth, detection_limits=teeth[:1])) == ""
     assert "mesh stiffness loss ≥ 2.1 %" in flowing(printed(terminal.diagnosis_screen(d)))
     assert diagnosis.detection_words(found("adequate")) == ""
 
@@ -552,7 +561,8 @@ def test_summary_holds_what_the_data_would_show(run: RunResults, tmp_path: Path)
     write_summary(replace(run, diagnosis=d), tmp_path / "summary.json")
     content = json.loads((tmp_path / "summary.json").read_text())["diagnosis"]
     assert content["detection_limits"][0] == {
-        "effect": "mesh_stiffness_loss@sun-planet1", "parameter": "fraction", "size": 0.021, "unit": "1"
+        "effect": "mesh_stiffness_loss@sun-planet1", "parameter": "fraction", "size": 0.021, "unit": "1",
+        "largest": False,
     }  # fmt: skip
     assert content["detection_limits"][1]["size"] is None  # JSON has no infinity
 
