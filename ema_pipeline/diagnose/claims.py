@@ -117,12 +117,11 @@ def judge(
     base = at_scatters(observations, ranking.base, ranked.fit.posterior.scatters)
     base, mended = within_scatter(observations, base), within_scatter(observations, ranked.fit)
     before, after, left = NOTHING_HELD_OUT, NOTHING_HELD_OUT, np.inf
-    effect = ranked.hypothesis.placed.effect
     linearisation = doubtful_evidence(observations, ranked.hypothesis, settings)
     needed = settings.claim + evidence_beyond(observations, ranked.hypothesis, settings)
     doubt = _weak(observations, ranked, gain, needed, settings, nothing)
     if not doubt:
-        asked = observations.holding_out_predictable(base.posterior.residuals, effect)
+        asked = observations.holding_out_explained(base.posterior.residuals)
         before, after = (held_out(asked, fit, settings.processes) for fit in (base, mended))
         left = left_of_close_modes(base, mended)
         share = LINEARISED_SHARE if _linearised(observations, ranked.hypothesis) else HELD_OUT_SHARE

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.parallel import spread
-from ema_pipeline.inference import Bounded, Posterior, Residuals, descend, lower_factor, solve_lower
+from ema_pipeline.inference import (
+    Bounded,
+    Posterior,
+    Problem,
+    Residuals,
+    Unknowns,
+    descend,
+    lower_factor,
+    solve_lower,
+)
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, part_reach, transferred
 
 _STEPS = 20
+_FOLLOWED = 6
+"""Steps in which what is uncertain follows the data that are held out."""
 
 
 @dataclass(frozen=True)
@@ -60,41 +72,76 @@ def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, 
     """Sum of squares, its number of terms, and log density of one part."""
     problem = fit.model.problem(out)
     x = transferred(trained, problem.unknowns)
-    found = problem.residuals(x, trained.scatters)
-    if not np.all(np.isfinite(found.values)):
-        return 0.0, 0, -np.inf
     prior = problem.unknowns.prior_std(trained.scatters)
     covariance = np.diag(prior**2)
     known = [trained.unknowns.index.get(n, -1) for n in problem.unknowns.names]
     at = np.array([i for i, k in enumerate(known) if k >= 0], int)
     to = np.array([k for k in known if k >= 0], int)
     covariance[np.ix_(at, at)] = trained.covariance[np.ix_(to, to)]
+    given = _Given(problem, x, covariance)
+    told = descend(given, trained.scatters, np.zeros(len(x)), steps=_FOLLOWED)
+    found = told.residuals
+    if not np.all(np.isfinite(found.values)):
+        return 0.0, 0, -np.inf
+    # as predicted, to first order about where the data take what is uncertain
+    predicted = replace(found, values=found.values - found.jacobian @ told.x)
     count = max(len(found.values) - found.projected, 1)
     if found.block is not None:
-        squares, cost = _in_blocks(found, covariance)
+        squares, cost = _in_blocks(predicted)
         return squares + 2 * found.penalty, count, -cost - found.log_scale - found.penalty
-    squares, half_log_det = _marginal(found.values, found.jacobian, covariance)
+    squares, half_log_det = _marginal(predicted.values, predicted.jacobian)
     density = -0.5 * squares - half_log_det - found.log_scale - found.penalty
     if found.relative is not None:
-        squares, _ = _marginal(found.stated, found.jacobian * found.relative[:, None], covariance)
+        squares, _ = _marginal(predicted.stated, predicted.jacobian * found.relative[:, None])
     return squares + 2 * found.penalty, count, density
 
 
-def _in_blocks(found: Residuals, covariance: NDArray[np.float64]) -> tuple[float, float]:
+class _Given:
+    """A problem after a fit to other data: its unknowns are what that leaves uncertain, in standard deviations.
+
+    Far from the prediction its first order does not hold: how two close modes turn into each other depends on the
+    damping of each, and teeth may part in those hits only that are held out.
+
+    Parameters
+    ----------
+    problem : Problem
+    x : ndarray, (n,)
+        As fitted.
+    covariance : ndarray, (n, n)
+    """
+
+    def __init__(self, problem: Problem, x: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
+        self._problem, self._x = problem, x
+        size, directions = np.linalg.eigh(covariance)
+        self._factor = directions * np.sqrt(np.maximum(size, 0.0))
+        self.unknowns = Unknowns.plain([f"direction {k}" for k in range(len(x))], 1.0)
+
+    def residuals(
+        self,
+        x: NDArray[np.float64],
+        scatters: Mapping[str, float],
+        *,
+        heat: float = 1.0,
+        matching: object = None,
+        derivatives: bool = True,
+    ) -> Residuals:
+        """See `Problem`."""
+        at = self._problem.unknowns.clipped(self._x + self._factor @ x)
+        found = self._problem.residuals(at, scatters, heat=heat, matching=matching, derivatives=derivatives)
+        return replace(found, jacobian=found.jacobian @ self._factor)
+
+
+def _in_blocks(found: Residuals) -> tuple[float, float]:
     """Sum of squares in which errors count, and -log density, each value predicted from those before it."""
-    spread = np.eye(len(found.values)) + found.jacobian @ covariance @ found.jacobian.T
+    spread = np.eye(len(found.values)) + found.jacobian @ found.jacobian.T
     factor = lower_factor(spread)
     values = solve_lower(factor, found.values)
-    whitened = Residuals(values, np.zeros((0, len(covariance))), block=found.block)
+    whitened = Residuals(values, np.zeros((0, found.jacobian.shape[1])), block=found.block)
     return whitened.squares, whitened.cost + float(np.sum(np.log(np.diag(factor))))
 
 
-def _marginal(
-    values: NDArray[np.float64], jacobian: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> tuple[float, float]:
-    """vᵀ(I + J C Jᵀ)⁻¹v and half the log determinant, by the smaller matrix of as many rows as unknowns."""
-    size, directions = np.linalg.eigh(covariance)
-    reach = jacobian @ (directions * np.sqrt(np.maximum(size, 0.0)))
-    factor = lower_factor(np.eye(len(size)) + reach.T @ reach)
-    taken = solve_lower(factor, reach.T @ values)
+def _marginal(values: NDArray[np.float64], jacobian: NDArray[np.float64]) -> tuple[float, float]:
+    """vᵀ(I + J Jᵀ)⁻¹v and half the log determinant, by the smaller matrix of as many rows as unknowns."""
+    factor = lower_factor(np.eye(jacobian.shape[1]) + jacobian.T @ jacobian)
+    taken = solve_lower(factor, jacobian.T @ values)
     return float(values @ values - taken @ taken), float(np.sum(np.log(np.diag(factor))))

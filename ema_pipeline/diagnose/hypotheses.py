@@ -90,8 +90,8 @@ class Hypothesis:
 
     @property
     def shown_by_less(self) -> bool:
-        """See `Effect`."""
-        return self.placed.effect.shown_by_less
+        """True where the effect shows the more the smaller its size is: teeth part where the motion exceeds it."""
+        return self.placed.effect.parameters[0].null == float("inf")
 
     def starts(self) -> list[dict[str, float]]:
         """Unknowns of the sizes, by ``id@place.name``, from which a fit is begun."""

@@ -109,11 +109,6 @@ class Effect:
     records_order: int | None = None
     elsewhere: Effect | None = None
 
-    @property
-    def shown_by_less(self) -> bool:
-        """True where the effect shows the more the smaller its size is: teeth part where the motion exceeds it."""
-        return self.parameters[0].null == float("inf")
-
     def places(self, rig: Rig, configuration: str) -> tuple[str, ...]:
         """Places of `rig` where the effect can sit in this configuration."""
         return self.find_places(rig.assembly(configuration))

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.effects.base import Effect, PlacedEffect, effect_of
+from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.inference import Posterior, Residuals, Unknowns, joined
 from ema_pipeline.observations.hit_lattice import SPACING, MarchedHits
 from ema_pipeline.observations.hit_modes import HitData, comparable
@@ -66,8 +66,6 @@ class AmplitudeObservations:
         True where the hits tell only how far the modes of their level lie from those of the linear structure.
     marched : MarchedHits, optional
         Of the fit whose structure stands for all where hits are marched; each structure its own where left out.
-    hardest_held_out : bool
-        False where no fold holds out the hardest hits.
     """
 
     linearised = True
@@ -78,10 +76,8 @@ class AmplitudeObservations:
         hits: Sequence[HitData],
         of_modes: bool = False,
         marched: MarchedHits | None = None,
-        hardest_held_out: bool = True,
     ) -> None:
         self.modes, self.hits, self.of_modes, self.marched = modes, tuple(hits), of_modes, marched
-        self.hardest_held_out = hardest_held_out
         self.level_dependent = any(
             h.level_dependent and not modes.rig.assembly(h.configuration).nonlinear for h in hits
         )
@@ -101,16 +97,11 @@ class AmplitudeObservations:
         """See `Observations`."""
         return AmplitudeProblem(self, effects, scales)
 
-    def holding_out_predictable(self, found: Residuals, effect: Effect) -> AmplitudeObservations:
-        """See `Observations`: softer hits do not tell of teeth that part in the hardest ones only."""
+    def holding_out_explained(self, found: Residuals) -> AmplitudeObservations:
+        """See `Observations`."""
         assert isinstance(found.matching, tuple)
-        of_modes = dataclasses.replace(found, matching=found.matching[0])
-        modes = self.modes.holding_out_predictable(of_modes, effect)
-        if modes is self.modes and not effect.shown_by_less:
-            return self
-        return AmplitudeObservations(
-            modes, self.hits, marched=self.marched, hardest_held_out=not effect.shown_by_less
-        )
+        modes = self.modes.holding_out_explained(dataclasses.replace(found, matching=found.matching[0]))
+        return self if modes is self.modes else AmplitudeObservations(modes, self.hits, marched=self.marched)
 
     def folds(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
         """Every fourth mode held out in turn, then every force level."""
@@ -131,8 +122,7 @@ class AmplitudeObservations:
         """Every force level held out, with the nearest other level beside it that it is compared with."""
         levels = sorted({int(k) for h in self.hits for k in h.level})
         pairs = []
-        held_out = levels if self.hardest_held_out else levels[:-1]
-        for k in held_out if len(levels) > 2 else []:
+        for k in levels if len(levels) > 2 else []:
             beside = levels[1] if k == levels[0] else levels[0]
             kept = [h.only(h.level != k) for h in self.hits]
             out = [h.only((h.level == k) | (h.level == beside)) for h in self.hits]

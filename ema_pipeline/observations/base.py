@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Posterior, Problem, Residuals, Scatter
 from ema_pipeline.observations.rig_model import SizeMap
 
@@ -86,9 +86,8 @@ class Observations(Protocol):
         """Pairs of what is fitted and what is held out: a configuration, a hit point, a level, a share of modes."""
         ...
 
-    def holding_out_predictable(self, found: Residuals, effect: Effect) -> Observations:
-        """The same data, of which folds hold out what a fit to the rest could predict: no mode without a partner in
-        `found`, which an effect may add, and no hardest hits of an effect that begins at some force. Often the same
-        object.
+    def holding_out_explained(self, found: Residuals) -> Observations:
+        """The same data, of which folds hold out nothing that has no partner in `found`: no fit to the rest could tell
+        of a mode that an effect adds. Often the same object.
         """
         ...

@@ -14,7 +14,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns, descend, joined
 from ema_pipeline.ingest.defaults import CALIBRATION_STD
@@ -199,7 +199,7 @@ class LoopObservations:
             whole=self,
         )
 
-    def holding_out_predictable(self, found: Residuals, effect: Effect) -> LoopObservations:
+    def holding_out_explained(self, found: Residuals) -> LoopObservations:
         """See `Observations`."""
         return self
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns, joined
@@ -160,7 +160,7 @@ class ModeObservations:
             self.rig, data, self.channels, self.shared, self.sensors, self.test, own_damping
         )
 
-    def holding_out_predictable(self, found: Residuals, effect: Effect) -> ModeObservations:
+    def holding_out_explained(self, found: Residuals) -> ModeObservations:
         """See `Observations`."""
         if not isinstance(found.matching, tuple) or not any(np.any(m < 0) for m in found.matching):
             return self

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
@@ -114,7 +114,7 @@ class PairObservations:
             ModeProblem(self.b, RigModel(self.a.rig, effects, scales, self.a.shared)),
         )
 
-    def holding_out_predictable(self, found: Residuals, effect: Effect) -> PairObservations:
+    def holding_out_explained(self, found: Residuals) -> PairObservations:
         """See `Observations`."""
         return self
 

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from ema_pipeline.effects.base import Effect, PlacedEffect
+from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.effects.generic import is_place, place_rows
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
@@ -302,7 +302,7 @@ class RecordObservations:
             phase or self.phase,
         )  # fmt: skip
 
-    def holding_out_predictable(self, found: Residuals, effect: Effect) -> RecordObservations:
+    def holding_out_explained(self, found: Residuals) -> RecordObservations:
         """See `Observations`."""
         return self
 

@@ -106,9 +106,43 @@ def test_sums_over_several_unknowns_are_those_of_the_normal_distribution() -> No
     random = np.random.default_rng(1)
     values, jacobian, root = (random.standard_normal(n) for n in (6, (6, 3), (3, 3)))
     spread = np.eye(6) + jacobian @ root @ root.T @ jacobian.T
-    squares, half = _marginal(values, jacobian, root @ root.T)
+    squares, half = _marginal(values, jacobian @ root)
     assert squares == pytest.approx(values @ np.linalg.solve(spread, values))
     assert half == pytest.approx(0.5 * np.linalg.slogdet(spread)[1])
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """Values of what begins at a threshold: next to nothing where the fit to the others, which tells nothing, is."""
+
+    y: Array
+    unknowns: Unknowns = field(default_factory=lambda: Unknowns.plain(["size"], PRIOR_STD))
+    scatters: Mapping[str, Scatter] = field(default_factory=dict)
+
+    def problem(self, effects: object, scales: object) -> Threshold:
+        return self
+
+    def start(self, sizes: object = None) -> Array:
+        return np.zeros(1)
+
+    def residuals(self, x: Array, scatters: object, **how: object) -> Residuals:
+        return Residuals(self.y - np.exp(2 * x[0]), np.full((len(self.y), 1), -2 * np.exp(2 * x[0])))
+
+    def folds(self) -> Sequence[tuple[Threshold, Threshold]]:
+        return [(Threshold(self.y[:0]), self)]
+
+
+@pytest.mark.parametrize("size", [1.0, 1.5, 2.0])
+def test_what_is_uncertain_follows_the_data_that_are_held_out(size: float) -> None:
+    """Against the density by quadrature; to first order about the fit to the others it is off by up to 84."""
+    y = np.exp(2 * size) + np.array([0.4, -0.3, 0.1])
+    x = np.linspace(-10, 4, 200001)
+    log = -0.5 * np.sum((y[:, None] - np.exp(2 * x)) ** 2, axis=0) - 0.5 * (x / PRIOR_STD) ** 2
+    density = np.log(np.sum(np.exp(log)) * (x[1] - x[0]) / np.sqrt(2 * np.pi) / PRIOR_STD)
+    observations = Threshold(y)
+    found = held_out(observations, Fit(Model(), descend(observations, {}, np.zeros(1))))
+    assert found.log_density == pytest.approx(density, abs=0.2)
+    assert found.error < 1.0
 
 
 def test_errors_count_in_the_stated_uncertainty_where_there_is_one() -> None:

@@ -386,7 +386,7 @@ def test_the_search_for_a_limit_ends_at_the_size_that_gains_enough(
 
     class Power(_Shown):
         def _gained(self, unknown: float) -> tuple[float, float]:
-            return float(wanted * (unknown / true) ** power), 1 / sigma
+            return float(wanted * (unknown / true) ** power), unknown / sigma
 
     def least(most: float, gain: float = 8.0, sigmas: float = 2.0) -> float:
         problem = SimpleNamespace(unknowns=SimpleNamespace(upper=np.array([most])))

@@ -20,8 +20,8 @@ from ema_pipeline.diagnose.sentences import STANDING_STILL
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.verdict import explains
 from ema_pipeline.dof import Dof
-from ema_pipeline.effects.library import effect_library, parse_effect
-from ema_pipeline.inference import Posterior, Residuals
+from ema_pipeline.effects.library import parse_effect
+from ema_pipeline.inference import Posterior
 from ema_pipeline.levels.differences import smooth_terms
 from ema_pipeline.mechanics.laws import DryFriction, Nonlinear, PartingSpring, PolynomialSpring
 from ema_pipeline.mechanics.marching import element_rows
@@ -454,23 +454,6 @@ def test_every_mode_and_every_level_is_held_out_once() -> None:
         assert len(found.values) == len(alone.residuals(alone.start(), scatters).values)  # none of the hits
         held += list(out.modes.data[0].log_frequency)
     assert sorted(held) == pytest.approx(sorted(observations.modes.data[0].log_frequency))
-
-
-def test_the_hardest_hits_are_not_held_out_of_teeth_that_may_part_in_them_only() -> None:
-    observations = synthetic()
-    hits, reference = observations.hits, observations.modes
-    found = Residuals(
-        np.zeros(0), np.zeros((0, 0)), matching=((np.arange(len(reference.data[0])),), (np.zeros(0),))
-    )
-    teeth, cubic = effect_library()["mesh_backlash"], effect_library()["bearing_cubic"]
-    assert observations.holding_out_predictable(found, cubic) is observations
-    kept = observations.holding_out_predictable(found, teeth)
-    assert (kept.hits, kept.modes) == (hits, reference)
-    folds = kept.folds()
-    assert len(folds) == len(observations.folds()) - 1
-    for k, (rest, out) in enumerate(folds[-len(LEVELS) + 1 :]):
-        assert len(LEVELS) - 1 in rest.hits[0].level
-        assert set(out.hits[0].level) == {k, 1 if k == 0 else 0}
 
 
 def test_modes_held_out_lie_where_the_hits_of_their_level_find_them() -> None:

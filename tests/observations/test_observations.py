@@ -46,7 +46,6 @@ from ema_pipeline.rigs.planetary import planetary
 from ema_pipeline.rigs.types import Parameter, Rig
 
 SHIPPED = ("planetary", "gearbox", "frame")
-SPRING = effect_library()["spring"]
 
 
 def observed(rig: Rig, measured: dict[str, MeasuredModes]) -> ModeObservations:
@@ -664,10 +663,10 @@ def test_what_has_no_partner_in_a_fit_is_not_held_out_where_that_is_asked() -> N
     observations = observed(rig, planetary_modes(rig, 8, GOOD))
     matching = [np.arange(len(d)) for d in observations.data]
     found: Any = SimpleNamespace(matching=tuple(matching))
-    assert observations.holding_out_predictable(found, SPRING) is observations
+    assert observations.holding_out_explained(found) is observations
     matching[0][3] = -1
     lone = observations.data[0].log_frequency[3]
-    kept = observations.holding_out_predictable(found, SPRING)
+    kept = observations.holding_out_explained(found)
     assert isinstance(kept, ModeObservations)
     for held, rest in ((o, k) for k, o in kept.folds()):
         assert lone not in np.concatenate([d.log_frequency for d in held.data])
@@ -675,7 +674,7 @@ def test_what_has_no_partner_in_a_fit_is_not_held_out_where_that_is_asked() -> N
     total = sum(len(d) for _, o in observations.folds() for d in o.data)
     assert sum(len(d) for _, o in kept.folds() for d in o.data) == total - 1
     nothing: Any = SimpleNamespace(matching=tuple(np.full(len(d), -1) for d in observations.data))
-    assert observations.holding_out_predictable(nothing, SPRING).folds() == []
+    assert observations.holding_out_explained(nothing).folds() == []
 
 
 # --- data that lack something -----------------------------------------------------------------------------
