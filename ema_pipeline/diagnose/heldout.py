@@ -34,10 +34,11 @@ class HeldOut:
     Attributes
     ----------
     error : float
-        Root mean square of (measurement - prediction)/σ, σ with the uncertainty of the fit; about 1 where the model
-        holds.
+        Root mean square of (measurement - prediction)/σ, σ with the uncertainty of the fit to first order; about 1
+        where the model holds.
     log_density : float
-        Natural logarithm of the predictive density, up to a constant of the data.
+        Natural logarithm of the predictive density, up to a constant of the data: Laplace's approximation about where
+        the data take what that fit leaves uncertain.
     """
 
     error: float
@@ -79,21 +80,15 @@ def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, 
     to = np.array([k for k in known if k >= 0], int)
     covariance[np.ix_(at, at)] = trained.covariance[np.ix_(to, to)]
     given = _Given(problem, x, covariance)
+    as_fitted = given.residuals(np.zeros(len(x)), trained.scatters)
+    if not np.all(np.isfinite(as_fitted.values)):
+        return 0.0, 0, -np.inf
+    count = max(len(as_fitted.values) - as_fitted.projected, 1)
+    squares = _squares(as_fitted) + 2 * as_fitted.penalty
     told = descend(given, trained.scatters, np.zeros(len(x)), steps=_FOLLOWED)
     found = told.residuals
-    if not np.all(np.isfinite(found.values)):
-        return 0.0, 0, -np.inf
-    # as predicted, to first order about where the data take what is uncertain
-    predicted = replace(found, values=found.values - found.jacobian @ told.x)
-    count = max(len(found.values) - found.projected, 1)
-    if found.block is not None:
-        squares, cost = _in_blocks(predicted)
-        return squares + 2 * found.penalty, count, -cost - found.log_scale - found.penalty
-    squares, half_log_det = _marginal(predicted.values, predicted.jacobian)
-    density = -0.5 * squares - half_log_det - found.log_scale - found.penalty
-    if found.relative is not None:
-        squares, _ = _marginal(predicted.stated, predicted.jacobian * found.relative[:, None])
-    return squares + 2 * found.penalty, count, density
+    to_first_order = replace(found, values=found.values - found.jacobian @ told.x)
+    return squares, count, -_cost(to_first_order) - found.log_scale - found.penalty
 
 
 class _Given:
@@ -131,13 +126,28 @@ class _Given:
         return replace(found, jacobian=found.jacobian @ self._factor)
 
 
-def _in_blocks(found: Residuals) -> tuple[float, float]:
-    """Sum of squares in which errors count, and -log density, each value predicted from those before it."""
-    spread = np.eye(len(found.values)) + found.jacobian @ found.jacobian.T
-    factor = lower_factor(spread)
+def _squares(found: Residuals) -> float:
+    """Sum of squares in which errors count, what is uncertain allowed for."""
+    if found.block is None and found.relative is not None:
+        return _marginal(found.stated, found.jacobian * found.relative[:, None])[0]
+    return _marginal(found.values, found.jacobian)[0] if found.block is None else _in_blocks(found)[0].squares
+
+
+def _cost(found: Residuals) -> float:
+    """-log density but for what wider scatters and modes without a partner cost."""
+    if found.block is None:
+        squares, half_log_det = _marginal(found.values, found.jacobian)
+        return 0.5 * squares + half_log_det
+    whitened, half_log_det = _in_blocks(found)
+    return whitened.cost + half_log_det
+
+
+def _in_blocks(found: Residuals) -> tuple[Residuals, float]:
+    """Each value predicted from those before it, and half the log determinant of their covariance."""
+    factor = lower_factor(np.eye(len(found.values)) + found.jacobian @ found.jacobian.T)
     values = solve_lower(factor, found.values)
     whitened = Residuals(values, np.zeros((0, found.jacobian.shape[1])), block=found.block)
-    return whitened.squares, whitened.cost + float(np.sum(np.log(np.diag(factor))))
+    return whitened, float(np.sum(np.log(np.diag(factor))))
 
 
 def _marginal(values: NDArray[np.float64], jacobian: NDArray[np.float64]) -> tuple[float, float]:

@@ -142,7 +142,8 @@ def test_what_is_uncertain_follows_the_data_that_are_held_out(size: float) -> No
     observations = Threshold(y)
     found = held_out(observations, Fit(Model(), descend(observations, {}, np.zeros(1))))
     assert found.log_density == pytest.approx(density, abs=0.2)
-    assert found.error < 1.0
+    off, spread = y - 1.0, np.eye(3) + 4 * PRIOR_STD**2  # the error is that of the prediction itself
+    assert found.error == close(np.sqrt(off @ np.linalg.solve(spread, off) / 3))
 
 
 def test_errors_count_in_the_stated_uncertainty_where_there_is_one() -> None:
