@@ -389,20 +389,14 @@ class ModeProblem(EffectProblem):
     def tuned(self, x: NDArray[np.float64], name: str) -> list[float]:
         """See `EffectProblem`: of every measured mode without a partner the sizes that give it one of its shape."""
         at, found = self.unknowns.index[name], list[float]()
-        step = min(1.0, float(self.unknowns.upper[at]))
-        without, changed = x.copy(), x.copy()
-        without[at], changed[at] = 0.0, step
+        without = x.copy()
+        without[at] = 0.0
         for data in self.observations.data:
             pair = self.paired(data, without)
             if pair is None or np.all(pair.match >= 0):
                 continue
-            dense, moved = (
-                self.model.matrices(data.configuration, y[: self.offset], derivatives=False).dense
-                for y in (without, changed)
-            )
-            if dense.shape != moved.shape:
-                continue
-            change = (moved - dense) / step
+            matrices = self.model.matrices(data.configuration, without[: self.offset])
+            dense, change = matrices.dense, matrices.by_shape[at - self.model.shape_start]
             along = self.sensing(data).along
             for r in np.flatnonzero(pair.match < 0):
                 hz = float(np.exp(data.log_frequency[r]))
