@@ -103,6 +103,7 @@ def told(summary: str) -> Line:
                 "parameter": x["parameter"],
                 "size": x["size"],
                 "unit": x.get("unit", ""),
+                "largest": x.get("largest", False),
             }
             for x in found.get("detection_limits") or ()
         ],

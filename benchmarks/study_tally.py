@@ -19,8 +19,6 @@ CLEARLY = 2.0
 """An effect so many times its stated limit must be found."""
 TWO_SIDED_90 = 1.645
 """Half width of a 90 % interval in standard deviations."""
-DECIDED_BY_LESS = {"mesh_backlash"}
-"""Effects that are the larger the smaller their parameter is: teeth part at a small preload."""
 
 _MASSES = ("mass", "sensor_mass", "planet_mass_mistune")
 _OTHER_NAMES = {"local_damper": "damper", "shaft_torsion": "spring"}
@@ -104,7 +102,7 @@ def over_limit(line: Line) -> float | None:
         if not own:
             return None
         limit, size = own[0]["size"], abs(t["size"])  # none: not to be seen, whatever its size
-        if t["label"].partition("@")[0] in DECIDED_BY_LESS:
+        if own[0].get("largest"):  # teeth part at a small preload
             ratios.append((limit or 0.0) / size)
         else:
             ratios.append(size / limit if limit else 0.0)
