@@ -130,7 +130,7 @@ def _squares(found: Residuals) -> float:
     """Sum of squares in which errors count, what is uncertain allowed for."""
     if found.block is None and found.relative is not None:
         return _marginal(found.stated, found.jacobian * found.relative[:, None])[0]
-    return _marginal(found.values, found.jacobian)[0] if found.block is None else _in_blocks(found)[0].squares
+    return _marginal(found.values, found.jacobian)[0] if found.block is None else _whitened(found)[0].squares
 
 
 def _cost(found: Residuals) -> float:
@@ -138,11 +138,11 @@ def _cost(found: Residuals) -> float:
     if found.block is None:
         squares, half_log_det = _marginal(found.values, found.jacobian)
         return 0.5 * squares + half_log_det
-    whitened, half_log_det = _in_blocks(found)
+    whitened, half_log_det = _whitened(found)
     return whitened.cost + half_log_det
 
 
-def _in_blocks(found: Residuals) -> tuple[Residuals, float]:
+def _whitened(found: Residuals) -> tuple[Residuals, float]:
     """Each value predicted from those before it, and half the log determinant of their covariance."""
     factor = lower_factor(np.eye(len(found.values)) + found.jacobian @ found.jacobian.T)
     values = solve_lower(factor, found.values)

@@ -83,9 +83,7 @@ def test_a_mode_with_a_mix_of_close_shapes_is_a_double_and_one_with_a_shape_of_i
     assert not np.any(prepare(few).double)  # three sensors cannot tell three shapes apart
 
 
-def test_a_mode_that_may_be_at_the_frequency_of_one_known_better_is_a_double_and_needs_the_shape_of_a_partner() -> (
-    None
-):
+def test_a_mode_that_may_share_the_frequency_of_one_known_better_needs_the_shape_of_a_partner() -> None:
     measured = chain_modes(6, EXACT)["all"]
     f, shapes = measured.frequency_hz, measured.shapes
     assert shapes is not None
@@ -114,9 +112,8 @@ def test_a_mode_that_may_be_at_the_frequency_of_one_known_better_is_a_double_and
     assert prepare(with_one(0.3 * width, 0.4 * width, odd)).double.tolist() == [False] * 5 + [True]
     assert not np.any(prepare(with_one(0.3 * width, 0.2 * width, odd)).double)  # told apart
     assert not np.any(prepare(with_one(0.9 * own, 1.9 * own, odd)).double)  # known as well as the other
-    assert not np.any(
-        prepare(with_one(0.3 * width, 0.4 * width, other)).double
-    )  # as modes at one frequency are
+    orthogonal = with_one(0.3 * width, 0.4 * width, other)  # as modes at one frequency are
+    assert not np.any(prepare(orthogonal).double)
     problem = observed(chain(), {"all": with_one(0.3 * width, 0.4 * width, odd)}).problem((), {})
     scatters = {n: s.default for n, s in problem.observations.scatters.items()}
     found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
