@@ -107,6 +107,7 @@ def told(summary: str) -> Line:
             }
             for x in found.get("detection_limits") or ()
         ],
+        "scatters": {name: x["learned"] for name, x in (found.get("scatter") or {}).items()},
         "fit": _fit(content.get("fit")),
         "next": found.get("next_measurement", ""),
     }
