@@ -12,6 +12,7 @@ from ema_pipeline.diagnose.naming import Named, named, sizes_of
 from ema_pipeline.diagnose.ranking import Ranked, Ranking
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
 from ema_pipeline.inference import tails
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, averaged, within_scatter
@@ -71,6 +72,12 @@ class Judged:
     def hypothesis(self) -> Hypothesis:
         """What was fitted."""
         return self.ranked.hypothesis
+
+    @property
+    def specific(self) -> bool:
+        """True where the name that is said is one of the rig's own effects, and more than a part out of tolerance."""
+        effect = self.named.name.placed.effect
+        return not effect.generic and effect.id != OUT_OF_TOLERANCE
 
     @property
     def claimed(self) -> bool:
@@ -146,11 +153,8 @@ def _weak(
 ) -> str:
     if gain < needed:
         return f"its gain in log evidence, {gain:.1f}, is below {needed:g}"
-    if nothing > settings.doubt:
-        return (
-            f"the probability that nothing is missing, {probability_text(nothing)}, is above "
-            f"{probability_text(settings.doubt)}"
-        )
+    if doubt := doubt_of_nothing(nothing, settings):
+        return doubt
     if not ranked.hypothesis.size_cannot_be_zero:
         p = ranked.hypothesis.placed.effect.parameters[0]
         i = ranked.fit.posterior.unknowns.index[ranked.hypothesis.placed.parameter_name(p.name)]
@@ -159,6 +163,14 @@ def _weak(
         if abs(x) < sigmas * std:
             return f"its size is within {sigmas:g} standard deviations of zero"
     return ""
+
+
+def doubt_of_nothing(nothing: float, settings: DiagnoseSettings) -> str:
+    """Why nothing is claimed at a probability that nothing is missing; empty where something may be."""
+    if nothing <= settings.doubt:
+        return ""
+    told, most = (probability_text(p) for p in (nothing, settings.doubt))
+    return f"the probability that nothing is missing, {told}, is above {most}"
 
 
 def sigmas_asked(observations: Observations, hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:

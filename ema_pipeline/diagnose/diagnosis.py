@@ -72,8 +72,6 @@ def diagnose(
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
     found = select(observations, known, hypotheses, settings, progress)
     observations = found.observations
-    explained = explains(observations, found.final, settings)
-    verdict = verdict_of(found, settings, explained)
     start = found.rounds[0].ranking.base
     fits = [start, *(j.ranked.fit for j in found.claimed)]
     if found.claimed:
@@ -81,13 +79,18 @@ def diagnose(
     said = [(j.hypothesis, j.named.name) for j in found.claimed]
     named = [in_said_names(observations, f, said) for f in fits]
     rungs = rungs_of(observations, named, settings.processes)
+    missed = bool(found.claimed) and rungs[-1].heldout_error > settings.heldout_limit  # no data held out: NaN
+    explained = not missed and explains(observations, found.final, settings)
+    verdict = verdict_of(found, settings, explained)
     in_model = set(found.final.model.labels)
     further = [h for h in hypotheses if h.label not in in_model]
     group = alike(found, settings)
     candidates = _candidates(found, settings, group, hypotheses, rungs[-1].parameters)
     told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.claimed]
+    beside: list[tuple[str, str]] = []
     if verdict == "ambiguous":
         names = [j.named.label for j in group]
+        beside = [one for one in told if one[0] not in names]
         told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.label in names]
     probabilities = dict(found.rounds[0].probabilities)
     if not (explained if start is found.final else explains(observations, start, settings)):
@@ -105,12 +108,19 @@ def diagnose(
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
     bent = sentences.standing_out(outlying_parts(observations, found.final))
     reasons = " ".join(
-        filter(None, (sentences.STANDING_STILL if stands_still(observations, found.final) else "", bent))
+        filter(
+            None,
+            (
+                sentences.STANDING_STILL if stands_still(observations, found.final) else "",
+                sentences.held_out_missed(rungs[-1].heldout_error) if missed else "",
+                bent,
+            ),
+        )
     )
     errors = (rungs[0].error, rungs[-1].error)
     return Diagnosis(
         verdict=verdict,
-        summary=sentences.summary(verdict, told, errors, nothing, best, reasons),
+        summary=sentences.summary(verdict, told, errors, nothing, best, reasons, beside),
         null_probability=nothing,
         candidates=candidates,
         indistinguishable=_groups(found, group, settings),

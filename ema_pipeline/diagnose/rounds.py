@@ -11,6 +11,7 @@ from ema_pipeline.diagnose.claims import (
     BETTER_CONTRADICTED,
     BETTER_DOUBTED,
     Judged,
+    doubt_of_nothing,
     doubtful_evidence,
     judge,
 )
@@ -52,9 +53,10 @@ class Round:
         return next((j for j in self.judged if j.claimed), None)
 
     def alike(self, settings: DiagnoseSettings) -> tuple[Judged, ...]:
-        """The best claimed hypothesis and all that explain the data as well; the rig's own before generic ones.
+        """The best claimed hypothesis and all that explain the data as well; the rig's own effects first.
 
-        Rivals need not pass the threshold of a claim themselves: what the best one has, they nearly have.
+        A part out of tolerance is no more likely than a generic effect that explains the data better. Rivals need not
+        pass the threshold of a claim themselves: what the best one has, they nearly have.
         """
         best = self.best
         if best is None:
@@ -63,7 +65,7 @@ class Round:
 
         def order(j: Judged) -> tuple[bool, float, str]:
             behind = best.gain - j.gain
-            return j.hypothesis.generic, behind if behind > _TIE else 0.0, j.hypothesis.label
+            return not j.specific, behind if behind > _TIE else 0.0, j.hypothesis.label
 
         return tuple(sorted(near, key=order))
 
@@ -88,7 +90,8 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
 
     Left alone, the scatter of a few parts grows until none stands out, and the evidence of a base model that bends
     one part is hardly behind that of the model with what is missing there. An effect that changes just what a part
-    that stands out changes is helped to the difference, if it explains the data with none that does.
+    that stands out changes is helped to the difference, if it explains the data with none that does; and so is every
+    other one that explains them so and gains no less.
     """
     p = ranking.base.posterior
     bounded = within_scatter(observations, ranking.base).posterior
@@ -97,15 +100,18 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
     relief = p.log_evidence + p.scatter_cost - bounded.log_evidence - bounded.scatter_cost
     parts = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, part_reach(observations, p)))]
 
-    def relieved(one: Ranked) -> Ranked:
-        if not one.final or not _changes(one, parts):
-            return one
+    def explains(one: Ranked) -> bool:
         found = within_scatter(observations, one.fit)
-        explains = found is one.fit and found.posterior.error <= settings.error_limit
-        return replace(one, gain=one.gain + max(relief, 0.0)) if explains else one
+        return found is one.fit and found.posterior.error <= settings.error_limit
 
-    ranked = sorted(map(relieved, ranking.ranked), key=lambda r: -r.gain)
-    return replace(ranking, ranked=tuple(ranked))
+    able = [r for r in ranking.ranked if r.final and explains(r)]
+    least = min((r.gain for r in able if _changes(r, parts)), default=np.inf)
+    helped = [r.hypothesis.label for r in able if r.gain >= least]
+    ranked = [
+        replace(r, gain=r.gain + max(relief, 0.0)) if r.hypothesis.label in helped else r
+        for r in ranking.ranked
+    ]
+    return replace(ranking, ranked=tuple(sorted(ranked, key=lambda r: -r.gain)))
 
 
 def _changes(one: Ranked, parts: Sequence[str]) -> bool:
@@ -126,11 +132,15 @@ def weighed(
     settings: DiagnoseSettings,
     found: int,
 ) -> Round:
-    """The round in which nothing is claimed that others speak against, see `_against`."""
+    """The round in which nothing is claimed that others speak against, or that may as well be nothing.
+
+    Of the evidence only what is believed counts: verdict and probabilities agree.
+    """
     least = _least_believed(judged, settings)
     believed = _without_linearisation(ranking, settings) | {j.named.label: j.believed for j in judged}
     told = probabilities(ranking, hypotheses, settings, found, believed, least)
-    doubts = [_against(j, judged, least) if j.claimed else "" for j in judged]
+    nothing = doubt_of_nothing(told[NOTHING], settings)
+    doubts = [_against(j, judged, least) or nothing if j.claimed else "" for j in judged]
     judged = [replace(j, doubt=doubt) if doubt else j for j, doubt in zip(judged, doubts, strict=True)]
     return Round(ranking, tuple(judged), told)
 

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from ema_pipeline.diagnose.backward import reconsidered
 from ema_pipeline.diagnose.claims import BY_OTHERS, Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
@@ -173,7 +175,7 @@ def _acquitted(
     Where others gained more alone, it counts with what both gain.
     """
     leads = leader is found.judged[0]
-    acquitted = replace(leader, doubt="", gain=leader.gain if leads else both.gain)
+    acquitted = replace(leader, doubt="", gain=leader.gain if leads else both.gain, left=np.inf)
     others = [j for j in found.judged if j is not leader]
     others = [replace(j, doubt="") if j.doubt in BY_OTHERS else j for j in others]
     return weighed(found.ranking, [acquitted, *others], hypotheses, settings, known)

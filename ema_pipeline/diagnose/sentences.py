@@ -57,6 +57,7 @@ def summary(
     nothing: float,
     best: tuple[str, str] = ("", ""),
     reasons: str = "",
+    beside: Sequence[tuple[str, str]] = (),
 ) -> str:
     """One to three sentences.
 
@@ -74,15 +75,22 @@ def summary(
         would.
     reasons : str, optional
         Why the model does not explain the data, beside its error.
+    beside : sequence of (label, size), optional
+        What is claimed beside effects that explain the data equally well.
     """
     before, after = error
-    named = "; ".join(f"{label_text(label)}, {size}" for label, size in claimed)
+    named, sure = ("; ".join(f"{label_text(label)}, {size}" for label, size in x) for x in (claimed, beside))
     if verdict == "effect":
         added = "these" if len(claimed) > 1 else "this"
         return f"Missing from the model: {named}. Adding {added} reduces the error from {before:.2f} to {after:.2f}."
     if verdict == "ambiguous":
+        first, added = (
+            (f"Missing from the model: {sure}. Beside it, several", "it and one")
+            if sure
+            else ("Several", "one")
+        )
         return (
-            f"Several effects explain the data equally well: {named}. Adding one of them reduces the error from "
+            f"{first} effects explain the data equally well: {named}. Adding {added} of them reduces the error from "
             f"{before:.2f} to {after:.2f}."
         )
     if verdict == "adequate":
@@ -107,6 +115,11 @@ def _candidate(best: tuple[str, str]) -> str:
 STANDING_STILL = (
     "Modes move with the force of the hits, and no effect that moves them is supported by these data."
 )
+
+
+def held_out_missed(error: float) -> str:
+    """Said of effects that fit the data, and predict none."""
+    return f"With what fits best, data held out are off by {error:.1f} times their uncertainty."
 
 
 def standing_out(parts: Sequence[OutlyingPart]) -> str:

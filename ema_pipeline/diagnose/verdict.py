@@ -66,12 +66,13 @@ def verdict_of(found: Selection, settings: DiagnoseSettings, explained: bool) ->
 def alike(found: Selection, settings: DiagnoseSettings) -> tuple[Judged, ...]:
     """Hypotheses of the round that claimed the last effect which explain the data as well.
 
-    Where one of the rig's own effects is among them, it is named, and generic ones stand beside it as equivalents.
+    Where one of the rig's own effects is among them, it is named, and generic ones stand beside it as equivalents; not
+    so where it is but a part out of tolerance.
     """
     for k in reversed(range(len(found.claimed))):
         near = found.rounds[k].alike(settings)
         own = tuple(j for j in near if not j.hypothesis.generic)
-        contenders = own or near
+        contenders = own if any(j.specific for j in own) else near
         if len(contenders) > 1:
             return contenders
     return ()

@@ -30,8 +30,8 @@ def heading(found: Diagnosis) -> str:
             f"Missing: {' and '.join(label_words(c.label) for c in claimed(found)) or 'see the candidates'}"
         )
     if found.verdict == "ambiguous":
-        count = len(found.indistinguishable[0]) if found.indistinguishable else 2
-        return f"{_COUNTS.get(count, str(count))} effects explain the data equally well"
+        told, sure = heading_of_alike(found), " and ".join(label_words(c.label) for c in undisputed(found))
+        return f"Missing: {sure}; beside it, {_lower(told)}" if sure else told
     near = any(c.would_explain(ERROR_LIMIT) for c in found.candidates[:1])
     if found.verdict == "unknown_effect" and near:
         return "Something is missing, and no effect is supported enough to be named"
@@ -40,6 +40,12 @@ def heading(found: Diagnosis) -> str:
         "unknown_effect": "Something is missing that is not in the library",
         "not_enough_data": "Not enough data to show what is missing",
     }[found.verdict]
+
+
+def heading_of_alike(found: Diagnosis) -> str:
+    """How many effects the data do not tell apart."""
+    count = len(found.indistinguishable[0]) if found.indistinguishable else 2
+    return f"{_COUNTS.get(count, str(count))} effects explain the data equally well"
 
 
 def label_words(label: str) -> str:
@@ -54,12 +60,20 @@ def claimed(found: Diagnosis) -> tuple[Candidate, ...]:
     return tuple(sorted(mine, key=lambda c: order.get(c.label, len(order))))
 
 
+def alike(found: Diagnosis) -> tuple[Candidate, ...]:
+    """Candidates of which the data do not tell which one it is; none where there is no doubt."""
+    group = found.indistinguishable[:1] if found.verdict == "ambiguous" else ()
+    return tuple(c for c in found.candidates if any(c.label in labels for labels in group))
+
+
+def undisputed(found: Diagnosis) -> tuple[Candidate, ...]:
+    """Claimed candidates beside those of which the data do not tell which one it is."""
+    return tuple(c for c in claimed(found) if c not in alike(found))
+
+
 def leading(found: Diagnosis) -> tuple[Candidate, ...]:
-    """What a reader should know of: the group that fits equally well, the claimed candidates, or the best one."""
-    alike = {label for group in found.indistinguishable for label in group}
-    if alike and found.verdict == "ambiguous":
-        return tuple(c for c in found.candidates if c.label in alike)
-    return claimed(found) or found.candidates[:1]
+    """What a reader should know of: the claimed candidates, the group that fits equally well, or the best one."""
+    return (*undisputed(found), *alike(found)) or found.candidates[:1]
 
 
 def size_words(parameters: Mapping[str, EffectSize], between: str = "; ") -> str:
@@ -72,8 +86,7 @@ def size_words(parameters: Mapping[str, EffectSize], between: str = "; ") -> str
 
 def standing(found: Diagnosis, candidate: Candidate) -> str:
     """What the data say of a candidate, in a word or two."""
-    grouped = any(candidate.label in group for group in found.indistinguishable)
-    if grouped and found.verdict == "ambiguous":
+    if candidate in alike(found):
         return "fits equally well"
     if candidate.claimed:
         return "best, not enough" if found.verdict == "unknown_effect" else "supported"
@@ -247,7 +260,10 @@ def next_commands(found: Diagnosis, out: str = "OUT", added: Sequence[str] = ())
         return (f"ema add {folder} {' '.join(new)}", f"ema ladder {folder}") if new else ()
     if found.verdict == "ambiguous":
         # one of them, the user's choice: each line stands for itself
-        return tuple(f"ema add {folder} {c.label}" for c in leading(found) if c.label not in added)
+        sure = [c.label for c in undisputed(found) if c.label not in added]
+        return tuple(
+            f"ema add {folder} {' '.join([*sure, c.label])}" for c in alike(found) if c.label not in added
+        )
     if found.verdict == "unknown_effect":
         return (f"ema compare {folder}", f"ema diagnose {folder} --effect-file my_effect.py")
     return ()

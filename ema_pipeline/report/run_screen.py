@@ -13,7 +13,7 @@ from rich.text import Text
 from ema_pipeline.choices import Choices
 from ema_pipeline.correlate.types import percent_off
 from ema_pipeline.diagnose.sentences import probability_text
-from ema_pipeline.diagnose.types import Diagnosis
+from ema_pipeline.diagnose.types import Candidate, Diagnosis
 from ema_pipeline.modal.chosen import EXCLUDED
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report import diagnosis
@@ -130,21 +130,27 @@ def _diagnosed(found: Diagnosis) -> str:
     if found.verdict == "not_enough_data":
         return f"{heading}. {found.summary}"
     top = found.ladder.rungs[-1].parameters if found.ladder.rungs else {}
-    named = []
-    for c in diagnosis.leading(found):
-        sizes = {
-            n: top.get(f"{c.label}.{n}", s) for n, s in c.parameters.items()
-        }  # as the ladder states them
-        shown = diagnosis.size_words(sizes, ", ")
-        named.append(diagnosis.label_words(c.label) + (f", {shown}" if shown else ""))
+
+    def named(candidates: Sequence[Candidate]) -> str:
+        told = []
+        for c in candidates:
+            sizes = {
+                n: top.get(f"{c.label}.{n}", s) for n, s in c.parameters.items()
+            }  # as the ladder has them
+            shown = diagnosis.size_words(sizes, ", ")
+            told.append(diagnosis.label_words(c.label) + (f", {shown}" if shown else ""))
+        return "; ".join(told)
+
     if found.verdict == "effect":
         mine = diagnosis.claimed(found)
         odds = probability_text(min((c.probability for c in mine), default=math.nan))
         rungs = found.ladder.rungs
         fall = f", error {plain(error, 3)} → {plain(rungs[-1].error, 3)}" if rungs else ""
-        return f"Missing: {'; '.join(named)} (probability {odds}{fall})."
+        return f"Missing: {named(mine)} (probability {odds}{fall})."
     if found.verdict == "ambiguous":
-        return f"{heading}: {'; '.join(named)}."
+        sure = named(diagnosis.undisputed(found))
+        told = f"{diagnosis.heading_of_alike(found)}: {named(diagnosis.alike(found))}."
+        return f"Missing: {sure}. Beside it, {told[:1].lower()}{told[1:]}" if sure else told
     return f"{heading} (error {plain(error, 3)})."
 
 

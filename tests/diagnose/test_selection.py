@@ -24,6 +24,7 @@ from ema_pipeline.diagnose.rounds import Round
 from ema_pipeline.diagnose.selection import Selection, _beside, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import EffectSize
+from ema_pipeline.diagnose.verdict import alike
 
 SETTINGS = DiagnoseSettings(alike=3.0, claim=3.5, linearised=0.1, candidates=5)
 
@@ -33,12 +34,15 @@ def judged(
     gain: float,
     doubt: str = "",
     generic: bool = False,
+    specific: bool = True,
     linear: bool = True,
     equivalents: tuple[str, ...] = (),
 ) -> Any:
     """A hypothesis with what it gains; every number of it another one."""
     effect_id, _, place = label.partition("@")
-    effect = SimpleNamespace(id=effect_id, title=f"title of {label}", signs="signs", linear=linear)
+    effect = SimpleNamespace(
+        id=effect_id, title=f"title of {label}", signs="signs", linear=linear, generic=generic
+    )
     placed = SimpleNamespace(effect=effect, place=place, label=label)
     fit = SimpleNamespace(model=f"model of {label}")
     hypothesis = SimpleNamespace(label=label, generic=generic, placed=placed)
@@ -53,6 +57,7 @@ def judged(
         ),
         gain=gain,
         needed=3.5,
+        specific=specific and not generic,
         doubt=doubt,
         claimed=not doubt,
         predicts_worse=doubt == PREDICTED_WORSE,
@@ -102,8 +107,9 @@ def test_the_rigs_own_come_before_generic_ones_and_ties_are_in_the_order_of_name
         judged("a@generic", 9.0, generic=True),
         judged("c@own", 7.0),
         judged("a@own", 8.85),
+        judged("a@part", 8.0, specific=False),
     )
-    assert labels(one.alike(SETTINGS)) == ["b@own", "z@own", "a@own", "c@own", "a@generic"]
+    assert labels(one.alike(SETTINGS)) == ["b@own", "z@own", "a@own", "c@own", "a@generic", "a@part"]
 
 
 def test_a_further_effect_must_gain_a_share_of_what_those_gained_that_are_linearised() -> None:
@@ -287,7 +293,10 @@ def test_a_model_that_explains_the_data_or_is_linearised_calls_for_no_pairs(
 def test_a_base_model_that_fails_once_no_part_stands_out_counts_with_that_fit(
     monkeypatch: pytest.MonkeyPatch, error: float, relief: float
 ) -> None:
-    """What changes just that part, and explains the data with none that stands out, is helped to the difference."""
+    """What changes just that part, and explains the data with none that stands out, is helped to the difference.
+
+    So is what explains them better still; else a mass at the part that stands out takes the place of a true spring.
+    """
 
     def fit(log_evidence: float, error: float, bounded: Any = None, cosine: float = 0.96) -> Any:
         jacobian = np.array([[1.0, cosine], [0.0, np.sqrt(1 - cosine**2)]])
@@ -311,6 +320,7 @@ def test_a_base_model_that_fails_once_no_part_stands_out_counts_with_that_fit(
         base,
         (
             ranked("bends a part", 9.0, fit(69.0, 1.0, fit(30.0, 1.2))),
+            ranked("explains better", 3.5, fit(63.5, 0.5, cosine=0.1)),
             ranked("explains", 3.0, fit(63.0, 1.5)),
             ranked("at another part", 2.5, fit(62.5, 1.0, cosine=0.94)),
             ranked("fails", 2.0, fit(62.0, 1.51)),
@@ -319,7 +329,8 @@ def test_a_base_model_that_fails_once_no_part_stands_out_counts_with_that_fit(
     )
     data: Any = None
     found = rounds._with_relief(data, given, SETTINGS)
-    expected = [("bends a part", 9.0), ("explains", 3.0 + relief), ("at another part", 2.5), ("fails", 2.0)]
+    expected = [("bends a part", 9.0), ("at another part", 2.5), ("fails", 2.0)]
+    expected += [("explains better", 3.5 + relief), ("explains", 3.0 + relief)]
     expected = sorted([*expected, ("no finalist", 1.0)], key=lambda one: -one[1])
     assert [(r.hypothesis.label, r.gain) for r in found.ranked] == expected
     assert found.base is base
@@ -353,7 +364,7 @@ def test_a_linearised_effect_is_one_of_many_where_a_better_one_is_doubted(
 
 def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
     ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (1.0, 9.0, 4.0, 2.0)]
-    told = {NOTHING: 0.7}
+    told = {NOTHING: 0.1}
     monkeypatch.setattr(rounds, "_with_relief", lambda o, ranking, settings: ranking)
     monkeypatch.setattr(
         rounds,
@@ -377,7 +388,7 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
     given: Any = SimpleNamespace(ranked=ranked, linearised=False)
     data: Any = None
     found = rounds.round_of(data, given, [], SETTINGS, 2)
-    assert [(j.gain, j.nothing) for j in found.judged] == [(4.0, 0.7), (2.0, 0.7), (1.0, 0.7)]  # type: ignore[attr-defined]
+    assert [(j.gain, j.nothing) for j in found.judged] == [(4.0, 0.1), (2.0, 0.1), (1.0, 0.1)]  # type: ignore[attr-defined]
     assert found.probabilities == told | {"n": 2}
     assert found.ranking is given
 
@@ -401,8 +412,27 @@ def test_nothing_is_claimed_far_behind_what_held_out_data_contradict(
     assert ahead.judged[0].claimed
 
 
-def judged_round(monkeypatch: pytest.MonkeyPatch, found: list[tuple[str, float, str]]) -> Round:
-    """A round of hypotheses with what they gain and what speaks against them."""
+@pytest.mark.parametrize(("left", "claimed"), [(9.0, True), (3.6, True), (3.5, False)])
+def test_nothing_is_claimed_where_its_probability_without_doubtful_evidence_is_too_low(
+    monkeypatch: pytest.MonkeyPatch, left: float, claimed: bool
+) -> None:
+    """Of a gain that rests on close modes only what is left counts, for the claim as for the probability."""
+    prior = {"null_prior": 0.9}
+    one = judged_round(monkeypatch, [("damper@x", 9.0, "")], left, SETTINGS.model_copy(update=prior))
+    nothing = 0.9 / (0.9 + 0.1 * np.exp(left))
+    assert one.probabilities[NOTHING] == pytest.approx(nothing)
+    assert one.judged[0].claimed is claimed is bool(nothing <= SETTINGS.doubt)
+    told = "" if claimed else "the probability that nothing is missing, 21 %, is above 20 %"
+    assert one.judged[0].doubt == told
+
+
+def judged_round(
+    monkeypatch: pytest.MonkeyPatch,
+    found: list[tuple[str, float, str]],
+    left: float = np.inf,
+    settings: DiagnoseSettings = SETTINGS,
+) -> Round:
+    """A round of hypotheses with what they gain, what speaks against them, and what is left without close modes."""
     doubts = {label: doubt for label, _, doubt in found}
     names = {label: SimpleNamespace(label=label, advantage=0.0) for label, _, _ in found}
     told: Any = [
@@ -425,11 +455,12 @@ def judged_round(monkeypatch: pytest.MonkeyPatch, found: list[tuple[str, float, 
             fit,
             doubts[r.hypothesis.label],
             3.5,  # type: ignore[arg-type]
+            left,
         ),
     )
     data: Any = None
     ranking: Any = SimpleNamespace(ranked=told, linearised=False)
-    return rounds.round_of(data, ranking, [t.hypothesis for t in told], SETTINGS, 0)
+    return rounds.round_of(data, ranking, [t.hypothesis for t in told], settings, 0)
 
 
 @pytest.mark.parametrize("doubt", [PREDICTED_WORSE, NO_LESS_ERROR])
@@ -528,6 +559,15 @@ def test_a_claim_that_took_the_place_of_an_earlier_one_has_a_probability_of_its_
     )
     odds = np.exp(10.0) * (1 - SETTINGS.null_prior) / 2 / SETTINGS.null_prior
     assert found[0].probability == pytest.approx(odds / (1 + odds), rel=1e-3)
+
+
+def test_a_part_out_of_tolerance_stands_beside_a_generic_effect_as_likely() -> None:
+    """One of the rig's own effects alone makes generic ones its equivalents."""
+    generic, part = judged("damper@m1", 8.0, generic=True), judged("out_of_tolerance@k1", 7.0, specific=False)
+    own = judged("sensor_mass@m1", 6.0)
+    alone, beside = a_round(generic, part), a_round(generic, part, own)
+    assert labels(alike(selected([generic], alone), SETTINGS)) == ["damper@m1", "out_of_tolerance@k1"]
+    assert labels(alike(selected([generic], beside), SETTINGS)) == ["sensor_mass@m1", "out_of_tolerance@k1"]
 
 
 def test_groups_are_rivals_and_names_of_one_each_told_once() -> None:

@@ -30,7 +30,7 @@ from ema_pipeline.diagnose.types import (
     VerdictWord,
 )
 from ema_pipeline.fit.types import ErrorSweep
-from ema_pipeline.report import diagnosis, diagnosis_tables, summary, tables, terminal
+from ema_pipeline.report import diagnosis, diagnosis_tables, run_screen, summary, tables, terminal
 from ema_pipeline.report.figures.diagnosis import ladder_errors, where_it_fails
 from ema_pipeline.report.html import bokeh_script, report_html
 from ema_pipeline.report.numbers import below
@@ -184,6 +184,39 @@ def test_what_is_missing_may_be_in_the_library_where_the_best_candidate_would_ex
 def test_three_that_fit_alike_are_counted_in_the_heading() -> None:
     three = replace(found("ambiguous"), indistinguishable=((CRACK, OTHER, SUPPORT),))
     assert diagnosis.heading(three) == "Three effects explain the data equally well"
+
+
+def test_what_is_claimed_beside_effects_that_fit_alike_is_told_with_them() -> None:
+    one = found("ambiguous")
+    sure, *others = one.candidates
+    both = replace(
+        one,
+        candidates=(replace(sure, claimed=True), *others),
+        indistinguishable=((OTHER, SUPPORT), (CRACK, "x@y")),
+    )
+    assert diagnosis.heading(both) == (
+        "Missing: mesh stiffness loss at sun-planet1; beside it, two effects explain the data equally well"
+    )
+    assert [c.label for c in diagnosis.leading(both)] == [CRACK, OTHER, SUPPORT]
+    words = [diagnosis.standing(both, c) for c in both.candidates]
+    assert words == ["supported", "fits equally well", "fits equally well"]
+    assert diagnosis.next_commands(both, "out") == (
+        f"ema add out {CRACK} {OTHER}",
+        f"ema add out {CRACK} {SUPPORT}",
+    )
+    assert diagnosis.next_commands(both, "out", (CRACK,))[0] == f"ema add out {OTHER}"
+    told = run_screen._diagnosed(both)
+    assert told.startswith(
+        "Missing: mesh stiffness loss at sun-planet1, fraction 0.340 ± 0.010. Beside it, two"
+    )
+    assert told.count("mesh stiffness loss") == 1
+    text = sentences.summary(
+        "ambiguous", [("a@x", "1 N"), ("b@y", "2 N")], (3.1, 1.0), 0.0, beside=[("c@z", "3 N")]
+    )
+    assert text == (
+        "Missing from the model: c at z, 3 N. Beside it, several effects explain the data equally well: a at x, 1 N; "
+        "b at y, 2 N. Adding it and one of them reduces the error from 3.10 to 1.00."
+    )
 
 
 def test_probability_is_never_rounded_to_certainty_or_to_nothing() -> None:
