@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
 from ema_pipeline.modal.all_rows import linear_fit, placed
 from ema_pipeline.modal.bands import SubBand
@@ -345,13 +346,11 @@ def _apart(weak: Estimate, known: Estimate) -> NDArray[np.bool_]:
 
 
 def _holds(larger: Estimate, smaller: Estimate) -> bool:
-    """True where every mode of the smaller set is still in the larger one, within its bandwidth."""
-    if not len(smaller.poles):
-        return True
-    if not len(larger.poles):
+    """True where every mode of the smaller set is still in the larger one, within its bandwidth, none for two."""
+    if len(larger.poles) < len(smaller.poles):
         return False
-    distance = np.abs(smaller.poles[:, None] - larger.poles[None]).min(axis=1)
-    return bool(np.all(distance < 2 * -smaller.poles.real))
+    lost = np.abs(smaller.poles[:, None] - larger.poles[None]) >= -2 * smaller.poles.real[:, None]
+    return not lost[linear_sum_assignment(lost)].any()
 
 
 @dataclass(frozen=True)

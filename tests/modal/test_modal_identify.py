@@ -27,7 +27,7 @@ from ema_pipeline.ingest.description import read_description
 from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import cut_hit
-from ema_pipeline.modal import segment
+from ema_pipeline.modal import segment, sub_bands
 from ema_pipeline.modal.data import FitData, arrange
 from ema_pipeline.modal.fit import Estimate
 from ema_pipeline.modal.identify import identify
@@ -479,3 +479,24 @@ def test_noise_averaged_over_lines_is_not_taken_for_more_of_it_beside_a_narrow_p
     assert right[..., peak].mean() == pytest.approx(1, abs=0.1)
     assert right[..., flank].mean() == pytest.approx(1, abs=0.1)
     assert max(wrong[..., peak].mean(), wrong[..., flank].mean()) > 1.3
+
+
+@pytest.mark.parametrize(
+    ("after", "holds"),
+    [
+        ([-3 + 100j, -6 + 110j, -1 + 150j], True),
+        ([-3 + 101j, -6 + 112j], True),
+        ([-9 + 104j], False),  # one for both, near to either
+        ([-9 + 104j, -1 + 150j], False),
+        ([-3 + 100j, -6 + 125j], False),
+        ([], False),
+    ],
+)
+def test_weak_candidates_may_not_merge_modes_that_were_found(after: list[complex], holds: bool) -> None:
+    """Else what a tool holder shows depends on the processor: one has a weak candidate more than another."""
+
+    def at(poles: list[complex]) -> Estimate:
+        return Estimate(np.array(poles, complex), np.ones((len(poles), 1), complex))
+
+    assert sub_bands._holds(at(after), at([-3 + 100j, -6 + 110j])) is holds
+    assert sub_bands._holds(at(after), at([]))
