@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,10 @@ import numpy as np
 from study_own_rigs import BASE_DAMPING, OwnRig, draw_rig
 
 from ema_pipeline.effects.library import shipped_effects
+from ema_pipeline.observations.parts import dependence
 from ema_pipeline.rigs import load_rig
 from ema_pipeline.rigs.types import Rig
-from ema_pipeline.simulate import simulate_campaign
+from ema_pipeline.simulate import SimulatedCampaign, simulate_campaign
 from ema_pipeline.simulate.imperfections import LEVELS
 
 Kind = Literal["own", "planetary", "gearbox", "isolator", "levels"]
@@ -256,10 +258,20 @@ def _shipped(
         values=_free_values(rig, random), scatter=1.0, format="hdf5", seed=case.seed, imperfection=case.level,
         **settings,
     )  # fmt: skip
-    values = {n: v for n, v in made.values.items() if "@" not in n}
+    values = {n: v for n, v in made.values.items() if "@" not in n} | _of_sole_parts(rig, made)
     return Made(
         f"{base}, {planets} planets, {' + '.join(configurations)}", tuple(t for t, _ in drawn), values
     )
+
+
+def _of_sole_parts(rig: Rig, made: SimulatedCampaign) -> dict[str, float]:
+    """True values of parameters that one part alone has: what is stated of them is that part's."""
+    truth = json.loads((made.folder / "truth.json").read_text(encoding="utf-8"))
+    parts = truth.get("imperfections", {}).get("parts", {})
+    return {
+        name: made.values[name] * parts.get(part.rpartition(" (")[0], 1.0) ** power
+        for name, (part, power) in dependence(rig).sole_parts.items()
+    }
 
 
 def _planetary(case: Case, raw: Path, random: np.random.Generator) -> Made:

@@ -92,6 +92,11 @@ def _strange(line: Line) -> list[str]:
 
 def over_limit(line: Line) -> float | None:
     """Least of the hidden effects' sizes over their stated limits; None where one has no limit stated."""
+    return min(_over_limits(line) or (), default=None)
+
+
+def _over_limits(line: Line) -> list[float] | None:
+    """The hidden effects' sizes over their stated limits; None where one has no limit stated."""
     ratios = []
     for t in line["truth"]:
         own = [
@@ -106,7 +111,7 @@ def over_limit(line: Line) -> float | None:
             ratios.append((limit or 0.0) / size)
         else:
             ratios.append(size / limit if limit else 0.0)
-    return min(ratios) if ratios else None
+    return ratios
 
 
 def outcome(line: Line) -> str:
@@ -173,7 +178,9 @@ def ranks(z: Sequence[float], bins: int = 10) -> list[int]:
     return [int(n) for n in np.histogram(norm.cdf(-np.asarray(z)), bins, (0, 1))[0]]
 
 
-def statements(lines: Iterable[Line], of_effects: bool | None = None) -> list[tuple[float, bool]]:
+def statements(
+    lines: Iterable[Line], of_effects: bool | None = None, shown: bool = False
+) -> list[tuple[float, bool]]:
     """The most probable statement of each case, "nothing" among them: its probability, and whether it is true.
 
     Parameters
@@ -181,6 +188,8 @@ def statements(lines: Iterable[Line], of_effects: bool | None = None) -> list[tu
     lines : iterable of dict
     of_effects : bool, optional
         True for statements that name an effect, False for those that nothing is missing; all where left out.
+    shown : bool
+        True where "nothing" is true, too, if all that is hidden is smaller than its stated limit.
     """
     told = []
     for line in lines:
@@ -190,7 +199,8 @@ def statements(lines: Iterable[Line], of_effects: bool | None = None) -> list[tu
         best = max(line["candidates"], key=lambda c: c["probability"] or 0.0, default=None)
         if best is None or nothing >= (best["probability"] or 0.0):
             if of_effects is not True:
-                told.append((nothing, not line["truth"]))
+                ratios = _over_limits(line) if shown else None
+                told.append((nothing, not line["truth"] or max(ratios or (np.inf,)) < 1))
             continue
         if of_effects is False:
             continue
@@ -229,6 +239,7 @@ def table(lines: Sequence[Line]) -> str:
     inside = [line for line in lines if not line["without"]]
     z, own_z, told = sizes(inside), parameters(inside), statements(inside)
     named, silent = statements(inside, True), statements(inside, False)
+    to_be_seen = statements(inside, False, shown=True)
     clear = [x for x in inside if x["truth"] and not x.get("failed") and (over_limit(x) or 0) >= CLEARLY]
     found = sum(outcome(x) in ("right", "group") for x in clear)
     out += [
@@ -241,7 +252,8 @@ def table(lines: Sequence[Line]) -> str:
         f"ranks {ranks(own_z)}.",
         f"- Expected calibration error of {len(told)} probabilities: {calibration_error(told):.3f}; of the "
         f"{len(named)} that name an effect {calibration_error(named):.3f}, of the {len(silent)} that "
-        f"nothing is missing {calibration_error(silent):.3f}.",
+        f"nothing is missing {calibration_error(silent):.3f}, or nothing above its limit "
+        f"{calibration_error(to_be_seen):.3f}.",
         "",
         *_not_right(lines),
     ]

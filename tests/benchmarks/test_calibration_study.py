@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import tomllib
 from pathlib import Path
@@ -153,3 +154,28 @@ def test_a_case_is_a_raw_folder_with_the_rig_as_stated(tmp_path: Path, kind: stu
 def test_a_library_without_an_effect_lacks_its_other_names_too() -> None:
     assert study_cases.lacking([study_cases.Truth("sensor_mass@sun", "mass", 0.1)]) >= {"mass", "sensor_mass"}
     assert study_cases.lacking([study_cases.Truth("gyroscopic@sun", "c", 1.0)]) == {"gyroscopic"}
+
+
+def test_the_true_value_of_a_parameter_with_one_part_is_that_of_the_part(tmp_path: Path) -> None:
+    made = study_cases.make(study_cases.Case("planetary", "normal", 0), tmp_path / "raw")
+    truth = json.loads((tmp_path / "raw" / "truth.json").read_text(encoding="utf-8"))
+    parts = truth["imperfections"]["parts"]
+    assert made.values["sun_mass"] == pytest.approx(truth["values"]["sun_mass"] * parts["sun mass"])
+    assert parts["sun mass"] != 1.0
+    assert made.values["planet_mass"] == truth["values"]["planet_mass"]  # of several parts
+
+
+@pytest.mark.parametrize(("size", "true"), [(0.5, True), (1.5, False)])
+def test_nothing_is_missing_that_could_show_where_all_that_is_hidden_is_below_its_limit(
+    size: float, true: bool
+) -> None:
+    silent = {"claimed": [], "verdict": "adequate", "nothing": 0.8, "candidates": [], "failed": None}
+    limit = {"label": "mass@m1.x", "parameter": "mass", "size": 1.0}
+    hidden = {
+        "truth": [{"label": "mass@m1.x", "parameter": "mass", "size": size, "also": ""}],
+        "limits": [limit],
+    }
+    own = line(**(silent | hidden))
+    assert tally.statements([own]) == [(0.8, False)]
+    assert tally.statements([own], False, shown=True) == [(0.8, true)]
+    assert tally.statements([line(**(silent | hidden | {"limits": []}))], shown=True) == [(0.8, False)]

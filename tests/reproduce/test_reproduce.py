@@ -169,8 +169,13 @@ NUMBER = re.compile(r"[+-]?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 
 def _alike(row: str, line: str) -> bool:
-    """Equal but for what rounding changes between machines: 4 % of a number, 0.3 of a percentage."""
+    """Equal but for what rounding changes between machines: 4 % of a number, 0.35 of a percentage.
+
+    A value with its standard deviation may differ by a tenth of that, and both come from a fit that stops near the
+    optimum: 10 % of them.
+    """
     if NUMBER.sub("0", row) != NUMBER.sub("0", line):
         return False
     found, printed = (np.array([float(n) for n in NUMBER.findall(text)]) for text in (row, line))
-    return bool(np.all(np.abs(found - printed) <= np.maximum(0.04 * np.abs(printed), 0.3)))
+    share = 0.1 if "±" in line else 0.04
+    return bool(np.all(np.abs(found - printed) <= np.maximum(share * np.abs(printed), 0.35)))
