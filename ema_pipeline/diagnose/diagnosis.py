@@ -72,6 +72,8 @@ def diagnose(
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
     found = select(observations, known, hypotheses, settings, progress)
     observations = found.observations
+    explained = explains(observations, found.final, settings)
+    verdict = verdict_of(found, settings, explained)
     start = found.rounds[0].ranking.base
     fits = [start, *(j.ranked.fit for j in found.claimed)]
     if found.claimed:
@@ -79,9 +81,6 @@ def diagnose(
     said = [(j.hypothesis, j.named.name) for j in found.claimed]
     named = [in_said_names(observations, f, said) for f in fits]
     rungs = rungs_of(observations, named, settings.processes)
-    missed = bool(found.claimed) and rungs[-1].heldout_error > settings.heldout_limit  # no data held out: NaN
-    explained = not missed and explains(observations, found.final, settings)
-    verdict = verdict_of(found, settings, explained)
     in_model = set(found.final.model.labels)
     further = [h for h in hypotheses if h.label not in in_model]
     group = alike(found, settings)
@@ -108,14 +107,7 @@ def diagnose(
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
     bent = sentences.standing_out(outlying_parts(observations, found.final))
     reasons = " ".join(
-        filter(
-            None,
-            (
-                sentences.STANDING_STILL if stands_still(observations, found.final) else "",
-                sentences.held_out_missed(rungs[-1].heldout_error) if missed else "",
-                bent,
-            ),
-        )
+        filter(None, (sentences.STANDING_STILL if stands_still(observations, found.final) else "", bent))
     )
     errors = (rungs[0].error, rungs[-1].error)
     return Diagnosis(

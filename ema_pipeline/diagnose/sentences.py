@@ -117,11 +117,6 @@ STANDING_STILL = (
 )
 
 
-def held_out_missed(error: float) -> str:
-    """Said of effects that fit the data, and predict none."""
-    return f"With what fits best, data held out are off by {error:.1f} times their uncertainty."
-
-
 def standing_out(parts: Sequence[OutlyingPart]) -> str:
     """Parts that deviate more than similar ones scatter; empty without any."""
     if not parts:

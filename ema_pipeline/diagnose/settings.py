@@ -82,12 +82,6 @@ class DiagnoseSettings(Settings):
         gt=1,
         description="Error up to which a model counts as one that explains the data.",
     )
-    heldout_limit: float = Field(
-        default=2.0,
-        gt=1,
-        description="Error of data held out above which the model with the claimed effects does not explain the data: "
-        "wrong effects may fit few modes, and predict none.",
-    )
     folds: int = Field(default=4, ge=2, le=20, description="Number of cross-validation folds.")
     most_effects: int = Field(
         default=3, ge=1, le=6, description="Largest number of effects that are added automatically."

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -15,7 +14,6 @@ from imperfect_modes import GOOD, NORMAL, Hidden, Lab, chain, chain_modes, plane
 
 from ema_pipeline import codec
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
-from ema_pipeline.diagnose import diagnosis, rungs
 from ema_pipeline.diagnose.claims import judge, left_of_close_modes
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.heldout import held_out
@@ -24,7 +22,7 @@ from ema_pipeline.diagnose.probability import NOTHING, UNKNOWN
 from ema_pipeline.diagnose.ranking import rank
 from ema_pipeline.diagnose.rungs import make_ladder
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Diagnosis, Rung
+from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.inference import Posterior, Residuals, Unknowns
@@ -173,25 +171,6 @@ def test_two_hidden_effects_are_found_one_after_the_other() -> None:
     assert [len(r.effects) for r in found.ladder.rungs] == [0, 1, 2]
     errors = [r.error for r in found.ladder.rungs]
     assert errors == sorted(errors, reverse=True)
-
-
-@pytest.mark.parametrize(
-    ("error", "verdict"), [(1.99, "effect"), (np.nan, "effect"), (2.01, "unknown_effect")]
-)
-def test_effects_that_fit_and_predict_nothing_are_no_explanation(
-    monkeypatch: pytest.MonkeyPatch, error: float, verdict: str
-) -> None:
-    made = rungs.rungs_of
-
-    def of_error(*asked: Any) -> tuple[Rung, ...]:
-        first, last = made(*asked)
-        return first, replace(last, heldout_error=error)
-
-    monkeypatch.setattr(diagnosis, "rungs_of", of_error)
-    found = of_chain(3, added(Mass, 0.8, {"m4.z": 1.0}))
-    assert found.verdict == verdict
-    told = "With what fits best, data held out are off by 2.0 times their uncertainty."
-    assert (told in found.summary) is (verdict == "unknown_effect")
 
 
 def test_an_effect_far_below_its_limit_is_not_claimed() -> None:
