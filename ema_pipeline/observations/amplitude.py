@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.inference import Posterior, Residuals, Unknowns, joined
+from ema_pipeline.observations.hit_data import HitData, comparable
 from ema_pipeline.observations.hit_lattice import SPACING, MarchedHits
-from ema_pipeline.observations.hit_modes import HitData, comparable
 from ema_pipeline.observations.hit_residuals import (
     AMPLITUDE,
     DRIFT,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.fitting import transferred
-from ema_pipeline.observations.hit_modes import HitData
+from ema_pipeline.observations.hit_data import HitData
 from ema_pipeline.observations.hit_residuals import AMPLITUDE, HitResiduals
 from ema_pipeline.observations.rig_model import LOG_STD
 

@@ -18,7 +18,7 @@ from scipy.fft import rfft
 from ema_pipeline.levels.differences import smooth_terms
 from ema_pipeline.mechanics.batch import fine_force
 from ema_pipeline.mechanics.laws import PARTING, Nonlinear
-from ema_pipeline.observations.hit_modes import HitData
+from ema_pipeline.observations.hit_data import HitData
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -1,44 +1,27 @@
-"""Modes of single hits at several force levels, and how far nonlinear elements move them.
+"""How far nonlinear elements move the modes of single hits, by equivalent linearisation.
 
-A blow excites all modes at once, and their amplitudes fall while they are observed. A fit of one pole to the spectrum
-of a whole decay finds a mean of the momentary pole over time. Fitted to all lines its weight were (2σ)²t·exp(-2σt),
-which leaves a quarter of the shift that a cubic spring makes at the blow; the band and the smooth terms of the fit
-leave less, so the weight is taken from that fit itself. Modes so near to each other that their beat is slower than
-their decay move in step, so their motions add before an element's force is found; far ones meet in all phases.
+A fit of one pole to the spectrum of a whole decay finds a mean of the momentary pole over time. Fitted to all lines its
+weight were (2σ)²t·exp(-2σt), which leaves a quarter of the shift that a cubic spring makes at the blow; the band and
+the smooth terms of the fit leave less, so the weight is taken from that fit itself. The motions of modes that move in
+step add before an element's force is found.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.correlate.measured import from_modal_model
-from ema_pipeline.dof import Dof
-from ema_pipeline.levels.sizes import means_of_sheets
-from ema_pipeline.levels.types import HitModes, Pulses
 from ema_pipeline.mechanics.equivalent import Motions, settled_offsets
 from ema_pipeline.mechanics.laws import POLYNOMIAL, Nonlinear
-from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.observations.hit_reading import LAST, drive_gains, momentary_weights
-from ema_pipeline.observations.mode_data import ModeData, prepare
+from ema_pipeline.observations.hit_data import HitData
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
-IN_STEP = 4.0
-"""Distance of poles, in decay rates, within which modes move in step while they are observed: at this distance the
-weight of one mode's force in the other's pole, 1/|1 - jΔω/2σ|², is 0.2."""
-
-_FIRST = 0.03
-"""First instant, in units of 1/2σ of the fastest mode."""
-_PER_EFOLD = 1.1
-_TOLD = 0.15
-"""1 σ of a change of a size that a model tells, over that change: it knows neither every hit's aim nor all modes."""
 _STILL = 1e-300
 _QUASI_STATIC = 0.5
 """Modes below the lowest measured frequency times this take no part in static flexibility: they are slower than the
@@ -49,323 +32,10 @@ _RIGID = 0.02
 _SETTLING_STEPS = 3
 _MOST_GIVEN = 5.0
 """Change of a stretch by its own force that is not worth a further step, most steps, and largest change allowed."""
-_FAR, _FAR_STD = 0.5, 0.5
-"""Distance of a pole from that of the softest hits, in decay rates, at which half of the relative error is reached that
-a shift read from a decay has against one of first order; and that error of far ones, 1 σ."""
-_HEARD = 0.1
-"""Motion of a mode over that of the largest that moves in step with it, below which a hit does not tell its pole."""
 _FASTER = 1.5
 """Most by which a mode's motion decays faster or slower in one hit than in most. The weight of each instant is that of
 the median decay; a hit read with nine times that would leave, next to a mode that moves in step, no motion to refer to.
 """
-
-
-@dataclass(frozen=True)
-class HitData:
-    """One configuration's modes in every single hit.
-
-    Attributes
-    ----------
-    reference : ModeData
-        Modes of the level that is nearest to the linear structure; the hits' modes are among them.
-    modes : ndarray of int, (m,)
-        Their indices.
-    dofs : tuple of Dof
-    shapes : complex ndarray, (m, s)
-        Shapes of unit `motion`.
-    names : tuple of str
-    level, sheet : ndarray of int, (h,)
-        Force level; only differences between hits of one sheet count.
-    force_n : ndarray, (n_levels,)
-    log_frequency, log_frequency_std, damping, damping_std : ndarray, (h, m)
-        Infinite standard deviations where a hit tells nothing.
-    motion : complex ndarray, (h, m)
-        Displacement amplitude just after the hit, m.
-    size, size_std : complex and real ndarray, (h, m)
-        Participation in the FRFs, and the standard deviation of either part.
-    window_decay : float
-        Of the exponential window, 1/s.
-    band_hz : ndarray, (m, 2)
-        Lines from which each mode was read.
-    line_hz : float
-        Their distance.
-    reference_level : int or None
-        Force level whose hits gave `reference`; None for all.
-    level_dependent : bool
-        True where there is no doubt that the structure is not linear.
-    pulses : Pulses or None
-        What struck the structure.
-    """
-
-    reference: ModeData
-    modes: Integers
-    dofs: tuple[Dof, ...]
-    shapes: Complex
-    names: tuple[str, ...]
-    level: Integers
-    sheet: Integers
-    force_n: Real
-    log_frequency: Real
-    log_frequency_std: Real
-    damping: Real
-    damping_std: Real
-    motion: Complex
-    size: Complex
-    size_std: Real
-    window_decay: float
-    band_hz: Real
-    line_hz: float
-    reference_level: int | None = None
-    level_dependent: bool = False
-    pulses: Pulses | None = None
-
-    @property
-    def configuration(self) -> str:
-        """Name of the configuration."""
-        return self.reference.configuration
-
-    @cached_property
-    def used(self) -> NDArray[np.bool_]:
-        """Mask of hits and modes that can be compared, (h, m)."""
-        known = self._known.copy()
-        size = np.nan_to_num(np.abs(self.motion)) * np.max(np.abs(self.shapes), axis=1, initial=0.0)
-        for group in self.groups:
-            known[:, group] &= size[:, group] >= _HEARD * size[:, group].max(axis=1, keepdims=True)
-        return known
-
-    @cached_property
-    def reference_weights(self) -> Real:
-        """Share of every hit in each mode of `reference`, (h, m): of the hits that it comes from, by their energy."""
-        of = (
-            np.ones(len(self.level), bool)
-            if self.reference_level is None
-            else self.level == self.reference_level
-        )
-        energy = np.where(self.used & of[:, None], np.abs(self.motion) ** 2, 0.0)
-        total = energy.sum(axis=0)
-        return np.asarray(np.divide(energy, total, out=np.zeros_like(energy), where=total > 0))
-
-    @cached_property
-    def _known(self) -> NDArray[np.bool_]:
-        known = np.isfinite(self.log_frequency_std) & np.isfinite(self.damping_std)
-        known &= np.isfinite(self.log_frequency) & (self.damping > 0)
-        return np.asarray(known & np.isfinite(self.motion))
-
-    def only(self, keep: NDArray[np.bool_]) -> HitData:
-        """Some of the hits."""
-        of_hits = (
-            "level", "sheet", "log_frequency", "log_frequency_std", "damping", "damping_std", "motion", "size",
-            "size_std",
-        )  # fmt: skip
-        names = tuple(n for n, k in zip(self.names, keep, strict=True) if k)
-        pulses = self.pulses and self.pulses.only(keep)
-        return replace(self, names=names, pulses=pulses, **{n: getattr(self, n)[keep] for n in of_hits})
-
-    @cached_property
-    def poles(self) -> Complex:
-        """Of every mode in every hit, 1/s, (h, m); the reference's where a hit tells none that can be compared."""
-        own = 2 * np.pi * np.exp(self.log_frequency) * (1j - self.damping)
-        return np.asarray(np.where(self.used, own, self._reference_poles))
-
-    @cached_property
-    def _reference_poles(self) -> Complex:
-        """Of the level nearest to the linear structure, 1/s, (m,)."""
-        own = self.reference
-        decay = np.nan_to_num(np.exp(own.log_damping[self.modes]), nan=1e-3)
-        return np.asarray(2 * np.pi * np.exp(own.log_frequency[self.modes]) * (1j - decay))
-
-    @cached_property
-    def omega(self) -> Real:
-        """Median of every mode over the hits, rad/s, (m,)."""
-        return np.asarray(np.median(self.poles.imag, axis=0))
-
-    @cached_property
-    def decay(self) -> Real:
-        """Median decay rate of every mode over the hits, 1/s, (m,)."""
-        return np.asarray(np.median(-self.poles.real, axis=0))
-
-    @cached_property
-    def usual_damping(self) -> Real:
-        """Median damping ratio of every mode over the hits, (m,)."""
-        return np.asarray(np.median(-self.poles.real / self.poles.imag, axis=0))
-
-    @cached_property
-    def groups(self) -> tuple[Integers, ...]:
-        """Modes that move in step, by their place among `modes`, from the lowest up."""
-        pole = self._reference_poles
-        groups: list[list[int]] = []
-        for r in np.argsort(pole.imag):
-            last = groups[-1][-1] if groups else None
-            near = last is not None and pole[r].imag - pole[last].imag < -IN_STEP * min(
-                pole[r].real, pole[last].real
-            )
-            if near:
-                groups[-1].append(int(r))
-            else:
-                groups.append([int(r)])
-        return tuple(np.array(g) for g in groups)
-
-    def reach(self, sheet: int) -> Real:
-        """Largest measured change of each mode's pole between hits of a sheet, in its decay rates, (m,)."""
-        on = self.sheet == sheet
-        used, poles = self.used[on], self.poles[on]
-        known = used.any(axis=0)
-        middle = [
-            np.nanmedian(np.where(used | ~known, part, np.nan), axis=0) for part in (poles.real, poles.imag)
-        ]
-        apart = np.where(used, np.abs(poles - (middle[0] + 1j * middle[1])), 0.0)
-        return np.asarray(apart.max(axis=0, initial=0.0) / self.decay)
-
-    @cached_property
-    def _moved(self) -> Real:
-        """Distance of every pole from that of the softest hits of its sheet, in decay rates, (h, m)."""
-        apart = np.zeros(self.poles.shape)
-        for sheet in np.unique(self.sheet):
-            on = np.flatnonzero(self.sheet == sheet)
-            for r in range(len(self.modes)):
-                heard = on[self.used[on, r]]
-                if len(heard):
-                    softest = heard[self.level[heard] == self.level[heard].min()]
-                    apart[heard, r] = np.abs(self.poles[heard, r] - self.poles[softest, r].mean())
-        return np.asarray(apart / self.decay)
-
-    @cached_property
-    def linearised_std(self) -> Real:
-        """1 σ of what a fit of one pole reads of a decay that is no small change, in decay rates, (h, m).
-
-        The pole moves while it is read: by half a width and more, what is read is no mean of the momentary pole.
-        """
-        return np.asarray(_FAR_STD * self._moved**2 / (self._moved + _FAR))
-
-    @cached_property
-    def moves(self) -> tuple[float, float]:
-        """Mean distance of poles from those of the softest hits, in decay rates, each by its square over its variance;
-        and the sum of these weights."""
-        noise = np.hypot(self.log_frequency_std / self.usual_damping, self.damping_std / self.usual_damping)
-        weight = np.where(self.used, (self._moved / np.where(self.used, noise, 1.0)) ** 2, 0.0)
-        total = float(weight.sum())
-        return float((weight * self._moved).sum() / total) if total else 0.0, total
-
-    @cached_property
-    def relative_size(self) -> Complex:
-        """Size of every mode in every hit over the mean of its sheet, (h, m); 1 for a linear mode, well aimed."""
-        return np.asarray(np.where(self.used, self.size, self._mean_size) / self._mean_size)
-
-    @cached_property
-    def quadrature_std(self) -> Real:
-        """1 σ of the imaginary part of `relative_size` from noise and from what a model has wrong of it, (h, m)."""
-        noise = np.where(self.used, self.size_std, np.inf) / np.abs(self._mean_size)
-        return np.asarray(np.hypot(noise, _TOLD * self.relative_size.imag))
-
-    @cached_property
-    def otherwise(self) -> Real:
-        """How far the size of every mode in every hit lies from the mean of its sheet in phase, over that mean, (h, m).
-
-        Mostly by the aim of the hit: what is read then of a mode is the more a neighbour's.
-        """
-        return np.asarray(np.abs(self.relative_size.real - 1))
-
-    @cached_property
-    def _mean_size(self) -> Complex:
-        """Mean of every hit's sheet, (h, m); 1 where no hit tells."""
-        size, std = np.where(self.used, self.size, 0.0), np.where(self.used, self.size_std, np.inf)
-        mean = means_of_sheets(size, std, self.sheet)
-        return np.where(mean == 0, 1.0, mean)
-
-    @cached_property
-    def weights(self) -> tuple[Real, Complex]:
-        """Instants after the blow, (t,), and the weight of each in what is read of every mode, (2, t, m).
-
-        See `hit_reading.momentary_weights`.
-        """
-        decay = self.decay + self.window_decay
-        first, last = np.log(0.5 * _FIRST / decay.max()), np.log(0.5 * LAST / decay.min())
-        instants = np.exp(np.linspace(first, last, int(_PER_EFOLD * (last - first)) + 2))
-        columns = [
-            momentary_weights(instants, complex(-s, w), np.arange(low, high, self.line_hz))
-            for s, w, (low, high) in zip(decay, self.omega, self.band_hz.tolist(), strict=True)
-        ]
-        return instants, np.stack(columns, axis=2)
-
-    @cached_property
-    def product_gains(self) -> Complex:
-        """What is read of every mode where the product of two motions drives it, (2, m, 2m, 2m).
-
-        By the exponents of the two among `exponents`; see `hit_reading.drive_gains`.
-        """
-        together = self.exponents[:, None] + self.exponents - self.window_decay
-        poles = self.exponents[: len(self.modes)] - self.window_decay
-        return np.stack(
-            [
-                drive_gains(together, pole, np.arange(low, high, self.line_hz))
-                for pole, (low, high) in zip(poles, self.band_hz.tolist(), strict=True)
-            ],
-            axis=1,
-        )
-
-    @cached_property
-    def exponents(self) -> Complex:
-        """Poles of all modes, then their conjugates, 1/s, (2m,)."""
-        pole = 1j * self.omega - self.decay
-        return np.concatenate([pole, pole.conj()])
-
-
-def prepare_hits(
-    configuration: str,
-    hits: HitModes,
-    modal: ModalModel,
-    force_n: Sequence[float],
-    reference_level: int | None = None,
-    level_dependent: bool = False,
-) -> HitData | None:
-    """What single hits tell, prepared; None where no sheet was struck at several levels.
-
-    Parameters
-    ----------
-    configuration : str
-    hits : HitModes
-    modal : ModalModel
-        Of the level that is nearest to the linear structure.
-    force_n : sequence of float
-        Of each level.
-    reference_level : int, optional
-        Level that `modal` is of; all hits where left out.
-    level_dependent : bool, optional
-        What the study of the levels leaves no doubt of.
-    """
-    data = HitData(
-        prepare(from_modal_model(modal, configuration)),
-        hits.modes,
-        hits.outputs,
-        np.nan_to_num(hits.shapes),
-        hits.names,
-        hits.level,
-        hits.sheet,
-        np.asarray(force_n, float),
-        hits.log_frequency,
-        hits.log_frequency_std,
-        hits.damping_ratio,
-        hits.damping_std,
-        hits.motion_m,
-        hits.size,
-        hits.size_std,
-        hits.window_decay_rad_s,
-        hits.band_hz,
-        hits.line_hz,
-        reference_level,
-        level_dependent,
-        hits.pulses,
-    )
-    return data if comparable(data) else None
-
-
-def comparable(data: HitData) -> bool:
-    """True where hits of several levels share a sheet and tell of a mode."""
-    return any(
-        len(set(data.level[data.used[:, r] & (data.sheet == s)].tolist())) > 1
-        for r in range(len(data.modes))
-        for s in np.unique(data.sheet)
-    )
 
 
 @dataclass(frozen=True)

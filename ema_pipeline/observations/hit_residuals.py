@@ -19,8 +19,9 @@ from ema_pipeline.inference import Residuals, Scatter
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.laws import Nonlinear, Spring
 from ema_pipeline.mechanics.marching import element_rows
+from ema_pipeline.observations.hit_data import HitData
 from ema_pipeline.observations.hit_march import Driven, marched_modes, parts
-from ema_pipeline.observations.hit_modes import HitData, Linear, changed_modes
+from ema_pipeline.observations.hit_modes import Linear, changed_modes
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE
 from ema_pipeline.observations.modes import Paired
 from ema_pipeline.observations.parts import DAMPING_SCATTER, part_key

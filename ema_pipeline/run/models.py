@@ -56,7 +56,7 @@ def amplitude_observations(run: Run) -> AmplitudeObservations | None:
     """Modes and hits of all configurations; None where none was struck at several levels."""
     from ema_pipeline.levels.harmonics import may_be_products
     from ema_pipeline.observations.amplitude import AmplitudeObservations
-    from ema_pipeline.observations.hit_modes import prepare_hits
+    from ema_pipeline.observations.hit_data import prepare_hits
 
     hits, products = [], {}
     for name, study in level_studies(run).items():

@@ -37,7 +37,8 @@ from ema_pipeline.observations.fitting import (
     refined,
     transferred,
 )
-from ema_pipeline.observations.hit_modes import HitData, Linear, changed_modes, comparable
+from ema_pipeline.observations.hit_data import HitData, comparable
+from ema_pipeline.observations.hit_modes import Linear, changed_modes
 from ema_pipeline.observations.hit_reading import momentary_weights
 from ema_pipeline.observations.hit_residuals import AMPLITUDE
 from ema_pipeline.observations.mode_data import prepare

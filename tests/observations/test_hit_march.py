@@ -16,8 +16,9 @@ from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.observations.amplitude import AmplitudeObservations
 from ema_pipeline.observations.fitting import Model, fit_base
+from ema_pipeline.observations.hit_data import HitData
 from ema_pipeline.observations.hit_march import Driven, marched_modes
-from ema_pipeline.observations.hit_modes import HitData, Linear, changed_modes
+from ema_pipeline.observations.hit_modes import Linear, changed_modes
 from ema_pipeline.observations.hit_reading import drive_gains, momentary_weights
 from ema_pipeline.observations.hit_residuals import AMPLITUDE
 

@@ -19,7 +19,7 @@ from ema_pipeline.mechanics.laws import PartingSpring
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.observations.amplitude import AmplitudeObservations
-from ema_pipeline.observations.hit_modes import prepare_hits
+from ema_pipeline.observations.hit_data import prepare_hits
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.types import Parameter
