@@ -16,7 +16,7 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.mechanics.frf import receptance
 from ema_pipeline.mechanics.modes import total_damping
 from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
-from ema_pipeline.observations.modes import ModeRows
+from ema_pipeline.observations.mode_problem import ModeRows
 
 
 def compare(

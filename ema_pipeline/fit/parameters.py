@@ -25,7 +25,8 @@ from ema_pipeline.observations.fitting import (
     made_up_of,
     wide,
 )
-from ema_pipeline.observations.modes import ModeObservations, ModeProblem
+from ema_pipeline.observations.mode_problem import ModeProblem
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs.types import Parameter, Rig
 
 _OUT_OF_TOLERANCE = 3.0

@@ -27,8 +27,9 @@ from ema_pipeline.observations.hit_residuals import (
     HitResiduals,
     hit_scatters,
 )
+from ema_pipeline.observations.mode_problem import ModeProblem
 from ema_pipeline.observations.mode_rows import SHAPE, stacked
-from ema_pipeline.observations.modes import ModeObservations, ModeProblem
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.rig_model import LOG_STD, RigModel, SizeMap
 
 AMPLITUDE_STD = 0.02

@@ -22,8 +22,8 @@ from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.observations.hit_data import HitData
 from ema_pipeline.observations.hit_march import Driven, marched_modes, parts
 from ema_pipeline.observations.hit_modes import Linear, changed_modes
+from ema_pipeline.observations.mode_problem import Paired
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE
-from ema_pipeline.observations.modes import Paired
 from ema_pipeline.observations.parts import DAMPING_SCATTER, part_key
 
 if TYPE_CHECKING:

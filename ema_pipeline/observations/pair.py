@@ -21,8 +21,9 @@ from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
+from ema_pipeline.observations.mode_problem import ModeProblem
 from ema_pipeline.observations.mode_rows import FREQUENCY, SHAPE, Compared, Rows, stacked
-from ema_pipeline.observations.modes import ModeObservations, ModeProblem
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.parts import DAMPING_SCATTER
 from ema_pipeline.observations.rig_model import RigModel, SizeMap
 from ema_pipeline.settings import Settings

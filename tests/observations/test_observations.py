@@ -22,8 +22,9 @@ from ema_pipeline.modal.assurance import mac
 from ema_pipeline.observations import fitting
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, model_with
 from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.mode_problem import MIXING, ModeProblem
 from ema_pipeline.observations.mode_rows import SHAPE, SHAPE_NOISE
-from ema_pipeline.observations.modes import MIXING, ModeObservations, ModeProblem
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.parts import (
     MASS_SCATTER,
     MASS_STD,
