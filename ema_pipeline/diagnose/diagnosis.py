@@ -9,6 +9,7 @@ from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.claims import Judged
 from ema_pipeline.diagnose.detection_limits import detection_limits
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
+from ema_pipeline.diagnose.in_full import in_full
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names
 from ema_pipeline.diagnose.next_test import next_measurement
@@ -70,7 +71,8 @@ def diagnose(
     settings, known = settings or DiagnoseSettings(), known or Model()
     if hypotheses is None:
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
-    found = select(observations, known, hypotheses, settings, progress)
+    first = select(observations, known, hypotheses, settings, progress)
+    found = in_full(first)
     observations = found.observations
     explained = explains(observations, found.final, settings)
     verdict = verdict_of(found, settings, explained)
@@ -92,7 +94,7 @@ def diagnose(
         beside = [one for one in told if one[0] not in names]
         told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.label in names]
     probabilities = dict(found.rounds[0].probabilities)
-    if not (explained if start is found.final else explains(observations, start, settings)):
+    if not (explained if start is found.final else explains(first.observations, start, settings)):
         probabilities = of_failing_model(probabilities)
     nothing = probabilities[NOTHING]
     best = next(
@@ -116,16 +118,16 @@ def diagnose(
         null_probability=nothing,
         candidates=candidates,
         indistinguishable=_groups(found, group, settings),
-        next_measurement=next_measurement(observations, found, group, verdict),
+        next_measurement=next_measurement(first.observations, first, group, verdict),
         localisation=()
         if explained
-        else localise(scores(observations, found.final, further, processes=settings.processes)),
+        else localise(scores(first.observations, first.final, further, processes=settings.processes)),
         probabilities=probabilities,
         error=rungs[0].error,
         heldout_error=rungs[0].heldout_error,
         ladder=ladder,
         notes=(*((bent,) if bent and verdict != "unknown_effect" else ()), *notes),
-        detection_limits=detection_limits(observations, found.final, hypotheses, settings)
+        detection_limits=detection_limits(first.observations, first.final, hypotheses, settings)
         if explained
         else (),
     )

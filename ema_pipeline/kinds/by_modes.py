@@ -105,6 +105,7 @@ def _measured(run: Run) -> Ladder:
     EmaError
         For an effect that shows in hits at several levels only, where there are none.
     """
+    from ema_pipeline.diagnose.in_full import fit_in_full
     from ema_pipeline.diagnose.rungs import fits_of, ladder_of
     from ema_pipeline.fit.parameters import begun_at
     from ema_pipeline.observations.fitting import Model, model_with
@@ -130,7 +131,8 @@ def _measured(run: Run) -> Ladder:
     with single_blas_thread():
         known = earlier_unknowns(run, ())
         fits = fits_of(observations, models, begun_at(observations, models[0], known) if known else None)
-        return ladder_of(observations, fits, diagnosed_scatters(run))
+        full, top = fit_in_full(observations, fits[-1])
+        return ladder_of(full, [*fits[:-1], top], diagnosed_scatters(run))
 
 
 def _check_model(run: Run) -> None:

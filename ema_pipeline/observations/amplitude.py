@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.inference import Posterior, Residuals, Unknowns, joined
+from ema_pipeline.mechanics.laws import Nonlinear
 from ema_pipeline.observations.hit_data import HitData, comparable
-from ema_pipeline.observations.hit_lattice import SPACING, MarchedHits
+from ema_pipeline.observations.hit_lattice import LEAST, SPACING, MarchedHits
+from ema_pipeline.observations.hit_march import rubs
 from ema_pipeline.observations.hit_residuals import (
     AMPLITUDE,
     DRIFT,
@@ -37,11 +39,16 @@ AMPLITUDE_STD = 0.02
 FAR_AMPLITUDE_STD, _FAR = 0.35, 0.3
 """That of the amplitude at which a law stands whose poles move by many decay rates, and the distance at which half of
 its growth is reached. Teeth simulated with 1.74 µm of preload, whose modes move by 0.7, read as 2.28 µm."""
+RUBBING_AMPLITUDE_STD = 0.25
+"""The same in addition where friction is calculated in full: a fit of single hits heeds the late part of a decay, which
+friction cuts off, less than is calculated."""
 
 _LEAST_SHAPE = 0.25
 """Least discrepancy of shapes, in units of the default: those of a structure that is not linear agree with none better,
 and a smaller one bends calibrations to them.
 """
+_STEP, _MARCHED_STEP = 1e-3, 1e-2
+"""Steps of the differences by sizes, in units of their prior σ."""
 _BEYOND = 3.0
 """Growth of what linearisation leaves out per decay rate by which a pole moves: it is of first order in that."""
 _DECADES = 6.0
@@ -50,6 +57,8 @@ _ALONG, _ACROSS, _FINE = 19, 3, 41
 for their preload alone."""
 _LOWEST = 3
 """Most of them that fits begin at."""
+_FACTORS = tuple(np.geomspace(0.5, 10.0, 8))
+"""Of the linearised size of what is calculated in full: sizes that are tried."""
 _BESIDE = (-2, -1, 1, 2)
 """Places of the lattice about these that are tried, too: between two sizes of the grid others may fit far better."""
 
@@ -67,6 +76,8 @@ class AmplitudeObservations:
         True where the hits tell only how far the modes of their level lie from those of the linear structure.
     marched : MarchedHits, optional
         Of the fit whose structure stands for all where hits are marched; each structure its own where left out.
+    rubbing : dict of str to set of str
+        Effects whose hits are marched as those of teeth are, and the names of their elements, by label.
     """
 
     linearised = True
@@ -77,8 +88,10 @@ class AmplitudeObservations:
         hits: Sequence[HitData],
         of_modes: bool = False,
         marched: MarchedHits | None = None,
+        rubbing: Mapping[str, frozenset[str]] | None = None,
     ) -> None:
         self.modes, self.hits, self.of_modes, self.marched = modes, tuple(hits), of_modes, marched
+        self.rubbing = dict(rubbing or {})
         self.level_dependent = any(
             h.level_dependent and not modes.rig.assembly(h.configuration).nonlinear for h in hits
         )
@@ -91,8 +104,46 @@ class AmplitudeObservations:
 
     def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> AmplitudeObservations:
         """See `Observations`: hits are marched about the structure of this fit."""
-        plain = AmplitudeObservations(self.modes, self.hits, self.of_modes)
-        return AmplitudeObservations(self.modes, self.hits, self.of_modes, MarchedHits(plain, effects, found))
+        return self._about(effects, found, self.rubbing)
+
+    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> AmplitudeObservations:
+        """See `Observations`: hits are marched where there is friction, which equivalent linearisation finds too small.
+
+        Friction ends a decay, and holds a body once it rests: no small change of a pole.
+        """
+        if any(h.pulses is None for h in self.hits):
+            return self
+        rubbing = {e.label: self._friction_of(e) for e in effects if not e.effect.linear}
+        rubbing = {label: names for label, names in rubbing.items() if names}
+        return self if rubbing.keys() <= self.rubbing.keys() else self._about(effects, found, rubbing)
+
+    def _friction_of(self, effect: PlacedEffect) -> frozenset[str]:
+        """Names of the elements that an effect adds, where all of them that depend on the amplitude are friction."""
+        values = {p.name: p.start for p in effect.effect.parameters}
+        added: list[Nonlinear] = []
+        for name in self.modes.rig.configurations:
+            before = self.modes.rig.assembly(name)
+            if effect.effect.fits(before, effect.place):
+                known = {e.name for e in before.nonlinear}
+                edited = effect.effect.edit(before, effect.place, values)
+                added += [e for e in edited.nonlinear if e.name not in known]
+        return frozenset(e.name for e in added) if all(rubs(e) for e in added) else frozenset()
+
+    def _about(
+        self, effects: Sequence[PlacedEffect], found: Posterior, rubbing: Mapping[str, frozenset[str]]
+    ) -> AmplitudeObservations:
+        plain = AmplitudeObservations(self.modes, self.hits, self.of_modes, rubbing=rubbing)
+        return plain._of(self.modes, self.hits, self.of_modes, MarchedHits(plain, effects, found))
+
+    def _of(
+        self,
+        modes: ModeObservations,
+        hits: Sequence[HitData],
+        of_modes: bool = False,
+        marched: MarchedHits | None = None,
+    ) -> AmplitudeObservations:
+        """Some of the data, known in the same way."""
+        return AmplitudeObservations(modes, hits, of_modes, marched or self.marched, self.rubbing)
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> AmplitudeProblem:
         """See `Observations`."""
@@ -102,7 +153,7 @@ class AmplitudeObservations:
         """See `Observations`."""
         assert isinstance(found.matching, tuple)
         modes = self.modes.holding_out_explained(dataclasses.replace(found, matching=found.matching[0]))
-        return self if modes is self.modes else AmplitudeObservations(modes, self.hits, marched=self.marched)
+        return self if modes is self.modes else self._of(modes, self.hits)
 
     def folds(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
         """Every fourth mode held out in turn, then every force level."""
@@ -112,8 +163,8 @@ class AmplitudeObservations:
     def _folds(self) -> list[tuple[AmplitudeObservations, AmplitudeObservations]]:
         of_modes = [
             (
-                AmplitudeObservations(kept, self.hits, marched=self.marched),
-                AmplitudeObservations(out, self.hits, True, self.marched),
+                self._of(kept, self.hits),
+                self._of(out, self.hits, True),
             )
             for kept, out in self.modes.folds()
         ]
@@ -130,12 +181,8 @@ class AmplitudeObservations:
             without_modes = self.modes.with_data(())
             pairs.append(
                 (
-                    AmplitudeObservations(
-                        self.modes, [h for h in kept if comparable(h)], marched=self.marched
-                    ),
-                    AmplitudeObservations(
-                        without_modes, [h for h in out if comparable(h)], marched=self.marched
-                    ),
+                    self._of(self.modes, [h for h in kept if comparable(h)]),
+                    self._of(without_modes, [h for h in out if comparable(h)]),
                 )
             )
         return pairs
@@ -212,7 +259,8 @@ class AmplitudeProblem:
         moves = [h.moves for h in self.observations.hits]
         total = sum(weight for _, weight in moves)
         far = sum(apart * weight for apart, weight in moves) / total if total else 0.0
-        return float(np.hypot(AMPLITUDE_STD, FAR_AMPLITUDE_STD * far / (far + _FAR)))
+        rubs = RUBBING_AMPLITUDE_STD if self.observations.rubbing else 0.0
+        return float(np.linalg.norm([AMPLITUDE_STD, FAR_AMPLITUDE_STD * far / (far + _FAR), rubs]))
 
     def positions(self, data: HitData) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Positions of the hits' drift, (h,), and of what linearisation leaves out, (h, m)."""
@@ -233,7 +281,9 @@ class AmplitudeProblem:
 
     @cached_property
     def marched_sizes(self) -> tuple[int, ...]:
-        """Positions of the sizes of effects all of whose sizes are lengths: teeth that part. Their hits are marched."""
+        """Positions of the sizes of effects whose hits are marched: of teeth, all of whose sizes are lengths, and of
+        what is calculated in full.
+        """
         if any(h.pulses is None for h in self.observations.hits):
             return ()
         lengths = {
@@ -241,7 +291,16 @@ class AmplitudeProblem:
             for e in self.effects
             if not e.effect.linear and all(p.unit == "m" for p in e.effect.parameters)
         }
-        return tuple(self.unknowns.index[n] for n in self.sizes if effect_of(n) in lengths)
+        marched = lengths | self.observations.rubbing.keys()
+        return tuple(self.unknowns.index[n] for n in self.sizes if effect_of(n) in marched)
+
+    def step(self, i: int, x: NDArray[np.float64]) -> float:
+        """Step of the difference by the unknown at position `i`; of what is marched finer ones show its own steps."""
+        if i not in self.marched_sizes:
+            return _STEP
+        name = self.unknowns.names[i]
+        in_decades = effect_of(name) in self.observations.rubbing and not self.sizes[name].logarithmic
+        return _MARCHED_STEP * (max(float(x[i]), LEAST) if in_decades else 1.0)
 
     def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> list[NDArray[np.float64]]:
         """`x` with the sizes of the effect added last at the best of a grid; nothing where it is linear.
@@ -282,6 +341,24 @@ class AmplitudeProblem:
             near = [(places[i][0] + k * SPACING, *places[i][1:]) for k in _BESIDE]
             best.append(min([tries[i], *map(tried, near)], key=lambda one: one[0]))
         return [trial for _, trial in sorted(best, key=lambda one: one[0])] or [x]
+
+    def sized_anew(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64]:
+        """See `EffectProblem`: the first size of what is calculated in full, from its linearised one on."""
+        matching = self.residuals(x, scatters, derivatives=False).matching
+        for effect in self.effects:
+            if effect.label not in self.observations.rubbing:
+                continue
+            name = effect.parameter_name(effect.effect.parameters[0].name)
+            i, size = self.unknowns.index[name], self.sizes[name]
+            tries = []
+            for factor in _FACTORS:
+                trial = x.copy()
+                trial[i] = size.of_coordinate(factor * size.coordinate(x[i]))
+                trial = self.unknowns.clipped(trial)
+                found = self.residuals(trial, scatters, matching=matching, by_sizes=False)
+                tries.append((self._followed(found, scatters), trial))
+            x = min(tries, key=lambda one: one[0])[1]
+        return x
 
     def _followed(self, found: Residuals, scatters: Mapping[str, float]) -> float:
         """Sum of squares once every hit's drift and what the calculation leaves out have followed in one step."""

@@ -43,6 +43,10 @@ class EffectProblem(Problem, Protocol):
         """Points beyond a barrier that no descent passes, where the fit at `x` looks stuck before one."""
         return []
 
+    def sized_anew(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64]:
+        """`x` with the sizes of what is calculated in full where it fits best, as far as a look around tells."""
+        return x
+
     def tuned(self, x: NDArray[np.float64], name: str) -> list[float]:
         """Unknowns of the size `name` at which a mode comes to where one was measured that has no partner at `x`."""
         return []
@@ -80,6 +84,12 @@ class Observations(Protocol):
 
     def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> Observations:
         """The same data, with what takes long found about a fit with these effects. Often the same object."""
+        ...
+
+    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> Observations:
+        """The same data, with what these effects do calculated in full about a fit with them, where it is known to
+        first order only. Often the same object.
+        """
         ...
 
     def folds(self) -> Sequence[tuple[Observations, Observations]]:

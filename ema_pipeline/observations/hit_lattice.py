@@ -26,13 +26,16 @@ if TYPE_CHECKING:
 Complex = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
-SPACING = 0.05
-"""Of the lattice, in the unknowns of sizes, of which one is the prior σ."""
+SPACING, _COARSE = 0.05, 0.2
+"""Of the lattice, in the unknowns of sizes, of which one is the prior σ; and of what is calculated in full, whose hits
+are marched to the end of their records."""
 _ON = 1e-6
+LEAST = 1e-6
+"""Size, in its prior σ, below which a size that cannot be negative is nothing."""
 
 
 class MarchedHits:
-    """What effects change of the modes in single hits whose sizes are lengths.
+    """What effects change of the modes in single hits whose hits are marched.
 
     Parameters
     ----------
@@ -50,7 +53,7 @@ class MarchedHits:
         self._nodes: dict[tuple[object, ...], Complex] = {}
 
     def changes(self, data: HitData, problem: AmplitudeProblem, x: NDArray[np.float64]) -> Complex:
-        """What effects change whose sizes are lengths, as `HitResiduals.moved` has it, of all or some hits."""
+        """What effects change whose hits are marched, as `HitResiduals.moved` has it, of all or some hits."""
         names, at = self._place(problem, x)
         low = np.floor(at + _ON).astype(np.int64)
         first = self._node(data, problem, names, low)
@@ -66,11 +69,17 @@ class MarchedHits:
 
     @staticmethod
     def _place(problem: AmplitudeProblem, x: NDArray[np.float64]) -> tuple[list[str], NDArray[np.float64]]:
-        """Unknowns that span the lattice, and where `x` lies in it: larger motions are as smaller lengths."""
+        """Unknowns that span the lattice, and where `x` lies in it.
+
+        Larger motions are as smaller lengths, forces and rates.
+        """
         names = [problem.unknowns.names[i] for i in problem.marched_sizes]
         at, scale = x[list(problem.marched_sizes)], x[problem.unknowns.index[AMPLITUDE]]
+        coarse = np.array([_coarse(problem, n) for n in names])
         logarithmic = np.array([problem.sizes[n].logarithmic for n in names])
-        return names, np.where(logarithmic, at - scale / LOG_STD, at * np.exp(-scale)) / SPACING
+        at = np.where(coarse & ~logarithmic, np.log(np.maximum(at, LEAST)) / LOG_STD, at)
+        moved = np.where(logarithmic | coarse, at - scale / LOG_STD, at * np.exp(-scale))
+        return names, moved / np.where(coarse, _COARSE, SPACING)
 
     def _whole(self, data: HitData) -> HitData:
         return next(h for h in self._observations.hits if h.configuration == data.configuration)
@@ -89,10 +98,23 @@ class MarchedHits:
     def _marched(self, data: HitData, problem: AmplitudeProblem, names: list[str], at: Integers) -> Complex:
         posterior, unknowns = self._found, problem.unknowns
         x = transferred(posterior, unknowns, problem.start())
-        x[[unknowns.index[n] for n in names]] = at * SPACING
+        for name, place in zip(names, at.tolist(), strict=True):
+            x[unknowns.index[name]] = _unknown(problem, name, place)
         x[unknowns.index[AMPLITUDE]] = 0.0
         x = unknowns.clipped(x)
         paired = problem.modes.paired(data.reference, x[: len(problem.modes.unknowns)], None)
         if paired is None:
             return np.zeros((2, *data.log_frequency.shape), complex)
         return HitResiduals(problem, data, paired, x, posterior.scatters, 1.0).moved(x)
+
+
+def _coarse(problem: AmplitudeProblem, name: str) -> bool:
+    return effect_of(name) in problem.observations.rubbing
+
+
+def _unknown(problem: AmplitudeProblem, name: str, place: int) -> float:
+    """The unknown of a size at a place of the lattice."""
+    if not _coarse(problem, name):
+        return place * SPACING
+    at = place * _COARSE
+    return at if problem.sizes[name].logarithmic else float(np.exp(at * LOG_STD))

@@ -39,8 +39,6 @@ AMPLITUDE = "amplitude of all modes"
 """Unknown by whose exponential all amplitudes are multiplied."""
 _REMEMBERED = 16
 """Last points at which the shifts are kept: a step is tried without derivatives, then taken with them."""
-_STEP, _MARCHED_STEP = 1e-3, 1e-2
-"""Steps of the differences by sizes, in units of their prior σ; of what is marched finer ones show its own steps."""
 
 
 def hit_scatters() -> dict[str, Scatter]:
@@ -124,7 +122,7 @@ class HitResiduals:
             if i == self.scale and not np.any(moved):
                 continue
             ahead = x.copy()
-            step = _MARCHED_STEP if i in self.problem.marched_sizes else _STEP
+            step = self.problem.step(i, x)
             ahead[i] += step if ahead[i] + step <= self.problem.unknowns.upper[i] else -step
             found[i] = self._read(left * (self.moved(ahead) - moved) / (ahead[i] - x[i]))
         return found
@@ -205,17 +203,25 @@ class HitResiduals:
         stretch = rows @ solution.shapes[: rows.shape[1]]
         displacement = self._displacement(x, match, on)
         scaled = [self._scaled(e, x) for e in elements]
-        apart = [e for e in scaled if parts(e)] if self.problem.marched_sizes else []
-        if apart:
-            of_apart = np.array([parts(e) for e in scaled])
-            marched = self._marched(x, apart, stretch[of_apart], match, displacement)
+        of_marched = np.array([self._is_marched(e) for e in scaled])
+        if of_marched.any():
+            through_time = [e for e in scaled if self._is_marched(e)]
+            marched = self._marched(x, through_time, stretch[of_marched], match, displacement)
             if marched is not None:
-                scaled, stretch = [e for e in scaled if not parts(e)], stretch[~of_apart]
+                scaled, stretch = [e for e in scaled if not self._is_marched(e)], stretch[~of_marched]
                 total += marched
         if not scaled:
             return total
         linear = Linear.of(data, stretch, match, solution.eigenvalues, displacement)
         return total + changed_modes(data, scaled, linear)
+
+    def _is_marched(self, element: Nonlinear) -> bool:
+        """True for elements whose hits are marched."""
+        if not self.problem.marched_sizes:
+            return False
+        return parts(element) or any(
+            element.name in names for names in self.problem.observations.rubbing.values()
+        )
 
     def _marched(
         self,
@@ -225,7 +231,7 @@ class HitResiduals:
         match: NDArray[np.int64],
         displacement: NDArray[np.complex128],
     ) -> NDArray[np.complex128] | None:
-        """What elements that part change, by marching the hits; None where their motion has no bound."""
+        """What these elements change, by marching the hits; None where their motion has no bound."""
         data, lattice = self.data, self.problem.observations.marched
         if lattice is not None:
             return lattice.changes(data, self.problem, x)

@@ -172,6 +172,10 @@ class LoopObservations:
         """See `Observations`."""
         return self
 
+    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> LoopObservations:
+        """See `Observations`."""
+        return self
+
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> LoopProblem:
         """See `Observations`."""
         mine = [self.scaled(e) for e in effects]

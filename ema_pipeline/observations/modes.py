@@ -103,6 +103,10 @@ class ModeObservations:
         """See `Observations`."""
         return self
 
+    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> ModeObservations:
+        """See `Observations`."""
+        return self
+
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> ModeProblem:
         """See `Observations`."""
         return ModeProblem(self, RigModel(self.rig, effects, scales, self.shared, self.own_damping))

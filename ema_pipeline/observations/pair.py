@@ -106,6 +106,10 @@ class PairObservations:
         """See `Observations`."""
         return self
 
+    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> PairObservations:
+        """See `Observations`."""
+        return self
+
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> PairProblem:
         """See `Observations`."""
         known = [e for e in effects if e.label in self.common]

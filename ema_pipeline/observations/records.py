@@ -284,6 +284,10 @@ class RecordObservations:
         """See `Observations`."""
         return self
 
+    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> RecordObservations:
+        """See `Observations`."""
+        return self
+
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> RecordProblem:
         """See `Observations`."""
         return RecordProblem(self, RecordModel(self.basis, [self.scaled(e) for e in effects], scales))

@@ -1,0 +1,127 @@
+"""Friction whose hits are marched: the size that equivalent linearisation finds too small."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from simulate_amplitude import RIG, observed, simulated_hits
+
+from ema_pipeline.diagnose import in_full
+from ema_pipeline.effects.library import parse_effect, shipped_effects
+from ema_pipeline.mechanics.laws import DryFriction
+from ema_pipeline.observations.amplitude import AmplitudeObservations
+from ema_pipeline.observations.fitting import (
+    Fit,
+    Model,
+    best_refined,
+    fit_base,
+    learned,
+    model_with,
+    refined,
+    transferred,
+    wide,
+)
+
+LABEL = "dry_friction@hub"
+FORCE = f"{LABEL}.force"
+
+
+@cache
+def linearised(force: float) -> tuple[AmplitudeObservations, Fit]:
+    """Hits with friction at the hub, and the fit by equivalent linearisation."""
+    hits = simulated_hits([DryFriction(f"f{a}", {f"hub.{a}": 1.0}, force) for a in "xy"])
+    observations = observed(hits)
+    base = fit_base(observations, Model())
+    observations = observations.about((), base.posterior)
+    base = learned(observations, base)
+    model = model_with([LABEL], RIG, shipped_effects(), base.model, with_hits=True)
+    problem = model.problem(observations)
+    start = transferred(base.posterior, problem.unknowns, problem.start())
+    return observations, learned(
+        observations, best_refined(observations, model, problem.begun(start, wide(observations)))
+    )
+
+
+def size(fit: Fit, observations: AmplitudeObservations) -> tuple[float, float]:
+    """Force of the friction and its 1 σ, N."""
+    posterior = fit.posterior
+    i, told = posterior.unknowns.index[FORCE], fit.model.problem(observations).sizes[FORCE]
+    x = float(posterior.x[i])
+    return told.value(x), float(posterior.std[i]) * told.slope(x)
+
+
+@pytest.mark.parametrize("force", [0.02, 0.1])
+def test_friction_calculated_in_full_has_its_true_size(force: float) -> None:
+    observations, fit = linearised(force)
+    value, std = size(fit, observations)
+    assert value < 0.75 * force
+    assert value + 3 * std < force
+    full = observations.in_full(fit.model.effects, fit.posterior)
+    start = fit.model.problem(full).sized_anew(fit.posterior.x, fit.posterior.scatters)
+    again = refined(full, fit.model, start, fit.posterior.scatters)
+    value, std = size(again, full)
+    assert abs(value - force) < 1.5 * std
+    assert 0.2 * force < std < 0.5 * force
+    assert again.log_evidence > fit.log_evidence + 3
+
+
+def test_only_friction_is_calculated_in_full_and_once() -> None:
+    observations, fit = linearised(0.1)
+    cubic = parse_effect("cubic_spring@hub.x", RIG, library=shipped_effects())
+    assert observations.in_full([cubic], fit.posterior) is observations
+    full = observations.in_full([*fit.model.effects, cubic], fit.posterior)
+    assert set(full.rubbing) == {LABEL}
+    assert full.rubbing[LABEL] == {"hub friction 0", "hub friction 1"}
+    assert full.in_full(fit.model.effects, fit.posterior) is full
+    for kept, out in full.folds():
+        assert kept.rubbing == out.rubbing == full.rubbing
+    without = AmplitudeObservations(observations.modes, [replace(h, pulses=None) for h in observations.hits])
+    assert without.in_full(fit.model.effects, fit.posterior) is without
+
+
+def test_larger_motions_are_as_smaller_forces_and_rates() -> None:
+    observations, fit = linearised(0.1)
+    full = observations.in_full(fit.model.effects, fit.posterior)
+    assert full.marched is not None
+    problem, x = fit.model.problem(full), fit.posterior.x.copy()
+    index = problem.unknowns.index
+    names, at = full.marched._place(problem, x)
+    assert names == [FORCE, f"{LABEL}.velocity"]
+    x[index["amplitude of all modes"]] += 0.3
+    further = full.marched._place(problem, x)[1]
+    x[index[FORCE]] *= np.exp(0.3)
+    rate = problem.sizes[f"{LABEL}.velocity"]
+    x[index[f"{LABEL}.velocity"]] = rate.unknown(rate.value(x[index[f"{LABEL}.velocity"]]) * np.exp(0.3))
+    assert np.all(further < at)
+    np.testing.assert_allclose(full.marched._place(problem, x)[1], at)
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Stands for a selection."""
+
+    final: Any
+    observations: Any
+
+
+def test_a_calculation_in_full_that_explains_the_data_no_better_is_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    observations, fit = linearised(0.1)
+    found: Any = Chosen(fit, observations)
+    better = in_full.in_full(found)
+    assert better.observations is not observations
+    assert better.final.log_evidence > fit.log_evidence
+    monkeypatch.setattr(in_full, "refined", lambda *asked: Worse(fit.log_evidence - 1))
+    assert in_full.in_full(found) is found
+
+
+@dataclass(frozen=True)
+class Worse:
+    """Stands for a fit."""
+
+    log_evidence: float
