@@ -47,6 +47,13 @@ def rubs(element: Nonlinear) -> bool:
     return element.law is not None and element.law[0] == FRICTION
 
 
+def steps_to_end(data: HitData) -> float:
+    """Steps of a march of all hits to the end of their records, about."""
+    assert data.pulses is not None
+    per_second = max(data.pulses.sample_rate_hz, float(data.omega.max()) / _PHASE)
+    return len(data.names) / data.line_hz * per_second
+
+
 @dataclass(frozen=True)
 class Driven:
     """The linear model that blows and elements drive.

@@ -81,6 +81,9 @@ def test_only_friction_is_calculated_in_full_and_once() -> None:
         assert kept.rubbing == out.rubbing == full.rubbing
     without = AmplitudeObservations(observations.modes, [replace(h, pulses=None) for h in observations.hits])
     assert without.in_full(fit.model.effects, fit.posterior) is without
+    long = [replace(h, line_hz=h.line_hz / 300) for h in observations.hits]  # records of some minutes
+    endless = AmplitudeObservations(observations.modes, long)
+    assert endless.in_full(fit.model.effects, fit.posterior) is endless
 
 
 def test_larger_motions_are_as_smaller_forces_and_rates() -> None:
