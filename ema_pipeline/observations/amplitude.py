@@ -40,8 +40,8 @@ FAR_AMPLITUDE_STD, _FAR = 0.35, 0.3
 """That of the amplitude at which a law stands whose poles move by many decay rates, and the distance at which half of
 its growth is reached. Teeth simulated with 1.74 µm of preload, whose modes move by 0.7, read as 2.28 µm."""
 RUBBING_AMPLITUDE_STD = 0.25
-"""The same in addition where friction is calculated in full: a fit of single hits heeds the late part of a decay, which
-friction cuts off, less than is calculated."""
+"""The same in addition where friction is calculated in full: lines are weighed about as the fit of single hits weighs
+them, and from one force to the next the evidence jumps."""
 
 _MOST_STEPS = 6e6
 """Steps through all records, about as many microseconds, for which hits are marched to their end: some thirty sizes are

@@ -30,8 +30,8 @@ _PHASE = 0.4
 _SLOWEST = 2 * np.pi * 1e-2
 """Rigid-body modes are held by springs so soft that no record sees them, rad/s."""
 _BLOW_S, _LONGER, _FADED = 0.01, 3.0, 0.02
-"""Time that is marched at least, s, and factor by which it is extended until of each hit's largest force no more than
-this share is left in the last third: friction only fades."""
+"""Time that is marched at least, s, and factor by which it is extended until no force is left in its last third; of
+friction, which only fades, no more than this share of each hit's largest."""
 _STEPS, _LEFT = 3, 0.1
 """Steps of the fit that reads a mode anew about what it found, and least share of its size that a step may leave."""
 _STILL = 1e-300
@@ -164,6 +164,7 @@ def _forces(data: HitData, elements: Sequence[Nonlinear], driven: Driven) -> tup
     nothing = np.zeros((1, 0, len(poles)), complex), np.zeros((1, 0, len(elements)))
     hits, whole = len(pulses.force_n), int(rate / data.line_hz)
     found: Real = np.zeros((hits, len(elements), 0))
+    faded = _FADED if any(map(rubs, elements)) else 0.0
     left, count = np.arange(hits), pulses.force_n.shape[1] + int(_BLOW_S * rate)
     while len(left):
         count = min(count, whole)
@@ -188,7 +189,7 @@ def _forces(data: HitData, elements: Sequence[Nonlinear], driven: Driven) -> tup
         forces = marched.forces[0]
         found = np.pad(found, ((0, 0), (0, 0), (0, forces.shape[2] - found.shape[2])))
         found[left] = forces
-        late = _largest(forces[:, :, forces.shape[2] * 2 // 3 :]) > _FADED * _largest(forces)
+        late = _largest(forces[:, :, forces.shape[2] * 2 // 3 :]) > faded * _largest(forces)
         left = left[late] if count < whole else left[:0]
         count = int(_LONGER * count)
     return found, 1 / (rate * substeps)
