@@ -25,6 +25,7 @@ def fit_in_full(observations: Observations, fit: Fit) -> tuple[Observations, Fit
     full = observations.in_full(model.effects, posterior)
     if full is observations:
         return observations, fit
-    start = model.problem(full).sized_anew(posterior.x, posterior.scatters)
-    final = refined(full, model, start, posterior.scatters)
+    starts = model.problem(full).sized_anew(posterior.x)
+    tried = [refined(full, model, x, posterior.scatters) for x in starts]
+    final = max(tried, key=lambda one: one.log_evidence)
     return (full, final) if final.log_evidence > fit.log_evidence else (observations, fit)

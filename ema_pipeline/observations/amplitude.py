@@ -61,8 +61,8 @@ _ALONG, _ACROSS, _FINE = 19, 3, 41
 for their preload alone."""
 _LOWEST = 3
 """Most of them that fits begin at."""
-_FACTORS = tuple(np.geomspace(0.5, 10.0, 8))
-"""Of the linearised size of what is calculated in full: sizes that are tried."""
+_FACTORS = tuple(np.geomspace(0.5, 8.0, 6))
+"""Of the linearised size of what is calculated in full: sizes from which fits begin."""
 _BESIDE = (-2, -1, 1, 2)
 """Places of the lattice about these that are tried, too: between two sizes of the grid others may fit far better."""
 
@@ -300,12 +300,17 @@ class AmplitudeProblem:
         return tuple(self.unknowns.index[n] for n in self.sizes if effect_of(n) in marched)
 
     def step(self, i: int, x: NDArray[np.float64]) -> float:
-        """Step of the difference by the unknown at position `i`; of what is marched finer ones show its own steps."""
+        """Step of the difference by the unknown at position `i`; of what is marched finer ones show its own steps.
+
+        Of what is calculated in full it goes back, to where larger motions lead as well: into the same cell of the
+        lattice, in which force, rate and amplitude together change nothing.
+        """
         if i not in self.marched_sizes:
             return _STEP
         name = self.unknowns.names[i]
-        in_decades = effect_of(name) in self.observations.rubbing and not self.sizes[name].logarithmic
-        return _MARCHED_STEP * (max(float(x[i]), LEAST) if in_decades else 1.0)
+        if effect_of(name) not in self.observations.rubbing:
+            return _MARCHED_STEP
+        return -_MARCHED_STEP * (1.0 if self.sizes[name].logarithmic else max(float(x[i]), LEAST))
 
     def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> list[NDArray[np.float64]]:
         """`x` with the sizes of the effect added last at the best of a grid; nothing where it is linear.
@@ -347,23 +352,23 @@ class AmplitudeProblem:
             best.append(min([tries[i], *map(tried, near)], key=lambda one: one[0]))
         return [trial for _, trial in sorted(best, key=lambda one: one[0])] or [x]
 
-    def sized_anew(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64]:
-        """See `EffectProblem`: the first size of what is calculated in full, from its linearised one on."""
-        matching = self.residuals(x, scatters, derivatives=False).matching
+    def sized_anew(self, x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """See `EffectProblem`: multiples of the first size of what is calculated in full, its other sizes as usual."""
+        starts = [x]
         for effect in self.effects:
             if effect.label not in self.observations.rubbing:
                 continue
-            name = effect.parameter_name(effect.effect.parameters[0].name)
-            i, size = self.unknowns.index[name], self.sizes[name]
-            tries = []
-            for factor in _FACTORS:
-                trial = x.copy()
-                trial[i] = size.of_coordinate(factor * size.coordinate(x[i]))
-                trial = self.unknowns.clipped(trial)
-                found = self.residuals(trial, scatters, matching=matching, by_sizes=False)
-                tries.append((self._followed(found, scatters), trial))
-            x = min(tries, key=lambda one: one[0])[1]
-        return x
+            first, *others = (effect.parameter_name(p.name) for p in effect.effect.parameters)
+            i, size, tried = self.unknowns.index[first], self.sizes[first], []
+            for start, factor in itertools.product(starts, _FACTORS):
+                trial = start.copy()
+                trial[i] = size.of_coordinate(factor * size.coordinate(start[i]))
+                trial[[self.unknowns.index[n] for n in others]] = self.start()[
+                    [self.unknowns.index[n] for n in others]
+                ]
+                tried.append(self.unknowns.clipped(trial))
+            starts = tried
+        return starts
 
     def _followed(self, found: Residuals, scatters: Mapping[str, float]) -> float:
         """Sum of squares once every hit's drift and what the calculation leaves out have followed in one step."""

@@ -43,9 +43,9 @@ class EffectProblem(Problem, Protocol):
         """Points beyond a barrier that no descent passes, where the fit at `x` looks stuck before one."""
         return []
 
-    def sized_anew(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> NDArray[np.float64]:
-        """`x` with the sizes of what is calculated in full where it fits best, as far as a look around tells."""
-        return x
+    def sized_anew(self, x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """`x` with other sizes of what is calculated in full, from which fits begin."""
+        return [x]
 
     def tuned(self, x: NDArray[np.float64], name: str) -> list[float]:
         """Unknowns of the size `name` at which a mode comes to where one was measured that has no partner at `x`."""

@@ -21,7 +21,6 @@ from ema_pipeline.observations.fitting import (
     fit_base,
     learned,
     model_with,
-    refined,
     transferred,
     wide,
 )
@@ -61,8 +60,8 @@ def test_friction_calculated_in_full_has_its_true_size(force: float) -> None:
     assert value < 0.75 * force
     assert value + 3 * std < force
     full = observations.in_full(fit.model.effects, fit.posterior)
-    start = fit.model.problem(full).sized_anew(fit.posterior.x, fit.posterior.scatters)
-    again = refined(full, fit.model, start, fit.posterior.scatters)
+    data, again = in_full.fit_in_full(observations, fit)
+    assert data is not observations
     value, std = size(again, full)
     assert abs(value - force) < 1.5 * std
     assert 0.2 * force < std < 0.5 * force
