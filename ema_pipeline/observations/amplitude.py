@@ -299,6 +299,10 @@ class AmplitudeProblem:
         marched = lengths | self.observations.rubbing.keys()
         return tuple(self.unknowns.index[n] for n in self.sizes if effect_of(n) in marched)
 
+    def in_full(self, name: str) -> bool:
+        """True for a size of an effect that is calculated in full, beside teeth."""
+        return effect_of(name) in self.observations.rubbing
+
     def step(self, i: int, x: NDArray[np.float64]) -> float:
         """Step of the difference by the unknown at position `i`; of what is marched finer ones show its own steps.
 
@@ -308,7 +312,7 @@ class AmplitudeProblem:
         if i not in self.marched_sizes:
             return _STEP
         name = self.unknowns.names[i]
-        if effect_of(name) not in self.observations.rubbing:
+        if not self.in_full(name):
             return _MARCHED_STEP
         return -_MARCHED_STEP * (1.0 if self.sizes[name].logarithmic else max(float(x[i]), LEAST))
 
@@ -358,14 +362,14 @@ class AmplitudeProblem:
         for effect in self.effects:
             if effect.label not in self.observations.rubbing:
                 continue
-            first, *others = (effect.parameter_name(p.name) for p in effect.effect.parameters)
-            i, size, tried = self.unknowns.index[first], self.sizes[first], []
+            i, *others = (
+                self.unknowns.index[effect.parameter_name(p.name)] for p in effect.effect.parameters
+            )
+            size, usual, tried = self.sizes[self.unknowns.names[i]], self.start()[others], []
             for start, factor in itertools.product(starts, _FACTORS):
                 trial = start.copy()
                 trial[i] = size.of_coordinate(factor * size.coordinate(start[i]))
-                trial[[self.unknowns.index[n] for n in others]] = self.start()[
-                    [self.unknowns.index[n] for n in others]
-                ]
+                trial[others] = usual
                 tried.append(self.unknowns.clipped(trial))
             starts = tried
         return starts

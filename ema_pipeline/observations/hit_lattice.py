@@ -75,7 +75,7 @@ class MarchedHits:
         """
         names = [problem.unknowns.names[i] for i in problem.marched_sizes]
         at, scale = x[list(problem.marched_sizes)], x[problem.unknowns.index[AMPLITUDE]]
-        coarse = np.array([_coarse(problem, n) for n in names])
+        coarse = np.array([problem.in_full(n) for n in names])
         logarithmic = np.array([problem.sizes[n].logarithmic for n in names])
         at = np.where(coarse & ~logarithmic, np.log(np.maximum(at, LEAST)) / LOG_STD, at)
         moved = np.where(logarithmic | coarse, at - scale / LOG_STD, at * np.exp(-scale))
@@ -108,13 +108,9 @@ class MarchedHits:
         return HitResiduals(problem, data, paired, x, posterior.scatters, 1.0).moved(x)
 
 
-def _coarse(problem: AmplitudeProblem, name: str) -> bool:
-    return effect_of(name) in problem.observations.rubbing
-
-
 def _unknown(problem: AmplitudeProblem, name: str, place: int) -> float:
     """The unknown of a size at a place of the lattice."""
-    if not _coarse(problem, name):
+    if not problem.in_full(name):
         return place * SPACING
     at = place * _COARSE
     return at if problem.sizes[name].logarithmic else float(np.exp(at * LOG_STD))

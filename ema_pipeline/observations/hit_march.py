@@ -136,14 +136,14 @@ def marched_modes(
     result = np.zeros((2, *displacement.shape), complex)
     if not np.any(forces):
         return result
-    spectra = _spectra(data, forces, step)
+    spectra, by_response = _spectra(data, forces, step), any(map(rubs, elements))
     for r in np.flatnonzero(driven.match >= 0):
         low, high = data.band_hz[r].tolist()
         lines = np.arange(low, high, data.line_hz)
         own = spectra[:, :, np.rint(lines / data.line_hz).astype(int)]
         drive = 1j / data.omega[r] * np.einsum("j,hjl->hl", driven.stretch[:, driven.match[r]], own)
         s = 2j * np.pi * lines + data.window_decay - complex(-data.decay[r], data.omega[r])
-        weight = np.abs(s) if any(map(rubs, elements)) else np.ones(len(s))
+        weight = np.abs(s) if by_response else np.ones(len(s))
         pole, size = _read(s, drive, displacement[:, r], data.decay[r], weight)
         result[0, :, r], result[1, :, r] = pole, size
     return result

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -205,10 +206,10 @@ class HitResiduals:
         scaled = [self._scaled(e, x) for e in elements]
         of_marched = np.array([self._is_marched(e) for e in scaled])
         if of_marched.any():
-            through_time = [e for e in scaled if self._is_marched(e)]
+            through_time = list(compress(scaled, of_marched))
             marched = self._marched(x, through_time, stretch[of_marched], match, displacement)
             if marched is not None:
-                scaled, stretch = [e for e in scaled if not self._is_marched(e)], stretch[~of_marched]
+                scaled, stretch = list(compress(scaled, ~of_marched)), stretch[~of_marched]
                 total += marched
         if not scaled:
             return total

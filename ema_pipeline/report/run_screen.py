@@ -146,7 +146,7 @@ def _diagnosed(found: Diagnosis) -> str:
         odds = probability_text(min((c.probability for c in mine), default=math.nan))
         rungs = found.ladder.rungs
         fall = f", error {plain(error, 3)} → {plain(rungs[-1].error, 3)}" if rungs else ""
-        return f"Missing: {named(mine)} (probability {odds}{fall})."
+        return f"Missing: {named(diagnosis.leading(found))} (probability {odds}{fall})."
     if found.verdict == "ambiguous":
         sure = named(diagnosis.undisputed(found))
         told = f"{diagnosis.heading_of_alike(found)}: {named(diagnosis.alike(found))}."
