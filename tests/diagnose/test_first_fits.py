@@ -78,9 +78,10 @@ def test_an_effect_that_adds_modes_begins_at_the_best_of_a_grid() -> None:
     data: Any = SimpleNamespace(scatters={})
     one = hypothesis("a", sizes=2, extends=True)
     best = _best_of_grid(data, problem, np.array([0.4, 0.0, 0.0]), one)
-    assert best == [{"a.s1": 0.5, "a.s2": -1.0}, {"a.s1": 0.5, "a.s2": -1.5}]
+    nearest = [(0.5, -1.0), (0.5, -1.5), (1.0, -1.0), (0.0, -1.0), (1.0, -1.5)]
+    assert best == [{"a.s1": a, "a.s2": b} for a, b in nearest]
     starts = _starts(data, problem, one, np.array([0.4, 0.0, 0.0]))
-    np.testing.assert_array_equal(starts, [[k, 0.5, s] for k in (0.4, 0.0) for s in (-1.0, -1.5)])
+    np.testing.assert_array_equal(starts, [[k, *near] for k in (0.4, 0.0) for near in nearest])
 
 
 @pytest.mark.parametrize(
