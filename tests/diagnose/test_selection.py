@@ -178,22 +178,36 @@ class Steps:
 
 
 def test_effects_are_added_one_by_one_until_nothing_more_is_claimed(monkeypatch: pytest.MonkeyPatch) -> None:
-    a, b, c = judged("a@x", 20.0, linear=False), judged("b@x", 9.0), judged("c@x", 4.0, "weak")
-    rival = judged("b@y", 9.05, "weak")  # would stand first among those alike
+    a, b, c = judged("a@x", 20.0, linear=False), judged("b@y", 9.0), judged("c@y", 4.0, "weak")
+    rival = judged("b@z", 9.05, "weak")  # would stand first among those alike
     steps = Steps(monkeypatch, [[a], [rival, b], [c]], linearised=True)
     told: list[float] = []
     found = steps.select([j.hypothesis for j in (a, b, c)], SETTINGS, told)
     assert found.claimed == (a, b)
     assert len(found.rounds) == 3
-    assert steps.asked == [(["a@x", "b@x", "c@x"], 0.0), (["b@x", "c@x"], 10.0), (["c@x"], 20.0)]
-    assert [name for name, _ in steps.begun] == ["base", "a@x", "b@x"]
+    assert steps.asked == [(["a@x", "b@y", "c@y"], 0.0), (["b@y", "c@y"], 10.0), (["c@y"], 20.0)]
+    assert [name for name, _ in steps.begun] == ["base", "a@x", "b@y"]
     assert steps.begun[1][1] is a.ranked.fit
     assert found.final is found.rounds[-1].ranking.base
     assert found.final.at == 3  # type: ignore[attr-defined]
     more = pytest.approx(5.5 + SETTINGS.linearised_claim)
     assert steps.shares == [(3, 3.5, 0), (2, more, 1), (1, more, 2)]
     assert told == pytest.approx([0.125, 0.375, 0.625])
-    assert steps.reconsidered == [(["a@x", "b@x"], ["a@x", "b@x"])]  # one alone has nothing beside it
+    assert steps.reconsidered == [(["a@x", "b@y"], ["a@x", "b@y"])]  # one alone has nothing beside it
+
+
+def test_linear_effects_at_the_place_of_a_linearised_one_are_not_asked_about(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    a, other = judged("backlash@x", 20.0, linear=False), judged("cubic@x", 1.0, "weak", linear=False)
+    loss, far = judged("loss@x", 9.0), judged("loss@y", 1.0, "weak")
+    hypotheses = [j.hypothesis for j in (a, other, loss, far)]
+    steps = Steps(monkeypatch, [[a], [far]], linearised=True)
+    steps.select(hypotheses, SETTINGS, [])
+    assert [asked for asked, _ in steps.asked[1:]] == [["cubic@x", "loss@y"]]
+    steps = Steps(monkeypatch, [[a], [far]])
+    steps.select(hypotheses, SETTINGS, [])
+    assert [asked for asked, _ in steps.asked[1:]] == [["cubic@x", "loss@x", "loss@y"]]
 
 
 def test_what_was_claimed_is_asked_about_again_with_unknowns_that_a_later_claim_calls_for(
