@@ -322,7 +322,7 @@ class AmplitudeProblem:
         From far off there is often no slope that leads to the right size: teeth that never part, friction that locks,
         and a quadratic spring of no size change nothing. Rows far off count by their logarithm: what other unknowns
         will take up must not outweigh what most rows say. Of teeth, whose rows go up and down with the size, some
-        lowest points count, once what is known least has followed.
+        lowest points count, once all else has followed.
         """
         last = self.model.effects[-1] if self.model.effects else None
         if last is None or last.effect.linear or not self.observations.hits:
@@ -340,8 +340,9 @@ class AmplitudeProblem:
             trial = x.copy()
             trial[at] = values
             found = self.residuals(trial, scatters, matching=matching, derivatives=marched, by_sizes=False)
-            cost = self._followed(found, scatters) if marched else float(np.sum(np.log1p(found.values**2)))
-            return 0.5 * (cost + float(np.sum(np.square(values)))), trial
+            if marched:
+                return 0.5 * self._followed(found, trial, scatters, at), trial
+            return 0.5 * float(np.sum(np.log1p(found.values**2)) + np.sum(np.square(values))), trial
 
         places = list(itertools.product(*grids))
         tries = [tried(values) for values in places]
@@ -374,15 +375,23 @@ class AmplitudeProblem:
             starts = tried
         return starts
 
-    def _followed(self, found: Residuals, scatters: Mapping[str, float]) -> float:
-        """Sum of squares once every hit's drift and what the calculation leaves out have followed in one step."""
+    def _followed(
+        self, found: Residuals, x: NDArray[np.float64], scatters: Mapping[str, float], held: Sequence[int]
+    ) -> float:
+        """Twice the cost once all unknowns but those `held` have followed in one step.
+
+        What is seen of a structure at any force is what the teeth leave of it: its parts are not where the linear model
+        found them.
+        """
         prior = self.unknowns.prior_std(scatters)
-        kinds = (DRIFT, LINEARISATION)
-        columns = np.flatnonzero([self.unknowns.scatter[i] in kinds for i in range(len(self.unknowns))])
-        jacobian = found.jacobian[:, columns] * prior[columns]
-        normal = jacobian.T @ jacobian + np.eye(len(columns))
-        right = jacobian.T @ found.values
-        return float(found.values @ found.values - right @ np.linalg.solve(normal, right))
+        free = np.setdiff1d(np.arange(len(x)), held)
+        jacobian = found.jacobian[:, free] * prior[free]
+        at = x[free] / prior[free]
+        slope = jacobian.T @ found.values + at
+        normal = jacobian.T @ jacobian + np.eye(len(free))
+        return float(
+            found.values @ found.values + np.sum((x / prior) ** 2) - slope @ np.linalg.solve(normal, slope)
+        )
 
     def residuals(
         self,

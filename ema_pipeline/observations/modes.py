@@ -37,12 +37,12 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
         Scatter(MASS_SCATTER, "mass of parts", MASS_STD, 1.0, 0.02, 8.0),
         Scatter(CALIBRATION, "calibration", CALIBRATION_STD, 0.7, 0.04),
         Scatter(DAMPING_SCATTER, "ln ζ from mode to mode", rig.modal_damping_scatter, 0.5, 0.5),
-        Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 5.0, 0.2),
+        Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 2.0, 0.2),
         Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03, 1.5, 0.03),
         # What hits have in common (drift, aim) is in their scatter, and no error of one mode against another.
-        Scatter(FREQUENCY_NOISE, "stated uncertainty of frequencies", 1.0, 0.5),
+        Scatter(FREQUENCY_NOISE, "stated uncertainty of frequencies", 1.0, 0.5, most=1.5),
         Scatter(SHAPE_NOISE, "stated uncertainty of shapes", 1.0, 0.5),
-        Scatter(MIXING, "shapes of close modes along each other", 0.01, 1.0, 0.03, 20.0),
+        Scatter(MIXING, "shapes of close modes along each other", 0.01, 1.0, 0.03, 5.0),
     )
     return {s.name: s for s in known}
 

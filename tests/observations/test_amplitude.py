@@ -130,6 +130,24 @@ CASES = {
 }  # fmt: skip
 
 
+def test_sizes_that_are_tried_count_once_all_else_has_followed() -> None:
+    observations = synthetic(CASES["mesh_backlash@hub-rim"][0])
+    base = base_fit(observations)
+    model = base.model.plus(parse_effect("mesh_backlash@hub-rim", RIG), {})
+    problem = observations.problem(model.effects, model.scales)
+    x = transferred(base.posterior, problem.unknowns, problem.start())
+    scatters = base.posterior.scatters
+    held = [problem.unknowns.index[name] for name in problem.sizes]
+    found = problem.residuals(x, scatters, by_sizes=False)
+    std = problem.unknowns.prior_std(scatters)
+    rows = np.vstack([found.jacobian, np.diag(1 / std)])
+    right = np.concatenate([found.values, x / std])
+    step = np.linalg.lstsq(np.delete(rows, held, axis=1), -right)[0]
+    left = right + np.delete(rows, held, axis=1) @ step
+    assert problem._followed(found, x, scatters, held) == pytest.approx(float(left @ left))
+    assert np.max(np.abs(step)) > 1e-3
+
+
 @pytest.mark.parametrize("label", list(CASES))
 def test_each_effect_is_told_at_its_place_with_its_size(label: str) -> None:
     elements, parameter, size = CASES[label]
