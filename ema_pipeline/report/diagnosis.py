@@ -32,6 +32,9 @@ def heading(found: Diagnosis) -> str:
     if found.verdict == "ambiguous":
         told, sure = heading_of_alike(found), " and ".join(label_words(c.label) for c in undisputed(found))
         return f"Missing: {sure}; beside it, {_lower(told)}" if sure else told
+    closest = " and ".join(label_words(c.label) for c in claimed(found))
+    if found.verdict == "unknown_effect" and closest:
+        return f"Something is missing that the library does not explain; closest to it: {closest}"
     near = any(c.would_explain(ERROR_LIMIT) for c in found.candidates[:1])
     if found.verdict == "unknown_effect" and near:
         return "Something is missing, and no effect is supported enough to be named"

@@ -181,6 +181,14 @@ def test_what_is_missing_may_be_in_the_library_where_the_best_candidate_would_ex
     )
 
 
+def test_what_is_claimed_of_a_model_that_fails_is_in_the_heading() -> None:
+    told = found("unknown_effect")
+    closest = replace(told, candidates=(replace(told.candidates[0], claimed=True), *told.candidates[1:]))
+    assert diagnosis.heading(closest) == (
+        "Something is missing that the library does not explain; closest to it: mesh stiffness loss at sun-planet1"
+    )
+
+
 def test_three_that_fit_alike_are_counted_in_the_heading() -> None:
     three = replace(found("ambiguous"), indistinguishable=((CRACK, OTHER, SUPPORT),))
     assert diagnosis.heading(three) == "Three effects explain the data equally well"
