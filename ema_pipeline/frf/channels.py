@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.ingest.defaults import CALIBRATION_STD, TRANSVERSE
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 
 SEVERAL = " + "
 """Stands between the names of sensors that have measured one and the same DOF."""
+OFF_DIRECTION = 0.1
+"""1 σ, in rad, of the direction of all blows on one DOF together: two of them, each 8° off."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,24 @@ class ChannelQuality:
     name: str = ""
     calibration_std: float = CALIBRATION_STD
     transverse: float = TRANSVERSE
+    off_direction: ClassVar[float] = 0.0
+    """1 σ, in rad, of the direction in which blows read a DOF; that of a sensor is in `transverse`."""
+    aim: ClassVar[float] = 0.0
+    """Relative 1 σ of how much of a blow its direction lets act, for all modes alike."""
+
+
+@dataclass(frozen=True)
+class InTurn(ChannelQuality):
+    """Uncertainty of a DOF to which a sensor was moved: it has blows of its own."""
+
+    aim = math.sqrt(2) * OFF_DIRECTION**2  # of 1 - cos, off in two directions, two blows
+
+
+@dataclass(frozen=True)
+class StruckPoint(InTurn):
+    """Uncertainty of a DOF that was struck and carried no sensor: the direction of the blows is what is read."""
+
+    off_direction = OFF_DIRECTION
 
 
 def channel_uncertainty(frfs: FrfSet | None, dof: Dof) -> ChannelQuality:
@@ -49,16 +70,19 @@ def channel_uncertainty(frfs: FrfSet | None, dof: Dof) -> ChannelQuality:
     Returns
     -------
     ChannelQuality
-        Of the sensor at that DOF; of the hammer where the DOF was struck but carried no sensor (a roving hammer,
-        whose one gain is common to all such DOFs); the defaults where nothing is known.
+        Of the sensor at that DOF, `InTurn` where it has measured others, too; a `StruckPoint` of the hammer where the
+        DOF was struck but carried no sensor (a roving hammer, whose one gain is common to all such DOFs); the defaults
+        where nothing is known.
     """
     if frfs is None:
         return ChannelQuality()
     for output, channel in zip(frfs.outputs, frfs.channels, strict=False):
         if output.point == dof.point:
-            return channel
+            moved = channel.name and sum(c.name == channel.name for c in frfs.channels) > 1
+            return InTurn(channel.name, channel.calibration_std, channel.transverse) if moved else channel
     if dof.point in {d.point for d in frfs.inputs} - {d.point for d in frfs.outputs}:
-        return hammer_uncertainty(frfs)
+        hammer = hammer_uncertainty(frfs)
+        return StruckPoint(hammer.name, hammer.calibration_std, hammer.transverse)
     return ChannelQuality()
 
 
@@ -72,7 +96,8 @@ def merged(one: ChannelQuality | None, other: ChannelQuality) -> ChannelQuality:
     if one is None or one == other:
         return other
     names = list(dict.fromkeys([*one.name.split(SEVERAL), other.name]))
-    return ChannelQuality(
+    worse = max(one, other, key=lambda channel: (channel.off_direction, channel.aim))
+    return type(worse)(
         SEVERAL.join(names),
         max(one.calibration_std, other.calibration_std),
         max(one.transverse, other.transverse),

@@ -43,6 +43,8 @@ class FitData:
         True where rows are inputs and references are outputs.
     window_rad_s : float
         Decay rate of the exponential window under which all was measured, noise too; 0 for none.
+    in_turn : bool
+        True where a sensor was moved from DOF to DOF, and several points were struck each time.
     """
 
     omega: NDArray[np.float64]
@@ -52,19 +54,12 @@ class FitData:
     rest_s: float
     transposed: bool
     window_rad_s: float = 0.0
+    in_turn: bool = False
 
     def lines(self, first: int, stop: int) -> FitData:
         """The same FRFs on lines ``first:stop``."""
         cut = slice(first, stop)
-        return FitData(
-            self.omega[cut],
-            self.frf[..., cut],
-            self.variance[..., cut],
-            self.measured,
-            self.rest_s,
-            self.transposed,
-            self.window_rad_s,
-        )
+        return replace(self, omega=self.omega[cut], frf=self.frf[..., cut], variance=self.variance[..., cut])
 
     def rows(self, rows: slice) -> FitData:
         """Some rows on the same lines."""
@@ -140,4 +135,6 @@ def arrange(frfs: FrfSet, band_hz: tuple[float, float]) -> FitData:
     transposed = acc.shape[0] < acc.shape[1]
     if transposed:
         acc, variance, measured = acc.swapaxes(0, 1), variance.swapaxes(0, 1), measured.T
-    return FitData(omega, acc, variance, measured, rest_s, transposed, frfs.response_decay_rad_s)
+    sensors = [channel.name for channel in frfs.channels if channel.name]
+    in_turn = len(frfs.inputs) > 1 and len(set(sensors)) < len(sensors)
+    return FitData(omega, acc, variance, measured, rest_s, transposed, frfs.response_decay_rad_s, in_turn)

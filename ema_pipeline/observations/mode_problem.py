@@ -66,6 +66,11 @@ def _transverse(sensor: str, direction: str) -> str:
     return f"transverse sensitivity at {sensor} along {direction}"
 
 
+def _aim(sensor: str) -> str:
+    """Name of the unknown: blows off their direction excite less, all modes alike."""
+    return f"aim at {sensor}"
+
+
 @dataclass(frozen=True)
 class ModeRows:
     """Measurement minus model over 1 σ of one mode; NaN where not measured.
@@ -141,15 +146,18 @@ class ModeProblem(EffectProblem):
 
     @cached_property
     def unknowns(self) -> Unknowns:
-        """The model's unknowns, every sensor's calibration, and its transverse sensitivity where it has one."""
+        """The model's unknowns, every sensor's calibration and transverse sensitivity, and how blows were aimed."""
         sensors = {s: self.observations.channel(s) for s in self.observations.sensors}
         gains = {_calibration(s, c): c.calibration_std / CALIBRATION_STD for s, c in sensors.items()}
         gains = {name: std for name, std in gains.items() if std > 0}
         across: dict[str, float] = {}
         for s, c in sensors.items():
-            others = self._directions_across(s)
-            if c.transverse > 0:
-                across |= {_transverse(s, d): c.transverse / np.sqrt(len(others)) for d in others}
+            others, off = self._directions_across(s), c.off_direction
+            if c.transverse > 0 or off:
+                std = float(np.hypot(c.transverse / np.sqrt(max(len(others), 1)), off))
+                across |= {_transverse(s, d): std for d in others}
+            if c.aim:
+                across[_aim(s)] = c.aim
         drifts = [_drift(d.configuration, self.observations.test) for d in self.observations.data]
         return joined(
             self.model.unknowns,
@@ -190,7 +198,7 @@ class ModeProblem(EffectProblem):
 
     def _found_sensing(self, d: ModeData) -> Sensing:
         along = self.model.sensor_rows(d.configuration, d.dofs)
-        most = max(map(len, _FRAMES))
+        most = max(map(len, _FRAMES)) + 1
         across = np.zeros((most, *along.shape))
         gain = np.full(len(d.dofs), -1)
         transverse = np.full((most, len(d.dofs)), -1)
@@ -203,6 +211,8 @@ class ModeProblem(EffectProblem):
                 transverse[k, i] = self.unknowns.index.get(_transverse(dof.point, direction), -1)
                 if transverse[k, i] >= 0 and self.observations.has(d.configuration, other):
                     across[k, i] = self.model.sensor_rows(d.configuration, (other,))[0]
+            transverse[-1, i] = self.unknowns.index.get(_aim(dof.point), -1)
+            across[-1, i] = along[i]
         drift = self.unknowns.index.get(_drift(d.configuration, self.observations.test), -1)
         mixing = np.array([self.unknowns.index.get(n, -1) for n in self._mixing(d)], np.int64)
         return Sensing(along, across, gain, transverse, drift, mixing)

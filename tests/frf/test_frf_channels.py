@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from frf_hits import clean_hits
 from ingest_example import DESCRIPTION, make_test
@@ -19,6 +20,7 @@ from ema_pipeline.frf import (
     estimate_frfs,
     hammer_uncertainty,
 )
+from ema_pipeline.frf.channels import InTurn, StruckPoint, merged
 from ema_pipeline.ingest.description import read_description
 from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.load import load_records
@@ -73,7 +75,8 @@ def test_a_roving_sensor_keeps_its_name_and_two_sensors_at_one_dof_are_never_bet
     frfs = estimate_frfs([with_channel(one, calibration_std=0.03), roving, three], FrfSettings())
     at = {d.point: channel_uncertainty(frfs, d) for d in frfs.outputs}
     assert at["p0.z"].name == at["p2.z"].name == "a0"
-    assert at["p2.z"].calibration_std == 0.01
+    assert at["p2.z"] == InTurn("a0", 0.01, 0.03)
+    assert merged(at["p2.z"], at["p1.z"]) == InTurn("a0 + a1 + b", 0.05, 0.03)
     assert at["p1.z"] == ChannelQuality("a1 + b", 0.05, 0.03)
 
 
@@ -81,8 +84,15 @@ def test_a_dof_that_was_only_struck_has_the_hammers_gain() -> None:
     hits = [replace(h, force_name="hammer", force_calibration_std=0.07) for h in clean_hits(2, 512)]
     moved = replace(hits[1], hit=replace(hits[1].hit, impact=Dof("p9", "z")))
     frfs = estimate_frfs([hits[0], moved], FrfSettings())
-    assert channel_uncertainty(frfs, Dof("p9", "z")) == ChannelQuality("hammer", 0.07, 0.03)
+    assert channel_uncertainty(frfs, Dof("p9", "z")) == StruckPoint("hammer", 0.07, 0.03)
     assert channel_uncertainty(frfs, Dof("p0", "z")).name == "a0"
+
+
+def test_two_blows_8_degrees_off_are_read_as_far_off_as_is_stated() -> None:
+    off = np.deg2rad(8) * np.random.default_rng(1).standard_normal((2, 2, 20000))  # directions, blows, DOFs
+    assert StruckPoint.off_direction == pytest.approx(np.std(off.mean(axis=1)), rel=0.03)
+    acting = np.cos(np.linalg.norm(off, axis=0)).mean(axis=0)
+    assert InTurn.aim == pytest.approx(np.std(np.log(acting)), rel=0.05)
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -20,6 +20,7 @@ from simulate_modal import (
 
 from ema_pipeline import threads
 from ema_pipeline.errors import EmaError
+from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
@@ -384,6 +385,27 @@ def test_records_under_different_windows_are_not_averaged() -> None:
     found = [cut_hit(r, hits_of_test([r])[0]) for r in (one, other)]
     with pytest.raises(EmaError, match=r"exponential window of 1.5 rad/s, 'p0_0.h5' with 0 rad/s"):
         estimate_frfs(found)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_blows_off_their_direction_make_no_second_mode_where_sensors_are_moved(seed: int) -> None:
+    """Each position of two sensors has blows of its own, whose directions mix what the others excite."""
+    frfs, rng = hammer_test(FIVE, list(range(8)), [0, 3, 6]), np.random.default_rng(seed)
+    frf = frfs.frf.copy()
+    for first in range(0, 8, 2):
+        mix = 0.1 * rng.standard_normal((3, 3))
+        np.fill_diagonal(mix, 1 + 0.01 * rng.standard_normal(3))
+        frf[first : first + 2] = np.einsum("oil,ij->ojl", frfs.frf[first : first + 2], mix)
+
+    def found(sensors: list[str]) -> ModalModel:
+        channels = tuple(ChannelQuality(name) for name in sensors)
+        return identify(replace(frfs, frf=frf, channels=channels), ModalSettings())
+
+    moved = found(["a0", "a1"] * 4)
+    assert frequencies(moved) == pytest.approx(FIVE.frequency_hz, rel=1e-3)
+    assert (
+        len(found([f"a{k}" for k in range(8)]).modes) > 7
+    )  # all at once, the same FRFs are no single modes'
 
 
 def test_frfs_that_were_not_measured_cost_no_modes_and_get_shapes_where_measured() -> None:

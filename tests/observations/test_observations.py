@@ -15,6 +15,7 @@ from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import effect_library, parse_effect
 from ema_pipeline.errors import EmaError
+from ema_pipeline.frf.channels import ChannelQuality, InTurn, StruckPoint
 from ema_pipeline.inference import Scatter, Unknowns, descend
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Gyroscopic, Mass, Spring
 from ema_pipeline.mechanics.modes import complex_modes
@@ -492,6 +493,28 @@ def test_a_sensor_reads_across_what_others_of_its_body_measure_and_one_that_turn
     assert sorted(n.removeprefix(told) for n in names if n.startswith(told)) == [
         "u along x", "u along y", "x along y", "y along x"
     ]  # fmt: skip
+
+
+def test_a_point_that_was_struck_is_read_as_its_blows_were_aimed() -> None:
+    """Derivatives included; a sensor that stays where it is has no aim."""
+    rig = planetary()
+    struck, moved, still = StruckPoint("hammer", 0.02, 0.03), InTurn("a", 0.02, 0.03), ChannelQuality("b")
+    channels = {"sun.x": struck, "sun.y": moved, "carrier.x": still}
+    measured = observed(rig, planetary_modes(rig, 2, GOOD))
+    problem = ModeObservations(rig, measured.data, channels).problem((), {})
+    std = dict(zip(problem.unknowns.names, problem.unknowns.std, strict=True))
+    assert {n: s for n, s in std.items() if n.startswith("aim")} == {
+        "aim at sun.x": pytest.approx(0.0141, rel=0.01), "aim at sun.y": pytest.approx(0.0141, rel=0.01)
+    }  # fmt: skip
+    across = [std[f"transverse sensitivity at sun.{d}"] for d in ("x along y", "y along x")]
+    assert across == pytest.approx([np.hypot(0.03, 0.1), 0.03])
+    scatters = {n: s.default for n, s in measured.scatters.items()}
+    x, i = problem.start(), problem.unknowns.index["aim at sun.x"]
+    here = problem.residuals(x, scatters)
+    x[i] = 1e-4
+    there = problem.residuals(x, scatters, matching=here.matching)
+    np.testing.assert_allclose(there.stated - here.stated, 1e-4 * here.jacobian[:, i], rtol=0.01, atol=1e-5)
+    assert np.max(np.abs(here.jacobian[:, i])) > 1
 
 
 def test_a_rig_that_is_as_drawn_has_residuals_of_nothing_but_noise() -> None:
