@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.score import Marginal
-from ema_pipeline.inference import Posterior, Scatter
+from ema_pipeline.inference import Posterior, Scatter, tails
+from ema_pipeline.inference.problem import in_blocks
 from ema_pipeline.inference.scatter import determined
 
 _STEPS = 12
@@ -45,7 +46,8 @@ class ExpectedGain:
     """Gains on top of one fitted model.
 
     A model without the effect can take it for scatter: its scatters rise together until they explain it best. One that
-    n values determine makes a squared distance z² gain n/2·ln(1 + z²/n), as in Student's test, and not z²/2.
+    n values determine makes a squared distance z² gain n/2·ln(1 + z²/n), as in Student's test, and not z²/2. Shapes of
+    a few modes that are far off gain less still: their density has tails (`inference.tails`).
 
     Parameters
     ----------
@@ -62,7 +64,8 @@ class ExpectedGain:
         self._shares = np.zeros((marginal.count, len(learned)))
         for k, s in enumerate(learned):
             self._shares[:, k] = fit.residuals.share.get(s.name, 0.0)
-        self._square = fit.expected_squares()
+        self._square, self._block = fit.expected_squares(), fit.residuals.block
+        self._unweighted = fit.residuals.weight**-2.0
         of_residuals = np.sum(self._shares, axis=0)
         self._values = np.array([determined(fit, s.name) for s in learned]) - of_residuals
         now = np.array([np.log(fit.scatters[s.name]) for s in learned])
@@ -98,15 +101,32 @@ class ExpectedGain:
             variance = fixed + np.sum(added, axis=1)
             above = self._above + 0.5 * log
             inverse = np.exp(-log)
-            cost = 0.5 * float(
-                np.sum(np.log(variance) + square / variance)
+            own = square / variance
+            cost = self._of_residuals(own) + 0.5 * float(
+                np.sum(np.log(variance))
                 + np.sum(count * log + of_unknowns * inverse + self._weight * above**2)
             )
             best = min(best, cost)
-            part, excess = added / variance[:, None], square / variance
+            part, excess = added / variance[:, None], own * self._factor(own)
             slope = 0.5 * (part.T @ (1 - excess) + count - of_unknowns * inverse + self._weight * above)
             curvature = 0.5 * (part.T @ (np.maximum(excess, 1.0)[:, None] * part))
             curvature[np.diag_indices_from(curvature)] += 0.5 * of_unknowns * inverse + 0.25 * self._weight
             step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST, _LONGEST)
             log = np.minimum(log + step, self._widest)
         return best
+
+    def _of_residuals(self, square: NDArray[np.float64]) -> float:
+        """-log density of residuals by their weighted squares, up to a constant."""
+        if self._block is None:
+            return 0.5 * float(np.sum(square))
+        blocks = in_blocks(square * self._unweighted, self._block)
+        return 0.5 * float(np.sum(square[self._block < 0])) + float(np.sum(tails.cost(*blocks)))
+
+    def _factor(self, square: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Slope of that density over a Gaussian's, (m,)."""
+        factor = np.ones(len(square))
+        if self._block is not None:
+            inside = self._block >= 0
+            weight = tails.weight(*in_blocks(square * self._unweighted, self._block))
+            factor[inside] = self._unweighted[inside] * weight[self._block[inside]]
+        return factor

@@ -29,7 +29,9 @@ from ema_pipeline.diagnose.ranking import (
     _promising,
     _screened,
 )
+from ema_pipeline.inference import Scatter
 from ema_pipeline.observations.fitting import Fit
+from ema_pipeline.observations.mode_rows import SHAPE
 
 
 def test_where_the_base_model_fails_laws_in_time_are_screened_among_themselves() -> None:
@@ -84,7 +86,7 @@ def test_finalists_are_learned_and_compared_with_the_learned_base(monkeypatch: p
     monkeypatch.setattr(ranking, "_crossed", cross)
     found = found_of(a=60.0, b=50.0, c=-139.0, d=-140.0, e=-141.0, f=-150.0, g=-200.0)
     promising = [(hypothesis("g"), fit("g", 20.0))]
-    told = _finals(NO_DATA, fit("base", 10.0), list(found.values()), promising, 1)
+    told = _finals(NO_DATA, fit("base", 10.0), list(found.values()), promising, 1, (), True)
     asked = [(name, True) for name in ("base", "a", "b", "c", "d", "g")]
     assert learned == [*asked, ("e", False)]  # e can no longer catch up
     assert crossed == ["base", "a", "b", "c", "d", "g"]
@@ -97,10 +99,10 @@ def test_finalists_are_learned_and_compared_with_the_learned_base(monkeypatch: p
     assert gains["e"] == (-141.0 + 3.0 - 14.0, True)
     assert gains["f"] == (-160.0, False)
     close = list(found_of(a=13.0, b=12.8, c=12.6, d=12.4, e=12.0, f=11.5).values())
-    told = _finals(NO_DATA, fit("base", 10.0), close, [], 1)
+    told = _finals(NO_DATA, fit("base", 10.0), close, [], 1, (), True)
     last = told.ranked[-1]  # at wide scatters ahead of nothing by 1.5, no finalist by 1
     assert (last.hypothesis.label, last.gain) == ("f", told.ranked[-2].gain) == ("f", 1.0)
-    assert _finals(NO_DATA, fit("base", 10.0), [], [], 1).ranked == ()
+    assert _finals(NO_DATA, fit("base", 10.0), [], [], 1, (), True).ranked == ()
 
 
 def test_beside_a_base_model_that_explains_the_data_nothing_is_led_past_its_barriers_again(
@@ -115,7 +117,8 @@ def test_beside_a_base_model_that_explains_the_data_nothing_is_led_past_its_barr
     monkeypatch.setattr(ranking, "_learned", learn)
     monkeypatch.setattr(ranking, "_crossed", lambda o, sources, one: one.posterior)
     order = list(found_of(a=12.0, b=11.9, c=11.8, d=11.7, e=11.6, f=11.5).values())
-    told = _finals(NO_DATA, fit("base", 10.0), order, [], 1, fit("settled", 111.0))
+    known = [fit("settled", 111.0), fit("narrow", 110.0)]
+    told = _finals(NO_DATA, fit("base", 10.0), order, [], 1, known, False)
     assert learned == [(name, False) for name in "abcde"]
     assert told.base.log_evidence == 111.0
     # what is no finalist is held against the base model at the same wide scatters
@@ -308,7 +311,8 @@ class Stages:
             if h.label != "f"
         ]
         monkeypatch.setattr(ranking, "scores", lambda *given: told)
-        monkeypatch.setattr(ranking, "learned", lambda o, one: fit("learned", 0.0))
+        monkeypatch.setattr(ranking, "learned", lambda o, one, past_barriers=True: fit("learned", 0.0))
+        monkeypatch.setattr(ranking, "_narrowed", lambda o, settled: None)
         monkeypatch.setattr(ranking, "unbent", lambda o, one: not bent)
         monkeypatch.setattr(ranking, "tried_sizes", self.tried_sizes)
         monkeypatch.setattr(ranking, "_screened", self.screened)
@@ -327,11 +331,11 @@ class Stages:
         monkeypatch.setattr(
             ranking,
             "_finals",
-            lambda o, base, order, promising, processes, settled=None: (
+            lambda o, base, order, promising, processes, known, past_barriers: (
                 base,
                 order,
                 list(promising),
-                settled,
+                [f.model.name for f in known] + ["past barriers"] * past_barriers,
             ),
         )
         for h in self.hypotheses:
@@ -399,9 +403,9 @@ def test_those_behind_in_short_fits_are_annealed_where_a_size_leads_modes_to_par
 
 def test_near_the_base_model_scores_tell_where_fits_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = Stages(monkeypatch)
-    base, order, promising, settled = stages.rank(stages.base, further=2, unpaired=2.0)
+    base, order, promising, known = stages.rank(stages.base, further=2, unpaired=2.0)
     assert base is stages.base
-    assert settled.model.name == "learned"
+    assert known == ["learned"]
     assert [h.label for h, _ in order] == ["a", "b", "c", "d", "e", "f"]
     assert promising == ["more"]
     assert stages.asked[0] == (
@@ -413,6 +417,34 @@ def test_near_the_base_model_scores_tell_where_fits_begin(monkeypatch: pytest.Mo
     assert stages.asked[7:] == [("freed", 6), ("again", 6, 12), ("promising", "learned", ["f"], 2)]
 
 
+@pytest.mark.parametrize("bent", [False, True])
+def test_what_promises_beside_narrow_shapes_is_a_finalist_whatever_was_one_before(
+    monkeypatch: pytest.MonkeyPatch, bent: bool
+) -> None:
+    """What is missing may have been learned as scatter."""
+    stages = Stages(monkeypatch, bent)
+    monkeypatch.setattr(ranking, "_narrowed", lambda o, settled: fit("narrow", 0.0))
+    _, _, promising, known = stages.rank(stages.base, further=2, unpaired=2.0)
+    assert promising == ["more"] * (1 if bent else 2)
+    assert stages.asked[-1] == ("promising", "narrow", ["a", "b", "c", "d", "e", "f"], 0)
+    assert known == (["learned", "past barriers"] if bent else ["learned", "learned"])
+
+
+def test_the_scatter_of_shapes_is_narrowed_half_the_way_where_something_may_have_been_learned_as_scatter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shape = Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03, 1.5, 0.03)
+    other = Scatter("part", "parts", 0.02)
+    data: Any = SimpleNamespace(scatters={s.name: s for s in (shape, other)})
+    monkeypatch.setattr(ranking, "refined", lambda o, model, x, scatters: scatters)
+    wide: Any = SimpleNamespace(model="base", posterior=SimpleNamespace(x=0))
+    wide.posterior.scatters = {SHAPE: 0.0045, "part": 0.03}
+    assert ranking._narrowed(data, wide) == pytest.approx({SHAPE: 0.0045 / np.sqrt(10), "part": 0.03})
+    wide.posterior.scatters = {SHAPE: 0.0008, "part": 0.03}
+    assert ranking._narrowed(data, wide) is None
+    assert ranking._narrowed(SimpleNamespace(scatters={}), wide) is None  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("error", "unpaired", "bent"), [(1.31, 2.0, False), (1.3, 1.9, False), (1.3, 2.0, True)]
 )
@@ -421,9 +453,9 @@ def test_a_base_model_that_is_stuck_or_bent_is_begun_again_with_all(
 ) -> None:
     stages = Stages(monkeypatch, bent)
     stages.base.posterior.error = error  # type: ignore[misc]
-    _, _, promising, settled = stages.rank(stages.base, further=2, unpaired=unpaired)
+    _, _, promising, known = stages.rank(stages.base, further=2, unpaired=unpaired)
     assert promising == []
-    assert settled is None
+    assert known == ["past barriers"]
     assert stages.asked[0][2] is False
     lost = unpaired < 2.0
     assert stages.asked[1] == ("first" if bent else f"annealed{int(lost)}", "a", 6)
