@@ -43,11 +43,11 @@ def format_value(value: float, std: float, unit: str = "") -> str:
     std *= scale
     exponent = math.floor(math.log10(float(f"{std:.1e}")))
     decimals = 1 - exponent
-    if 0 <= decimals <= 6:
+    power = math.floor(math.log10(max(abs(value), std)))
+    if 0 <= decimals <= 6 or (decimals > 6 and power == 0):
         return f"{_minus(f'{value:.{decimals}f}')} ± {std:.{decimals}f}{tail}"
     if -4 <= decimals < 0:
         return f"{_minus(f'{round(value, decimals):.0f}')} ± {round(std, decimals):.0f}{tail}"
-    power = math.floor(math.log10(max(abs(value), std)))
     decimals += power
     mantissa = (
         f"{_minus(f'{value / 10**power:.{max(decimals, 0)}f}')} ± {std / 10**power:.{max(decimals, 0)}f}"

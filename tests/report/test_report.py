@@ -73,6 +73,8 @@ def html(run: RunResults) -> str:
         (math.nan, 1.0, "kg", "not determined"),
         (1e6, math.inf, "N/m", "1.000 MN/m"),
         (0.0, 0.012, "1", "0.000 ± 0.012"),
+        (1.0299978, 8.0e-6, "", "1.0299978 ± 0.0000080"),
+        (0.02, 3.0e-8, "", "(2.0000000 ± 0.0000030) × 10^-2"),
     ],
 )
 def test_values_are_rounded_to_two_figures_of_their_uncertainty(
