@@ -294,7 +294,10 @@ def test_rig_file_travels_with_the_data(tmp_path: Path) -> None:
         ({"converter_bits": 3}, "converter_bits = 3"),
         ({"values": {"sun_mass": "abc"}}, "value of parameter 'sun_mass' = abc: give a number"),
         ({"values": {"sun_mass": 1e300}}, "'sun_mass' = 1e\\+300: give a number of at most 1e\\+30"),
-        ({"sample_rate_hz": 1e12}, "sample_rate_hz = 1e\\+12 and duration_s = 2 make 2e\\+12 samples per hit"),
+        (
+            {"sample_rate_hz": 1e12},
+            "sample_rate_hz = 1e\\+12 and duration_s = 2 make 2e\\+12 samples per hit",
+        ),
         ({"duration_s": 1e9}, "make 5.12e\\+12 samples per hit, 1e\\+07 at most; lower one of them"),
     ],
 )
