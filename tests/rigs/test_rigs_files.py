@@ -460,3 +460,10 @@ def test_a_unit_of_another_dimension_is_an_error(
     assert code == 1
     assert f"line {line}: " in err
     assert words in err
+
+
+def test_a_model_without_a_mode_that_vibrates_says_what_to_correct(tmp_path: Path) -> None:
+    text = '[[masses]]\nat = "m.x"\nvalue = 1.0\n[[springs]]\nat = "m.x"\nvalue = 1e4\n'
+    rig = load_rig(write(tmp_path, text + '[[dampers]]\nat = "m.x"\nvalue = 1e6\n'))
+    with pytest.raises(EmaError, match="its damping lets no mode vibrate; correct dampers"):
+        model_modes(rig, "default")
