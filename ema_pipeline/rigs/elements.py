@@ -158,11 +158,11 @@ def _sensors(file: ElementRigFile) -> dict[str, Row]:
     coordinates = {_parsed_dof(at, where).point for where, at in masses} | {
         dof for entry in file.masses for dof in entry.row or ()
     }
-    for i, place in enumerate(sensors):
-        if place in coordinates:
+    for i, point in enumerate(sensors):
+        if point in coordinates:
             raise Mistake(
                 ("sensors", i, "dof"),
-                f"sensor place '{place}' has mass and so is a coordinate already; drop it",
+                f"sensor place '{point}' has mass and so is a coordinate already; drop it",
             )
     return sensors
 
