@@ -101,6 +101,7 @@ def excluding(hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Change:
             if choice in choices.excluded_modes:
                 raise EmaError(f"mode '{choice}' is excluded already")
             choices = dataclasses.replace(choices, excluded_modes=(*choices.excluded_modes, choice))
+        _require_modes(run, choices)
         return choices
 
     return change
@@ -189,6 +190,20 @@ def _require_others(run: Run, choices: Choices, choice: HitChoice) -> None:
     ]
     if not left:
         raise EmaError(f"hit '{choice}' is the last good one on {point}; a point needs one")
+
+
+def _require_modes(run: Run, choices: Choices) -> None:
+    """A configuration needs one mode."""
+    before = run.info.choices
+    dropped = [x for x in choices.excluded_modes if x not in before.excluded_modes]
+    dropped += [x for x in before.included_modes if x not in choices.included_modes]
+    for configuration in run.info.configurations:
+        gone = [x for x in dropped if x.configuration == configuration]
+        if gone and len(gone) >= len(_modal(run, configuration).modes):
+            raise EmaError(
+                f"{run.store.folder}: without the mode '{gone[-1]}' no mode of '{configuration}' would be left to fit; "
+                "keep one"
+            )
 
 
 def _hits(run: Run, configuration: str) -> tuple[Hit, ...]:

@@ -3,18 +3,35 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, field_validator
 
 from ema_pipeline.errors import EmaError, did_you_mean
 
 
 class Settings(BaseModel):
-    """Base of all settings: immutable, unknown keys forbidden, every field has a documented default."""
+    """Base of all settings: immutable, unknown keys forbidden, no type taken for another (``true`` is not 1)."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, validate_default=True, allow_inf_nan=False
+    )
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _lists_are_tuples(cls, given: object) -> object:
+        """TOML has lists only."""
+        return tuple(map(cls._lists_are_tuples, given)) if isinstance(given, list) else given
+
+
+def _no_boolean(given: object) -> object:
+    if isinstance(given, bool):  # which equals 1
+        raise ValueError("give the number 1")
+    return given
+
+
+FirstLayout = Annotated[Literal[1], BeforeValidator(_no_boolean)]
+"""``schema = 1`` of a file."""
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -48,10 +65,18 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
             ) from None
         if first["type"] == "missing":
             raise EmaError(f"{where}: key '{path}' is missing; add it") from None
-        shown = repr(first.get("input"))
-        shown = shown if len(shown) <= 60 else shown[:57] + "..."
         message = first["msg"].removeprefix("Value error, ")
+        message = message.replace("valid tuple", "list in [ ]").replace("Tuple", "List")
+        shown = _shown(first.get("input"))
         raise EmaError(f"{where}: {path or 'file'} = {shown}: {message}") from None
+
+
+def _shown(value: Any) -> str:
+    """A value as TOML writes it, cut to what a line can hold."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    text = repr(list(value) if isinstance(value, tuple) else value)
+    return text if len(text) <= 60 else text[:57] + "..."
 
 
 def setting_names(model: type[BaseModel], prefix: str = "") -> tuple[str, ...]:

@@ -144,7 +144,7 @@ class Store:
         try:
             with h5py.File(self.path, "r") as file:
                 yield file
-        except OSError as error:
+        except (OSError, RuntimeError) as error:  # h5py raises either on damaged content
             raise self._damaged(error) from None
 
     @contextlib.contextmanager
@@ -174,7 +174,7 @@ class Store:
                 return
             try:
                 yield stack.enter_context(h5py.File(part, "r"))
-            except OSError as error:
+            except (OSError, RuntimeError) as error:
                 raise EmaError(f"{part}: is damaged ({reason(error)}); delete it and run again") from None
 
     def _part_of(self, link: h5py.ExternalLink) -> Path:
@@ -196,8 +196,13 @@ class Store:
             new = not self.path.exists()
             if not new:
                 shutil.copyfile(self.path, scratch)
-            with contextlib.closing(ScratchFile(scratch)) as disk, self._open_to_change(disk, new) as file:
-                yield file
+            with contextlib.closing(ScratchFile(scratch)) as disk:
+                try:
+                    with self._open_to_change(disk, new) as file:
+                        yield file
+                except (RuntimeError, KeyError) as error:  # h5py raises either on damaged content
+                    disk.check()
+                    raise self._damaged(error) from None
             disk.check()
 
     def _open_to_change(self, disk: ScratchFile, new: bool) -> h5py.File:
@@ -212,7 +217,7 @@ class Store:
         file.attrs["format"] = _FORMAT
         return file
 
-    def _damaged(self, error: OSError) -> EmaError:
+    def _damaged(self, error: Exception) -> EmaError:
         if not h5py.is_hdf5(self.path) and self.path.is_file():
             return EmaError(f"{self.path}: is not a readable HDF5 file; delete it and run again")
         return EmaError(f"{self.path}: is damaged ({reason(error)}); delete it and run again")
@@ -220,7 +225,7 @@ class Store:
     def key(self, stage: str, configuration: str = ALL) -> str:
         """Key of the stored result, empty where there is none."""
         with self.group(stage, configuration) as group:
-            return "" if group is None else str(codec.read(group, "provenance", Provenance).key)
+            return "" if group is None else _provenance(group).key
 
     def save(
         self, stage: str, configuration: str, key: str, settings: str, seconds: float, **results: Any
@@ -366,12 +371,21 @@ class Store:
         for stage, configuration in places:
             with self.group(stage, configuration) as group:
                 if group is not None:
-                    found[stage, configuration] = codec.read(group, "provenance", Provenance)
+                    found[stage, configuration] = _provenance(group)
         return found
 
 
 def _group(stage: str, configuration: str) -> str:
     return f"stages/{stage}/{configuration}"
+
+
+def _provenance(group: h5py.Group) -> Provenance:
+    """Where a stage's results come from; every version has written all of it."""
+    try:
+        found: Provenance = codec.read(group, "provenance", Provenance)
+    except codec.MissingError as error:
+        raise codec.DamagedError(f"{error.args[0]} is missing") from None
+    return found
 
 
 def _find(file: h5py.File, path: str) -> h5py.Group | None:

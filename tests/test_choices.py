@@ -30,6 +30,8 @@ from ema_pipeline.levels.settings import LevelSettings
 from ema_pipeline.modal.chosen import EXCLUDED, INCLUDED, wanted
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.report.html import report_html
 from ema_pipeline.report.moved_modes import error_words, moved_table, seen, still
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.run.opening import existing_run
@@ -116,6 +118,24 @@ def test_the_last_good_hit_of_a_point_cannot_be_excluded(out: Path) -> None:
     with pytest.raises(EmaError, match="last good one"):
         change_choices(out, excluding(hits=pair))
     assert (out / "ema.h5").read_bytes() == before
+
+
+def test_the_last_modes_of_a_configuration_cannot_be_excluded(out: Path) -> None:
+    before, every = results(out), [f"default:{f:.6g}" for f in frequencies(out)]
+    with pytest.raises(EmaError, match="no mode of 'default' would be left to fit; keep one"):
+        change_choices(out, excluding(modes=every))
+    assert results(out).choices == before.choices
+    assert len(frequencies(out)) == len(every)
+
+
+def test_results_whose_fit_failed_have_no_pairs_of_modes_that_are_gone(out: Path) -> None:
+    run = existing_run(out)
+    modal = run.store.load("modal", "default", "modal", ModalModel)
+    run.store.save("modal", "default", "other", "{}", 0.1, modal=replace(modal, modes=()))
+    run.store.save("levels", "default", "other", "{}", 0.1)
+    left = results(out)
+    assert left.configurations[0].pairing is None
+    assert "<html" in report_html(left)
 
 
 def test_an_excluded_mode_is_not_compared_and_the_others_stay(out: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import signal
@@ -20,6 +21,7 @@ from numpy.testing import assert_array_equal
 from ema_pipeline import codec
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
+from ema_pipeline.run.opening import load_info
 from ema_pipeline.store import ALL, Store, _holder
 
 
@@ -127,13 +129,13 @@ def test_plain_hdf5_tools_can_read_scalars_arrays_and_tables(tmp_path: Path) -> 
 def change_and_fail(store: Store) -> None:
     with store.changing() as file:
         del file["stages/frf/all/result"]
-        raise RuntimeError("half-way")
+        raise ArithmeticError("half-way")
 
 
 def test_a_stage_that_fails_half_way_leaves_the_store_as_it_was(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.save("frf", ALL, "key1", "{}", 0.1, result=Nested((), "old"))
-    with pytest.raises(RuntimeError, match="half-way"):
+    with pytest.raises(ArithmeticError, match="half-way"):
         change_and_fail(store)
     assert store.load("frf", ALL, "result", Nested).note == "old"
     assert store.key("frf") == "key1"
@@ -579,3 +581,35 @@ def test_what_is_left_out_is_not_read(tmp_path: Path) -> None:
     with h5py.File(store.path, "r+") as file:
         del file["stages/frf/all/result/array"]  # so it cannot have been read
     assert store.load("frf", ALL, "result", Everything, {"array": np.zeros(0)}).text == example().text
+
+
+@pytest.mark.parametrize("mark", [b"OHDR", b"FRHP", b"BTHD"])
+def test_damage_that_is_met_while_the_store_is_changed_is_said_in_one_line(
+    tmp_path: Path, mark: bytes
+) -> None:
+    store = Store(tmp_path)
+    small_stages(store)
+    whole = store.path.read_bytes()
+    places = [at for at in range(len(whole)) if whole.startswith(mark, at)]
+    assert places
+    for at in places:
+        content = bytearray(whole)
+        content[at + 8 : at + 16] = b"\xff" * 8
+        store.path.write_bytes(content)
+        for touch in (load_info, save_again):
+            with contextlib.suppress(EmaError):  # another error is a fault of the program
+                touch(store)
+
+
+def save_again(store: Store) -> None:
+    store.save("frf", ALL, "other", "{}", 0.1, result=np.zeros(3))
+
+
+def test_a_stage_whose_origin_lacks_something_is_damaged(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key", "{}", 0.1, result=np.zeros(3))
+    with h5py.File(store.path, "r+") as file:
+        del file["stages/frf/all/provenance"].attrs["settings"]
+    for read in (store.provenance, lambda: store.key("frf")):
+        with pytest.raises(EmaError, match=r"ema\.h5: is damaged \(.*settings is missing\); delete it"):
+            read()

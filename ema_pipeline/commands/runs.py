@@ -230,8 +230,10 @@ def view(
         serve_hits(out, point or (), hits, poll, port, ready)
         show(f"Next: {program()} run {out}")
         return
+    from ema_pipeline.store import Store
     from ema_pipeline.view.server import serve
 
+    Store.existing(out)
     go_on_with(f"view {shlex.quote(str(out))}")  # what was changed on the page is kept
     serve(out, effect_file or [], port, ready)
 

@@ -12,6 +12,7 @@ import numpy as np
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly
+from ema_pipeline.rigs.entries import LARGEST
 from ema_pipeline.rigs.types import Rig
 
 SAME = 1e-9
@@ -27,15 +28,15 @@ def check_definition(effect: Effect, path: Path) -> None:
         Names file, line and remedy.
     """
     line = definition_line(path)
-    if not effect.id.isidentifier():
+    if not isinstance(effect.id, str) or not effect.id.isidentifier():
         raise EmaError(f"{path}, line {line}: id '{effect.id}' is no name; take letters, digits and '_'")
     names = [p.name for p in effect.parameters]
     for p in effect.parameters:
         where = f"{path}, line {_parameter_line(path, p.name) or line}: parameter '{p.name}'"
         if names.count(p.name) > 1:
             raise EmaError(f"{where} is defined twice; name them apart")
-        if not all(math.isfinite(x) for x in (p.start, p.scale)) or math.isnan(p.null):
-            raise EmaError(f"{where}: null, start and scale must be numbers")
+        for key in ("null", "start", "scale", "minimum", "maximum"):
+            _check_number(getattr(p, key), f"{where}: {key}", bounded=key in ("start", "scale"))
         if not p.minimum <= p.start <= p.maximum:
             raise EmaError(
                 f"{where}: start {p.start:g} lies outside {p.minimum:g} … {p.maximum:g}; change one of them"
@@ -46,6 +47,14 @@ def check_definition(effect: Effect, path: Path) -> None:
         raise EmaError(
             f"{path}, line {line}: all parameters start at null; start at a clearly visible effect"
         )
+
+
+def _check_number(value: object, what: str, *, bounded: bool) -> None:
+    """EmaError where a value is no number, or infinite although it must not be."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+        raise EmaError(f"{what} = {value!r} must be a number")
+    if bounded and abs(value) > LARGEST:
+        raise EmaError(f"{what} = {value:g} must not exceed {LARGEST:g} in size")
 
 
 def check_on_rig(effect: Effect, rig: Rig, path: Path) -> None:
@@ -64,7 +73,7 @@ def check_on_rig(effect: Effect, rig: Rig, path: Path) -> None:
                 _check_at(effect, assembly, place, path)
         except EmaError:
             raise
-        except Exception as error:  # whatever a user's code raises is shown as one line
+        except (Exception, SystemExit) as error:  # whatever a user's code raises is shown as one line
             raise EmaError(_fault(error, effect, path)) from None
 
 
@@ -81,10 +90,17 @@ def _check_at(effect: Effect, assembly: Assembly, place: str, path: Path) -> Non
             raise EmaError(
                 f"{where} changes the {name} although all is null ({stated}); correct null, or edit"
             )
-    effect.edit(assembly, place, {p.name: p.start for p in effect.parameters}).system()
+    started = effect.edit(assembly, place, {p.name: p.start for p in effect.parameters}).system()
+    for name in ("mass", "stiffness", "damping", "structural"):
+        largest = float(np.max(np.abs(getattr(started, name)), initial=0.0))
+        if not largest <= LARGEST:  # `not` catches NaN as well
+            raise EmaError(
+                f"{where} makes the {name} {largest:.3g} at its start values; keep it below {LARGEST:g}: correct "
+                "edit or start"
+            )
 
 
-def _fault(error: Exception, effect: Effect, path: Path) -> str:
+def _fault(error: BaseException, effect: Effect, path: Path) -> str:
     where = f"{path}, line {line_of_error(error, path) or _edit_line(effect, path)}: effect '{effect.id}'"
     if isinstance(error, KeyError):
         known = ", ".join(f"'{p.name}'" for p in effect.parameters) or "none"

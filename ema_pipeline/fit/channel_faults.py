@@ -114,7 +114,7 @@ def _against_model(frfs: FrfSet, systems: Sequence[LinearSystem]) -> tuple[Real,
         largest = np.sqrt(level.max(axis=0, keepdims=True) * level.max(axis=1, keepdims=True))
         known = np.isfinite(measured).all(axis=2) & (level > SMALLEST_LEVEL * largest)
         tiny = np.finfo(float).tiny
-        ratio = np.median(np.log(np.maximum(np.abs(measured), tiny) / np.maximum(size, tiny)), axis=2)
+        ratio = np.median(np.log(np.maximum(np.abs(measured), tiny)) - np.log(np.maximum(size, tiny)), axis=2)
         product = measured * model.conj()
         cosine = np.mean(product.real / np.maximum(np.abs(product), tiny), axis=2)
         ratio, cosine = np.where(known, ratio, np.nan), np.where(known, cosine, np.nan)

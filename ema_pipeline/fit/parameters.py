@@ -93,7 +93,10 @@ def fit_modes(
         If the rig has nothing that is uncertain, or there is no mode.
     """
     if not observations.data:
-        raise EmaError("no measured mode lies in the band: nothing to fit")
+        raise EmaError(
+            f"no mode was measured that rig '{observations.rig.name}' could be fitted to; widen modal.identify.low_hz "
+            "and high_hz, or take modes in with 'ema include'"
+        )
     problem = observations.problem(model.effects, model.scales)
     if not len(problem.model.unknowns):
         raise EmaError(

@@ -33,7 +33,7 @@ def factor_words(factor: float) -> str:
     ('9.8 times too high', '10 times too low')
     """
     side, size = ("high", factor) if factor >= 1 else ("low", 1 / factor)
-    return f"{size:.2g} times too {side}" if size < 100 else f"{size:.0f} times too {side}"
+    return f"{size:.2g} times too {side}" if size < 100 else f"{size:.3g} times too {side}"
 
 
 def likely_cause(factor: float, quantity: str) -> str:
@@ -56,7 +56,7 @@ def likely_cause(factor: float, quantity: str) -> str:
     if quantity == "force" and _near(size, _POUND):
         return f" ({'mV/lbf stated as mV/N' if low else 'mV/N stated as mV/lbf'})"
     power = round(math.log10(size))
-    return f" (a gain of {10**power})" if power > 0 and _near(size, 10.0**power) else ""
+    return f" (a gain of {10.0**power:g})" if power > 0 and _near(size, 10.0**power) else ""
 
 
 def channels_words(names: Sequence[str]) -> str:

@@ -16,7 +16,7 @@ from ema_pipeline.ingest.driven_entries import check_driven_test
 from ema_pipeline.ingest.record_entries import check_records
 from ema_pipeline.names import check_name
 from ema_pipeline.plain_text import has_control_characters
-from ema_pipeline.settings import Settings, parse
+from ema_pipeline.settings import FirstLayout, Settings, parse
 from ema_pipeline.toml_text import read_toml
 from ema_pipeline.units import SI_SYMBOL, Unit, parse_unit
 
@@ -42,6 +42,16 @@ def _parse_dof(value: Any) -> Dof:
         raise ValueError(str(error)) from None
 
 
+_HEAVIEST_SENSOR_KG = 2.0
+"""Seismic accelerometers, the heaviest sensors in use, have less than 1 kg."""
+
+
+def _check_sensor_mass(value: float) -> float:
+    if not 0 <= value <= _HEAVIEST_SENSOR_KG:
+        raise ValueError(f"give the sensor's mass in kg, 0 to {_HEAVIEST_SENSOR_KG:g}, e.g. 0.005 for 5 g")
+    return value
+
+
 DofText = Annotated[Dof, BeforeValidator(_parse_dof)]
 
 
@@ -52,6 +62,7 @@ def _check_share(value: float) -> float:
 
 
 Share = Annotated[float, AfterValidator(_check_share)]
+SensorMass = Annotated[float, AfterValidator(_check_sensor_mass)]
 
 
 def _iso_date(value: Any) -> Any:
@@ -82,7 +93,7 @@ class ChannelDescription(Settings):
         default=None, gt=0, description="mV per unit; left out: the file is in `unit` already"
     )
     dof: DofText | None = Field(default=None, description="Where and which way; '-' in front for reversed")
-    sensor_mass_kg: float = Field(default=0.0, ge=0, description="Mass of the sensor")
+    sensor_mass_kg: SensorMass = Field(default=0.0, description="Mass of the sensor")
     full_scale: float | None = Field(
         default=None, gt=0, description="Largest value that the input can carry, in `unit`"
     )
@@ -130,7 +141,7 @@ class RecordDescription(Settings):
 class _TestFile(Settings):
     """The keys of ``test.toml``."""
 
-    version: Literal[1] = Field(default=1, alias="schema", description="Version of this file's layout")
+    version: FirstLayout = Field(default=1, alias="schema", description="Version of this file's layout")
     title: str = Field(default="", description="Free text")
     kind: Literal["hammer", "hysteresis", "continuous"] = Field(default="hammer", description="Kind of test")
     serial_number: str = Field(default="", description="Which specimen was tested")

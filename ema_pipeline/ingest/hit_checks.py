@@ -63,7 +63,7 @@ def hits_of_test(records: Sequence[Record], settings: HitSettings | None = None)
     copies: dict[int, str] = {}
     seen: dict[bytes, str] = {}
     for index, record in enumerate(records):
-        original = seen.setdefault(hashlib.sha256(record.force.tobytes()).digest(), record.file)
+        original = seen.setdefault(_digest(record.force), record.file)
         if original != record.file:
             copies[index] = original
         try:
@@ -92,6 +92,20 @@ def _copy_told(hit: Hit, original: str) -> Hit:
     fault = f"{hit.file} holds the same force record as {original}, bit for bit: one is a copy; take it out"
     verdict = judged("copy", 1.0, 0.0, False, "", "warn", fault, unit="copies")
     return replace(hit, verdicts=(*hit.verdicts, verdict))
+
+
+def _digest(samples: NDArray[np.float64]) -> bytes:
+    """Equal for equal samples only."""
+    return hashlib.sha256(samples.tobytes()).digest()
+
+
+def _copied_channel(original: str, name: str) -> CheckResult:
+    """No two sensors read the same to the last bit."""
+    fault = (
+        f"channels '{original}' and '{name}' hold the same samples: one is a copy; correct its name in test.toml or "
+        "take the channel out"
+    )
+    return judged("copy", 1.0, 0.0, False, "", "warn", fault, channel=name, unit="copies")
 
 
 def _without_false_clipping(
@@ -170,12 +184,19 @@ def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> 
     # Before the first hit of a record the structure is at rest: what is there is noise and hum.
     rest = pulse.start if hit.start == 0 and hit.number == 0 else 0
 
-    def check(row: int) -> list[CheckResult]:
+    def check(row: int) -> tuple[list[CheckResult], bytes]:
         samples = record.responses[row, hit.start : hit.stop]
-        return _check_response(record.channels[row], samples, pulse, rest, rate, settings)
+        found = _check_response(record.channels[row], samples, pulse, rest, rate, settings)
+        return found, _digest(samples)
 
-    for found in in_order(check, range(len(record.channels))):
+    seen: dict[bytes, str] = {}
+    for channel, (found, digest) in zip(
+        record.channels, in_order(check, range(len(record.channels))), strict=True
+    ):
         verdicts += found
+        original = seen.setdefault(digest, channel.name)
+        if original != channel.name and found[0].passes:
+            verdicts.append(_copied_channel(original, channel.name))
     return replace(hit, verdicts=tuple(verdicts))
 
 

@@ -23,6 +23,9 @@ LONGEST_PULSE_S = 0.03
 QUIET_LEAD = 16
 """Samples kept before what is seen of the pulse: the ringing ahead of it goes on under the noise."""
 
+SMALLEST_PULSE = 1e-12
+"""N, or V of an uncalibrated hammer; far below the resolution of every converter, so that less is nothing."""
+
 MINIMUM_GUARD = 8
 """Samples kept before a peak at least, so that slowly sampled pulses are whole."""
 
@@ -63,7 +66,7 @@ def find_hits(record: Record, settings: HitSettings | None = None) -> tuple[Hit,
     # The median sees hum, which is no broadband noise, and yet no blow either.
     noise = max(noise_of(force), float(np.median(short)))
     threshold = max(settings.trigger_level * height, settings.trigger_noise * noise)
-    if height == 0 or height < threshold:
+    if height < max(threshold, SMALLEST_PULSE):
         raise EmaError(
             f"{record.file}: no hit found on hammer channel '{record.force_name}': its largest pulse is "
             f"{height:.3g}, its noise {noise:.3g}; "

@@ -31,6 +31,9 @@ LARGEST_VOLTAGE = 1000.0
 LARGEST_VALUE = 1e15
 """SI units; far beyond every force and motion, and its square is still far from the largest number."""
 
+LARGEST_WINDOW = float(-np.log(np.finfo(np.float32).tiny))
+"""Decay rate times length of a record; a stronger window leaves at its end what single precision cannot hold."""
+
 RATE_TOLERANCE = 1e-4
 """Relative difference up to which two statements of a sample rate mean the same."""
 
@@ -132,12 +135,13 @@ def load_record(test: TestDescription, entry: RecordDescription, limits: ReadLim
     ------
     EmaError
         Where the file cannot be read, lacks a channel, is too short, holds values that are no numbers,
-        contradicts the description (unit, sensitivity, sample rate), or where hammer and response are
+        contradicts the description (unit, sensitivity, sample rate, window), or where hammer and response are
         swapped.
     """
     if entry.impact is None:
         raise EmaError(f"{test.file}: record '{entry.file}' has no impact: it is no hammer record")
     rate, sources = _open(test, entry, limits)
+    _check_window(test, entry, sources[test.force.name].samples.size / rate)
     hammer, responses = sources[test.force.name], {c.name: sources[c.name] for c in test.responses}
     force = hammer.scaled()
     swap = find_swap(force, {name: source.samples for name, source in responses.items()})
@@ -179,6 +183,17 @@ def load_record(test: TestDescription, entry: RecordDescription, limits: ReadLim
         part=test.part,
         band_hz=ANY_BAND_HZ if test.band_hz is None else test.band_hz,
     )
+
+
+def _check_window(test: TestDescription, entry: RecordDescription, record_s: float) -> None:
+    """Refuse an exponential window that nobody can have applied to a record of this length."""
+    stated = test.exponential_window_rad_s
+    if stated * record_s > LARGEST_WINDOW:
+        raise EmaError(
+            f"{test.file}: exponential_window_rad_s = {stated:.3g}: such a window leaves nothing of "
+            f"'{entry.file}' at its end ({record_s:.3g} s; at most {LARGEST_WINDOW / record_s:.3g} rad/s); state the "
+            "window that was applied, 0 if none"
+        )
 
 
 def load_channels(

@@ -121,8 +121,8 @@ def _measured(run: Run) -> Ladder:
     unseen = next((x for x in run.info.effects if depends_on_level(x, run.library)), "")
     if unseen and hits is None:
         raise EmaError(
-            f"{run.store.folder}: '{unseen}' shows in hits at several force levels only, and there are none; "
-            f"take it out with 'ema remove {run.store.folder} {unseen}'"
+            f"{run.store.folder}: '{unseen}' shows in hits at several force levels only, and there are none: "
+            "strike with several forces, or do without this effect"
         )
     models = [Model()]
     for label in run.info.effects:

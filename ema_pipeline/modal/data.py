@@ -96,7 +96,8 @@ def analysis_band(frfs: FrfSet, settings: ModalSettings) -> tuple[float, float]:
     if (high - low) / df < 16:
         raise EmaError(
             f"the band to analyse, {low:.4g} to {high:.4g} Hz, holds fewer than 16 lines of {df:.4g} Hz: "
-            "widen low_hz and high_hz, record for longer, or use a harder hammer tip"
+            "widen band_hz of test.toml, or low_hz and high_hz of modal.identify, record for longer, or use a "
+            "harder hammer tip"
         )
     return low, high
 

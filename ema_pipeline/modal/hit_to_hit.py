@@ -23,6 +23,7 @@ from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.mains_hum import without_hum
 from ema_pipeline.modal.serial import widening
 from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.modal.stated_window import without_growing
 from ema_pipeline.modal.types import ModalModel, Mode
 from ema_pipeline.processes import release_memory
 from ema_pipeline.threads import single_blas_thread
@@ -107,7 +108,7 @@ def identify_hits(
     release_memory()
     asked = wanted(included, frfs.response_decay_rad_s)
     modal = identify(frfs, settings, progress, alignment.known_peaks(), asked)
-    modal = without_hum(modal, frfs, asked)
+    modal = without_growing(without_hum(modal, frfs, asked), frfs)
     decay = frfs.response_decay_rad_s
     if alignment.n_hits == 1:
         modal = within_decay(of_one_hit(modal, settings.repeatability), alignment, decay)

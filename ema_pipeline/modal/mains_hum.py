@@ -50,7 +50,7 @@ def without_hum(modal: ModalModel, frfs: FrfSet, wanted: KnownPeaks) -> ModalMod
 
 def _is_hum(mode: Mode, rest_s: float, window_rad_s: float) -> bool:
     """True for a pole at a multiple of 50 or 60 Hz that hardly decays, as far as no exponential window hides that."""
-    if np.exp(mode.pole.real * rest_s) < GOES_ON or window_rad_s:
+    if window_rad_s or np.exp(mode.pole.real * rest_s) < GOES_ON:
         return False
     f = mode.frequency_hz
     reach = max(MAINS_DRIFT * f, 0.5 / rest_s)  # half a line: a tone that is cut off is no sharper

@@ -141,6 +141,9 @@ class LeftOut:
     reason: str
 
 
+GROWS = "its damping is negative once the exponential window is taken off"
+"""Reason for which a mode is left out: the window that test.toml states decays faster than the mode."""
+
 NO_SYNTHESIS = np.zeros((0, 0, 0), dtype=np.complex64)
 """In place of a synthesis that was not loaded: it is as large as the FRFs."""
 

@@ -10,6 +10,7 @@ from enum import IntEnum
 from ema_pipeline.check_result import CheckResult
 from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
 from ema_pipeline.frf.channel_faults import SENSITIVITY
+from ema_pipeline.modal.types import GROWS
 from ema_pipeline.report.numbers import below, format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC, POOR_ERROR
@@ -140,6 +141,10 @@ def _of_configuration(c: ConfigurationResults) -> Iterator[tuple[Weight, str]]:
             what = "average" if c.frfs.excitation else "hit"
             yield Weight.SCATTER, f"{singles} {rests} on one {what}: no coherence and no scatter to judge by"
     if c.modal is not None:
+        growing = ", ".join(f"{x.frequency_hz:.5g}" for x in c.modal.left_out if x.reason == GROWS)
+        if growing:
+            told = f"left out at {growing} Hz: {GROWS}; correct exponential_window_rad_s in test.toml (0 if none)"
+            yield Weight.LEFT_OUT, told
         if not c.modal.scaled and c.modal.dofs:
             yield Weight.SCALE, c.modal.scaling_note or "shapes are unscaled: no driving point"
         yield from ((Weight.MODE, note) for note in c.modal.notes if note != c.modal.scaling_note)

@@ -135,6 +135,10 @@ def modes_of(rig: Rig, system: LinearSystem) -> tuple[ModelMode, ...]:
             for i in range(len(families))
         )
     damped = complex_modes(system)
+    if not damped.poles.size:
+        raise EmaError(
+            f"rig '{rig.name}': its damping lets no mode vibrate; correct dampers and loss factors"
+        )
     frequency_hz = damped.frequency_hz
     real = np.stack([_real_shape(v, system.mass) for v in damped.shapes.T], axis=1)
     families, _ = rig.classify(system, frequency_hz, real)

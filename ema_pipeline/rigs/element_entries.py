@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 
-from ema_pipeline.rigs.entries import ParameterEntry
+from ema_pipeline.rigs.entries import Number, NumberOrName, ParameterEntry
 from ema_pipeline.rigs.types import MODAL_DAMPING_SCATTER
 from ema_pipeline.settings import Settings
 from ema_pipeline.toml_lines import Location
@@ -26,18 +26,25 @@ def _flat(row: Any) -> Any:
     return flat
 
 
+def _moves(row: dict[str, float]) -> dict[str, float]:
+    if not any(row.values()):
+        raise ValueError("name at least one dof with a coefficient other than 0, e.g. { 'plate.x' = 1.0 }")
+    return row
+
+
+Coefficients = Annotated[dict[str, Number], BeforeValidator(_flat), AfterValidator(_moves)]
+
+
 class ElementEntry(Settings):
     """A mass, spring or damper at one DOF, between two, or along a row of coefficients."""
 
     name: str | None = Field(None, description="name that effects and messages use")
     at: str | None = Field(None, description="DOF, to ground: 'plate.x'")
     between: tuple[str, str] | None = Field(None, description="two DOFs: ['plate.x', 'base.x']")
-    row: dict[str, float] | None = Field(None, description="coefficients of the stretch over DOFs")
-    value: float | str = Field(description="number, or the name of a parameter")
+    row: Coefficients | None = Field(None, description="coefficients of the stretch over DOFs")
+    value: NumberOrName = Field(description="number, or the name of a parameter")
     unit: str | None = Field(None, description="unit of a number in `value`; SI where left out")
     configurations: tuple[str, ...] = Field((), description="only in these configurations; all if empty")
-
-    _flat_row = field_validator("row", mode="before")(_flat)
 
     @field_validator("between", mode="before")
     @classmethod
@@ -60,7 +67,7 @@ class ElementEntry(Settings):
 class SpringEntry(ElementEntry):
     """A spring, with loss where it is not lossless."""
 
-    loss_factor: float | str = Field(0.0, description="imaginary over real stiffness")
+    loss_factor: NumberOrName = Field(0.0, description="imaginary over real stiffness")
 
     @property
     def numbers(self) -> dict[str, float | str]:
@@ -92,13 +99,13 @@ class NonlinearEntry(ElementEntry):
     """An element with a law of `mechanics.laws`; `value` is its factor, stiffness or force."""
 
     law: Law = Field(description="what its force follows")
-    velocity: float | str = Field(1e-3, description="friction: below it creeps, m/s")
-    preload: float | str | None = Field(None, description="contact: deflection beyond which it separates, m")
-    gap: float | str = Field(1e3, description="contact: gap to its back, m")
-    rho: float | str | None = Field(None, description="hysteresis: 1/m")
-    sigma: float | str | None = Field(None, description="hysteresis: shape of the unloading branch")
-    exponent: float | str = Field(1.0, description="hysteresis: sharpness of the yield")
-    time: float | str | None = Field(None, description="relaxation: damper over spring, s")
+    velocity: NumberOrName = Field(1e-3, description="friction: below it creeps, m/s")
+    preload: NumberOrName | None = Field(None, description="contact: deflection beyond which it separates, m")
+    gap: NumberOrName = Field(1e3, description="contact: gap to its back, m")
+    rho: NumberOrName | None = Field(None, description="hysteresis: 1/m")
+    sigma: NumberOrName | None = Field(None, description="hysteresis: shape of the unloading branch")
+    exponent: NumberOrName = Field(1.0, description="hysteresis: sharpness of the yield")
+    time: NumberOrName | None = Field(None, description="relaxation: damper over spring, s")
 
     @property
     def numbers(self) -> dict[str, float | str]:
@@ -116,9 +123,7 @@ class SensorEntry(Settings):
     """A sensor place that is no coordinate of its own."""
 
     dof: str = Field(description="place, 'plate.corner'")
-    row: dict[str, float] = Field(description="coefficients of what the sensor reads over the coordinates")
-
-    _flat_row = field_validator("row", mode="before")(_flat)
+    row: Coefficients = Field(description="coefficients of what the sensor reads over the coordinates")
 
 
 class ElementRigFile(Settings):

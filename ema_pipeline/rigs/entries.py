@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, ValidationError
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.rigs.types import Parameter
@@ -14,6 +14,25 @@ from ema_pipeline.toml_lines import Location
 
 M = TypeVar("M", bound=BaseModel)
 LARGEST_TOLERANCE = 3.0
+
+SMALLEST, LARGEST = 1e-30, 1e30
+"""SI units, of whatever is not 0; products of numbers beyond these leave the range of double precision."""
+
+
+def _of_a_size(number: float) -> float:
+    if number and not SMALLEST <= abs(number) <= LARGEST:
+        raise ValueError(f"give 0, or a number from {SMALLEST:g} to {LARGEST:g} in size")
+    return number
+
+
+def _number_or_name(given: object) -> object:
+    if isinstance(given, bool) or not isinstance(given, int | float | str):
+        raise ValueError("give a number, or the name of a parameter")
+    return given if isinstance(given, str) else _of_a_size(given)
+
+
+Number = Annotated[float, AfterValidator(_of_a_size)]
+NumberOrName = Annotated[float | str, BeforeValidator(_number_or_name)]
 
 
 class Mistake(Exception):
@@ -27,9 +46,7 @@ class Mistake(Exception):
 class ParameterEntry(Settings):
     """One parameter of a rig file; what is left out keeps its default."""
 
-    model_config = ConfigDict(strict=True)
-
-    value: float | None = Field(None, description="nominal value in `unit`")
+    value: Number | None = Field(None, description="nominal value in `unit`")
     unit: str | None = Field(None, description="unit of value, min and max; converted to the rig's")
     tolerance: float | None = Field(
         None, ge=0, description="relative standard deviation of the nominal value"
@@ -53,13 +70,7 @@ def parsed(model: type[M], data: dict[str, Any]) -> M:
     try:
         return parse(model, data, "")
     except EmaError as error:
-        message = (
-            str(error)
-            .removeprefix(":")
-            .strip()
-            .replace("valid tuple", "list in [ ]")
-            .replace("Tuple", "List")
-        )
+        message = str(error).removeprefix(":").strip()
         try:
             model.model_validate(data)
         except ValidationError as details:

@@ -17,7 +17,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import replace_file
 from ema_pipeline.series.features import DAMPING, FREQUENCY, PARAMETER, Features
-from ema_pipeline.settings import Settings, parse
+from ema_pipeline.settings import FirstLayout, Settings, parse
 from ema_pipeline.significance import tolerance_factor
 from ema_pipeline.toml_text import read_toml
 
@@ -81,7 +81,7 @@ class ParameterLimits(Range):
 class Limits(Settings):
     """The content of ``limits.toml``."""
 
-    version: Literal[1] = Field(1, alias="schema", description="version of this file's layout")
+    version: FirstLayout = Field(1, alias="schema", description="version of this file's layout")
     learnt_from: str = Field("", description="what they were learned from; empty where written by hand")
     lot: int = Field(0, ge=0, description="tests that they were learned from")
     content: float = Field(0.0, ge=0, lt=1, description="share of good tests within all limits together")

@@ -16,6 +16,7 @@ from ema_pipeline.effects.library import Library
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.rigs import load_rig, model_modes, rig_names
+from ema_pipeline.rigs.entries import LARGEST
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.settings import parse
 from ema_pipeline.simulate.folder import BAD_HIT, TestFolder
@@ -28,6 +29,9 @@ from ema_pipeline.simulate.truth import TrueRig, true_rig
 from ema_pipeline.threads import single_blas_thread
 
 TRUTH_FILE = "truth.json"
+
+MOST_SAMPLES = 1e7
+"""Per hit; a hundred times what hammer tests take."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,12 @@ def simulate_campaign(
     """
     out = Path(out)
     options = parse(SimulationSettings, settings, "simulate")
+    samples = options.sample_rate_hz * options.duration_s
+    if samples > MOST_SAMPLES:
+        raise EmaError(
+            f"simulate: sample_rate_hz = {options.sample_rate_hz:g} and duration_s = {options.duration_s:g} make "
+            f"{samples:.3g} samples per hit, {MOST_SAMPLES:g} at most; lower one of them"
+        )
     if any(out.glob("test.toml")) or any(out.glob("*/test.toml")):
         raise EmaError(f"{out}: holds a test already; name another folder or delete it")
     base = rig if not isinstance(rig, str | Path) else load_rig(rig)
@@ -143,11 +153,18 @@ def true_values(
     for name in values:
         if name not in rig.parameters:
             raise EmaError(f"rig '{rig.name}' has no parameter '{name}'{did_you_mean(name, rig.parameters)}")
+        _check_value(name, values[name])
     result = {}
     for name, p in rig.parameters.items():
         deviation = 1 + scatter * p.tolerance * float(np.clip(random.standard_normal(), -3, 3))
         result[name] = float(values.get(name, np.clip(p.value * deviation, p.minimum, p.maximum)))
     return result
+
+
+def _check_value(name: str, value: object) -> None:
+    """EmaError for a true value that is no number, or one that no model can be computed with."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        raise EmaError(f"value of parameter '{name}' = {value}: give a number of at most {LARGEST:g} in size")
 
 
 def default_sensors(assembly: Assembly) -> tuple[Dof, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import ConfigDict, Field, field_validator
 
 from ema_pipeline.settings import Settings
 from ema_pipeline.simulate.imperfections import LEVELS, DriftKind, Imperfections, Level
@@ -15,6 +15,8 @@ RecordFormat = Literal["uff", "csv", "hdf5", "mat", "wav", "tdms"]
 
 class SimulationSettings(Settings):
     """How the simulated test is made and recorded."""
+
+    model_config = ConfigDict(strict=False)  # numbers may come as text: "30,100,300"
 
     hits: int = Field(2, ge=1, description="hits per impact point and force level")
     hits_per_record: int = Field(1, ge=1, description="hits in one continuous record file")

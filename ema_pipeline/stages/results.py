@@ -23,7 +23,7 @@ from ema_pipeline.loops.types import IsolatorResult
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import NO_SYNTHESIS, ModalModel
 from ema_pipeline.report.results import ConfigurationResults, LoopResults, RunResults
-from ema_pipeline.run.measured import level_study
+from ema_pipeline.run.measured import level_study, modes_key
 from ema_pipeline.run.models import diagnosed_choices, diagnosis_is_of_other_data
 from ema_pipeline.run.records import count_driven
 from ema_pipeline.run.types import Run
@@ -38,6 +38,8 @@ def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
     left_out = {} if synthesis else {"synthesis": NO_SYNTHESIS}
     fit = run.store.find("fit", ALL, "fit", FitResult)
     values = fitted_values(fit)
+    # A run that failed half-way leaves pairs of modes that have since been replaced.
+    paired = run.store.find("fit", ALL, "modes_key", str) == modes_key(run)
     configurations = []
     kind = kind_of(run.info)
     for name in run.info.configurations:
@@ -50,7 +52,7 @@ def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
                 hits=run.store.find("hits", name, "hits", tuple[Hit, ...]) or (),
                 frfs=None if frfs is None else structure_frfs(frfs, levels),
                 modal=modal if modal is None or levels is None else flagged(structure(modal, levels), levels),
-                pairing=run.store.find("correlate", ALL, f"pairing {name}", Pairing),
+                pairing=run.store.find("correlate", ALL, f"pairing {name}", Pairing) if paired else None,
                 system=None if run.model is None or not kind.of_rig else _system(run, name, values),
                 transducers=run.store.find("ingest", name, "transducers", tuple[Transducer, ...]) or (),
                 base_system=run.store.find("fit", ALL, f"base system {name}", LinearSystem),

@@ -190,6 +190,26 @@ def test_an_effect_that_does_not_exist_is_refused_and_changes_nothing(
     assert (results / "ema.h5").read_bytes() == before
 
 
+def test_an_effect_that_one_force_level_cannot_show_is_refused_before_it_is_added(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, err = ema(capsys, "add", results, "cubic_spring@sun.y")
+    assert code == 1
+    assert (
+        "'cubic_spring@sun.y' shows in hits at several force levels only, and there are none: strike with"
+        in err
+    )
+    assert "ema remove" not in err
+
+
+def test_the_live_page_of_a_folder_without_results_says_how_to_make_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, out, err = ema(capsys, "view", tmp_path / "nope", "--no-browser")
+    assert_one_clear_line(code, out, err)
+    assert "nope: holds no ema.h5; make one with 'ema run RAW --out" in err
+
+
 def test_exported_files_are_read_by_another_program(
     results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,6 +10,14 @@ from pathlib import Path
 import pytest
 from bench import ema, write_bench
 
+from ema_pipeline.fit.channel_faults import suspected_sensitivities
+from ema_pipeline.frf.estimate import estimate_frfs
+from ema_pipeline.ingest.campaign import read_campaign
+from ema_pipeline.ingest.hit_checks import hits_of_test
+from ema_pipeline.ingest.load import load_records
+from ema_pipeline.ingest.records import HitSamples, cut_hit
+from ema_pipeline.rigs import load_rig
+
 QUICK = 'stages=["ingest", "hits", "frf", "modal", "ladder", "fit", "correlate"]'
 """Without diagnosis and report, which take longest."""
 
@@ -101,6 +109,21 @@ def test_a_force_that_no_hammer_makes_is_the_first_caution(cautions: Told) -> No
     first = cautions("hammer", scaled(1e-3), model=False)[0]
     assert "channel 'hammer' peaks at" in first
     assert "which no impact hammer makes" in first
+
+
+def test_a_model_that_falls_into_two_parts_is_compared_where_it_has_frfs(bench: Path, tmp_path: Path) -> None:
+    text = (bench.parent / "bench.toml").read_text(encoding="utf-8")
+    rig = tmp_path / "two_parts.toml"
+    rig.write_text(text.replace('between = ["m1.x", "m2.x"]', 'at = "m2.x"'), encoding="utf-8")
+    measured = estimate_frfs(hits_in(bench))
+    assert not suspected_sensitivities({"default": measured}, {"default": [load_rig(rig).system("default")]})
+
+
+def hits_in(raw: Path) -> list[HitSamples]:
+    """The hits of a test, cut from their records."""
+    records = [r for test in read_campaign(raw).tests for r in load_records(test)]
+    by_file = {r.file: r for r in records}
+    return [cut_hit(by_file[h.file], h) for h in hits_of_test(records)]
 
 
 def test_a_usual_laboratory_raises_no_suspicion(cautions: Told) -> None:

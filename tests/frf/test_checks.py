@@ -7,6 +7,7 @@ import pytest
 
 from ema_pipeline.check_result import CheckResult
 from ema_pipeline.dof import Dof
+from ema_pipeline.frf.channel_faults import factor_words, likely_cause
 from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.frf.checks import check_frfs
 from ema_pipeline.frf.settings import FrfSettings
@@ -149,3 +150,9 @@ def test_scatter_of_single_hits_is_what_peaks_have_beyond_the_floor() -> None:
     found = only(made(frf, (1.0, 6399.0), hits=4, coherence=1.0, variance=variance), "repeatability")
     # the variance of one of four hits is 4·0.01, over |H|² = 4: 0.1
     assert found.value == pytest.approx(0.1, rel=1e-6)
+
+
+def test_factors_of_any_size_are_told_in_a_few_digits() -> None:
+    assert factor_words(1e250) == "1e+250 times too high"
+    assert factor_words(123.4) == "123 times too high"
+    assert likely_cause(1e250, "force") == " (a gain of 1e+250)"

@@ -249,9 +249,23 @@ def test_real_hits_raise_no_false_alarm(test_data: Path) -> None:
     assert count >= 190
 
 
-def test_a_record_without_a_blow_is_left_out_while_the_others_go_on() -> None:
+@pytest.mark.parametrize("constant", [False, True])
+def test_channels_that_hold_the_same_samples_are_told_unless_they_are_dead(constant: bool) -> None:
+    record = clean()
+    one = np.zeros(record.force.size) if constant else np.asarray(record.responses)[0]
+    copies = [
+        v for v in checked(replace(record, responses=np.stack([one, one]))).verdicts if v.check == "copy"
+    ]
+    assert [v.message.partition(":")[0] for v in copies] == (
+        [] if constant else ["channels 'a0' and 'a1' hold the same samples"]
+    )
+    assert not [v for v in checked(record).verdicts if v.check == "copy"]
+
+
+@pytest.mark.parametrize("factor", [0.0, 1e-200])
+def test_a_record_without_a_blow_is_left_out_while_the_others_go_on(factor: float) -> None:
     good = clean()
-    dead = replace(good, file="dead.csv", force=np.zeros_like(good.force))
+    dead = replace(good, file="dead.csv", force=factor * good.force)
     hits = hits_of_test([good, dead, replace(good, file="second.csv")])
     assert [h.file for h in hits] == [good.file, "dead.csv", "second.csv"]
     assert [h.accepted for h in hits] == [True, False, True]

@@ -152,6 +152,29 @@ WRONG = {
         DESCRIPTION.replace("schema = 1", 'schema = 1\nkind = "hysteresis"'),
         "needs a channel with quantity 'displacement'",
     ),
+    **{
+        f"{key} a {kind}": (DESCRIPTION.replace(after, f"{after}\n{key} = {value}"), f"{key} = {shown}: ")
+        for kind, value, shown in (("boolean", "true", "true"), ("text", '"2560"', "'2560'"))
+        for key, after in (
+            ("sensitivity_mv", 'unit = "N"'),
+            ("full_scale_v", 'unit = "N"'),
+            ("sensor_mass_kg", 'dof = "tip.z"'),
+            ("exponential_window_rad_s", "schema = 1"),
+        )
+    },
+    "sample rate a boolean": (
+        DESCRIPTION.replace("sample_rate_hz = 2048", "sample_rate_hz = true"),
+        "sample_rate_hz = true: Input should be a valid number",
+    ),
+    "schema a boolean": (DESCRIPTION.replace("schema = 1", "schema = true"), "schema = true: give the number 1"),
+    "sensor's mass in grams": (
+        DESCRIPTION.replace('dof = "tip.z"', 'dof = "tip.z"\nsensor_mass_kg = 5'),
+        "sensor_mass_kg = 5: give the sensor's mass in kg, 0 to 2",
+    ),
+    "band a number": (
+        DESCRIPTION.replace("schema = 1", "schema = 1\nband_hz = 20"),
+        "band_hz = 20: Input should be a list in [ ]",
+    ),
     "broken TOML": (DESCRIPTION.replace("sample_rate_hz = 2048", "sample_rate_hz = "), "line 4"),
 }  # fmt: skip
 

@@ -318,6 +318,46 @@ def test_hdf5_that_contradicts_itself_about_the_rate_is_refused(tmp_path: Path) 
         read_raw(path)
 
 
+@pytest.mark.parametrize("stated", [-5.0, float("nan"), "abc", "2 kHz"])
+def test_hdf5_that_states_no_sample_rate_under_that_name_is_refused(
+    tmp_path: Path, stated: float | str
+) -> None:
+    path = tmp_path / "hit.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["sample_rate"] = stated
+        file["tip"] = DATA["tip"]
+    with pytest.raises(
+        EmaError, match=rf"states sample_rate = '{stated}' .* no sample rate; correct or remove"
+    ):
+        read_raw(path)
+
+
+@pytest.mark.parametrize("stated", ["2048", "2048.0 Hz"])
+def test_hdf5_may_state_its_sample_rate_as_text(tmp_path: Path, stated: str) -> None:
+    path = tmp_path / "hit.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["Sample rate"] = stated
+        file["tip"] = DATA["tip"]
+    assert read_raw(path).sample_rate_hz == 2048.0
+
+
+@pytest.mark.parametrize(
+    ("values", "why"),
+    [
+        (DATA["tip"] * 1j, "'tip' is complex"),
+        (DATA["tip"][:1000].reshape(10, 10, 10), "'tip' has 3 dimensions"),
+        ([f"{x:.4f}" for x in DATA["tip"][:100]], "'tip' holds text"),
+    ],
+    ids=["complex", "3-D", "text"],
+)
+def test_hdf5_without_channels_says_why(tmp_path: Path, values: object, why: str) -> None:
+    path = tmp_path / "hit.h5"
+    with h5py.File(path, "w") as file:
+        file["tip"] = values
+    with pytest.raises(EmaError, match=rf"holds no channels \({why}.*; export the time data as numbers"):
+        read_raw(path)
+
+
 def test_mat_5_vectors_with_a_rate_scalar(tmp_path: Path) -> None:
     path = tmp_path / "hit.mat"
     scipy.io.savemat(path, {**DATA, "Fs": RATE, "comment": "first"})

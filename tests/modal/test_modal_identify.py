@@ -456,7 +456,7 @@ def test_modes_outside_the_chosen_band_are_not_reported() -> None:
 
 def test_a_band_without_lines_is_refused_with_a_remedy() -> None:
     frfs = hammer_test(FIVE, list(range(8)), [0], record_s=2.0)
-    with pytest.raises(EmaError, match="fewer than 16 lines"):
+    with pytest.raises(EmaError, match=r"fewer than 16 lines .*widen band_hz of test\.toml, or low_hz"):
         identify(frfs, ModalSettings(low_hz=100, high_hz=101))
 
 

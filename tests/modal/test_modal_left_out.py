@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import Result
 from simulate_modal import Hits, TrueSystem, records_of, simulate_hits, write_raw_folder
 from typer.testing import CliRunner
 
 from ema_pipeline import cli
+from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.hit_checks import hits_of_test
@@ -114,3 +117,42 @@ def test_every_plain_peak_is_held_against_the_list_however_many_there_are() -> N
     found = np.sort(plain_peaks(frfs, (20.0, 780.0)).poles.imag) / (2 * np.pi)
     assert len(found) > MAX_PEAKS
     assert all(np.abs(frequency - f).min() < 0.3 for f in found)
+
+
+def run_with_window(folder: Path, stated: str) -> Result:
+    """The three modes, which decay by 3.1, 5.4 and 6.6 rad/s, in records that no window was applied to."""
+    rng = np.random.default_rng(2)
+    made = simulate_hits(
+        SYSTEM, [0], [0], f_max=400, record_s=4.0, n_hits=3, force_noise=2e-3, response_noise=2e-3, rng=rng
+    )
+    write_raw_folder(folder / "raw", records_of(made, [0], [0]))
+    file = next((folder / "raw").rglob("test.toml"))
+    file.write_text(f"exponential_window_rad_s = {stated}\n{file.read_text()}")
+    return CliRunner().invoke(cli.app, ["run", str(folder / "raw"), "--out", str(folder / "out")])
+
+
+def test_a_mode_that_grows_without_the_stated_window_is_left_out_with_a_caution(tmp_path: Path) -> None:
+    done = run_with_window(tmp_path, "4.0")
+    assert done.exit_code == 0, done.output
+    text = " ".join(done.output.split())
+    assert "2 modes from 171" in text
+    assert "! left out at 8" in text
+    assert (
+        "its damping is negative once the exponential window is taken off; correct exponential_window" in text
+    )
+
+
+@pytest.mark.parametrize(
+    ("stated", "words"),
+    [
+        ("10.0", r"3 of 3 modes have negative damping .*10 rad/s is taken off.*test\.toml, 0 if none"),
+        (
+            "1e300",
+            r"test\.toml: exponential_window_rad_s = 1e\+300: such a window leaves nothing .* at its end",
+        ),
+    ],
+)
+def test_a_window_that_cannot_have_been_applied_ends_the_run(tmp_path: Path, stated: str, words: str) -> None:
+    done = run_with_window(tmp_path, stated)
+    assert isinstance(done.exception, EmaError)
+    assert re.search(words, str(done.exception)), done.exception

@@ -136,6 +136,21 @@ def test_a_test_is_simulated_with_the_effect_of_a_file(
             10,
             "does not run: SyntaxError",
         ),
+        ('id="oil_film"', "id=5", 19, "id '5' is no name"),
+        ("1e5, 3e5, 0.0, 1e9", '"a", 3e5, 0.0, 1e9', 24, "'stiffness': start = 'a' must be a number"),
+        (
+            "1e5, 3e5, 0.0, 1e9",
+            "1e5, 3e300, 0.0, 1e9",
+            24,
+            "'stiffness': scale = 3e+300 must not exceed 1e+30",
+        ),
+        (
+            "    return assembly.add(",
+            "    raise SystemExit(7)\n    return assembly.add(",
+            13,
+            "SystemExit: 7",
+        ),
+        ('values["stiffness"]', '1e300 * values["stiffness"]', 10, "makes the stiffness 1e+305 at its start"),
     ],
 )
 def test_mistakes_in_an_effect_file_are_told_with_line_and_remedy_before_anything_is_computed(

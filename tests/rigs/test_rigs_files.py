@@ -310,6 +310,23 @@ ELEMENT_MISTAKES = [
     ("value = 5.0", "value = -5.0", 21, "a damper cannot be negative"),
     ('dof = "middle.x"', 'dof = "top.x"', 23, "'top.x' has mass and so is a coordinate already"),
     ('"top.x" = 0.5', '"tip.x" = 0.5', 24, "dof 'tip.x' has no mass"),
+    (
+        'dof = "middle.x"\nrow = { "top.x" = 0.5, "base.x" = 0.5 }',
+        'dof = "top.x"\nrow = { "base.x" = 1.0 }',
+        23,
+        "'top.x' has mass and so is a coordinate already",
+    ),
+    ('row = { "top.x" = 1.0, "base.x" = -1.0 }', "row = {}", 20, "dampers.0.row = {}: name at least one dof"),
+    ('"top.x" = 0.5, "base.x" = 0.5', "", 24, "sensors.0.row = {}: name at least one dof"),
+    ('"top.x" = 0.5, "base.x" = 0.5', '"top.x" = 0.0', 24, "with a coefficient other than 0"),
+    ('"top.x" = 0.5', '"top.x" = true', 24, "sensors.0.row.top.x = true: Input should be a valid number"),
+    ("value = 1e6", "value = true", 17, "springs.1.value = true: give a number, or the name of a parameter"),
+    ("value = 1e6", "value = 1e300", 17, "value = 1e+300: give 0, or a number from 1e-30 to 1e+30 in size"),
+    ("value = 1e6", "value = 1e6\nloss_factor = true", 18, "springs.1.loss_factor = true: give a number"),
+    ("value = 1e5", "value = 1e300", 4, "parameters.link.value = 1e+300: give 0"),
+    ('"top.x" = 1.0', '"top.x" = 1e300', 20, "dampers.0.row.top.x = 1e+300: give 0"),
+    ("[parameters]", "modal_damping_scatter = true\n[parameters]", 3, "modal_damping_scatter = true"),
+    ("[parameters]", '[parameters]\n"" = { value = 1.0 }', 4, "parameter '' has no name; give it one"),
 ]
 
 
@@ -443,3 +460,10 @@ def test_a_unit_of_another_dimension_is_an_error(
     assert code == 1
     assert f"line {line}: " in err
     assert words in err
+
+
+def test_a_model_without_a_mode_that_vibrates_says_what_to_correct(tmp_path: Path) -> None:
+    text = '[[masses]]\nat = "m.x"\nvalue = 1.0\n[[springs]]\nat = "m.x"\nvalue = 1e4\n'
+    rig = load_rig(write(tmp_path, text + '[[dampers]]\nat = "m.x"\nvalue = 1e6\n'))
+    with pytest.raises(EmaError, match="its damping lets no mode vibrate; correct dampers"):
+        model_modes(rig, "default")

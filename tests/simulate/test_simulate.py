@@ -292,6 +292,13 @@ def test_rig_file_travels_with_the_data(tmp_path: Path) -> None:
         ({"double_hits": ["sun.y#9"]}, "2 hits per point"),
         ({"peak_force_n": "30,hard"}, "peak_force_n.*'hard'"),
         ({"converter_bits": 3}, "converter_bits = 3"),
+        ({"values": {"sun_mass": "abc"}}, "value of parameter 'sun_mass' = abc: give a number"),
+        ({"values": {"sun_mass": 1e300}}, "'sun_mass' = 1e\\+300: give a number of at most 1e\\+30"),
+        (
+            {"sample_rate_hz": 1e12},
+            "sample_rate_hz = 1e\\+12 and duration_s = 2 make 2e\\+12 samples per hit",
+        ),
+        ({"duration_s": 1e9}, "make 5.12e\\+12 samples per hit, 1e\\+07 at most; lower one of them"),
     ],
 )
 def test_mistakes_are_named_before_anything_is_written(tmp_path: Path, arguments: dict, message: str) -> None:

@@ -137,7 +137,8 @@ def _read(path: Path, head: bytes, shown: str, limits: ReadLimits) -> RawRecord:
             "copy or export it again"
         ) from error
     if not record.channels:
-        raise EmaError(f"{shown}: holds no channels; export the time data")
+        why = f" ({'; '.join(record.notes[:3])})" if record.notes else ""
+        raise EmaError(f"{shown}: holds no channels{why}; export the time data as numbers")
     return record
 
 

@@ -29,6 +29,9 @@ _RATE_KEYS = {
 _STEP_KEYS = {"dt", "dts", "deltat", "ts", "wfincrement", "timestep", "samplinginterval", "sampleinterval"}
 _UNIT_KEYS = {"unit", "units", "unitstring", "niunitdescription", "engineeringunits", "ylabelunit"}
 _NAME_KEYS = {"channels", "channelnames", "names", "labels", "columns", "channelname"}
+_FEWEST_SAMPLES = 16
+"""What holds fewer values is no record."""
+
 _DOF_KEYS = {"dof", "location"}
 
 
@@ -101,6 +104,8 @@ def assemble(
                 column_names = _texts(values)
             if _key(array.name) in _UNIT_KEYS:
                 unit_names = _texts(values)
+            elif values.size >= _FEWEST_SAMPLES:
+                notes.append(f"'{label}' holds text and is left out")
             continue
         if values.dtype.kind == "c":
             notes.append(f"'{label}' is complex (a spectrum?) and is left out")
@@ -155,9 +160,16 @@ class _Rates:
             if plain not in _RATE_KEYS | _STEP_KEYS:
                 continue
             number = np.ravel(np.asarray(raw))
-            if number.size != 1 or number.dtype.kind not in "fiu" or not float(number[0]) > 0:
-                continue
-            value = float(number[0])
+            if number.size != 1 or (number.dtype.kind not in "fiu" and not plain.startswith("sampl")):
+                continue  # short keys may mean something else
+            text = _texts(number)[0][:40]
+            value = _number_of(text)
+            if not value > 0:
+                if not plain.startswith("sampl") or not text:
+                    continue
+                raise EmaError(
+                    f"states {key} = '{text}' ({label}), which is no sample rate; correct or remove it"
+                )
             self.add(label, value if plain in _RATE_KEYS else whole_rate(value, 1e-9))
 
     def add(self, label: str, rate: float | None) -> None:
@@ -170,6 +182,14 @@ class _Rates:
                 f"contradicts itself: sample rate {self.value:.10g} Hz ({self._source}) "
                 f"and {rate:.10g} Hz ({label}); correct the file"
             )
+
+
+def _number_of(text: str) -> float:
+    """The number that a text states, of hertz where it names a unit; NaN for other text."""
+    try:
+        return float(text.casefold().removesuffix("hz"))
+    except ValueError:
+        return float("nan")
 
 
 def _split_matrix(array: NamedArray, numbers: NDArray[np.float64]) -> list[_Column]:
@@ -204,7 +224,7 @@ def _split_matrix(array: NamedArray, numbers: NDArray[np.float64]) -> list[_Colu
 def _without_housekeeping(columns: list[_Column], notes: list[str]) -> list[_Column]:
     """Leave out the handful of numbers (channel numbers, sensitivities) that stand beside real records."""
     longest = max((c.samples.size for c in columns), default=0)
-    enough = min(16, longest)
+    enough = min(_FEWEST_SAMPLES, longest)
     for column in columns:
         if column.samples.size < enough:
             notes.append(f"'{'/'.join(column.path)}' has {column.samples.size} values and is left out")
