@@ -154,16 +154,6 @@ def _sensors(file: ElementRigFile) -> dict[str, Row]:
         if place.point in sensors:
             raise Mistake(here, f"sensor place '{place.point}' is named twice; name it once")
         sensors[place.point] = {d: place.sign * c for d, c in s.row.items()}
-    masses = [(("masses", i, "at"), entry.at) for i, entry in enumerate(file.masses) if entry.at is not None]
-    coordinates = {_parsed_dof(at, where).point for where, at in masses} | {
-        dof for entry in file.masses for dof in entry.row or ()
-    }
-    for i, point in enumerate(sensors):
-        if point in coordinates:
-            raise Mistake(
-                ("sensors", i, "dof"),
-                f"sensor place '{point}' has mass and so is a coordinate already; drop it",
-            )
     return sensors
 
 
@@ -197,6 +187,11 @@ def _check_dofs(file: ElementRigFile, configuration: str, sensors: Mapping[str, 
     dofs = {d for where, row in rows.items() if where[0] == "masses" for d in row}
     for i, place in enumerate(sensors):
         rows["sensors", i] = sensors[place]
+        if place in dofs:
+            raise Mistake(
+                ("sensors", i, "dof"),
+                f"sensor place '{place}' has mass and so is a coordinate already; drop it",
+            )
     where_from = f" in configuration '{configuration}'" if len(file.configurations) > 1 else ""
     for where, row in rows.items():
         for dof in row:

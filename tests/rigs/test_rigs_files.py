@@ -310,12 +310,6 @@ ELEMENT_MISTAKES = [
     ("value = 5.0", "value = -5.0", 21, "a damper cannot be negative"),
     ('dof = "middle.x"', 'dof = "top.x"', 23, "'top.x' has mass and so is a coordinate already"),
     ('"top.x" = 0.5', '"tip.x" = 0.5', 24, "dof 'tip.x' has no mass"),
-    (
-        'dof = "middle.x"\nrow = { "top.x" = 0.5, "base.x" = 0.5 }',
-        'dof = "top.x"\nrow = { "base.x" = 1.0 }',
-        23,
-        "'top.x' has mass and so is a coordinate already",
-    ),
     ('row = { "top.x" = 1.0, "base.x" = -1.0 }', "row = {}", 20, "dampers.0.row = {}: name at least one dof"),
     ('"top.x" = 0.5, "base.x" = 0.5', "", 24, "sensors.0.row = {}: name at least one dof"),
     ('"top.x" = 0.5, "base.x" = 0.5', '"top.x" = 0.0', 24, "with a coefficient other than 0"),
