@@ -164,16 +164,19 @@ def _mode_difference(
     m = measured[row.configuration]
     pairing = pairings[row.configuration]
     model = fitted.problem.solution(row.configuration, fitted.posterior.x)
+    frequency_hz = float(model.frequency_hz[row.model])
+    # Where a mode is damped so far that it does not vibrate, the pairing has fewer of them.
+    listed = int(np.argmin([abs(mode.frequency_hz - frequency_hz) for mode in pairing.model_modes]))
     pair = next((p for p in pairing.pairs if p.measured == row.measured), None)
-    mac = pair.mac if pair is not None else float(np.nan_to_num(pairing.mac[row.measured, row.model]))
+    mac = pair.mac if pair is not None else float(np.nan_to_num(pairing.mac[row.measured, listed]))
     shape = row.shape[np.isfinite(row.shape)]
     return ModeDifference(
         configuration=row.configuration,
         measured=row.measured,
-        family=pairing.model_modes[row.model].family,
+        family=pairing.model_modes[listed].family,
         measured_frequency_hz=float(m.frequency_hz[row.measured]),
         frequency_std_hz=float(m.frequency_std_hz[row.measured]),
-        model_frequency_hz=float(model.frequency_hz[row.model]),
+        model_frequency_hz=frequency_hz,
         frequency_z=row.frequency,
         measured_damping_ratio=float(m.damping_ratio[row.measured]),
         damping_std=float(m.damping_std[row.measured]),

@@ -243,7 +243,10 @@ class DampedModes:
         own = whole[:, every, every] + (pole**2)[:, None] + 1e-30
         whole[:, every, every] = own + (_CLOSE * np.abs(pole[:, None]) ** 2) ** 2 / np.conj(own)
         whole[at, :, modes] = (2 * pole * share + damping @ share).T
-        found = np.linalg.solve(whole, -force.transpose(2, 1, 0))
+        try:
+            found = np.linalg.solve(whole, -force.transpose(2, 1, 0))
+        except np.linalg.LinAlgError:  # a damper beside which nothing else is left in double precision
+            found = -np.linalg.pinv(whole) @ force.transpose(2, 1, 0)
         frequency, ratio = _of_pole(pole[:, None], found[at, modes])
         found[at, modes] = 0.0
         return frequency, ratio, np.asarray(shapes @ found, complex)

@@ -119,6 +119,18 @@ def test_a_model_that_falls_into_two_parts_is_compared_where_it_has_frfs(bench: 
     assert not suspected_sensitivities({"default": measured}, {"default": [load_rig(rig).system("default")]})
 
 
+@pytest.mark.parametrize("coefficient", [1e4, 1e20])
+def test_a_damper_that_holds_a_mass_makes_a_poor_model_and_no_fault(
+    bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], coefficient: float
+) -> None:
+    rig = tmp_path / "held.toml"
+    text = (bench.parent / "bench.toml").read_text(encoding="utf-8")
+    rig.write_text(f'{text}\n[[dampers]]\nat = "m1.x"\nvalue = {coefficient}\n', encoding="utf-8")
+    code, out, err = ema(capsys, "run", bench, "--rig", rig, "--out", tmp_path / "out", "--set", QUICK)
+    assert code == 0, err
+    assert "no model mode within" in out
+
+
 def hits_in(raw: Path) -> list[HitSamples]:
     """The hits of a test, cut from their records."""
     records = [r for test in read_campaign(raw).tests for r in load_records(test)]
