@@ -40,7 +40,7 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
         Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 2.0, 0.2),
         Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03, 1.5, 0.03),
         # What hits have in common (drift, aim) is in their scatter, and no error of one mode against another.
-        Scatter(FREQUENCY_NOISE, "stated uncertainty of frequencies", 1.0, 0.5, most=1.5),
+        Scatter(FREQUENCY_NOISE, "stated uncertainty of frequencies", 1.0, 0.5, most=2.0),
         Scatter(SHAPE_NOISE, "stated uncertainty of shapes", 1.0, 0.5),
         Scatter(MIXING, "shapes of close modes along each other", 0.01, 1.0, 0.03, 5.0),
     )

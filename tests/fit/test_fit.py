@@ -260,7 +260,7 @@ def test_the_same_data_give_the_same_numbers_to_the_last_bit() -> None:
 
 
 def test_nothing_to_fit_is_said_in_one_line() -> None:
-    with pytest.raises(EmaError, match="no measured mode"):
+    with pytest.raises(EmaError, match="no mode was measured that rig"):
         fit(RIG, {"no_ring": from_frequencies("no_ring", [])})
 
 
