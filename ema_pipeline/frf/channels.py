@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
@@ -78,12 +79,18 @@ def channel_uncertainty(frfs: FrfSet | None, dof: Dof) -> ChannelQuality:
         return ChannelQuality()
     for output, channel in zip(frfs.outputs, frfs.channels, strict=False):
         if output.point == dof.point:
-            moved = channel.name and sum(c.name == channel.name for c in frfs.channels) > 1
+            moved = moved_sensors(frfs) & set(channel.name.split(SEVERAL))
             return InTurn(channel.name, channel.calibration_std, channel.transverse) if moved else channel
     if dof.point in {d.point for d in frfs.inputs} - {d.point for d in frfs.outputs}:
         hammer = hammer_uncertainty(frfs)
         return StruckPoint(hammer.name, hammer.calibration_std, hammer.transverse)
     return ChannelQuality()
+
+
+def moved_sensors(frfs: FrfSet) -> set[str]:
+    """Names of the sensors that have measured several outputs."""
+    names = Counter(name for channel in frfs.channels for name in channel.name.split(SEVERAL) if name)
+    return {name for name, count in names.items() if count > 1}
 
 
 def hammer_uncertainty(frfs: FrfSet | None) -> ChannelQuality:

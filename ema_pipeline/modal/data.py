@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.frf.channels import moved_sensors
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.settings import ModalSettings
 
@@ -136,6 +137,5 @@ def arrange(frfs: FrfSet, band_hz: tuple[float, float]) -> FitData:
     transposed = acc.shape[0] < acc.shape[1]
     if transposed:
         acc, variance, measured = acc.swapaxes(0, 1), variance.swapaxes(0, 1), measured.T
-    sensors = [channel.name for channel in frfs.channels if channel.name]
-    in_turn = len(frfs.inputs) > 1 and len(set(sensors)) < len(sensors)
+    in_turn = len(frfs.inputs) > 1 and bool(moved_sensors(frfs))
     return FitData(omega, acc, variance, measured, rest_s, transposed, frfs.response_decay_rad_s, in_turn)

@@ -20,7 +20,7 @@ from ema_pipeline.frf import (
     estimate_frfs,
     hammer_uncertainty,
 )
-from ema_pipeline.frf.channels import InTurn, StruckPoint, merged
+from ema_pipeline.frf.channels import InTurn, StruckPoint, merged, moved_sensors
 from ema_pipeline.ingest.description import read_description
 from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.load import load_records
@@ -73,6 +73,10 @@ def test_a_roving_sensor_keeps_its_name_and_two_sensors_at_one_dof_are_never_bet
         ),
     )
     frfs = estimate_frfs([with_channel(one, calibration_std=0.03), roving, three], FrfSettings())
+    assert moved_sensors(frfs) == {"a0"}
+    shared = replace(frfs, channels=tuple(ChannelQuality(n) for n in ("a0", "a1 + a0", "a2")))
+    assert moved_sensors(shared) == {"a0"}
+    assert channel_uncertainty(shared, Dof("p1", "z")) == InTurn("a1 + a0")
     at = {d.point: channel_uncertainty(frfs, d) for d in frfs.outputs}
     assert at["p0.z"].name == at["p2.z"].name == "a0"
     assert at["p2.z"] == InTurn("a0", 0.01, 0.03)
