@@ -60,7 +60,7 @@ RANK_ONE = 0.05
 """Second over first singular value of the common residue of two coinciding poles, below which they are one
 mode, where a misfit is left over. A hundredth of it where the noise explains what is left."""
 
-OFF_DIRECTION, OFF_DIRECTION_REACH = 0.25, 0.7
+MIXED_RANK, MIXED_REACH = 0.25, 0.7
 """The same, and the distance in decay rates, where every sensor position has blows of its own on several points: a blow
 that is some degrees off its direction excites another mix, so that the residue of one mode has more than one singular
 value. At 8°, with hits on frames, second poles reached 0.13 of the first and distances up to 0.6; two modes of such
@@ -250,8 +250,8 @@ def _doubles(
     least = np.where(explained, 0.01 * RANK_ONE, RANK_ONE)[:, None]
     double = close & (_second_singular(estimate, solution, close) < least)
     if data.in_turn:
-        near = distance < OFF_DIRECTION_REACH * np.maximum(decay[:, None], decay)
-        double |= near & (_second_singular(estimate, solution, near) < OFF_DIRECTION)
+        near = distance < MIXED_REACH * np.maximum(decay[:, None], decay)
+        double |= near & (_second_singular(estimate, solution, near) < MIXED_RANK)
     if n_sensors > 2:
         double |= close & (sensors > SAME_RESPONSE) & ~explained[:, None]
     double |= _one_shape(estimate.poles, sensors, n_sensors)

@@ -47,7 +47,7 @@ class Sensing:
     ----------
     along : ndarray, (s, n)
     across : ndarray, (k, s, n)
-        In up to k directions.
+        In up to k - 1 directions; last along it once more, for how blows were aimed.
     gain : ndarray of int, (s,)
     transverse : ndarray of int, (k, s)
         Positions of their unknowns, -1 for none.

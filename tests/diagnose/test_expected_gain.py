@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.expected_gain import ExpectedGain
 from ema_pipeline.diagnose.score import Marginal
-from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns, descend, learn
+from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns, descend, learn, tails
+from ema_pipeline.inference.problem import in_blocks
 from ema_pipeline.observations.fitting import Fit, Model
 
 Array = NDArray[np.float64]
@@ -91,3 +92,16 @@ def test_scatters_that_are_known_take_nothing_up() -> None:
     assert change.total == pytest.approx(16.0, rel=0.1)  # but for the offset, which follows a little
     assert gains.of(change) == pytest.approx(0.5 * change.total)
     assert gains.of(gains.change(np.zeros(ROWS))) == 0.0
+
+
+def test_a_shape_that_is_far_off_gains_as_its_density_has_tails() -> None:
+    block = np.repeat(np.arange(6), 5)
+    alone = fitted(quiet(), KNOWN)
+    found = replace(alone, residuals=replace(alone.residuals, block=block))
+    gains = ExpectedGain(found, KNOWN, Marginal(Fit(Model(), found)))
+    change = gains.change(np.eye(ROWS)[20] * 20.0)
+    before = found.expected_squares(weighted=False)
+    after = before + change.residuals / found.residuals.weight**2
+    costs = [float(np.sum(tails.cost(*in_blocks(squares, block)))) for squares in (before, after)]
+    assert gains.of(change) == pytest.approx(0.5 * change.rest + costs[1] - costs[0])
+    assert gains.of(change) < 0.2 * 0.5 * change.total
