@@ -47,6 +47,7 @@ def detection_limits(
     fit: Fit,
     hypotheses: Sequence[Hypothesis],
     settings: DiagnoseSettings,
+    some: Sequence[Hypothesis] | None = None,
 ) -> tuple[DetectionLimit, ...]:
     """Limit of every effect, from what the data say of its size beside everything uncertain.
 
@@ -62,6 +63,8 @@ def detection_limits(
     hypotheses : sequence of Hypothesis
         All that compete.
     settings : DiagnoseSettings
+    some : sequence of Hypothesis, optional
+        Those that are asked about; all where left out.
     """
     had = set(fit.model.labels)
     whole = ExpectedGain(fit.posterior, observations.scatters, Marginal(fit))
@@ -77,7 +80,8 @@ def detection_limits(
         evidence += evidence_beyond(observations, hypothesis, settings)
         return shown.largest(evidence) if hypothesis.shown_by_less else shown.least(evidence, sigmas)
 
-    asked = [h for h in hypotheses if h.shown_by_less or not h.size_cannot_be_zero]
+    asked = hypotheses if some is None else some
+    asked = [h for h in asked if h.shown_by_less or not h.size_cannot_be_zero]
     found = zip(asked, spread(limit, asked, settings.processes), strict=True)
     return tuple(_under(name, h, size) for h, size in found if size is not None for name in h.names)
 

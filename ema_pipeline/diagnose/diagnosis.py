@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.claims import Judged
 from ema_pipeline.diagnose.detection_limits import detection_limits
@@ -24,6 +26,12 @@ from ema_pipeline.effects.base import Effect
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Model
 from ema_pipeline.rigs.types import Rig
+
+_FAINT = 0.33
+"""Size over the least that would be claimed in nine tests of ten, below which a claim is none: of 211 right claims in
+simulated tests none was below 0.38; two of eight wrong ones were at 0.11 and 0.29."""
+_MOST_AGAIN = 3
+"""Selections without what is so small, one after the other."""
 
 
 def diagnose(
@@ -71,7 +79,7 @@ def diagnose(
     settings, known = settings or DiagnoseSettings(), known or Model()
     if hypotheses is None:
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
-    first = select(observations, known, hypotheses, settings, progress)
+    first, faint = _selected(observations, known, hypotheses, settings, progress)
     found = in_full(first)  # what else there may be is told to first order, as it was looked for
     observations = found.observations
     explained = explains(observations, found.final, settings)
@@ -126,11 +134,59 @@ def diagnose(
         error=rungs[0].error,
         heldout_error=rungs[0].heldout_error,
         ladder=ladder,
-        notes=(*((bent,) if bent and verdict != "unknown_effect" else ()), *notes),
+        notes=(*((bent,) if bent and verdict != "unknown_effect" else ()), *faint, *notes),
         detection_limits=detection_limits(first.observations, first.final, hypotheses, settings)
         if explained
         else (),
     )
+
+
+def _selected(
+    observations: Observations,
+    known: Model,
+    hypotheses: Sequence[Hypothesis],
+    settings: DiagnoseSettings,
+    progress: Progress,
+) -> tuple[Selection, list[str]]:
+    """What is claimed, once more without what is too small to be; and what that is, in sentences.
+
+    An effect far below the least size that these data would show gains little. What gains more at such a size takes up
+    something else.
+    """
+    told: list[str] = []
+    found = select(observations, known, hypotheses, settings, progress)
+    for _ in range(_MOST_AGAIN):
+        claimed = _faint(found, found.claimed, hypotheses, settings)
+        if not claimed:
+            break
+        told += [
+            f"{sentences.label_text(j.named.label)} fits with {sentences.size_text(j.named.sizes)}, and is not "
+            "claimed: of such a size these data would show nothing."
+            for j in claimed
+        ]
+        tried = {j.hypothesis.label: j for of in found.rounds for j in of.judged}
+        tried |= {j.hypothesis.label: j for j in claimed}
+        dropped = {j.hypothesis.label for j in _faint(found, [*tried.values()], hypotheses, settings)}
+        hypotheses = [h for h in hypotheses if h.label not in dropped]
+        found = select(observations, known, hypotheses, settings, progress)
+    return found, told
+
+
+def _faint(
+    found: Selection, judged: Sequence[Judged], hypotheses: Sequence[Hypothesis], settings: DiagnoseSettings
+) -> list[Judged]:
+    """Those that are far smaller than the least size that these data would show."""
+    asked = [j.hypothesis for j in judged]
+    limits = detection_limits(found.observations, found.final, hypotheses, settings, asked)
+    least = {(limit.label, limit.parameter): limit.size for limit in limits if not limit.largest}
+    return [
+        j
+        for j in judged
+        if any(
+            abs(size.value) < _FAINT * least.get((j.named.label, name), 0.0) < np.inf
+            for name, size in j.named.sizes.items()
+        )
+    ]
 
 
 def _candidates(

@@ -16,9 +16,12 @@ from ema_pipeline.diagnose.rounds import Round, round_of, weighed
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, Model, fit_base, within_scatter
+from ema_pipeline.observations.fitting import Fit, Model, fit_base, refined, transferred, within_scatter
 
 Progress = Callable[[float, str], None]
+
+_CONTINUED = 20
+"""Steps of a fit from a good start but for unknowns that are new."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +69,8 @@ def select(
     before : dict of str to Posterior, optional
         Fits of hypotheses to the same data with fewer unknowns.
     """
-    observations = observations.suited(known.effects)
-    base = start = fit_base(observations, known)
+    plain, observations = observations, observations.suited(known.effects)
+    base = start = _fitted(observations, plain, known)
     observations = observations.about(known.effects, base.posterior)
     rounds: list[Round] = []
     claimed: list[Judged] = []
@@ -119,6 +122,20 @@ def select(
             claimed = now
         if ahead is None:
             base = fit_base(observations, claimed[-1].ranked.fit.model, claimed[-1].ranked.fit)
+
+
+def _fitted(observations: Observations, plain: Observations, known: Model) -> Fit:
+    """Fit of the known model: begun anew, or from that to `plain` data, with fewer unknowns, where this leads further.
+
+    With a damping ratio of its own for every mode, all modes of a gearbox but one lost their partners.
+    """
+    anew = fit_base(observations, known)
+    if observations is plain:
+        return anew
+    unknowns = known.problem(observations).unknowns
+    start = transferred(fit_base(plain, known).posterior, unknowns)
+    continued = refined(observations, known, start, steps=_CONTINUED)
+    return max(anew, continued, key=lambda fit: fit.log_evidence)
 
 
 def _taken(observations: Observations, hypothesis: Hypothesis, claimed: Sequence[Judged]) -> bool:

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import h5py
 import numpy as np
@@ -22,7 +25,7 @@ from ema_pipeline.diagnose.probability import NOTHING, UNKNOWN
 from ema_pipeline.diagnose.ranking import rank
 from ema_pipeline.diagnose.rungs import make_ladder
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Diagnosis
+from ema_pipeline.diagnose.types import DetectionLimit, Diagnosis, EffectSize
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.inference import Posterior, Residuals, Unknowns
@@ -33,6 +36,7 @@ from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs.planetary import planetary
 from ema_pipeline.rigs.types import Rig
 
+diagnosis: Any = import_module("ema_pipeline.diagnose.diagnosis")
 SETTINGS = DiagnoseSettings(processes=1)
 GENERIC = {k: v for k, v in shipped_effects().items() if k in ("spring", "mass", "damper")}
 MESHES = {k: shipped_effects()[k] for k in ("mesh_stiffness_loss", "planet_bearing_mistune", "shaft_torsion")}
@@ -410,3 +414,33 @@ def test_no_modes_at_all_are_refused_or_called_too_few() -> None:
     found = diagnose(observed(rig, {"all": from_frequencies("all", [])}), rig, GENERIC, None, SETTINGS)
     assert found.verdict == "not_enough_data"
     assert not names_of(found)
+
+
+@pytest.mark.parametrize(
+    ("size", "limit", "largest", "dropped"),
+    [(0.9, 3.0, False, True), (-0.9, 3.0, False, True), (1.1, 3.0, False, False), (0.9, 3.0, True, False),
+     (0.9, np.inf, False, False)],
+)  # fmt: skip
+def test_what_is_far_too_small_to_be_seen_is_not_claimed(
+    monkeypatch: pytest.MonkeyPatch, size: float, limit: float, largest: bool, dropped: bool
+) -> None:
+    """The selection is made once more without it, and the reader is told."""
+    one, other = (SimpleNamespace(label=f"spring@{place}") for place in ("m1", "m2"))
+    sizes = {"stiffness": EffectSize(size, 0.1, "N/m")}
+    named = SimpleNamespace(label=one.label, sizes=sizes)
+    asked: list[list[str]] = []
+
+    def select(observations: Any, known: Any, hypotheses: Any, settings: Any, progress: Any) -> Any:
+        asked.append([h.label for h in hypotheses])
+        claimed = [SimpleNamespace(hypothesis=one, named=named)] if one in hypotheses else []
+        return SimpleNamespace(claimed=claimed, rounds=[], observations=observations, final=None)
+
+    limits = [DetectionLimit(one.label, "stiffness", limit, "N/m", largest=largest)]
+    monkeypatch.setattr(diagnosis, "select", select)
+    monkeypatch.setattr(diagnosis, "detection_limits", lambda *given: limits)
+    nothing: Any = None
+    found, told = diagnosis._selected(nothing, nothing, [one, other], nothing, nothing)
+    assert asked == [["spring@m1", "spring@m2"], *([["spring@m2"]] if dropped else [])]
+    assert bool(found.claimed) is not dropped
+    text = f"spring at m1 fits with stiffness {size:.4g} ± 0.1 N/m, and is not claimed: "
+    assert told == ([f"{text}of such a size these data would show nothing."] if dropped else [])

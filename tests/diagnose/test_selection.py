@@ -196,6 +196,28 @@ def test_effects_are_added_one_by_one_until_nothing_more_is_claimed(monkeypatch:
     assert steps.reconsidered == [(["a@x", "b@y"], ["a@x", "b@y"])]  # one alone has nothing beside it
 
 
+@pytest.mark.parametrize(("anew", "continued", "best"), [(3.0, 2.0, "anew"), (2.0, 3.0, "continued")])
+def test_the_known_model_is_also_fitted_from_data_with_fewer_unknowns(
+    monkeypatch: pytest.MonkeyPatch, anew: float, continued: float, best: str
+) -> None:
+    plain, suited, model = SimpleNamespace(), SimpleNamespace(), SimpleNamespace()
+    model.problem = lambda data: SimpleNamespace(unknowns=("of suited", data is suited))
+    fits = {
+        id(suited): SimpleNamespace(name="anew", log_evidence=anew),
+        id(plain): SimpleNamespace(posterior="p"),
+    }
+    monkeypatch.setattr(selection, "fit_base", lambda data, known: fits[id(data)])
+    monkeypatch.setattr(selection, "transferred", lambda posterior, unknowns: (posterior, unknowns))
+
+    def refined(data: Any, known: Any, start: Any, steps: int) -> Any:
+        assert start == ("p", ("of suited", True))
+        return SimpleNamespace(name="continued", log_evidence=continued)
+
+    monkeypatch.setattr(selection, "refined", refined)
+    assert selection._fitted(suited, plain, model).name == best  # type: ignore[arg-type, attr-defined]
+    assert selection._fitted(suited, suited, model).name == "anew"  # type: ignore[arg-type, attr-defined]
+
+
 def test_linear_effects_at_the_place_of_a_linearised_one_are_not_asked_about(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
