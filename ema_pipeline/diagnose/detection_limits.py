@@ -67,7 +67,10 @@ def detection_limits(
         Those that are asked about; all where left out.
     """
     had = set(fit.model.labels)
-    whole = ExpectedGain(fit.posterior, observations.scatters, Marginal(fit))
+    asked = hypotheses if some is None else some
+    asked = [h for h in asked if h.shown_by_less or not h.size_cannot_be_zero]
+    more = any(h.label not in had for h in asked)
+    whole = ExpectedGain(fit.posterior, observations.scatters, Marginal(fit)) if more else None
 
     def limit(hypothesis: Hypothesis) -> float | None:
         own = hypothesis.label in had
@@ -80,8 +83,6 @@ def detection_limits(
         evidence += evidence_beyond(observations, hypothesis, settings)
         return shown.largest(evidence) if hypothesis.shown_by_less else shown.least(evidence, sigmas)
 
-    asked = hypotheses if some is None else some
-    asked = [h for h in asked if h.shown_by_less or not h.size_cannot_be_zero]
     found = zip(asked, spread(limit, asked, settings.processes), strict=True)
     return tuple(_under(name, h, size) for h, size in found if size is not None for name in h.names)
 

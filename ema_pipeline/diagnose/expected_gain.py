@@ -102,12 +102,13 @@ class ExpectedGain:
             above = self._above + 0.5 * log
             inverse = np.exp(-log)
             own = square / variance
-            cost = self._of_residuals(own) + 0.5 * float(
+            of_residuals, factor = self._density(own)
+            cost = of_residuals + 0.5 * float(
                 np.sum(np.log(variance))
                 + np.sum(count * log + of_unknowns * inverse + self._weight * above**2)
             )
             best = min(best, cost)
-            part, excess = added / variance[:, None], own * self._factor(own)
+            part, excess = added / variance[:, None], own * factor
             slope = 0.5 * (part.T @ (1 - excess) + count - of_unknowns * inverse + self._weight * above)
             curvature = 0.5 * (part.T @ (np.maximum(excess, 1.0)[:, None] * part))
             curvature[np.diag_indices_from(curvature)] += 0.5 * of_unknowns * inverse + 0.25 * self._weight
@@ -115,18 +116,11 @@ class ExpectedGain:
             log = np.minimum(log + step, self._widest)
         return best
 
-    def _of_residuals(self, square: NDArray[np.float64]) -> float:
-        """-log density of residuals by their weighted squares, up to a constant."""
-        if self._block is None:
-            return 0.5 * float(np.sum(square))
-        blocks = in_blocks(square * self._unweighted, self._block)
-        return 0.5 * float(np.sum(square[self._block < 0])) + float(np.sum(tails.cost(*blocks)))
-
-    def _factor(self, square: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Slope of that density over a Gaussian's, (m,)."""
+    def _density(self, square: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """-log density of residuals by weighted squares, up to a constant, and its slope over a Gaussian's, (m,)."""
         factor = np.ones(len(square))
-        if self._block is not None:
-            inside = self._block >= 0
-            weight = tails.weight(*in_blocks(square * self._unweighted, self._block))
-            factor[inside] = self._unweighted[inside] * weight[self._block[inside]]
-        return factor
+        if self._block is None:
+            return 0.5 * float(np.sum(square)), factor
+        inside, blocks = self._block >= 0, in_blocks(square * self._unweighted, self._block)
+        factor[inside] = self._unweighted[inside] * tails.weight(*blocks)[self._block[inside]]
+        return 0.5 * float(np.sum(square[~inside])) + float(np.sum(tails.cost(*blocks))), factor

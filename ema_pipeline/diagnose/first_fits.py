@@ -30,7 +30,7 @@ Schedule = tuple[tuple[float, int], ...]
 
 _SHORT = 8
 """Steps of a short fit."""
-_CONTINUED = 20
+CONTINUED = 20
 """The same where the start is good but for unknowns that are new."""
 _HALF, _LITTLE = 1.0, 0.05
 """Largest unknown of a size, in units of its prior σ, from which a fit begins where half of what its score tells is
@@ -181,7 +181,7 @@ def continued_fit(
     """The fit begun where that to the same data with fewer unknowns ended; `otherwise` where that does not help."""
     unknowns = model.problem(observations).unknowns
     x = transferred(before, unknowns, transferred(base.posterior, unknowns))
-    found = refined(observations, model, x, steps=_CONTINUED).posterior
+    found = refined(observations, model, x, steps=CONTINUED).posterior
     if found.log_evidence > base.log_evidence:
         return found
     return max(found, otherwise(), key=lambda p: p.log_evidence)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ema_pipeline.diagnose.backward import reconsidered
 from ema_pipeline.diagnose.claims import BY_OTHERS, Judged, judge
+from ema_pipeline.diagnose.first_fits import CONTINUED
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.ranking import CONTENDERS, rank, unbeaten
 from ema_pipeline.diagnose.rounds import Round, round_of, weighed
@@ -19,9 +20,6 @@ from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, refined, transferred, within_scatter
 
 Progress = Callable[[float, str], None]
-
-_CONTINUED = 20
-"""Steps of a fit from a good start but for unknowns that are new."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +132,7 @@ def _fitted(observations: Observations, plain: Observations, known: Model) -> Fi
         return anew
     unknowns = known.problem(observations).unknowns
     start = transferred(fit_base(plain, known).posterior, unknowns)
-    continued = refined(observations, known, start, steps=_CONTINUED)
+    continued = refined(observations, known, start, steps=CONTINUED)
     return max(anew, continued, key=lambda fit: fit.log_evidence)
 
 

@@ -246,12 +246,13 @@ def _doubles(
     sensors, n_sensors = _sensors(data, estimate, solution)
     decay = -estimate.poles.real
     distance = np.abs(estimate.poles[:, None] - estimate.poles[None])
-    close = distance < COINCIDENT * np.maximum(decay[:, None], decay)
-    least = np.where(explained, 0.01 * RANK_ONE, RANK_ONE)[:, None]
-    double = close & (_second_singular(estimate, solution, close) < least)
+    heavier = _heavier(estimate.poles)
+    close = distance < COINCIDENT * heavier
     if data.in_turn:
-        near = distance < MIXED_REACH * np.maximum(decay[:, None], decay)
-        double |= near & (_second_singular(estimate, solution, near) < MIXED_RANK)
+        near, least = distance < MIXED_REACH * heavier, np.full((len(decay), 1), MIXED_RANK)
+    else:
+        near, least = close, np.where(explained, 0.01 * RANK_ONE, RANK_ONE)[:, None]
+    double = near & (_second_singular(estimate, solution, near) < least)
     if n_sensors > 2:
         double |= close & (sensors > SAME_RESPONSE) & ~explained[:, None]
     double |= _one_shape(estimate.poles, sensors, n_sensors)
