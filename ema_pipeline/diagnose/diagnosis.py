@@ -160,8 +160,8 @@ def _selected(
         if not claimed:
             break
         told += [
-            f"{sentences.label_text(j.named.label)} fits with {sentences.size_text(j.named.sizes)}, and is not "
-            "claimed: of such a size these data would show nothing."
+            f"Not claimed: {sentences.label_text(j.named.label)}, {sentences.size_text(j.named.sizes)}. Of such a size "
+            "these data would show nothing."
             for j in claimed
         ]
         tried = {j.hypothesis.label: j for of in found.rounds for j in of.judged}

@@ -442,5 +442,5 @@ def test_what_is_far_too_small_to_be_seen_is_not_claimed(
     found, told = diagnosis._selected(nothing, nothing, [one, other], nothing, nothing)
     assert asked == [["spring@m1", "spring@m2"], *([["spring@m2"]] if dropped else [])]
     assert bool(found.claimed) is not dropped
-    text = f"spring at m1 fits with stiffness {size:.4g} ± 0.1 N/m, and is not claimed: "
-    assert told == ([f"{text}of such a size these data would show nothing."] if dropped else [])
+    text = f"Not claimed: spring at m1, stiffness {size:.4g} ± 0.1 N/m. "
+    assert told == ([f"{text}Of such a size these data would show nothing."] if dropped else [])
