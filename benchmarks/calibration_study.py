@@ -95,6 +95,7 @@ def told(summary: str) -> Line:
         "groups": found["indistinguishable"],
         "candidates": candidates,
         "nothing": _nothing(found),
+        "visible": found.get("nothing_visible_probability"),
         "error": found.get("error"),
         "errors": [[r["error"], r["heldout_error"]] for r in content.get("ladder") or ()],
         "limits": [

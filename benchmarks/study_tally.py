@@ -178,9 +178,7 @@ def ranks(z: Sequence[float], bins: int = 10) -> list[int]:
     return [int(n) for n in np.histogram(norm.cdf(-np.asarray(z)), bins, (0, 1))[0]]
 
 
-def statements(
-    lines: Iterable[Line], of_effects: bool | None = None, shown: bool = False
-) -> list[tuple[float, bool]]:
+def statements(lines: Iterable[Line], of_effects: bool | None = None) -> list[tuple[float, bool]]:
     """The most probable statement of each case, "nothing" among them: its probability, and whether it is true.
 
     Parameters
@@ -188,8 +186,6 @@ def statements(
     lines : iterable of dict
     of_effects : bool, optional
         True for statements that name an effect, False for those that nothing is missing; all where left out.
-    shown : bool
-        True where "nothing" is true, too, if all that is hidden is smaller than its stated limit.
     """
     told = []
     for line in lines:
@@ -199,8 +195,7 @@ def statements(
         best = max(line["candidates"], key=lambda c: c["probability"] or 0.0, default=None)
         if best is None or nothing >= (best["probability"] or 0.0):
             if of_effects is not True:
-                ratios = _over_limits(line) if shown else None
-                told.append((nothing, not line["truth"] or max(ratios or (np.inf,)) < 1))
+                told.append((nothing, not line["truth"]))
             continue
         if of_effects is False:
             continue
@@ -209,6 +204,15 @@ def statements(
         true = any(is_truth(line, name, t) for name in group for t in line["truth"])
         told.append((min(p, 1.0), true))
     return told
+
+
+def visible(lines: Iterable[Line]) -> list[tuple[float, bool]]:
+    """Probability of every verdict ``"adequate"``, and whether all that is hidden is smaller than its stated limit."""
+    return [
+        (line["visible"], not line["truth"] or max(_over_limits(line) or (np.inf,)) < 1)
+        for line in lines
+        if not line.get("failed") and line["verdict"] == "adequate" and line.get("visible") is not None
+    ]
 
 
 def calibration_error(told: Sequence[tuple[float, bool]], bins: int = 10) -> float:
@@ -239,7 +243,7 @@ def table(lines: Sequence[Line]) -> str:
     inside = [line for line in lines if not line["without"]]
     z, own_z, told = sizes(inside), parameters(inside), statements(inside)
     named, silent = statements(inside, True), statements(inside, False)
-    to_be_seen = statements(inside, False, shown=True)
+    adequate = visible(inside)
     clear = [x for x in inside if x["truth"] and not x.get("failed") and (over_limit(x) or 0) >= CLEARLY]
     found = sum(outcome(x) in ("right", "group") for x in clear)
     out += [
@@ -252,8 +256,9 @@ def table(lines: Sequence[Line]) -> str:
         f"ranks {ranks(own_z)}.",
         f"- Expected calibration error of {len(told)} probabilities: {calibration_error(told):.3f}; of the "
         f"{len(named)} that name an effect {calibration_error(named):.3f}, of the {len(silent)} that "
-        f"nothing is missing {calibration_error(silent):.3f}, or nothing above its limit "
-        f"{calibration_error(to_be_seen):.3f}.",
+        f"nothing is missing at all {calibration_error(silent):.3f}.",
+        f"- Expected calibration error of the {len(adequate)} probabilities of the verdict `adequate`, that nothing is "
+        f"missing beyond its limit: {calibration_error(adequate):.3f}; {sum(t for _, t in adequate)} are true.",
         "",
         *_not_right(lines),
     ]

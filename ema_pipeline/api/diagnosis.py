@@ -92,7 +92,7 @@ class Diagnosis(Report):
             Axes to draw on; those of a new pyplot figure where left out.
         """
         bars = [(c.label, c.probability, c.claimed) for c in self.candidates]
-        bars.append(("nothing missing", self.result.null_probability, self.verdict == "adequate"))
+        bars.append(("nothing missing at all", self.result.null_probability, self.verdict == "adequate"))
         ax = axes_or_new(ax, 0.8 + 0.25 * len(bars))
         for at, (_, probability, supported) in enumerate(bars):
             ax.barh(at, probability, 0.6, fc="C0" if supported else "white", ec="C0")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -20,8 +21,9 @@ from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder
+from ema_pipeline.diagnose.types import DOUBTFUL, Candidate, Diagnosis, EffectSize, Ladder
 from ema_pipeline.diagnose.verdict import alike, explains, outlying_parts, stands_still, verdict_of
+from ema_pipeline.diagnose.visible import nothing_visible
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Model
@@ -109,10 +111,14 @@ def diagnose(
         (
             (c.label, c.why)
             for c in candidates[:1]
-            if (explained and not c.claimed) or c.would_explain(settings.error_limit)
+            if (explained and not c.claimed and nothing < DOUBTFUL) or c.would_explain(settings.error_limit)
         ),
         ("", ""),
     )
+    limits = detection_limits(first.observations, first.final, hypotheses, settings) if explained else ()
+    visible = math.nan
+    if verdict == "adequate":
+        visible = nothing_visible(first.rounds[0].ranking, probabilities, limits)
     scatter = learned_scatters(observations, found.final)
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
     bent = sentences.standing_out(outlying_parts(observations, found.final))
@@ -122,7 +128,7 @@ def diagnose(
     errors = (rungs[0].error, rungs[-1].error)
     return Diagnosis(
         verdict=verdict,
-        summary=sentences.summary(verdict, told, errors, nothing, best, reasons, beside),
+        summary=sentences.summary(verdict, told, errors, visible, best, reasons, beside),
         null_probability=nothing,
         candidates=candidates,
         indistinguishable=_groups(found, group, settings),
@@ -135,9 +141,8 @@ def diagnose(
         heldout_error=rungs[0].heldout_error,
         ladder=ladder,
         notes=(*((bent,) if bent and verdict != "unknown_effect" else ()), *faint, *notes),
-        detection_limits=detection_limits(first.observations, first.final, hypotheses, settings)
-        if explained
-        else (),
+        detection_limits=limits,
+        nothing_visible=visible,
     )
 
 

@@ -351,7 +351,7 @@ def _with_whole(found: Diagnosis, ladder: Ladder) -> Diagnosis:
     first = ladder.rungs[0]
     words = found.summary
     if found.verdict in ("effect", "adequate"):
-        words = summary(found.verdict, told, (first.error, last.error), found.null_probability)
+        words = summary(found.verdict, told, (first.error, last.error), found.adequate_probability)
     return dataclasses.replace(
         found,
         candidates=candidates,

@@ -46,10 +46,6 @@ def _one_size(s: EffectSize) -> str:
     return f"{s.value:.4g} ± {s.std:.2g}{'' if s.unit in ('', '1') else ' ' + s.unit}"
 
 
-DOUBTFUL = 0.5
-"""Probability that nothing is missing, below which an adequate model has a candidate worth a word."""
-
-
 def summary(
     verdict: VerdictWord,
     claimed: Sequence[tuple[str, str]],
@@ -69,10 +65,10 @@ def summary(
     error : (float, float)
         Before and after.
     nothing : float
-        Probability that nothing is missing.
+        Probability that nothing is missing that these data would show.
     best : (label, why), optional
-        The best candidate where none is claimed, and why it is not; of a model that does not explain the data, one that
-        would.
+        The best candidate where none is claimed and one is worth a word, and why it is not; of a model that does not
+        explain the data, one that would.
     reasons : str, optional
         Why the model does not explain the data, beside its error.
     beside : sequence of (label, size), optional
@@ -94,10 +90,10 @@ def summary(
             f"{before:.2f} to {after:.2f}."
         )
     if verdict == "adequate":
-        odds = f"Probability that nothing is missing that these data could show: {probability_text(nothing)}."
-        if best[0] and nothing < DOUBTFUL:
-            odds += f" {_candidate(best)}"
-        return f"The model explains the data: error {before:.2f}. {odds}"
+        odds = f"Probability that nothing is missing that these data would show: {probability_text(nothing)}."
+        return " ".join(
+            filter(None, (f"The model explains the data: error {before:.2f}. {odds}", _candidate(best)))
+        )
     if verdict == "unknown_effect":
         verb = "are" if len(claimed) > 1 else "is"
         closest = f" The closest {verb} {named}." if named else ""

@@ -21,6 +21,9 @@ EXTRA_COORDINATE = "a degree of freedom of its own"
 
 NOT_DETERMINED = "not determined by these data"
 
+DOUBTFUL = 0.5
+"""Probability that nothing is missing, however small, below which an adequate model has a candidate worth a word."""
+
 _UNDETERMINED = 100.0
 """Above this ratio of standard deviation to value a size counts as not determined."""
 
@@ -303,7 +306,7 @@ class Diagnosis:
     summary : str
         The verdict in one or two plain sentences.
     null_probability : float
-        Probability that nothing is missing.
+        Probability that nothing is missing, however small.
     candidates : tuple of Candidate
         The most probable first.
     indistinguishable : tuple of tuple of str
@@ -322,6 +325,8 @@ class Diagnosis:
         What the data's screening found.
     detection_limits : tuple of DetectionLimit
         What these data would show; empty where even the best model fails.
+    nothing_visible : float
+        Probability that nothing is missing that is larger than its detection limit; NaN where that was not calculated.
     """
 
     verdict: VerdictWord
@@ -337,3 +342,15 @@ class Diagnosis:
     ladder: Ladder
     notes: tuple[str, ...] = ()
     detection_limits: tuple[DetectionLimit, ...] = ()
+    nothing_visible: float = math.nan
+
+    @property
+    def suspected(self) -> Candidate | None:
+        """Best candidate of an adequate model that some small effect is more probable to be missing from than none."""
+        doubtful = self.verdict == "adequate" and self.null_probability < DOUBTFUL
+        return self.candidates[0] if doubtful and self.candidates else None
+
+    @property
+    def adequate_probability(self) -> float:
+        """Probability of the verdict ``"adequate"``: nothing is missing that these data would show."""
+        return self.null_probability if math.isnan(self.nothing_visible) else self.nothing_visible

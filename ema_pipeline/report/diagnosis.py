@@ -131,6 +131,21 @@ def _also_called(c: Candidate) -> str:
     return f" Also called: {', '.join(label_words(x) for x in c.equivalents)}." if c.equivalents else ""
 
 
+def perhaps_words(found: Diagnosis) -> str:
+    """The candidate that an adequate model may miss; empty without one."""
+    c = found.suspected
+    if c is None:
+        return ""
+    return f"Perhaps {label_words(c.label)} ({probability_text(c.probability)}), not supported enough to be claimed."
+
+
+def or_words(c: Candidate) -> str:
+    """Another effect that is the same change of the model, e.g. ``or parameter k8 out of tolerance``; or nothing."""
+    own = c.label.partition("@")[0]
+    others = [label for label in c.equivalents if label.partition("@")[0] != own]
+    return f"or {label_words(others[0])}" if others else ""
+
+
 def detection_words(found: Diagnosis) -> str:
     """What these data would show, in one sentence; empty where that is not known."""
     shown = [
@@ -222,11 +237,11 @@ def group_words(found: Diagnosis) -> tuple[str, ...]:
 def compact(found: Diagnosis) -> str:
     """Verdict, best candidates with probability and size, error before and after, in a sentence or two."""
     if found.verdict == "adequate":
-        odds = probability_text(found.null_probability)
+        odds = probability_text(found.adequate_probability)
         return (
             f"Diagnosis: {_lower(heading(found))} (probability {odds}); error {plain(found.error, 3)}, "
-            f"{plain(found.heldout_error, 3)} on held-out data."
-        )
+            f"{plain(found.heldout_error, 3)} on held-out data. {perhaps_words(found)}"
+        ).rstrip()
     if found.verdict == "not_enough_data":
         return f"Diagnosis: {_lower(heading(found))}. {found.summary}"
     if found.verdict == "effect":

@@ -56,7 +56,7 @@ def candidates_table(found: Diagnosis) -> Table:
     rows.append(
         Row(
             (
-                "nothing missing",
+                "nothing missing at all",
                 "",
                 "",
                 probability_text(found.null_probability),
@@ -94,7 +94,7 @@ def short_candidates_table(found: Diagnosis) -> Table:
     rows.append(
         Row(
             (
-                "nothing missing",
+                "nothing missing at all",
                 "",
                 probability_text(found.null_probability),
                 plain(found.error, 3),

@@ -149,7 +149,7 @@ def _against(found: Diagnosis) -> tuple[str, ...]:
             if c.label not in named
         ][:_OTHERS]
         lines.append(
-            f"Nothing missing has probability {nothing}"
+            f"Nothing missing at all has probability {nothing}"
             + (f"; less likely: {', '.join(others)}." if others else ".")
         )
     if found.verdict == "adequate":

@@ -125,8 +125,9 @@ def _diagnosed(found: Diagnosis) -> str:
     error = found.error
     heading = diagnosis.heading(found)
     if found.verdict == "adequate":
-        odds = probability_text(found.null_probability)
-        return f"{heading} (probability {odds}, error {plain(error, 3)})."
+        odds = probability_text(found.adequate_probability)
+        perhaps = diagnosis.perhaps_words(found)
+        return " ".join(filter(None, (f"{heading} (probability {odds}, error {plain(error, 3)}).", perhaps)))
     if found.verdict == "not_enough_data":
         return f"{heading}. {found.summary}"
     top = found.ladder.rungs[-1].parameters if found.ladder.rungs else {}
@@ -138,7 +139,9 @@ def _diagnosed(found: Diagnosis) -> str:
                 n: top.get(f"{c.label}.{n}", s) for n, s in c.parameters.items()
             }  # as the ladder has them
             shown = diagnosis.size_words(sizes, ", ")
-            told.append(diagnosis.label_words(c.label) + (f", {shown}" if shown else ""))
+            told.append(
+                ", ".join(filter(None, (diagnosis.label_words(c.label), shown, diagnosis.or_words(c))))
+            )
         return "; ".join(told)
 
     if found.verdict == "effect":

@@ -135,6 +135,7 @@ def _diagnosis(found: Diagnosis) -> dict[str, Any]:
         "indistinguishable": [list(group) for group in found.indistinguishable],
         "next_measurement": found.next_measurement,
         "nothing_missing_probability": found.null_probability,
+        "nothing_visible_probability": found.adequate_probability,
         "probabilities": dict(found.probabilities),
         "error": found.error,
         "heldout_error": found.heldout_error,

@@ -169,7 +169,7 @@ def test_the_true_value_of_a_parameter_with_one_part_is_that_of_the_part(tmp_pat
 def test_nothing_is_missing_that_could_show_where_all_that_is_hidden_is_below_its_limit(
     size: float, true: bool
 ) -> None:
-    silent = {"claimed": [], "verdict": "adequate", "nothing": 0.8, "candidates": [], "failed": None}
+    silent = {"claimed": [], "verdict": "adequate", "nothing": 0.8, "visible": 0.97, "candidates": []}
     limit = {"label": "mass@m1.x", "parameter": "mass", "size": 1.0}
     hidden = {
         "truth": [{"label": "mass@m1.x", "parameter": "mass", "size": size, "also": ""}],
@@ -177,5 +177,7 @@ def test_nothing_is_missing_that_could_show_where_all_that_is_hidden_is_below_it
     }
     own = line(**(silent | hidden))
     assert tally.statements([own]) == [(0.8, False)]
-    assert tally.statements([own], False, shown=True) == [(0.8, true)]
-    assert tally.statements([line(**(silent | hidden | {"limits": []}))], shown=True) == [(0.8, False)]
+    assert tally.visible([own]) == [(0.97, true)]
+    assert tally.visible([line(**(silent | hidden | {"limits": []}))]) == [(0.97, False)]
+    assert tally.visible([line(**(silent | HEALTHY)), line()]) == [(0.97, True)]
+    assert tally.visible([line(**(own | {"visible": None})), line(**(own | {"failed": "ended"}))]) == []

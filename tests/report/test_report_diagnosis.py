@@ -227,6 +227,22 @@ def test_what_is_claimed_beside_effects_that_fit_alike_is_told_with_them() -> No
     )
 
 
+def test_another_effect_that_is_the_same_change_is_told_with_what_is_missing() -> None:
+    one = found("effect")
+    claimed, *others = one.candidates
+
+    def told(*equivalents: str) -> str:
+        return run_screen._diagnosed(
+            replace(one, candidates=(replace(claimed, equivalents=equivalents), *others))
+        )
+
+    plain = told()
+    assert plain == told("mesh_stiffness_loss@sun-planet1.x")  # the same effect at another name of its place
+    assert told("out_of_tolerance@k8") == plain.replace(
+        " (probability", ", or parameter k8 out of tolerance (probability"
+    )
+
+
 def test_probability_is_never_rounded_to_certainty_or_to_nothing() -> None:
     words = [probability_text(p) for p in (1.0, 0.99951, 0.9949, 0.97, 0.5, 0.032, 0.0004, 0.0)]
     assert words == [">99.9 %", ">99.9 %", "99.5 %", "97 %", "50 %", "3.2 %", "<0.1 %", "<0.1 %"]
@@ -309,7 +325,7 @@ def test_bars_of_the_candidates_are_their_probabilities_and_add_up_to_one(run: R
     names = [t.get_text().replace("\n", " ") for t in ax.get_yticklabels()]
     widths = [p.get_width() for p in ax.patches]  # type: ignore[attr-defined]
     assert names[0] == "mesh stiffness loss at sun-planet1"
-    assert names[-1] == "nothing missing"
+    assert names[-1] == "nothing missing at all"
     assert widths[:3] == [0.97, 0.01, 0.005]
     assert sum(widths) == pytest.approx(1.0)
     assert next(t.get_text() for t in ax.texts) == "97 % ◆"
@@ -433,11 +449,24 @@ def test_an_adequate_model_with_a_likely_candidate_says_which_and_why_it_is_not_
     best = ("spring@m2.x", "Not claimed: its size is within 2 standard deviations of zero.")
     doubtful = sentences.summary("adequate", [], (1.2, 1.2), 0.04, best)
     assert doubtful == (
-        "The model explains the data: error 1.20. Probability that nothing is missing that these data could show: "
+        "The model explains the data: error 1.20. Probability that nothing is missing that these data would show: "
         "4.0 %. The best candidate is spring at m2.x. Not claimed: its size is within 2 standard deviations of zero."
     )
-    assert "candidate" not in sentences.summary("adequate", [], (1.2, 1.2), 0.6, best)
     assert "candidate" not in sentences.summary("adequate", [], (1.2, 1.2), 0.04)
+
+
+def test_an_adequate_verdict_has_the_probability_that_nothing_is_missing_that_would_show() -> None:
+    one = replace(found("adequate"), nothing_visible=0.985)
+    assert "(probability 98 %, error 3.10)." in run_screen._diagnosed(one)
+    assert "Perhaps" not in run_screen._diagnosed(one)
+    assert diagnosis.compact(one).startswith(
+        "Diagnosis: nothing is missing as far as these data can tell (probability 98 %)"
+    )
+    doubtful = replace(one, null_probability=0.3)
+    assert run_screen._diagnosed(doubtful).endswith(
+        "Perhaps mesh stiffness loss at sun-planet1 (4.0 %), not supported enough to be claimed."
+    )
+    assert replace(one, nothing_visible=math.nan).adequate_probability == one.null_probability == 0.9
 
 
 def test_the_sentence_on_what_is_missing_names_one_effect_or_several() -> None:

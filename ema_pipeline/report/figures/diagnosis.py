@@ -63,7 +63,7 @@ def candidate_probabilities(found: Diagnosis) -> Figure:
     if others:
         name = "1 other" if len(others) == 1 else f"{len(others)} others together"
         bars.append((name, math.fsum(others), False))
-    bars.append(("nothing missing", found.null_probability, found.verdict == "adequate"))
+    bars.append(("nothing missing at all", found.null_probability, found.verdict == "adequate"))
     figure = new_figure(0.75 + 0.235 * max(len(bars), 7), HALF_IN)
     ax = figure.add_subplot(
         figure.add_gridspec(1, 1, **margins(figure, left=1.42, right=0.1, bottom=0.42))[0]
