@@ -25,6 +25,7 @@ come, are never held out. What equivalent linearisation leaves out makes the sha
 
 NO_LESS_ERROR = "adding it does not reduce the error"
 PREDICTED_WORSE = "held-out data are predicted worse when it is added"
+MAY_BE_ZERO = "its size is within"
 BETTER_CONTRADICTED = "an effect that explains the data better is contradicted by held-out data"
 BETTER_DOUBTED = "a similar effect that gains more evidence cannot be claimed"
 BY_OTHERS = (BETTER_CONTRADICTED, BETTER_DOUBTED)
@@ -95,10 +96,18 @@ class Judged:
         return self.doubt in (NO_LESS_ERROR, PREDICTED_WORSE)
 
     @property
+    def may_be_zero(self) -> bool:
+        """True where it gains evidence with a size that may as well be zero: that is no gain of the effect's.
+
+        The base model was stuck, or its close modes were compared otherwise.
+        """
+        return self.doubt.startswith(MAY_BE_ZERO)
+
+    @property
     def believed(self) -> float:
         """Log evidence that counts for its probability."""
         counted = min(self.gain, self.left) - self.linearisation
-        return min(counted, 0.0) if self.contradicted else counted
+        return min(counted, 0.0) if self.contradicted or self.may_be_zero else counted
 
 
 def judge(
@@ -161,7 +170,7 @@ def _weak(
         x, std = ranked.fit.posterior.x[i], _std_of_first(ranked)
         sigmas = sigmas_asked(observations, ranked.hypothesis, settings)
         if abs(x) < sigmas * std:
-            return f"its size is within {sigmas:g} standard deviations of zero"
+            return f"{MAY_BE_ZERO} {sigmas:g} standard deviations of zero"
     return ""
 
 

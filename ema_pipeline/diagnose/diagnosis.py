@@ -32,6 +32,8 @@ from ema_pipeline.rigs.types import Rig
 _FAINT = 0.33
 """Size over the least that would be claimed in nine tests of ten, below which a claim is none: of 211 right claims in
 simulated tests none was below 0.38; two of eight wrong ones were at 0.11 and 0.29."""
+_ALTERNATIVES = 1e-6
+"""Probability of all that is not claimed, below which what is claimed is weighed against nothing alone."""
 _MOST_AGAIN = 3
 """Selections without what is so small, one after the other."""
 
@@ -206,10 +208,13 @@ def _candidates(
     mine = []
     for k, j in enumerate(found.claimed):
         of = found.rounds[k]
-        told = of.probabilities.get(j.named.label, 0.0)
-        if not any(
-            j is one for one in of.judged
-        ):  # it took the place of an earlier claim once others were known
+        # what else is claimed is no alternative to it
+        alternatives = 1 - math.fsum(
+            of.probabilities.get(one.named.label, 0.0) for one in found.claimed if one is not j
+        )
+        if alternatives > _ALTERNATIVES and any(j is one for one in of.judged):
+            told = of.probabilities.get(j.named.label, 0.0) / alternatives
+        else:  # there are none, or it took the place of an earlier claim once others were known
             told = against_nothing(j.hypothesis, j.gain, hypotheses, settings, k)
         sizes = {n: final.get(f"{j.named.label}.{n}", s) for n, s in j.named.sizes.items()}
         mine.append(replace(_candidate(j, told, True), parameters=sizes))

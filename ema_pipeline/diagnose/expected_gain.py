@@ -76,7 +76,10 @@ class ExpectedGain:
 
     def change(self, residuals: NDArray[np.float64]) -> Change:
         """Of a change of the residuals, (m,)."""
-        left, moved = self.marginal.left(residuals)
+        return self.of_moved(*self.marginal.left(residuals))
+
+    def of_moved(self, left: NDArray[np.float64], moved: NDArray[np.float64]) -> Change:
+        """Of weighted residuals, (m,), and of unknowns that have moved by so many prior σ, (n,)."""
         square = moved**2
         unknowns = np.array([np.sum(square[at]) for at in self._governed])
         return Change(left**2, unknowns, max(float(np.sum(square) - np.sum(unknowns)), 0.0))

@@ -56,12 +56,17 @@ class Round:
         """The best claimed hypothesis and all that explain the data as well; the rig's own effects first.
 
         A part out of tolerance is no more likely than a generic effect that explains the data better. Rivals need not
-        pass the threshold of a claim themselves: what the best one has, they nearly have.
+        pass the threshold of a claim themselves: what the best one has, they nearly have. Those whose size may be zero
+        explain nothing.
         """
         best = self.best
         if best is None:
             return ()
-        near = [j for j in self.judged if j is best or (j.gain > 0 and best.gain - j.gain < settings.alike)]
+        near = [
+            j
+            for j in self.judged
+            if j is best or (j.gain > 0 and best.gain - j.gain < settings.alike and not j.may_be_zero)
+        ]
 
         def order(j: Judged) -> tuple[bool, float, str]:
             behind = best.gain - j.gain

@@ -140,9 +140,8 @@ def perhaps_words(found: Diagnosis) -> str:
 
 
 def or_words(c: Candidate) -> str:
-    """Another effect that is the same change of the model, e.g. ``or parameter k8 out of tolerance``; or nothing."""
-    own = c.label.partition("@")[0]
-    others = [label for label in c.equivalents if label.partition("@")[0] != own]
+    """The parameter whose change is the same, e.g. ``or parameter k8 out of tolerance``; empty without one."""
+    others = [label for label in c.equivalents if label.partition("@")[0] == OUT_OF_TOLERANCE]
     return f"or {label_words(others[0])}" if others else ""
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ema_pipeline.check_result import CheckResult
+from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.run.measured import measured_frfs
 from ema_pipeline.run.types import Progress, Run
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 NAME = "correlate"
 NEEDS = ("frf", "modal", "fit")
-USES = ("levels",)
+USES = ("levels", "diagnose")
 PER_CONFIGURATION = False
 NEEDS_RIG = True
 
@@ -44,9 +45,25 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
 
 
 def _suspected(run: Run, fitted: FittedModes) -> tuple[CheckResult, ...]:
-    """Sensitivities that neither the nominal nor the fitted model can explain."""
+    """Sensitivities that neither the nominal nor the fitted model can explain, nor the one with what is missing."""
     from ema_pipeline.fit.channel_faults import suspected_sensitivities
 
     model, frfs = run.require_model(NAME), measured_frfs(run)
-    systems = {name: (model.system(name), fitted.system(name)) for name in frfs}
+    fits = [fitted, *_diagnosed(run)]
+    systems = {name: (model.system(name), *(f.system(name) for f in fits)) for name in frfs}
     return suspected_sensitivities(frfs, systems)
+
+
+def _diagnosed(run: Run) -> list[FittedModes]:
+    """The model with all that the diagnosis found missing; none where that is nothing."""
+    from ema_pipeline.fit.parameters import restored
+    from ema_pipeline.observations.fitting import model_with
+    from ema_pipeline.run.models import mode_observations
+
+    found = run.store.find("diagnose", ALL, "diagnosis", Diagnosis)
+    last = found.ladder.rungs[-1] if found is not None and found.ladder.rungs else None
+    if last is None or run.rig is None or set(last.effects) <= set(run.info.effects):
+        return []
+    model = model_with(last.effects, run.rig, run.library)
+    fit = replace(run.store.load("fit", ALL, "fit", FitResult), unknowns=last.unknowns)
+    return [restored(mode_observations(run).suited(model.effects), model, fit)]

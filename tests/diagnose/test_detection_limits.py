@@ -1,16 +1,22 @@
-"""The largest size of an effect that shows the more the smaller it is."""
+"""Limits of effects that show the more the smaller they are, and of those that bend what is predicted."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from ema_pipeline.diagnose.detection_limits import _Shown, _under
+from ema_pipeline.diagnose.expected_gain import ExpectedGain
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
+from ema_pipeline.diagnose.score import Marginal
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.effects.library import effect_library
+from ema_pipeline.inference import Posterior, Residuals, Unknowns
 from ema_pipeline.observations.rig_model import LOG_STD
 
 GAIN = 20.0
@@ -23,7 +29,7 @@ def shown(monkeypatch: pytest.MonkeyPatch, edge: float, asked: list[float]) -> _
         asked.append(unknown)
         return (30.0 if unknown <= edge else 5.0), 8.0
 
-    monkeypatch.setattr(_Shown, "_gained", gained)
+    monkeypatch.setattr(_Shown, "_gained_at", gained)
     nothing: Any = None
     return _Shown(nothing, np.zeros(1), 0, {}, nothing, nothing, 1.0, linear=False)
 
@@ -56,3 +62,72 @@ def test_the_limit_is_a_size_of_the_parameter_and_nothing_where_none_shows() -> 
     assert limit.size == pytest.approx(2e-6 * np.exp(0.5 * LOG_STD))
     none = _under(name, hypothesis, -np.inf)
     assert (none.size, none.seen) == (0.0, False)
+
+
+class Bent:
+    """An effect that bends predictions with the square of its size; two unknowns follow it, one of them in a curve."""
+
+    def __init__(self, curve: float) -> None:
+        self.curve = curve
+
+    unknowns = Unknowns.plain(("a", "b", "damper@m.coefficient"), 1.0)
+
+    def residuals(
+        self, x: Any, scatters: Any, *, derivatives: bool = True, matching: Any = None
+    ) -> Residuals:
+        a, b, size = x
+        values = np.array(
+            [
+                10 * a + 0.6 * size + size**2,
+                5 * b + self.curve * b**2 + 3 * size**2,
+                4 * a - 2 * b,
+                2 * b + size**2,
+            ]
+        )
+        slope = np.array(
+            [
+                [10, 0, 0.6 + 2 * size],
+                [0, 5 + 2 * self.curve * b, 6 * size],
+                [4, -2, 0],
+                [0, 2, 2 * size],
+            ]
+        )
+        return Residuals(values, slope, matching=matching or (np.arange(2),))
+
+
+def bent(curve: float) -> _Shown:
+    problem = Bent(curve)
+    x = np.zeros(3)
+    before = problem.residuals(x, {})
+    fit = SimpleNamespace(posterior=Posterior(problem.unknowns, x, {}, before))
+    marginal = Marginal(fit, without="damper@m")  # type: ignore[arg-type]
+    nothing = Residuals(np.zeros(4), np.zeros((4, 3)))
+    gains = ExpectedGain(Posterior(problem.unknowns, x, {}, nothing), {}, marginal)
+    return _Shown(problem, x, 2, {}, before, gains, 1.0, linear=True)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("size", [0.8, 1.5, 2.0])
+def test_everything_follows_an_effect_as_it_would_in_a_fit(size: float) -> None:
+    one = bent(0.3)
+    first, begin, change = one._moved(size)
+    assert change is not None
+    followed = one._followed(begin, change)
+    assert followed is not None
+
+    def asked(free: Any) -> Any:
+        there = Bent(0.3).residuals((*free, size), {}).values
+        return np.concatenate([there, free])
+
+    best = 2 * least_squares(asked, [0.0, 0.0]).cost
+    assert followed.total == pytest.approx(best, rel=0.05)
+    assert best > 1.5 * first.total  # to first order nearly nothing is left
+
+
+def test_the_limit_of_an_effect_that_bends_predictions_is_that_of_the_fit_and_not_of_first_order() -> None:
+    one = bent(0.0)
+    one = replace(one, std=float(1 / np.sqrt(one.gains.change(one.before.jacobian[:, 2]).total)))
+    limit, wanted = one.least(5.0, 2.0), one._wanted(5.0, 2.0, 1 / one.std)
+    followed = one._followed(*one._moved(limit)[1:])  # type: ignore[arg-type]
+    assert followed is not None
+    assert one._gained(followed)[0] == pytest.approx(wanted, rel=0.12)
+    assert limit < 0.5 * one.std * (np.sqrt(2 * wanted) + 1.28)

@@ -385,8 +385,9 @@ def test_the_search_for_a_limit_ends_at_the_size_that_gains_enough(
     true = off * sigma * (np.sqrt(2 * wanted) + 1.2816)
 
     class Power(_Shown):
-        def _gained(self, unknown: float) -> tuple[float, float]:
-            return float(wanted * (unknown / true) ** power), unknown / sigma
+        def _above(self, unknown: float, gain: float, sigmas: float) -> tuple[float, bool]:
+            asked = self._wanted(gain, sigmas, 1 / sigma)
+            return float(np.log(wanted / asked * (unknown / true) ** power)), True
 
     def least(most: float, gain: float = 8.0, sigmas: float = 2.0) -> float:
         problem = SimpleNamespace(unknowns=SimpleNamespace(upper=np.array([most])))

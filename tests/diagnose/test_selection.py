@@ -13,6 +13,7 @@ from ema_pipeline.diagnose import probability, rounds, selection
 from ema_pipeline.diagnose.claims import (
     BETTER_CONTRADICTED,
     BETTER_DOUBTED,
+    MAY_BE_ZERO,
     NO_LESS_ERROR,
     PREDICTED_WORSE,
     Judged,
@@ -61,6 +62,7 @@ def judged(
         doubt=doubt,
         claimed=not doubt,
         predicts_worse=doubt == PREDICTED_WORSE,
+        may_be_zero=doubt.startswith(MAY_BE_ZERO),
         base=SimpleNamespace(posterior=SimpleNamespace(error=2.0)),
         after=SimpleNamespace(posterior=SimpleNamespace(error=1.0)),
         held_before=SimpleNamespace(error=3.0),
@@ -91,6 +93,11 @@ def test_the_best_is_the_first_that_is_claimed_and_rivals_need_not_be() -> None:
     ]  # in order of names: the first is not behind
     assert a_round(better, near).best is None
     assert a_round(better, near).alike(SETTINGS) == ()
+
+
+def test_a_rival_whose_size_may_be_zero_is_none() -> None:
+    best, stuck = judged("mass@m2", 18.5), judged("gyroscopic@sun", 59.6, f"{MAY_BE_ZERO} 2 standard deviations")
+    assert labels(a_round(stuck, best).alike(SETTINGS)) == ["mass@m2"]
 
 
 def test_a_rival_that_gains_nothing_is_none() -> None:
@@ -517,6 +524,10 @@ def test_what_is_contradicted_takes_nothing_from_what_is_ahead_of_it(monkeypatch
     found = [("mass@sun", 30.0, ""), ("support@sun", 20.0, PREDICTED_WORSE)]
     told = judged_round(monkeypatch, found).probabilities
     assert told["mass@sun"] > 0.999
+    found = [("gyroscopic@sun", 60.0, f"{MAY_BE_ZERO} 2 standard deviations of zero"), ("mass@sun", 20.0, "")]
+    one = judged_round(monkeypatch, found)
+    assert one.probabilities["mass@sun"] > 0.999
+    assert one.best is not None
     found = [("support@sun", 21.0, PREDICTED_WORSE), ("mass@sun", 20.0, "")]  # as good
     told = judged_round(monkeypatch, found).probabilities
     assert told["mass@sun"] > 0.999
@@ -560,7 +571,7 @@ def test_candidates_are_the_claimed_ones_with_final_sizes_then_the_group_then_th
     hypotheses: Any = [j.hypothesis for j in (a, b, alike, rest)]
     found = _candidates(selected([a, b], first, second, third), SETTINGS, (b, alike), hypotheses, final)
     assert [(c.label, c.claimed, c.probability) for c in found] == [
-        ("a@x", True, 0.9), ("b@x", True, 0.8), ("c@x", False, 0.15), ("d@x", False, 0.01)
+        ("a@x", True, pytest.approx(0.9 / 0.95)), ("b@x", True, 0.8), ("c@x", False, 0.15), ("d@x", False, 0.01)
     ]  # fmt: skip
     assert [c.parameters["size"].value for c in found] == [5.0, 6.0, 7.0, 8.0]
     assert found[0].why == "Its signs: signs."
@@ -584,6 +595,14 @@ def test_without_a_claim_the_candidates_are_those_of_the_first_round() -> None:
     found = _candidates(selected([], one), SETTINGS, (), [], {})
     assert [(c.label, c.probability) for c in found] == [("a@x", 0.2), ("b@x", 0.0)]
     assert len(_candidates(selected([], one), SETTINGS.model_copy(update={"candidates": 1}), (), [], {})) == 1
+
+
+def test_what_else_is_claimed_is_no_alternative_to_a_claim() -> None:
+    """The second effect alone gained more than the first one, and is certain beside it: neither is improbable."""
+    a, b = judged("a@x", 1657.0), judged("b@x", 2925.0)
+    first, second = a_round(a, told={"a@x": 0.0, "b@x": 1.0}), a_round(b, told={"b@x": 1.0})
+    found = _candidates(selected([a, b], first, second), SETTINGS, (), [a.hypothesis, b.hypothesis], {})
+    assert [(c.label, c.probability) for c in found] == [("a@x", 1.0), ("b@x", 1.0)]
 
 
 def test_a_claim_that_took_the_place_of_an_earlier_one_has_a_probability_of_its_own() -> None:

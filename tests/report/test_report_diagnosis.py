@@ -227,7 +227,7 @@ def test_what_is_claimed_beside_effects_that_fit_alike_is_told_with_them() -> No
     )
 
 
-def test_another_effect_that_is_the_same_change_is_told_with_what_is_missing() -> None:
+def test_a_parameter_whose_change_is_the_same_is_told_with_what_is_missing() -> None:
     one = found("effect")
     claimed, *others = one.candidates
 
@@ -237,7 +237,7 @@ def test_another_effect_that_is_the_same_change_is_told_with_what_is_missing() -
         )
 
     plain = told()
-    assert plain == told("mesh_stiffness_loss@sun-planet1.x")  # the same effect at another name of its place
+    assert plain == told("spring@sun-planet1", "mesh_stiffness_loss@sun-planet1.x")
     assert told("out_of_tolerance@k8") == plain.replace(
         " (probability", ", or parameter k8 out of tolerance (probability"
     )
