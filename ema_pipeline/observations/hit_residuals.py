@@ -102,7 +102,7 @@ class HitResiduals:
         bent = 1 / (1 + turned**2)
         own = np.stack([data.log_frequency_std, damping_std, data.quadrature_std * bent])
         in_decay_rates = np.stack([data.usual_damping, *np.ones((2, len(data.modes)))])[:, None]
-        own = np.hypot(own, data.linearised_std * in_decay_rates)
+        own = np.hypot(own, data.linearised_std * in_decay_rates) * data.irregularity
         # not bent by the arc tangent: where aim alone excites a mode, its phase is anything
         otherwise = data.otherwise * in_decay_rates
         return self._whitened(

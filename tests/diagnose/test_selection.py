@@ -96,7 +96,10 @@ def test_the_best_is_the_first_that_is_claimed_and_rivals_need_not_be() -> None:
 
 
 def test_a_rival_whose_size_may_be_zero_is_none() -> None:
-    best, stuck = judged("mass@m2", 18.5), judged("gyroscopic@sun", 59.6, f"{MAY_BE_ZERO} 2 standard deviations")
+    best, stuck = (
+        judged("mass@m2", 18.5),
+        judged("gyroscopic@sun", 59.6, f"{MAY_BE_ZERO} 2 standard deviations"),
+    )
     assert labels(a_round(stuck, best).alike(SETTINGS)) == ["mass@m2"]
 
 

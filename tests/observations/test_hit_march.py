@@ -176,6 +176,20 @@ def test_how_far_a_hit_is_aimed_otherwise_is_noise_of_what_is_read() -> None:
     assert told[1] < 0.5 * told[0]
 
 
+def test_hits_that_scatter_about_any_smooth_curve_are_known_less_well() -> None:
+    (data,) = simulated("teeth").hits
+    assert np.all(data.irregularity < 1.5)  # as they part, and are read, smoothly
+    mode = int(np.flatnonzero(data.used[:6].all(axis=0))[0])
+    astray = data.damping.copy()
+    noise = 8 * np.hypot(data.damping_std[:6, mode], data.linearised_std[:6, mode] * astray[:6, mode])
+    astray[:6, mode] += noise * np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    factor = replace(data, damping=astray).irregularity
+    assert np.all(factor[:6, mode] > 1.5)
+    others = np.ones(factor.shape, bool)
+    others[:6, mode] = False
+    np.testing.assert_array_equal(factor[others], data.irregularity[others])
+
+
 def test_a_mode_that_aim_alone_excites_tells_nothing_by_its_phase() -> None:
     """Over a mean of nearly nothing sizes were ±70 with any phase, and friction of 1 mN explained it."""
     (data,) = simulated("teeth").hits
