@@ -44,7 +44,7 @@ def format_value(value: float, std: float, unit: str = "") -> str:
     exponent = math.floor(math.log10(float(f"{std:.1e}")))
     decimals = 1 - exponent
     power = math.floor(math.log10(max(abs(value), std)))
-    if 0 <= decimals <= 6 or (decimals > 6 and power == 0):
+    if 0 <= decimals <= 6 or (decimals > 6 and power in (-1, 0)):
         return f"{_minus(f'{value:.{decimals}f}')} ± {std:.{decimals}f}{tail}"
     if -4 <= decimals < 0:
         return f"{_minus(f'{round(value, decimals):.0f}')} ± {round(std, decimals):.0f}{tail}"
