@@ -8,6 +8,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.measure import Measurement
 from rich.text import Text
 
 from ema_pipeline.choices import Choices
@@ -24,7 +25,7 @@ from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.simulation import error_lines
 from ema_pipeline.report.summary import changed_words
 from ema_pipeline.report.tables import Row, Table
-from ema_pipeline.report.terminal import build_table, console_text
+from ema_pipeline.report.terminal import Clean, build_table, console_text
 from ema_pipeline.report.thresholds import LOW_MAC
 
 SCREEN_LINES = 15
@@ -36,6 +37,8 @@ LEAST_MODES = 3
 
 _MOST_RECORDS = 4
 """Records whose errors a screen has room for."""
+
+_MODEL_HZ = "model, Hz"
 
 _MOST_NAMED = 4
 """Candidates left out that a line has room for."""
@@ -78,10 +81,20 @@ class RunScreen:
         rows = table.rows if total <= shown else table.rows[: max(shown - 1, 0)]
         yield from (Text(line) for line in head)
         if rows:
-            yield build_table(Table(table.head, rows, table.numeric), "", clean, True, ruled=False)
+            yield _fitted(Table(table.head, rows, table.numeric), clean, console, options)
         if len(rows) < total:
             yield Text(clean(f"  … {total - len(rows)} more modes in {self._out}/modes.csv"))
         yield from (Text(line) for lines in told for line in lines)
+
+
+def _fitted(table: Table, clean: Clean, console: Console, options: ConsoleOptions) -> RenderableType:
+    """The table of modes; without the model's frequencies, which the differences tell, where that is too wide."""
+    built = build_table(table, "", clean, True, ruled=False)
+    needed = Measurement.get(console, options.update(max_width=10_000), built).maximum
+    if needed <= options.max_width or _MODEL_HZ not in table.head:
+        return built
+    left = [k for k, name in enumerate(table.head) if name != _MODEL_HZ]
+    return build_table(table.picked(left), "", clean, True, ruled=False)
 
 
 def _fitting(blocks: Sequence[list[str]], room: int) -> list[list[str]]:
@@ -223,7 +236,7 @@ def modes_table(results: RunResults) -> Table:
     several = len(results.configurations) > 1
     paired = any(c.pairing is not None for c in results.configurations)
     head = (("",) if several else ()) + ("mode", "frequency, Hz", "damping, %")
-    head += ("model, Hz", "difference, %", "MAC") if paired else ("MPC",)
+    head += (_MODEL_HZ, "difference, %", "MAC") if paired else ("MPC",)
     rows = tuple(
         Row(((c.name,) if several else ()) + cells, alert)
         for c in results.configurations

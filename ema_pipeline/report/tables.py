@@ -40,6 +40,14 @@ class Table:
     rows: tuple[Row, ...]
     numeric: frozenset[int] = frozenset()
 
+    def picked(self, columns: Sequence[int]) -> Table:
+        """Some of the columns."""
+        return Table(
+            tuple(self.head[c] for c in columns),
+            tuple(Row(tuple(r.cells[c] for c in columns), r.alert) for r in self.rows),
+            frozenset(k for k, c in enumerate(columns) if c in self.numeric),
+        )
+
 
 def modes_table(modal: ModalModel) -> Table:
     """One row per mode: frequency and damping of the pole and of all circles together, MPC, votes, remarks."""

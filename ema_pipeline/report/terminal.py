@@ -73,7 +73,7 @@ _ASCII = str.maketrans(
 
 def modes_table(modal: ModalModel, title: str = "Modes") -> RenderableType:
     """Frequency, damping, collinearity, votes and remarks of all modes."""
-    source = _pick(tables.modes_table(modal), (0, 1, 2, 5, 6, 7))
+    source = tables.modes_table(modal).picked((0, 1, 2, 5, 6, 7))
     source = _renamed(source, ("mode", "frequency, Hz", "damping, %", "MPC", "stable", "method"))
     remarks = [
         _line(f"mode {i}: {'; '.join(m.flags)}") for i, m in enumerate(modal.modes, start=1) if m.flags
@@ -88,7 +88,7 @@ def levels_tables(study: LevelStudy, modal: ModalModel, title: str = "") -> Rend
     if study.modes:
         table = levels.frequency_table(study, modal)
         last = len(table.head) - 1
-        parts += [_line(""), text_table(_pick(table, range(last)), "Natural frequency by force level")]
+        parts += [_line(""), text_table(table.picked(range(last)), "Natural frequency by force level")]
         remarks: dict[str, list[str]] = {}
         for row in table.rows:
             remarks.setdefault(row.cells[last], []).append(row.cells[0])
@@ -153,7 +153,7 @@ def comparison_tables(compared: Comparison) -> RenderableType:
             f"ε {plain(compared.frequency_error, 3)}"
         ),
         text_table(
-            _renamed(_pick(tables.differences_table(compared), columns), heads),
+            _renamed(tables.differences_table(compared).picked(columns), heads),
             "Per mode, (measured − model)/σ",
         ),
     ]
@@ -166,7 +166,7 @@ def comparison_tables(compared: Comparison) -> RenderableType:
 
 def fit_table(fit: FitResult) -> RenderableType:
     """Fitted parameters with their uncertainty, nominal values, and what the data say of each."""
-    source = _pick(tables.parameters_table(fit), (0, 1, 3, 4, 5))
+    source = tables.parameters_table(fit).picked((0, 1, 3, 4, 5))
     source = _renamed(source, ("parameter", "fitted (±1σ)", "nominal (±1σ)", "shift", "data say"))
     return Group(
         text_table(source, "Parameters; shift: in tolerances"),
@@ -273,15 +273,6 @@ def _commands(lines: Sequence[str]) -> list[RenderableType]:
 
 def _line(text: str) -> Safe:
     return Safe(lambda clean, rigid: Text(clean(text)))
-
-
-def _pick(source: tables.Table, columns: Sequence[int]) -> tables.Table:
-    """Some columns of a table."""
-    return tables.Table(
-        tuple(source.head[c] for c in columns),
-        tuple(tables.Row(tuple(r.cells[c] for c in columns), r.alert) for r in source.rows),
-        frozenset(k for k, c in enumerate(columns) if c in source.numeric),
-    )
 
 
 def _renamed(source: tables.Table, head: tuple[str, ...]) -> tables.Table:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
 from pathlib import Path
 
 import pytest
 from bench import ema, write_bench
+from rich.console import Console
 
 from ema_pipeline.commands.screen import program
+from ema_pipeline.report import run_screen
 from ema_pipeline.report.run_screen import SCREEN_LINES
+from ema_pipeline.report.tables import Row, Table
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -121,3 +125,17 @@ def test_the_command_is_shown_as_it_can_be_typed(tmp_path: Path, monkeypatch: py
     assert program() == ".venv/bin/ema"
     monkeypatch.setenv("PATH", str(script.parent))
     assert program() == "ema"
+
+
+@pytest.mark.parametrize(("width", "shown"), [(84, True), (80, False)])
+def test_modes_are_never_cut_off_at_the_edge_of_the_screen(width: int, shown: bool) -> None:
+    cells = ("no_ring", "10", "106.68136 ± 0.00086", "0.99971 ± 0.00073", "36.576", "−0.12", "0.98")
+    head = ("", "mode", "frequency, Hz", "damping, %", "model, Hz", "difference, %", "MAC")
+    console = Console(width=width, file=io.StringIO())
+    console.print(
+        run_screen._fitted(Table(head, (Row(cells),), frozenset(range(1, 7))), str, console, console.options)
+    )
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert all(cell in text for cell in cells if cell != "36.576")
+    assert ("36.576" in text) is shown
+    assert len(text.splitlines()) == 2
