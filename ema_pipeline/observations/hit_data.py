@@ -41,6 +41,8 @@ _FAR, _FAR_STD = 0.5, 0.5
 a shift read from a decay has against one of first order; and that error of far ones, 1 σ."""
 _UNLIKELY = 1e-3
 """Probability of hits that scatter so far about a smooth curve, below which their standard deviations are too small."""
+_FEW = 0.2
+"""Share of a sheet's modes in which that may be so; of more it is the structure that scatters."""
 _AIMED = 0.05
 """1 σ of what is read of a mode over how its size differs in phase, by the aim of the hit."""
 _CURVE = 3
@@ -258,20 +260,29 @@ class HitData:
     def irregularity(self) -> Real:
         """Factor on the standard deviations of what hits of a sheet tell of a mode, (h, m); 1 for most.
 
-        Whatever depends on the amplitude does so smoothly. Hits of one sheet that scatter about a smooth curve far more
-        than they say are known less well: where aim alone excites a mode, or mixes it with a neighbour, they differ by
-        ten standard deviations at one force. Friction of 3 mN explained a few such hits.
+        What depends on the amplitude does so smoothly, but for teeth that rattle, which make many modes scatter. Where
+        hits of one sheet scatter in one mode far more about a smooth curve than they say, they are known less well: aim
+        alone excites it, or mixes it with a neighbour, and they differ by ten standard deviations at one force.
+        Friction of 3 mN explained a few such hits.
         """
         found = np.ones(self.log_frequency.shape)
         for sheet in np.unique(self.sheet):
-            for r in range(len(self.modes)):
-                on = np.flatnonzero((self.sheet == sheet) & self.used[:, r])
-                terms = min(len(np.unique(self.level[on])), _CURVE)
-                if len(on) <= terms:
-                    continue
-                scatter, count = self._scatter(on, r, terms)
+            factors = self._irregular(sheet)
+            if len(factors) <= max(_FEW * np.sum(self.used[self.sheet == sheet].any(axis=0)), 1):
+                for mode, factor in factors.items():
+                    found[(self.sheet == sheet) & self.used[:, mode], mode] = factor
+        return found
+
+    def _irregular(self, sheet: int) -> dict[int, float]:
+        """Modes in which hits of a sheet scatter too far about a smooth curve, and how far, in their own σ."""
+        found = {}
+        for mode in range(len(self.modes)):
+            on = np.flatnonzero((self.sheet == sheet) & self.used[:, mode])
+            terms = min(len(np.unique(self.level[on])), _CURVE)
+            if len(on) > terms:
+                scatter, count = self._scatter(on, mode, terms)
                 if chi2.sf(scatter, count) < _UNLIKELY:
-                    found[on, r] = np.sqrt(scatter / count)
+                    found[mode] = float(np.sqrt(scatter / count))
         return found
 
     def _scatter(self, on: Integers, mode: int, terms: int) -> tuple[float, int]:

@@ -176,7 +176,7 @@ def test_how_far_a_hit_is_aimed_otherwise_is_noise_of_what_is_read() -> None:
     assert told[1] < 0.5 * told[0]
 
 
-def test_hits_that_scatter_about_any_smooth_curve_are_known_less_well() -> None:
+def test_hits_in_which_one_mode_scatters_about_any_smooth_curve_are_known_less_well() -> None:
     (data,) = simulated("teeth").hits
     assert np.all(data.irregularity < 1.5)  # as they part, and are read, smoothly
     mode = int(np.flatnonzero(data.used[:6].all(axis=0))[0])
@@ -188,6 +188,9 @@ def test_hits_that_scatter_about_any_smooth_curve_are_known_less_well() -> None:
     others = np.ones(factor.shape, bool)
     others[:6, mode] = False
     np.testing.assert_array_equal(factor[others], data.irregularity[others])
+    whole = data.damping.copy()  # where all modes do, the structure does
+    whole[:6] *= 1 + 0.2 * np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])[:, None]
+    np.testing.assert_array_equal(replace(data, damping=whole).irregularity[:6], 1.0)
 
 
 def test_a_mode_that_aim_alone_excites_tells_nothing_by_its_phase() -> None:
