@@ -268,9 +268,8 @@ class _Shown:
         return max(gain + 0.5 * float(np.log1p(known**2)), 0.5 * sigmas**2)
 
     def _moved(self, unknown: float) -> tuple[Change, NDArray[np.float64], NDArray[np.float64] | None]:
-        """How far a size moves the predictions to first order, all unknowns with it, and how it changes the residuals.
-
-        None of these where modes have other partners there.
+        """How far a size moves the predictions to first order, all unknowns with it, and how it changes the residuals;
+        None for these where modes have other partners there.
         """
         first = self.gains.change(self.before.jacobian[:, self.at] * unknown)
         x = self.null.copy()
