@@ -40,6 +40,8 @@ _BENT = 1.5
 """Squared distance as calculated over that to first order, above which what is uncertain has to follow step by step."""
 _FOLLOWED, _SETTLED = 6, 0.8
 """Such steps, and the share of the squared distance that the next one leaves where they have settled."""
+_FURTHEST = 10.0
+"""Prior σ beyond which no unknown follows: what that made of the model would be none."""
 _NEARER = (0.4, 0.15, 0.05)
 """Shares of a size that are tried where it is too large to be followed."""
 _SLOPES = (0.3, 5.0)
@@ -298,6 +300,8 @@ class _Shown:
         std = u.prior_std(self.scatters)[free]
         aim = self.gains.marginal.left(change)[1]
         for _ in range(_FOLLOWED):
+            if not np.all(np.abs(aim) < _FURTHEST):
+                return None
             x = begin.copy()
             x[free] += std * aim
             x = u.clipped(x)

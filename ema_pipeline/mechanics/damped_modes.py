@@ -101,7 +101,7 @@ class DampedModes:
             return None
         # What does not oscillate, a damped rigid body say, keeps the frequency and the shape that it has undamped.
         still = np.flatnonzero(np.imag(poles) < _OSCILLATES * np.abs(poles))
-        ratio = np.minimum(own[still] / (2 * values[still]), _LARGEST_RATIO)
+        ratio = np.clip(own[still] / (2 * values[still]), -_LARGEST_RATIO, _LARGEST_RATIO)
         poles[still] = omega[still] * (-ratio + 1j * np.sqrt(1 - ratio**2))
         weights[:, still] = np.eye(len(values))[:, still]
         return cls(poles, shapes @ weights, weights)
@@ -114,7 +114,7 @@ class DampedModes:
         shapes: NDArray[np.float64],
     ) -> DampedModes:
         """Modes that damping leaves as they are."""
-        ratio = np.minimum(damping_ratio, _LARGEST_RATIO)
+        ratio = np.clip(damping_ratio, -_LARGEST_RATIO, _LARGEST_RATIO)
         poles = 2 * np.pi * frequency_hz * (-ratio + 1j * np.sqrt(1 - ratio**2))
         return cls(poles, shapes.astype(complex), np.eye(len(poles), dtype=complex))
 

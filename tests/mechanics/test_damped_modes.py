@@ -53,6 +53,15 @@ def test_a_damped_rigid_body_leaves_the_modes_above_it_as_they_are() -> None:
     np.testing.assert_allclose(found.frequency_hz[1:], np.sort(np.abs(exact)) / (2 * np.pi), rtol=1e-4)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_modes_stay_finite_however_large_damping_is_that_a_search_tries(sign: float) -> None:
+    values, damping = np.array([1.0, 100.0**2, 200.0**2]), sign * np.full((3, 3), 1e5)
+    found = DampedModes.of(values, np.eye(3), damping, np.zeros((3, 3)))
+    assert found is not None
+    assert np.all(np.isfinite(found.poles))
+    assert np.all(np.isfinite(found.shapes))
+
+
 @pytest.mark.parametrize("coefficient", [5.0, 60.0])
 def test_gyroscopic_coupling_parts_pairs_as_the_first_order_system_does(coefficient: float) -> None:
     rig = planetary()
