@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.levels.common_drift import common_drift
 from ema_pipeline.levels.single import HitPoles, excitation
 from ema_pipeline.levels.sizes import (
     MISREAD,
@@ -72,8 +73,12 @@ def hit_trends(found: HitPoles, level: Integers, far: NDArray[np.bool_]) -> HitT
     values, std, mean = relative_sizes(found)
     misread = MISREAD * np.abs(values.real - mean) / np.maximum(mean, 1e-300)
     decay = np.median(found.damping_ratio, axis=0)
+    drift = common_drift(found.frequency_hz, found.frequency_std_hz, found.sheet)
     poles = trends(
-        given(found.frequency_hz, np.hypot(found.frequency_std_hz, misread * decay * found.frequency_hz))
+        given(
+            found.frequency_hz * np.exp(-drift)[:, None],
+            np.hypot(found.frequency_std_hz, misread * decay * found.frequency_hz),
+        )
         + given(found.damping_ratio, np.hypot(found.damping_std, misread * decay))
     )
 
