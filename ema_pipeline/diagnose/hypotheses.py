@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.effects.out_of_tolerance import proportional_elements, tolerance_effect
 from ema_pipeline.mechanics.assembly import Assembly
+from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.terms import assemble_terms
 from ema_pipeline.observations.rig_model import SizeMap
 from ema_pipeline.rigs.types import Rig
@@ -162,9 +163,16 @@ def _names(
 
 
 def _merged(names: Sequence[Name], assemblies: Mapping[str, Assembly]) -> list[Hypothesis]:
-    """Names whose changes of all matrices are proportional to each other, as one hypothesis."""
+    """Names whose changes of all matrices are proportional to each other, or which add the same nonlinear elements, as
+    one hypothesis."""
     groups: list[tuple[NDArray[np.float64] | None, list[Name]]] = []
+    nonlinear: dict[object, list[Name]] = {}
     for name in names:
+        if (added := _added(name, assemblies)) is not None:
+            if added not in nonlinear:
+                groups.append((None, nonlinear.setdefault(added, [])))
+            nonlinear[added].append(name)
+            continue
         change = _change(name, assemblies)
         if change is not None and not np.any(change):
             continue
@@ -178,6 +186,27 @@ def _merged(names: Sequence[Name], assemblies: Mapping[str, Assembly]) -> list[H
         else:
             groups.append((change, [name]))
     return [Hypothesis(tuple(members)) for _, members in groups]
+
+
+def _added(name: Name, assemblies: Mapping[str, Assembly]) -> object | None:
+    """What a nonlinear effect adds to every assembly, whatever it is called there; None for others.
+
+    On a rig of one direction friction at a body is that at its only DOF.
+    """
+    effect, place = name.placed.effect, name.placed.place
+    if effect.linear:
+        return None
+    values, told = {p.name: p.start for p in effect.parameters}, []
+    for configuration, assembly in assemblies.items():
+        if not effect.fits(assembly, place):
+            continue
+        edited, known = effect.edit(assembly, place, values), {e.name for e in assembly.elements}
+        new = [e for e in edited.nonlinear if e.name not in known]
+        if len(edited.elements) != len(assembly.elements) + len(new) or any(e.law is None for e in new):
+            return None  # it replaces elements, or has a memory
+        rows = element_rows(edited, new).round(9)
+        told.append((configuration, tuple(sorted((e.law, tuple(r)) for e, r in zip(new, rows, strict=True)))))
+    return effect.id, tuple(told)
 
 
 def _change(name: Name, assemblies: Mapping[str, Assembly]) -> NDArray[np.float64] | None:
