@@ -402,6 +402,18 @@ def test_the_search_for_a_limit_ends_at_the_size_that_gains_enough(
     )
 
 
+def test_the_same_nonlinear_element_under_two_names_is_one_hypothesis() -> None:
+    """At a body of one direction and at its only DOF; in a plane a body has two."""
+    of_line = list_hypotheses(chain(), shipped_effects(), linear=False)
+    names = [[n.label for n in h.names] for h in of_line if not h.placed.effect.linear]
+    for effect in ("dry_friction", "cubic_spring"):
+        assert [f"{effect}@m2", f"{effect}@m2.z"] in names
+    of_plane = list_hypotheses(planetary(), shipped_effects(), linear=False)
+    friction = [h for h in of_plane if h.placed.effect.id == "dry_friction"]
+    assert friction
+    assert all(len(h.names) == 1 for h in friction)
+
+
 def test_limits_of_several_names_are_the_same_change() -> None:
     observations, base, _ = scored()
     hypotheses = list_hypotheses(chain(), shipped_effects())
