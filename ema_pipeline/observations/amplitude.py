@@ -52,7 +52,7 @@ _LEAST_SHAPE = 0.25
 and a smaller one bends calibrations to them.
 """
 _STEP, _MARCHED_STEP = 1e-3, 1e-2
-"""Steps of the differences by sizes: shares of them, and of logarithmic ones in units of their prior σ."""
+"""Steps of the differences by sizes, in units of their prior σ."""
 _BEYOND = 3.0
 """Growth of what linearisation leaves out per decay rate by which a pole moves: it is of first order in that."""
 _DECADES = 6.0
@@ -309,10 +309,9 @@ class AmplitudeProblem:
         Of what is calculated in full it goes back, to where larger motions lead as well: into the same cell of the
         lattice, in which force, rate and amplitude together change nothing.
         """
-        name = self.unknowns.names[i]
         if i not in self.marched_sizes:
-            plain = name not in self.sizes or self.sizes[name].logarithmic
-            return _STEP * (1.0 if plain else max(abs(float(x[i])), LEAST))
+            return _STEP
+        name = self.unknowns.names[i]
         if not self.in_full(name):
             return _MARCHED_STEP
         return -_MARCHED_STEP * (1.0 if self.sizes[name].logarithmic else max(float(x[i]), LEAST))

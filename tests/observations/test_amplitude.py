@@ -289,7 +289,7 @@ def test_a_scale_of_amplitudes_that_is_hardly_known_does_not_take_a_size_to_noth
     (found,) = rank(observations, base_fit(observations), [hypothesis], 1).ranked
     posterior = found.fit.posterior
     i = posterior.unknowns.index["bearing_cubic@hub.stiffness"]
-    assert abs(posterior.x[i]) < 2.0 * np.sqrt(posterior.covariance[i, i])
+    assert abs(posterior.x[i]) < 1.5 * np.sqrt(posterior.covariance[i, i])
     assert claims._weak(observations, found, found.gain, settings.claim, settings, 0.0) == ""
     assert abs(posterior.x[i]) > 5.0 * claims._std_of_first(found)
 
@@ -308,13 +308,12 @@ def test_derivatives_by_sizes_are_those_of_small_differences() -> None:
     drift = next(i for i, n in enumerate(problem.unknowns.names) if n.startswith("drift"))
     for i in (*problem.nonlinear_sizes, problem.unknowns.index[AMPLITUDE], drift, *left):
         ahead, behind = x.copy(), x.copy()
-        step = 1e-5 * abs(x[i]) if i in problem.nonlinear_sizes else 1e-5
-        ahead[i], behind[i] = x[i] + step, x[i] - step
+        ahead[i], behind[i] = x[i] + 1e-5, x[i] - 1e-5
         values = [
             problem.residuals(p, scatters, matching=here.matching, derivatives=False).values
             for p in (ahead, behind)
         ]
-        slope = (values[0] - values[1]) / (2 * step)
+        slope = (values[0] - values[1]) / 2e-5
         for rows in (slice(count), slice(count, None)):
             close = 0.01 * np.abs(slope[rows]).max() + 1e-9
             np.testing.assert_allclose(here.jacobian[rows, i], slope[rows], atol=close)
