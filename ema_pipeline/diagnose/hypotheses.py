@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.effects.out_of_tolerance import proportional_elements, tolerance_effect
 from ema_pipeline.mechanics.assembly import Assembly
-from ema_pipeline.mechanics.marching import element_rows
+from ema_pipeline.mechanics.laws import Nonlinear
 from ema_pipeline.mechanics.terms import assemble_terms
 from ema_pipeline.observations.rig_model import SizeMap
 from ema_pipeline.rigs.types import Rig
@@ -189,24 +189,22 @@ def _merged(names: Sequence[Name], assemblies: Mapping[str, Assembly]) -> list[H
 
 
 def _added(name: Name, assemblies: Mapping[str, Assembly]) -> object | None:
-    """What a nonlinear effect adds to every assembly, whatever it is called there; None for others.
+    """What a nonlinear effect gives every assembly, whatever it is called there; None for others.
 
     On a rig of one direction friction at a body is that at its only DOF.
     """
-    effect, place = name.placed.effect, name.placed.place
-    if effect.linear:
+    if name.placed.effect.linear:
         return None
-    values, told = {p.name: p.start for p in effect.parameters}, []
-    for configuration, assembly in assemblies.items():
-        if not effect.fits(assembly, place):
-            continue
-        edited, known = effect.edit(assembly, place, values), {e.name for e in assembly.elements}
-        new = [e for e in edited.nonlinear if e.name not in known]
-        if len(edited.elements) != len(assembly.elements) + len(new) or any(e.law is None for e in new):
-            return None  # it replaces elements, or has a memory
-        rows = element_rows(edited, new).round(9)
-        told.append((configuration, tuple(sorted((e.law, tuple(r)) for e, r in zip(new, rows, strict=True)))))
-    return effect.id, tuple(told)
+    told = {c: name.placed.nonlinear_of(assembly) for c, assembly in assemblies.items()}
+    if not any(told.values()) or any(e.law is None for elements in told.values() for e in elements):
+        return None  # it has a memory, or acts otherwise
+    return name.placed.effect.id, tuple(
+        (c, tuple(sorted((e.law, _row(e)) for e in elements))) for c, elements in told.items()
+    )
+
+
+def _row(element: Nonlinear) -> tuple[tuple[str, float], ...]:
+    return tuple(sorted((dof, round(share, 9)) for dof, share in element.row.items()))
 
 
 def _change(name: Name, assemblies: Mapping[str, Assembly]) -> NDArray[np.float64] | None:

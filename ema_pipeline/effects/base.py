@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.mechanics.assembly import Assembly
+from ema_pipeline.mechanics.laws import Nonlinear
 from ema_pipeline.rigs.types import Parameter, Rig
 
 
@@ -185,6 +186,16 @@ class PlacedEffect:
     def label(self) -> str:
         """``id@place``."""
         return f"{self.effect.id}@{self.place}"
+
+    def nonlinear_of(self, assembly: Assembly) -> tuple[Nonlinear, ...]:
+        """Nonlinear elements that an assembly gets with it, at the sizes from which fits begin; none where it has no
+        such place.
+        """
+        if not self.effect.fits(assembly, self.place):
+            return ()
+        known = {e.name for e in assembly.nonlinear}
+        edited = self.effect.edit(assembly, self.place, {p.name: p.start for p in self.effect.parameters})
+        return tuple(e for e in edited.nonlinear if e.name not in known)
 
     def parameter_name(self, name: str) -> str:
         """Name of an effect's parameter among a rig's: ``id@place.name``."""

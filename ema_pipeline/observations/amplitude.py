@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.inference import Posterior, Residuals, Unknowns, joined
-from ema_pipeline.mechanics.laws import Nonlinear
 from ema_pipeline.observations.hit_data import HitData, comparable
 from ema_pipeline.observations.hit_lattice import LEAST, SPACING, MarchedHits
 from ema_pipeline.observations.hit_march import rubs, steps_to_end
@@ -124,14 +123,8 @@ class AmplitudeObservations:
 
     def _friction_of(self, effect: PlacedEffect) -> frozenset[str]:
         """Names of the elements that an effect adds, where all of them that depend on the amplitude are friction."""
-        values = {p.name: p.start for p in effect.effect.parameters}
-        added: list[Nonlinear] = []
-        for name in self.modes.rig.configurations:
-            before = self.modes.rig.assembly(name)
-            if effect.effect.fits(before, effect.place):
-                known = {e.name for e in before.nonlinear}
-                edited = effect.effect.edit(before, effect.place, values)
-                added += [e for e in edited.nonlinear if e.name not in known]
+        rig = self.modes.rig
+        added = [e for name in rig.configurations for e in effect.nonlinear_of(rig.assembly(name))]
         return frozenset(e.name for e in added) if all(rubs(e) for e in added) else frozenset()
 
     def _about(

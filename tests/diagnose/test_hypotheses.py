@@ -412,6 +412,9 @@ def test_the_same_nonlinear_element_under_two_names_is_one_hypothesis() -> None:
     friction = [h for h in of_plane if h.placed.effect.id == "dry_friction"]
     assert friction
     assert all(len(h.names) == 1 for h in friction)
+    # teeth take the place of a spring of their name, each of its own
+    teeth = [h.label for h in of_plane if h.placed.effect.id == "mesh_backlash"]
+    assert teeth == [f"mesh_backlash@{body}-planet{k}" for body in ("sun", "ring") for k in (1, 2)]
 
 
 def test_limits_of_several_names_are_the_same_change() -> None:
