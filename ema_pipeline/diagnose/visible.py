@@ -50,8 +50,6 @@ def _beyond(size: EffectSize, limit: DetectionLimit) -> float:
     """Share of a size, as the data leave it, that lies beyond its limit on either side, or within it."""
     if not limit.seen:
         return 0.0
-    above, below = (
-        norm.sf((limit.size - size.value) / size.std),
-        norm.cdf((-limit.size - size.value) / size.std),
-    )
+    std = max(size.std, 1e-300)  # nothing where a size is held at an end of its range
+    above, below = norm.sf((limit.size - size.value) / std), norm.cdf((-limit.size - size.value) / std)
     return float(1 - above if limit.largest else above + below)

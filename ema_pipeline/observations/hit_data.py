@@ -17,6 +17,7 @@ from scipy.stats import chi2
 
 from ema_pipeline.correlate.measured import from_modal_model
 from ema_pipeline.dof import Dof
+from ema_pipeline.levels.scatter import Scatter
 from ema_pipeline.levels.sizes import means_of_sheets
 from ema_pipeline.levels.types import HitModes, Pulses
 from ema_pipeline.modal.types import ModalModel
@@ -289,16 +290,16 @@ class HitData:
         """Squares of damping and quadrature about smooth curves over the amplitude, in their σ, and how many count."""
         at, damping = (on, mode), self.damping[on, mode]
         log = np.log(np.abs(self.motion[at]))
-        curve, squares = np.vander(log - log.mean(), terms), 0.0
-        for value, own in (
-            (np.log(damping), self.damping_std[at] / damping),
-            (self.relative_size.imag[at], self.quadrature_std[at]),
-        ):
-            std = np.sqrt(own**2 + self.linearised_std[at] ** 2 + (_AIMED * self.otherwise[at]) ** 2)
-            basis, y = np.linalg.qr(curve / std[:, None])[0], value / std
-            left = y - basis @ (basis.T @ y)
-            squares += float(left @ left)
-        return squares, 2 * (len(on) - terms)
+        curve = tuple((log - log.mean()) ** k for k in range(1, terms))
+        beside = self.linearised_std[at] ** 2 + (_AIMED * self.otherwise[at]) ** 2
+        both = [
+            Scatter(value, own**2 + beside, self.sheet[on], curve, shared=False)
+            for value, own in (
+                (np.log(damping), self.damping_std[at] / damping),
+                (self.relative_size.imag[at], self.quadrature_std[at]),
+            )
+        ]
+        return sum(s.noise_only for s in both), sum(s.dof for s in both)
 
     @cached_property
     def _mean_size(self) -> Complex:

@@ -51,6 +51,12 @@ def test_an_effect_counts_with_the_share_of_its_size_beyond_its_limit(
     assert found == pytest.approx(1 - 0.2 * expected, abs=1e-6)
 
 
+def test_a_size_that_is_held_at_an_end_of_its_range_has_no_share_beyond(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert told(monkeypatch, **{"spring@a.stiffness": EffectSize(0.0, 0.0, "")}) == 1.0
+
+
 def test_nothing_is_certain_without_candidates_and_less_so_with_each(monkeypatch: pytest.MonkeyPatch) -> None:
     assert told(monkeypatch) == 1.0
     both = {
