@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import is_
 
 import numpy as np
 
@@ -116,7 +117,7 @@ def select(
         rivals[added.hypothesis.label] = found.judged
         if len(claimed) > 1:
             now = reconsidered(observations, start, claimed, rivals, settings)
-            ahead = ahead if now == claimed else None
+            ahead = ahead if len(now) == len(claimed) and all(map(is_, now, claimed)) else None
             claimed = now
         if ahead is None:
             base = fit_base(observations, claimed[-1].ranked.fit.model, claimed[-1].ranked.fit)

@@ -206,6 +206,18 @@ def test_effects_are_added_one_by_one_until_nothing_more_is_claimed(monkeypatch:
     assert steps.reconsidered == [(["a@x", "b@y"], ["a@x", "b@y"])]  # one alone has nothing beside it
 
 
+def test_a_claim_that_another_one_has_changed_is_built_on_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Claims hold arrays, which have no truth: they are the same where they are the same objects."""
+    a, b = judged("a@x", 20.0), judged("b@y", 9.0)
+    a.samples = np.zeros(2)
+    changed = SimpleNamespace(**{**vars(a), "samples": np.zeros(2)})
+    steps = Steps(monkeypatch, [[a], [b], []])
+    monkeypatch.setattr(selection, "reconsidered", lambda o, start, claimed, rivals, settings: [changed, b])
+    found = steps.select([a.hypothesis, b.hypothesis], SETTINGS, [])
+    assert found.claimed[0] is changed
+    assert found.claimed[1] is b
+
+
 @pytest.mark.parametrize(("anew", "continued", "best"), [(3.0, 2.0, "anew"), (2.0, 3.0, "continued")])
 def test_the_known_model_is_also_fitted_from_data_with_fewer_unknowns(
     monkeypatch: pytest.MonkeyPatch, anew: float, continued: float, best: str
