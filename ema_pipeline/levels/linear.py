@@ -17,6 +17,10 @@ from ema_pipeline.modal.types import ModalModel
 
 Real = NDArray[np.float64]
 
+_LITTLE = 0.1
+"""Share of its damping that a mode loses from the softest to the hardest hits, below which the softest are as linear;
+and they show fewest of the poles that a nonlinearity makes."""
+
 
 def linear_level(levels: Sequence[ForceLevel], modes: Sequence[ModeLevels], frfs: FrfSet) -> int | None:
     """Index of the level that is nearest to the linear structure; None where no level saw all points.
@@ -93,7 +97,7 @@ def _rubs(modes: Sequence[ModeLevels]) -> bool:
 
     Where neither is seen to move, sizes that fall: what friction makes by locking fades, what springs make grows.
     """
-    loss, move, fade = 0.0, 0.0, 0.0
+    loss, most, move, fade = 0.0, 0.0, 0.0, 0.0
     for m in modes:
         if "size" in m.trend and m.size is not None and m.sized_levels is not None:
             softest, hardest = m.sized_levels
@@ -101,10 +105,11 @@ def _rubs(modes: Sequence[ModeLevels]) -> bool:
         if m.level_modes is None or m.level_modes[0] < 0:
             continue  # what the softest hits do not show may be no mode
         if "damping falls" in m.trend:
-            loss -= _change(m.damping_ratio, m.damping_shift)
+            lost = -_change(m.damping_ratio, m.damping_shift)
+            loss, most = loss + lost, max(most, lost / float(np.nanmax(m.damping_ratio)))
         if "hardening" in m.trend or "softening" in m.trend:
             move += abs(_change(m.frequency_hz, m.frequency_shift_hz)) / float(np.nanmax(m.frequency_hz))
-    return loss > move if max(loss, move) > 0 else fade > 0
+    return loss > move and most > _LITTLE if max(loss, move) > 0 else fade > 0
 
 
 def _change(values: Real, shift: Real | None) -> float:

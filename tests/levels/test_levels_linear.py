@@ -70,6 +70,13 @@ def test_a_structure_that_rubs_is_that_of_its_hardest_hits() -> None:
     assert "hardest hits alone" in study.summary
 
 
+def test_a_structure_that_rubs_a_little_is_that_of_its_softest_hits() -> None:
+    """These show fewest of the poles that friction makes."""
+    study, _, _ = studied(replace(CASE, mode=1, damping_shift=-0.07), 2)
+    assert "damping falls" in study.modes[1].trend
+    assert study.linear_level == 0
+
+
 def test_a_linear_structure_is_that_of_all_hits() -> None:
     study, modal, frfs = studied(CASE, 3)
     assert study.linear_level is None
