@@ -205,7 +205,8 @@ def rank(
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     others = [h for h in hypotheses if h.label not in {best.label for best, _ in order[:FINALISTS]}]
     if settled is None:
-        return _finals(observations, base, order, (), processes, (), past_barriers=True)
+        found_first = _finals(observations, base, order, (), processes, (), past_barriers=True)
+        return _with_promising(observations, found_first, hypotheses, models, processes)
     promising = _promising(observations, settled, others, models, further, processes) if near else []
     bases = [settled] if near else []
     narrow = _narrowed(observations, settled)
@@ -358,6 +359,27 @@ def _promising(
         fit = refined(observations, model, unknowns.clipped(x), settled.posterior.scatters)
         found.append((score.hypothesis, fit))
     return found
+
+
+def _with_promising(
+    observations: Observations,
+    ranking: Ranking,
+    hypotheses: Sequence[Hypothesis],
+    models: Mapping[str, Model],
+    processes: int | None,
+) -> Ranking:
+    """The ranking with what promises and gains something beside its learned scatters, and was behind at wide ones."""
+    base, final = ranking.base, [r for r in ranking.ranked if r.final]
+    if not unbent(observations, base):
+        return ranking
+    taken = {r.hypothesis.label for r in final}
+    others = [h for h in hypotheses if h.label not in taken]
+    found = _promising(observations, base, others, models, 0, processes)
+    more = [(h, fit) for h, fit in found if fit.log_evidence > base.log_evidence + _PROMISING]
+    if not more:
+        return ranking
+    order = [(r.hypothesis, r.fit) for r in ranking.ranked]
+    return _finals(observations, base, order, more, processes, (base,), past_barriers=False)
 
 
 def _narrowed(observations: Observations, settled: Fit) -> Fit | None:

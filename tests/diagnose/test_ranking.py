@@ -28,6 +28,7 @@ from ema_pipeline.diagnose.ranking import (
     _pairing,
     _promising,
     _screened,
+    _with_promising,
 )
 from ema_pipeline.inference import Scatter
 from ema_pipeline.observations.fitting import Fit
@@ -293,6 +294,43 @@ def test_what_promises_most_beside_learned_scatters_begins_at_its_size(
     assert len(_promising(NO_DATA, settled, everything, models, 4, 1)) == 4
 
 
+@pytest.mark.parametrize(
+    ("evidence", "bent", "added"), [(4.1, False, True), (3.9, False, False), (4.1, True, False)]
+)
+def test_what_was_behind_at_wide_scatters_and_gains_beside_learned_ones_is_a_finalist(
+    monkeypatch: pytest.MonkeyPatch, evidence: float, bent: bool, added: bool
+) -> None:
+    base, more = fit("base", 3.0), fit("b", evidence)
+    first = Ranking(
+        base,
+        (
+            Ranked(hypothesis("a"), fit("a", 1.0), -2.0, True),
+            Ranked(hypothesis("c"), fit("c", 0.0), -3.0, False),
+        ),
+    )
+    asked: list[Any] = []
+
+    def promising(o: object, settled: Fit, others: Any, models: object, count: int, processes: object) -> Any:
+        asked.append((settled, [h.label for h in others], count))
+        return [(others[0], more)]
+
+    def finals(
+        o: object, now: Fit, order: Any, found: Any, processes: object, known: Any, past_barriers: bool
+    ) -> Any:
+        return now, [h.label for h, _ in order], found, known, past_barriers
+
+    monkeypatch.setattr(ranking, "unbent", lambda o, one: not bent)
+    monkeypatch.setattr(ranking, "_promising", promising)
+    monkeypatch.setattr(ranking, "_finals", finals)
+    b, c = hypothesis("b"), first.ranked[1].hypothesis
+    found: Any = _with_promising(NO_DATA, first, [first.ranked[0].hypothesis, b, c], {}, 1)
+    if not added:
+        assert found is first
+        return
+    assert asked == [(base, ["b", "c"], 0)]
+    assert found == (base, ["a", "c"], [(b, more)], (base,), False)
+
+
 # --- all of it -----------------------------------------------------------------------------------------------------
 
 
@@ -328,6 +366,7 @@ class Stages:
         monkeypatch.setattr(ranking, "_begun_again", self.begun_again)
         monkeypatch.setattr(ranking, "_bettered", self.bettered)
         monkeypatch.setattr(ranking, "_promising", self.promising)
+        monkeypatch.setattr(ranking, "_with_promising", lambda o, found, hypotheses, models, processes: found)
         monkeypatch.setattr(
             ranking,
             "_finals",
