@@ -25,7 +25,7 @@ EFFECT = Effect(
     id="bearing_cubic",
     title="a bearing whose stiffness changes with its deflection",
     parameters=(
-        EffectParameter("stiffness", "N/m³", 0.0, 1e12, 1e13, -1e16, 1e16, "cubic stiffness in x and in y"),
+        EffectParameter("stiffness", "N/m³", 0.0, 1e12, 1e13, -1e18, 1e18, "cubic stiffness in x and in y"),
     ),
     find_places=bodies_with_bearings,
     edit=_edit,

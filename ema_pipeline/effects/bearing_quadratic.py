@@ -25,7 +25,7 @@ EFFECT = Effect(
     id="bearing_quadratic",
     title="a bearing whose stiffness differs between push and pull",
     parameters=(
-        EffectParameter("stiffness", "N/m²", 0.0, 1e8, 1e9, -1e13, 1e13, "quadratic stiffness in x and in y"),
+        EffectParameter("stiffness", "N/m²", 0.0, 1e8, 1e9, -1e15, 1e15, "quadratic stiffness in x and in y"),
     ),
     find_places=bodies_with_bearings,
     edit=_edit,

@@ -23,7 +23,7 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
 EFFECT = Effect(
     id="cubic_spring",
     title="spring whose force grows with the cube of its stretch",
-    parameters=(EffectParameter("stiffness", "N/m³", 0.0, 1e12, 1e13, -1e16, 1e16, "cubic stiffness"),),
+    parameters=(EffectParameter("stiffness", "N/m³", 0.0, 1e12, 1e13, -1e18, 1e18, "cubic stiffness"),),
     find_places=_places,
     edit=_edit,
     signs="frequencies of modes that strain it move with the force; third harmonics",

@@ -16,7 +16,7 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
 EFFECT = Effect(
     id="quadratic_spring",
     title="spring whose stiffness differs between pull and push",
-    parameters=(EffectParameter("stiffness", "N/m²", 0.0, 1e8, 1e9, -1e14, 1e14, "quadratic stiffness"),),
+    parameters=(EffectParameter("stiffness", "N/m²", 0.0, 1e8, 1e9, -1e15, 1e15, "quadratic stiffness"),),
     find_places=bodies_pairs_and_dofs,
     edit=_edit,
     signs="second harmonics, and a mean that moves with the level",

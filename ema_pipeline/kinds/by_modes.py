@@ -40,7 +40,7 @@ def diagnose(run: Run, progress: Progress) -> Results:
 
 def _diagnosed(run: Run, progress: Progress) -> Diagnosis:
     from ema_pipeline.diagnose.diagnosis import diagnose
-    from ema_pipeline.run.models import amplitude_observations, known_model, mode_observations
+    from ema_pipeline.run.models import amplitude_observations, known_model, library_of, mode_observations
     from ema_pipeline.threads import single_blas_thread
 
     model, hits = run.require_model("diagnose"), amplitude_observations(run)
@@ -49,8 +49,8 @@ def _diagnosed(run: Run, progress: Progress) -> Diagnosis:
         return diagnose(
             hits or mode_observations(run),
             model,
-            run.library,
-            known_model(run, with_hits=hits is not None),
+            library_of(run, hits),
+            known_model(run, hits),
             run.settings.diagnose,
             progress,
             notes,
@@ -113,6 +113,7 @@ def _measured(run: Run) -> Ladder:
         amplitude_observations,
         diagnosed_scatters,
         earlier_unknowns,
+        library_of,
         mode_observations,
     )
     from ema_pipeline.threads import single_blas_thread
@@ -124,9 +125,9 @@ def _measured(run: Run) -> Ladder:
             f"{run.store.folder}: '{unseen}' shows in hits at several force levels only, and there are none: "
             "strike with several forces, or do without this effect"
         )
-    models = [Model()]
+    models, library = [Model()], library_of(run, hits)
     for label in run.info.effects:
-        models.append(model_with([label], rig, run.library, models[-1], hits is not None))
+        models.append(model_with([label], rig, library, models[-1], hits is not None))
     observations = (hits or mode_observations(run)).suited(models[-1].effects)
     with single_blas_thread():
         known = earlier_unknowns(run, ())

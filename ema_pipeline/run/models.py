@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 from ema_pipeline.choices import NO_CHOICES, Choices
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.effects.base import Effect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import uncertainty_of_dofs
 from ema_pipeline.observations.fitting import Model, model_with
@@ -77,10 +78,17 @@ def amplitude_observations(run: Run) -> AmplitudeObservations | None:
     return AmplitudeObservations(modes.with_data(marked), hits)
 
 
-def known_model(run: Run, with_hits: bool = False) -> Model:
+def known_model(run: Run, hits: AmplitudeObservations | None = None) -> Model:
     """The model with the effects that the user added, see `model_with`."""
     assert run.model is not None
-    return model_with(run.info.effects, run.model, run.library, with_hits=with_hits)
+    return model_with(run.info.effects, run.model, library_of(run, hits), with_hits=hits is not None)
+
+
+def library_of(run: Run, hits: AmplitudeObservations | None) -> Mapping[str, Effect]:
+    """The run's library, nonlinear springs with the sizes to expect where hits struck with several forces."""
+    from ema_pipeline.observations.sizes_in_hits import sized_by_hits
+
+    return run.library if hits is None else sized_by_hits(run.library, hits.hits)
 
 
 def correlate(
