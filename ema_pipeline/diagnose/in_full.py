@@ -12,15 +12,19 @@ from ema_pipeline.diagnose.selection import Selection
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, refined
 
+_BEHIND = 10.0
+"""Log evidence by which the calculation in full may be behind: scatters were learned without it, and from one force to
+the next it jumps by as much. 0.18 N of friction were 5 behind 0.015 N, where 0.31 N was true."""
+
 
 def in_full(found: Selection) -> Selection:
-    """The selection with the sizes that a calculation in full gives, where it explains the data better."""
+    """The selection with the sizes that a calculation in full gives, where it explains the data about as well."""
     observations, final = fit_in_full(found.observations, found.final)
     return found if final is found.final else replace(found, final=final, observations=observations)
 
 
 def fit_in_full(observations: Observations, fit: Fit) -> tuple[Observations, Fit]:
-    """The data, and the fit to them, calculated in full; both as they are where that explains the data no better."""
+    """The data, and the fit to them, calculated in full; both as they are where that explains the data far worse."""
     model, posterior = fit.model, fit.posterior
     full = observations.in_full(model.effects, posterior)
     if full is observations:
@@ -28,4 +32,4 @@ def fit_in_full(observations: Observations, fit: Fit) -> tuple[Observations, Fit
     starts = model.problem(full).sized_anew(posterior.x)
     tried = [refined(full, model, x, posterior.scatters) for x in starts]
     final = max(tried, key=lambda one: one.log_evidence)
-    return (full, final) if final.log_evidence > fit.log_evidence else (observations, fit)
+    return (full, final) if final.log_evidence > fit.log_evidence - _BEHIND else (observations, fit)

@@ -60,7 +60,7 @@ _ALONG, _ACROSS, _FINE = 19, 3, 41
 for their preload alone."""
 _LOWEST = 3
 """Most of them that fits begin at."""
-_FACTORS = tuple(np.geomspace(0.5, 8.0, 6))
+_FACTORS = tuple(np.geomspace(1.0, 32.0, 6))
 """Of the linearised size of what is calculated in full: sizes from which fits begin."""
 _BESIDE = (-2, -1, 1, 2)
 """Places of the lattice about these that are tried, too: between two sizes of the grid others may fit far better."""

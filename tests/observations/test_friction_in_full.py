@@ -110,7 +110,7 @@ class Chosen:
     observations: Any
 
 
-def test_a_calculation_in_full_that_explains_the_data_no_better_is_left(
+def test_a_calculation_in_full_that_explains_the_data_far_worse_is_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     observations, fit = linearised(0.1)
@@ -118,7 +118,9 @@ def test_a_calculation_in_full_that_explains_the_data_no_better_is_left(
     better = in_full.in_full(found)
     assert better.observations is not observations
     assert better.final.log_evidence > fit.log_evidence
-    monkeypatch.setattr(in_full, "refined", lambda *asked: Worse(fit.log_evidence - 1))
+    monkeypatch.setattr(in_full, "refined", lambda *asked: Worse(fit.log_evidence - 9.9))
+    assert in_full.in_full(found).final.log_evidence == fit.log_evidence - 9.9
+    monkeypatch.setattr(in_full, "refined", lambda *asked: Worse(fit.log_evidence - 10.1))
     assert in_full.in_full(found) is found
 
 
