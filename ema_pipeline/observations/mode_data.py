@@ -23,6 +23,8 @@ _DOUBLE = 0.9
 """Share of a shape's squares that shapes of near modes explain, from which it is no mode of its own."""
 _BETTER_KNOWN = 2.0
 """Factor by which a near mode's frequency is known better, from which one that it may share is no mode of its own."""
+_LEAST_SENSORS = 2
+"""Sensors that tell whether shapes are alike: on one alone all are."""
 _ORTHOGONAL = 0.2
 """Modal assurance criterion up to which two modes are orthogonal, as far as sensors without masses tell."""
 _NEAR = 4.0
@@ -144,12 +146,14 @@ class ModeData:
             near = np.abs(self.log_frequency - self.log_frequency[i]) < _NEAR * np.maximum(width, width[i])
             near[i] = False
             on = (self.seen[i] > 0) & np.all(self.seen[near] > 0, axis=0)
-            if not np.any(near) or np.sum(on) < np.sum(near) + 2:
+            if not np.any(near) or np.sum(on) < _LEAST_SENSORS:
                 continue
+            found[i] = np.any(near & self._within_uncertainty(i))
+            if np.sum(on) < np.sum(near) + 2:
+                continue  # any shape is a mix of so many
             others, own = self.shapes[near][:, on].T, self.shapes[i, on]
             left = own - others @ np.linalg.lstsq(others, own, rcond=None)[0]
-            mix = left @ left < (1 - _DOUBLE) * (own @ own)
-            found[i] = mix or np.any(near & self._within_uncertainty(i))
+            found[i] |= left @ left < (1 - _DOUBLE) * (own @ own)
         return found
 
     def _within_uncertainty(self, i: int) -> NDArray[np.bool_]:

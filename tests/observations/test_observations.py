@@ -114,6 +114,11 @@ def test_a_mode_that_may_share_the_frequency_of_one_known_better_needs_the_shape
     assert prepare(with_one(0.3 * width, 0.4 * width, odd)).double.tolist() == [False] * 5 + [True]
     assert not np.any(prepare(with_one(0.3 * width, 0.2 * width, odd)).double)  # told apart
     assert not np.any(prepare(with_one(0.9 * own, 1.9 * own, odd)).double)  # known as well as the other
+    two = with_one(0.3 * width, 0.4 * width, odd)
+    two = replace(two, dofs=two.dofs[:2], shapes=two.shapes[:, :2], shape_std=two.shape_std[:, :2])  # type: ignore[index]
+    assert prepare(two).double.tolist() == [False] * 5 + [True]  # whose mix it is they cannot tell
+    one = replace(two, dofs=two.dofs[:1], shapes=two.shapes[:, :1], shape_std=two.shape_std[:, :1])  # type: ignore[index]
+    assert not np.any(prepare(one).double)  # nor one sensor what is alike
     orthogonal = with_one(0.3 * width, 0.4 * width, other)  # as modes at one frequency are
     assert not np.any(prepare(orthogonal).double)
     problem = observed(chain(), {"all": with_one(0.3 * width, 0.4 * width, odd)}).problem((), {})
