@@ -205,8 +205,8 @@ def rank(
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     others = [h for h in hypotheses if h.label not in {best.label for best, _ in order[:FINALISTS]}]
     if settled is None:
-        found_first = _finals(observations, base, order, (), processes, (), past_barriers=True)
-        return _with_promising(observations, found_first, hypotheses, models, processes)
+        ranking = _finals(observations, base, order, (), processes, (), past_barriers=True)
+        return _with_promising(observations, base, ranking, hypotheses, models, processes)
     promising = _promising(observations, settled, others, models, further, processes) if near else []
     bases = [settled] if near else []
     narrow = _narrowed(observations, settled)
@@ -363,12 +363,16 @@ def _promising(
 
 def _with_promising(
     observations: Observations,
+    wide: Fit,
     ranking: Ranking,
     hypotheses: Sequence[Hypothesis],
     models: Mapping[str, Model],
     processes: int | None,
 ) -> Ranking:
-    """The ranking with what promises and gains something beside its learned scatters, and was behind at wide ones."""
+    """The ranking with what promises and gains something beside its learned scatters, and was behind at wide ones.
+
+    `wide` is the base model at those, beside which all but the finalists are.
+    """
     base, final = ranking.base, [r for r in ranking.ranked if r.final]
     if not unbent(observations, base):
         return ranking
@@ -379,7 +383,7 @@ def _with_promising(
     if not more:
         return ranking
     order = [(r.hypothesis, r.fit) for r in ranking.ranked]
-    return _finals(observations, base, order, more, processes, (base,), past_barriers=False)
+    return _finals(observations, wide, order, more, processes, (base,), past_barriers=False)
 
 
 def _narrowed(observations: Observations, settled: Fit) -> Fit | None:

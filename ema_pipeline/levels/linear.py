@@ -93,7 +93,8 @@ def linear_words(study: LevelStudy) -> str:
 
 
 def _rubs(modes: Sequence[ModeLevels]) -> bool:
-    """True where damping falls with the force by more than frequencies move: friction, not a spring.
+    """True where damping falls with the force by more than frequencies move, and by more than a little: friction, not a
+    spring.
 
     Where neither is seen to move, sizes that fall: what friction makes by locking fades, what springs make grows.
     """

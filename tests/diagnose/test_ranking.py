@@ -300,7 +300,7 @@ def test_what_promises_most_beside_learned_scatters_begins_at_its_size(
 def test_what_was_behind_at_wide_scatters_and_gains_beside_learned_ones_is_a_finalist(
     monkeypatch: pytest.MonkeyPatch, evidence: float, bent: bool, added: bool
 ) -> None:
-    base, more = fit("base", 3.0), fit("b", evidence)
+    wide, base, more = fit("wide", 9.0), fit("base", 3.0), fit("b", evidence)
     first = Ranking(
         base,
         (
@@ -323,12 +323,12 @@ def test_what_was_behind_at_wide_scatters_and_gains_beside_learned_ones_is_a_fin
     monkeypatch.setattr(ranking, "_promising", promising)
     monkeypatch.setattr(ranking, "_finals", finals)
     b, c = hypothesis("b"), first.ranked[1].hypothesis
-    found: Any = _with_promising(NO_DATA, first, [first.ranked[0].hypothesis, b, c], {}, 1)
+    found: Any = _with_promising(NO_DATA, wide, first, [first.ranked[0].hypothesis, b, c], {}, 1)
     if not added:
         assert found is first
         return
     assert asked == [(base, ["b", "c"], 0)]
-    assert found == (base, ["a", "c"], [(b, more)], (base,), False)
+    assert found == (wide, ["a", "c"], [(b, more)], (base,), False)
 
 
 # --- all of it -----------------------------------------------------------------------------------------------------
@@ -366,7 +366,9 @@ class Stages:
         monkeypatch.setattr(ranking, "_begun_again", self.begun_again)
         monkeypatch.setattr(ranking, "_bettered", self.bettered)
         monkeypatch.setattr(ranking, "_promising", self.promising)
-        monkeypatch.setattr(ranking, "_with_promising", lambda o, found, hypotheses, models, processes: found)
+        monkeypatch.setattr(
+            ranking, "_with_promising", lambda o, base, found, hypotheses, models, processes: found
+        )
         monkeypatch.setattr(
             ranking,
             "_finals",
