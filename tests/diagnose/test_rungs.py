@@ -38,6 +38,25 @@ def test_gains_count_from_the_first_rung() -> None:
     assert [r.log_evidence for r in with_gains([rung(-7.0), rung(-4.0), rung(3.0)])] == [0.0, 3.0, 10.0]
 
 
+@pytest.mark.parametrize(("linearised", "std"), [(True, 2.5), (False, 2.0)])
+def test_a_size_that_single_hits_tell_is_no_better_known_than_it_is_calculated(
+    linearised: bool, std: float
+) -> None:
+    """Of -5 N a calculation that is off by 30 % has 1.5 N wrong."""
+    effects = [
+        SimpleNamespace(label="cubic@x", effect=SimpleNamespace(linear=False)),
+        SimpleNamespace(label="spring@x", effect=SimpleNamespace(linear=True)),
+    ]
+    sizes = {name: EffectSize(-5.0, 2.0, "N") for name in ("cubic@x.s", "spring@x.s", "mass")}
+    observations: Any = SimpleNamespace(linearised=linearised)
+    model: Any = SimpleNamespace(effects=effects)
+    found = rungs._stated(observations, model, sizes)
+    assert {n: s.std for n, s in found.items()} == pytest.approx(
+        {"cubic@x.s": std, "spring@x.s": 2.0, "mass": 2.0}
+    )
+    assert found["cubic@x.s"].value == -5.0
+
+
 def test_sizes_have_the_spread_of_all_that_makes_them_up() -> None:
     """A rig's parameter is a logarithm, with its only part; a size has a slope of its own."""
     unknowns = Unknowns.plain(("stiffness", "part", "a@x.s", "mass"), 1.0)
