@@ -110,7 +110,9 @@ def _rubs(modes: Sequence[ModeLevels]) -> bool:
             loss, most = loss + lost, max(most, lost / float(np.nanmax(m.damping_ratio)))
         if "hardening" in m.trend or "softening" in m.trend:
             move += abs(_change(m.frequency_hz, m.frequency_shift_hz)) / float(np.nanmax(m.frequency_hz))
-    return loss > move and most > _LITTLE if max(loss, move) > 0 else fade > 0
+    if max(loss, move) > 0:
+        return loss > move and most > _LITTLE
+    return fade > 0
 
 
 def _change(values: Real, shift: Real | None) -> float:

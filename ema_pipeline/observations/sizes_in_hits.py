@@ -10,12 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import normal_modes
+from ema_pipeline.mechanics.system import sensor_row
 from ema_pipeline.observations.hit_data import HitData
 from ema_pipeline.observations.typical import SIZE_SHARE, Typical
 
@@ -40,12 +41,12 @@ class _Blows:
     """Largest impulse at every DOF that was struck, and the band in which modes were measured."""
 
     def __init__(self, hits: Sequence[HitData]) -> None:
-        self.impulse: dict[str, float] = {}
+        self.impulse: dict[Dof, float] = {}
         for h in hits:
             assert h.pulses is not None
             momentum = np.abs(h.pulses.force_n.sum(axis=1)) / h.pulses.sample_rate_hz
             for dof, one in zip(h.pulses.struck, momentum.tolist(), strict=True):
-                self.impulse[dof.point] = max(one, self.impulse.get(dof.point, 0.0))
+                self.impulse[dof] = max(one, self.impulse.get(dof, 0.0))
         self.low = min(float(h.omega.min()) for h in hits) / _BEYOND
         self.high = max(float(h.omega.max()) for h in hits) * _BEYOND
 
@@ -67,15 +68,16 @@ class _Blows:
         added = placed.nonlinear_of(assembly)
         if not added:
             return None
-        frequency_hz, shapes = normal_modes(assembly.system())
+        system = assembly.system()
+        frequency_hz, shapes = normal_modes(system)
         omega = 2 * np.pi * frequency_hz
         inside = (omega > self.low) & (omega < self.high)
         omega, shapes = omega[inside], shapes[:, inside]
         struck = np.array(
             [
-                impulse * _along(assembly, point) @ shapes
-                for point, impulse in self.impulse.items()
-                if assembly.has_dof(point)
+                impulse * sensor_row(system, dof) @ shapes
+                for dof, impulse in self.impulse.items()
+                if assembly.has_dof(dof.point)
             ]
         )
         stretch = np.abs(element_rows(assembly, added) @ shapes)
@@ -90,8 +92,3 @@ class _Blows:
         x = float(moved[element, mode])
         modal_stiffness = float((omega[mode] / stretch[element, mode]) ** 2)
         return Typical(x, float(omega[mode]), modal_stiffness * x)
-
-
-def _along(assembly: Assembly, point: str) -> NDArray[np.float64]:
-    row = assembly.row(point)
-    return np.array([row.get(dof, 0.0) for dof in assembly.dofs])
