@@ -85,7 +85,8 @@ def fit_modes(
     scatters : dict of str to float, optional
         What parts, channels, damping and the model scatter; learned where left out.
     start : dict of str to float, optional
-        Unknowns of an earlier fit of this model to these data, which is then only refined.
+        Unknowns of an earlier fit of this model to these data, which is then only refined; begun anew where they are
+        not admissible.
 
     Raises
     ------
@@ -103,7 +104,9 @@ def fit_modes(
             f"rig '{observations.rig.name}' has no parameter with a tolerance or marked free: nothing to fit; "
             "add 'tolerance' or 'free = true' in the rig file"
         )
-    fit = fit_base(observations, model) if start is None else begun_at(observations, model, start)
+    fit = None if start is None else begun_at(observations, model, start)
+    if fit is None or not np.isfinite(fit.log_evidence):
+        fit = fit_base(observations, model)
     done = learned(observations, fit) if scatters is None else at_scatters(observations, fit, scatters)
     return FittedModes(observations, problem, done)
 

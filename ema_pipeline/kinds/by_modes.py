@@ -80,7 +80,7 @@ def _compared_with(run: Run, rig: Rig, labels: Sequence[str], unknowns: Mapping[
     from ema_pipeline.run.models import correlate, mode_observations
 
     mended = rig_with_effects(rig, labels, run.library)
-    model = model_with(labels, mended, run.library)
+    model = model_with(labels, rig, run.library)
     fitted = fit_modes(mode_observations(run).suited(model.effects), model, start=unknowns or None)
     systems = {f"system after {name}": fitted.system(name) for name in run.info.configurations}
     systems |= {f"like parts {name}": fitted.system_of_like_parts(name) for name in run.info.configurations}
@@ -108,7 +108,7 @@ def _measured(run: Run) -> Ladder:
     from ema_pipeline.diagnose.in_full import fit_in_full
     from ema_pipeline.diagnose.rungs import fits_of, ladder_of
     from ema_pipeline.fit.parameters import begun_at
-    from ema_pipeline.observations.fitting import Model, model_with
+    from ema_pipeline.observations.fitting import model_with
     from ema_pipeline.run.models import (
         amplitude_observations,
         diagnosed_scatters,
@@ -118,16 +118,19 @@ def _measured(run: Run) -> Ladder:
     )
     from ema_pipeline.threads import single_blas_thread
 
-    rig, hits = run.require_model("ladder"), amplitude_observations(run)
+    run.require_model("ladder")
+    assert run.rig is not None
+    hits = amplitude_observations(run)
     unseen = next((x for x in run.info.effects if depends_on_level(x, run.library)), "")
     if unseen and hits is None:
         raise EmaError(
             f"{run.store.folder}: '{unseen}' shows in hits at several force levels only, and there are none: "
             "strike with several forces, or do without this effect"
         )
-    models, library = [Model()], library_of(run, hits)
-    for label in run.info.effects:
-        models.append(model_with([label], rig, library, models[-1], hits is not None))
+    effects, library = run.info.effects, library_of(run, hits)
+    models = [
+        model_with(effects[:k], run.rig, library, with_hits=hits is not None) for k in range(len(effects) + 1)
+    ]
     observations = (hits or mode_observations(run)).suited(models[-1].effects)
     with single_blas_thread():
         known = earlier_unknowns(run, ())

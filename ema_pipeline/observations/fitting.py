@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.effects.library import depends_on_level, parse_effect
+from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.inference import (
     Bounded,
     Posterior,
@@ -81,31 +82,36 @@ def model_with(
     labels: Sequence[str],
     rig: Rig,
     library: Mapping[str, Effect],
-    model: Model | None = None,
     with_hits: bool = False,
 ) -> Model:
-    """A model with effects ``id@place`` added.
+    """The base model with effects ``id@place``.
+
+    Their sizes have the range and the prior 1 σ that the rig without them gives, as in the diagnosis that found them;
+    where a place is on what an earlier effect adds, those of the rig with that one.
 
     Parameters
     ----------
     labels : sequence of str
     rig : Rig
-        With the effects that `model` has.
+        Without the effects.
     library : mapping of str to Effect
-    model : Model, optional
-        What the effects are added to; the base model where left out.
     with_hits : bool
         False leaves out effects that depend on the force level: modes of one level do not show them.
     """
-    model = model or Model()
+    model = Model()
     for label in labels:
         if not with_hits and depends_on_level(label, library):
             continue
-        placed = parse_effect(label, rig, library=library)
-        assemblies = (rig.assembly(c) for c in rig.configurations)
+        current = rig_with_effects(rig, model.labels, library)
+        placed = parse_effect(label, current, library=library)
+        assemblies = (r.assembly(c) for r in (rig, current) for c in r.configurations)
         host = next((a for a in assemblies if placed.effect.fits(a, placed.place)), None)
-        scales = {} if host is None else placed.effect.scales(host, placed.place)
-        model = model.plus(placed, {placed.parameter_name(k): v for k, v in scales.items()})
+        if host is None:
+            model = model.plus(placed, {})
+            continue
+        scales = placed.effect.scales(host, placed.place)
+        narrowed = PlacedEffect(placed.effect.possible(host, placed.place), placed.place)
+        model = model.plus(narrowed, {placed.parameter_name(k): v for k, v in scales.items()})
     return model
 
 

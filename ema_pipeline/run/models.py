@@ -80,8 +80,8 @@ def amplitude_observations(run: Run) -> AmplitudeObservations | None:
 
 def known_model(run: Run, hits: AmplitudeObservations | None = None) -> Model:
     """The model with the effects that the user added, see `model_with`."""
-    assert run.model is not None
-    return model_with(run.info.effects, run.model, library_of(run, hits), with_hits=hits is not None)
+    assert run.rig is not None
+    return model_with(run.info.effects, run.rig, library_of(run, hits), with_hits=hits is not None)
 
 
 def library_of(run: Run, hits: AmplitudeObservations | None) -> Mapping[str, Effect]:

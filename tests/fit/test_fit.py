@@ -11,7 +11,7 @@ import pytest
 
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
 from ema_pipeline.dof import Dof
-from ema_pipeline.effects.library import parse_effect
+from ema_pipeline.effects.library import effect_library, parse_effect
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.error_function import error_sweep, frequency_error, stepwise
@@ -20,7 +20,7 @@ from ema_pipeline.fit.settings import FitSettings
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.mechanics.modes import normal_modes
 from ema_pipeline.mechanics.system import sensor_rows
-from ema_pipeline.observations.fitting import Model
+from ema_pipeline.observations.fitting import Model, model_with
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs import load_rig, model_modes
@@ -272,3 +272,14 @@ def test_a_fit_that_was_stored_is_restored_to_the_digit() -> None:
     back = restored(observations, Model(), fit_result(fitted, RIG, measured, FAST))
     assert back.posterior.error == pytest.approx(fitted.posterior.error, rel=1e-12)
     np.testing.assert_array_equal(back.posterior.x, fitted.posterior.x)
+
+
+def test_a_start_that_no_rig_can_have_is_not_refined_but_begun_anew() -> None:
+    rng = np.random.default_rng(13)
+    observations = ModeObservations(RIG, [prepare(simulate(RIG, "no_ring", draw(rng, (7, 7)), rng))])
+    model = model_with(["mass@sun"], RIG, effect_library())
+    anew = fit_modes(observations, model)
+    (size,) = (n for n in anew.posterior.unknowns.names if n.startswith("mass@sun"))
+    negative = fit_modes(observations, model, start=anew.fit.unknowns | {size: -1e3})
+    assert np.isfinite(anew.fit.log_evidence)
+    assert negative.fit.log_evidence == pytest.approx(anew.fit.log_evidence, abs=1e-6)

@@ -37,7 +37,7 @@ def linearised(force: float) -> tuple[AmplitudeObservations, Fit]:
     base = fit_base(observations, Model())
     observations = observations.about((), base.posterior)
     base = learned(observations, base)
-    model = model_with([LABEL], RIG, shipped_effects(), base.model, with_hits=True)
+    model = model_with([LABEL], RIG, shipped_effects(), with_hits=True)
     problem = model.problem(observations)
     start = transferred(base.posterior, problem.unknowns, problem.start())
     return observations, learned(

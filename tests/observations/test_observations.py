@@ -12,6 +12,7 @@ import scipy.linalg
 from imperfect_modes import EXACT, GOOD, Hidden, chain, chain_modes, planetary_modes
 
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
+from ema_pipeline.diagnose.hypotheses import list_hypotheses
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import effect_library, parse_effect
 from ema_pipeline.errors import EmaError
@@ -387,13 +388,27 @@ def test_a_parameter_is_made_up_of_its_family_and_its_only_part() -> None:
     assert fitting.made_up_of(problem, "m") == {"m": 1.0}  # type: ignore[arg-type]
 
 
+def test_sizes_of_an_added_effect_are_those_of_the_diagnosis_that_found_it() -> None:
+    """Another scale would read the same unknown as another size, and no mass may take more than there is."""
+    rig, library = planetary(), effect_library()
+    labels = ("mass@sun", "spring@carrier", "damper@carrier-sun")
+    model = model_with(labels, rig, library)
+    listed = {n.label: n for h in list_hypotheses(rig, library) for n in h.names}
+    for placed in model.effects:
+        name = listed[placed.label]
+        assert placed.effect.parameters == name.placed.effect.parameters
+        for short, scale in name.scales.items():
+            assert model.scales[placed.parameter_name(short)] == scale
+    (sun, *_) = model.effects
+    assert sun.effect.parameters[0].minimum == pytest.approx(-rig.parameters["sun_mass"].value)
+
+
 def test_effects_that_depend_on_the_level_are_added_where_hits_show_them() -> None:
     rig, library = planetary(), effect_library()
     labels = ["mass@sun", "bearing_cubic@sun"]
     assert model_with(labels, rig, library).labels == ("mass@sun",)
     both = model_with(labels, rig, library, with_hits=True)
     assert both.labels == tuple(labels)
-    assert model_with(["mass@carrier"], rig, library, both).labels == (*labels, "mass@carrier")
     (placed, *_) = both.effects
     scales = placed.effect.scales(rig.assembly("no_ring"), "sun")
     assert {n.rpartition(".")[2]: v for n, v in both.scales.items() if n.startswith("mass@sun")} == scales
