@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from ema_pipeline.diagnose.claims import Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.parallel import spread
-from ema_pipeline.diagnose.ranking import Ranked, Ranking
+from ema_pipeline.diagnose.ranked import Ranked, Ranking
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations

@@ -9,7 +9,7 @@ import numpy as np
 from ema_pipeline.diagnose.heldout import NOTHING_HELD_OUT, HeldOut, held_out
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import Named, named, sizes_of
-from ema_pipeline.diagnose.ranking import Ranked, Ranking
+from ema_pipeline.diagnose.ranked import Ranked, Ranking
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE

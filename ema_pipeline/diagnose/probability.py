@@ -9,7 +9,7 @@ from scipy.special import expit
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import named
-from ema_pipeline.diagnose.ranking import Ranking
+from ema_pipeline.diagnose.ranked import Ranking
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 
 NOTHING = "nothing"

@@ -8,12 +8,20 @@ else.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
+from ema_pipeline.diagnose.finals import (
+    FINALISTS,
+    PROMISING,
+    finals_of,
+    known_from,
+    narrowed,
+    promising_fits,
+    spread_fits,
+    with_promising,
+)
 from ema_pipeline.diagnose.first_fits import (
     Tried,
     annealed_fit,
@@ -24,28 +32,21 @@ from ema_pipeline.diagnose.first_fits import (
 )
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.parallel import spread
+from ema_pipeline.diagnose.ranked import BEATEN, Ranking, unbeaten
 from ema_pipeline.diagnose.score import UNSEEN, Score, scores
 from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import (
     Fit,
-    Model,
     freed,
     learned,
     refined,
-    transferred,
     unbent,
 )
-from ema_pipeline.observations.mode_rows import SHAPE
 
-T = TypeVar("T")
 Progress = Callable[[float, str], None]
 
-FINALISTS = 5
-"""Hypotheses for which the scatters are learned."""
-_BEATEN = 200.0
-"""Log evidence behind the best hypothesis from which another one cannot catch up: it is not begun again."""
 _SCREENED = 14
 """Hypotheses of one kind, generic or the rig's own, best first by their score, that are fitted in full."""
 _SCREENED_LAWS = 24
@@ -66,62 +67,10 @@ _ALL = 0.5
 _UNPROMISING = 6
 """The same where the score promises nothing and the base model is near, so that a fit gains what its score says to some
 tenths: more than `FINALISTS`, so that the reader sees what comes next."""
-_PROMISING = 1.0
-"""Log evidence that is something: a third of what a claim needs."""
-_FURTHER = 3
-"""Finalists beside these that promise something at learned scatters."""
-_TAKEN_UP = 2.0
-"""Learned scatter of shapes over its least, from which it may hold what is missing."""
 CONTENDERS = 12
 """Hypotheses that are worth a second refinement."""
-_BETTER = 0.05
-"""Log evidence by which a start must lead a fit to be followed."""
 _EXPLAINED = 1.3
 """Error up to which the base model is near enough for hypotheses to begin at its fit."""
-
-
-@dataclass(frozen=True)
-class Ranked:
-    """One hypothesis on top of the model.
-
-    Attributes
-    ----------
-    hypothesis : Hypothesis
-    fit : Fit
-    gain : float
-        Log evidence against the model without it, both with learned scatters where it is a finalist.
-    final : bool
-        True where its scatters were learned.
-    """
-
-    hypothesis: Hypothesis
-    fit: Fit
-    gain: float
-    final: bool
-
-
-@dataclass(frozen=True)
-class Ranking:
-    """The current model, and all hypotheses by evidence.
-
-    Attributes
-    ----------
-    base : Fit
-        With learned scatters.
-    ranked : tuple of Ranked
-        Best first.
-    linearised : bool
-        True where equivalent linearisation alone tells what effects do that depend on the amplitude.
-    """
-
-    base: Fit
-    ranked: tuple[Ranked, ...]
-    linearised: bool = False
-
-    @property
-    def unpaired(self) -> float:
-        """Least that modes without a partner cost, over all hypotheses."""
-        return min((r.fit.posterior.residuals.penalty for r in self.ranked), default=0.0)
 
 
 def rank(
@@ -182,7 +131,7 @@ def rank(
     known: dict[str, Posterior] = {}
     if not near:
         # A few steps do not lead a mode of the model to a measured one that has no partner yet.
-        leads = {label for label, one in tried.items() if one.gain > _PROMISING}
+        leads = {label for label, one in tried.items() if one.gain > PROMISING}
         behind = short(chosen, processes)[_ANNEALED:]
         known |= {h.label: posterior for h, posterior in behind if h.label not in leads}
     decided = False
@@ -205,15 +154,15 @@ def rank(
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
     others = [h for h in hypotheses if h.label not in {best.label for best, _ in order[:FINALISTS]}]
     if settled is None:
-        ranking = _finals(observations, base, order, (), processes, (), past_barriers=True)
-        return _with_promising(observations, base, ranking, hypotheses, models, processes)
-    promising = _promising(observations, settled, others, models, further, processes) if near else []
+        ranking = finals_of(observations, base, order, (), processes, (), past_barriers=True)
+        return with_promising(observations, base, ranking, hypotheses, models, processes)
+    promising = promising_fits(observations, settled, others, models, further, processes) if near else []
     bases = [settled] if near else []
-    narrow = _narrowed(observations, settled)
+    narrow = narrowed(observations, settled)
     if narrow is not None:
-        promising += _promising(observations, narrow, hypotheses, models, 0, processes)
+        promising += promising_fits(observations, narrow, hypotheses, models, 0, processes)
         bases.append(learned(observations, narrow, past_barriers=False))
-    return _finals(observations, base, order, promising, processes, bases, past_barriers=not near)
+    return finals_of(observations, base, order, promising, processes, bases, past_barriers=not near)
 
 
 def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], near: bool) -> list[Hypothesis]:
@@ -232,7 +181,7 @@ def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], ne
         order = sorted((h for h in scored if h.generic is generic), key=lambda h: -promise[h.label].gain)
         out |= {h.label for h in order[_SCREENED:]}
         if near:
-            out |= {h.label for h in order[_UNPROMISING:] if promise[h.label].gain < _PROMISING}
+            out |= {h.label for h in order[_UNPROMISING:] if promise[h.label].gain < PROMISING}
     return [h for h in hypotheses if h.label not in out]
 
 
@@ -256,7 +205,7 @@ def _batches(
 
 def _decides(found: Posterior, base: Fit) -> bool:
     """True where one hypothesis explains all that the base model does not: no other one can lead it."""
-    return found.error < _ALL and found.log_evidence > base.log_evidence + _BEATEN
+    return found.error < _ALL and found.log_evidence > base.log_evidence + BEATEN
 
 
 Found = dict[str, tuple[Hypothesis, Fit]]
@@ -272,7 +221,7 @@ def _begun_again(
 ) -> tuple[Fit, Found]:
     """The base model and some hypotheses, begun at what the best of all knows of everything else."""
     top = max((f for _, f in found.values()), key=lambda f: f.log_evidence, default=base)
-    again = refined(observations, base.model, _on(observations, base.model, top, base), steps=20)
+    again = refined(observations, base.model, known_from(observations, base.model, top, base), steps=20)
     if again.log_evidence > base.log_evidence:
         base = again
     job = partial(_better, observations, (base, top), steps)
@@ -285,17 +234,12 @@ def _contenders(found: Found, most: int = CONTENDERS) -> list[str]:
     return unbeaten(best, lambda label: found[label][1].log_evidence)
 
 
-def unbeaten(best_first: Sequence[T], evidence: Callable[[T], float]) -> list[T]:
-    """Those that can catch up with the first one."""
-    return [one for one in best_first if evidence(one) >= evidence(best_first[0]) - _BEATEN]
-
-
 def _bettered(
     found: Found, contenders: Collection[str], job: Callable[[Fit], Posterior], processes: int | None
 ) -> Found:
     """The hypotheses, some of them with what `job` makes of their fits."""
     items = [found[label] for label in contenders]
-    better = _spread_fits(job, [fit for _, fit in items], processes)
+    better = spread_fits(job, [fit for _, fit in items], processes)
     return found | {h.label: (h, fit) for (h, _), fit in zip(items, better, strict=True)}
 
 
@@ -304,164 +248,13 @@ def _free(observations: Observations, fit: Fit) -> Posterior:
     return freed(observations, fit).posterior
 
 
-def _on(observations: Observations, model: Model, source: Fit, sizes: Fit) -> np.ndarray:
-    """Everything that `source` knows, and the effects' sizes of `sizes`."""
-    problem = model.problem(observations)
-    x = transferred(sizes.posterior, problem.unknowns)
-    moved = transferred(source.posterior, problem.unknowns, x)
-    for name in problem.sizes:
-        i = problem.unknowns.index[name]
-        if name in sizes.posterior.unknowns.index:
-            moved[i] = x[i]
-    return moved
-
-
 def _better(observations: Observations, sources: Sequence[Fit], steps: int, fit: Fit) -> Posterior:
     best = fit
     for source in sources:
-        x = _on(observations, fit.model, source, fit)
+        x = known_from(observations, fit.model, source, fit)
         if np.allclose(x, best.posterior.x):
             continue
         again = refined(observations, fit.model, x, steps=steps)
         if again.log_evidence > best.log_evidence:
             best = again
-    return best.posterior
-
-
-def _spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes: int | None) -> list[Fit]:
-    """Better fits of the same models; only posteriors go between processes, a user's effects cannot."""
-    return [Fit(fit.model, p) for fit, p in zip(fits, spread(job, fits, processes), strict=True)]
-
-
-def _promising(
-    observations: Observations,
-    settled: Fit,
-    hypotheses: Sequence[Hypothesis],
-    models: Mapping[str, Model],
-    count: int,
-    processes: int | None,
-) -> list[tuple[Hypothesis, Fit]]:
-    """What promises most on top of the base model with learned scatters, begun at the size of its score.
-
-    At wide scatters an effect that moves frequencies by a permille gains nothing.
-    """
-    found = []
-    best = sorted(scores(observations, settled, hypotheses, models, processes), key=lambda s: -s.gain)
-    chosen = best[:count]  # what the scatters took up promises little, and gains it back
-    chosen += [score for score in best[count:_FURTHER] if score.gain > _PROMISING]
-    for score in chosen:
-        model = models[score.hypothesis.label]
-        unknowns = model.problem(observations).unknowns
-        x = transferred(settled.posterior, unknowns)
-        placed = score.hypothesis.placed
-        for parameter, size in zip(placed.effect.parameters, score.size, strict=True):
-            x[unknowns.index[placed.parameter_name(parameter.name)]] = size
-        fit = refined(observations, model, unknowns.clipped(x), settled.posterior.scatters)
-        found.append((score.hypothesis, fit))
-    return found
-
-
-def _with_promising(
-    observations: Observations,
-    wide: Fit,
-    ranking: Ranking,
-    hypotheses: Sequence[Hypothesis],
-    models: Mapping[str, Model],
-    processes: int | None,
-) -> Ranking:
-    """The ranking with what promises and gains something beside its learned scatters, and was behind at wide ones.
-
-    `wide` is the base model at those, beside which all but the finalists are.
-    """
-    base, final = ranking.base, [r for r in ranking.ranked if r.final]
-    if not unbent(observations, base):
-        return ranking
-    taken = {r.hypothesis.label for r in final}
-    others = [h for h in hypotheses if h.label not in taken]
-    found = _promising(observations, base, others, models, 0, processes)
-    more = [(h, fit) for h, fit in found if fit.log_evidence > base.log_evidence + _PROMISING]
-    if not more:
-        return ranking
-    order = [(r.hypothesis, r.fit) for r in ranking.ranked]
-    return _finals(observations, wide, order, more, processes, (base,), past_barriers=False)
-
-
-def _narrowed(observations: Observations, settled: Fit) -> Fit | None:
-    """The base model at a scatter of shapes half the way to its least; None where it is near it.
-
-    What is missing may have been learned as scatter of shapes: a spring of 171 kN/m between the first and the fifth of
-    six masses gained nothing beside shapes that scatter by 0.006, and 26 once that was learned anew with it.
-    """
-    shapes, scatters = observations.scatters.get(SHAPE), settled.posterior.scatters
-    if shapes is None or scatters[SHAPE] <= _TAKEN_UP * shapes.least * shapes.default:
-        return None
-    narrow = float(np.sqrt(shapes.least * shapes.default * scatters[SHAPE]))
-    return refined(observations, settled.model, settled.posterior.x, {**scatters, SHAPE: narrow})
-
-
-def _finals(
-    observations: Observations,
-    base: Fit,
-    order: Sequence[tuple[Hypothesis, Fit]],
-    promising: Sequence[tuple[Hypothesis, Fit]],
-    processes: int | None,
-    known: Sequence[Fit],
-    past_barriers: bool,
-) -> Ranking:
-    """Scatters learned for the base model and the best hypotheses, each from what the others know.
-
-    `known` are fits of the base model whose scatters are learned already. Fits are led past barriers, but for those
-    that begin beside a base model that was.
-    """
-    best, rest = order[:FINALISTS], order[FINALISTS:]
-    near = unbeaten(best, lambda pair: pair[1].log_evidence)
-    far = best[len(near) :]
-    finalists = [*near, *promising]
-    job = partial(_learned, observations, past_barriers)
-    fits = [fit for _, fit in finalists]
-    if past_barriers:
-        base_now, *first = _spread_fits(job, [base, *fits], processes)
-        known = [base_now, *known]
-    else:
-        first = _spread_fits(job, fits, processes)
-    first = [max(known, key=lambda f: f.log_evidence), *first]
-    beaten = _spread_fits(partial(_learned, observations, False), [fit for _, fit in far], processes)
-    leaders = sorted(first[1:], key=lambda f: -f.log_evidence)
-    job = partial(_crossed, observations, (first[0], *leaders[:2]))
-    final_base, *again = _spread_fits(job, first, processes)
-    found = [
-        Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True)
-        for (hypothesis, _), fit in zip((*finalists, *far), (*again, *beaten), strict=True)
-    ]
-    best_of_each = {r.hypothesis.label: r for r in sorted(found, key=lambda r: r.gain)}
-    finals = sorted(best_of_each.values(), key=lambda r: -r.gain)
-    least = finals[-1].gain if finals else 0.0
-    taken = {r.hypothesis.label for r in finals}
-    # An effect that is no finalist was behind at wide scatters; it cannot lead at learned ones.
-    others = [
-        Ranked(hypothesis, fit, min(fit.log_evidence - base.log_evidence, least), False)
-        for hypothesis, fit in rest
-        if hypothesis.label not in taken
-    ]
-    return Ranking(final_base, (*finals, *others), observations.linearised)
-
-
-def _learned(observations: Observations, past_barriers: bool, fit: Fit) -> Posterior:
-    return learned(observations, fit, past_barriers).posterior
-
-
-def _crossed(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:
-    """The fit begun again at what others know, scatters included, and learned from there where that is better."""
-    best = fit
-    for source in sources:
-        if source is fit:
-            continue
-        scatters = source.posterior.scatters
-        start = refined(
-            observations, fit.model, _on(observations, fit.model, source, fit), scatters, steps=10
-        )
-        here = refined(observations, fit.model, best.posterior.x, scatters, steps=4)
-        if start.log_evidence > here.log_evidence + _BETTER:
-            again = learned(observations, start, past_barriers=False)
-            best = max(best, again, key=lambda f: f.log_evidence)
     return best.posterior

@@ -13,7 +13,8 @@ from ema_pipeline.diagnose.backward import reconsidered
 from ema_pipeline.diagnose.claims import BY_OTHERS, Judged, judge
 from ema_pipeline.diagnose.first_fits import CONTINUED
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.ranking import CONTENDERS, rank, unbeaten
+from ema_pipeline.diagnose.ranked import unbeaten
+from ema_pipeline.diagnose.ranking import CONTENDERS, rank
 from ema_pipeline.diagnose.rounds import Round, round_of, weighed
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import Posterior

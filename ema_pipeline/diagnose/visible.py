@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from scipy.stats import norm
 
 from ema_pipeline.diagnose.naming import Named, named
-from ema_pipeline.diagnose.ranking import Ranking
+from ema_pipeline.diagnose.ranked import Ranking
 from ema_pipeline.diagnose.types import DetectionLimit, EffectSize
 
 

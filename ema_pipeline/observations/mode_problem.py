@@ -273,7 +273,7 @@ class ModeProblem(EffectProblem):
                 sizes, shapes = tuned_sizes(
                     dense[MASS], dense[STIFFNESS], change[MASS], change[STIFFNESS], hz
                 )
-                like = mac(data.shapes[r], (along @ shapes).T)[0]
+                like = mac(data.shapes[r], (along @ shapes[: along.shape[1]]).T)[0]
                 found += [float(sizes[k]) for k in np.argsort(-like)[:_MOST_TUNED]]
         return found
 

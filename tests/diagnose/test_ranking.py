@@ -8,31 +8,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from written_fits import NO_DATA, Parabola, fit, hypothesis, law, score, with_model
+from written_fits import NO_DATA, Parabola, fit, found_of, hypothesis, law, score, with_model
 
 from ema_pipeline.diagnose import ranking
 from ema_pipeline.diagnose.first_fits import Tried
+from ema_pipeline.diagnose.ranked import Ranked, Ranking
 from ema_pipeline.diagnose.ranking import (
-    Found,
-    Ranked,
-    Ranking,
     _batches,
     _begun_again,
     _better,
     _bettered,
     _contenders,
-    _crossed,
     _decides,
-    _finals,
-    _on,
     _pairing,
-    _promising,
     _screened,
-    _with_promising,
 )
-from ema_pipeline.inference import Scatter
 from ema_pipeline.observations.fitting import Fit
-from ema_pipeline.observations.mode_rows import SHAPE
 
 
 def test_where_the_base_model_fails_laws_in_time_are_screened_among_themselves() -> None:
@@ -63,67 +54,6 @@ def test_of_many_hypotheses_those_of_each_kind_are_fitted_that_promise_most() ->
 
 
 # --- the order of fits ---------------------------------------------------------------------------------------------
-
-
-def found_of(**values: float) -> Found:
-    return {name: (hypothesis(name), fit(name, value)) for name, value in values.items()}
-
-
-def test_finalists_are_learned_and_compared_with_the_learned_base(monkeypatch: pytest.MonkeyPatch) -> None:
-    learned: list[tuple[str, bool]] = []
-    crossed: list[str] = []
-    among: set[tuple[str, ...]] = set()
-
-    def learn(observations: object, past_barriers: bool, one: Any) -> Any:
-        learned.append((one.model.name, past_barriers))
-        return SimpleNamespace(log_evidence=one.log_evidence + (30.0 if one.model.name == "b" else 3.0))
-
-    def cross(observations: object, sources: Any, one: Any) -> Any:
-        crossed.append(one.model.name)
-        among.add(tuple(s.model.name for s in sources))
-        return SimpleNamespace(log_evidence=one.log_evidence + (1.0 if one.model.name == "base" else 0.0))
-
-    monkeypatch.setattr(ranking, "_learned", learn)
-    monkeypatch.setattr(ranking, "_crossed", cross)
-    found = found_of(a=60.0, b=50.0, c=-139.0, d=-140.0, e=-141.0, f=-150.0, g=-200.0)
-    promising = [(hypothesis("g"), fit("g", 20.0))]
-    told = _finals(NO_DATA, fit("base", 10.0), list(found.values()), promising, 1, (), True)
-    asked = [(name, True) for name in ("base", "a", "b", "c", "d", "g")]
-    assert learned == [*asked, ("e", False)]  # e can no longer catch up
-    assert crossed == ["base", "a", "b", "c", "d", "g"]
-    assert among == {("base", "b", "a")}
-    assert told.base.log_evidence == 14.0
-    gains = {r.hypothesis.label: (r.gain, r.final) for r in told.ranked}
-    assert list(gains) == ["b", "a", "g", "c", "d", "e", "f"]
-    assert gains["b"] == (50.0 + 30.0 - 14.0, True)
-    assert gains["g"] == (9.0, True)
-    assert gains["e"] == (-141.0 + 3.0 - 14.0, True)
-    assert gains["f"] == (-160.0, False)
-    close = list(found_of(a=13.0, b=12.8, c=12.6, d=12.4, e=12.0, f=11.5).values())
-    told = _finals(NO_DATA, fit("base", 10.0), close, [], 1, (), True)
-    last = told.ranked[-1]  # at wide scatters ahead of nothing by 1.5, no finalist by 1
-    assert (last.hypothesis.label, last.gain) == ("f", told.ranked[-2].gain) == ("f", 1.0)
-    assert _finals(NO_DATA, fit("base", 10.0), [], [], 1, (), True).ranked == ()
-
-
-def test_beside_a_base_model_that_explains_the_data_nothing_is_led_past_its_barriers_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    learned: list[tuple[str, bool]] = []
-
-    def learn(observations: object, past_barriers: bool, one: Any) -> Any:
-        learned.append((one.model.name, past_barriers))
-        return SimpleNamespace(log_evidence=one.log_evidence + 100.0)
-
-    monkeypatch.setattr(ranking, "_learned", learn)
-    monkeypatch.setattr(ranking, "_crossed", lambda o, sources, one: one.posterior)
-    order = list(found_of(a=12.0, b=11.9, c=11.8, d=11.7, e=11.6, f=11.5).values())
-    known = [fit("settled", 111.0), fit("narrow", 110.0)]
-    told = _finals(NO_DATA, fit("base", 10.0), order, [], 1, known, False)
-    assert learned == [(name, False) for name in "abcde"]
-    assert told.base.log_evidence == 111.0
-    # what is no finalist is held against the base model at the same wide scatters
-    assert [round(r.gain, 1) for r in told.ranked] == [1.0, 0.9, 0.8, 0.7, 0.6, 0.6]
 
 
 def test_what_modes_without_a_partner_cost_is_the_least_over_all() -> None:
@@ -186,7 +116,7 @@ def test_the_base_and_the_best_begin_again_at_what_the_best_of_all_knows(
 
     monkeypatch.setattr(ranking, "refined", refined)
     monkeypatch.setattr(
-        ranking, "_on", lambda o, model, source, sizes: f"{sizes.model.name} at {source.model.name}"
+        ranking, "known_from", lambda o, model, source, sizes: f"{sizes.model.name} at {source.model.name}"
     )
     monkeypatch.setattr(
         ranking,
@@ -205,16 +135,6 @@ def test_the_base_and_the_best_begin_again_at_what_the_best_of_all_knows(
     assert better.log_evidence == 12.0
 
 
-def test_what_another_fit_knows_is_taken_over_but_for_the_sizes() -> None:
-    mine = with_model("a", Parabola(("part", "common", "a.s"), ("a.s",)), [0.1, 0.2, 0.3])
-    other = with_model("b", Parabola(("part", "a.s", "b.s"), ("a.s", "b.s")), [0.7, 0.8, 0.9])
-    np.testing.assert_array_equal(_on(NO_DATA, mine.model, other, mine), [0.7, 0.2, 0.3])
-    new = with_model("c", Parabola(("part", "b.s"), ("b.s",)), [0.0, 0.0])
-    np.testing.assert_array_equal(
-        _on(NO_DATA, new.model, other, mine), [0.7, 0.9]
-    )  # nobody else knows that size
-
-
 def test_a_better_fit_is_kept_and_the_same_start_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     mine = with_model("a", Parabola(("part", "a.s"), ("a.s",)), [0.1, 0.3], 5.0)
     sources = [with_model("b", Parabola(("part",), ()), [v]) for v in (0.1, 0.5, 0.7)]
@@ -228,110 +148,6 @@ def test_a_better_fit_is_kept_and_the_same_start_not_tried_again(monkeypatch: py
     best = _better(NO_DATA, sources, 4, mine)
     assert tried == [([0.5, 0.3], 4), ([0.7, 0.3], 4)]
     assert best.x.tolist() == [0.5, 0.3]
-
-
-def test_scatters_are_learned_again_where_another_start_leads_further(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    mine = with_model("a", Parabola(("part", "a.s"), ("a.s",)), [0.1, 0.3], 5.0)
-    there, elsewhere = (with_model("b", Parabola(("part",), ()), [v]) for v in (0.5, 0.7))
-
-    def refined(observations: object, model: Any, x: np.ndarray, scatters: object, steps: int) -> Fit:
-        reached = {(0.5, 10): 6.0, (0.7, 10): 6.04, (0.1, 4): 6.0}
-        return with_model("a", Parabola(("part", "a.s"), ("a.s",)), x.tolist(), reached[x[0], steps])
-
-    def learned(observations: object, one: Fit, past_barriers: bool) -> Fit:
-        assert not past_barriers
-        asked.append(float(one.posterior.x[0]))
-        return with_model("a", Parabola(("part", "a.s"), ("a.s",)), one.posterior.x.tolist(), value)
-
-    monkeypatch.setattr(ranking, "refined", refined)
-    monkeypatch.setattr(ranking, "learned", learned)
-    asked: list[float] = []
-    value = 9.0
-    assert _crossed(NO_DATA, [mine, there, elsewhere], mine) is mine.posterior
-    assert asked == []  # neither leads further by as much as is worth it
-    monkeypatch.setattr(ranking, "_BETTER", 0.03)
-    assert _crossed(NO_DATA, [mine, there, elsewhere], mine).log_evidence == 9.0
-    assert asked == [0.7]
-    value = 4.0
-    assert _crossed(NO_DATA, [elsewhere], mine) is mine.posterior
-
-
-def test_what_promises_most_beside_learned_scatters_begins_at_its_size(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    settled = with_model("base", Parabola(("part",), ()), [0.4])
-    names = {k: (f"{k}.s1",) for k in "abc"}
-    models = {k: with_model(k, Parabola(("part", *names[k]), names[k]), [0.0, 0.0]).model for k in "abc"}
-    told = {"a": (1.0, 0.1), "b": (3.0, 0.2), "c": (2.0, 9.0)}
-
-    def scores(
-        observations: object, fit: object, hypotheses: Any, models: object, processes: int
-    ) -> list[Any]:
-        return [
-            SimpleNamespace(hypothesis=h, gain=told[h.label][0], size=np.array([told[h.label][1]]))
-            for h in hypotheses
-        ]
-
-    monkeypatch.setattr(ranking, "scores", scores)
-    monkeypatch.setattr(ranking, "refined", lambda o, model, x, scatters: (model.name, x.tolist(), scatters))
-    asked = [hypothesis(k) for k in "abc"]
-    found: Any = _promising(NO_DATA, settled, asked, models, 2, 1)
-    assert [(h.label, f) for h, f in found] == [
-        ("b", ("b", [0.4, 0.2], {"part": 1.0})),
-        ("c", ("c", [0.4, 1.9], {"part": 1.0})),
-    ]
-    told = {"a": (1.0, 0.1), "b": (1.1, 0.2), "c": (-2.0, 9.0)}
-    promised = [h.label for h, _ in _promising(NO_DATA, settled, asked, models, 0, 1)]
-    assert promised == ["b"]  # a promises no more than what is next to nothing
-    assert [h.label for h, _ in _promising(NO_DATA, settled, asked, models, 2, 1)] == ["b", "a"]
-    told = dict.fromkeys("abcde", (5.0, 0.1))
-    names |= {k: (f"{k}.s1",) for k in "de"}
-    models |= {k: with_model(k, Parabola(("part", *names[k]), names[k]), [0.0, 0.0]).model for k in "de"}
-    everything = [hypothesis(k) for k in "abcde"]
-    assert len(_promising(NO_DATA, settled, everything, models, 0, 1)) == 3
-    assert len(_promising(NO_DATA, settled, everything, models, 4, 1)) == 4
-
-
-@pytest.mark.parametrize(
-    ("evidence", "bent", "added"), [(4.1, False, True), (3.9, False, False), (4.1, True, False)]
-)
-def test_what_was_behind_at_wide_scatters_and_gains_beside_learned_ones_is_a_finalist(
-    monkeypatch: pytest.MonkeyPatch, evidence: float, bent: bool, added: bool
-) -> None:
-    wide, base, more = fit("wide", 9.0), fit("base", 3.0), fit("b", evidence)
-    first = Ranking(
-        base,
-        (
-            Ranked(hypothesis("a"), fit("a", 1.0), -2.0, True),
-            Ranked(hypothesis("c"), fit("c", 0.0), -3.0, False),
-        ),
-    )
-    asked: list[Any] = []
-
-    def promising(o: object, settled: Fit, others: Any, models: object, count: int, processes: object) -> Any:
-        asked.append((settled, [h.label for h in others], count))
-        return [(others[0], more)]
-
-    def finals(
-        o: object, now: Fit, order: Any, found: Any, processes: object, known: Any, past_barriers: bool
-    ) -> Any:
-        return now, [h.label for h, _ in order], found, known, past_barriers
-
-    monkeypatch.setattr(ranking, "unbent", lambda o, one: not bent)
-    monkeypatch.setattr(ranking, "_promising", promising)
-    monkeypatch.setattr(ranking, "_finals", finals)
-    b, c = hypothesis("b"), first.ranked[1].hypothesis
-    found: Any = _with_promising(NO_DATA, wide, first, [first.ranked[0].hypothesis, b, c], {}, 1)
-    if not added:
-        assert found is first
-        return
-    assert asked == [(base, ["b", "c"], 0)]
-    assert found == (wide, ["a", "c"], [(b, more)], (base,), False)
-
-
-# --- all of it -----------------------------------------------------------------------------------------------------
 
 
 class Stages:
@@ -350,7 +166,7 @@ class Stages:
         ]
         monkeypatch.setattr(ranking, "scores", lambda *given: told)
         monkeypatch.setattr(ranking, "learned", lambda o, one, past_barriers=True: fit("learned", 0.0))
-        monkeypatch.setattr(ranking, "_narrowed", lambda o, settled: None)
+        monkeypatch.setattr(ranking, "narrowed", lambda o, settled: None)
         monkeypatch.setattr(ranking, "unbent", lambda o, one: not bent)
         monkeypatch.setattr(ranking, "tried_sizes", self.tried_sizes)
         monkeypatch.setattr(ranking, "_screened", self.screened)
@@ -365,13 +181,13 @@ class Stages:
         )
         monkeypatch.setattr(ranking, "_begun_again", self.begun_again)
         monkeypatch.setattr(ranking, "_bettered", self.bettered)
-        monkeypatch.setattr(ranking, "_promising", self.promising)
+        monkeypatch.setattr(ranking, "promising_fits", self.promising)
         monkeypatch.setattr(
-            ranking, "_with_promising", lambda o, base, found, hypotheses, models, processes: found
+            ranking, "with_promising", lambda o, base, found, hypotheses, models, processes: found
         )
         monkeypatch.setattr(
             ranking,
-            "_finals",
+            "finals_of",
             lambda o, base, order, promising, processes, known, past_barriers: (
                 base,
                 order,
@@ -464,26 +280,11 @@ def test_what_promises_beside_narrow_shapes_is_a_finalist_whatever_was_one_befor
 ) -> None:
     """What is missing may have been learned as scatter."""
     stages = Stages(monkeypatch, bent)
-    monkeypatch.setattr(ranking, "_narrowed", lambda o, settled: fit("narrow", 0.0))
+    monkeypatch.setattr(ranking, "narrowed", lambda o, settled: fit("narrow", 0.0))
     _, _, promising, known = stages.rank(stages.base, further=2, unpaired=2.0)
     assert promising == ["more"] * (1 if bent else 2)
     assert stages.asked[-1] == ("promising", "narrow", ["a", "b", "c", "d", "e", "f"], 0)
     assert known == (["learned", "past barriers"] if bent else ["learned", "learned"])
-
-
-def test_the_scatter_of_shapes_is_narrowed_half_the_way_where_something_may_have_been_learned_as_scatter(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    shape = Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03, 1.5, 0.03)
-    other = Scatter("part", "parts", 0.02)
-    data: Any = SimpleNamespace(scatters={s.name: s for s in (shape, other)})
-    monkeypatch.setattr(ranking, "refined", lambda o, model, x, scatters: scatters)
-    wide: Any = SimpleNamespace(model="base", posterior=SimpleNamespace(x=0))
-    wide.posterior.scatters = {SHAPE: 0.0045, "part": 0.03}
-    assert ranking._narrowed(data, wide) == pytest.approx({SHAPE: 0.0045 / np.sqrt(10), "part": 0.03})
-    wide.posterior.scatters = {SHAPE: 0.0008, "part": 0.03}
-    assert ranking._narrowed(data, wide) is None
-    assert ranking._narrowed(SimpleNamespace(scatters={}), wide) is None  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

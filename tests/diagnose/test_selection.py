@@ -20,7 +20,7 @@ from ema_pipeline.diagnose.claims import (
 )
 from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _groups
 from ema_pipeline.diagnose.probability import NOTHING
-from ema_pipeline.diagnose.ranking import Ranked, Ranking
+from ema_pipeline.diagnose.ranked import Ranked, Ranking
 from ema_pipeline.diagnose.rounds import Round
 from ema_pipeline.diagnose.selection import Selection, _beside, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings

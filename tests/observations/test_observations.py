@@ -147,6 +147,19 @@ def test_a_size_gives_a_mode_without_a_partner_one_of_its_frequency_and_shape() 
     assert observed(rig, chain_modes(6, EXACT)).problem((placed,), {}).tuned(x, name) == []
 
 
+def test_such_a_size_is_found_beside_an_effect_that_adds_coordinates() -> None:
+    rig = planetary()
+    support, torsion = (
+        parse_effect(label, rig) for label in ("flexible_support@carrier", "shaft_torsion@sun")
+    )
+    name = torsion.parameter_name("stiffness")
+    hidden = Hidden(added=(Spring("hidden", {"sun.u": 1.0}, 3e5),))
+    measured = planetary_modes(rig, 3, EXACT, hidden, ("no_ring",))
+    problem = observed(rig, measured).problem((support, torsion), {})
+    sizes = [problem.sizes[name].value(u) for u in problem.tuned(problem.start({name: 0.0}), name)]
+    assert any(size == pytest.approx(3e5, rel=0.05) for size in sizes)
+
+
 def test_what_modes_are_to_each_other_stays_when_one_of_them_is_held_out() -> None:
     f = np.array([100.0, 100.5, 140.0])
     shapes = np.array([[1.0, 0, 0.5, 0.2], [1.0, 0.05, 0.5, 0.2], [0, 1.0, -0.5, 0.4]], complex)

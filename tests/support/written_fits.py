@@ -79,3 +79,8 @@ def with_model(name: str, problem: Parabola, x: list[float], log_evidence: float
     )
     model: Any = SimpleNamespace(name=name, problem=lambda observations: problem)
     return Fit(model, posterior)
+
+
+def found_of(**values: float) -> dict[str, tuple[Any, Fit]]:
+    """Hypotheses, and fits of these log evidences."""
+    return {name: (hypothesis(name), fit(name, value)) for name, value in values.items()}

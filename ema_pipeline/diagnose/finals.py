@@ -1,0 +1,182 @@
+"""The best hypotheses with scatters of their own, learned for each of them and for the base model.
+
+Beside scatters that were learned for one of them, others are compared unfairly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.parallel import spread
+from ema_pipeline.diagnose.ranked import Ranked, Ranking, unbeaten
+from ema_pipeline.diagnose.score import scores
+from ema_pipeline.inference import Posterior
+from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.fitting import Fit, Model, learned, refined, transferred, unbent
+from ema_pipeline.observations.mode_rows import SHAPE
+
+FINALISTS = 5
+"""Hypotheses for which the scatters are learned."""
+PROMISING = 1.0
+"""Log evidence that is something: a third of what a claim needs."""
+_FURTHER = 3
+"""Finalists beside these that promise something at learned scatters."""
+_TAKEN_UP = 2.0
+"""Learned scatter of shapes over its least, from which it may hold what is missing."""
+_BETTER = 0.05
+"""Log evidence by which a start must lead a fit to be followed."""
+
+
+def spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes: int | None) -> list[Fit]:
+    """Better fits of the same models; only posteriors go between processes, a user's effects cannot."""
+    return [Fit(fit.model, p) for fit, p in zip(fits, spread(job, fits, processes), strict=True)]
+
+
+def promising_fits(
+    observations: Observations,
+    settled: Fit,
+    hypotheses: Sequence[Hypothesis],
+    models: Mapping[str, Model],
+    count: int,
+    processes: int | None,
+) -> list[tuple[Hypothesis, Fit]]:
+    """What promises most on top of the base model with learned scatters, begun at the size of its score.
+
+    At wide scatters an effect that moves frequencies by a permille gains nothing.
+    """
+    found = []
+    best = sorted(scores(observations, settled, hypotheses, models, processes), key=lambda s: -s.gain)
+    chosen = best[:count]  # what the scatters took up promises little, and gains it back
+    chosen += [score for score in best[count:_FURTHER] if score.gain > PROMISING]
+    for score in chosen:
+        model = models[score.hypothesis.label]
+        unknowns = model.problem(observations).unknowns
+        x = transferred(settled.posterior, unknowns)
+        placed = score.hypothesis.placed
+        for parameter, size in zip(placed.effect.parameters, score.size, strict=True):
+            x[unknowns.index[placed.parameter_name(parameter.name)]] = size
+        fit = refined(observations, model, unknowns.clipped(x), settled.posterior.scatters)
+        found.append((score.hypothesis, fit))
+    return found
+
+
+def with_promising(
+    observations: Observations,
+    wide: Fit,
+    ranking: Ranking,
+    hypotheses: Sequence[Hypothesis],
+    models: Mapping[str, Model],
+    processes: int | None,
+) -> Ranking:
+    """The ranking with what promises and gains something beside its learned scatters, and was behind at wide ones.
+
+    `wide` is the base model at those, beside which all but the finalists are.
+    """
+    base, final = ranking.base, [r for r in ranking.ranked if r.final]
+    if not unbent(observations, base):
+        return ranking
+    taken = {r.hypothesis.label for r in final}
+    others = [h for h in hypotheses if h.label not in taken]
+    found = promising_fits(observations, base, others, models, 0, processes)
+    more = [(h, fit) for h, fit in found if fit.log_evidence > base.log_evidence + PROMISING]
+    if not more:
+        return ranking
+    order = [(r.hypothesis, r.fit) for r in ranking.ranked]
+    return finals_of(observations, wide, order, more, processes, (base,), past_barriers=False)
+
+
+def narrowed(observations: Observations, settled: Fit) -> Fit | None:
+    """The base model at a scatter of shapes half the way to its least; None where it is near it.
+
+    What is missing may have been learned as scatter of shapes: a spring of 171 kN/m between the first and the fifth of
+    six masses gained nothing beside shapes that scatter by 0.006, and 26 once that was learned anew with it.
+    """
+    shapes, scatters = observations.scatters.get(SHAPE), settled.posterior.scatters
+    if shapes is None or scatters[SHAPE] <= _TAKEN_UP * shapes.least * shapes.default:
+        return None
+    narrow = float(np.sqrt(shapes.least * shapes.default * scatters[SHAPE]))
+    return refined(observations, settled.model, settled.posterior.x, {**scatters, SHAPE: narrow})
+
+
+def finals_of(
+    observations: Observations,
+    base: Fit,
+    order: Sequence[tuple[Hypothesis, Fit]],
+    promising: Sequence[tuple[Hypothesis, Fit]],
+    processes: int | None,
+    known: Sequence[Fit],
+    past_barriers: bool,
+) -> Ranking:
+    """Scatters learned for the base model and the best hypotheses, each from what the others know.
+
+    `known` are fits of the base model whose scatters are learned already. Fits are led past barriers, but for those
+    that begin beside a base model that was.
+    """
+    best, rest = order[:FINALISTS], order[FINALISTS:]
+    near = unbeaten(best, lambda pair: pair[1].log_evidence)
+    far = best[len(near) :]
+    finalists = [*near, *promising]
+    job = partial(_learned, observations, past_barriers)
+    fits = [fit for _, fit in finalists]
+    if past_barriers:
+        base_now, *first = spread_fits(job, [base, *fits], processes)
+        known = [base_now, *known]
+    else:
+        first = spread_fits(job, fits, processes)
+    first = [max(known, key=lambda f: f.log_evidence), *first]
+    beaten = spread_fits(partial(_learned, observations, False), [fit for _, fit in far], processes)
+    leaders = sorted(first[1:], key=lambda f: -f.log_evidence)
+    job = partial(_crossed, observations, (first[0], *leaders[:2]))
+    final_base, *again = spread_fits(job, first, processes)
+    found = [
+        Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True)
+        for (hypothesis, _), fit in zip((*finalists, *far), (*again, *beaten), strict=True)
+    ]
+    best_of_each = {r.hypothesis.label: r for r in sorted(found, key=lambda r: r.gain)}
+    finals = sorted(best_of_each.values(), key=lambda r: -r.gain)
+    least = finals[-1].gain if finals else 0.0
+    taken = {r.hypothesis.label for r in finals}
+    # An effect that is no finalist was behind at wide scatters; it cannot lead at learned ones.
+    others = [
+        Ranked(hypothesis, fit, min(fit.log_evidence - base.log_evidence, least), False)
+        for hypothesis, fit in rest
+        if hypothesis.label not in taken
+    ]
+    return Ranking(final_base, (*finals, *others), observations.linearised)
+
+
+def _learned(observations: Observations, past_barriers: bool, fit: Fit) -> Posterior:
+    return learned(observations, fit, past_barriers).posterior
+
+
+def _crossed(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:
+    """The fit begun again at what others know, scatters included, and learned from there where that is better."""
+    best = fit
+    for source in sources:
+        if source is fit:
+            continue
+        scatters = source.posterior.scatters
+        start = refined(
+            observations, fit.model, known_from(observations, fit.model, source, fit), scatters, steps=10
+        )
+        here = refined(observations, fit.model, best.posterior.x, scatters, steps=4)
+        if start.log_evidence > here.log_evidence + _BETTER:
+            again = learned(observations, start, past_barriers=False)
+            best = max(best, again, key=lambda f: f.log_evidence)
+    return best.posterior
+
+
+def known_from(observations: Observations, model: Model, source: Fit, sizes: Fit) -> np.ndarray:
+    """Everything that `source` knows, and the effects' sizes of `sizes`."""
+    problem = model.problem(observations)
+    x = transferred(sizes.posterior, problem.unknowns)
+    moved = transferred(source.posterior, problem.unknowns, x)
+    for name in problem.sizes:
+        i = problem.unknowns.index[name]
+        if name in sizes.posterior.unknowns.index:
+            moved[i] = x[i]
+    return moved
