@@ -10,7 +10,6 @@ from ema_pipeline.files import replace_file
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.kinds import kind_of
 from ema_pipeline.pipeline import ShowStage
-from ema_pipeline.report.thresholds import POOR_ERROR
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.run.types import Run
 from ema_pipeline.store import ALL, Store
@@ -44,7 +43,7 @@ def save_rig(run: Run, file: Path) -> None:
     if file.exists():
         raise EmaError(f"{file}: exists already and is kept; name another file")
     heads = [f"Fitted by ema to {run.info.raw}; tolerances are the values' own uncertainties, 1 sigma."]
-    if fit.error > POOR_ERROR:
+    if fit.error > fit.error_limit:
         heads.append(f"Provisional: the model does not explain the data (error {fit.error:.3g}).")
     try:
         replace_file(file, saved_rig(run.info.rig, fit, heads))

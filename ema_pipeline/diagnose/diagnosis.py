@@ -16,7 +16,7 @@ from ema_pipeline.diagnose.in_full import in_full
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names
 from ema_pipeline.diagnose.next_test import next_measurement
-from ema_pipeline.diagnose.probability import NOTHING, against_nothing, of_failing_model
+from ema_pipeline.diagnose.probability import CLOSEST, NOTHING, against_nothing, of_failing_model
 from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
@@ -106,14 +106,18 @@ def diagnose(
         beside = [one for one in told if one[0] not in names]
         told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.label in names]
     probabilities = dict(found.rounds[0].probabilities)
-    if not (explained if start is found.final else explains(first.observations, start, settings)):
+    if verdict == "unknown_effect":
+        probabilities = of_failing_model(probabilities, CLOSEST)
+        candidates = tuple(replace(c, probability=CLOSEST * c.probability) for c in candidates)
+    elif not (explained if start is found.final else explains(first.observations, start, settings)):
         probabilities = of_failing_model(probabilities)
     nothing = probabilities[NOTHING]
+    limit = found.final.posterior.error_limit(settings.error_limit)
     best = next(
         (
             (c.label, c.why)
             for c in candidates[:1]
-            if (explained and not c.claimed and nothing < DOUBTFUL) or c.would_explain(settings.error_limit)
+            if (explained and not c.claimed and nothing < DOUBTFUL) or c.would_explain(limit)
         ),
         ("", ""),
     )
@@ -124,10 +128,10 @@ def diagnose(
     scatter = learned_scatters(observations, found.final)
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
     bent = sentences.standing_out(outlying_parts(observations, found.final))
-    reasons = " ".join(
-        filter(None, (sentences.STANDING_STILL if stands_still(observations, found.final) else "", bent))
-    )
     errors = (rungs[0].error, rungs[-1].error)
+    apart = sentences.of_modes_alone(found.final.posterior.error_apart, max(errors[1], limit))
+    still = sentences.STANDING_STILL if stands_still(observations, found.final) else ""
+    reasons = " ".join(filter(None, (still, apart, bent)))
     return Diagnosis(
         verdict=verdict,
         summary=sentences.summary(verdict, told, errors, visible, best, reasons, beside),
@@ -145,6 +149,7 @@ def diagnose(
         notes=(*((bent,) if bent and verdict != "unknown_effect" else ()), *faint, *notes),
         detection_limits=limits,
         nothing_visible=visible,
+        error_limit=limit,
     )
 
 

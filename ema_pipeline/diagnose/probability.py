@@ -14,6 +14,10 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 
 NOTHING = "nothing"
 UNKNOWN = "an effect that is not in the library"
+CLOSEST = 0.5
+"""Probability that what is claimed is right where the model does not explain the data with it either, over what it
+would be if it did: of eight such claims in simulated tests whose effects are in the library five were right, of twelve
+where they are not none."""
 
 
 def weight(hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
@@ -74,9 +78,13 @@ def probabilities(
     return told | {NOTHING: float(shares[-1])}
 
 
-def of_failing_model(told: Mapping[str, float]) -> dict[str, float]:
-    """The same where the model does not explain the data: what nothing missing had goes to `UNKNOWN`."""
-    return {name: 0.0 if name == NOTHING else p for name, p in told.items()} | {UNKNOWN: told[NOTHING]}
+def of_failing_model(told: Mapping[str, float], named: float = 1.0) -> dict[str, float]:
+    """The same where the model does not explain the data: what nothing missing had goes to `UNKNOWN`.
+
+    So does what effects that are named do not keep, a share `named`: `CLOSEST` where the model fails with them, too.
+    """
+    kept = {name: 0.0 if name == NOTHING else named * p for name, p in told.items()}
+    return kept | {UNKNOWN: max(1.0 - sum(kept.values()), 0.0)}
 
 
 def against_nothing(

@@ -100,14 +100,14 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
     """
     p = ranking.base.posterior
     bounded = within_scatter(observations, ranking.base).posterior
-    if bounded is p or bounded.error <= settings.error_limit:
+    if bounded is p or not bounded.fails(settings.error_limit):
         return ranking
     relief = p.log_evidence + p.scatter_cost - bounded.log_evidence - bounded.scatter_cost
     parts = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, part_reach(observations, p)))]
 
     def explains(one: Ranked) -> bool:
         found = within_scatter(observations, one.fit)
-        return found is one.fit and found.posterior.error <= settings.error_limit
+        return found is one.fit and not found.posterior.fails(settings.error_limit)
 
     able = [r for r in ranking.ranked if r.final and explains(r)]
     least = min((r.gain for r in able if _changes(r, parts)), default=np.inf)

@@ -172,7 +172,7 @@ def _tentative(observations: Observations, found: Round, settings: DiagnoseSetti
     if observations.linearised or least.after.posterior.error >= least.base.posterior.error:
         return None
     base = within_scatter(observations, found.ranking.base)
-    return least if base.posterior.error > settings.error_limit else None
+    return least if base.posterior.fails(settings.error_limit) else None
 
 
 def _both(

@@ -113,6 +113,13 @@ STANDING_STILL = (
 )
 
 
+def of_modes_alone(apart: float, limit: float) -> str:
+    """Where the modes show that a model fails, and many data of single hits that fit hide it; empty where not."""
+    if apart <= limit:
+        return ""
+    return f"The error of the modes alone is {apart:.2f}: many data of single hits, which fit, hide it."
+
+
 def standing_out(parts: Sequence[OutlyingPart]) -> str:
     """Parts that deviate more than similar ones scatter; empty without any."""
     if not parts:

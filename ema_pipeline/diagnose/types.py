@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
+from ema_pipeline.inference import ERROR_LIMIT
 
 VerdictWord = Literal["adequate", "effect", "ambiguous", "unknown_effect", "not_enough_data"]
 
@@ -327,6 +328,8 @@ class Diagnosis:
         What these data would show; empty where even the best model fails.
     nothing_visible : float
         Probability that nothing is missing that is larger than its detection limit; NaN where that was not calculated.
+    error_limit : float
+        Error up to which a model explains so many data.
     """
 
     verdict: VerdictWord
@@ -343,6 +346,7 @@ class Diagnosis:
     notes: tuple[str, ...] = ()
     detection_limits: tuple[DetectionLimit, ...] = ()
     nothing_visible: float = math.nan
+    error_limit: float = ERROR_LIMIT
 
     @property
     def suspected(self) -> Candidate | None:

@@ -18,7 +18,7 @@ def explains(observations: Observations, fit: Fit, settings: DiagnoseSettings) -
     """True where the model explains the data, all measured modes but one, no part further out than parts scatter."""
     found = within_scatter(observations, fit).posterior
     return (
-        found.error <= settings.error_limit
+        not found.fails(settings.error_limit)
         and found.residuals.unexplained <= MOST_UNEXPLAINED
         and not stands_still(observations, fit)
     )

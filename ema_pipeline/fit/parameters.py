@@ -33,8 +33,6 @@ _OUT_OF_TOLERANCE = 3.0
 """Prior standard deviations from the stated value from which a parameter is remarked."""
 _UNTOUCHED = 0.999
 """Posterior over prior standard deviation from which nothing that was measured depends on a parameter."""
-_FAILS = 1.5
-"""Error from which a reader is told that the standard deviations rest on a model that does not explain the data."""
 
 
 @dataclass(frozen=True)
@@ -238,7 +236,7 @@ def _not_measured(p: Parameter, value: float, prior: float) -> ParameterEstimate
 
 def _notes(fitted: FittedModes) -> tuple[str, ...]:
     notes = []
-    if fitted.posterior.error > _FAILS:
+    if fitted.posterior.fails():
         notes.append(
             f"the model does not explain the data (error {fitted.posterior.error:.1f}): standard deviations of "
             "parameters hold for a model that does"

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.inference import error_limit
+
 
 @dataclass(frozen=True)
 class ErrorSweep:
@@ -155,6 +157,11 @@ class FitResult:
     notes: tuple[str, ...] = ()
     unknowns: dict[str, float] = field(default_factory=dict)
     scatters: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def error_limit(self) -> float:
+        """Error up to which a model explains so many data."""
+        return error_limit(self.data_count)
 
     def values(self) -> dict[str, float]:
         """Parameter values at the optimum, as `Rig.system` takes them."""

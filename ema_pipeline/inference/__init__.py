@@ -7,12 +7,14 @@ everything else that a user sees is read from the `Posterior`.
 from ema_pipeline.inference.bounded import Bounded, beyond, reach
 from ema_pipeline.inference.factor import lower_factor, solve_lower
 from ema_pipeline.inference.maximise import anneal, descend
-from ema_pipeline.inference.posterior import Posterior
-from ema_pipeline.inference.problem import Problem, Residuals
+from ema_pipeline.inference.posterior import ERROR_LIMIT, Posterior, error_limit
+from ema_pipeline.inference.problem import Apart, Problem, Residuals
 from ema_pipeline.inference.scatter import Scatter, learn, widened
 from ema_pipeline.inference.unknowns import Unknowns, joined
 
 __all__ = [
+    "ERROR_LIMIT",
+    "Apart",
     "Bounded",
     "Posterior",
     "Problem",
@@ -22,6 +24,7 @@ __all__ = [
     "anneal",
     "beyond",
     "descend",
+    "error_limit",
     "joined",
     "learn",
     "lower_factor",

@@ -15,6 +15,22 @@ from ema_pipeline.inference.unknowns import Unknowns
 
 
 @dataclass(frozen=True)
+class Apart:
+    """Values, from the first on, that a model has to explain on their own as well, however many others there are.
+
+    Attributes
+    ----------
+    values, projected, unknowns : int
+        Their number, how many of them were spent on factors of no interest, and the number of the unknowns, from the
+        first on, whose priors belong to them.
+    """
+
+    values: int
+    projected: int
+    unknowns: int
+
+
+@dataclass(frozen=True)
 class Residuals:
     """Differences of measurement and model at one point, in units of their standard uncertainties.
 
@@ -46,6 +62,8 @@ class Residuals:
         Measured mode that each value belongs to, numbered through all data; -1 for none.
     blurred : ndarray of bool, (m,), optional
         True for values of shapes that hold more than what they are compared with, by a mode without a partner.
+    apart : Apart, optional
+        The first values, where a model has to explain them on their own as well.
     matching : object
         Whatever the problem wants to have back to evaluate the same assignment of data to model again.
     """
@@ -64,6 +82,7 @@ class Residuals:
     mixed: NDArray[np.bool_] | None = None
     mode: NDArray[np.int64] | None = None
     blurred: NDArray[np.bool_] | None = None
+    apart: Apart | None = None
 
     @property
     def stated(self) -> NDArray[np.float64]:
@@ -119,8 +138,19 @@ class Residuals:
     @property
     def squares(self) -> float:
         """Sum of squares in which errors count."""
-        alone = self.stated if self.block is None else self.stated[self.block < 0]
-        return float(alone @ alone) + float(np.sum(tails.deviance(*self.blocks)))
+        return self._squares(len(self.values))
+
+    @property
+    def squares_apart(self) -> float:
+        """The same of the values that count on their own as well."""
+        return self._squares(0 if self.apart is None else self.apart.values)
+
+    def _squares(self, count: int) -> float:
+        """That of the first values."""
+        stated, block = self.stated[:count], None if self.block is None else self.block[:count]
+        alone = stated if block is None else stated[block < 0]
+        of_blocks = in_blocks(self.values[:count] ** 2, block)
+        return float(alone @ alone) + float(np.sum(tails.deviance(*of_blocks)))
 
     @property
     def cost(self) -> float:

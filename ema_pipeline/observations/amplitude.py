@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect, effect_of
-from ema_pipeline.inference import Posterior, Residuals, Unknowns, joined
+from ema_pipeline.inference import Apart, Posterior, Residuals, Unknowns, joined
 from ema_pipeline.observations.hit_data import HitData, comparable
 from ema_pipeline.observations.hit_lattice import LEAST, SPACING, MarchedHits
 from ema_pipeline.observations.hit_march import rubs, steps_to_end
@@ -418,7 +418,9 @@ class AmplitudeProblem:
             else:
                 parts.append(hits.residuals(derivatives, by_sizes))
         return dataclasses.replace(
-            stacked(parts, len(x)), matching=(modes.matching, tuple(p.matching for p in parts[1:]))
+            stacked(parts, len(x)),
+            matching=(modes.matching, tuple(p.matching for p in parts[1:])),
+            apart=Apart(len(modes.values), modes.projected, count),
         )
 
 

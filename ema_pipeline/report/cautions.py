@@ -13,7 +13,7 @@ from ema_pipeline.frf.channel_faults import SENSITIVITY
 from ema_pipeline.modal.types import GROWS
 from ema_pipeline.report.numbers import below, format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
-from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC, POOR_ERROR
+from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC
 
 SAME_KIND = 2
 """Cautions of one kind that are written out; the rest is counted."""
@@ -77,7 +77,7 @@ def identified_words(p: ParameterEstimate, fit: FitResult) -> str:
 
 def fails(fit: FitResult) -> bool:
     """True where the model does not fit, so that its values hold only for a model that lacks nothing."""
-    return fit.error > POOR_ERROR
+    return fit.error > fit.error_limit
 
 
 def _where(results: RunResults, c: ConfigurationResults) -> str:

@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Mapping, Sequence
 
 from ema_pipeline.diagnose.sentences import label_text, probability_text
-from ema_pipeline.diagnose.settings import ERROR_LIMIT
 from ema_pipeline.diagnose.types import (
     NOT_DETERMINED,
     OUT_OF_TOLERANCE,
@@ -35,7 +34,7 @@ def heading(found: Diagnosis) -> str:
     closest = " and ".join(label_words(c.label) for c in claimed(found))
     if found.verdict == "unknown_effect" and closest:
         return f"Something is missing that the library does not explain; closest to it: {closest}"
-    near = any(c.would_explain(ERROR_LIMIT) for c in found.candidates[:1])
+    near = any(c.would_explain(found.error_limit) for c in found.candidates[:1])
     if found.verdict == "unknown_effect" and near:
         return "Something is missing, and no effect is supported enough to be named"
     return {

@@ -6,13 +6,14 @@ import math
 
 from ema_pipeline.correlate.types import Pairing
 from ema_pipeline.fit.types import FitResult, ParameterEstimate
+from ema_pipeline.inference import ERROR_LIMIT
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import cautions, fails, identified_words, suspicions
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.simulation import error_lines, loop_words
-from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC, POOR_ERROR
+from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC
 
 __all__ = ["cautions", "fails", "findings", "identified_words", "stiffnesses"]
 
@@ -48,12 +49,13 @@ def findings(results: RunResults) -> tuple[str, ...]:
     if compared is not None and math.isfinite(compared.error):
         size = plain(compared.error, 3)
         verdict = None if results.diagnosis is None else results.diagnosis.verdict
-        if compared.error <= POOR_ERROR and verdict in ("effect", "ambiguous"):
+        explained = compared.error <= (ERROR_LIMIT if fit is None else fit.error_limit)
+        if explained and verdict in ("effect", "ambiguous"):
             lines.append(
                 f"Model and measurement differ by {size} standard uncertainties (root mean square); "
                 "the diagnosis above says what would reduce this."
             )
-        elif compared.error <= POOR_ERROR:
+        elif explained:
             lines.append(
                 f"Model and measurement differ by {size} standard uncertainties (root mean square): "
                 "the model explains the data to within their uncertainty."

@@ -12,6 +12,7 @@ from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.modal.types import ModalModel, Mode
+from ema_pipeline.report.cautions import fails
 from ema_pipeline.report.numbers import (
     below,
     format_percent,
@@ -21,7 +22,7 @@ from ema_pipeline.report.numbers import (
     signed,
     words,
 )
-from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC, POOR_ERROR
+from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC
 
 
 @dataclass(frozen=True)
@@ -113,7 +114,7 @@ def parameters_table(fit: FitResult) -> Table:
         low, high = (plain(v * scale, 4) if math.isfinite(v) else "open" for v in (p.low, p.high))
         tail = f" {unit}" if unit not in ("", "1") else ""
         far = math.isfinite(p.shift_z) and abs(p.shift_z) > FAR_SIGMA
-        held = "identified" if fit.error <= POOR_ERROR else "provisional"
+        held = "provisional" if fails(fit) else "identified"
         status = held if p.identified else ("NOT identified" if p.free else "not narrowed")
         rows.append(
             Row(

@@ -202,6 +202,9 @@ def test_a_mass_that_only_one_part_far_off_can_follow_is_unknown_to_a_library_wi
     assert found.null_probability == found.probabilities[NOTHING] == 0.0
     assert found.probabilities[UNKNOWN] > 0.5
     assert sum(found.probabilities.values()) == pytest.approx(1)
+    for c in found.candidates:  # what does not mend the model is not probable, whatever evidence it gains
+        assert c.probability <= 0.5
+        assert c.probability == pytest.approx(found.probabilities[c.label])
 
 
 # --- the planetary rig ------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import pytest
 from two_bodies import BEGIN, LIBRARY, STIFFNESS, decaying, rig, steady
 
 from ema_pipeline.diagnose import records
-from ema_pipeline.diagnose.probability import NOTHING
+from ema_pipeline.diagnose.probability import NOTHING, UNKNOWN
 from ema_pipeline.diagnose.records import (
     _OUT_OF_PHASE,
     _linear_change,
@@ -161,16 +161,20 @@ def test_a_claim_that_is_withdrawn_takes_its_group_and_its_rung_with_it() -> Non
     assert _withdrawn(other, searched, "of doubt", 5.0, SETTINGS)[0].verdict == "ambiguous"
 
 
-@pytest.mark.parametrize(("error", "verdict"), [(1.5, "adequate"), (1.51, "unknown_effect")])
+@pytest.mark.parametrize(
+    ("error", "verdict", "named", "nothing"),
+    [(1.5, "adequate", 0.25, 0.5), (1.51, "unknown_effect", 0.125, 0.0)],
+)
 def test_without_the_only_claim_nothing_is_as_probable_as_the_evidence_lost_makes_it(
-    error: float, verdict: str
+    error: float, verdict: str, named: float, nothing: float
 ) -> None:
     found = diagnosis(candidate("a@x", 9.0), candidate("b@x", 1.0, claimed=False))
     kept = _nothing_claimed(found, error, np.log(4.0), SETTINGS)
     assert kept.verdict == verdict
-    assert kept.probabilities == pytest.approx({"a@x": 0.25, "b@x": 0.25, NOTHING: 0.5})
-    assert kept.null_probability == pytest.approx(0.5)
-    assert [c.probability for c in kept.candidates] == pytest.approx([0.25, 0.25])
+    unknown = {} if nothing else {UNKNOWN: 0.75}
+    assert kept.probabilities == pytest.approx({"a@x": named, "b@x": named, NOTHING: nothing} | unknown)
+    assert kept.null_probability == pytest.approx(nothing)
+    assert [c.probability for c in kept.candidates] == pytest.approx([named, named])
     searched = ladder(rung(0.0, error=error), rung(5.0, ("a@x",)))
     assert _withdrawn(found, searched, "of doubt", np.log(4.0), SETTINGS)[0].verdict == verdict
 

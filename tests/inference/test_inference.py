@@ -13,6 +13,8 @@ import scipy.stats
 from numpy.typing import NDArray
 
 from ema_pipeline.inference import (
+    ERROR_LIMIT,
+    Apart,
     Bounded,
     Posterior,
     Residuals,
@@ -21,6 +23,7 @@ from ema_pipeline.inference import (
     anneal,
     beyond,
     descend,
+    error_limit,
     joined,
     learn,
     lower_factor,
@@ -129,6 +132,33 @@ def test_the_error_of_true_models_is_about_one() -> None:
         errors.append(descend(problem, {}, np.zeros(4), steps=30).error ** 2)
     # the mean of 60 mean squares of 40 standard normal values has a standard deviation of 0.029
     assert np.mean(errors) == pytest.approx(1.0, abs=0.09)
+
+
+def test_many_data_are_explained_with_a_smaller_error_than_few() -> None:
+    random = np.random.default_rng(5)
+    for count in (20, 35, 50):
+        by_chance = np.sqrt(np.mean(random.standard_normal((40000, count)) ** 2, axis=1))
+        assert np.mean(by_chance > error_limit(count)) == pytest.approx(1e-3, abs=5e-4)
+    assert error_limit(0) == error_limit(1) == error_limit(10) == ERROR_LIMIT == 1.5
+    assert error_limit(60) == error_limit(10**6) == 1.3
+    assert error_limit(10**6, 3.0) == pytest.approx(2.6)
+    assert error_limit(35, 3.0) == pytest.approx(2 * error_limit(35))
+
+
+def test_what_counts_on_its_own_as_well_is_not_hidden_by_many_other_data() -> None:
+    values = np.concatenate([[2.0, 2.0, 6.0, 6.0, 0.0], np.full(95, 0.5)])
+    block = np.array([-1, -1, 0, 0, 0] + [-1] * 95)
+    unknowns = Unknowns.plain(("a", "b"), 1.0)
+    whole = Residuals(values, np.zeros((100, 2)), block=block, penalty=1.0)
+    apart = replace(whole, apart=Apart(values=5, projected=1, unknowns=1))
+    one, both = (Posterior(unknowns, np.array([1.0, 3.0]), {}, r) for r in (whole, apart))
+    assert one.error == both.error < 1.3
+    assert one.error_apart == 0.0
+    assert not one.fails()
+    alone = Residuals(values[:5], np.zeros((5, 1)), block=block[:5], penalty=1.0, projected=1)
+    assert both.error_apart == Posterior(Unknowns.plain(("a",), 1.0), np.ones(1), {}, alone).error > 1.5
+    assert both.fails()
+    assert not both.fails(5.0)
 
 
 def test_ninety_per_cent_intervals_hold_nine_times_in_ten() -> None:

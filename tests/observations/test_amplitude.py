@@ -194,6 +194,21 @@ def test_nothing_is_claimed_where_only_drift_moves_the_modes() -> None:
         assert found.log_evidence - base.log_evidence < 5
 
 
+def test_modes_that_the_model_misses_are_not_hidden_by_hits_that_fit() -> None:
+    settings, quiet = DiagnoseSettings(processes=1), synthetic()
+    (hits,) = quiet.hits
+    off = np.zeros(len(hits.reference))
+    off[1] = 0.06
+    reference = replace(hits.reference, log_frequency=hits.reference.log_frequency + off)
+    moved = replace(hits, reference=reference, log_frequency=hits.log_frequency + off)
+    observations = AmplitudeObservations(ModeObservations(RIG, [reference]), [moved])
+    found = base_fit(observations).posterior
+    assert found.error < found.error_limit() < found.error_apart
+    told = diagnose(observations, RIG, {}, settings=settings, hypotheses=())
+    assert told.verdict == "unknown_effect"
+    assert "The error of the modes alone is" in told.summary
+
+
 def test_modes_that_move_with_the_force_are_not_explained_by_a_model_that_moves_none() -> None:
     settings = DiagnoseSettings(processes=1)
     quiet = synthetic()  # far below the error limit: what moves is not seen in it
