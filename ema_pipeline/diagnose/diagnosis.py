@@ -16,7 +16,7 @@ from ema_pipeline.diagnose.in_full import in_full
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names
 from ema_pipeline.diagnose.next_test import next_measurement
-from ema_pipeline.diagnose.probability import CLOSEST, NOTHING, against_nothing, of_failing_model
+from ema_pipeline.diagnose.probability import CLOSEST, NOTHING, against_nothing, complete, shared
 from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
@@ -105,12 +105,10 @@ def diagnose(
         names = [j.named.label for j in group]
         beside = [one for one in told if one[0] not in names]
         told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.label in names]
-    probabilities = dict(found.rounds[0].probabilities)
-    if verdict == "unknown_effect":
-        probabilities = of_failing_model(probabilities, CLOSEST)
-        candidates = tuple(replace(c, probability=CLOSEST * c.probability) for c in candidates)
-    elif not (explained if start is found.final else explains(first.observations, start, settings)):
-        probabilities = of_failing_model(probabilities)
+    share = complete(rungs[-1].error, found.final.posterior.count) if explained else CLOSEST
+    candidates = tuple(replace(c, probability=share * c.probability) for c in candidates)
+    suffices = explained if start is found.final else explains(first.observations, start, settings)
+    probabilities = shared(found.rounds[0].probabilities, share, share if suffices else 0.0)
     nothing = probabilities[NOTHING]
     limit = found.final.posterior.error_limit(settings.error_limit)
     best = next(
@@ -124,7 +122,7 @@ def diagnose(
     limits = detection_limits(first.observations, first.final, hypotheses, settings) if explained else ()
     visible = math.nan
     if verdict == "adequate":
-        visible = nothing_visible(first.rounds[0].ranking, probabilities, limits)
+        visible = share * nothing_visible(first.rounds[0].ranking, found.rounds[0].probabilities, limits)
     scatter = learned_scatters(observations, found.final)
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
     bent = sentences.standing_out(outlying_parts(observations, found.final))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.special import expit
+from scipy.stats import norm
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import named
@@ -18,6 +20,11 @@ CLOSEST = 0.5
 """Probability that what is claimed is right where the model does not explain the data with it either, over what it
 would be if it did: of eight such claims in simulated tests whose effects are in the library five were right, of twelve
 where they are not none."""
+
+_OUTSIDE = 0.02
+"""Prior probability that something is missing that is not in the library, and yet the model is near the data."""
+_USUAL_ERROR, _USUAL_SPREAD = 0.93, 0.11
+"""Mean error, and its 1 σ for many data, of 400 models of simulated rigs that lacked nothing."""
 
 
 def weight(hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
@@ -78,13 +85,29 @@ def probabilities(
     return told | {NOTHING: float(shares[-1])}
 
 
-def of_failing_model(told: Mapping[str, float], named: float = 1.0) -> dict[str, float]:
-    """The same where the model does not explain the data: what nothing missing had goes to `UNKNOWN`.
+def complete(error: float, count: int) -> float:
+    """Probability that a model which explains the data lacks nothing that the library lacks, by its error.
 
-    So does what effects that are named do not keep, a share `named`: `CLOSEST` where the model fails with them, too.
+    Effects that are not in the library may be followed by others that are, and by scatter: of 13 such claims in
+    simulated tests eight had errors of 1.2 to 1.5, of 290 right ones five. Below 1 an error tells nothing of them.
+
+    Parameters
+    ----------
+    error : float
+    count : int
+        Number of data.
     """
-    kept = {name: 0.0 if name == NOTHING else named * p for name, p in told.items()}
-    return kept | {UNKNOWN: max(1.0 - sum(kept.values()), 0.0)}
+    spread = math.hypot(_USUAL_SPREAD, 1 / math.sqrt(2 * max(count, 1)))
+    usual = (1 - _OUTSIDE) * float(norm.pdf(error, _USUAL_ERROR, spread))
+    outside = _OUTSIDE * 8 * max(error - 1, 0.0)  # up from 1 to the limit of few data, 1.5
+    return usual / (usual + outside)
+
+
+def shared(told: Mapping[str, float], named: float, nothing: float) -> dict[str, float]:
+    """Probabilities of which the effects that are named, and `NOTHING`, keep a share: the rest is that of `UNKNOWN`."""
+    shares = {name: nothing if name == NOTHING else named for name in told}
+    rest = math.fsum(p * (1 - shares[name]) for name, p in told.items())
+    return {name: p * shares[name] for name, p in told.items()} | ({UNKNOWN: rest} if rest else {})
 
 
 def against_nothing(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
 from ema_pipeline.diagnose.parallel import spread
-from ema_pipeline.diagnose.probability import CLOSEST, NOTHING, of_failing_model
+from ema_pipeline.diagnose.probability import CLOSEST, NOTHING, shared
 from ema_pipeline.diagnose.rungs import (
     learned_scatters,
     make_ladder,
@@ -171,7 +171,7 @@ def _nothing_claimed(found: Diagnosis, error: float, lost: float, settings: Diag
     told = {n: p / total for n, p in told.items()}
     verdict: VerdictWord = "adequate" if error <= settings.error_limit else "unknown_effect"
     if verdict == "unknown_effect":
-        told = of_failing_model(told, CLOSEST)
+        told = shared(told, CLOSEST, 0.0)
     return dataclasses.replace(
         found,
         verdict=verdict,

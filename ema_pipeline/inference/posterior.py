@@ -108,7 +108,7 @@ class Posterior:
         everything uncertain: what parts, channels and damping may scatter is in it.
         """
         squares = self.residuals.squares + self._squares_beside(len(self.x))
-        return float(np.sqrt(squares / max(self._count, 1)))
+        return float(np.sqrt(squares / max(self.count, 1)))
 
     @property
     def error_apart(self) -> float:
@@ -121,7 +121,7 @@ class Posterior:
 
     def error_limit(self, most: float = ERROR_LIMIT) -> float:
         """Error up to which a model explains so many data, see `error_limit`."""
-        return error_limit(self._count, most)
+        return error_limit(self.count, most)
 
     def fails(self, most: float = ERROR_LIMIT) -> bool:
         """True where the model does not explain the data, or those that count on their own as well."""
@@ -131,7 +131,7 @@ class Posterior:
         return self.error > self.error_limit(most)
 
     @property
-    def _count(self) -> int:
+    def count(self) -> int:
         """Number of data."""
         return len(self.residuals.values) - self.residuals.projected
 
