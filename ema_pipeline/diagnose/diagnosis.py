@@ -84,7 +84,9 @@ def diagnose(
     if hypotheses is None:
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
     first, faint = _selected(observations, known, hypotheses, settings, progress)
-    found = in_full(first)  # what else there may be is told to first order, as it was looked for
+    found = in_full(
+        first, settings.processes
+    )  # what else there may be is told to first order, as it was looked for
     observations = found.observations
     explained = explains(observations, found.final, settings)
     verdict = verdict_of(found, settings, explained)

@@ -8,7 +8,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.selection import Selection
+from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, refined
 
@@ -17,19 +22,25 @@ _BEHIND = 10.0
 the next it jumps by as much. 0.18 N of friction were 5 behind 0.015 N, where 0.31 N was true."""
 
 
-def in_full(found: Selection) -> Selection:
+def in_full(found: Selection, processes: int | None = 1) -> Selection:
     """The selection with the sizes that a calculation in full gives, where it explains the data about as well."""
-    observations, final = fit_in_full(found.observations, found.final)
+    observations, final = fit_in_full(found.observations, found.final, processes)
     return found if final is found.final else replace(found, final=final, observations=observations)
 
 
-def fit_in_full(observations: Observations, fit: Fit) -> tuple[Observations, Fit]:
-    """The data, and the fit to them, calculated in full; both as they are where that explains the data far worse."""
+def fit_in_full(observations: Observations, fit: Fit, processes: int | None = 1) -> tuple[Observations, Fit]:
+    """The data, and the fit to them, calculated in full; both as they are where that explains the data far worse.
+
+    Processes share the starts, None for one per processor.
+    """
     model, posterior = fit.model, fit.posterior
     full = observations.in_full(model.effects, posterior)
     if full is observations:
         return observations, fit
     starts = model.problem(full).sized_anew(posterior.x)
-    tried = [refined(full, model, x, posterior.scatters) for x in starts]
-    final = max(tried, key=lambda one: one.log_evidence)
+
+    def job(x: NDArray[np.float64]) -> Posterior:
+        return refined(full, model, x, posterior.scatters).posterior
+
+    final = Fit(model, max(spread(job, starts, processes), key=lambda one: one.log_evidence))
     return (full, final) if final.log_evidence > fit.log_evidence - _BEHIND else (observations, fit)

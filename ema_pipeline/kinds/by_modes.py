@@ -135,7 +135,7 @@ def _measured(run: Run) -> Ladder:
     with single_blas_thread():
         known = earlier_unknowns(run, ())
         fits = fits_of(observations, models, begun_at(observations, models[0], known) if known else None)
-        full, top = fit_in_full(observations, fits[-1])
+        full, top = fit_in_full(observations, fits[-1], run.settings.diagnose.processes)
         return ladder_of(full, [*fits[:-1], top], diagnosed_scatters(run))
 
 

@@ -66,6 +66,8 @@ def test_friction_calculated_in_full_has_its_true_size(force: float) -> None:
     assert abs(value - force) < 1.5 * std
     assert 0.2 * force < std < 0.5 * force
     assert again.log_evidence > fit.log_evidence + 3
+    _, shared = in_full.fit_in_full(observations, fit, processes=2)
+    assert np.array_equal(shared.posterior.x, again.posterior.x)
 
 
 def test_only_friction_is_calculated_in_full_and_once() -> None:
@@ -126,6 +128,11 @@ def test_a_calculation_in_full_that_explains_the_data_far_worse_is_left(
 
 @dataclass(frozen=True)
 class Worse:
-    """Stands for a fit."""
+    """Stands for a fit, and for its posterior."""
 
     log_evidence: float
+
+    @property
+    def posterior(self) -> Worse:
+        """Itself."""
+        return self
