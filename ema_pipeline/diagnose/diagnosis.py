@@ -16,12 +16,12 @@ from ema_pipeline.diagnose.in_full import in_full
 from ema_pipeline.diagnose.localise import localise
 from ema_pipeline.diagnose.naming import in_said_names
 from ema_pipeline.diagnose.next_test import next_measurement
-from ema_pipeline.diagnose.probability import CLOSEST, NOTHING, against_nothing, complete, shared
+from ema_pipeline.diagnose.probability import CLOSEST, against_nothing, complete, shared
 from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import DOUBTFUL, Candidate, Diagnosis, EffectSize, Ladder
+from ema_pipeline.diagnose.types import DOUBTFUL, NOTHING, Candidate, Diagnosis, EffectSize, Ladder
 from ema_pipeline.diagnose.verdict import alike, explains, outlying_parts, stands_still, verdict_of
 from ema_pipeline.diagnose.visible import nothing_visible
 from ema_pipeline.effects.base import Effect
@@ -84,9 +84,8 @@ def diagnose(
     if hypotheses is None:
         hypotheses = list_hypotheses(rig, library, known.labels, linear)
     first, faint = _selected(observations, known, hypotheses, settings, progress)
-    found = in_full(
-        first, settings.processes
-    )  # what else there may be is told to first order, as it was looked for
+    # what else there may be is told to first order, as it was looked for
+    found = in_full(first, settings.processes)
     observations = found.observations
     explained = explains(observations, found.final, settings)
     verdict = verdict_of(found, settings, explained)

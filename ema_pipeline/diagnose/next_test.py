@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.claims import Judged
-from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.selection import Selection
 from ema_pipeline.diagnose.sentences import label_text
-from ema_pipeline.diagnose.types import VerdictWord
+from ema_pipeline.diagnose.types import NOTHING, VerdictWord
 from ema_pipeline.dof import Dof
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
 from ema_pipeline.mechanics.system import LinearSystem, sensor_row

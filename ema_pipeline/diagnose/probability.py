@@ -13,9 +13,8 @@ from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import named
 from ema_pipeline.diagnose.ranked import Ranking
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import NOTHING, UNKNOWN
 
-NOTHING = "nothing"
-UNKNOWN = "an effect that is not in the library"
 CLOSEST = 0.5
 """Probability that what is claimed is right where the model does not explain the data with it either, over what it
 would be if it did: of eight such claims in simulated tests whose effects are in the library five were right, of twelve

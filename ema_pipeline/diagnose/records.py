@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
 from ema_pipeline.diagnose.parallel import spread
-from ema_pipeline.diagnose.probability import CLOSEST, NOTHING, shared
+from ema_pipeline.diagnose.probability import CLOSEST, shared
 from ema_pipeline.diagnose.rungs import (
     learned_scatters,
     make_ladder,
@@ -24,7 +24,7 @@ from ema_pipeline.diagnose.rungs import (
 from ema_pipeline.diagnose.selection import Progress
 from ema_pipeline.diagnose.sentences import label_text, size_text, summary
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, Ladder, Rung, VerdictWord
+from ema_pipeline.diagnose.types import NOTHING, Candidate, Diagnosis, Ladder, Rung, VerdictWord
 from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.errors import EmaError

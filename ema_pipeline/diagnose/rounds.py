@@ -17,9 +17,10 @@ from ema_pipeline.diagnose.claims import (
 )
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import named
-from ema_pipeline.diagnose.probability import NOTHING, probabilities
+from ema_pipeline.diagnose.probability import probabilities
 from ema_pipeline.diagnose.ranked import Ranked, Ranking
 from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.types import NOTHING
 from ema_pipeline.inference import beyond
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import part_reach, within_scatter

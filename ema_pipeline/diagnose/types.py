@@ -22,6 +22,9 @@ EXTRA_COORDINATE = "a degree of freedom of its own"
 
 NOT_DETERMINED = "not determined by these data"
 
+NOTHING = "nothing"
+UNKNOWN = "an effect that is not in the library"
+"""Beside the hypotheses, what else may be so."""
 DOUBTFUL = 0.5
 """Probability that nothing is missing, however small, below which an adequate model has a candidate worth a word."""
 

@@ -8,13 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ema_pipeline.diagnose.sentences import probability_text
-from ema_pipeline.diagnose.types import Diagnosis, Rung
+from ema_pipeline.diagnose.types import UNKNOWN, Diagnosis, Rung
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.effect_places import EffectPlaces, effect_places
 from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.shapes import drawing_for
 
+_WORTH_A_WORD = 0.01
+"""Probability of an effect that is not in the library from which it is told."""
 _OTHERS = 3
 """Less likely explanations that are named."""
 
@@ -148,8 +150,10 @@ def _against(found: Diagnosis) -> tuple[str, ...]:
             for c in found.candidates
             if c.label not in named
         ][:_OTHERS]
+        unknown = found.probabilities.get(UNKNOWN, 0.0)
         lines.append(
             f"Nothing missing at all has probability {nothing}"
+            + (f", {UNKNOWN} {probability_text(unknown)}" if unknown > _WORTH_A_WORD else "")
             + (f"; less likely: {', '.join(others)}." if others else ".")
         )
     if found.verdict == "adequate":

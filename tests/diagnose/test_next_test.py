@@ -11,7 +11,7 @@ import pytest
 import scipy.linalg
 from imperfect_modes import EXACT, chain, chain_modes, planetary_modes
 
-from ema_pipeline.diagnose.probability import NOTHING
+from ema_pipeline.diagnose.types import NOTHING
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.inference import descend
 from ema_pipeline.mechanics.system import LinearSystem

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ema_pipeline.diagnose.probability import NOTHING, UNKNOWN, complete, shared
+from ema_pipeline.diagnose.probability import complete, shared
+from ema_pipeline.diagnose.types import NOTHING, UNKNOWN
 
 
 @pytest.mark.parametrize("count", [10, 40, 400])

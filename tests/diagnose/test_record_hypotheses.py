@@ -11,7 +11,6 @@ import pytest
 from two_bodies import BEGIN, LIBRARY, STIFFNESS, decaying, rig, steady
 
 from ema_pipeline.diagnose import records
-from ema_pipeline.diagnose.probability import NOTHING, UNKNOWN
 from ema_pipeline.diagnose.records import (
     _OUT_OF_PHASE,
     _linear_change,
@@ -26,7 +25,7 @@ from ema_pipeline.diagnose.records import (
     whole_ladder,
 )
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Rung
+from ema_pipeline.diagnose.types import NOTHING, UNKNOWN, Candidate, Diagnosis, EffectSize, Ladder, Rung
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.inference import Unknowns
 from ema_pipeline.observations.records import RecordObservations

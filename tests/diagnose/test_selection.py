@@ -19,12 +19,11 @@ from ema_pipeline.diagnose.claims import (
     Judged,
 )
 from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _groups
-from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.ranked import Ranked, Ranking
 from ema_pipeline.diagnose.rounds import Round
 from ema_pipeline.diagnose.selection import Selection, _beside, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import EffectSize
+from ema_pipeline.diagnose.types import NOTHING, EffectSize
 from ema_pipeline.diagnose.verdict import alike
 
 SETTINGS = DiagnoseSettings(alike=3.0, claim=3.5, linearised=0.1, candidates=5)

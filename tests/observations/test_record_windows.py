@@ -11,11 +11,10 @@ import pytest
 from continuous_cases import RIG, write_oscillator
 
 import ema_pipeline as ema
-from ema_pipeline.diagnose.probability import NOTHING
 from ema_pipeline.diagnose.records import in_windows, record_hypotheses, record_model, whole_ladder
 from ema_pipeline.diagnose.rungs import ladder_of, make_ladder
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import Candidate, Diagnosis
+from ema_pipeline.diagnose.types import NOTHING, Candidate, Diagnosis
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.ingest.description import read_description
 from ema_pipeline.ingest.driven import load_driven

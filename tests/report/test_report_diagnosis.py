@@ -19,6 +19,8 @@ from rich.console import Console
 from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import (
+    NOTHING,
+    UNKNOWN,
     Candidate,
     DetectionLimit,
     Diagnosis,
@@ -30,7 +32,7 @@ from ema_pipeline.diagnose.types import (
     VerdictWord,
 )
 from ema_pipeline.fit.types import ErrorSweep
-from ema_pipeline.report import diagnosis, diagnosis_tables, run_screen, summary, tables, terminal
+from ema_pipeline.report import diagnosis, diagnosis_tables, page_top, run_screen, summary, tables, terminal
 from ema_pipeline.report.figures.diagnosis import ladder_errors, where_it_fails
 from ema_pipeline.report.html import bokeh_script, report_html
 from ema_pipeline.report.numbers import below
@@ -467,6 +469,21 @@ def test_an_adequate_verdict_has_the_probability_that_nothing_is_missing_that_wo
         "Perhaps mesh stiffness loss at sun-planet1 (4.0 %), not supported enough to be claimed."
     )
     assert replace(one, nothing_visible=math.nan).adequate_probability == one.null_probability == 0.9
+
+
+def test_the_probability_of_what_the_library_lacks_is_told_where_it_is_worth_a_word() -> None:
+    one = found("unknown_effect")
+    assert any(
+        line.startswith("Nothing missing at all has probability <0.1 %; less")
+        for line in page_top._against(one)
+    )
+    lacking = replace(one, null_probability=0.0, probabilities={NOTHING: 0.0, UNKNOWN: 0.5})
+    assert any(
+        line.startswith(
+            "Nothing missing at all has probability <0.1 %, an effect that is not in the library 50 %; "
+        )
+        for line in page_top._against(lacking)
+    )
 
 
 def test_the_sentence_on_what_is_missing_names_one_effect_or_several() -> None:
