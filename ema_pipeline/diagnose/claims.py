@@ -144,10 +144,7 @@ def judge(
         tie = HELD_OUT_TIE + share * max(min(gain, left), 0.0)
         doubt = _contradicted(base, mended, before, after, tie)
         if not doubt and left < needed:
-            doubt = (
-                f"its gain in log evidence drops to {left:.1f}, below {needed:g}, without what tests often "
-                "make of closely spaced modes: a wrong shape, one mode found twice, or two found as one"
-            )
+            doubt = f"{drops_to(left)}, below {needed:g}"
         name = replace(name, sizes=sizes_of(ranked.hypothesis, name.name, averaged(observations, mended)))
     return Judged(ranked, name, gain, base, mended, before, after, doubt, needed, left, linearisation)
 
@@ -172,6 +169,14 @@ def _weak(
         if abs(x) < sigmas * std:
             return f"{MAY_BE_ZERO} {sigmas:g} standard deviations of zero"
     return ""
+
+
+def drops_to(left: float) -> str:
+    """What is left of a gain without what some effect or other explains wherever modes lie close together."""
+    return (
+        "without what tests often make of closely spaced modes (a wrong shape, one mode found twice, or two found as "
+        f"one) its gain in log evidence drops to {left:.1f}"
+    )
 
 
 def doubt_of_nothing(nothing: float, settings: DiagnoseSettings) -> str:

@@ -13,6 +13,7 @@ from ema_pipeline.diagnose.claims import (
     Judged,
     doubt_of_nothing,
     doubtful_evidence,
+    drops_to,
     judge,
 )
 from ema_pipeline.diagnose.hypotheses import Hypothesis
@@ -146,7 +147,7 @@ def weighed(
     believed = _without_linearisation(ranking, settings) | {j.named.label: j.believed for j in judged}
     told = probabilities(ranking, hypotheses, settings, found, believed, least)
     nothing = doubt_of_nothing(told[NOTHING], settings)
-    doubts = [_against(j, judged, least) or nothing if j.claimed else "" for j in judged]
+    doubts = [_against(j, judged, least) or _too_little(j, nothing) if j.claimed else "" for j in judged]
     judged = [replace(j, doubt=doubt) if doubt else j for j, doubt in zip(judged, doubts, strict=True)]
     return Round(ranking, tuple(judged), told)
 
@@ -156,6 +157,11 @@ def _against(one: Judged, judged: Sequence[Judged], least: float) -> str:
     if one.gain < least:
         return BETTER_CONTRADICTED
     return BETTER_DOUBTED if _one_of_many(one, judged) else ""
+
+
+def _too_little(one: Judged, nothing: str) -> str:
+    """Why nothing is claimed where nothing missing is too probable, with what that rests on; empty where it is not."""
+    return f"{nothing}, and {drops_to(one.left)}" if nothing and one.left < one.gain else nothing
 
 
 def _one_of_many(one: Judged, judged: Sequence[Judged]) -> bool:

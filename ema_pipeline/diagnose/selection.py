@@ -203,8 +203,13 @@ def _acquitted(
 
     Where others gained more alone, it counts with what both gain.
     """
-    leads = leader is found.judged[0]
-    acquitted = replace(leader, doubt="", gain=leader.gain if leads else both.gain, left=np.inf)
+    gain = leader.gain if leader is found.judged[0] else both.gain
+    ranked = tuple(
+        replace(r, gain=gain) if r.hypothesis.label == leader.hypothesis.label else r
+        for r in found.ranking.ranked
+    )
+    acquitted = replace(leader, doubt="", gain=gain, left=np.inf)
     others = [j for j in found.judged if j is not leader]
     others = [replace(j, doubt="") if j.doubt in BY_OTHERS else j for j in others]
-    return weighed(found.ranking, [acquitted, *others], hypotheses, settings, known)
+    ranking = replace(found.ranking, ranked=ranked)
+    return weighed(ranking, [acquitted, *others], hypotheses, settings, known)
