@@ -42,17 +42,24 @@ def test_gains_count_from_the_first_rung() -> None:
 def test_a_size_that_single_hits_tell_is_no_better_known_than_it_is_calculated(
     linearised: bool, std: float
 ) -> None:
-    """Of -5 N a calculation that is off by 30 % has 1.5 N wrong."""
+    """Of -5 N/m a calculation that is off by 30 % has 1.5 N/m wrong, of friction of 5 N 3 N."""
     effects = [
         SimpleNamespace(label="cubic@x", effect=SimpleNamespace(linear=False)),
         SimpleNamespace(label="spring@x", effect=SimpleNamespace(linear=True)),
+        SimpleNamespace(label="friction@x", effect=SimpleNamespace(linear=False)),
     ]
-    sizes = {name: EffectSize(-5.0, 2.0, "N") for name in ("cubic@x.s", "spring@x.s", "mass")}
+    sizes = {name: EffectSize(-5.0, 2.0, "N/m") for name in ("cubic@x.s", "spring@x.s", "mass")}
+    sizes["friction@x.s"] = EffectSize(5.0, 2.0, "N")
     observations: Any = SimpleNamespace(linearised=linearised)
     model: Any = SimpleNamespace(effects=effects)
     found = rungs._stated(observations, model, sizes)
     assert {n: s.std for n, s in found.items()} == pytest.approx(
-        {"cubic@x.s": std, "spring@x.s": 2.0, "mass": 2.0}
+        {
+            "cubic@x.s": std,
+            "spring@x.s": 2.0,
+            "mass": 2.0,
+            "friction@x.s": np.hypot(2.0, 3.0) if linearised else 2.0,
+        }
     )
     assert found["cubic@x.s"].value == -5.0
 
