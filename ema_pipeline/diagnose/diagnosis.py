@@ -106,12 +106,13 @@ def diagnose(
         names = [j.named.label for j in group]
         beside = [one for one in told if one[0] not in names]
         told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.label in names]
-    share = complete(rungs[-1].error, found.final.posterior.count) if explained else CLOSEST
+    final = found.final.posterior
+    share = complete(*final.telling) if explained else CLOSEST
     candidates = tuple(replace(c, probability=share * c.probability) for c in candidates)
     suffices = explained if start is found.final else explains(first.observations, start, settings)
     probabilities = shared(found.rounds[0].probabilities, share, share if suffices else 0.0)
     nothing = probabilities[NOTHING]
-    limit = found.final.posterior.error_limit(settings.error_limit)
+    limit = final.error_limit(settings.error_limit)
     best = next(
         (
             (c.label, c.why)
@@ -128,7 +129,7 @@ def diagnose(
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
     bent = sentences.standing_out(outlying_parts(observations, found.final))
     errors = (rungs[0].error, rungs[-1].error)
-    apart = sentences.of_modes_alone(found.final.posterior.error_apart, max(errors[1], limit))
+    apart = sentences.of_modes_alone(final.error_apart, max(errors[1], limit))
     still = sentences.STANDING_STILL if stands_still(observations, found.final) else ""
     reasons = " ".join(filter(None, (still, apart, bent)))
     return Diagnosis(

@@ -117,18 +117,25 @@ class Posterior:
         if apart is None:
             return 0.0
         squares = self.residuals.squares_apart + self._squares_beside(apart.unknowns)
-        return float(np.sqrt(squares / max(apart.values - apart.projected, 1)))
+        return float(np.sqrt(squares / max(apart.count, 1)))
+
+    @property
+    def telling(self) -> tuple[float, int]:
+        """Error and number of the data that tell whether the model lacks something: of those apart, or else of all.
+
+        What is calculated to first order only leaves an error of its own.
+        """
+        apart = self.residuals.apart
+        return (self.error, self.count) if apart is None else (self.error_apart, apart.count)
 
     def error_limit(self, most: float = ERROR_LIMIT) -> float:
-        """Error up to which a model explains so many data, see `error_limit`."""
-        return error_limit(self.count, most)
+        """Error of all data up to which the model explains them, see `error_limit`; beside data apart the largest."""
+        return error_limit(self.count, most) if self.residuals.apart is None else most
 
     def fails(self, most: float = ERROR_LIMIT) -> bool:
         """True where the model does not explain the data, or those that count on their own as well."""
-        apart = self.residuals.apart
-        if apart is not None and self.error_apart > error_limit(apart.values - apart.projected, most):
-            return True
-        return self.error > self.error_limit(most)
+        error, count = self.telling
+        return error > error_limit(count, most) or self.error > self.error_limit(most)
 
     @property
     def count(self) -> int:

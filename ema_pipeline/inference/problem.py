@@ -29,6 +29,11 @@ class Apart:
     projected: int
     unknowns: int
 
+    @property
+    def count(self) -> int:
+        """Number of data."""
+        return self.values - self.projected
+
 
 @dataclass(frozen=True)
 class Residuals:

@@ -159,6 +159,10 @@ def test_what_counts_on_its_own_as_well_is_not_hidden_by_many_other_data() -> No
     assert both.error_apart == Posterior(Unknowns.plain(("a",), 1.0), np.ones(1), {}, alone).error > 1.5
     assert both.fails()
     assert not both.fails(5.0)
+    assert one.telling == (one.error, 100)
+    assert both.telling == (both.error_apart, 4)
+    # beside data that tell on their own, all together may be calculated to first order only
+    assert (one.error_limit(), both.error_limit()) == (1.3, 1.5)
 
 
 def test_ninety_per_cent_intervals_hold_nine_times_in_ten() -> None:
