@@ -20,6 +20,7 @@ _LEAST_LIMIT = 1.3
 """The same of many, whose σ are themselves known to some tenths only: of 400 models of simulated rigs that lacked
 nothing one had an error above it, of 103 that lacked too little to be named ten."""
 _ONCE_IN = 1e-3
+_FEW = 20
 
 
 def error_limit(count: int, most: float = ERROR_LIMIT) -> float:
@@ -112,9 +113,9 @@ class Posterior:
 
     @property
     def error_apart(self) -> float:
-        """The same of the values that count on their own as well; 0 where there are none."""
+        """The same of the values that count on their own as well; 0 where there are none, or they are rough."""
         apart = self.residuals.apart
-        if apart is None:
+        if apart is None or apart.rough:
             return 0.0
         squares = self.residuals.squares_apart + self._squares_beside(apart.unknowns)
         return float(np.sqrt(squares / max(apart.count, 1)))
@@ -123,10 +124,12 @@ class Posterior:
     def telling(self) -> tuple[float, int]:
         """Error and number of the data that tell whether the model lacks something: of those apart, or else of all.
 
-        What is calculated to first order only leaves an error of its own.
+        What is calculated to first order only leaves an error of its own: it tells no more than few data.
         """
         apart = self.residuals.apart
-        return (self.error, self.count) if apart is None else (self.error_apart, apart.count)
+        if apart is None:
+            return self.error, self.count
+        return (self.error, min(self.count, _FEW)) if apart.rough else (self.error_apart, apart.count)
 
     def error_limit(self, most: float = ERROR_LIMIT) -> float:
         """Error of all data up to which the model explains them, see `error_limit`; beside data apart the largest."""

@@ -23,11 +23,14 @@ class Apart:
     values, projected, unknowns : int
         Their number, how many of them were spent on factors of no interest, and the number of the unknowns, from the
         first on, whose priors belong to them.
+    rough : bool
+        True where they, too, are calculated to first order only: they need not be explained on their own.
     """
 
     values: int
     projected: int
     unknowns: int
+    rough: bool = False
 
     @property
     def count(self) -> int:

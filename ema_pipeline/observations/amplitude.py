@@ -420,7 +420,7 @@ class AmplitudeProblem:
         return dataclasses.replace(
             stacked(parts, len(x)),
             matching=(modes.matching, tuple(p.matching for p in parts[1:])),
-            apart=Apart(len(modes.values), modes.projected, count),
+            apart=Apart(len(modes.values), modes.projected, count, rough=bool(self._nonlinear)),
         )
 
 
