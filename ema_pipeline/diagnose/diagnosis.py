@@ -129,7 +129,8 @@ def diagnose(
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
     bent = sentences.standing_out(outlying_parts(observations, found.final))
     errors = (rungs[0].error, rungs[-1].error)
-    apart = sentences.of_modes_alone(final.error_apart, max(errors[1], limit))
+    hidden = final.fails(settings.error_limit) and final.error_apart > errors[1]
+    apart = sentences.of_modes_alone(final.error_apart) if hidden else ""
     still = sentences.STANDING_STILL if stands_still(observations, found.final) else ""
     reasons = " ".join(filter(None, (still, apart, bent)))
     return Diagnosis(

@@ -83,7 +83,7 @@ def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, 
     as_fitted = given.residuals(np.zeros(len(x)), trained.scatters)
     if not np.all(np.isfinite(as_fitted.values)):
         return 0.0, 0, -np.inf
-    count = max(len(as_fitted.values) - as_fitted.projected, 1)
+    count = max(as_fitted.count, 1)
     squares = _squares(as_fitted) + 2 * as_fitted.penalty
     told = descend(given, trained.scatters, np.zeros(len(x)), steps=_FOLLOWED)
     found = told.residuals

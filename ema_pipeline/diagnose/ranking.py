@@ -37,13 +37,7 @@ from ema_pipeline.diagnose.score import UNSEEN, Score, scores
 from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import (
-    Fit,
-    freed,
-    learned,
-    refined,
-    unbent,
-)
+from ema_pipeline.observations.fitting import Fit, freed, learned, refined, unbent
 
 Progress = Callable[[float, str], None]
 

@@ -113,10 +113,8 @@ STANDING_STILL = (
 )
 
 
-def of_modes_alone(apart: float, limit: float) -> str:
-    """Where the modes show that a model fails, and many data of single hits that fit hide it; empty where not."""
-    if apart <= limit:
-        return ""
+def of_modes_alone(apart: float) -> str:
+    """Where the modes show that a model fails, and many data of single hits that fit hide it."""
     return f"The error of the modes alone is {apart:.2f}: many data of single hits, which fit, hide it."
 
 

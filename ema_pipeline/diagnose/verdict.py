@@ -49,7 +49,7 @@ def too_few(fit: Fit) -> bool:
         for name, std, scatter in zip(unknowns.names, unknowns.std, unknowns.scatter, strict=True)
         if not scatter and "@" not in name and std >= FREE_STD[0]
     ]
-    return len(residuals.values) - residuals.projected <= len(loose) + 1
+    return residuals.count <= len(loose) + 1
 
 
 def verdict_of(found: Selection, settings: DiagnoseSettings, explained: bool) -> VerdictWord:

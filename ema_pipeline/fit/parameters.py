@@ -158,7 +158,6 @@ def fit_result(
     covariance, _ = sized.posterior.of_sums([made_up_of(fitted.problem, n) for n in names])
     deviation = np.sqrt(np.diag(covariance))
     sweeps, steps = seed_route(rig, measured, settings)
-    count = len(posterior.residuals.values) - posterior.residuals.projected
     return FitResult(
         parameters=estimates,
         names=names,
@@ -166,7 +165,7 @@ def fit_result(
         error=posterior.error,
         chi2_per_dof=posterior.error**2,
         frequency_error=_frequency_error(fitted),
-        data_count=count,
+        data_count=posterior.residuals.count,
         stop_reason="converged",
         sweeps=sweeps,
         stepwise=steps,

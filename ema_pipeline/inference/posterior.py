@@ -21,6 +21,7 @@ _LEAST_LIMIT = 1.3
 nothing one had an error above it, of 103 that lacked too little to be named ten."""
 _ONCE_IN = 1e-3
 _FEW = 20
+"""Data that what is calculated to first order only counts as."""
 
 
 def error_limit(count: int, most: float = ERROR_LIMIT) -> float:
@@ -108,8 +109,13 @@ class Posterior:
         The sum of squares at the maximum, priors included, is that of the residual whitened by the covariance of
         everything uncertain: what parts, channels and damping may scatter is in it.
         """
-        squares = self.residuals.squares + self._squares_beside(len(self.x))
-        return float(np.sqrt(squares / max(self.count, 1)))
+        return self._error(self.residuals, len(self.x))
+
+    def _error(self, residuals: Residuals, unknowns: int) -> float:
+        """Of some residuals, with the priors of the first unknowns."""
+        squares = residuals.squares + 2 * residuals.penalty
+        squares += float(np.sum((self.x / self.prior_std)[:unknowns] ** 2))
+        return float(np.sqrt(squares / max(residuals.count, 1)))
 
     @property
     def error_apart(self) -> float:
@@ -117,8 +123,7 @@ class Posterior:
         apart = self.residuals.apart
         if apart is None or apart.rough:
             return 0.0
-        squares = self.residuals.squares_apart + self._squares_beside(apart.unknowns)
-        return float(np.sqrt(squares / max(apart.count, 1)))
+        return self._error(self.residuals.only_apart(apart), apart.unknowns)
 
     @property
     def telling(self) -> tuple[float, int]:
@@ -126,28 +131,23 @@ class Posterior:
 
         What is calculated to first order only leaves an error of its own: it tells no more than few data.
         """
-        apart = self.residuals.apart
+        apart, count = self.residuals.apart, self.residuals.count
         if apart is None:
-            return self.error, self.count
-        return (self.error, min(self.count, _FEW)) if apart.rough else (self.error_apart, apart.count)
+            return self.error, count
+        return (
+            (self.error, min(count, _FEW))
+            if apart.rough
+            else (self.error_apart, apart.values - apart.projected)
+        )
 
     def error_limit(self, most: float = ERROR_LIMIT) -> float:
         """Error of all data up to which the model explains them, see `error_limit`; beside data apart the largest."""
-        return error_limit(self.count, most) if self.residuals.apart is None else most
+        return error_limit(self.residuals.count, most) if self.residuals.apart is None else most
 
     def fails(self, most: float = ERROR_LIMIT) -> bool:
         """True where the model does not explain the data, or those that count on their own as well."""
         error, count = self.telling
         return error > error_limit(count, most) or self.error > self.error_limit(most)
-
-    @property
-    def count(self) -> int:
-        """Number of data."""
-        return len(self.residuals.values) - self.residuals.projected
-
-    def _squares_beside(self, unknowns: int) -> float:
-        """What modes without a partner and the priors of the first unknowns add to the squares."""
-        return 2 * self.residuals.penalty + float(np.sum((self.x / self.prior_std)[:unknowns] ** 2))
 
     def expected_squares(self, weighted: bool = True) -> NDArray[np.float64]:
         """Expected squares of the residuals while the unknowns are as uncertain as they are, (m,).

@@ -32,11 +32,6 @@ class Apart:
     unknowns: int
     rough: bool = False
 
-    @property
-    def count(self) -> int:
-        """Number of data."""
-        return self.values - self.projected
-
 
 @dataclass(frozen=True)
 class Residuals:
@@ -146,19 +141,25 @@ class Residuals:
     @property
     def squares(self) -> float:
         """Sum of squares in which errors count."""
-        return self._squares(len(self.values))
+        alone = self.stated if self.block is None else self.stated[self.block < 0]
+        return float(alone @ alone) + float(np.sum(tails.deviance(*self.blocks)))
 
     @property
-    def squares_apart(self) -> float:
-        """The same of the values that count on their own as well."""
-        return self._squares(0 if self.apart is None else self.apart.values)
+    def count(self) -> int:
+        """Number of data: of values that were not spent on factors of no interest."""
+        return len(self.values) - self.projected
 
-    def _squares(self, count: int) -> float:
-        """That of the first values."""
-        stated, block = self.stated[:count], None if self.block is None else self.block[:count]
-        alone = stated if block is None else stated[block < 0]
-        of_blocks = in_blocks(self.values[:count] ** 2, block)
-        return float(alone @ alone) + float(np.sum(tails.deviance(*of_blocks)))
+    def only_apart(self, apart: Apart) -> Residuals:
+        """The values that count on their own as well, without derivatives."""
+        count = apart.values
+        return Residuals(
+            self.values[:count],
+            self.jacobian[:0],
+            penalty=self.penalty,
+            projected=apart.projected,
+            relative=None if self.relative is None else self.relative[:count],
+            block=None if self.block is None else self.block[:count],
+        )
 
     @property
     def cost(self) -> float:
