@@ -125,6 +125,7 @@ class ModeProblem(EffectProblem):
         self.offset = len(model.unknowns)
         self._defaults = {name: s.default for name, s in observations.scatters.items()}
         self._sensing: dict[tuple[str, int], tuple[ModeData, Sensing]] = {}
+        self._comparisons: dict[tuple[str, int], tuple[object, Comparison]] = {}
 
     @property
     def sizes(self) -> Mapping[str, SizeMap]:
@@ -235,8 +236,13 @@ class ModeProblem(EffectProblem):
     def comparison(
         self, data: ModeData, x: NDArray[np.float64], scatters: Mapping[str, float], heat: float = 1.0
     ) -> Comparison:
-        """One configuration's modes against the model's at `x`."""
-        return Comparison(self.model, data, self.sensing(data), x, scatters, self._defaults, heat)
+        """One configuration's modes against the model's at `x`, the last one kept."""
+        key, at = (data.configuration, id(data)), (x.tobytes(), dict(scatters), heat)
+        known = self._comparisons.get(key)
+        if known is None or known[0] != at:
+            found = Comparison(self.model, data, self.sensing(data), x.copy(), scatters, self._defaults, heat)
+            known = self._comparisons[key] = at, found
+        return known[1]
 
     def _modes(self, configuration: str, x: NDArray[np.float64]) -> EigenSolution | None:
         return self.model.modes(configuration, x[: self.offset], derivatives=False)[1]

@@ -89,6 +89,41 @@ class _Known:
     mixed: list[tuple[int, int, int]]
 
 
+@dataclass(frozen=True)
+class _Pairs:
+    """Measured modes and those of the model that they are, and what is known of them without derivatives.
+
+    Attributes
+    ----------
+    match : ndarray of int, (m,)
+        Model mode of every measured one, -1 for none.
+    anew : bool
+        True where the pairs were found here, False where they were given.
+    on, to : ndarray of int, (k,)
+        Measured modes with a partner, and these.
+    hidden : ndarray of int, (k,)
+        See `hidden_partners`.
+    read : ndarray, (s, n)
+        What the sensors read of the model's modes.
+    known : _Known
+    groups : list of (ndarray of int, Groups)
+        See `Comparison._groups`.
+    """
+
+    match: NDArray[np.int64]
+    anew: bool
+    on: NDArray[np.int64]
+    to: NDArray[np.int64]
+    hidden: NDArray[np.int64]
+    read: NDArray[np.float64]
+    known: _Known
+    groups: list[tuple[NDArray[np.int64], Groups]]
+
+    def are(self, matching: object) -> bool:
+        """True where `matching` leads to the same pairs at the same point."""
+        return np.array_equal(self.match, matching) if isinstance(matching, np.ndarray) else self.anew
+
+
 @dataclass
 class _Predicted:
     """What the model says of modes that have a partner.
@@ -146,6 +181,7 @@ class Comparison:
         self.reading = self.gain[:, None] * (
             sensing.along + np.sum(cross[..., None] * sensing.across, axis=0)
         )
+        self._last: _Pairs | None = None
 
     def residuals(self, matching: object, derivatives: bool) -> Residuals:
         """Residuals with the pairs of `matching`, or with new ones where it is no array."""
@@ -160,31 +196,28 @@ class Comparison:
         matrices, solution = self.model.modes(self.data.configuration, own, derivatives)
         if solution is None:
             return None
-        predicted = self.seen(solution)
-        match = matching if isinstance(matching, np.ndarray) else self.matched(solution)
-        on, alone = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
-        to = match[on]
-        sensors = np.count_nonzero(self.data.seen[on], axis=1) * self.data.may_hide_another[on]
-        hidden = hidden_partners(solution, to, sensors, predicted)
-        known = self._known(on, hidden)
-        groups = self._groups(solution, predicted, known, to)
-        number = np.full(len(on), -1)
-        for members, _ in groups:
-            number[members] = members[:, :1]
-        slopes = ModeDerivatives.of(matrices, solution, to, number) if derivatives else None
-        shapes = self._predicted(solution, predicted, known, to, groups, slopes)
+        pairs = self._pairs(solution, matching)
+        on, to, hidden = pairs.on, pairs.to, pairs.hidden
+        slopes = None
+        if derivatives:
+            number = np.full(len(on), -1)
+            for members, _ in pairs.groups:
+                number[members] = members[:, :1]
+            slopes = ModeDerivatives.of(matrices, solution, to, number)
+        shapes = self._predicted(solution, pairs, slopes)
         rows: tuple[Rows, ...] = (
             self._frequencies(shapes, on),
             self._damping(solution, matrices, on, to, slopes),
-            self._shapes(predicted, shapes, known, hidden),
+            self._shapes(pairs, shapes),
         )
         if np.any(self.data.whirling[on]):
             rows += (self._complex_shapes(solution, on, to, slopes),)
+        alone = np.flatnonzero(pairs.match < 0)
         left = Alone.of(self.data, alone, self.scatters, self.defaults)
         accounted = np.concatenate([to, hidden[hidden >= 0]])
         return Compared(
             rows=rows,
-            match=match,
+            match=pairs.match,
             log_scale=left.usual,
             penalty=left.penalty + unseen(self.data, solution.frequency_hz, accounted),
             split=left.split,
@@ -193,6 +226,20 @@ class Comparison:
             if self.data.shapes.shape[1]
             else 0,
         )
+
+    def _pairs(self, solution: EigenSolution, matching: object) -> _Pairs:
+        """Kept, since derivatives are mostly wanted where a trial step was found to lead."""
+        if self._last is None or not self._last.are(matching):
+            given = isinstance(matching, np.ndarray)
+            match = np.asarray(matching) if given else self.matched(solution)
+            on, read = np.flatnonzero(match >= 0), self.seen(solution)
+            to = match[on]
+            sensors = np.count_nonzero(self.data.seen[on], axis=1) * self.data.may_hide_another[on]
+            hidden = hidden_partners(solution, to, sensors, read)
+            known = self._known(on, hidden)
+            groups = self._groups(solution, read, known, to)
+            self._last = _Pairs(match, not given, on, to, hidden, read, known, groups)
+        return self._last
 
     def seen(self, solution: EigenSolution) -> NDArray[np.float64]:
         """What the sensors read of every shape, (s, n); complex shapes turned as measured ones are, and made real."""
@@ -288,16 +335,10 @@ class Comparison:
         return found
 
     def _predicted(
-        self,
-        solution: EigenSolution,
-        read: NDArray[np.float64],
-        known: _Known,
-        to: NDArray[np.int64],
-        groups: list[tuple[NDArray[np.int64], Groups]],
-        slopes: ModeDerivatives | None,
+        self, solution: EigenSolution, pairs: _Pairs, slopes: ModeDerivatives | None
     ) -> _Predicted:
         """What the model says of the frequencies and shapes of modes with a partner, close ones as groups."""
-        n = len(self.x)
+        n, to, read = len(self.x), pairs.to, pairs.read
         log = np.log(np.maximum(solution.frequency_hz[to], 1e-6))
         found = _Predicted(log, read[:, to].T, np.zeros((len(to), len(read))))
         if slopes is not None:
@@ -308,10 +349,10 @@ class Comparison:
                 slope = _turned_slopes(self._read(solution)[:, to].T, slope)
             slope = np.real(slope)
             found.slope = _Predicted(log_slope, slope, np.zeros(slope.shape))
-        for members, group in groups:
+        for members, group in pairs.groups:
             found.put(members, group)
             if found.slope is not None and slopes is not None:
-                by = self._group_slopes(found.slope.shapes[members], slopes, known, members)
+                by = self._group_slopes(found.slope.shapes[members], slopes, pairs.known, members)
                 found.slope.put(members, group.slopes(by))
         return found
 
@@ -333,20 +374,15 @@ class Comparison:
                 measured[(*place[k], slice(None), unknown)] = -self.data.known_shapes[other]
         return Slopes(read, reduced, measured)
 
-    def _shapes(
-        self,
-        predicted: NDArray[np.float64],
-        shapes: _Predicted,
-        known: _Known,
-        hidden: NDArray[np.int64],
-    ) -> Rows:
+    def _shapes(self, pairs: _Pairs, shapes: _Predicted) -> Rows:
         """Shapes with the factor projected out that fits them best, and what coinciding modes add; none of whirling
         modes.
         """
+        known = pairs.known
         whirling = self.data.whirling[known.on]
         places = np.flatnonzero(~whirling)
         real = places if np.any(whirling) else slice(None)  # most rigs have none, and need no copies
-        on, hidden = known.on[real], hidden[real]
+        on, hidden = known.on[real], pairs.hidden[real]
         place = {int(k): i for i, k in enumerate(places)}
         seen = self.data.seen[on] > 0
         y, weight, p, turned = (
@@ -372,7 +408,7 @@ class Comparison:
                     scaled[place[k], unknown] -= weighted[place[k]] @ along / squared[place[k]]
             slope += (p + turned)[:, :, None] * scaled[:, None, :]
         difference = y - scale[:, None] * (p + turned)
-        for k, along in directions(hidden, predicted, p, weight):
+        for k, along in directions(hidden, pairs.read, p, weight):
             difference[k] -= along * (weight[k] @ (along * difference[k]))
             if slope is not None:
                 slope[k] -= along[:, None] * ((weight[k] * along) @ slope[k])
