@@ -49,8 +49,8 @@ of a model that is bent to the data, and put a cubic spring of a chain of three,
 chain has eighteen of one size."""
 _ANNEALED = 16
 """Hypotheses, best first by a short fit, that are fitted in full where the base model fails, or is bent to the data;
-beside them those of which some size gives modes without a partner one. What led in the end was among the first eight of
-some sixty, or among these."""
+beside them as many of which some size gives modes without a partner one. What led in the end was among the first eight
+of some sixty, or of these."""
 _FIRST = 24
 """Hypotheses of one size that are annealed first where a measured mode has no partner, and those that are begun again
 where the base model is bent to the data."""
@@ -106,7 +106,7 @@ def rank(
     stuck = lost or base.posterior.error > _EXPLAINED
     settled = None if stuck else learned(observations, base)
     near = settled is not None and unbent(observations, settled)
-    pairing = _pairing(tried)
+    pairing = _best_tried(tried, _PAIRING)
     among = _screened(hypotheses, promise, near)
     chosen = [h for h in hypotheses if h in among or h.label in pairing]
     earlier = before or {}
@@ -125,7 +125,7 @@ def rank(
     known: dict[str, Posterior] = {}
     if not near:
         # A few steps do not lead a mode of the model to a measured one that has no partner yet.
-        leads = {label for label, one in tried.items() if one.gain > PROMISING}
+        leads = _best_tried({label: one for label, one in tried.items() if one.gain > PROMISING}, _ANNEALED)
         behind = short(chosen, processes)[_ANNEALED:]
         known |= {h.label: posterior for h, posterior in behind if h.label not in leads}
     decided = False
@@ -140,7 +140,7 @@ def rank(
         decided = lost and any(_decides(p, base) for p in known.values())
     found = {h.label: (h, Fit(models[h.label], known[h.label])) for h in chosen}
     if not near and not decided:
-        again = found if stuck else _contenders(found, _FIRST)
+        again = _leading(found, _FIRST) if stuck else _contenders(found, _FIRST)
         base, found = _begun_again(observations, base, found, processes, again, steps=5)
     found = _bettered(found, _contenders(found), partial(_free, observations), processes)
     base, found = _begun_again(observations, base, found, processes, _contenders(found), steps=12)
@@ -179,9 +179,9 @@ def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], ne
     return [h for h in hypotheses if h.label not in out]
 
 
-def _pairing(tried: Mapping[str, Tried]) -> set[str]:
+def _best_tried(tried: Mapping[str, Tried], most: int) -> set[str]:
     """Hypotheses of which some size gives modes without a partner one, the best of them."""
-    return set(sorted(tried, key=lambda label: -tried[label].gain)[:_PAIRING])
+    return set(sorted(tried, key=lambda label: -tried[label].gain)[:most])
 
 
 def _batches(
@@ -224,8 +224,12 @@ def _begun_again(
 
 def _contenders(found: Found, most: int = CONTENDERS) -> list[str]:
     """The best hypotheses, and none that is beaten."""
-    best = sorted(found, key=lambda label: -found[label][1].log_evidence)[:most]
-    return unbeaten(best, lambda label: found[label][1].log_evidence)
+    return unbeaten(_leading(found, most), lambda label: found[label][1].log_evidence)
+
+
+def _leading(found: Found, most: int) -> list[str]:
+    """The best hypotheses."""
+    return sorted(found, key=lambda label: -found[label][1].log_evidence)[:most]
 
 
 def _bettered(

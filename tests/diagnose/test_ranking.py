@@ -16,11 +16,11 @@ from ema_pipeline.diagnose.ranked import Ranked, Ranking
 from ema_pipeline.diagnose.ranking import (
     _batches,
     _begun_again,
+    _best_tried,
     _better,
     _bettered,
     _contenders,
     _decides,
-    _pairing,
     _screened,
 )
 from ema_pipeline.observations.fitting import Fit
@@ -95,7 +95,7 @@ def test_what_promises_most_is_fitted_first_and_the_rest_in_a_few_steps_once_all
 
 def test_what_gives_a_lost_mode_a_partner_is_fitted_though_its_score_promises_nothing() -> None:
     tried = {f"h{k}": Tried(8.0, float(k)) for k in range(20)}
-    assert _pairing(tried) == {f"h{k}" for k in range(12, 20)}
+    assert _best_tried(tried, 8) == {f"h{k}" for k in range(12, 20)}
 
 
 def test_the_search_ends_where_one_hypothesis_explains_all() -> None:
