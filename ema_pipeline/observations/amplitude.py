@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.inference import Apart, Posterior, Residuals, Unknowns, joined
 from ema_pipeline.observations.hit_data import HitData, comparable
-from ema_pipeline.observations.hit_lattice import LEAST, SPACING, MarchedHits
+from ema_pipeline.observations.hit_lattice import LEAST, SPACING, MarchedHits, on_lattice
 from ema_pipeline.observations.hit_march import rubs, steps_to_end
 from ema_pipeline.observations.hit_residuals import (
     AMPLITUDE,
@@ -325,13 +325,13 @@ class AmplitudeProblem:
         marched = set(at) <= set(self.marched_sizes)
         counts = (_FINE, *[1] * (len(names) - 1)) if marched else (_ALONG, *[_ACROSS] * (len(names) - 1))
         grids = [_grid(self.sizes[n], count) for n, count in zip(names, counts, strict=True)]
-        if marched:
-            grids = [np.rint(g / SPACING) * SPACING for g in grids]
         matching = self.residuals(x, scatters, derivatives=False).matching
 
         def tried(values: Sequence[float]) -> tuple[float, NDArray[np.float64]]:
             trial = x.copy()
             trial[at] = values
+            if marched:
+                trial = on_lattice(self, trial)
             found = self.residuals(trial, scatters, matching=matching, derivatives=marched, by_sizes=False)
             if marched:
                 return 0.5 * self._followed(found, trial, scatters, at), trial

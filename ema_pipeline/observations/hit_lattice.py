@@ -108,6 +108,18 @@ class MarchedHits:
         return HitResiduals(problem, data, paired, x, posterior.scatters, 1.0).moved(x)
 
 
+def on_lattice(problem: AmplitudeProblem, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`x` with the lengths of teeth at the nearest place of the lattice, where nothing is interpolated, (n,).
+
+    Every length that lies between two places costs another march of all hits.
+    """
+    lengths = [i for i in problem.marched_sizes if not problem.in_full(problem.unknowns.names[i])]
+    moved = x[problem.unknowns.index[AMPLITUDE]] / LOG_STD
+    x = x.copy()
+    x[lengths] = np.rint((x[lengths] - moved) / SPACING) * SPACING + moved
+    return x
+
+
 def _unknown(problem: AmplitudeProblem, name: str, place: int) -> float:
     """The unknown of a size at a place of the lattice."""
     if not problem.in_full(name):

@@ -17,6 +17,7 @@ from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.observations.amplitude import AmplitudeObservations
 from ema_pipeline.observations.fitting import Model, fit_base
 from ema_pipeline.observations.hit_data import HitData
+from ema_pipeline.observations.hit_lattice import on_lattice
 from ema_pipeline.observations.hit_march import Driven, marched_modes
 from ema_pipeline.observations.hit_modes import Linear, changed_modes
 from ema_pipeline.observations.hit_reading import drive_gains, momentary_weights
@@ -136,6 +137,26 @@ def test_marched_hits_lie_straight_between_those_of_the_lattice_in_any_order() -
     x = problem.start()
     whole = first.marched.changes(data, problem, x)
     np.testing.assert_array_equal(first.marched.changes(some, problem, x), whole[:, data.level > 0])
+
+
+def test_sizes_that_are_tried_lie_on_the_lattice_where_each_costs_one_march() -> None:
+    observations = simulated("teeth")
+    about = observations.about((), fit_base(observations, Model()).posterior)
+    problem = about.problem([parse_effect("mesh_backlash@hub-rim", RIG)], {})
+    x = problem.start({"mesh_backlash@hub-rim.preload": PRELOAD, "mesh_backlash@hub-rim.gap": 1e-2})
+    x[problem.unknowns.index[AMPLITUDE]] = 0.013
+    lattice = about.marched
+    assert lattice is not None
+    moved = on_lattice(problem, x)
+    at = lattice._place(problem, moved)[1]
+    np.testing.assert_allclose(at, np.rint(lattice._place(problem, x)[1]), atol=1e-9)
+    others = np.setdiff1d(np.arange(len(x)), problem.marched_sizes)
+    np.testing.assert_array_equal(moved[others], x[others])
+    (data,) = about.hits
+    lattice.changes(data, problem, moved)
+    assert len(lattice._nodes) == 1
+    lattice.changes(data, problem, x)
+    assert len(lattice._nodes) == 3  # ahead in both sizes
 
 
 @pytest.mark.parametrize(
