@@ -22,7 +22,14 @@ from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import DOUBTFUL, NOTHING, Candidate, Diagnosis, EffectSize, Ladder
-from ema_pipeline.diagnose.verdict import alike, explains, outlying_parts, stands_still, verdict_of
+from ema_pipeline.diagnose.verdict import (
+    alike,
+    explains,
+    outlying_damping,
+    outlying_parts,
+    stands_still,
+    verdict_of,
+)
 from ema_pipeline.diagnose.visible import nothing_visible
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.observations.base import Observations
@@ -132,7 +139,8 @@ def diagnose(
     hidden = final.fails(settings.error_limit) and final.error_apart > errors[1]
     apart = sentences.of_modes_alone(final.error_apart) if hidden else ""
     still = sentences.STANDING_STILL if stands_still(observations, found.final) else ""
-    reasons = " ".join(filter(None, (still, apart, bent)))
+    damping = sentences.of_damping(outlying_damping(observations, found.final))
+    reasons = " ".join(filter(None, (still, apart, damping, bent)))
     return Diagnosis(
         verdict=verdict,
         summary=sentences.summary(verdict, told, errors, visible, best, reasons, beside),

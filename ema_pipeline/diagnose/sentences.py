@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from ema_pipeline.diagnose.types import NOT_DETERMINED, EffectSize, OutlyingPart, VerdictWord
+from ema_pipeline.diagnose.types import NOT_DETERMINED, EffectSize, OutlyingDamping, OutlyingPart, VerdictWord
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
 
 _SHOWN = 3
@@ -116,6 +116,16 @@ STANDING_STILL = (
 def of_modes_alone(apart: float) -> str:
     """Where the modes show that a model fails, and many data of single hits that fit hide it."""
     return f"The error of the modes alone is {apart:.2f}: many data of single hits, which fit, hide it."
+
+
+def of_damping(found: OutlyingDamping | None) -> str:
+    """Where damping ratios scatter more than those of structures that lack no damper; empty where they do not."""
+    return (
+        f"The damping ratios scatter by {100 * found.scatter:.0f} % about the model's (1 σ of ln ζ), more than the "
+        f"{100 * found.usual:.0f} % of structures that lack no damper."
+        if found
+        else ""
+    )
 
 
 def standing_out(parts: Sequence[OutlyingPart]) -> str:

@@ -284,6 +284,20 @@ class DetectionLimit:
 
 
 @dataclass(frozen=True)
+class OutlyingDamping:
+    """Damping ratios that scatter more than those of structures that lack no damper.
+
+    Attributes
+    ----------
+    scatter, usual : float
+        1 σ of ln ζ about the model's, and the largest of such structures.
+    """
+
+    scatter: float
+    usual: float
+
+
+@dataclass(frozen=True)
 class OutlyingPart:
     """A part that deviates further from similar ones than these do.
 

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.special
 
 from ema_pipeline.diagnose.claims import Judged
 from ema_pipeline.diagnose.selection import Selection
 from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED, DiagnoseSettings
-from ema_pipeline.diagnose.types import OutlyingPart, VerdictWord
+from ema_pipeline.diagnose.types import OutlyingDamping, OutlyingPart, VerdictWord
 from ema_pipeline.inference import beyond
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, part_reach, within_scatter
-from ema_pipeline.observations.parts import FREE_STD
+from ema_pipeline.observations.parts import DAMPING_SCATTER, FREE_STD
+
+_USUAL_DAMPING_SCATTER = 0.5
+"""1 σ of ln ζ from mode to mode in normal laboratories, where nothing but joints, cables and the suspension damps."""
+_BY_CHANCE = 0.005
+"""Probability by which damping ratios may scatter as they do and no damper be missing."""
+_OF_SCATTER = 0.5
+"""Share of its variance from which a damping ratio tells of their scatter, and not of the test."""
 
 
 def explains(observations: Observations, fit: Fit, settings: DiagnoseSettings) -> bool:
@@ -21,6 +29,7 @@ def explains(observations: Observations, fit: Fit, settings: DiagnoseSettings) -
         not found.fails(settings.error_limit)
         and found.residuals.unexplained <= MOST_UNEXPLAINED
         and not stands_still(observations, fit)
+        and outlying_damping(observations, fit) is None
     )
 
 
@@ -30,6 +39,25 @@ def stands_still(observations: Observations, fit: Fit) -> bool:
     Few modes that move weigh little in the error of all.
     """
     return observations.level_dependent and all(e.effect.linear for e in fit.model.effects)
+
+
+def outlying_damping(observations: Observations, fit: Fit) -> OutlyingDamping | None:
+    """Damping ratios that scatter about the model's more than those of structures that lack no damper.
+
+    Damping follows no law, so its scatter is learned. That alone would hide a damper which the library lacks: of seven
+    such dampers in simulated tests, six were taken for scatter.
+    """
+    p = fit.posterior
+    share = p.residuals.share.get(DAMPING_SCATTER)
+    if share is None or DAMPING_SCATTER not in observations.scatters:
+        return None
+    usual = max(_USUAL_DAMPING_SCATTER, observations.scatters[DAMPING_SCATTER].default)
+    on = share > _OF_SCATTER
+    variance = 1 - share[on] + share[on] * (usual / p.scatters[DAMPING_SCATTER]) ** 2
+    squares, count = float(np.sum(p.residuals.values[on] ** 2 / variance)), int(np.sum(on))
+    if not count or scipy.special.chdtrc(count, squares) > _BY_CHANCE:
+        return None
+    return OutlyingDamping(usual * float(np.sqrt(squares / count)), usual)
 
 
 def outlying_parts(observations: Observations, fit: Fit) -> tuple[OutlyingPart, ...]:

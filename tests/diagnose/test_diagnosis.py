@@ -206,6 +206,16 @@ def test_a_mass_that_only_one_part_far_off_can_follow_is_unknown_to_a_library_wi
         assert c.probability == pytest.approx(found.probabilities[c.label])
 
 
+def test_a_damper_is_not_taken_for_scatter_of_damping_by_a_library_without_dampers() -> None:
+    only = {k: v for k, v in GENERIC.items() if k != "damper"}
+    found = of_chain(22, added(Damper, 400.0, {"m3.z": 1.0}), library=only)
+    assert found.verdict == "unknown_effect"
+    assert found.error < found.error_limit  # the scatter of damping, which is learned, hides it
+    assert "The damping ratios scatter by 1" in found.summary
+    assert "more than the 50 %" in found.summary
+    assert of_chain(22, library=only).verdict == "adequate"
+
+
 # --- the planetary rig ------------------------------------------------------------------------------------------
 
 
