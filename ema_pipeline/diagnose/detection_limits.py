@@ -158,6 +158,7 @@ class _Shown:
         size = hypothesis.placed.effect.parameters[0].name
         at = problem.unknowns.index[hypothesis.placed.parameter_name(size)]
         null[at] = problem.unknowns.upper[at] if hypothesis.shown_by_less else 0.0
+        null = problem.uninterpolated(null)
         before = problem.residuals(null, scatters, matching=fit.posterior.residuals.matching)
         if gains is None:
             if _not_there(before, fit.posterior, at):
@@ -276,6 +277,7 @@ class _Shown:
         first = self.gains.change(self.before.jacobian[:, self.at] * unknown)
         x = self.null.copy()
         x[self.at] = unknown
+        x = self.problem.uninterpolated(x)
         there = self.problem.residuals(x, self.scatters, derivatives=False)
         return first, x, there.values - self.before.values if self._as_before(there) else None
 

@@ -24,6 +24,7 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import DOUBTFUL, NOTHING, Candidate, Diagnosis, EffectSize, Ladder
 from ema_pipeline.diagnose.verdict import (
     alike,
+    at_usual_scatters,
     explains,
     outlying_damping,
     outlying_parts,
@@ -138,9 +139,12 @@ def diagnose(
     errors = (rungs[0].error, rungs[-1].error)
     hidden = final.fails(settings.error_limit) and final.error_apart > errors[1]
     apart = sentences.of_modes_alone(final.error_apart) if hidden else ""
+    usual = at_usual_scatters(observations, found.final).posterior
+    by_scatter = usual.fails(settings.error_limit) and not final.fails(settings.error_limit)
+    scattered = sentences.of_usual_scatters(usual.error) if by_scatter else ""
     still = sentences.STANDING_STILL if stands_still(observations, found.final) else ""
     damping = sentences.of_damping(outlying_damping(observations, found.final))
-    reasons = " ".join(filter(None, (still, apart, damping, bent)))
+    reasons = " ".join(filter(None, (still, apart, scattered, damping, bent)))
     return Diagnosis(
         verdict=verdict,
         summary=sentences.summary(verdict, told, errors, visible, best, reasons, beside),

@@ -118,6 +118,11 @@ def of_modes_alone(apart: float) -> str:
     return f"The error of the modes alone is {apart:.2f}: many data of single hits, which fit, hide it."
 
 
+def of_usual_scatters(error: float) -> str:
+    """Where a model explains the data by learned scatters alone that are larger than usual."""
+    return f"Only a scatter that is larger than usual explains the data: with the usual one the error is {error:.2f}."
+
+
 def of_damping(found: OutlyingDamping | None) -> str:
     """Where damping ratios scatter more than those of structures that lack no damper; empty where they do not."""
     return (

@@ -331,7 +331,7 @@ class AmplitudeProblem:
             trial = x.copy()
             trial[at] = values
             if marched:
-                trial = on_lattice(self, trial)
+                trial = self.uninterpolated(trial)
             found = self.residuals(trial, scatters, matching=matching, derivatives=marched, by_sizes=False)
             if marched:
                 return 0.5 * self._followed(found, trial, scatters, at), trial
@@ -349,6 +349,10 @@ class AmplitudeProblem:
             near = [(places[i][0] + k * SPACING, *places[i][1:]) for k in _BESIDE]
             best.append(min([tries[i], *map(tried, near)], key=lambda one: one[0]))
         return [trial for _, trial in sorted(best, key=lambda one: one[0])] or [x]
+
+    def uninterpolated(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """See `EffectProblem`: with the lengths of teeth on the lattice of marched hits."""
+        return on_lattice(self, x)
 
     def sized_anew(self, x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
         """See `EffectProblem`: multiples of the first size of what is calculated in full, its other sizes as usual."""

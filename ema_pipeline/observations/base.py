@@ -47,6 +47,10 @@ class EffectProblem(Problem, Protocol):
         """`x` with other sizes of what is calculated in full, from which fits begin."""
         return [x]
 
+    def uninterpolated(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The nearest point to `x` at which nothing lies between what is calculated once for all."""
+        return x
+
     def tuned(self, x: NDArray[np.float64], name: str) -> list[float]:
         """Unknowns of the size `name` at which a mode comes to where one was measured that has no partner at `x`."""
         return []

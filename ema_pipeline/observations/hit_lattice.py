@@ -117,7 +117,7 @@ def on_lattice(problem: AmplitudeProblem, x: NDArray[np.float64]) -> NDArray[np.
     moved = x[problem.unknowns.index[AMPLITUDE]] / LOG_STD
     x = x.copy()
     x[lengths] = np.rint((x[lengths] - moved) / SPACING) * SPACING + moved
-    return x
+    return problem.unknowns.clipped(x)
 
 
 def _unknown(problem: AmplitudeProblem, name: str, place: int) -> float:

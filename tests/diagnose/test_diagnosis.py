@@ -25,6 +25,7 @@ from ema_pipeline.diagnose.ranking import rank
 from ema_pipeline.diagnose.rungs import make_ladder
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import NOTHING, UNKNOWN, DetectionLimit, Diagnosis, EffectSize
+from ema_pipeline.diagnose.verdict import at_usual_scatters
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.inference import Posterior, Residuals, Unknowns
@@ -214,6 +215,24 @@ def test_a_damper_is_not_taken_for_scatter_of_damping_by_a_library_without_dampe
     assert "The damping ratios scatter by 1" in found.summary
     assert "more than the 50 %" in found.summary
     assert of_chain(22, library=only).verdict == "adequate"
+
+
+def test_a_model_that_only_a_larger_scatter_than_usual_explains_fails() -> None:
+    rig, measured, signs = chain(), chain_modes(7, GOOD), np.random.default_rng(5)
+    off = {
+        name: replace(
+            m, frequency_hz=m.frequency_hz * (1 + 0.008 * signs.choice([-1, 1], len(m.frequency_hz)))
+        )
+        for name, m in measured.items()
+    }
+    only = {k: v for k, v in GENERIC.items() if k == "damper"}
+    found = diagnose(observed(rig, off), rig, only, None, SETTINGS)
+    assert found.verdict == "unknown_effect"
+    assert found.error < found.error_limit
+    assert "with the usual one the error is 1.4" in found.summary
+    observations = observed(rig, measured)
+    right = learned(observations, fit_base(observations, Model()))
+    assert at_usual_scatters(observations, right) is right
 
 
 # --- the planetary rig ------------------------------------------------------------------------------------------
