@@ -17,8 +17,8 @@ from ema_pipeline.observations.parts import DAMPING_SCATTER, FREE_STD, MASS_SCAT
 
 _USUAL = {FREQUENCY: 1.0, FREQUENCY_NOISE: 1.0, SHAPE: 1.0, MASS_SCATTER: 3.0}
 """Largest usual values of learned scatters, in units of their defaults. In 118 simulated tests of rigs without fault
-none but shapes' noise was above its default; what was not in the library and was missed had brought them to two of
-it, and those of masses to four."""
+none of these was more than a fifteenth above its default; what was not in the library and was missed had brought them
+to twice their defaults, and those of masses to four times."""
 _USUAL_DAMPING_SCATTER = 0.5
 """1 σ of ln ζ from mode to mode in normal laboratories, where nothing but joints, cables and the suspension damps."""
 _BY_CHANCE = 0.005
@@ -69,11 +69,14 @@ def outlying_damping(observations: Observations, fit: Fit) -> OutlyingDamping | 
     share = p.residuals.share.get(DAMPING_SCATTER)
     if share is None or DAMPING_SCATTER not in observations.scatters:
         return None
-    usual = max(_USUAL_DAMPING_SCATTER, observations.scatters[DAMPING_SCATTER].default)
     on = share > _OF_SCATTER
+    count = int(np.sum(on))
+    if not count:  # a scatter that is stated to be none has no share
+        return None
+    usual = max(_USUAL_DAMPING_SCATTER, observations.scatters[DAMPING_SCATTER].default)
     variance = 1 - share[on] + share[on] * (usual / p.scatters[DAMPING_SCATTER]) ** 2
-    squares, count = float(np.sum(p.residuals.values[on] ** 2 / variance)), int(np.sum(on))
-    if not count or scipy.special.chdtrc(count, squares) > _BY_CHANCE:
+    squares = float(np.sum(p.residuals.values[on] ** 2 / variance))
+    if scipy.special.chdtrc(count, squares) > _BY_CHANCE:
         return None
     return OutlyingDamping(usual * float(np.sqrt(squares / count)), usual)
 
