@@ -13,12 +13,12 @@ from ema_pipeline.inference import beyond
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, part_reach, within_scatter
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE
-from ema_pipeline.observations.parts import DAMPING_SCATTER, FREE_STD, MASS_SCATTER
+from ema_pipeline.observations.parts import DAMPING_SCATTER, FREE_STD
 
-_USUAL = {FREQUENCY: 1.0, FREQUENCY_NOISE: 1.0, SHAPE: 1.0, MASS_SCATTER: 3.0}
-"""Largest usual values of learned scatters, in units of their defaults. In 118 simulated tests of rigs without fault
-none of these was more than a fifteenth above its default; what was not in the library and was missed had brought them
-to twice their defaults, and those of masses to four times."""
+_OF_TESTS = (FREQUENCY, FREQUENCY_NOISE, SHAPE)
+"""Scatters of what tests and models have wrong, and no parts. In 118 simulated tests of rigs without fault none was
+more than a fifteenth above its default, which is what is usual; what was not in the library and was missed had brought
+them to twice their defaults. Those of parts differ from rig to rig: masses of a right model scattered by 4 %."""
 _USUAL_DAMPING_SCATTER = 0.5
 """1 σ of ln ζ from mode to mode in normal laboratories, where nothing but joints, cables and the suspension damps."""
 _BY_CHANCE = 0.005
@@ -39,13 +39,11 @@ def explains(observations: Observations, fit: Fit, settings: DiagnoseSettings) -
 
 
 def at_usual_scatters(observations: Observations, fit: Fit) -> Fit:
-    """The fit with learned scatters no larger than usual; the same where none is.
+    """The fit with frequencies and shapes no further from the model's than usual; the same where they are not.
 
     Scatters that are learned take up what a model lacks.
     """
-    usual = {
-        n: most * observations.scatters[n].default for n, most in _USUAL.items() if n in observations.scatters
-    }
+    usual = {n: observations.scatters[n].default for n in _OF_TESTS if n in observations.scatters}
     learned = fit.posterior.scatters
     capped = {n: min(value, usual.get(n, value)) for n, value in learned.items()}
     return fit if capped == learned else at_scatters(observations, fit, capped)
