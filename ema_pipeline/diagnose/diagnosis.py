@@ -11,6 +11,7 @@ import numpy as np
 from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.claims import Judged
 from ema_pipeline.diagnose.detection_limits import detection_limits
+from ema_pipeline.diagnose.explained import explanation
 from ema_pipeline.diagnose.hypotheses import Hypothesis, list_hypotheses
 from ema_pipeline.diagnose.in_full import in_full
 from ema_pipeline.diagnose.localise import localise
@@ -22,15 +23,7 @@ from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import DOUBTFUL, NOTHING, Candidate, Diagnosis, EffectSize, Ladder
-from ema_pipeline.diagnose.verdict import (
-    alike,
-    at_usual_scatters,
-    explains,
-    outlying_damping,
-    outlying_parts,
-    stands_still,
-    verdict_of,
-)
+from ema_pipeline.diagnose.verdict import alike, verdict_of
 from ema_pipeline.diagnose.visible import nothing_visible
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.observations.base import Observations
@@ -95,7 +88,8 @@ def diagnose(
     # what else there may be is told to first order, as it was looked for
     found = in_full(first, settings.processes)
     observations = found.observations
-    explained = explains(observations, found.final, settings)
+    reached = explanation(observations, found.final, settings)
+    explained = reached.explained
     verdict = verdict_of(found, settings, explained)
     start = found.rounds[0].ranking.base
     fits = [start, *(j.ranked.fit for j in found.claimed)]
@@ -117,8 +111,8 @@ def diagnose(
     final = found.final.posterior
     share = complete(*final.telling) if explained else CLOSEST
     candidates = tuple(replace(c, probability=share * c.probability) for c in candidates)
-    suffices = explained if start is found.final else explains(first.observations, start, settings)
-    probabilities = shared(found.rounds[0].probabilities, share, share if suffices else 0.0)
+    begun = reached if start is found.final else explanation(first.observations, start, settings)
+    probabilities = shared(found.rounds[0].probabilities, share, share if begun.explained else 0.0)
     nothing = probabilities[NOTHING]
     limit = final.error_limit(settings.error_limit)
     best = next(
@@ -135,16 +129,9 @@ def diagnose(
         visible = share * nothing_visible(first.rounds[0].ranking, found.rounds[0].probabilities, limits)
     scatter = learned_scatters(observations, found.final)
     ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
-    bent = sentences.standing_out(outlying_parts(observations, found.final))
+    bent = sentences.standing_out(reached.parts)
     errors = (rungs[0].error, rungs[-1].error)
-    hidden = final.fails(settings.error_limit) and final.error_apart > errors[1]
-    apart = sentences.of_modes_alone(final.error_apart) if hidden else ""
-    usual = at_usual_scatters(observations, found.final).posterior
-    by_scatter = usual.fails(settings.error_limit) and not final.fails(settings.error_limit)
-    scattered = sentences.of_usual_scatters(usual.error) if by_scatter else ""
-    still = sentences.STANDING_STILL if stands_still(observations, found.final) else ""
-    damping = sentences.of_damping(outlying_damping(observations, found.final))
-    reasons = " ".join(filter(None, (still, apart, scattered, damping, bent)))
+    reasons = sentences.reasons(reached, errors[1])
     return Diagnosis(
         verdict=verdict,
         summary=sentences.summary(verdict, told, errors, visible, best, reasons, beside),

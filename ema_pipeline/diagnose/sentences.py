@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from ema_pipeline.diagnose.types import NOT_DETERMINED, EffectSize, OutlyingDamping, OutlyingPart, VerdictWord
+from ema_pipeline.diagnose.explained import Explanation, OutlyingDamping, OutlyingPart
+from ema_pipeline.diagnose.types import NOT_DETERMINED, EffectSize, VerdictWord
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
 
 _SHOWN = 3
@@ -113,23 +114,30 @@ STANDING_STILL = (
 )
 
 
-def of_modes_alone(apart: float) -> str:
-    """Where the modes show that a model fails, and many data of single hits that fit hide it."""
-    return f"The error of the modes alone is {apart:.2f}: many data of single hits, which fit, hide it."
+def reasons(found: Explanation, error: float) -> str:
+    """Why a model does not explain the data, beside its `error`; empty where there is nothing to add."""
+    told = (
+        STANDING_STILL if found.stands_still else "",
+        _of_modes_alone(found.by_modes) if found.by_modes > error else "",
+        _of_usual_scatters(found.by_scatter) if found.by_scatter else "",
+        _of_damping(found.damping) if found.damping else "",
+        standing_out(found.parts),
+    )
+    return " ".join(filter(None, told))
 
 
-def of_usual_scatters(error: float) -> str:
-    """Where a model explains the data by learned scatters alone that are larger than usual."""
+def _of_modes_alone(error: float) -> str:
+    return f"The error of the modes alone is {error:.2f}: many data of single hits, which fit, hide it."
+
+
+def _of_usual_scatters(error: float) -> str:
     return f"Only a scatter that is larger than usual explains the data: with the usual one the error is {error:.2f}."
 
 
-def of_damping(found: OutlyingDamping | None) -> str:
-    """Where damping ratios scatter more than those of structures that lack no damper; empty where they do not."""
+def _of_damping(found: OutlyingDamping) -> str:
     return (
         f"The damping ratios scatter by {100 * found.scatter:.0f} % about the model's (1 σ of ln ζ), more than the "
         f"{100 * found.usual:.0f} % of structures that lack no damper."
-        if found
-        else ""
     )
 
 

@@ -284,36 +284,6 @@ class DetectionLimit:
 
 
 @dataclass(frozen=True)
-class OutlyingDamping:
-    """Damping ratios that scatter more than those of structures that lack no damper.
-
-    Attributes
-    ----------
-    scatter, usual : float
-        1 σ of ln ζ about the model's, and the largest of such structures.
-    """
-
-    scatter: float
-    usual: float
-
-
-@dataclass(frozen=True)
-class OutlyingPart:
-    """A part that deviates further from similar ones than these do.
-
-    Attributes
-    ----------
-    name : str
-    deviation, others : float
-        Its relative deviation, and the 1 σ by which the others scatter.
-    """
-
-    name: str
-    deviation: float
-    others: float
-
-
-@dataclass(frozen=True)
 class Diagnosis:
     """The answer to: which physics is the model missing?
 

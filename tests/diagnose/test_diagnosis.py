@@ -19,13 +19,13 @@ from ema_pipeline import codec
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
 from ema_pipeline.diagnose.claims import judge, left_of_close_modes
 from ema_pipeline.diagnose.diagnosis import diagnose
+from ema_pipeline.diagnose.explained import at_usual_scatters
 from ema_pipeline.diagnose.heldout import held_out
 from ema_pipeline.diagnose.hypotheses import list_hypotheses
 from ema_pipeline.diagnose.ranking import rank
 from ema_pipeline.diagnose.rungs import make_ladder
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import NOTHING, UNKNOWN, DetectionLimit, Diagnosis, EffectSize
-from ema_pipeline.diagnose.verdict import at_usual_scatters
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.inference import Posterior, Residuals, Unknowns

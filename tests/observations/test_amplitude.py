@@ -13,12 +13,12 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose import claims, rounds
 from ema_pipeline.diagnose.detection_limits import detection_limits
 from ema_pipeline.diagnose.diagnosis import diagnose
+from ema_pipeline.diagnose.explained import explanation
 from ema_pipeline.diagnose.heldout import HeldOut
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
 from ema_pipeline.diagnose.ranking import rank
 from ema_pipeline.diagnose.sentences import STANDING_STILL
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.verdict import explains
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.inference import Posterior
@@ -215,9 +215,9 @@ def test_modes_that_move_with_the_force_are_not_explained_by_a_model_that_moves_
     moving = AmplitudeObservations(quiet.modes, [replace(h, level_dependent=True) for h in quiet.hits])
     assert not quiet.level_dependent
     assert moving.level_dependent
-    assert explains(quiet, base_fit(quiet), settings)
+    assert explanation(quiet, base_fit(quiet), settings).explained
     base = base_fit(moving)
-    assert not explains(moving, base, settings)
+    assert not explanation(moving, base, settings).explained
 
     def with_effect(label: str) -> Fit:
         model = base.model.plus(parse_effect(label, RIG), {})
@@ -225,8 +225,8 @@ def test_modes_that_move_with_the_force_are_not_explained_by_a_model_that_moves_
         start = transferred(base.posterior, problem.unknowns, np.zeros(len(problem.unknowns)))
         return refined(moving, model, start, base.posterior.scatters)
 
-    assert not explains(moving, with_effect("local_damper@hub"), settings)
-    assert explains(moving, with_effect("bearing_cubic@hub"), settings)
+    assert not explanation(moving, with_effect("local_damper@hub"), settings).explained
+    assert explanation(moving, with_effect("bearing_cubic@hub"), settings).explained
     told = diagnose(moving, RIG, {}, settings=settings, hypotheses=())
     assert told.verdict == "unknown_effect"
     assert STANDING_STILL in told.summary
