@@ -26,9 +26,10 @@ from ema_pipeline.mechanics.tuned import tuned_sizes
 from ema_pipeline.modal.assurance import mac
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.mode_data import ModeData
-from ema_pipeline.observations.mode_residuals import Comparison, Sensing
+from ema_pipeline.observations.mode_residuals import Comparison
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, stacked
 from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.observations.sensing import Sensing
 
 if TYPE_CHECKING:
     from ema_pipeline.observations.modes import ModeObservations

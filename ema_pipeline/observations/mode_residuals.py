@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +27,7 @@ from ema_pipeline.observations.mode_rows import (
 )
 from ema_pipeline.observations.parts import DAMPING_SCATTER
 from ema_pipeline.observations.rig_model import RigModel
+from ema_pipeline.observations.sensing import Sensing, SensorReadings
 from ema_pipeline.observations.without_partner import Alone, unseen
 
 _LEAST_FREQUENCY_STD = 3e-4
@@ -37,32 +37,6 @@ _FITTED_AS_ONE_STD = 0.3
 sensor shows another mix of the two where hits differ."""
 _DAMPING_STD = 0.02
 """1 σ of ln ζ that no model is better than, where each mode has a damping ratio of its own."""
-
-
-@dataclass(frozen=True)
-class Sensing:
-    """What the sensors of one configuration read: rows of the motion along and across each, and their unknowns.
-
-    Attributes
-    ----------
-    along : ndarray, (s, n)
-    across : ndarray, (k, s, n)
-        In up to k - 1 directions; last along it once more, for how blows were aimed.
-    gain : ndarray of int, (s,)
-    transverse : ndarray of int, (k, s)
-        Positions of their unknowns, -1 for none.
-    drift : int
-        Position of the unknown by which all frequencies are off together; -1 where no frequencies are compared.
-    mixing : ndarray of int, (k,)
-        Positions of the unknowns of `ModeData.mixes`.
-    """
-
-    along: NDArray[np.float64]
-    across: NDArray[np.float64]
-    gain: NDArray[np.int64]
-    transverse: NDArray[np.int64]
-    drift: int
-    mixing: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -99,8 +73,8 @@ class _Pairs:
         Model mode of every measured one, -1 for none.
     anew : bool
         True where the pairs were found here, False where they were given.
-    on, to : ndarray of int, (k,)
-        Measured modes with a partner, and these.
+    to : ndarray of int, (k,)
+        Modes of the model that are partners of `known.on`.
     hidden : ndarray of int, (k,)
         See `hidden_partners`.
     read : ndarray, (s, n)
@@ -112,7 +86,6 @@ class _Pairs:
 
     match: NDArray[np.int64]
     anew: bool
-    on: NDArray[np.int64]
     to: NDArray[np.int64]
     hidden: NDArray[np.int64]
     read: NDArray[np.float64]
@@ -176,11 +149,7 @@ class Comparison:
     ) -> None:
         self.model, self.data, self.sensing, self.x, self.heat = model, data, sensing, x, heat
         self.scatters, self.defaults = scatters, defaults
-        self.gain = np.where(sensing.gain >= 0, np.exp(x[np.maximum(sensing.gain, 0)]), 1.0)
-        cross = np.where(sensing.transverse >= 0, x[np.maximum(sensing.transverse, 0)], 0.0)
-        self.reading = self.gain[:, None] * (
-            sensing.along + np.sum(cross[..., None] * sensing.across, axis=0)
-        )
+        self.readings = SensorReadings(sensing, x)
         self._last: _Pairs | None = None
 
     def residuals(self, matching: object, derivatives: bool) -> Residuals:
@@ -197,7 +166,7 @@ class Comparison:
         if solution is None:
             return None
         pairs = self._pairs(solution, matching)
-        on, to, hidden = pairs.on, pairs.to, pairs.hidden
+        on, to, hidden = pairs.known.on, pairs.to, pairs.hidden
         slopes = None
         if derivatives:
             number = np.full(len(on), -1)
@@ -232,27 +201,18 @@ class Comparison:
         if self._last is None or not self._last.are(matching):
             given = isinstance(matching, np.ndarray)
             match = np.asarray(matching) if given else self.matched(solution)
-            on, read = np.flatnonzero(match >= 0), self.seen(solution)
+            on, read = np.flatnonzero(match >= 0), turned(self.readings.of(solution))
             to = match[on]
             sensors = np.count_nonzero(self.data.seen[on], axis=1) * self.data.may_hide_another[on]
             hidden = hidden_partners(solution, to, sensors, read)
             known = self._known(on, hidden)
             groups = self._groups(solution, read, known, to)
-            self._last = _Pairs(match, not given, on, to, hidden, read, known, groups)
+            self._last = _Pairs(match, not given, to, hidden, read, known, groups)
         return self._last
-
-    def seen(self, solution: EigenSolution) -> NDArray[np.float64]:
-        """What the sensors read of every shape, (s, n); complex shapes turned as measured ones are, and made real."""
-        return turned(self._read(solution))
-
-    def _read(self, solution: EigenSolution) -> NDArray[Any]:
-        """The same with complex shapes as they are."""
-        shapes = solution.shapes if solution.damped is None else solution.damped.shapes
-        return np.asarray(self.reading @ shapes[: self.reading.shape[1]])
 
     def matched(self, solution: EigenSolution) -> NDArray[np.int64]:
         """Index of the model mode of every measured one, -1 for none, (m,)."""
-        return paired(self.data, solution.frequency_hz, self._read(solution), self.heat)
+        return paired(self.data, solution.frequency_hz, self.readings.of(solution), self.heat)
 
     def _frequencies(self, predicted: _Predicted, on: NDArray[np.int64]) -> Rows:
         d = self.data
@@ -344,10 +304,7 @@ class Comparison:
         if slopes is not None:
             log_slope = np.zeros((len(to), n))
             log_slope[:, : slopes.log_frequency.shape[1]] = slopes.log_frequency
-            slope = self._shape_slopes(slopes.shapes, solution, to)
-            if solution.damped is not None and np.iscomplexobj(slope):
-                slope = _turned_slopes(self._read(solution)[:, to].T, slope)
-            slope = np.real(slope)
+            slope = self.readings.real_slopes(slopes.shapes, solution, to)
             found.slope = _Predicted(log_slope, slope, np.zeros(slope.shape))
         for members, group in pairs.groups:
             found.put(members, group)
@@ -439,7 +396,7 @@ class Comparison:
         """Real and imaginary parts of whirling modes' shapes, a complex factor projected out."""
         d, whirl = self.data, np.flatnonzero(self.data.whirling[on])
         on, to = on[whirl], to[whirl]
-        p, y, seen = self._read(solution)[:, to].T.astype(complex), d.complex_shapes[on], d.seen[on] > 0
+        p, y, seen = self.readings.of(solution)[:, to].T.astype(complex), d.complex_shapes[on], d.seen[on] > 0
         own = d.compared_std[on]
         unit = shape_unit(y)
         weight = seen / (own**2 + (self.scatters[SHAPE] * unit) ** 2)
@@ -447,7 +404,7 @@ class Comparison:
         factor = np.sum(weight * np.conj(p) * y, axis=1) / squared
         slope = None
         if slopes is not None:
-            dp = self._shape_slopes(slopes.shapes[:, whirl], solution, to).astype(complex)
+            dp = self.readings.slopes(slopes.shapes[:, whirl], solution, to).astype(complex)
             turns = np.einsum("ks,ksn->kn", weight * y, np.conj(dp))
             grows = 2 * np.real(np.einsum("ks,ksn->kn", weight * np.conj(p), dp))
             change = (turns - factor[:, None] * grows) / squared[:, None]
@@ -459,34 +416,3 @@ class Comparison:
             np.concatenate([left.real, left.imag]), np.tile(own[seen], 2), np.tile(unit[seen], 2), SHAPE,
             1 + 0.1 * (self.heat - 1), np.tile(on[mode], 2), np.tile(sensor, 2), np.tile(d.close[on[mode]], 2), slope,
         )  # fmt: skip
-
-    def _shape_slopes(
-        self,
-        by_model: NDArray[np.float64] | NDArray[np.complex128],
-        solution: EigenSolution,
-        to: NDArray[np.int64],
-    ) -> NDArray[Any]:
-        """Derivatives of what the sensors read of some shapes by all unknowns, complex where they are, (k, s, n)."""
-        width, s = self.reading.shape[1], self.sensing
-        follows = solution.damped if np.iscomplexobj(by_model) else None
-        shapes = (solution if follows is None else follows).shapes[:width, to]
-        predicted = (self.reading @ shapes).T
-        k, count = predicted.shape
-        slope = np.zeros((k, count, len(self.x)), np.result_type(predicted, by_model))
-        read = self.reading @ by_model[:width].reshape(width, k * by_model.shape[2])
-        slope[:, :, : by_model.shape[2]] = read.reshape(count, k, by_model.shape[2]).transpose(1, 0, 2)
-        has = np.flatnonzero(s.gain >= 0)
-        slope[:, has, s.gain[has]] += predicted[:, has]
-        for across, unknown in zip(s.across, s.transverse, strict=True):
-            has = np.flatnonzero(unknown >= 0)
-            slope[:, has, unknown[has]] += (self.gain[:, None] * (across @ shapes)).T[:, has]
-        return slope
-
-
-def _turned_slopes(read: NDArray[np.complex128], slope: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Derivatives of `turned` shapes from those (k, s, n) of the complex ones (k, s), which turn the angle, too."""
-    square = np.sum(read**2, axis=1)
-    square = np.where(square == 0, 1.0, square)  # no sensor reads the mode: nothing turns
-    back = np.exp(-0.5j * np.angle(square))[:, None]
-    angle = np.imag(np.einsum("ks,ksn->kn", read, slope) / square[:, None])
-    return np.asarray(np.real(back[..., None] * slope) + np.imag(back * read)[..., None] * angle[:, None, :])

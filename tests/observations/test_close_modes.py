@@ -12,7 +12,7 @@ import pytest
 from ema_pipeline.dof import Dof
 from ema_pipeline.observations.close_modes import Groups, Slopes
 from ema_pipeline.observations.mode_data import ModeData
-from ema_pipeline.observations.mode_residuals import _turned_slopes
+from ema_pipeline.observations.sensing import turned_slopes
 
 SENSORS = 7
 
@@ -172,4 +172,4 @@ def test_neighbours_are_of_one_group_as_far_as_sensors_tell_them_apart() -> None
 
 def test_a_mode_that_no_sensor_reads_has_no_angle_that_turns() -> None:
     read, slope = np.zeros((1, 2), complex), np.zeros((1, 2, 3), complex)
-    np.testing.assert_array_equal(_turned_slopes(read, slope), np.zeros((1, 2, 3)))
+    np.testing.assert_array_equal(turned_slopes(read, slope), np.zeros((1, 2, 3)))
