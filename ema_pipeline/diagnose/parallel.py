@@ -13,6 +13,9 @@ from ema_pipeline.threads import cores, single_blas_thread
 A = TypeVar("A")
 R = TypeVar("R")
 
+_CHUNKS = 12
+"""Pieces in which each process gets its share: of many that take milliseconds each, handing over takes as long."""
+
 _job: Callable[..., object] | None = None
 _items: Sequence[object] = ()
 
@@ -42,7 +45,8 @@ def spread(job: Callable[[A], R], items: Sequence[A], processes: int | None, lea
     try:
         context = multiprocessing.get_context("fork")
         with ProcessPoolExecutor(min(processes, len(items)), mp_context=context) as pool:
-            yield from cast("Iterator[R]", pool.map(_run, range(len(items))))
+            chunk = max(1, len(items) // (_CHUNKS * processes))
+            yield from cast("Iterator[R]", pool.map(_run, range(len(items)), chunksize=chunk))
     finally:
         _job, _items = None, ()
 

@@ -63,25 +63,31 @@ def scores(
         Processes that share the hypotheses, None for one per processor.
     """
     marginal = Marginal(base)
+    asked = [h for h in hypotheses if not h.size_cannot_be_zero]
+    problems = {
+        h.label: (models[h.label] if models else base.model.plus(h.placed, h.scales)).problem(observations)
+        for h in asked
+    }
+    at_once = base.model.problem(observations).first_order(base.posterior, [problems[h.label] for h in asked])
+    columns = {h.label: found for h, found in zip(asked, at_once, strict=True) if found is not None}
 
     def told(hypothesis: Hypothesis) -> tuple[NDArray[np.float64], float, float] | None:
         """Size, σ and gain; None where the effect changes what is compared."""
-        model = models[hypothesis.label] if models else base.model.plus(hypothesis.placed, hypothesis.scales)
-        problem = model.problem(observations)
-        names = [n for n in problem.unknowns.names if effect_of(n) == hypothesis.label]
-        start = transferred(base.posterior, problem.unknowns)
-        at = [problem.unknowns.index[n] for n in names]
-        residuals = problem.residuals(
-            start, base.posterior.scatters, matching=base.posterior.residuals.matching
-        )
-        if residuals.jacobian.shape[0] != marginal.count:
+        label = hypothesis.label
+        problem, by_size = problems[label], columns.get(label)
+        at = [problem.unknowns.index[name] for name in problem.sizes if effect_of(name) == label]
+        if by_size is None:
+            start = transferred(base.posterior, problem.unknowns)
+            matching = base.posterior.residuals.matching
+            by_size = problem.residuals(start, base.posterior.scatters, matching=matching).jacobian[:, at]
+        if len(by_size) != marginal.count:
             return None
-        columns = residuals.jacobian[:, at] * marginal.weight[:, None]
-        return marginal.score(columns, problem.unknowns.lower[at])
+        return marginal.score(by_size * marginal.weight[:, None], problem.unknowns.lower[at])
 
-    asked = [h for h in hypotheses if not h.size_cannot_be_zero]
-    found = zip(asked, spread(told, asked, processes, _WORTH), strict=True)
-    return [Score(h, *one) for h, one in found if one is not None]
+    alone = [h for h in asked if h.label not in columns]
+    scored = {h.label: told(h) for h in asked if h.label in columns}
+    scored |= zip([h.label for h in alone], spread(told, alone, processes, _WORTH), strict=True)
+    return [Score(h, *one) for h in asked if (one := scored[h.label]) is not None]
 
 
 class Marginal:

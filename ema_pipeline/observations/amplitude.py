@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.inference import Apart, Posterior, Residuals, Unknowns, joined
+from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.hit_data import HitData, comparable
 from ema_pipeline.observations.hit_lattice import LEAST, SPACING, MarchedHits, on_lattice
 from ema_pipeline.observations.hit_march import rubs, steps_to_end
@@ -186,7 +187,7 @@ class AmplitudeObservations:
         return pairs
 
 
-class AmplitudeProblem:
+class AmplitudeProblem(EffectProblem):
     """Hits at several levels, and the rig with a list of effects."""
 
     def __init__(
@@ -215,12 +216,6 @@ class AmplitudeProblem:
         """See `EffectProblem`."""
         x = self.modes.start(sizes)
         return np.concatenate([x, np.zeros(len(self.unknowns) - len(x))])
-
-    def escapes(
-        self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals
-    ) -> list[NDArray[np.float64]]:
-        """See `EffectProblem`: none."""
-        return []
 
     def tuned(self, x: NDArray[np.float64], name: str) -> list[float]:
         """See `EffectProblem`."""

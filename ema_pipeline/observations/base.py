@@ -55,6 +55,15 @@ class EffectProblem(Problem, Protocol):
         """Unknowns of the size `name` at which a mode comes to where one was measured that has no partner at `x`."""
         return []
 
+    def first_order(
+        self, found: Posterior, added: Sequence[EffectProblem]
+    ) -> list[NDArray[np.float64] | None]:
+        """Derivatives of the residuals of a fit by the sizes of effects that are not there, (m, k) each.
+
+        None for what must be asked of the problem with that effect: each of `added` has one more.
+        """
+        return [None] * len(added)
+
     def parameter_values(self, x: NDArray[np.float64]) -> dict[str, float]:
         """Values of the rig's parameters and of the effects' sizes."""
         ...

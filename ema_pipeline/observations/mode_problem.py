@@ -6,7 +6,7 @@ configurations share. Shapes are compared up to a factor, which is projected out
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import ChannelQuality
-from ema_pipeline.inference import Residuals, Unknowns, joined
+from ema_pipeline.inference import Posterior, Residuals, Unknowns, joined
 from ema_pipeline.ingest.defaults import CALIBRATION_STD
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
 from ema_pipeline.mechanics.terms import MASS, STIFFNESS
 from ema_pipeline.mechanics.tuned import tuned_sizes
 from ema_pipeline.modal.assurance import mac
 from ema_pipeline.observations.base import EffectProblem
+from ema_pipeline.observations.first_order import FirstOrderModel
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_residuals import Comparison
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, stacked
@@ -193,9 +194,14 @@ class ModeProblem(EffectProblem):
 
     def sensing(self, data: ModeData) -> Sensing:
         """What the sensors of one configuration's modes read."""
-        key = (data.configuration, id(data))  # the cache holds the data, so that their id stays
+        key = (data.configuration, id(data))  # the caches hold the data, so that their id stays
         if key not in self._sensing:
-            self._sensing[key] = data, self._found_sensing(data)
+            shared = self.observations.sensing
+            if (
+                key not in shared
+            ):  # the sensors' unknowns come after the model's, in the same order for all models
+                shared[key] = data, self._found_sensing(data).moved(-self.offset)
+            self._sensing[key] = data, shared[key][1].moved(self.offset)
         return self._sensing[key][1]
 
     def _found_sensing(self, d: ModeData) -> Sensing:
@@ -283,6 +289,25 @@ class ModeProblem(EffectProblem):
                 like = mac(data.shapes[r], (along @ shapes[: along.shape[1]]).T)[0]
                 found += [float(sizes[k]) for k in np.argsort(-like)[:_MOST_TUNED]]
         return found
+
+    def first_order(
+        self, found: Posterior, added: Sequence[EffectProblem]
+    ) -> list[NDArray[np.float64] | None]:
+        """See `EffectProblem`."""
+        models = [one.model for one in added if isinstance(one, ModeProblem)]
+        configurations = [d.configuration for d in self.observations.data]
+        model = FirstOrderModel(self.model, models, configurations, found.x[: self.offset])
+        problem = ModeProblem(self.observations, model)
+        sizes = np.zeros(len(problem.unknowns) - len(self.unknowns))
+        at = np.concatenate([found.x[: self.offset], sizes, found.x[self.offset :]])
+        residuals = problem.residuals(at, found.scatters, matching=found.residuals.matching)
+        columns = {
+            one: residuals.jacobian[
+                :, [problem.unknowns.index[name] for name in one.sizes if name not in self.sizes]
+            ]
+            for one in model.together
+        }
+        return [columns.get(one.model) if isinstance(one, ModeProblem) else None for one in added]
 
     def escapes(
         self, x: NDArray[np.float64], scatters: Mapping[str, float], found: Residuals

@@ -26,6 +26,7 @@ from ema_pipeline.observations.parts import (
     dependence,
 )
 from ema_pipeline.observations.rig_model import RigModel
+from ema_pipeline.observations.sensing import Sensing
 from ema_pipeline.rigs.types import Rig
 
 
@@ -65,6 +66,12 @@ class ModeObservations:
         Name of the test among several whose unknowns are shared: its drift is its own.
     own_damping : dict of str to OwnDamping, optional
         Undamped modes whose damping ratios are unknowns of their own, by configuration.
+
+    Attributes
+    ----------
+    sensing : dict
+        What the sensors of a configuration read, by it and the id of its data, the positions of unknowns counted from
+        the first one that is not the model's: the same for all models, so cached here by their problems.
     """
 
     linearised = False
@@ -86,6 +93,7 @@ class ModeObservations:
         self.channels = dict(channels or {})
         self.shared = shared or dependence(rig)
         self.scatters = scatters_of(rig)
+        self.sensing: dict[tuple[str, int], tuple[ModeData, Sensing]] = {}
         self._has: dict[tuple[str, Dof], bool] = {}
 
     def channel(self, sensor: str) -> ChannelQuality:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,16 @@ class Sensing:
     transverse: NDArray[np.int64]
     drift: int
     mixing: NDArray[np.int64]
+
+    def moved(self, by: int) -> Sensing:
+        """With all unknowns so many places further on."""
+
+        def further(at: NDArray[np.int64]) -> NDArray[np.int64]:
+            return np.where(at >= 0, at + by, at)
+
+        gain, transverse, mixing = map(further, (self.gain, self.transverse, self.mixing))
+        drift = self.drift + by if self.drift >= 0 else self.drift
+        return replace(self, gain=gain, transverse=transverse, drift=drift, mixing=mixing)
 
 
 class SensorReadings:
