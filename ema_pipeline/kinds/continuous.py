@@ -21,6 +21,8 @@ from ema_pipeline.store import ALL
 from ema_pipeline.toml_text import parse_toml
 
 if TYPE_CHECKING:
+    from ema_pipeline.diagnose.types import Ladder
+    from ema_pipeline.observations.free_run import RecordError
     from ema_pipeline.observations.records import RecordObservations
 
 
@@ -143,7 +145,6 @@ def record_observations(run: Run) -> RecordObservations:
 
 def diagnose(run: Run, progress: Progress) -> Results:
     """What the model is missing, on top of the effects that the user added, and its free-run errors."""
-    from ema_pipeline.diagnose.free_run import free_run
     from ema_pipeline.diagnose.hysteresis_loop import hysteresis_loops
     from ema_pipeline.diagnose.records import diagnose_records
     from ema_pipeline.threads import single_blas_thread
@@ -154,14 +155,24 @@ def diagnose(run: Run, progress: Progress) -> Results:
         observations = record_observations(run)
         found = diagnose_records(observations, run.library, run.info.effects, run.settings.diagnose, progress)
         progress(0.95, "free run")
-        errors = free_run(observations, run.library, found.ladder)
+        errors = _free_run(run, observations, found.ladder)
         loops = hysteresis_loops(observations, run.library, found.ladder)
     return {"diagnosis": found, "simulation": errors, "hysteresis": loops, "on_top_of": run.info.effects}
 
 
+def _free_run(run: Run, observations: RecordObservations, ladder: Ladder) -> tuple[RecordError, ...]:
+    """Errors of the first and the last model of a ladder."""
+    from ema_pipeline.diagnose.records import record_model
+    from ema_pipeline.observations.free_run import free_run
+
+    rungs = ladder.rungs[0], ladder.rungs[-1]
+    return free_run(
+        observations, [(record_model(observations, run.library, r.effects), r.unknowns) for r in rungs]
+    )
+
+
 def ladder(run: Run, progress: Progress) -> Results:
     """The effects that the user added, rung by rung, with the free-run errors of the last one."""
-    from ema_pipeline.diagnose.free_run import free_run
     from ema_pipeline.diagnose.hysteresis_loop import hysteresis_loops
     from ema_pipeline.diagnose.records import records_ladder
     from ema_pipeline.diagnose.types import Diagnosis
@@ -178,7 +189,7 @@ def ladder(run: Run, progress: Progress) -> Results:
         rungs = records_ladder(observations, run.library, effects, known, run.settings.diagnose.processes)
         return {
             "ladder": rungs,
-            "simulation": free_run(observations, run.library, rungs),
+            "simulation": _free_run(run, observations, rungs),
             "hysteresis": hysteresis_loops(observations, run.library, rungs),
         }
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from ema_pipeline.check_result import CheckResult
 from ema_pipeline.choices import NO_CHOICES, Choices
 from ema_pipeline.correlate.types import Comparison, Pairing
-from ema_pipeline.diagnose.free_run import RecordError
 from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
@@ -18,6 +17,7 @@ from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.loops.types import IsolatorResult, Loop, LoopModel
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.observations.free_run import RecordError
 
 
 @dataclass(frozen=True)

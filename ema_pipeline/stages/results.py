@@ -8,7 +8,6 @@ from typing import TypeVar, cast
 
 from ema_pipeline.check_result import CheckResult
 from ema_pipeline.correlate.types import Comparison, Pairing
-from ema_pipeline.diagnose.free_run import RecordError
 from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
 from ema_pipeline.diagnose.types import Diagnosis, Ladder
 from ema_pipeline.fit.types import FitResult
@@ -22,6 +21,7 @@ from ema_pipeline.levels.sentences import flagged
 from ema_pipeline.loops.types import IsolatorResult
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import NO_SYNTHESIS, ModalModel
+from ema_pipeline.observations.free_run import RecordError
 from ema_pipeline.report.results import ConfigurationResults, LoopResults, RunResults
 from ema_pipeline.run.measured import level_study, modes_key
 from ema_pipeline.run.models import diagnosed_choices, diagnosis_is_of_other_data

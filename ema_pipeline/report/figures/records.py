@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ema_pipeline.diagnose.free_run import RecordError
 from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
+from ema_pipeline.observations.free_run import RecordError
 from ema_pipeline.report.style import GREY, MEASURED, MODEL, SECOND, margins, new_figure, styled
 
 _SCALES = ((1e-9, 1e9, "n"), (1e-6, 1e6, "µ"), (1e-3, 1e3, "m"))

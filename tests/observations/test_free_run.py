@@ -7,18 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from two_bodies import BEGIN, LIBRARY, decaying, rig, steady, truth
+from two_bodies import BEGIN, decaying, rig, steady, truth
 
-from ema_pipeline.diagnose.types import Ladder, Rung
+from ema_pipeline.observations.fitting import Model
 from ema_pipeline.observations.record_data import DISCREPANCY
 from ema_pipeline.observations.records import RecordObservations
 
-free_run = importlib.import_module("ema_pipeline.diagnose.free_run")
+free_run = importlib.import_module("ema_pipeline.observations.free_run")
 __all__ = ["rig"]  # a fixture
-
-
-def rung(unknowns: dict[str, float]) -> Rung:
-    return Rung((), 1.0, 1.0, 1.0, 1.0, {}, 0.0, 0, unknowns=unknowns)
 
 
 def test_a_wrong_calibration_is_an_error_of_its_size_in_every_record(rig) -> None:
@@ -30,8 +26,7 @@ def test_a_wrong_calibration_is_an_error_of_its_size_in_every_record(rig) -> Non
     problem = observations.problem((), {})
     true = dict(zip(problem.unknowns.names, truth(problem).tolist(), strict=True))
     wrong = true | {"calibration of ab": np.log(1.1), "zero of xa": 3.0}
-    ladder = Ladder((rung(wrong), rung(true)), 0.0, 0.0, 0.0, "")
-    found = free_run.free_run(observations, LIBRARY, ladder)
+    found = free_run.free_run(observations, [(Model(), wrong), (Model(), true)])
     named = [(e.record, e.use, e.sensor.point, e.quantity, e.unit) for e in found]
     assert named[:3] == [
         ("steady", "fit", "a.x", "displacement", "m"),

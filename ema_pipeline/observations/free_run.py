@@ -8,10 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.diagnose.records import record_model
-from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.dof import Dof
-from ema_pipeline.effects.base import Effect
+from ema_pipeline.observations.fitting import Model
 from ema_pipeline.observations.record_problem import RecordProblem
 from ema_pipeline.observations.records import RecordObservations
 
@@ -72,18 +70,24 @@ class RecordError:
 
 
 def free_run(
-    observations: RecordObservations, library: Mapping[str, Effect], ladder: Ladder
+    observations: RecordObservations, models: Sequence[tuple[Model, Mapping[str, float]]]
 ) -> tuple[RecordError, ...]:
-    """Errors of the first and the last model of a ladder in all records, those held out too."""
-    first, last = ladder.rungs[0], ladder.rungs[-1]
+    """Errors of two models in all records, those held out too.
+
+    Parameters
+    ----------
+    observations : RecordObservations
+    models : sequence of (Model, dict of str to float)
+        The one without added effects and the last one, each with its fitted unknowns by name.
+    """
     found: list[RecordError] = []
     for record in (*(d.record for d in observations.data), *observations.held_out):
         one = observations.with_records([record], ())
         runs = []
-        for rung in (first, last):
-            problem = record_model(observations, library, rung.effects).problem(one)
+        for model, unknowns in models:
+            problem = model.problem(one)
             assert isinstance(problem, RecordProblem)
-            runs.append(_simulated(one, problem, rung.unknowns))
+            runs.append(_simulated(one, problem, unknowns))
         found += _errors(one, runs)
     return tuple(found)
 
