@@ -109,7 +109,7 @@ def diagnose(
         beside = [one for one in told if one[0] not in names]
         told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.label in names]
     final = found.final.posterior
-    share = complete(*final.telling) if explained else CLOSEST
+    share = complete(*reached.telling) if explained else CLOSEST
     candidates = tuple(replace(c, probability=share * c.probability) for c in candidates)
     begun = reached if start is found.final else explanation(first.observations, start, settings)
     probabilities = shared(found.rounds[0].probabilities, share, share if begun.explained else 0.0)

@@ -62,8 +62,11 @@ class Explanation:
 
     Attributes
     ----------
+    telling : (float, int)
+        Its error with scatters no larger than usual and no part further out than parts scatter, and of how many data;
+        see `Posterior.telling`.
     fails : bool
-        True where its error is too large with scatters no larger than usual and no part further out than parts scatter.
+        True where that is too large.
     by_modes : float
         Where its error is too large as it was fitted, that of the modes alone, which many data of single hits may hide;
         0 elsewhere.
@@ -79,6 +82,7 @@ class Explanation:
         Furthest first. They speak against a model by the error that it has without them.
     """
 
+    telling: tuple[float, int]
     fails: bool
     by_modes: float
     by_scatter: float
@@ -101,6 +105,7 @@ def explanation(observations: Observations, fit: Fit, settings: DiagnoseSettings
     fails = judged.fails(limit)
     by_scatter = fails and usual is not fit and not within_scatter(observations, fit).posterior.fails(limit)
     return Explanation(
+        telling=judged.telling,
         fails=fails,
         by_modes=p.error_apart if p.fails(limit) else 0.0,
         by_scatter=judged.error if by_scatter else 0.0,

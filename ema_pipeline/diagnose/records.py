@@ -106,7 +106,7 @@ def diagnose_records(
     ladder = whole_ladder(observations, library, searched, settings.processes)
     while doubt := _unconfirmed(observations, found, ladder, settings):
         lost = max(0.0, _claimed(found)[-1].log_evidence - _last_gain(ladder))
-        found, searched = _withdrawn(found, searched, doubt, lost, settings)
+        found, searched = _withdrawn(found, searched, doubt, lost)
         ladder = whole_ladder(observations, library, searched, settings.processes)
     return _with_whole(found, ladder)
 
@@ -143,9 +143,7 @@ def _claimed(found: Diagnosis) -> list[Candidate]:
     return [c for c in found.candidates if c.claimed]
 
 
-def _withdrawn(
-    found: Diagnosis, searched: Ladder, doubt: str, lost: float, settings: DiagnoseSettings
-) -> tuple[Diagnosis, Ladder]:
+def _withdrawn(found: Diagnosis, searched: Ladder, doubt: str, lost: float) -> tuple[Diagnosis, Ladder]:
     """Diagnosis and ladder of the search without the last claim."""
     label = searched.rungs[-1].effects[-1]
     candidates = tuple(
@@ -160,16 +158,16 @@ def _withdrawn(
         verdict = "effect"
     kept = dataclasses.replace(found, verdict=verdict, candidates=candidates, indistinguishable=groups)
     if len(rungs) == 1:
-        kept = _nothing_claimed(kept, rungs[0].error, lost, settings)
+        kept = _nothing_claimed(kept, rungs[0].error, lost)
     return kept, dataclasses.replace(searched, rungs=rungs, note=note)
 
 
-def _nothing_claimed(found: Diagnosis, error: float, lost: float, settings: DiagnoseSettings) -> Diagnosis:
+def _nothing_claimed(found: Diagnosis, error: float, lost: float) -> Diagnosis:
     """Verdict and probabilities where whole records take back the only claim, by `lost` in log evidence."""
     told = {n: p if n == NOTHING else p * float(np.exp(-lost)) for n, p in found.probabilities.items()}
     total = sum(told.values())
     told = {n: p / total for n, p in told.items()}
-    verdict: VerdictWord = "adequate" if error <= settings.error_limit else "unknown_effect"
+    verdict: VerdictWord = "adequate" if error <= found.error_limit else "unknown_effect"
     if verdict == "unknown_effect":
         told = shared(told, CLOSEST, 0.0)
     return dataclasses.replace(

@@ -8,7 +8,14 @@ from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.explained import Explanation, OutlyingDamping, OutlyingPart
 
 NOTHING_AGAINST = Explanation(
-    fails=False, by_modes=0.0, by_scatter=0.0, unpaired=False, stands_still=False, damping=None, parts=()
+    telling=(0.9, 60),
+    fails=False,
+    by_modes=0.0,
+    by_scatter=0.0,
+    unpaired=False,
+    stands_still=False,
+    damping=None,
+    parts=(),
 )
 DAMPING, PART = OutlyingDamping(0.8, 0.5), OutlyingPart("m2 (mass)", 0.23, 0.01)
 
@@ -33,7 +40,7 @@ def test_parts_that_stand_out_speak_against_a_model_only_where_it_fails_without_
 
 def test_every_reason_is_told_once_and_nothing_without_one() -> None:
     assert sentences.reasons(NOTHING_AGAINST, 0.9) == ""
-    told = sentences.reasons(Explanation(True, 2.1, 1.6, False, True, DAMPING, (PART,)), 1.2)
+    told = sentences.reasons(Explanation((1.6, 60), True, 2.1, 1.6, False, True, DAMPING, (PART,)), 1.2)
     for part in (
         "Modes move with the force",
         "modes alone is 2.10",

@@ -148,7 +148,7 @@ def test_a_claim_that_is_withdrawn_takes_its_group_and_its_rung_with_it() -> Non
         groups=(("b@x", "c@x"), ("a@x", "d@x")),
     )
     searched = ladder(rung(0.0), rung(5.0, ("a@x",)), rung(9.0, ("a@x", "b@x")))
-    kept, left = _withdrawn(found, searched, "of doubt", 5.0, SETTINGS)
+    kept, left = _withdrawn(found, searched, "of doubt", 5.0)
     assert [(c.label, c.claimed, c.why) for c in kept.candidates] == [
         ("a@x", True, "Its signs."), ("b@x", False, "Not claimed: of doubt.")
     ]  # fmt: skip
@@ -157,25 +157,25 @@ def test_a_claim_that_is_withdrawn_takes_its_group_and_its_rung_with_it() -> Non
     assert left.note == "the best further effect is b at x, and of doubt"
     assert kept.probabilities == found.probabilities
     other = replace(found, indistinguishable=(("a@x", "d@x"), ("b@x", "c@x")))
-    assert _withdrawn(other, searched, "of doubt", 5.0, SETTINGS)[0].verdict == "ambiguous"
+    assert _withdrawn(other, searched, "of doubt", 5.0)[0].verdict == "ambiguous"
 
 
 @pytest.mark.parametrize(
     ("error", "verdict", "named", "nothing"),
-    [(1.5, "adequate", 0.25, 0.5), (1.51, "unknown_effect", 0.125, 0.0)],
+    [(1.3, "adequate", 0.25, 0.5), (1.31, "unknown_effect", 0.125, 0.0)],
 )
 def test_without_the_only_claim_nothing_is_as_probable_as_the_evidence_lost_makes_it(
     error: float, verdict: str, named: float, nothing: float
 ) -> None:
-    found = diagnosis(candidate("a@x", 9.0), candidate("b@x", 1.0, claimed=False))
-    kept = _nothing_claimed(found, error, np.log(4.0), SETTINGS)
+    found = replace(diagnosis(candidate("a@x", 9.0), candidate("b@x", 1.0, claimed=False)), error_limit=1.3)
+    kept = _nothing_claimed(found, error, np.log(4.0))
     assert kept.verdict == verdict
     unknown = {} if nothing else {UNKNOWN: 0.75}
     assert kept.probabilities == pytest.approx({"a@x": named, "b@x": named, NOTHING: nothing} | unknown)
     assert kept.null_probability == pytest.approx(nothing)
     assert [c.probability for c in kept.candidates] == pytest.approx([named, named])
     searched = ladder(rung(0.0, error=error), rung(5.0, ("a@x",)))
-    assert _withdrawn(found, searched, "of doubt", np.log(4.0), SETTINGS)[0].verdict == verdict
+    assert _withdrawn(found, searched, "of doubt", np.log(4.0))[0].verdict == verdict
 
 
 def test_sizes_of_a_candidate_are_those_of_the_last_rung_where_it_has_it() -> None:
