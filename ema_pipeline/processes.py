@@ -144,8 +144,9 @@ def side_by_side(
             while left and len(running) < processes:
                 index, item = left.pop(0)
                 mine, theirs = context.Pipe(duplex=False)
-                process = context.Process(target=_do, args=(job, item, theirs), daemon=True)
-                process.start()
+                process = context.Process(target=_do, args=(job, item, theirs))
+                with workers_die_with_us():
+                    process.start()
                 theirs.close()
                 running[mine] = (index, process)
             ready = wait(list(running))

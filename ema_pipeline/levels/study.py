@@ -15,6 +15,8 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels.settings import LevelSettings
 from ema_pipeline.levels.types import DecayCurve, ForceLevel, HitModes, LevelStudy, ModeLevels
 from ema_pipeline.modal.settings import ModalSettings
+from ema_pipeline.processes import Send, can_fork, side_by_side
+from ema_pipeline.threads import cores, share_cores
 
 if TYPE_CHECKING:
     from ema_pipeline.ingest.records import Hit, HitSamples
@@ -105,12 +107,12 @@ def study_levels(
         study = LevelStudy((level,), frfs.inputs, modes, curves, (), depends, p_value, "")
         return replace(study, summary=one_level(study, modal))
 
-    levels: tuple[ForceLevel, ...] = ()
-    for k in range(n_levels):
-        level_force = float(np.median(force[place == k]))
-        progress(0.7 * k / n_levels, f"modes at {level_force:.3g} {unit}")
+    def of_place(k: int) -> ForceLevel:
         chosen = tuple(n for n, p in zip(names, place, strict=True) if p == k)
-        levels += (_level(hits, chosen, level_force, unit, frf_settings, modal_settings, choices),)
+        level_force = float(np.median(force[place == k]))
+        return _level(hits, chosen, level_force, unit, frf_settings, modal_settings, choices)
+
+    levels = _side_by_side(of_place, n_levels, progress)
     progress(0.7, "modes of single hits")
     level_of = dict(zip(names, place.tolist(), strict=True))
 
@@ -141,6 +143,31 @@ def study_levels(
         levels, frfs.inputs, modes, curves, verdicts, depends, p_value, "", linear, products, hit_modes
     )
     return replace(study, summary=several_levels(study, modal, settings))
+
+
+def _side_by_side(
+    level_of: Callable[[int], ForceLevel], count: int, progress: Progress
+) -> tuple[ForceLevel, ...]:
+    """All levels, softest first; one more at a time than there are processors, so that of three on two none waits."""
+    found: dict[int, ForceLevel] = {}
+
+    def heard(one: tuple[int, ForceLevel]) -> None:
+        found[one[0]] = one[1]
+        progress(0.7 * len(found) / count, f"modes at {one[1].force_n:.3g} {one[1].unit}")
+
+    progress(0.0, f"modes of {count} force levels")
+    processes = min(count, cores() + 1)
+    if cores() > 1 and can_fork():
+
+        def job(k: int, send: Send) -> None:
+            share_cores(processes)
+            send((k, level_of(k)))
+
+        side_by_side(job, range(count), processes, heard)
+    else:
+        for k in range(count):
+            heard((k, level_of(k)))
+    return tuple(found[k] for k in range(count))
 
 
 def with_circles(study: LevelStudy, settings: CircleSettings) -> LevelStudy:

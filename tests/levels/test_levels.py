@@ -65,6 +65,20 @@ def test_a_mode_that_moves_is_found_and_no_other_is_blamed(moving: tuple[LevelSt
     assert mode.frequency_hz[2] - mode.frequency_hz[0] == pytest.approx(expected, rel=0.25)
 
 
+@pytest.mark.parametrize("processors", [1, 2])
+def test_levels_are_the_same_in_one_process_and_in_several(
+    moving: tuple[LevelStudy, ModalModel], monkeypatch: pytest.MonkeyPatch, processors: int
+) -> None:
+    monkeypatch.setattr("ema_pipeline.levels.study.cores", lambda: processors)
+    case = replace(LINEAR, mode=1, frequency_shift=5e-4)
+    again, _ = studied(hits_of(case, np.random.default_rng(1)))
+    for a, b in zip(moving[0].levels, again.levels, strict=True):
+        assert a.hits == b.hits
+        assert a.modal is not None
+        assert b.modal is not None
+        assert [m.pole for m in a.modal.modes] == [m.pole for m in b.modal.modes]
+
+
 def test_every_level_keeps_its_own_modal_model(moving: tuple[LevelStudy, ModalModel]) -> None:
     study, _ = moving
     for k, level in enumerate(study.levels):
