@@ -22,7 +22,7 @@ def too_few(fit: Fit) -> bool:
 
 
 def verdict_of(found: Selection, settings: DiagnoseSettings, explained: bool) -> VerdictWord:
-    """What the data support; `explained` where the final model explains them, see `explained`."""
+    """What the data support; `explained` where the final model explains them, see `Explanation.explained`."""
     if not found.claimed and too_few(found.final):
         return "not_enough_data"
     if not explained:

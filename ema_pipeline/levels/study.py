@@ -60,6 +60,7 @@ def study_levels(
     modal_settings: ModalSettings,
     progress: Progress,
     choices: Choices = NO_CHOICES,
+    processes: int | None = None,
 ) -> LevelStudy:
     """Follow every mode over the force levels of the hits.
 
@@ -80,6 +81,8 @@ def study_levels(
         Called with the share done (0…1) and a word on what is being done.
     choices : Choices, optional
         Modes that the user excluded from `modal` or included; the levels' own modes follow them.
+    processes : int, optional
+        Most in which levels are identified side by side; as many as suit the processors where left out.
 
     Returns
     -------
@@ -112,7 +115,7 @@ def study_levels(
         level_force = float(np.median(force[place == k]))
         return _level(hits, chosen, level_force, unit, frf_settings, modal_settings, choices)
 
-    levels = _side_by_side(of_place, n_levels, progress)
+    levels = _side_by_side(of_place, n_levels, processes, progress)
     progress(0.7, "modes of single hits")
     level_of = dict(zip(names, place.tolist(), strict=True))
 
@@ -146,9 +149,10 @@ def study_levels(
 
 
 def _side_by_side(
-    level_of: Callable[[int], ForceLevel], count: int, progress: Progress
+    level_of: Callable[[int], ForceLevel], count: int, processes: int | None, progress: Progress
 ) -> tuple[ForceLevel, ...]:
     """All levels, softest first; one more at a time than there are processors, so that of three on two none waits."""
+    most = min(count, processes or cores() + 1)
     found: dict[int, ForceLevel] = {}
 
     def heard(one: tuple[int, ForceLevel]) -> None:
@@ -156,14 +160,13 @@ def _side_by_side(
         progress(0.7 * len(found) / count, f"modes at {one[1].force_n:.3g} {one[1].unit}")
 
     progress(0.0, f"modes of {count} force levels")
-    processes = min(count, cores() + 1)
-    if cores() > 1 and can_fork():
+    if most > 1 and cores() > 1 and can_fork():
 
         def job(k: int, send: Send) -> None:
-            share_cores(processes)
+            share_cores(most)
             send((k, level_of(k)))
 
-        side_by_side(job, range(count), processes, heard)
+        side_by_side(job, range(count), most, heard)
     else:
         for k in range(count):
             heard((k, level_of(k)))

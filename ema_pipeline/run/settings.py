@@ -63,7 +63,10 @@ class PipelineSettings(Settings):
     stages: tuple[str, ...] = Field(STAGES, description="stages to run, in order")
     effect_files: tuple[str, ...] = Field((), description="Python files with effects of the user's own")
     processes: int | None = Field(
-        None, ge=1, le=64, description="configurations worked on at a time; left out: one per processor"
+        None,
+        ge=1,
+        le=64,
+        description="configurations, or force levels of one, worked on at a time; left out: what suits the processors",
     )
     ingest: IngestSettings = Field(IngestSettings(), description="reading raw folders")
     hits: HitSettings = Field(HitSettings(), description="hit finding and quality limits")

@@ -38,5 +38,6 @@ def work(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
         run.settings.modal.identify,
         progress,
         run.info.choices.of(configuration),
+        run.settings.processes,
     )
     return {"study": with_circles(study, run.settings.modal.circle)}
