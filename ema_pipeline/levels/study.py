@@ -29,6 +29,9 @@ Hits = Callable[[], "Iterable[HitSamples]"]
 Real = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
+MOST_SIDE_BY_SIDE = 10_000_000
+"""Values of all FRFs, 160 MB, above which levels are identified one after the other."""
+
 TRUSTED_VOTES = 0.3
 """Share of model orders that must show a mode which the softest hits do not show."""
 
@@ -82,7 +85,8 @@ def study_levels(
     choices : Choices, optional
         Modes that the user excluded from `modal` or included; the levels' own modes follow them.
     processes : int, optional
-        Most in which levels are identified side by side; as many as suit the processors where left out.
+        Most in which levels are identified side by side; left out, one more than there are processors, so that of three
+        levels on two none waits. One in any case where FRFs are so many that memory may be short.
 
     Returns
     -------
@@ -115,7 +119,8 @@ def study_levels(
         level_force = float(np.median(force[place == k]))
         return _level(hits, chosen, level_force, unit, frf_settings, modal_settings, choices)
 
-    levels = _side_by_side(of_place, n_levels, processes, progress)
+    at_once = 1 if frfs.frf.size > MOST_SIDE_BY_SIDE else processes or cores() + 1
+    levels = _side_by_side(of_place, n_levels, min(at_once, n_levels), progress)
     progress(0.7, "modes of single hits")
     level_of = dict(zip(names, place.tolist(), strict=True))
 
@@ -149,10 +154,9 @@ def study_levels(
 
 
 def _side_by_side(
-    level_of: Callable[[int], ForceLevel], count: int, processes: int | None, progress: Progress
+    level_of: Callable[[int], ForceLevel], count: int, processes: int, progress: Progress
 ) -> tuple[ForceLevel, ...]:
-    """All levels, softest first; one more at a time than there are processors, so that of three on two none waits."""
-    most = min(count, processes or cores() + 1)
+    """All levels, softest first, some at a time."""
     found: dict[int, ForceLevel] = {}
 
     def heard(one: tuple[int, ForceLevel]) -> None:
@@ -160,13 +164,13 @@ def _side_by_side(
         progress(0.7 * len(found) / count, f"modes at {one[1].force_n:.3g} {one[1].unit}")
 
     progress(0.0, f"modes of {count} force levels")
-    if most > 1 and cores() > 1 and can_fork():
+    if processes > 1 and cores() > 1 and can_fork():
 
         def job(k: int, send: Send) -> None:
-            share_cores(most)
+            share_cores(processes)
             send((k, level_of(k)))
 
-        side_by_side(job, range(count), most, heard)
+        side_by_side(job, range(count), processes, heard)
     else:
         for k in range(count):
             heard((k, level_of(k)))

@@ -79,6 +79,18 @@ def test_levels_are_the_same_in_one_process_and_in_several(
         assert [m.pole for m in a.modal.modes] == [m.pole for m in b.modal.modes]
 
 
+def test_levels_of_many_frfs_are_identified_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ema_pipeline.levels.study.cores", lambda: 2)
+    monkeypatch.setattr("ema_pipeline.levels.study.MOST_SIDE_BY_SIDE", 0)
+
+    def side_by_side(*given: object) -> None:
+        raise AssertionError("in processes of their own")
+
+    monkeypatch.setattr("ema_pipeline.levels.study.side_by_side", side_by_side)
+    study, _ = studied(hits_of(replace(LINEAR, mode=1, frequency_shift=5e-4), np.random.default_rng(1)))
+    assert len(study.levels) == 3
+
+
 def test_every_level_keeps_its_own_modal_model(moving: tuple[LevelStudy, ModalModel]) -> None:
     study, _ = moving
     for k, level in enumerate(study.levels):
