@@ -76,8 +76,8 @@ def _slopes(
 ) -> NDArray[np.float64] | None:
     """Derivatives of the matrices by the sizes that `one` has more than `model`, (k, 4, n, n).
 
-    None where it is another model at unknowns of 0.
-    An effect that lets shapes lag behind is asked of alone: with it those of all modes are complex.
+    None where it is another model at unknowns of 0, and for an effect that lets shapes lag behind: with it those of all
+    modes are complex.
     """
     sizes = len(one.sizes) - len(model.sizes)
     own = one.matrices(configuration, np.concatenate([x, np.zeros(sizes)]))

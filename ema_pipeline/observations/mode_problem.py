@@ -126,7 +126,7 @@ class ModeProblem(EffectProblem):
         self.observations, self.model = observations, model
         self.offset = len(model.unknowns)
         self._defaults = {name: s.default for name, s in observations.scatters.items()}
-        self._sensing: dict[tuple[str, int], tuple[ModeData, Sensing]] = {}
+        self._sensing: dict[tuple[str, int], Sensing] = {}
         self._comparisons: dict[tuple[str, int], tuple[object, Comparison]] = {}
 
     @property
@@ -194,15 +194,14 @@ class ModeProblem(EffectProblem):
 
     def sensing(self, data: ModeData) -> Sensing:
         """What the sensors of one configuration's modes read."""
-        key = (data.configuration, id(data))  # the caches hold the data, so that their id stays
+        key = (data.configuration, id(data))  # the observations' cache holds the data, so that their id stays
         if key not in self._sensing:
             shared = self.observations.sensing
-            if (
-                key not in shared
-            ):  # the sensors' unknowns come after the model's, in the same order for all models
+            if key not in shared:
+                # the sensors' unknowns come after the model's, in the same order for all models
                 shared[key] = data, self._found_sensing(data).moved(-self.offset)
-            self._sensing[key] = data, shared[key][1].moved(self.offset)
-        return self._sensing[key][1]
+            self._sensing[key] = shared[key][1].moved(self.offset)
+        return self._sensing[key]
 
     def _found_sensing(self, d: ModeData) -> Sensing:
         along = self.model.sensor_rows(d.configuration, d.dofs)

@@ -162,7 +162,7 @@ class RigModel:
         self._terms: dict[tuple[object, ...], Terms] = {}
         self._linear: dict[str, LinearTerms | None] = {}
         self._nominal: dict[tuple[object, ...], Assembly] = {}
-        self._fits: dict[tuple[str, int], bool] = {}
+        self._fits: dict[tuple[str, int, tuple[str, ...]], bool] = {}
         self._modes: dict[str, tuple[bytes, bool, Matrices, EigenSolution | None]] = {}
 
     @cached_property
@@ -382,9 +382,10 @@ class RigModel:
         assembly = self._base(configuration, shape[: len(geometric)])
         values = dict(zip(self.sizes, shape[len(geometric) :], strict=True))
         for i, one in enumerate(self.effects):
-            if (configuration, i) not in self._fits:  # whatever the sizes
-                self._fits[configuration, i] = one.effect.fits(assembly, one.place)
-            if self._fits[configuration, i]:
+            key = (configuration, i, assembly.dofs)  # whatever the sizes, but for one that adds a coordinate
+            if key not in self._fits:
+                self._fits[key] = one.effect.fits(assembly, one.place)
+            if self._fits[key]:
                 names = {p.name: one.parameter_name(p.name) for p in one.effect.parameters}
                 own = {short: self.sizes[full].value(float(values[full])) for short, full in names.items()}
                 assembly = one.effect.edit(assembly, one.place, own)
