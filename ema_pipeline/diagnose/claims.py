@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ema_pipeline.diagnose.heldout import NOTHING_HELD_OUT, HeldOut, held_out
+from ema_pipeline.diagnose.heldout import NOTHING_HELD_OUT, HeldOut, held_out_of_each
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import Named, named, sizes_of
 from ema_pipeline.diagnose.ranked import Ranked, Ranking
@@ -138,7 +138,7 @@ def judge(
     doubt = _weak(observations, ranked, gain, needed, settings, nothing)
     if not doubt:
         asked = observations.holding_out_explained(base.posterior.residuals)
-        before, after = (held_out(asked, fit, settings.processes) for fit in (base, mended))
+        before, after = held_out_of_each(asked, [base, mended], settings.processes)
         left = left_of_close_modes(base, mended)
         share = LINEARISED_SHARE if _linearised(observations, ranked.hypothesis) else HELD_OUT_SHARE
         tie = HELD_OUT_TIE + share * max(min(gain, left), 0.0)

@@ -120,23 +120,21 @@ def finals_of(
     near = unbeaten(best, lambda pair: pair[1].log_evidence)
     far = best[len(near) :]
     finalists = [*near, *promising]
-    job = partial(_learned, observations, past_barriers)
-    fits = [fit for _, fit in finalists]
-    if past_barriers:
-        base_now, *first = spread_fits(job, [base, *fits], processes)
-        known = [base_now, *known]
-    else:
-        first = spread_fits(job, fits, processes)
-    first = [max(known, key=lambda f: f.log_evidence), *first]
-    beaten = spread_fits(partial(_learned, observations, False), [fit for _, fit in far], processes)
+    own = [base] if past_barriers else []
+    led = [*own, *(fit for _, fit in finalists)]
+    asked = [*((fit, past_barriers) for fit in led), *((fit, False) for _, fit in far)]
+    found = _learned_each(observations, asked, processes)
+    bases = [*found[: len(own)], *known]
+    first = [max(bases, key=lambda f: f.log_evidence), *found[len(own) : len(led)]]
+    beaten = found[len(led) :]
     leaders = sorted(first[1:], key=lambda f: -f.log_evidence)
     job = partial(_crossed, observations, (first[0], *leaders[:2]))
     final_base, *again = spread_fits(job, first, processes)
-    found = [
+    ranked = [
         Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True)
         for (hypothesis, _), fit in zip((*finalists, *far), (*again, *beaten), strict=True)
     ]
-    best_of_each = {r.hypothesis.label: r for r in sorted(found, key=lambda r: r.gain)}
+    best_of_each = {r.hypothesis.label: r for r in sorted(ranked, key=lambda r: r.gain)}
     finals = sorted(best_of_each.values(), key=lambda r: -r.gain)
     least = finals[-1].gain if finals else 0.0
     taken = {r.hypothesis.label for r in finals}
@@ -147,6 +145,18 @@ def finals_of(
         if hypothesis.label not in taken
     ]
     return Ranking(final_base, (*finals, *others), observations.linearised)
+
+
+def _learned_each(
+    observations: Observations, asked: Sequence[tuple[Fit, bool]], processes: int | None
+) -> list[Fit]:
+    """Fits with their scatters learned, those with True led past barriers as well."""
+
+    def job(one: tuple[Fit, bool]) -> Posterior:
+        fit, past_barriers = one
+        return _learned(observations, past_barriers, fit)
+
+    return [Fit(fit.model, p) for (fit, _), p in zip(asked, spread(job, asked, processes), strict=True)]
 
 
 def _learned(observations: Observations, past_barriers: bool, fit: Fit) -> Posterior:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,25 +49,37 @@ class HeldOut:
 NOTHING_HELD_OUT = HeldOut(float("nan"), float("nan"))
 
 
-def held_out(observations: Observations, fit: Fit, processes: int | None = 1) -> HeldOut:
+def held_out(observations: Observations, fit: Fit) -> HeldOut:
     """Fit to all but one part, predict that part, in turn; scatters as they are in `fit`.
 
     No part may lie further out than parts scatter: otherwise a part moved far from its prior would stand in for the
-    effect and predict just as well. `processes` share the parts, None for one per processor.
+    effect and predict just as well.
     """
-    most = part_reach(observations, fit.posterior)
+    return held_out_of_each(observations, [fit])[0]
 
-    def told(fold: tuple[Observations, Observations]) -> tuple[float, int, float]:
-        kept, out = fold
+
+def held_out_of_each(
+    observations: Observations, fits: Sequence[Fit], processes: int | None = 1
+) -> list[HeldOut]:
+    """The same of several fits; `processes` share the parts of all, None for one per processor."""
+    folds = list(observations.folds())
+    reach = [part_reach(observations, fit.posterior) for fit in fits]
+
+    def told(item: tuple[int, int]) -> tuple[float, int, float]:
+        fit, most = fits[item[0]], reach[item[0]]
+        kept, out = folds[item[1]]
         problem, scatters = fit.model.problem(kept), fit.posterior.scatters
         start = transferred(fit.posterior, problem.unknowns, problem.start())
         return _predicted(out, fit, descend(Bounded(problem, most), scatters, start, steps=_STEPS))
 
-    parts = list(spread(told, observations.folds(), processes))
+    items = list(product(range(len(fits)), range(len(folds))))
+    parts = list(spread(told, items, processes))
+    return [_summed(parts[k * len(folds) : (k + 1) * len(folds)]) for k in range(len(fits))]
+
+
+def _summed(parts: Sequence[tuple[float, int, float]]) -> HeldOut:
     squares, count, density = (sum(of) for of in zip(*parts, strict=True)) if parts else (0.0, 0, 0.0)
-    if not count:
-        return NOTHING_HELD_OUT
-    return HeldOut(float(np.sqrt(squares / count)), density)
+    return HeldOut(float(np.sqrt(squares / count)), density) if count else NOTHING_HELD_OUT
 
 
 def _predicted(out: Observations, fit: Fit, trained: Posterior) -> tuple[float, int, float]:

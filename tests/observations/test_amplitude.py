@@ -250,8 +250,10 @@ def test_data_held_out_may_speak_against_an_effect_by_a_share_of_its_gain(
     most = claims.HELD_OUT_TIE + share * 0.8 * found.gain
     monkeypatch.setattr(observations, "linearised", linearised)
     for further, doubt in ((-0.1, ""), (0.1, claims.PREDICTED_WORSE)):
-        densities = iter([HeldOut(1.0, 0.0), HeldOut(1.0, -most - further)])
-        monkeypatch.setattr(claims, "held_out", lambda observations, fit, processes, d=densities: next(d))
+        densities = [HeldOut(1.0, 0.0), HeldOut(1.0, -most - further)]
+        monkeypatch.setattr(
+            claims, "held_out_of_each", lambda observations, fits, processes, found=densities: found
+        )
         judged = claims.judge(observations, ranking, found, settings)
         assert judged.doubt == doubt
         assert judged.contradicted is bool(doubt)
