@@ -14,8 +14,9 @@ from ema_pipeline.inference.problem import in_blocks
 from ema_pipeline.inference.scatter import determined
 
 _STEPS = 12
-_LONGEST = 1.5
-"""Steps, and longest step in the logarithm of a variance, of the search for the scatters that take a change up."""
+_LONGEST, _SETTLED = 1.5, 1e-3
+"""Most steps of the search for the scatters that take a change up, and the longest step in the logarithm of a variance,
+and the one at which it ends."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,9 @@ class ExpectedGain:
             curvature = 0.5 * (part.T @ (np.maximum(excess, 1.0)[:, None] * part))
             curvature[np.diag_indices_from(curvature)] += 0.5 * of_unknowns * inverse + 0.25 * self._weight
             step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST, _LONGEST)
-            log = np.minimum(log + step, self._widest)
+            before, log = log, np.minimum(log + step, self._widest)
+            if np.max(np.abs(log - before), initial=0.0) < _SETTLED:
+                break
         return best
 
     def _density(self, square: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -105,13 +105,15 @@ class _Step:
         held_low = (x <= unknowns.lower) & (self.gradient > 0)
         held_high = (x >= unknowns.upper) & (self.gradient < 0)
         self.free = np.flatnonzero(~(held_low | held_high))
+        self._of_free = self.hessian[np.ix_(self.free, self.free)]
 
     def to(self, damping: float) -> NDArray[np.float64]:
         """The point that a step with this damping leads to."""
         if not self.free.size:  # every unknown is held at a bound
             return self.x
-        h = self.hessian[np.ix_(self.free, self.free)]
-        damped = h + damping * np.diag(np.diag(h))
+        h = self._of_free
+        damped = h.copy()
+        np.fill_diagonal(damped, (1 + damping) * np.diag(h))
         step = np.zeros_like(self.x)
         try:
             factor = scipy.linalg.cho_factor(damped, check_finite=False)

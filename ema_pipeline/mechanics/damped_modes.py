@@ -13,6 +13,7 @@ T. K. Caughey, M. E. J. O'Kelly, Classical normal modes in damped linear dynamic
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -118,9 +119,10 @@ class DampedModes:
         poles = 2 * np.pi * frequency_hz * (-ratio + 1j * np.sqrt(1 - ratio**2))
         return cls(poles, shapes.astype(complex), np.eye(len(poles), dtype=complex))
 
-    def turned(self, r: int) -> bool:
-        """True for a mode whose shape damping turns so far that derivatives have to follow it."""
-        return bool(np.sum(np.abs(self.shares[:, r]) > _TURNS) > 1)
+    @cached_property
+    def turned(self) -> NDArray[np.bool_]:
+        """True for modes whose shapes damping turns so far that derivatives have to follow them, (n,)."""
+        return np.asarray(np.count_nonzero(np.abs(self.shares) > _TURNS, axis=0) > 1)
 
     def lag(self, coupling: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Shares of the undamped modes that a small skew `coupling`, (n, n), adds to every shape, (n, n)."""
@@ -299,9 +301,12 @@ def _exact(
     """The same from the eigenvalues of the first-order system; None where they cannot be told apart by shape."""
     n = len(values)
     scale = float(np.sqrt(np.max(values)))
-    first = np.zeros((2 * n, 2 * n), complex)
+    stiff = np.diag(values)
+    if np.any(structural):  # a real matrix takes half the time
+        stiff = stiff + 1j * structural
+    first = np.zeros((2 * n, 2 * n), stiff.dtype)
     first[:n, n:] = np.eye(n)
-    first[n:, :n] = -(np.diag(values) + 1j * structural) / scale**2
+    first[n:, :n] = -stiff / scale**2
     first[n:, n:] = -damping / scale
     try:
         found, vectors = scipy.linalg.eig(first, check_finite=False)

@@ -180,10 +180,10 @@ class ModeDerivatives:
         omega, phi = np.sqrt(solution.eigenvalues), solution.shapes
         bare, weight, reduced = _undamped(matrices, solution, modes, group)
         log_frequency, ratio = damped.derivatives(matrices, modes, bare, weight, omega)
-        turned = [k for k, r in enumerate(modes.tolist()) if damped.turned(r)]
+        turned = np.flatnonzero(damped.turned[modes])
         skew = np.flatnonzero(np.any(matrices.skew_by_shape, axis=(1, 2)))
         shapes: NDArray[Any] = phi @ weight
-        if turned or len(skew):
+        if len(turned) or len(skew):
             shapes = shapes.astype(complex)
         at = matrices.terms.log.shape[1]
         for j in skew:
@@ -193,7 +193,7 @@ class ModeDerivatives:
         log_frequency, ratio, shapes, reduced = _with_ratios(
             matrices, modes, log_frequency, ratio, shapes, reduced
         )
-        if turned:
+        if len(turned):
             bare, weight, _ = _undamped(matrices, solution, np.arange(len(omega)), np.full(len(omega), -1))
             count = len(weight)
             order = [*range(at), *range(count, count + len(matrices.damping_log)), *range(at, count)]

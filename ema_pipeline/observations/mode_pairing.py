@@ -53,7 +53,7 @@ def paired(
         cost = np.minimum(apart * (1 + apart) / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
     m = len(data)
     leave = np.where(data.double, _LEAVE_DOUBLE, _LEAVE)
-    padded = np.hstack([cost, np.tile(leave[:, None], m)])
+    padded = np.concatenate([cost, np.repeat(leave[:, None], m, axis=1)], axis=1)
     column = scipy.optimize.linear_sum_assignment(padded)[1]
     return np.where(column < cost.shape[1], column, -1)
 

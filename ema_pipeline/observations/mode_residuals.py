@@ -262,7 +262,7 @@ class Comparison:
         mixed = self._mixed(on)
         for k, other, unknown in mixed:
             y[k] -= self.x[unknown] * d.known_shapes[other]
-        blur = np.tile(np.where(hidden >= 0, _FITTED_AS_ONE_STD, 0.0)[:, None], y.shape[1])
+        blur = np.repeat(np.where(hidden >= 0, _FITTED_AS_ONE_STD, 0.0)[:, None], y.shape[1], axis=1)
         variance = own**2 + (self.scatters[SHAPE] * unit) ** 2 + blur**2
         return _Known(on, y, own, unit, blur, d.seen[on] / variance, mixed)
 
@@ -275,7 +275,7 @@ class Comparison:
         """
         number, damped = self.data.group[known.on], solution.damped
         if damped is not None:
-            number = np.where([damped.turned(int(r)) for r in to], -1, number)
+            number = np.where(damped.turned[to], -1, number)
         numbers, counts = np.unique(number[number >= 0], return_counts=True)
         found = []
         for count in np.unique(counts[counts > 1]):
@@ -411,8 +411,8 @@ class Comparison:
             both = factor[:, None, None] * dp + p[:, :, None] * change[:, None, :]
             slope = np.concatenate([np.real(both)[seen], np.imag(both)[seen]])
         left = (y - factor[:, None] * p)[seen]
-        mode, sensor = np.nonzero(seen)
+        mode, sensor = (np.concatenate([at, at]) for at in np.nonzero(seen))
         return Rows(
-            np.concatenate([left.real, left.imag]), np.tile(own[seen], 2), np.tile(unit[seen], 2), SHAPE,
-            1 + 0.1 * (self.heat - 1), np.tile(on[mode], 2), np.tile(sensor, 2), np.tile(d.close[on[mode]], 2), slope,
+            np.concatenate([left.real, left.imag]), own[mode, sensor], unit[mode, sensor], SHAPE,
+            1 + 0.1 * (self.heat - 1), on[mode], sensor, d.close[on[mode]], slope,
         )  # fmt: skip

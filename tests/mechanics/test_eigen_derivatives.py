@@ -46,7 +46,7 @@ def compare(
     modes = np.flatnonzero((before.frequency_hz > band[0]) & (before.frequency_hz < band[1]))
     _, slope = derivatives(model, configuration, x, modes)
     for k, r in enumerate(modes.tolist()):
-        turned = before.damped is not None and before.damped.turned(r)
+        turned = before.damped is not None and before.damped.turned[r]
         # Of hardly turned shapes, derivatives are those of the undamped ones; weakly coupled poles are not exact.
         near = 0.0 if before.damped is None else 2e-3 if turned else 1e-2
         for i, name in enumerate(model.unknowns.names):
