@@ -14,9 +14,8 @@ from ema_pipeline.inference.problem import in_blocks
 from ema_pipeline.inference.scatter import determined
 
 _STEPS = 12
-_LONGEST, _SETTLED = 1.5, 1e-3
-"""Most steps of the search for the scatters that take a change up, and the longest step in the logarithm of a variance,
-and the one at which it ends."""
+_LONGEST = 1.5
+"""Steps, and longest step in the logarithm of a variance, of the search for the scatters that take a change up."""
 
 
 @dataclass(frozen=True)
@@ -117,9 +116,7 @@ class ExpectedGain:
             curvature = 0.5 * (part.T @ (np.maximum(excess, 1.0)[:, None] * part))
             curvature[np.diag_indices_from(curvature)] += 0.5 * of_unknowns * inverse + 0.25 * self._weight
             step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST, _LONGEST)
-            before, log = log, np.minimum(log + step, self._widest)
-            if np.max(np.abs(log - before), initial=0.0) < _SETTLED:
-                break
+            log = np.minimum(log + step, self._widest)
         return best
 
     def _density(self, square: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
