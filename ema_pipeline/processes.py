@@ -10,12 +10,19 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+from ema_pipeline.threads import cores, share_cores, single_blas_thread
 
 if TYPE_CHECKING:
     from multiprocessing.context import ForkProcess
+
+A = TypeVar("A")
+R = TypeVar("R")
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # malloc.h
@@ -108,6 +115,59 @@ def _in_child() -> None:
 def can_fork() -> bool:
     """True where this process may share its work with copies of itself."""
     return sys.platform == "linux" and not multiprocessing.current_process().daemon
+
+
+_CHUNKS = 12
+"""Pieces in which each process gets its share: of many that take milliseconds each, handing over takes as long."""
+
+_job: Callable[..., object] | None = None
+_items: Sequence[object] = ()
+
+
+def spread(job: Callable[[A], R], items: Sequence[A], processes: int | None, least: int = 4) -> Iterator[R]:
+    """``map(job, items)`` over forked processes; in this one where the system cannot fork or it is not worth it.
+
+    Results come in the order of the items, so that they do not depend on the number of processes. The job and its items
+    go over by forking, so they may hold what cannot be pickled (effects of a user's own file); results are pickled.
+    Each process has its share of the processors for what it does within.
+
+    Parameters
+    ----------
+    job : callable
+    items : sequence
+    processes : int or None
+        None stands for a process per processor.
+    least : int
+        Items from which processes are worth it: fewer where each takes seconds.
+
+    Raises
+    ------
+    MemoryError
+        If a process was killed, for want of memory most likely.
+    """
+    processes = min(processes or cores(), len(items))
+    if processes < 2 or len(items) < least or not can_fork():
+        with single_blas_thread():
+            for item in items:
+                yield job(item)
+        return
+    global _job, _items
+    _job, _items = job, items
+    context = multiprocessing.get_context("fork")
+    chunk = max(1, len(items) // (_CHUNKS * processes))
+    try:
+        with ProcessPoolExecutor(processes, context, share_cores, (processes,)) as pool:
+            yield from cast("Iterator[R]", pool.map(_run, range(len(items)), chunksize=chunk))
+    except BrokenProcessPool:
+        raise MemoryError("a worker process ended unexpectedly") from None
+    finally:
+        _job, _items = None, ()
+
+
+def _run(index: int) -> object:
+    assert _job is not None
+    with single_blas_thread():
+        return _job(_items[index])
 
 
 Send = Callable[[Any], None]

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from ema_pipeline import keys, pipeline
-from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.errors import EmaError
-from ema_pipeline.processes import Send, side_by_side
+from ema_pipeline.processes import Send, side_by_side, spread
 from ema_pipeline.run.opening import describe_run, new_run, save_info
 from ema_pipeline.run.settings import PipelineSettings
 from ema_pipeline.run.types import Progress, Run
@@ -85,6 +84,18 @@ def test_items_are_shared_from_as_many_as_are_worth_it(processes: int, least: in
     found = list(spread(lambda item: (item, os.getpid()), "abc", processes, least))
     assert [item for item, _ in found] == list("abc")
     assert all((process != os.getpid()) == shared for _, process in found)
+
+
+def test_a_process_that_is_killed_among_those_that_share_items_is_an_error_and_no_hang() -> None:
+    with pytest.raises(MemoryError, match="ended unexpectedly"):
+        list(spread(lambda item: os.kill(os.getpid(), signal.SIGKILL), range(4), 2))
+    assert list(spread(lambda item: item + 1, range(4), 2)) == [1, 2, 3, 4]  # nothing is left of it
+
+
+def test_processes_that_share_items_share_the_processors() -> None:
+    here = cores()
+    assert set(spread(lambda item: cores(), range(4), 2)) == {max(1, here // 2)}
+    assert cores() == here
 
 
 def test_an_interruption_ends_the_workers() -> None:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 from ema_pipeline.diagnose.claims import Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.ranked import Ranked, Ranking
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, learned, refined, transferred
+from ema_pipeline.processes import spread
 
 _WORTH = 2
 """Changes that are worth a process each: their scatters are learned, which takes as long as dozens of steps."""

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from ema_pipeline.diagnose.claims import evidence_beyond, sigmas_asked
 from ema_pipeline.diagnose.expected_gain import Change, ExpectedGain
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
-from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.probability import needed
 from ema_pipeline.diagnose.score import UNSEEN, Marginal
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -25,6 +24,7 @@ from ema_pipeline.inference import Posterior, Residuals, lower_factor
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import Fit, Model, transferred
 from ema_pipeline.observations.rig_model import LOG_STD, SizeMap
+from ema_pipeline.processes import spread
 
 _NINE_OF_TEN = 1.2816
 """Quantile of the normal distribution: in nine tests of ten the estimate is no further than this below the truth."""

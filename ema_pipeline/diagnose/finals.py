@@ -11,13 +11,13 @@ from functools import partial
 import numpy as np
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.ranked import Ranked, Ranking, unbeaten
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, learned, refined, transferred, unbent
 from ema_pipeline.observations.mode_rows import SHAPE
+from ema_pipeline.processes import spread
 
 FINALISTS = 5
 """Hypotheses for which the scatters are learned."""

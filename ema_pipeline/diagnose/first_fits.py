@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.score import Score
 from ema_pipeline.inference import Posterior, Unknowns
 from ema_pipeline.observations.base import EffectProblem, Observations
@@ -25,6 +24,7 @@ from ema_pipeline.observations.fitting import (
     transferred,
     wide,
 )
+from ema_pipeline.processes import spread
 
 Schedule = tuple[tuple[float, int], ...]
 

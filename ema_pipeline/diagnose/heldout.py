@@ -9,7 +9,6 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.inference import (
     Bounded,
     Posterior,
@@ -22,6 +21,7 @@ from ema_pipeline.inference import (
 )
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, part_reach, transferred
+from ema_pipeline.processes import spread
 
 _STEPS = 20
 _FOLLOWED = 6

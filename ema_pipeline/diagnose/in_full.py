@@ -11,11 +11,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.selection import Selection
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, refined
+from ema_pipeline.processes import spread
 
 _BEHIND = 10.0
 """Log evidence by which the calculation in full may be behind: scatters were learned without it, and from one force to

@@ -31,13 +31,13 @@ from ema_pipeline.diagnose.first_fits import (
     tried_sizes,
 )
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.ranked import BEATEN, Ranking, unbeaten
 from ema_pipeline.diagnose.score import UNSEEN, Score, scores
 from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, freed, learned, refined, unbent
+from ema_pipeline.processes import spread
 
 Progress = Callable[[float, str], None]
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, size_starts
-from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.probability import CLOSEST, shared
 from ema_pipeline.diagnose.rungs import (
     learned_scatters,
@@ -33,6 +32,7 @@ from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.fitting import Fit, Model, learned, refined
 from ema_pipeline.observations.records import RecordObservations
+from ema_pipeline.processes import spread
 
 SEARCHED = 2048
 """Samples of all responses together, in windows, on which hypotheses are compared: enough to give gains of hundreds

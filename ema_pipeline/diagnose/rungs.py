@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from ema_pipeline.diagnose.heldout import held_out
-from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.diagnose.types import EffectSize, Ladder, LearnedScatter, Rung
 from ema_pipeline.effects.base import effect_of
 from ema_pipeline.inference import Posterior
@@ -26,6 +25,7 @@ from ema_pipeline.observations.fitting import (
     transferred,
     within_scatter,
 )
+from ema_pipeline.processes import spread
 
 _CALCULATED_STD, _RUBBED_STD = 0.3, 0.6
 """1 σ, over a size that the motion in single hits tells, of what their calculation has wrong of it, and over a force,

@@ -10,11 +10,11 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.parallel import spread
 from ema_pipeline.effects.base import effect_of
 from ema_pipeline.inference import lower_factor
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, transferred
+from ema_pipeline.processes import spread
 
 UNSEEN = 1e6
 """1 σ of a size, in units of its prior, above which the data carry no information on it."""

@@ -15,8 +15,8 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.levels.settings import LevelSettings
 from ema_pipeline.levels.types import DecayCurve, ForceLevel, HitModes, LevelStudy, ModeLevels
 from ema_pipeline.modal.settings import ModalSettings
-from ema_pipeline.processes import Send, can_fork, side_by_side
-from ema_pipeline.threads import cores, share_cores
+from ema_pipeline.processes import spread
+from ema_pipeline.threads import cores
 
 if TYPE_CHECKING:
     from ema_pipeline.ingest.records import Hit, HitSamples
@@ -119,8 +119,12 @@ def study_levels(
         level_force = float(np.median(force[place == k]))
         return _level(hits, chosen, level_force, unit, frf_settings, modal_settings, choices)
 
-    at_once = 1 if frfs.frf.size > MOST_SIDE_BY_SIDE else processes or cores() + 1
-    levels = _side_by_side(of_place, n_levels, min(at_once, n_levels), progress)
+    progress(0.0, f"modes of {n_levels} force levels")
+    found: list[ForceLevel] = []
+    for level in spread(of_place, range(n_levels), _at_once(frfs, processes), least=2):
+        found.append(level)
+        progress(0.7 * len(found) / n_levels, f"modes at {level.force_n:.3g} {level.unit}")
+    levels = tuple(found)
     progress(0.7, "modes of single hits")
     level_of = dict(zip(names, place.tolist(), strict=True))
 
@@ -153,28 +157,11 @@ def study_levels(
     return replace(study, summary=several_levels(study, modal, settings))
 
 
-def _side_by_side(
-    level_of: Callable[[int], ForceLevel], count: int, processes: int, progress: Progress
-) -> tuple[ForceLevel, ...]:
-    """All levels, softest first, some at a time."""
-    found: dict[int, ForceLevel] = {}
-
-    def heard(one: tuple[int, ForceLevel]) -> None:
-        found[one[0]] = one[1]
-        progress(0.7 * len(found) / count, f"modes at {one[1].force_n:.3g} {one[1].unit}")
-
-    progress(0.0, f"modes of {count} force levels")
-    if processes > 1 and cores() > 1 and can_fork():
-
-        def job(k: int, send: Send) -> None:
-            share_cores(processes)
-            send((k, level_of(k)))
-
-        side_by_side(job, range(count), processes, heard)
-    else:
-        for k in range(count):
-            heard((k, level_of(k)))
-    return tuple(found[k] for k in range(count))
+def _at_once(frfs: FrfSet, processes: int | None) -> int:
+    """Levels that are identified at a time: one more than there are processors, so that each is busy to the end."""
+    if frfs.frf.size > MOST_SIDE_BY_SIDE or cores() < 2:
+        return 1
+    return processes or cores() + 1
 
 
 def with_circles(study: LevelStudy, settings: CircleSettings) -> LevelStudy:

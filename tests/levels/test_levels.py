@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -83,12 +84,16 @@ def test_levels_of_many_frfs_are_identified_one_after_the_other(monkeypatch: pyt
     monkeypatch.setattr("ema_pipeline.levels.study.cores", lambda: 2)
     monkeypatch.setattr("ema_pipeline.levels.study.MOST_SIDE_BY_SIDE", 0)
 
-    def side_by_side(*given: object) -> None:
-        raise AssertionError("in processes of their own")
+    asked: list[int] = []
 
-    monkeypatch.setattr("ema_pipeline.levels.study.side_by_side", side_by_side)
+    def spread(job: Callable[[int], object], items: range, processes: int, least: int) -> Iterator[object]:
+        asked.append(processes)
+        return map(job, items)
+
+    monkeypatch.setattr("ema_pipeline.levels.study.spread", spread)
     study, _ = studied(hits_of(replace(LINEAR, mode=1, frequency_shift=5e-4), np.random.default_rng(1)))
     assert len(study.levels) == 3
+    assert asked == [1]
 
 
 def test_every_level_keeps_its_own_modal_model(moving: tuple[LevelStudy, ModalModel]) -> None:
