@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.settings import AssumedSettings
 from ema_pipeline.dof import Dof
 from ema_pipeline.modal.assurance import mac
+
+if TYPE_CHECKING:
+    from ema_pipeline.observations.without_partner import Alone
 
 _MIXED_STD = 0.1
 """1 σ, in the largest entry, of shapes that identification may have mixed."""
@@ -125,6 +129,11 @@ class ModeData:
         """Shapes with the imaginary parts of `whirling` modes, 0 where not measured, (m, s)."""
         imaginary = 0.0 if self.imaginary is None else np.where(self.whirling[:, None], self.imaginary, 0.0)
         return np.asarray(self.known_shapes + 1j * imaginary, complex)
+
+    @cached_property
+    def costs_alone(self) -> dict[tuple[object, ...], Alone]:
+        """Costs of modes without a partner that were calculated last, see `Alone.of`."""
+        return {}
 
     @cached_property
     def squares(self) -> NDArray[np.float64]:

@@ -21,6 +21,9 @@ UNEXPLAINED_DOUBLE = 12.0
 UNEXPLAINED_PRODUCT = 5.0
 """The same of one at a multiple or sum of others' frequencies, in tests at several force levels: of some 340 modes in
 24 of them, two that passed were third and second harmonics."""
+_SCATTERS = (FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, DAMPING_SCATTER)
+_KEPT = 64
+"""Costs that are kept."""
 UNSEEN = 3.0
 """Cost of a model mode in the band that was not measured: it may lie on a node of every sensor or hit point."""
 
@@ -55,9 +58,28 @@ class Alone:
         scatters: Mapping[str, float],
         defaults: Mapping[str, float],
     ) -> Alone:
-        """From their numbers among the measured modes, (k,), and the scatters as they are tried and stated."""
+        """From their numbers among the measured modes, (k,), and the scatters as they are tried and stated.
+
+        They stay the same from step to step of a fit: what was calculated last is kept with the data.
+        """
         if not len(alone):
             return cls()
+        key = alone.tobytes(), *(at.get(name) for at in (scatters, defaults) for name in _SCATTERS)
+        known = data.costs_alone
+        if key not in known:
+            if len(known) >= _KEPT:
+                known.clear()
+            known[key] = cls._of(data, alone, scatters, defaults)
+        return known[key]
+
+    @classmethod
+    def _of(
+        cls,
+        data: ModeData,
+        alone: NDArray[np.int64],
+        scatters: Mapping[str, float],
+        defaults: Mapping[str, float],
+    ) -> Alone:
         sure = alone[~data.doubtful[alone]]
         doubles = int(np.sum(data.double[alone]))
         split = UNEXPLAINED_DOUBLE * doubles + UNEXPLAINED_PRODUCT * (len(alone) - len(sure) - doubles)

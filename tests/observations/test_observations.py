@@ -42,6 +42,7 @@ from ema_pipeline.observations.without_partner import (
     UNEXPLAINED_DOUBLE,
     UNEXPLAINED_PRODUCT,
     UNSEEN,
+    Alone,
 )
 from ema_pipeline.rigs import load_rig
 from ema_pipeline.rigs.base import ParametricRig
@@ -673,6 +674,18 @@ def test_a_mode_without_a_partner_is_not_credited_with_how_well_the_shapes_of_ot
     assert now.penalty - usual.penalty > 5 * np.log(9)
     wide = scatters | {SHAPE: 3.0 * scatters[SHAPE]}
     assert problem.residuals(x, wide, matching=(without,)).penalty == usual.penalty
+
+
+def test_costs_that_are_kept_are_those_of_the_modes_and_scatters_asked_for() -> None:
+    (data,) = chain_observations(7).data
+    defaults = {n: s.default for n, s in chain_observations(7).scatters.items()}
+    some = [np.array([4]), np.array([1, 4])]
+    asked = [(some[k % 2], defaults | {SHAPE: 1e-3 * (1 + k // 2)}) for k in range(100)]
+    for alone, scatters in [*asked, asked[0], asked[-1]]:
+        fresh = Alone.of(replace(data), alone, scatters, defaults)
+        assert Alone.of(data, alone, scatters, defaults) == fresh
+    assert Alone.of(data, *asked[-1], defaults) is Alone.of(data, *asked[-1], defaults)
+    assert len({one.usual for one in data.costs_alone.values()}) == len(data.costs_alone) < 100
 
 
 def test_rows_of_the_residuals_stand_by_their_mode_and_sensor() -> None:
