@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +22,15 @@ from ema_pipeline.diagnose.rungs import learned_scatters, noise, rungs_of
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.diagnose.selection import Progress, Selection, select
 from ema_pipeline.diagnose.settings import DiagnoseSettings
-from ema_pipeline.diagnose.types import DOUBTFUL, NOTHING, Candidate, Diagnosis, EffectSize, Ladder
+from ema_pipeline.diagnose.types import (
+    DOUBTFUL,
+    NOTHING,
+    Candidate,
+    Diagnosis,
+    EffectSize,
+    Ladder,
+    VerdictWord,
+)
 from ema_pipeline.diagnose.verdict import alike, verdict_of
 from ema_pipeline.diagnose.visible import nothing_visible
 from ema_pipeline.effects.base import Effect
@@ -87,54 +95,35 @@ def diagnose(
     first, faint = _selected(observations, known, hypotheses, settings, progress)
     # what else there may be is told to first order, as it was looked for
     found = in_full(first, settings.processes)
-    observations = found.observations
-    reached = explanation(observations, found.final, settings)
+    reached = explanation(found.observations, found.final, settings)
     explained = reached.explained
     verdict = verdict_of(found, settings, explained)
-    start = found.rounds[0].ranking.base
-    fits = [start, *(j.ranked.fit for j in found.claimed)]
-    if found.claimed:
-        fits[-1] = found.final
-    said = [(j.hypothesis, j.named.name) for j in found.claimed]
-    named = [in_said_names(observations, f, said) for f in fits]
-    rungs = rungs_of(observations, named, settings.processes)
-    in_model = set(found.final.model.labels)
-    further = [h for h in hypotheses if h.label not in in_model]
+    ladder = _ladder(found, settings)
+    errors = (ladder.rungs[0].error, ladder.rungs[-1].error)
     group = alike(found, settings)
-    candidates = _candidates(found, settings, group, hypotheses, rungs[-1].parameters)
-    told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.claimed]
-    beside: list[tuple[str, str]] = []
-    if verdict == "ambiguous":
-        names = [j.named.label for j in group]
-        beside = [one for one in told if one[0] not in names]
-        told = [(c.label, sentences.size_text(c.parameters)) for c in candidates if c.label in names]
-    final = found.final.posterior
     share = complete(*reached.telling) if explained else CLOSEST
-    candidates = tuple(replace(c, probability=share * c.probability) for c in candidates)
+    candidates = tuple(
+        replace(c, probability=share * c.probability)
+        for c in _candidates(found, settings, group, hypotheses, ladder.rungs[-1].parameters)
+    )
+    start = found.rounds[0].ranking.base
     begun = reached if start is found.final else explanation(first.observations, start, settings)
     probabilities = shared(found.rounds[0].probabilities, share, share if begun.explained else 0.0)
-    nothing = probabilities[NOTHING]
-    limit = final.error_limit(settings.error_limit)
-    best = next(
-        (
-            (c.label, c.why)
-            for c in candidates[:1]
-            if (explained and not c.claimed and nothing < DOUBTFUL) or c.would_explain(limit)
-        ),
-        ("", ""),
-    )
+    nothing, limit = probabilities[NOTHING], found.final.posterior.error_limit(settings.error_limit)
     limits = detection_limits(first.observations, first.final, hypotheses, settings) if explained else ()
     visible = math.nan
     if verdict == "adequate":
         visible = share * nothing_visible(first.rounds[0].ranking, found.rounds[0].probabilities, limits)
-    scatter = learned_scatters(observations, found.final)
-    ladder = Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatter)
+    told, beside = _told(candidates, group, verdict)
+    best = _worth_a_word(candidates, explained, nothing, limit)
     bent = sentences.standing_out(reached.parts)
-    errors = (rungs[0].error, rungs[-1].error)
-    reasons = sentences.reasons(reached, errors[1])
+    in_model = set(found.final.model.labels)
+    further = [h for h in hypotheses if h.label not in in_model]
     return Diagnosis(
         verdict=verdict,
-        summary=sentences.summary(verdict, told, errors, visible, best, reasons, beside),
+        summary=sentences.summary(
+            verdict, told, errors, visible, best, sentences.reasons(reached, errors[1]), beside
+        ),
         null_probability=nothing,
         candidates=candidates,
         indistinguishable=_groups(found, group, settings),
@@ -143,14 +132,55 @@ def diagnose(
         if explained
         else localise(scores(first.observations, first.final, further, processes=settings.processes)),
         probabilities=probabilities,
-        error=rungs[0].error,
-        heldout_error=rungs[0].heldout_error,
+        error=errors[0],
+        heldout_error=ladder.rungs[0].heldout_error,
         ladder=ladder,
         notes=(*((bent,) if bent and verdict != "unknown_effect" else ()), *faint, *notes),
         detection_limits=limits,
         nothing_visible=visible,
         error_limit=limit,
     )
+
+
+def _ladder(found: Selection, settings: DiagnoseSettings) -> Ladder:
+    """The model without and with what is claimed, one effect after the other."""
+    fits = [found.rounds[0].ranking.base, *(j.ranked.fit for j in found.claimed)]
+    if found.claimed:
+        fits[-1] = found.final
+    said = [(j.hypothesis, j.named.name) for j in found.claimed]
+    named = [in_said_names(found.observations, f, said) for f in fits]
+    rungs = rungs_of(found.observations, named, settings.processes)
+    scatters = learned_scatters(found.observations, found.final)
+    return Ladder(rungs, *noise(found.final), note=_ended(found, settings), scatters=scatters)
+
+
+Said = list[tuple[str, str]]
+"""Labels of effects and their sizes in words."""
+
+
+def _told(
+    candidates: Sequence[Candidate], group: Sequence[Judged], verdict: VerdictWord
+) -> tuple[Said, Said]:
+    """What is claimed, or what explains the data equally well and what is claimed beside it."""
+
+    def said(some: Iterable[Candidate]) -> Said:
+        return [(c.label, sentences.size_text(c.parameters)) for c in some]
+
+    if verdict != "ambiguous":
+        return said(c for c in candidates if c.claimed), []
+    names = {j.named.label for j in group}
+    beside = (c for c in candidates if c.claimed and c.label not in names)
+    return said(c for c in candidates if c.label in names), said(beside)
+
+
+def _worth_a_word(
+    candidates: Sequence[Candidate], explained: bool, nothing: float, limit: float
+) -> tuple[str, str]:
+    """The best candidate and why it is not claimed, where it may well be right or would explain the data alone."""
+    for c in candidates[:1]:
+        if (explained and not c.claimed and nothing < DOUBTFUL) or c.would_explain(limit):
+            return c.label, c.why
+    return "", ""
 
 
 def _selected(
