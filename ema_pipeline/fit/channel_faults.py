@@ -26,6 +26,7 @@ from ema_pipeline.frf.channel_faults import (
 )
 from ema_pipeline.frf.channels import SEVERAL
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.ingest.defaults import TRANSVERSE
 from ema_pipeline.mechanics.system import LinearSystem
 
 Real = NDArray[np.float64]
@@ -46,6 +47,9 @@ ROUNDS = 10
 SMALLEST_LEVEL = 0.02
 """An FRF below this share of the largest at its output and at its input (geometric mean) is nearly a symmetry zero of
 the model: what parts that scatter, oblique blows and transverse sensitivity put there is as large."""
+
+LARGEST_TRANSVERSE = 3.0
+"""Transverse sensitivity that a sensor may have, over the 1 σ that is stated of it."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +117,7 @@ def _against_model(frfs: FrfSet, systems: Sequence[LinearSystem]) -> tuple[Real,
         level = np.median(size, axis=2)
         largest = np.sqrt(level.max(axis=0, keepdims=True) * level.max(axis=1, keepdims=True))
         known = np.isfinite(measured).all(axis=2) & (level > SMALLEST_LEVEL * largest)
+        known &= level > _across(picked, level)
         tiny = np.finfo(float).tiny
         ratio = np.median(np.log(np.maximum(np.abs(measured), tiny)) - np.log(np.maximum(size, tiny)), axis=2)
         product = measured * model.conj()
@@ -123,6 +128,18 @@ def _against_model(frfs: FrfSet, systems: Sequence[LinearSystem]) -> tuple[Real,
             best = agreement, ratio, cosine
     assert best is not None
     return best[1], best[2]
+
+
+def _across(frfs: FrfSet, level: Real) -> Real:
+    """What outputs may read of other directions at their body, (n_outputs, n_inputs).
+
+    A stiff shaft hardly turns: a sensor of its rotation reads its bending by transverse sensitivity.
+    """
+    bodies = np.array([d.body for d in frfs.outputs])
+    stated = [c.transverse for c in frfs.channels] or [TRANSVERSE] * len(bodies)
+    beside = (bodies[:, None] == bodies) & ~np.eye(len(bodies), dtype=bool)
+    strongest = np.max(np.where(beside[..., None], level, 0.0), axis=1)
+    return np.asarray(LARGEST_TRANSVERSE * np.array(stated)[:, None] * strongest)
 
 
 def _picked(frfs: FrfSet) -> FrfSet:

@@ -5,17 +5,23 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from bench import ema, write_bench
+from simulate_modal import frf_set
 
+from ema_pipeline.dof import Dof
 from ema_pipeline.fit.channel_faults import suspected_sensitivities
+from ema_pipeline.fit.comparison import windowed_accelerance
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import HitSamples, cut_hit
+from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.rigs import load_rig
 
 QUICK = 'stages=["ingest", "hits", "frf", "modal", "ladder", "fit", "correlate"]'
@@ -129,6 +135,31 @@ def test_a_damper_that_holds_a_mass_makes_a_poor_model_and_no_fault(
     code, out, err = ema(capsys, "run", bench, "--rig", rig, "--out", tmp_path / "out", "--set", QUICK)
     assert code == 0, err
     assert "no model mode within" in out
+
+
+def test_a_sensor_that_hardly_moves_its_own_way_may_read_another_one() -> None:
+    """A mass that a stiff spring holds in y moves by 3 % of its x: a sensor with 6 % of transverse sensitivity reads
+    three times as much."""
+    stiffness = np.array([[3e5, -2e5, -1e5], [-2e5, 7e6, 0.0], [-1e5, 0.0, 2e5]])
+    system = LinearSystem(
+        dofs=("m1.x", "m1.y", "m2.x"), mass=np.eye(3), stiffness=stiffness, damping=2e-5 * stiffness,
+        structural=np.zeros((3, 3)), modal_damping_ratio=0.0, sensors={},
+    )  # fmt: skip
+    lines = np.arange(1.0, 200.0, 0.25)
+    blank = frf_set(lines, np.zeros((3, 2, len(lines)), complex), range(3), range(2))
+    outputs = tuple(map(Dof.parse, system.dofs))
+    blank = replace(blank, outputs=outputs, inputs=(outputs[0], outputs[2]), band_hz=(2.0, 190.0))
+    exact = windowed_accelerance(system, blank)
+
+    def suspected(output: int, change: np.ndarray) -> list[str]:
+        read = exact.copy()
+        read[output] = change
+        told = suspected_sensitivities({"all": replace(blank, frf=read)}, {"all": [system]})
+        return [f"{c.channel} {c.value:.1f}" for c in told]
+
+    assert suspected(1, exact[1] + 0.06 * exact[0]) == []
+    assert suspected(0, 5.0 * exact[0]) == ["m1.x 5.0"]
+    assert suspected(2, 5.0 * exact[2]) == ["m2.x 5.0"]  # no other sensor at this body
 
 
 def hits_in(raw: Path) -> list[HitSamples]:
