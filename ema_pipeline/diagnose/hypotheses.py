@@ -149,12 +149,7 @@ def _names(
             continue
         for place in dict.fromkeys(p for a in assemblies.values() for p in effect.find_places(a)):
             assembly = next(a for a in assemblies.values() if effect.fits(a, place))
-            (generic if effect.generic else own).append(
-                Name(
-                    PlacedEffect(effect.possible(assembly, place), place),
-                    dict(effect.scales(assembly, place)),
-                )
-            )
+            (generic if effect.generic else own).append(Name(*PlacedEffect(effect, place).hosted(assembly)))
     for parameter in rig.parameters.values():
         known = parameter.tolerance > 0 and not parameter.free and parameter.value != 0
         if known and proportional_elements(rig, parameter.name):

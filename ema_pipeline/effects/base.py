@@ -187,6 +187,11 @@ class PlacedEffect:
         """``id@place``."""
         return f"{self.effect.id}@{self.place}"
 
+    def hosted(self, assembly: Assembly) -> tuple[PlacedEffect, dict[str, float]]:
+        """With the range of sizes that a rig leaves possible at its place, and their prior 1 σ by name."""
+        possible = PlacedEffect(self.effect.possible(assembly, self.place), self.place)
+        return possible, dict(self.effect.scales(assembly, self.place))
+
     def nonlinear_of(self, assembly: Assembly) -> tuple[Nonlinear, ...]:
         """Nonlinear elements that an assembly gets with it, at the sizes from which fits begin; none where it has no
         such place.

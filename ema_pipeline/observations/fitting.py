@@ -109,9 +109,8 @@ def model_with(
         if host is None:
             model = model.plus(placed, {})
             continue
-        scales = placed.effect.scales(host, placed.place)
-        narrowed = PlacedEffect(placed.effect.possible(host, placed.place), placed.place)
-        model = model.plus(narrowed, {placed.parameter_name(k): v for k, v in scales.items()})
+        possible, scales = placed.hosted(host)
+        model = model.plus(possible, {placed.parameter_name(k): v for k, v in scales.items()})
     return model
 
 
