@@ -25,7 +25,8 @@ def reconsidered(
     rivals: dict[str, tuple[Judged, ...]],
     settings: DiagnoseSettings,
 ) -> list[Judged]:
-    """Claims without those that are needless by now, and with those replaced that a rival explains better.
+    """Claims without those that are needless by now or cannot be told from a later one, and with those replaced that a
+    rival explains better.
 
     Parameters
     ----------
@@ -43,15 +44,30 @@ def reconsidered(
     list of Judged
         The same where nothing changes; else judged anew, one on top of the other.
     """
-    now = [j.hypothesis for j in claimed]
-    fit = learned(observations, claimed[-1].ranked.fit)
-    changed = False
+    now = _told_apart(observations, [j.hypothesis for j in claimed])
+    changed = len(now) < len(claimed)
+    last = claimed[-1].ranked.fit
+    fit = _fitted(observations, start.model, now, last) if changed else learned(observations, last)
     while len(now) > 1:
         better = _best_change(observations, start.model, now, fit, rivals, settings)
         if better is None:
             break
         now, fit, changed = *better, True
     return _judged_anew(observations, start, now, fit, settings) if changed else list(claimed)
+
+
+def cannot_be_told(observations: Observations, linear: Hypothesis, other: Hypothesis) -> bool:
+    """True where a linear effect does what equivalent linearisation leaves of a nonlinear one at the same place.
+
+    Teeth that part are softer on the average than what is calculated of them, just as worn ones are.
+    """
+    a, b = linear.placed, other.placed
+    return observations.linearised and a.effect.linear and not b.effect.linear and a.place == b.place
+
+
+def _told_apart(observations: Observations, effects: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Without linear effects beside a nonlinear one from which they cannot be told."""
+    return [h for h in effects if not any(cannot_be_told(observations, h, other) for other in effects)]
 
 
 @dataclass(frozen=True)

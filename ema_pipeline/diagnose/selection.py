@@ -9,7 +9,7 @@ from operator import is_
 
 import numpy as np
 
-from ema_pipeline.diagnose.backward import reconsidered
+from ema_pipeline.diagnose.backward import cannot_be_told, reconsidered
 from ema_pipeline.diagnose.claims import BY_OTHERS, Judged, judge
 from ema_pipeline.diagnose.first_fits import CONTINUED
 from ema_pipeline.diagnose.hypotheses import Hypothesis
@@ -139,16 +139,11 @@ def _fitted(observations: Observations, plain: Observations, known: Model) -> Fi
 
 
 def _taken(observations: Observations, hypothesis: Hypothesis, claimed: Sequence[Judged]) -> bool:
-    """True for what is claimed already, and for what could not be told from what linearisation leaves of it.
-
-    Teeth that part are softer on the average than what is calculated of them, just as worn ones are.
-    """
-    others = [j.hypothesis.placed for j in claimed]
-    if hypothesis.label in {other.label for other in others}:
-        return True
-    if not observations.linearised or not hypothesis.placed.effect.linear:
-        return False
-    return any(not other.effect.linear and other.place == hypothesis.placed.place for other in others)
+    """True for what is claimed already, and for what could not be told from what linearisation leaves of it."""
+    others = [j.hypothesis for j in claimed]
+    return any(
+        other.label == hypothesis.label or cannot_be_told(observations, hypothesis, other) for other in others
+    )
 
 
 def _beside(settings: DiagnoseSettings, claimed: Sequence[Judged]) -> DiagnoseSettings:
