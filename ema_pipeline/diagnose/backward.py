@@ -66,8 +66,17 @@ def cannot_be_told(observations: Observations, linear: Hypothesis, other: Hypoth
 
 
 def _told_apart(observations: Observations, effects: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Without linear effects beside a nonlinear one from which they cannot be told."""
-    return [h for h in effects if not any(cannot_be_told(observations, h, other) for other in effects)]
+    """Without linear effects beside a nonlinear one from which they cannot be told. Masses can: a law is a force.
+
+    The evidence does not tell: teeth that part gained 49 beside a loss of 68 % of their mesh's stiffness, which was
+    none, and that 107 beside the teeth.
+    """
+
+    def stays(one: Hypothesis) -> bool:
+        mass = any(p.unit == "kg" for p in one.placed.effect.parameters)
+        return mass or not any(cannot_be_told(observations, one, other) for other in effects)
+
+    return [h for h in effects if stays(h)]
 
 
 @dataclass(frozen=True)

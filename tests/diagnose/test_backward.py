@@ -12,15 +12,18 @@ from ema_pipeline.diagnose import backward
 from ema_pipeline.diagnose.backward import cannot_be_told, reconsidered
 
 
-def at(one: Any, place: str) -> Any:
+def at(one: Any, place: str, unit: str = "1") -> Any:
     one.placed.place = place
+    for p in one.placed.effect.parameters:
+        p.unit = unit
     return one
 
 
-LOSS, TEETH, ELSEWHERE = (
+LOSS, TEETH, ELSEWHERE, MASS = (
     at(hypothesis("loss@mesh1"), "mesh1"),
     at(law("teeth@mesh1"), "mesh1"),
     at(hypothesis("loss@mesh2"), "mesh2"),
+    at(hypothesis("mass@mesh1"), "mesh1", "kg"),
 )
 
 
@@ -38,7 +41,7 @@ def test_a_linear_claim_goes_once_a_law_at_its_place_is_claimed(
 ) -> None:
     claimed: Any = [
         SimpleNamespace(hypothesis=h, ranked=SimpleNamespace(fit=fit(h.label, 1.0)))
-        for h in (LOSS, ELSEWHERE, TEETH)
+        for h in (LOSS, ELSEWHERE, MASS, TEETH)
     ]
     fitted: list[list[str]] = []
 
@@ -61,8 +64,8 @@ def test_a_linear_claim_goes_once_a_law_at_its_place_is_claimed(
         SimpleNamespace(),  # type: ignore[arg-type]
     )
     if linearised:
-        assert fitted == [[ELSEWHERE.label, TEETH.label]]
-        assert found == [ELSEWHERE, TEETH, "without"]
+        assert fitted == [[ELSEWHERE.label, MASS.label, TEETH.label]]
+        assert found == [ELSEWHERE, MASS, TEETH, "without"]
     else:
         assert fitted == []
         assert found == claimed
