@@ -21,11 +21,12 @@ UNEXPLAINED_DOUBLE = 12.0
 UNEXPLAINED_PRODUCT = 5.0
 """The same of one at a multiple or sum of others' frequencies, in tests at several force levels: of some 340 modes in
 24 of them, two that passed were third and second harmonics."""
+UNSEEN = 3.0
+"""Cost of a model mode in the band that was not measured: it may lie on a node of every sensor or hit point."""
+
 _SCATTERS = (FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, DAMPING_SCATTER)
 _KEPT = 64
 """Costs that are kept."""
-UNSEEN = 3.0
-"""Cost of a model mode in the band that was not measured: it may lie on a node of every sensor or hit point."""
 
 
 @dataclass(frozen=True)
@@ -69,22 +70,12 @@ class Alone:
         if key not in known:
             if len(known) >= _KEPT:
                 known.clear()
-            known[key] = cls._of(data, alone, scatters, defaults)
+            sure = alone[~data.doubtful[alone]]
+            doubles = int(np.sum(data.double[alone]))
+            split = UNEXPLAINED_DOUBLE * doubles + UNEXPLAINED_PRODUCT * (len(alone) - len(sure) - doubles)
+            penalty = UNEXPLAINED * len(sure) + split + _credited(data, sure, scatters, defaults)
+            known[key] = cls(len(sure), split, penalty, _usual(data, alone, scatters, defaults))
         return known[key]
-
-    @classmethod
-    def _of(
-        cls,
-        data: ModeData,
-        alone: NDArray[np.int64],
-        scatters: Mapping[str, float],
-        defaults: Mapping[str, float],
-    ) -> Alone:
-        sure = alone[~data.doubtful[alone]]
-        doubles = int(np.sum(data.double[alone]))
-        split = UNEXPLAINED_DOUBLE * doubles + UNEXPLAINED_PRODUCT * (len(alone) - len(sure) - doubles)
-        penalty = UNEXPLAINED * len(sure) + split + _credited(data, sure, scatters, defaults)
-        return cls(len(sure), split, penalty, _usual(data, alone, scatters, defaults))
 
 
 def unseen(data: ModeData, frequency_hz: NDArray[np.float64], accounted: NDArray[np.int64]) -> float:
