@@ -23,7 +23,7 @@ from ema_pipeline.effects.base import effect_of
 from ema_pipeline.inference import Posterior, Residuals, lower_factor
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import Fit, Model, transferred
-from ema_pipeline.observations.rig_model import LOG_STD, SizeMap
+from ema_pipeline.observations.size_map import LOG_STD, SizeMap
 from ema_pipeline.processes import spread
 
 _NINE_OF_TEN = 1.2816

@@ -14,7 +14,7 @@ from ema_pipeline.effects.out_of_tolerance import proportional_elements, toleran
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.laws import Nonlinear
 from ema_pipeline.mechanics.terms import assemble_terms
-from ema_pipeline.observations.rig_model import SizeMap
+from ema_pipeline.observations.size_map import SizeMap
 from ema_pipeline.rigs.types import Rig
 
 _SAME = 1 - 1e-9

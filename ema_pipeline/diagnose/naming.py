@@ -13,7 +13,7 @@ from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, Model, refined
-from ema_pipeline.observations.rig_model import SizeMap
+from ema_pipeline.observations.size_map import SizeMap
 
 _ALIKE = 3.0
 """Log evidence by which a name's prior may be behind the best one's and still be said."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
@@ -50,6 +50,18 @@ class Terms:
     log: NDArray[np.float64]
     skew: NDArray[np.float64]
 
+    @classmethod
+    def joined(cls, parts: Sequence[Terms]) -> Terms:
+        """All terms of several parts with the same coordinates and unknowns."""
+        return cls(
+            parts[0].dofs,
+            np.concatenate([p.rows for p in parts]),
+            np.concatenate([p.coefficient for p in parts]),
+            np.concatenate([p.matrix for p in parts]),
+            np.concatenate([p.log for p in parts]),
+            sum((p.skew for p in parts[1:]), parts[0].skew),
+        )
+
     def scaled(self, logs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Coefficients at these unknown logarithms, (t,)."""
         return np.asarray(self.coefficient * np.exp(self.log @ logs))
@@ -66,10 +78,9 @@ class Terms:
     def by_kind(self) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
         """Positions and rows of the terms of each kind of matrix that has any."""
         found = {}
-        for kind in range(4):
+        for kind in sorted(set(self.matrix.tolist())):
             on = np.flatnonzero(self.matrix == kind)
-            if len(on):
-                found[kind] = (on, self.rows[on])
+            found[kind] = (on, self.rows[on])
         return found
 
 

@@ -32,7 +32,8 @@ from ema_pipeline.observations.hit_residuals import (
 from ema_pipeline.observations.mode_problem import ModeProblem
 from ema_pipeline.observations.mode_rows import SHAPE, stacked
 from ema_pipeline.observations.modes import ModeObservations
-from ema_pipeline.observations.rig_model import LOG_STD, RigModel, SizeMap
+from ema_pipeline.observations.rig_model import RigModel
+from ema_pipeline.observations.size_map import LOG_STD, SizeMap
 
 AMPLITUDE_STD = 0.02
 """1 σ of the logarithm of all amplitudes: the sensors' calibration, less what their number averages out."""

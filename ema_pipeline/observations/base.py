@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Posterior, Problem, Residuals, Scatter
-from ema_pipeline.observations.rig_model import SizeMap
+from ema_pipeline.observations.size_map import SizeMap
 
 
 class EffectProblem(Problem, Protocol):

@@ -18,7 +18,7 @@ from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.fitting import transferred
 from ema_pipeline.observations.hit_data import HitData
 from ema_pipeline.observations.hit_residuals import AMPLITUDE, HitResiduals
-from ema_pipeline.observations.rig_model import LOG_STD
+from ema_pipeline.observations.size_map import LOG_STD
 
 if TYPE_CHECKING:
     from ema_pipeline.observations.amplitude import AmplitudeObservations, AmplitudeProblem

@@ -25,7 +25,8 @@ from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.loop_data import LoopData, left_out, typical_of
 from ema_pipeline.observations.loop_forces import ForceAtPoint, Isolator, IsolatorForce
 from ema_pipeline.observations.parts import Dependence, dependence, part_key
-from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.observations.rig_model import RigModel
+from ema_pipeline.observations.size_map import SizeMap
 from ema_pipeline.observations.typical import SIZE_SHARE, Typical
 from ema_pipeline.rigs.types import Rig
 

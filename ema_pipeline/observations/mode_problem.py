@@ -29,8 +29,9 @@ from ema_pipeline.observations.first_order import FirstOrderModel
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_residuals import Comparison
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, stacked
-from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.observations.rig_model import RigModel
 from ema_pipeline.observations.sensing import Sensing
+from ema_pipeline.observations.size_map import SizeMap
 
 if TYPE_CHECKING:
     from ema_pipeline.observations.modes import ModeObservations

@@ -25,7 +25,8 @@ from ema_pipeline.observations.mode_problem import ModeProblem
 from ema_pipeline.observations.mode_rows import FREQUENCY, SHAPE, Compared, Rows, stacked
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.parts import DAMPING_SCATTER
-from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.observations.rig_model import RigModel
+from ema_pipeline.observations.size_map import SizeMap
 from ema_pipeline.settings import Settings
 
 A, B = "A", "B"

@@ -40,7 +40,8 @@ from ema_pipeline.observations.parts import (
     dependence,
 )
 from ema_pipeline.observations.record_data import DISCREPANCY
-from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.observations.rig_model import RigModel
+from ema_pipeline.observations.size_map import SizeMap
 from ema_pipeline.rigs.types import Parameter, Rig
 
 LINEAR_STD = 0.35

@@ -17,7 +17,7 @@ from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, SHARE, RecordData
 from ema_pipeline.observations.record_model import RecordModel
 from ema_pipeline.observations.record_motion import Motion
-from ema_pipeline.observations.rig_model import SizeMap
+from ema_pipeline.observations.size_map import SizeMap
 
 if TYPE_CHECKING:
     from ema_pipeline.observations.records import RecordObservations

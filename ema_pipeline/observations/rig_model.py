@@ -7,121 +7,24 @@ is one product. Only what an effect edits is differentiated by small differences
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.effects.base import EffectParameter, PlacedEffect
+from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Assembly, Row
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, solved
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.mechanics.terms import DAMPING_MATRIX, STRUCTURAL, Matrices, Terms, assemble_terms
+from ema_pipeline.observations.effect_terms import AddedTerms, EffectTerms, differences
 from ema_pipeline.observations.mode_pairing import OwnDamping
 from ema_pipeline.observations.parts import DAMPING, DAMPING_SCATTER, Dependence, dependence, part_key
+from ema_pipeline.observations.size_map import LOG_STD, SizeMap
 from ema_pipeline.rigs.types import Rig
-
-LOG_STD = 1.2
-"""Prior 1 σ of the logarithm of a size that has no null: within a factor of three of its start, mostly."""
-_DIFFERENCE = 1e-4
-"""Step of the differences by effects' sizes, in units of their prior σ."""
-
-
-@dataclass(frozen=True)
-class SizeMap:
-    """How one size of an effect follows from its unknown: value = null + scale·x, or start·exp(1.2 x)."""
-
-    parameter: EffectParameter
-    scale: float
-    logarithmic: bool
-
-    @classmethod
-    def of(cls, parameter: EffectParameter, scale: float) -> SizeMap:
-        """Logarithmic where the size has no finite null within its range, or cannot be zero."""
-        no_null = not np.isfinite(parameter.null) or not parameter.minimum <= parameter.null
-        return cls(parameter, scale, no_null or parameter.minimum > 0)
-
-    def value(self, x: float) -> float:
-        """Size at the unknown `x`, within its range."""
-        p = self.parameter
-        value = p.start * self.coordinate(x) if self.logarithmic else p.null + self.scale * x
-        return float(np.clip(value, p.minimum, p.maximum))
-
-    def unknown(self, value: float) -> float:
-        """The unknown at which the size is `value`."""
-        p = self.parameter
-        if self.logarithmic:
-            return self.of_coordinate(max(value, 1e-300) / p.start)
-        return (value - p.null) / self.scale
-
-    def slope(self, x: float) -> float:
-        """Derivative of the size by the unknown."""
-        return self.value(x) * LOG_STD if self.logarithmic else self.scale
-
-    def coordinate(self, x: float) -> float:
-        """What a size is linear in: the unknown itself, or the size over its start."""
-        return float(np.exp(LOG_STD * x)) if self.logarithmic else x
-
-    def of_coordinate(self, z: float) -> float:
-        """The unknown at a coordinate."""
-        return float(np.log(z)) / LOG_STD if self.logarithmic else z
-
-    def coordinate_slope(self, x: float) -> float:
-        """Derivative of the coordinate by the unknown."""
-        return LOG_STD * self.coordinate(x) if self.logarithmic else 1.0
-
-    @property
-    def bounds(self) -> tuple[float, float]:
-        """Range of the unknown."""
-        p = self.parameter
-        low = self.unknown(p.minimum) if p.minimum > 0 or not self.logarithmic else -np.inf
-        return low, self.unknown(p.maximum)
-
-
-@dataclass(frozen=True)
-class LinearTerms:
-    """Terms whose coefficients are linear functions of the effects' coordinates (`SizeMap.coordinate`).
-
-    Attributes
-    ----------
-    start : Terms
-        At `begin`.
-    begin : ndarray, (k,)
-    slopes : ndarray, (k, t)
-        Derivatives of the coefficients.
-    skew_slopes : ndarray, (k, n, n)
-    """
-
-    start: Terms
-    begin: NDArray[np.float64]
-    slopes: NDArray[np.float64]
-    skew_slopes: NDArray[np.float64]
-
-    def at(self, coordinates: NDArray[np.float64]) -> Terms:
-        """Terms at other coordinates."""
-        if not len(self.begin):
-            return self.start
-        moved = coordinates - self.begin
-        s = self.start
-        skew = s.skew
-        if np.any(self.skew_slopes):
-            skew = skew + np.tensordot(moved, self.skew_slopes, axes=1)
-        found = Terms(s.dofs, s.rows, s.coefficient + moved @ self.slopes, s.matrix, s.log, skew)
-        found.__dict__["by_kind"] = s.by_kind  # the rows are the same ones
-        return found
-
-
-def _same_rows(a: Terms, b: Terms) -> bool:
-    return (
-        a.dofs == b.dofs
-        and a.rows.shape == b.rows.shape
-        and bool(np.array_equal(a.rows, b.rows))
-        and bool(np.array_equal(a.matrix, b.matrix))
-        and bool(np.array_equal(a.log, b.log))
-    )
 
 
 class RigModel:
@@ -160,7 +63,7 @@ class RigModel:
             for p in one.effect.parameters
         }
         self._terms: dict[tuple[object, ...], Terms] = {}
-        self._linear: dict[str, LinearTerms | None] = {}
+        self._of_effects: dict[str, EffectTerms | None] = {}
         self._nominal: dict[tuple[object, ...], Assembly] = {}
         self._fits: dict[tuple[str, int, tuple[str, ...]], bool] = {}
         self._modes: dict[str, tuple[bytes, bool, Matrices, EigenSolution | None]] = {}
@@ -275,12 +178,9 @@ class RigModel:
         terms = self.terms(configuration, shape)
         slopes = np.zeros((self.shape_start - self._logs, len(terms.dofs)))
         slopes[: int(self.has_ratio)] = 1.0
-        factor = np.exp(terms.log @ logs)
-        coefficient = terms.coefficient * factor
+        coefficient = terms.scaled(logs)
         dense = terms.dense(coefficient)
-        by_shape, skew = self._by_shape(
-            configuration, terms, factor, logs, shape if derivatives else shape[:0]
-        )
+        by_shape, skew = self._by_shape(configuration, terms, logs, shape if derivatives else shape[:0])
         ratios = self._ratios(x, slopes)
         return Matrices(terms, coefficient, dense, terms.skew, ratios, slopes, by_shape, skew)
 
@@ -288,100 +188,62 @@ class RigModel:
         self,
         configuration: str,
         terms: Terms,
-        factor: NDArray[np.float64],
         logs: NDArray[np.float64],
         shape: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Derivatives of the matrices by effects' unknowns and geometry: exact where they are linear in the sizes."""
-        n = len(terms.dofs)
-        by_shape, skew = np.zeros((len(shape), 4, n, n)), np.zeros((len(shape), n, n))
         if not len(shape):
-            return by_shape, skew
-        linear = self._linear_terms(configuration)
-        if linear is not None:
-            for i, (size, x) in enumerate(zip(self.sizes.values(), shape, strict=True)):
-                slope = size.coordinate_slope(float(x))
-                by_shape[i] = slope * terms.dense(linear.slopes[i] * factor)
-                skew[i] = slope * linear.skew_slopes[i]
-            return by_shape, skew
-        for i in range(len(shape)):
-            ends = []
-            for h in (-_DIFFERENCE, _DIFFERENCE):
-                moved = shape.copy()
-                moved[i] += h
-                other = self.terms(configuration, moved)
-                ends.append((other.dense(other.scaled(logs)), other.skew))
-            if ends[0][0].shape == by_shape[i].shape == ends[1][0].shape:
-                by_shape[i] = (ends[1][0] - ends[0][0]) / (2 * _DIFFERENCE)
-                skew[i] = (ends[1][1] - ends[0][1]) / (2 * _DIFFERENCE)
-        return by_shape, skew
+            n = len(terms.dofs)
+            return np.zeros((0, 4, n, n)), np.zeros((0, n, n))
+        known = self._effect_terms(configuration)
+        slopes = None if known is None else known.slopes_at(shape, logs)
+        if slopes is None:
+            slopes = differences(partial(self._assembled, configuration), shape, logs)
+        assert slopes is not None  # whatever is assembled has terms
+        return slopes
 
     def terms(self, configuration: str, shape: NDArray[np.float64]) -> Terms:
         """Elements of a configuration with geometry and effects' unknowns at `shape`."""
-        linear = self._linear_terms(configuration)
-        return (
-            self._assembled(configuration, shape) if linear is None else linear.at(self._coordinates(shape))
-        )
+        known = self._effect_terms(configuration)
+        terms = None if known is None else known.at(shape)
+        return self._assembled(configuration, shape) if terms is None else terms
 
-    def _coordinates(self, shape: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Coordinates of the sizes in which terms may be linear, (k,)."""
-        return np.array([s.coordinate(float(x)) for s, x in zip(self.sizes.values(), shape, strict=True)])
-
-    def _assembled(self, configuration: str, shape: NDArray[np.float64]) -> Terms:
-        key = (configuration, shape.tobytes())
+    def _assembled(
+        self, configuration: str, shape: NDArray[np.float64], without: frozenset[int] = frozenset()
+    ) -> Terms:
+        key = (configuration, shape.tobytes(), without)
         if key not in self._terms:
             if len(self._terms) > 64:
                 self._terms.clear()
-            self._terms[key] = assemble_terms(
-                self.assembly(configuration, shape), self.dependence.elements[configuration], part_key
-            )
+            assembly = self.assembly(configuration, shape, without)
+            self._terms[key] = assemble_terms(assembly, self.dependence.elements[configuration], part_key)
         return self._terms[key]
 
-    def _linear_terms(self, configuration: str) -> LinearTerms | None:
-        """The terms as linear functions of the effects' coordinates; None where they are not."""
-        if configuration not in self._linear:
-            self._linear[configuration] = None if self.dependence.geometric else self._tried(configuration)
-        return self._linear[configuration]
+    def _effect_terms(self, configuration: str) -> EffectTerms | None:
+        """How the terms depend on the effects' sizes; None where that is not known."""
+        if configuration not in self._of_effects:
+            found = None
+            if not self.dependence.geometric:
+                host = self._base(configuration, np.zeros(0))
+                elements = self.dependence.elements[configuration]
+                each = []
+                for one in self.effects:
+                    sizes = tuple(self.sizes[one.parameter_name(p.name)] for p in one.effect.parameters)
+                    each.append(AddedTerms(host, elements, one, sizes))
+                found = EffectTerms.found(each, partial(self._assembled, configuration))
+            self._of_effects[configuration] = found
+        return self._of_effects[configuration]
 
-    def _tried(self, configuration: str) -> LinearTerms | None:
-        """Find the linear function from a few points, and try it at others."""
-        sizes, unknowns = tuple(self.sizes.values()), self.unknowns
-        low, high = unknowns.lower[self.shape_start :], unknowns.upper[self.shape_start :]
-        begin = np.where([s.logarithmic for s in sizes], 1.0, np.clip(0.2, 0.5 * low, 0.5 * high))
-
-        def at(coordinates: NDArray[np.float64]) -> Terms:
-            x = [s.of_coordinate(float(z)) for s, z in zip(sizes, coordinates, strict=True)]
-            return self._assembled(configuration, np.array(x))
-
-        start = at(begin)
-        slopes, skews = [], []
-        for i in range(len(begin)):
-            other = at(begin * np.where(np.arange(len(begin)) == i, 1.5, 1.0))
-            if not _same_rows(start, other):
-                return None
-            slopes.append((other.coefficient - start.coefficient) / (0.5 * begin[i]))
-            skews.append((other.skew - start.skew) / (0.5 * begin[i]))
-        n = len(start.dofs)
-        linear = LinearTerms(
-            start,
-            begin,
-            np.array(slopes).reshape(len(begin), len(start.coefficient)),
-            np.array(skews).reshape(len(begin), n, n),
-        )
-        for share in (0.6, 1.3) if len(begin) else ():
-            trial, told = at(share * begin), linear.at(share * begin)
-            if not _same_rows(start, trial) or not np.allclose(
-                told.coefficient, trial.coefficient, rtol=1e-9
-            ):
-                return None
-        return linear
-
-    def assembly(self, configuration: str, shape: NDArray[np.float64]) -> Assembly:
-        """Nominal elements with the effects applied."""
+    def assembly(
+        self, configuration: str, shape: NDArray[np.float64], without: frozenset[int] = frozenset()
+    ) -> Assembly:
+        """Nominal elements with the effects applied, but those of the numbers `without`."""
         geometric = self.dependence.geometric
         assembly = self._base(configuration, shape[: len(geometric)])
         values = dict(zip(self.sizes, shape[len(geometric) :], strict=True))
         for i, one in enumerate(self.effects):
+            if i in without:
+                continue
             key = (configuration, i, assembly.dofs)  # whatever the sizes, but for one that adds a coordinate
             if key not in self._fits:
                 self._fits[key] = one.effect.fits(assembly, one.place)

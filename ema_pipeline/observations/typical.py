@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ema_pipeline.effects.base import EffectParameter, PlacedEffect
-from ema_pipeline.observations.rig_model import SizeMap
+from ema_pipeline.observations.size_map import SizeMap
 
 SIZE_SHARE = 0.5
 """Prior 1 σ of an effect's force as a share of the measured one."""

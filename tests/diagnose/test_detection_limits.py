@@ -17,7 +17,7 @@ from ema_pipeline.diagnose.score import Marginal
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.inference import Posterior, Residuals, Unknowns
-from ema_pipeline.observations.rig_model import LOG_STD
+from ema_pipeline.observations.size_map import LOG_STD
 
 GAIN = 20.0
 

@@ -36,7 +36,7 @@ from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
 from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, refined
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
-from ema_pipeline.observations.rig_model import SizeMap
+from ema_pipeline.observations.size_map import SizeMap
 from ema_pipeline.rigs import load_rig
 from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.planetary import planetary

@@ -43,7 +43,7 @@ from ema_pipeline.observations.hit_reading import momentary_weights
 from ema_pipeline.observations.hit_residuals import AMPLITUDE
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
-from ema_pipeline.observations.rig_model import LOG_STD, SizeMap
+from ema_pipeline.observations.size_map import LOG_STD, SizeMap
 from ema_pipeline.rigs.isolator import isolator
 
 SETTINGS = DiagnoseSettings(processes=1)

@@ -36,7 +36,8 @@ from ema_pipeline.observations.parts import (
     part_key,
     value_of,
 )
-from ema_pipeline.observations.rig_model import RigModel, SizeMap
+from ema_pipeline.observations.rig_model import RigModel
+from ema_pipeline.observations.size_map import SizeMap
 from ema_pipeline.observations.without_partner import (
     UNEXPLAINED,
     UNEXPLAINED_DOUBLE,
