@@ -20,7 +20,7 @@ from ema_pipeline.diagnose.score import UNSEEN, Marginal
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import DetectionLimit
 from ema_pipeline.effects.base import effect_of
-from ema_pipeline.inference import Posterior, Residuals, lower_factor
+from ema_pipeline.inference import Posterior, Residuals, lower_factor, same_matching
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import Fit, Model, transferred
 from ema_pipeline.observations.size_map import LOG_STD, SizeMap
@@ -282,7 +282,7 @@ class _Shown:
         return first, x, there.values - self.before.values if self._as_before(there) else None
 
     def _as_before(self, there: Residuals) -> bool:
-        return _same_pairs(there.matching, self.before.matching) and bool(np.all(np.isfinite(there.values)))
+        return same_matching(there.matching, self.before.matching) and bool(np.all(np.isfinite(there.values)))
 
     def _followed(self, begin: NDArray[np.float64], change: NDArray[np.float64]) -> Change | None:
         """How far the predictions move once everything uncertain has followed, in Gauss-Newton steps.
@@ -342,7 +342,7 @@ def _without(
     The data would leave over what they leave of the fit; where modes have other partners, one standard deviation.
     """
     left = fit.posterior.residuals
-    if not _same_pairs(before.matching, left.matching):
+    if not same_matching(before.matching, left.matching):
         exact = replace(before, values=np.zeros(len(before.values)))
         followed = replace(fit.posterior, x=null, residuals=exact).expected_squares(weighted=False)
         left = replace(before, values=np.sqrt(np.maximum(1.0 - followed, 0.0)))
@@ -350,14 +350,3 @@ def _without(
         fit, posterior=replace(fit.posterior, x=null, residuals=replace(left, jacobian=before.jacobian))
     )
     return ExpectedGain(there.posterior, observations.scatters, Marginal(there, without=hypothesis.label))
-
-
-def _same_pairs(a: object, b: object) -> bool:
-    """True where two assignments of data to the model, nested in any way, are the same."""
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-        return np.array_equal(a, b)
-    if isinstance(a, Mapping) and isinstance(b, Mapping):
-        return a.keys() == b.keys() and all(_same_pairs(a[k], b[k]) for k in a)
-    if isinstance(a, Sequence) and isinstance(b, Sequence) and not isinstance(a, str):
-        return len(a) == len(b) and all(_same_pairs(x, y) for x, y in zip(a, b, strict=True))
-    return a is b or bool(a == b)

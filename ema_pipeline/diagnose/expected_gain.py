@@ -17,6 +17,9 @@ _STEPS = 12
 _LONGEST = 1.5
 """Steps, and longest step in the logarithm of a variance, of the search for the scatters that take a change up."""
 
+_SETTLED = 1e-4
+"""Log evidence that a step promises below which the search ends."""
+
 
 @dataclass(frozen=True)
 class Change:
@@ -116,7 +119,10 @@ class ExpectedGain:
             curvature = 0.5 * (part.T @ (np.maximum(excess, 1.0)[:, None] * part))
             curvature[np.diag_indices_from(curvature)] += 0.5 * of_unknowns * inverse + 0.25 * self._weight
             step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST, _LONGEST)
-            log = np.minimum(log + step, self._widest)
+            moved = np.minimum(log + step, self._widest) - log
+            if -float(moved @ (slope + 0.5 * curvature @ moved)) < _SETTLED:
+                break
+            log = log + moved
         return best
 
     def _density(self, square: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -31,9 +31,15 @@ _BETTER = 0.05
 """Log evidence by which a start must lead a fit to be followed."""
 
 
-def spread_fits(job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes: int | None) -> list[Fit]:
+_WORTH = 2
+"""Fits with scatters to be learned, which take longest, from which processes are worth it."""
+
+
+def spread_fits(
+    job: Callable[[Fit], Posterior], fits: Sequence[Fit], processes: int | None, least: int = 4
+) -> list[Fit]:
     """Better fits of the same models; only posteriors go between processes, a user's effects cannot."""
-    return [Fit(fit.model, p) for fit, p in zip(fits, spread(job, fits, processes), strict=True)]
+    return [Fit(fit.model, p) for fit, p in zip(fits, spread(job, fits, processes, least), strict=True)]
 
 
 def promising_fits(
@@ -129,7 +135,7 @@ def finals_of(
     beaten = found[len(led) :]
     leaders = sorted(first[1:], key=lambda f: -f.log_evidence)
     job = partial(_crossed, observations, (first[0], *leaders[:2]))
-    final_base, *again = spread_fits(job, first, processes)
+    final_base, *again = spread_fits(job, first, processes, _WORTH)
     ranked = [
         Ranked(hypothesis, fit, fit.log_evidence - final_base.log_evidence, True)
         for (hypothesis, _), fit in zip((*finalists, *far), (*again, *beaten), strict=True)
@@ -156,7 +162,8 @@ def _learned_each(
         fit, past_barriers = one
         return _learned(observations, past_barriers, fit)
 
-    return [Fit(fit.model, p) for (fit, _), p in zip(asked, spread(job, asked, processes), strict=True)]
+    learned_ones = spread(job, asked, processes, _WORTH)
+    return [Fit(fit.model, p) for (fit, _), p in zip(asked, learned_ones, strict=True)]
 
 
 def _learned(observations: Observations, past_barriers: bool, fit: Fit) -> Posterior:

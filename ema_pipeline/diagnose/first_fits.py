@@ -135,8 +135,12 @@ def first_fit(
     models: Mapping[str, Model],
     promise: Mapping[str, Score],
     hypothesis: Hypothesis,
+    near: bool = False,
 ) -> Posterior:
-    """The fit begun at the size that its score tells; annealed where that makes matters worse."""
+    """The fit begun at the size that its score tells; annealed where that makes matters worse.
+
+    `near` is true where the base model has not bent anything to the data.
+    """
     model, score = models[hypothesis.label], promise.get(hypothesis.label)
     begun = _begun(observations, base, model)
     if begun is not None:
@@ -146,7 +150,7 @@ def first_fit(
         found.append(_from_score(observations, base, model, hypothesis, score))
         if found[0].cost <= base.posterior.cost:
             return found[0]
-    found.append(annealed_fit(observations, base, models, promise, {}, hypothesis))
+    found.append(annealed_fit(observations, base, models, promise, {}, hypothesis, near))
     return max(found, key=lambda p: p.log_evidence)
 
 
@@ -157,6 +161,7 @@ def annealed_fit(
     promise: Mapping[str, Score],
     tried: Mapping[str, Tried],
     hypothesis: Hypothesis,
+    near: bool = False,
 ) -> Posterior:
     """The fit annealed from several sizes, or begun where the data themselves tell it to."""
     model = models[hypothesis.label]
@@ -167,7 +172,7 @@ def annealed_fit(
     problem = model.problem(observations)
     begin = transferred(base.posterior, problem.unknowns)
     label = hypothesis.label
-    starts = _starts(observations, problem, hypothesis, begin, promise.get(label), tried.get(label))
+    starts = _starts(observations, problem, hypothesis, begin, promise.get(label), tried.get(label), near)
     return annealed(observations, model, starts, schedule).posterior
 
 
@@ -202,12 +207,14 @@ def _starts(
     begin: NDArray[np.float64],
     score: Score | None = None,
     tried: Tried | None = None,
+    near: bool = False,
 ) -> list[NDArray[np.float64]]:
     """Points from which a hypothesis is fitted.
 
-    A base model that fails has bent parts and channels to the data: a true effect is found from unbent ones. In forces
-    in time it has bent everything, up to a fit that no true effect leads out of: there one fit begins where the base
-    model's did. Usual sizes may be ten times too large; the one that a score tells is about right where the effect is.
+    A base model that fails has bent parts and channels to the data: a true effect is found from unbent ones; where it
+    is `near`, its fit is as good a start. In forces in time it has bent everything, up to a fit that no true effect
+    leads out of: there one fit begins where the base model's did. Usual sizes may be ten times too large; the one that
+    a score tells is about right where the effect is.
     """
     if hypothesis.begun:
         sizes_known = [problem.unknowns.index[name] for name in problem.sizes]
@@ -218,12 +225,12 @@ def _starts(
     if hypothesis.size_cannot_be_zero:
         plans = [
             (x, start)
-            for x in (begin, unbent)
+            for x in ((begin,) if near else (begin, unbent))
             for start in _best_of_grid(observations, problem, x, hypothesis)
         ]
     else:
         plans = [(begin, start) for start in hypothesis.starts()]
-        plans += [(unbent, start) for start in hypothesis.starts()[:1]]
+        plans += [(unbent, start) for start in hypothesis.starts()[: 0 if near else 1]]
         if score is not None and len(score.size) == 1 and not hypothesis.begun:
             plans.append((begin, {_first_size(hypothesis): float(score.size[0])}))
         if tried is not None:

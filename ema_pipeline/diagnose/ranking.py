@@ -115,7 +115,7 @@ def rank(
         if stuck:
             anew = partial(annealed_fit, observations, base, models, promise, tried, hypothesis)
         else:
-            anew = partial(first_fit, observations, base, models, promise, hypothesis)
+            anew = partial(first_fit, observations, base, models, promise, hypothesis, near)
         label = hypothesis.label
         if label not in earlier:
             return anew()

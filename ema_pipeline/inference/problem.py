@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
@@ -184,6 +184,17 @@ def in_blocks(
     inside = block >= 0
     counts = np.bincount(block[inside])
     return np.bincount(block[inside], squares[inside]).astype(float), counts.astype(float)
+
+
+def same_matching(a: object, b: object) -> bool:
+    """True where two assignments of data to the model, nested in any way, are the same."""
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return np.array_equal(a, b)
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return a.keys() == b.keys() and all(same_matching(a[k], b[k]) for k in a)
+    if isinstance(a, Sequence) and isinstance(b, Sequence) and not isinstance(a, str):
+        return len(a) == len(b) and all(same_matching(x, y) for x, y in zip(a, b, strict=True))
+    return a is b or bool(a == b)
 
 
 class Problem(Protocol):

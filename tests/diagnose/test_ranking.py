@@ -212,7 +212,10 @@ class Stages:
         self.short = True
         return []
 
-    def first_fit(self, how: str, o: object, base: object, models: Any, promise: Any, h: Any) -> Any:
+    def first_fit(
+        self, how: str, o: object, base: object, models: Any, promise: Any, h: Any, near: bool = False
+    ) -> Any:
+        assert near is False or how == "first"
         self.asked.append((how, h.label, len(promise)))
         return SimpleNamespace(log_evidence=float("fedcba".index(h.label)), error=1.0)
 

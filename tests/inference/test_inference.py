@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -254,6 +255,45 @@ def test_bounds_are_kept_and_the_fit_within_them_is_the_best(
     found = anneal(problem, {}, np.full(3, 0.0 if start == "inside" else edge))
     assert np.all((found.x >= lower) & (found.x <= upper))
     assert found.cost == pytest.approx(known.cost, abs=5e-3)
+
+
+@dataclass
+class Counted:
+    """A problem that counts its evaluations, and whose pairs change with the first unknown where `jumps`."""
+
+    problem: Exponential
+    jumps: bool = False
+    derivatives: int = 0
+    trials: int = 0
+
+    @property
+    def unknowns(self) -> Unknowns:
+        return self.problem.unknowns
+
+    def residuals(
+        self, x: Array, scatters: Mapping[str, float], *, derivatives: bool = True, **given: Any
+    ) -> Residuals:
+        self.derivatives += derivatives
+        self.trials += not derivatives
+        found = self.problem.residuals(x, scatters, derivatives=derivatives, **given)
+        return replace(found, matching=(np.array([x[0]]),) if self.jumps else None)
+
+
+def test_derivatives_are_carried_on_while_the_cost_falls_as_they_promise() -> None:
+    counted = Counted(exponential(0))
+    found = descend(counted, {}, np.zeros(3), steps=40)
+    assert counted.derivatives < counted.trials
+    exact = counted.problem.residuals(found.x, {})
+    np.testing.assert_array_equal(found.residuals.values, exact.values)
+    np.testing.assert_array_equal(found.residuals.jacobian, exact.jacobian)
+
+
+def test_no_derivatives_are_carried_on_to_other_pairs() -> None:
+    counted = Counted(exponential(0), jumps=True)
+    found = descend(counted, {}, np.zeros(3), steps=40)
+    plain = descend(exponential(0), {}, np.zeros(3), steps=40)
+    assert counted.derivatives == counted.trials + 1  # every step was a way down
+    assert found.cost == pytest.approx(plain.cost, abs=1e-4)
 
 
 def test_a_fit_is_never_worse_than_its_start() -> None:
