@@ -17,9 +17,6 @@ _STEPS = 12
 _LONGEST = 1.5
 """Steps, and longest step in the logarithm of a variance, of the search for the scatters that take a change up."""
 
-_SETTLED = 1e-4
-"""Log evidence that a step promises below which the search ends."""
-
 
 @dataclass(frozen=True)
 class Change:
@@ -67,6 +64,7 @@ class ExpectedGain:
         self._shares = np.zeros((marginal.count, len(learned)))
         for k, s in enumerate(learned):
             self._shares[:, k] = fit.residuals.share.get(s.name, 0.0)
+        self._fixed = 1 - np.sum(self._shares, axis=1)
         self._square, self._block = fit.expected_squares(), fit.residuals.block
         self._unweighted = fit.residuals.weight**-2.0
         of_residuals = np.sum(self._shares, axis=0)
@@ -99,12 +97,11 @@ class ExpectedGain:
         scatters; that of unknowns is t.
         """
         square, count, of_unknowns = self._square + residuals, self._values, self._values + unknowns
-        fixed = 1 - np.sum(self._shares, axis=1)
-        log = np.zeros(len(self._weight))
+        log, diagonal = np.zeros(len(self._weight)), np.arange(len(self._weight))
         best = np.inf
         for _ in range(_STEPS):
             added = self._shares * np.exp(log)
-            variance = fixed + np.sum(added, axis=1)
+            variance = self._fixed + np.sum(added, axis=1)
             above = self._above + 0.5 * log
             inverse = np.exp(-log)
             own = square / variance
@@ -117,12 +114,9 @@ class ExpectedGain:
             part, excess = added / variance[:, None], own * factor
             slope = 0.5 * (part.T @ (1 - excess) + count - of_unknowns * inverse + self._weight * above)
             curvature = 0.5 * (part.T @ (np.maximum(excess, 1.0)[:, None] * part))
-            curvature[np.diag_indices_from(curvature)] += 0.5 * of_unknowns * inverse + 0.25 * self._weight
+            curvature[diagonal, diagonal] += 0.5 * of_unknowns * inverse + 0.25 * self._weight
             step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST, _LONGEST)
-            moved = np.minimum(log + step, self._widest) - log
-            if -float(moved @ (slope + 0.5 * curvature @ moved)) < _SETTLED:
-                break
-            log = log + moved
+            log = np.minimum(log + step, self._widest)
         return best
 
     def _density(self, square: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
