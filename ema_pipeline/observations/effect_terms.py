@@ -162,17 +162,16 @@ class AddedTerms:
         return assemble_terms(added, self.dependent, part_key)
 
     @property
-    def linear(self) -> bool:
-        """True unless the elements are others at other sizes than those at which it began."""
-        begin = _unknowns(self.sizes, 1.0)
-        if self.at(begin) is None:
-            return True
+    def anew(self) -> bool:
+        """True where the effect adds elements whose terms are not linear in its sizes, and does no more than that."""
+        if self.at(_unknowns(self.sizes, 1.0)) is None:
+            return False
 
         def added(unknowns: Real) -> Terms:
             found = self.at(unknowns)
             return assemble_terms(self.host, self.dependent, part_key) if found is None else found
 
-        return LinearTerms.found(self.sizes, added) is not None
+        return LinearTerms.found(self.sizes, added) is None
 
 
 @dataclass(frozen=True)
@@ -212,7 +211,7 @@ class EffectTerms:
         if linear is not None:
             return cls(linear, np.arange(len(sizes)))
         ends = np.cumsum([0, *(len(one.sizes) for one in each)])
-        anew = frozenset(i for i, one in enumerate(each) if not one.linear)
+        anew = frozenset(i for i, one in enumerate(each) if one.anew)
         at = [k for i in range(len(each)) if i not in anew for k in range(ends[i], ends[i + 1])]
         whole = _unknowns(sizes, 1.0)
 
