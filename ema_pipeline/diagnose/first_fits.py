@@ -222,15 +222,12 @@ def _starts(
         unbent[sizes_known] = begin[sizes_known]
     else:
         unbent = _unbent(problem.unknowns, begin)
+    sources = [begin] if near and not hypothesis.begun else [begin, unbent]
     if hypothesis.size_cannot_be_zero:
-        plans = [
-            (x, start)
-            for x in ((begin,) if near else (begin, unbent))
-            for start in _best_of_grid(observations, problem, x, hypothesis)
-        ]
+        plans = [(x, start) for x in sources for start in _best_of_grid(observations, problem, x, hypothesis)]
     else:
         plans = [(begin, start) for start in hypothesis.starts()]
-        plans += [(unbent, start) for start in hypothesis.starts()[: 0 if near else 1]]
+        plans += [(x, start) for x in sources[1:] for start in hypothesis.starts()[:1]]
         if score is not None and len(score.size) == 1 and not hypothesis.begun:
             plans.append((begin, {_first_size(hypothesis): float(score.size[0])}))
         if tried is not None:

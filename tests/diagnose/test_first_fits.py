@@ -56,6 +56,8 @@ def test_fits_begin_at_usual_sizes_and_once_with_parts_that_are_not_bent() -> No
     np.testing.assert_array_equal(starts, [[0.4, 0.5, 0.5], [0.4, 0.5, -0.5], [0.0, 0.5, 0.5]])
     told = _starts(NO_DATA, problem, hypothesis("a"), begin, score(3.0, 0.07))
     np.testing.assert_array_equal(told, [*starts, [0.4, 0.5, 0.07]])
+    near = _starts(NO_DATA, problem, hypothesis("a"), begin, near=True)  # the base model has bent nothing
+    np.testing.assert_array_equal(near, starts[:2])
 
 
 def test_where_sizes_are_given_one_fit_begins_where_that_of_the_base_model_did() -> None:
@@ -64,6 +66,10 @@ def test_where_sizes_are_given_one_fit_begins_where_that_of_the_base_model_did()
     problem: Any = Parabola(names, names[1:], np.array([0.1, 0.2, 0.3]))
     starts = _starts(NO_DATA, problem, _given(), np.array([0.4, 0.7, 0.0]))
     np.testing.assert_array_equal(starts, [[0.4, 0.7, 0.5], [0.4, 0.7, -0.5], [0.1, 0.7, 0.5]])
+    near = _starts(NO_DATA, problem, _given(), np.array([0.4, 0.7, 0.0]), near=True)
+    np.testing.assert_array_equal(
+        near, starts
+    )  # in forces in time everything may be bent, whatever the error
 
 
 def _given() -> Any:
@@ -82,6 +88,8 @@ def test_an_effect_that_adds_modes_begins_at_the_best_of_a_grid() -> None:
     assert best == [{"a.s1": a, "a.s2": b} for a, b in nearest]
     starts = _starts(data, problem, one, np.array([0.4, 0.0, 0.0]))
     np.testing.assert_array_equal(starts, [[k, *near] for k in (0.4, 0.0) for near in nearest])
+    beside = _starts(data, problem, one, np.array([0.4, 0.0, 0.0]), near=True)
+    np.testing.assert_array_equal(beside, starts[:5])
 
 
 @pytest.mark.parametrize(
