@@ -55,26 +55,27 @@ class LinearTerms:
     skew_slopes: Real
 
     @classmethod
-    def found(cls, sizes: Sequence[SizeMap], assembled: Callable[[Real], Terms]) -> LinearTerms | None:
+    def found(cls, sizes: Sequence[SizeMap], assembled: Callable[[Real], Terms | None]) -> LinearTerms | None:
         """The function through a few sizes, tried at others; None where there is none.
 
         Parameters
         ----------
         sizes : sequence of SizeMap
         assembled : callable
-            Terms at the sizes' unknowns, (k,).
+            Terms at the sizes' unknowns, (k,), None where there are none of that kind.
         """
         begin = _begin(sizes)
 
-        def at(coordinates: Real) -> Terms:
-            x = [s.of_coordinate(float(z)) for s, z in zip(sizes, coordinates, strict=True)]
-            return assembled(np.array(x))
+        def at(coordinates: Real) -> Terms | None:
+            return assembled(_unknowns(sizes, coordinates))
 
         start = at(begin)
+        if start is None:
+            return None
         slopes, skews = [], []
         for i in range(len(begin)):
             other = at(begin * np.where(np.arange(len(begin)) == i, _FURTHER, 1.0))
-            if not _same_rows(start, other):
+            if other is None or not _same_rows(start, other):
                 return None
             slopes.append((other.coefficient - start.coefficient) / ((_FURTHER - 1) * begin[i]))
             skews.append((other.skew - start.skew) / ((_FURTHER - 1) * begin[i]))
@@ -88,9 +89,9 @@ class LinearTerms:
         )
         for share in _TRIED if len(begin) else ():
             trial, told = at(share * begin), linear._at(share * begin)
-            if not _same_rows(start, trial) or not np.allclose(
-                told.coefficient, trial.coefficient, rtol=_SAME
-            ):
+            if trial is None or not _same_rows(start, trial):
+                return None
+            if not np.allclose(told.coefficient, trial.coefficient, rtol=_SAME):
                 return None
         return linear
 
@@ -164,14 +165,8 @@ class AddedTerms:
     @property
     def anew(self) -> bool:
         """True where the effect adds elements whose terms are not linear in its sizes, and does no more than that."""
-        if self.at(_unknowns(self.sizes, 1.0)) is None:
-            return False
-
-        def added(unknowns: Real) -> Terms:
-            found = self.at(unknowns)
-            return assemble_terms(self.host, self.dependent, part_key) if found is None else found
-
-        return LinearTerms.found(self.sizes, added) is None
+        adds = self.at(_unknowns(self.sizes, _begin(self.sizes))) is not None
+        return adds and LinearTerms.found(self.sizes, self.at) is None
 
 
 @dataclass(frozen=True)
@@ -213,10 +208,10 @@ class EffectTerms:
         ends = np.cumsum([0, *(len(one.sizes) for one in each)])
         anew = frozenset(i for i, one in enumerate(each) if one.anew)
         at = [k for i in range(len(each)) if i not in anew for k in range(ends[i], ends[i + 1])]
-        whole = _unknowns(sizes, 1.0)
+        begin = _begin(sizes)
 
         def without(unknowns: Real) -> Terms:
-            x = whole.copy()
+            x = _unknowns(sizes, begin)
             x[at] = unknowns
             return assembled(x, anew)
 
@@ -225,8 +220,8 @@ class EffectTerms:
             return None
         added = tuple((each[i], slice(int(ends[i]), int(ends[i + 1]))) for i in sorted(anew))
         terms = cls(linear, np.array(at, np.int64), added)
-        told = all(terms._is(assembled(x, frozenset()), x) for x in (_unknowns(sizes, f) for f in _TRIED))
-        return terms if told else None
+        tried = [_unknowns(sizes, share * begin) for share in _TRIED]
+        return terms if all(terms._is(assembled(x, frozenset()), x) for x in tried) else None
 
     def at(self, unknowns: Real) -> Terms | None:
         """Terms at all sizes' unknowns, (k,); None where an effect does more than add elements there."""
@@ -246,8 +241,8 @@ class EffectTerms:
         dense, skew = (np.zeros((len(unknowns), *a.shape[1:])) for a in own)
         dense[self.places], skew[self.places] = own
         for one, place in self.added:
-            at = partial(one.at, dofs=self.linear.start.dofs)
-            found = differences(at, unknowns[place], logs)
+            dofs = self.linear.start.dofs
+            found = differences(partial(one.at, dofs=dofs), unknowns[place], logs, len(dofs))
             if found is None:
                 return None
             dense[place], skew[place] = found
@@ -264,12 +259,8 @@ class EffectTerms:
         return bool(np.all(np.abs(own - its) <= _SAME * largest))
 
 
-def differences(terms: Callable[[Real], Terms | None], unknowns: Real, logs: Real) -> Slopes | None:
-    """Derivatives of the matrices by small differences of sizes' unknowns, (k,), where rows are as they are."""
-    here = terms(unknowns)
-    if here is None:
-        return None
-    n = len(here.dofs)
+def differences(terms: Callable[[Real], Terms | None], unknowns: Real, logs: Real, n: int) -> Slopes | None:
+    """Derivatives of n × n matrices by small differences of sizes' unknowns, (k,); 0 where a size changes n."""
     dense, skew = np.zeros((len(unknowns), 4, n, n)), np.zeros((len(unknowns), n, n))
     for i in range(len(unknowns)):
         ends = []
@@ -293,10 +284,9 @@ def _begin(sizes: Sequence[SizeMap]) -> Real:
     )
 
 
-def _unknowns(sizes: Sequence[SizeMap], factor: float) -> Real:
-    """Unknowns at `factor` times these coordinates, (k,)."""
-    begin = factor * _begin(sizes)
-    return np.array([s.of_coordinate(float(z)) for s, z in zip(sizes, begin, strict=True)])
+def _unknowns(sizes: Sequence[SizeMap], coordinates: Real) -> Real:
+    """Unknowns at sizes' coordinates, (k,)."""
+    return np.array([s.of_coordinate(float(z)) for s, z in zip(sizes, coordinates, strict=True)])
 
 
 def _same_rows(a: Terms, b: Terms) -> bool:

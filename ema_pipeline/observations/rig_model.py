@@ -192,13 +192,13 @@ class RigModel:
         shape: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Derivatives of the matrices by effects' unknowns and geometry: exact where they are linear in the sizes."""
+        n = len(terms.dofs)
         if not len(shape):
-            n = len(terms.dofs)
             return np.zeros((0, 4, n, n)), np.zeros((0, n, n))
         known = self._effect_terms(configuration)
         slopes = None if known is None else known.slopes_at(shape, logs)
         if slopes is None:
-            slopes = differences(partial(self._assembled, configuration), shape, logs)
+            slopes = differences(partial(self._assembled, configuration), shape, logs, n)
         assert slopes is not None  # whatever is assembled has terms
         return slopes
 
