@@ -325,19 +325,28 @@ class HitData:
 
     @cached_property
     def product_gains(self) -> Complex:
-        """What is read of every mode where the product of two motions drives it, (2, m, 2m, 2m).
+        """What is read of every mode where the product of two motions drives it, (pairs, 2m).
 
-        By the exponents of the two among `exponents`; see `hit_reading.drive_gains`.
+        Of `motion_pairs`, in both orders; poles, then sizes of all modes. See `hit_reading.drive_gains`.
         """
         together = self.exponents[:, None] + self.exponents - self.window_decay
         poles = self.exponents[: len(self.modes)] - self.window_decay
-        return np.stack(
+        gains = np.stack(
             [
                 drive_gains(together, pole, np.arange(low, high, self.line_hz))
                 for pole, (low, high) in zip(poles, self.band_hz.tolist(), strict=True)
             ],
             axis=1,
         )
+        a, b = self.motion_pairs
+        in_both_orders = gains[..., a, b] + np.where(a == b, 0.0, gains[..., b, a])
+        return np.ascontiguousarray(in_both_orders.reshape(-1, len(a)).T)
+
+    @property
+    def motion_pairs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Numbers of two among `exponents`, every pair once, two of (pairs,)."""
+        first, second = np.triu_indices(len(self.exponents))
+        return first, second
 
     @cached_property
     def exponents(self) -> Complex:

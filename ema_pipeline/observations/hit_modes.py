@@ -119,7 +119,8 @@ def changed_modes(data: HitData, elements: Sequence[Nonlinear], linear: Linear) 
         stiffness = _settled_stiffness(element, motion, offsets[i], linear.elsewhere[i])
         force = (stiffness.reshape(paths[i].shape) * paths[i])[..., group_of]
         ratio = np.where(still, 0.0, force / np.where(still, 1.0, z))
-        total += 0.5j * linear.along[i] / omega * np.einsum("htm,ktm->khm", ratio, weight)
+        weighed = (ratio.transpose(2, 0, 1) @ weight.transpose(2, 1, 0)).transpose(2, 1, 0)
+        total += 0.5j * linear.along[i] / omega * weighed
         total += _of_products(data, element, linear.along[i], linear.displacement)
     return total
 
@@ -130,7 +131,9 @@ def _of_products(data: HitData, element: Nonlinear, along: Real, displacement: C
         return np.zeros((2, *displacement.shape), complex)
     stretch = 0.5 * along * displacement
     both = np.concatenate([stretch, stretch.conj()], axis=1)
-    driven = np.einsum("ha,krab,hb->khr", both, data.product_gains, both, optimize=True)
+    a, b = data.motion_pairs
+    driven = (both[:, a] * both[:, b]) @ data.product_gains
+    driven = driven.reshape(len(both), 2, -1).transpose(1, 0, 2)
     still = np.abs(displacement) < _STILL
     relative = np.where(still, 0.0, driven / np.where(still, 1.0, displacement))
     return np.asarray(1j * element.law[1] * along / data.omega * relative, np.complex128)
