@@ -9,13 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.score import Marginal
-from ema_pipeline.inference import Posterior, Scatter, tails
-from ema_pipeline.inference.problem import in_blocks
-from ema_pipeline.inference.scatter import determined
-
-_STEPS = 12
-_LONGEST = 1.5
-"""Steps, and longest step in the logarithm of a variance, of the search for the scatters that take a change up."""
+from ema_pipeline.inference import CostOverScatters, Posterior, Scatter
 
 
 @dataclass(frozen=True)
@@ -59,21 +53,7 @@ class ExpectedGain:
 
     def __init__(self, fit: Posterior, scatters: Mapping[str, Scatter], marginal: Marginal) -> None:
         self.marginal = marginal
-        learned = [s for n, s in scatters.items() if s.spread and n in fit.scatters]
-        self._governed = [fit.unknowns.governed(s.name)[marginal.kept] for s in learned]
-        self._shares = np.zeros((marginal.count, len(learned)))
-        for k, s in enumerate(learned):
-            self._shares[:, k] = fit.residuals.share.get(s.name, 0.0)
-        self._fixed = 1 - np.sum(self._shares, axis=1)
-        self._square, self._block = fit.expected_squares(), fit.residuals.block
-        self._unweighted = fit.residuals.weight**-2.0
-        of_residuals = np.sum(self._shares, axis=0)
-        self._values = np.array([determined(fit, s.name) for s in learned]) - of_residuals
-        now = np.array([np.log(fit.scatters[s.name]) for s in learned])
-        self._above = np.where(of_residuals > 0, now - np.log([s.default for s in learned]), 0.0)
-        self._weight = np.array([s.spread**-2.0 for s in learned])
-        self._widest = np.maximum(2 * (np.log([s.most * s.default for s in learned]) - now), 0.0)
-        self._least = self._cost(np.zeros(marginal.count), np.zeros(len(learned)))
+        self._cost = CostOverScatters(fit, scatters, marginal.kept)
 
     def change(self, residuals: NDArray[np.float64]) -> Change:
         """Of a change of the residuals, (m,)."""
@@ -82,48 +62,11 @@ class ExpectedGain:
     def of_moved(self, left: NDArray[np.float64], moved: NDArray[np.float64]) -> Change:
         """Of weighted residuals, (m,), and of unknowns that have moved by so many prior σ, (n,)."""
         square = moved**2
-        unknowns = np.array([np.sum(square[at]) for at in self._governed])
+        unknowns = np.array([np.sum(square[at]) for at in self._cost.governed])
         return Change(left**2, unknowns, max(float(np.sum(square) - np.sum(unknowns)), 0.0))
 
     def of(self, change: Change, factor: float = 1.0) -> float:
         """Expected gain where the squared distance is `factor` times as large."""
-        cost = self._cost(factor * change.residuals, factor * change.unknowns) - self._least
-        return 0.5 * factor * change.rest + max(cost, 0.0)
-
-    def _cost(self, residuals: NDArray[np.float64], unknowns: NDArray[np.float64]) -> float:
-        """Least cost of squared distances over all values of the scatters, in units of log evidence.
-
-        With t = (scatter/now)², a residual's variance is 1 - share + share·t times what it is now, summed over the
-        scatters; that of unknowns is t.
-        """
-        square, count, of_unknowns = self._square + residuals, self._values, self._values + unknowns
-        log, diagonal = np.zeros(len(self._weight)), np.arange(len(self._weight))
-        best = np.inf
-        for _ in range(_STEPS):
-            added = self._shares * np.exp(log)
-            variance = self._fixed + np.sum(added, axis=1)
-            above = self._above + 0.5 * log
-            inverse = np.exp(-log)
-            own = square / variance
-            of_residuals, factor = self._density(own)
-            cost = of_residuals + 0.5 * float(
-                np.sum(np.log(variance))
-                + np.sum(count * log + of_unknowns * inverse + self._weight * above**2)
-            )
-            best = min(best, cost)
-            part, excess = added / variance[:, None], own * factor
-            slope = 0.5 * (part.T @ (1 - excess) + count - of_unknowns * inverse + self._weight * above)
-            curvature = 0.5 * (part.T @ (np.maximum(excess, 1.0)[:, None] * part))
-            curvature[diagonal, diagonal] += 0.5 * of_unknowns * inverse + 0.25 * self._weight
-            step = np.clip(-np.linalg.solve(curvature, slope), -_LONGEST, _LONGEST)
-            log = np.minimum(log + step, self._widest)
-        return best
-
-    def _density(self, square: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """-log density of residuals by weighted squares, up to a constant, and its slope over a Gaussian's, (m,)."""
-        factor = np.ones(len(square))
-        if self._block is None:
-            return 0.5 * float(np.sum(square)), factor
-        inside, blocks = self._block >= 0, in_blocks(square * self._unweighted, self._block)
-        factor[inside] = self._unweighted[inside] * tails.weight(*blocks)[self._block[inside]]
-        return 0.5 * float(np.sum(square[~inside])) + float(np.sum(tails.cost(*blocks))), factor
+        return 0.5 * factor * change.rest + self._cost.more(
+            factor * change.residuals, factor * change.unknowns
+        )

@@ -10,12 +10,14 @@ from ema_pipeline.inference.maximise import anneal, descend
 from ema_pipeline.inference.posterior import ERROR_LIMIT, Posterior, error_limit
 from ema_pipeline.inference.problem import Apart, Problem, Residuals, same_matching
 from ema_pipeline.inference.scatter import Scatter, learn, widened
+from ema_pipeline.inference.scatter_cost import CostOverScatters
 from ema_pipeline.inference.unknowns import Unknowns, joined
 
 __all__ = [
     "ERROR_LIMIT",
     "Apart",
     "Bounded",
+    "CostOverScatters",
     "Posterior",
     "Problem",
     "Residuals",

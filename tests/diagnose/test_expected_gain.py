@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 
 from ema_pipeline.diagnose.expected_gain import ExpectedGain
 from ema_pipeline.diagnose.score import Marginal
@@ -105,3 +106,33 @@ def test_a_shape_that_is_far_off_gains_as_its_density_has_tails() -> None:
     costs = [float(np.sum(tails.cost(*in_blocks(squares, block)))) for squares in (before, after)]
     assert gains.of(change) == pytest.approx(0.5 * change.rest + costs[1] - costs[0])
     assert gains.of(change) < 0.2 * 0.5 * change.total
+
+
+@pytest.mark.parametrize("size", [0.02, 0.1, 0.4])
+def test_the_cost_is_the_least_within_the_range_of_the_scatters(size: float) -> None:
+    """Against another search, of a scatter that would fall below its least and of one that has reached its most."""
+    narrow = {
+        "noise": Scatter("noise", "factor on the stated noise", 1.0, 0.5, least=0.4),
+        "repeat": Scatter("repeat", "from test to test", 0.05, 1.5, most=1.5),
+    }
+    found = fitted(quiet(), narrow)
+    assert found.scatters["noise"] == pytest.approx(0.4, rel=0.02)
+    gains = ExpectedGain(found, narrow, Marginal(Fit(Model(), found)))
+    change = gains.change(size * np.eye(ROWS)[20] / 0.1)
+    at = {n: np.log([s.least * s.default or 1e-9, s.most * s.default]) for n, s in narrow.items()}
+
+    def least(residuals: Array, unknowns: Array) -> float:
+        def cost(logs: Array) -> float:
+            now = dict(zip(narrow, np.exp(logs), strict=True))
+            t = [(now[n] / found.scatters[n]) ** 2 for n in narrow]
+            share = [found.residuals.share[n] for n in narrow]
+            variance = share[0] * t[0] + share[1] * t[1]
+            square = found.expected_squares() + residuals
+            prior = sum((np.log(now[n] / s.default) / s.spread) ** 2 for n, s in narrow.items())
+            return 0.5 * float(np.sum(np.log(variance) + square / variance) + prior)
+
+        begin = [np.log(found.scatters[n]) for n in narrow]
+        return float(minimize(cost, begin, bounds=list(at.values()), method="Nelder-Mead").fun)
+
+    true = least(change.residuals, change.unknowns) - least(np.zeros(ROWS), np.zeros(2))
+    assert gains.of(change) == pytest.approx(0.5 * change.rest + true, abs=0.1)
