@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from ema_pipeline.diagnose.heldout import NOTHING_HELD_OUT, HeldOut, held_out_of_each
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import Named, named, sizes_of
-from ema_pipeline.diagnose.ranked import Ranked, Ranking
+from ema_pipeline.diagnose.ranked import BEATEN, Ranked, Ranking
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
@@ -28,6 +29,7 @@ PREDICTED_WORSE = "held-out data are predicted worse when it is added"
 MAY_BE_ZERO = "its size is within"
 BETTER_CONTRADICTED = "an effect that explains the data better is contradicted by held-out data"
 BETTER_DOUBTED = "a similar effect that gains more evidence cannot be claimed"
+FAR_BEHIND = "another effect that can be claimed explains the data far better"
 BY_OTHERS = (BETTER_CONTRADICTED, BETTER_DOUBTED)
 """What is held against an effect for the sake of others alone."""
 
@@ -116,6 +118,7 @@ def judge(
     ranked: Ranked,
     settings: DiagnoseSettings,
     nothing: float = 0.0,
+    better: Sequence[Judged] = (),
 ) -> Judged:
     """Hold one finalist against all conditions of a claim.
 
@@ -127,6 +130,8 @@ def judge(
     settings : DiagnoseSettings
     nothing : float
         Probability that nothing is missing.
+    better : sequence of Judged
+        What was judged before it. Far behind one that is claimed nothing is held out for it.
     """
     name = named(ranked.hypothesis, ranked.fit)
     gain = ranked.gain + name.advantage
@@ -135,7 +140,8 @@ def judge(
     before, after, left = NOTHING_HELD_OUT, NOTHING_HELD_OUT, np.inf
     linearisation = doubtful_evidence(observations, ranked.hypothesis, settings)
     needed = settings.claim + evidence_beyond(observations, ranked.hypothesis, settings)
-    doubt = _weak(observations, ranked, gain, needed, settings, nothing)
+    beaten = any(j.claimed and gain < j.gain - BEATEN for j in better)
+    doubt = FAR_BEHIND if beaten else _weak(observations, ranked, gain, needed, settings, nothing)
     if not doubt:
         asked = observations.holding_out_explained(base.posterior.residuals)
         before, after = held_out_of_each(asked, [base, mended], settings.processes)

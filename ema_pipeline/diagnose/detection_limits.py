@@ -44,6 +44,8 @@ _FURTHEST = 10.0
 """Prior σ beyond which no unknown follows: what that made of the model would be none."""
 _NEARER = (0.4, 0.15, 0.05)
 """Shares of a size that are tried where it is too large to be followed."""
+_NEARLY = -1.0
+"""Logarithm of what is gained there over what is asked, from which the limit is sought about that size."""
 _SLOPES = (0.3, 5.0)
 """Least and largest power of the size with which the gain is taken to grow."""
 _DECADES = 4
@@ -81,11 +83,13 @@ def detection_limits(
     asked = [h for h in asked if h.shown_by_less or not h.size_cannot_be_zero]
     more = any(h.label not in had for h in asked)
     whole = ExpectedGain(fit.posterior, observations.scatters, Marginal(fit)) if more else None
+    models = {h.label: fit.model if h.label in had else fit.model.plus(h.placed, h.scales) for h in asked}
+    slopes = _slopes(observations, fit, models, [h for h in asked if h.label not in had])
 
     def limit(hypothesis: Hypothesis) -> float | None:
-        own = hypothesis.label in had
-        model = fit.model if own else fit.model.plus(hypothesis.placed, hypothesis.scales)
-        shown = _Shown.of(observations, fit, model, hypothesis, None if own else whole)
+        label = hypothesis.label
+        gains = None if label in had else whole
+        shown = _Shown.of(observations, fit, models[label], hypothesis, gains, slopes.get(label))
         if shown is None:
             return None
         sigmas = sigmas_asked(observations, hypothesis, settings)
@@ -95,6 +99,19 @@ def detection_limits(
 
     found = zip(asked, spread(limit, asked, settings.processes), strict=True)
     return tuple(_under(name, h, size) for h, size in found if size is not None for name in h.names)
+
+
+def _slopes(
+    observations: Observations, fit: Fit, models: Mapping[str, Model], further: Sequence[Hypothesis]
+) -> dict[str, NDArray[np.float64]]:
+    """How the first sizes of effects that a fit does not have change its residuals, (m,) each, by label.
+
+    All at once; without those that have to be calculated one by one.
+    """
+    able = [h for h in further if not h.shown_by_less]
+    problems = [models[h.label].problem(observations) for h in able]
+    found = fit.model.problem(observations).first_order(fit.posterior, problems)
+    return {h.label: slopes[:, 0] for h, slopes in zip(able, found, strict=True) if slopes is not None}
 
 
 def _under(name: Name, hypothesis: Hypothesis, unknown: float) -> DetectionLimit:
@@ -122,7 +139,9 @@ class _Shown:
         Position of its first size.
     scatters : dict of str to float
     before : Residuals
-        At `null`, with derivatives.
+        At `null`.
+    slope : ndarray, (m,)
+        Their derivatives by the size.
     gains : ExpectedGain
     std : float
         1 σ of the unknown at zero; of an effect that depends on the amplitude, as its usual size shows it.
@@ -136,6 +155,7 @@ class _Shown:
     at: int
     scatters: Mapping[str, float]
     before: Residuals
+    slope: NDArray[np.float64]
     gains: ExpectedGain
     std: float
     linear: bool
@@ -148,10 +168,12 @@ class _Shown:
         model: Model,
         hypothesis: Hypothesis,
         gains: ExpectedGain | None,
+        slope: NDArray[np.float64] | None = None,
     ) -> _Shown | None:
         """Of one hypothesis; None where these data carry no information on it.
 
-        `gains` is None for an effect that the fit has already: its gain is that on top of the rig without it.
+        `gains` is None for an effect that the fit has already: its gain is that on top of the rig without it. `slope`
+        is that of the fit's residuals by its size, where it is known.
         """
         problem, scatters = model.problem(observations), fit.posterior.scatters
         null = transferred(fit.posterior, problem.unknowns)
@@ -159,16 +181,19 @@ class _Shown:
         at = problem.unknowns.index[hypothesis.placed.parameter_name(size)]
         null[at] = problem.unknowns.upper[at] if hypothesis.shown_by_less else 0.0
         null = problem.uninterpolated(null)
-        before = problem.residuals(null, scatters, matching=fit.posterior.residuals.matching)
+        before = fit.posterior.residuals
+        if slope is None:
+            before = problem.residuals(null, scatters, matching=before.matching)
         if gains is None:
             if _not_there(before, fit.posterior, at):
                 before = problem.residuals(null, scatters)
             gains = _without(observations, fit, hypothesis, null, before)
         if len(before.values) != gains.marginal.count or not np.all(np.isfinite(before.values)):
             return None
+        slope = before.jacobian[:, at] if slope is None else slope
         if hypothesis.shown_by_less:
-            return cls(problem, null, at, scatters, before, gains, 1.0, linear=False)
-        linear, usual = hypothesis.placed.effect.linear, before.jacobian[:, at]
+            return cls(problem, null, at, scatters, before, slope, gains, 1.0, linear=False)
+        linear, usual = hypothesis.placed.effect.linear, slope
         if not linear:
             x = null.copy()
             x[at] = 1.0
@@ -177,7 +202,11 @@ class _Shown:
                 usual - before.values if len(usual) == len(before.values) else np.zeros_like(before.values)
             )
         std = 1 / np.sqrt(max(gains.change(np.nan_to_num(usual)).total, 1e-300))
-        return None if std > UNSEEN else cls(problem, null, at, scatters, before, gains, float(std), linear)
+        return (
+            None
+            if std > UNSEEN
+            else cls(problem, null, at, scatters, before, slope, gains, float(std), linear)
+        )
 
     def least(self, gain: float, sigmas: float) -> float:
         """Unknown of the least size that gains so much in nine tests of ten; infinite where none does."""
@@ -204,11 +233,11 @@ class _Shown:
         return unknown if unknown < most or off >= 0 else float("inf")
 
     def _nearer(self, unknown: float, off: float, gain: float, sigmas: float) -> tuple[float, float]:
-        """A smaller unknown that surely shows, if there is one, where of the first one that is not known."""
-        for smaller in unknown * np.array(_NEARER):
-            above, sure = self._above(float(smaller), gain, sigmas)
+        """A smaller unknown that surely shows, or nearly, if there is one, where of the first one that is not known."""
+        for share in _NEARER:
+            above, sure = self._above(share * unknown, gain, sigmas)
             if sure:
-                return (float(smaller), above) if above > 0 else (unknown, off)
+                return (share * unknown, above) if above > _NEARLY else (unknown, off)
         return unknown, off
 
     def largest(self, gain: float) -> float:
@@ -274,7 +303,7 @@ class _Shown:
         """How far a size moves the predictions to first order, all unknowns with it, and how it changes the residuals;
         None for these where modes have other partners there.
         """
-        first = self.gains.change(self.before.jacobian[:, self.at] * unknown)
+        first = self.gains.change(self.slope * unknown)
         x = self.null.copy()
         x[self.at] = unknown
         x = self.problem.uninterpolated(x)

@@ -15,12 +15,14 @@ from ema_pipeline.diagnose.ranked import Ranked, Ranking, unbeaten
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, Model, learned, refined, transferred, unbent
+from ema_pipeline.observations.fitting import Fit, Model, learned, met, refined, transferred, unbent
 from ema_pipeline.observations.mode_rows import SHAPE
 from ema_pipeline.processes import spread
 
 FINALISTS = 5
-"""Hypotheses for which the scatters are learned."""
+"""Hypotheses for which the scatters are learned, if they gain anything at wide ones."""
+_AT_LEAST = 3
+"""The same whatever they gain."""
 PROMISING = 1.0
 """Log evidence that is something: a third of what a claim needs."""
 _FURTHER = 3
@@ -29,6 +31,8 @@ _TAKEN_UP = 2.0
 """Learned scatter of shapes over its least, from which it may hold what is missing."""
 _BETTER = 0.05
 """Log evidence by which a start must lead a fit to be followed."""
+_ALIKE = 0.05
+"""Difference of the logarithms of two learned scatters that says nothing."""
 
 
 _WORTH = 2
@@ -122,7 +126,11 @@ def finals_of(
     `known` are fits of the base model whose scatters are learned already. Fits are led past barriers, but for those
     that begin beside a base model that was.
     """
-    best, rest = order[:FINALISTS], order[FINALISTS:]
+    best = [
+        *order[:_AT_LEAST],
+        *(o for o in order[_AT_LEAST:FINALISTS] if o[1].log_evidence > base.log_evidence),
+    ]
+    rest = order[len(best) :]
     near = unbeaten(best, lambda pair: pair[1].log_evidence)
     far = best[len(near) :]
     finalists = [*near, *promising]
@@ -176,15 +184,20 @@ def _crossed(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Po
     for source in sources:
         if source is fit:
             continue
-        scatters = source.posterior.scatters
-        start = refined(
-            observations, fit.model, known_from(observations, fit.model, source, fit), scatters, steps=10
-        )
+        scatters, x = source.posterior.scatters, known_from(observations, fit.model, source, fit)
+        if met(best.posterior, x) and _alike(best.posterior.scatters, scatters):
+            continue
+        start = refined(observations, fit.model, x, scatters, steps=10)
         here = refined(observations, fit.model, best.posterior.x, scatters, steps=4)
         if start.log_evidence > here.log_evidence + _BETTER:
             again = learned(observations, start, past_barriers=False)
             best = max(best, again, key=lambda f: f.log_evidence)
     return best.posterior
+
+
+def _alike(some: Mapping[str, float], others: Mapping[str, float]) -> bool:
+    """True where no scatter is another one."""
+    return all(abs(np.log(others[name] / value)) < _ALIKE for name, value in some.items())
 
 
 def known_from(observations: Observations, model: Model, source: Fit, sizes: Fit) -> np.ndarray:

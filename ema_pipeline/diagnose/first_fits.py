@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.score import Score
-from ema_pipeline.inference import Posterior, Unknowns
+from ema_pipeline.inference import Posterior, Residuals, Unknowns
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import (
     QUICK,
@@ -97,7 +97,11 @@ def tried_sizes(
     hypotheses: Sequence[Hypothesis],
     processes: int | None,
 ) -> dict[str, Tried]:
-    """What gives modes without a partner one: the best size of every effect of one size that makes matters better."""
+    """What gives modes without a partner one: the best size of every effect of one size that does, and makes matters
+    better.
+
+    Of a mode that no effect of any size makes, no hypothesis says what it is: a record's own, say.
+    """
     asked = [
         h
         for h in hypotheses
@@ -114,16 +118,19 @@ def tried_sizes(
         begin = _unbent(unknowns, transferred(base.posterior, unknowns))
         at = unknowns.index[_first_size(hypothesis)]
 
-        def cost(size: float) -> float:
+        def at_size(size: float) -> Residuals | None:
             x = begin.copy()
             x[at] = size
             if unknowns.clipped(x)[at] != size:
-                return np.inf
-            return problem.residuals(x, scatters, heat=_GRID_HEAT, derivatives=False).cost
+                return None
+            return problem.residuals(x, scatters, heat=_GRID_HEAT, derivatives=False)
 
-        costs = {size: cost(size) for size in (*_SIZES, *problem.tuned(begin, unknowns.names[at]))}
-        size = min(costs, key=lambda one: costs[one])
-        return Tried(size, cost(0.0) - costs[size])
+        sizes = [*_SIZES, *problem.tuned(begin, unknowns.names[at])]
+        found = [(size, at_size(size)) for size in sizes]
+        without = at_size(0.0)
+        fewer = [(r.cost, size) for size, r in found if r and without and r.penalty < without.penalty]
+        least, size = min(fewer, default=(np.inf, 0.0))
+        return Tried(size, without.cost - least if without else -np.inf)
 
     found = zip(asked, spread(best, asked, processes), strict=True)
     return {h.label: tried for h, tried in found if tried.gain > 0}

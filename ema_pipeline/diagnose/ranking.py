@@ -10,8 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
-import numpy as np
-
 from ema_pipeline.diagnose.finals import (
     FINALISTS,
     PROMISING,
@@ -36,7 +34,7 @@ from ema_pipeline.diagnose.score import UNSEEN, Score, scores
 from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, freed, learned, refined, unbent
+from ema_pipeline.observations.fitting import Fit, freed, learned, met, refined, unbent
 from ema_pipeline.processes import spread
 
 Progress = Callable[[float, str], None]
@@ -98,12 +96,17 @@ def rank(
     """
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
     promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models, processes)}
-    residuals = base.posterior.residuals
-    lost = residuals.penalty > (unpaired if residuals.unexplained <= MOST_UNEXPLAINED else 0.0)
-    tried = tried_sizes(observations, base, models, hypotheses, processes) if lost else {}
+    residuals, fails = base.posterior.residuals, base.posterior.error > _EXPLAINED
+    # a model that explains all that was surely measured needs no search for the sake of other modes
+    explains = not fails and not residuals.unexplained
+    alone = not explains and residuals.penalty > (
+        unpaired if residuals.unexplained <= MOST_UNEXPLAINED else 0.0
+    )
+    tried = tried_sizes(observations, base, models, hypotheses, processes) if alone else {}
+    lost = bool(tried) or residuals.unexplained > 0
     unseen = {label for label, score in promise.items() if score.std >= UNSEEN} - set(tried)
     hypotheses = [h for h in hypotheses if h.label not in unseen]
-    stuck = lost or base.posterior.error > _EXPLAINED
+    stuck = lost or fails
     settled = None if stuck else learned(observations, base)
     near = settled is not None and unbent(observations, settled)
     pairing = _best_tried(tried, _PAIRING)
@@ -250,7 +253,7 @@ def _better(observations: Observations, sources: Sequence[Fit], steps: int, fit:
     best = fit
     for source in sources:
         x = known_from(observations, fit.model, source, fit)
-        if np.allclose(x, best.posterior.x):
+        if met(best.posterior, x):
             continue
         again = refined(observations, fit.model, x, steps=steps)
         if again.log_evidence > best.log_evidence:

@@ -87,8 +87,10 @@ def round_of(
     """Judge the finalists of a ranking, beside `found` effects."""
     ranking = _with_relief(observations, ranking, settings)
     nothing = probabilities(ranking, hypotheses, settings, found)[NOTHING]
-    finals = [r for r in ranking.ranked if r.final]
-    judged = [judge(observations, ranking, r, settings, nothing) for r in finals]
+    judged: list[Judged] = []
+    for one in ranking.ranked:
+        if one.final:
+            judged.append(judge(observations, ranking, one, settings, nothing, judged))
     return weighed(ranking, sorted(judged, key=lambda j: -j.gain), hypotheses, settings, found)
 
 

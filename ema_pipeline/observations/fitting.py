@@ -45,7 +45,7 @@ _RACED = 2
 _RACE_STEPS = 8
 """Steps from each of several good starts, after which the best goes on."""
 _MET = 0.05
-"""Distance, in units of the prior 1 σ, below which two fits have met while they are still hot."""
+"""Distance, in units of the prior 1 σ, up to which two fits have met."""
 
 _FREE_STARTS = (0.0, 1.2, -1.2)
 """Start values of the logarithm of a free parameter: a decade to either side of its nominal value is reached."""
@@ -155,6 +155,11 @@ def wide(observations: Observations) -> dict[str, float]:
     return {name: s.start for name, s in observations.scatters.items()}
 
 
+def met(found: Posterior, x: NDArray[np.float64]) -> bool:
+    """True where a fit has come to `x`, so that it would end in the same place from there."""
+    return bool(np.all(np.abs(found.x - x) <= _MET * found.prior_std))
+
+
 def annealed(
     observations: Observations,
     model: Model,
@@ -166,11 +171,10 @@ def annealed(
     After the first steps of annealing only the most promising starts that did not meet go on.
     """
     problem, scatters = model.problem(observations), wide(observations)
-    std = problem.unknowns.prior_std(scatters)
     hot = [anneal(problem, scatters, x, schedule[:1]) for x in starts]
     kept: list[Posterior] = []
     for found in sorted(hot, key=lambda p: p.cost):
-        if len(kept) < _RACED and all(np.max(np.abs(found.x - k.x) / std) > _MET for k in kept):
+        if len(kept) < _RACED and not any(met(found, k.x) for k in kept):
             kept.append(found)
     cooled = [Fit(model, anneal(problem, scatters, p.x, schedule[1:])) for p in kept]
     return max(cooled, key=lambda f: f.log_evidence)

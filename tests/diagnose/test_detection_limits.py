@@ -8,15 +8,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from imperfect_modes import NORMAL, chain, chain_modes
 from scipy.optimize import least_squares
 
-from ema_pipeline.diagnose.detection_limits import _Shown, _under
+from ema_pipeline.diagnose.detection_limits import _Shown, _slopes, _under
 from ema_pipeline.diagnose.expected_gain import ExpectedGain
-from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
+from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, list_hypotheses
 from ema_pipeline.diagnose.score import Marginal
 from ema_pipeline.effects.base import PlacedEffect
-from ema_pipeline.effects.library import effect_library
+from ema_pipeline.effects.library import effect_library, shipped_effects
 from ema_pipeline.inference import Posterior, Residuals, Unknowns
+from ema_pipeline.observations.fitting import Model, fit_base, learned
+from ema_pipeline.observations.mode_data import prepare
+from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.size_map import LOG_STD
 
 GAIN = 20.0
@@ -31,7 +35,7 @@ def shown(monkeypatch: pytest.MonkeyPatch, edge: float, asked: list[float]) -> _
 
     monkeypatch.setattr(_Shown, "_gained_at", gained)
     nothing: Any = None
-    return _Shown(nothing, np.zeros(1), 0, {}, nothing, nothing, 1.0, linear=False)
+    return _Shown(nothing, np.zeros(1), 0, {}, nothing, nothing, nothing, 1.0, linear=False)
 
 
 @pytest.mark.parametrize("edge", [2.9, 0.3, -3.0])
@@ -107,7 +111,8 @@ def bent(curve: float) -> _Shown:
     marginal = Marginal(fit, without="damper@m")  # type: ignore[arg-type]
     nothing = Residuals(np.zeros(4), np.zeros((4, 3)))
     gains = ExpectedGain(Posterior(problem.unknowns, x, {}, nothing), {}, marginal)
-    return _Shown(problem, x, 2, {}, before, gains, 1.0, linear=True)  # type: ignore[arg-type]
+    slope = before.jacobian[:, 2]
+    return _Shown(problem, x, 2, {}, before, slope, gains, 1.0, linear=True)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("size", [0.8, 1.5, 2.0])
@@ -127,9 +132,44 @@ def test_everything_follows_an_effect_as_it_would_in_a_fit(size: float) -> None:
     assert best > 1.5 * first.total  # to first order nearly nothing is left
 
 
+@pytest.mark.parametrize(("above", "expected"), [(-0.9, (0.8, -0.9)), (-1.1, (2.0, -3.0)), (0.4, (0.8, 0.4))])
+def test_a_limit_is_sought_about_the_largest_size_that_can_be_followed(
+    monkeypatch: pytest.MonkeyPatch, above: float, expected: tuple[float, float]
+) -> None:
+    """Where it nearly shows: else a limit is one size or twenty times that by a rounding of its gain."""
+    asked: list[float] = []
+
+    def gained(self: Any, unknown: float, gain: float, sigmas: float) -> tuple[float, bool]:
+        asked.append(unknown)
+        return (above, True) if unknown < 1.0 else (-2.0, False)
+
+    monkeypatch.setattr(_Shown, "_above", gained)
+    assert bent(0.0)._nearer(2.0, -3.0, GAIN, 2.0) == pytest.approx(expected)
+    assert asked == pytest.approx([0.8])
+
+
+@pytest.mark.parametrize("label", ["spring@m2-m3", "mass@m3", "damper@m3", "sensor_mass@m2"])
+def test_slopes_of_all_effects_at_once_are_those_of_each(label: str) -> None:
+    rig = chain()
+    observations = ModeObservations(rig, [prepare(m) for m in chain_modes(3, NORMAL).values()])
+    fit = learned(observations, fit_base(observations, Model()))
+    hypotheses = list_hypotheses(rig, shipped_effects())
+    (asked,) = (h for h in hypotheses if label in [n.label for n in h.names])
+    models = {asked.label: Model().plus(asked.placed, asked.scales)}
+    at_once = _slopes(observations, fit, models, [asked])
+    gains = ExpectedGain(fit.posterior, observations.scatters, Marginal(fit))
+    given = (observations, fit, models[asked.label], asked, gains)
+    alone, shared = _Shown.of(*given), _Shown.of(*given, at_once[asked.label])
+    assert alone is not None
+    assert shared is not None
+    np.testing.assert_allclose(shared.slope, alone.slope, atol=1e-6 * np.max(np.abs(alone.slope)))
+    np.testing.assert_allclose(shared.before.values, alone.before.values, atol=1e-9)
+    assert shared.least(9.0, 2.0) == pytest.approx(alone.least(9.0, 2.0), rel=1e-5)
+
+
 def test_the_limit_of_an_effect_that_bends_predictions_is_that_of_the_fit_and_not_of_first_order() -> None:
     one = bent(0.0)
-    one = replace(one, std=float(1 / np.sqrt(one.gains.change(one.before.jacobian[:, 2]).total)))
+    one = replace(one, std=float(1 / np.sqrt(one.gains.change(one.slope).total)))
     limit, wanted = one.least(5.0, 2.0), one._wanted(5.0, 2.0, 1 / one.std)
     followed = one._followed(*one._moved(limit)[1:])  # type: ignore[arg-type]
     assert followed is not None

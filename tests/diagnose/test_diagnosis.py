@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
@@ -20,8 +20,9 @@ from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
 from ema_pipeline.diagnose.claims import judge, left_of_close_modes
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.explained import at_usual_scatters
-from ema_pipeline.diagnose.heldout import held_out
+from ema_pipeline.diagnose.heldout import HeldOut, held_out
 from ema_pipeline.diagnose.hypotheses import list_hypotheses
+from ema_pipeline.diagnose.ranked import BEATEN
 from ema_pipeline.diagnose.ranking import rank
 from ema_pipeline.diagnose.rungs import make_ladder
 from ema_pipeline.diagnose.settings import DiagnoseSettings
@@ -37,6 +38,7 @@ from ema_pipeline.rigs.planetary import planetary
 from ema_pipeline.rigs.types import Rig
 
 diagnosis: Any = import_module("ema_pipeline.diagnose.diagnosis")
+claims: Any = import_module("ema_pipeline.diagnose.claims")
 SETTINGS = DiagnoseSettings(processes=1)
 GENERIC = {k: v for k, v in shipped_effects().items() if k in ("spring", "mass", "damper")}
 MESHES = {k: shipped_effects()[k] for k in ("mesh_stiffness_loss", "planet_bearing_mistune", "shaft_torsion")}
@@ -368,6 +370,28 @@ def test_an_effect_is_claimed_only_where_everything_supports_it() -> None:
     again = judge(observations, ranking, judged[0].ranked, dearer)
     assert (judged[0].needed, again.needed) == (SETTINGS.claim, 50.0)
     assert again.doubt.endswith("is below 50")
+
+
+def test_nothing_is_held_out_for_what_is_far_behind_a_claim(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[object] = []
+
+    def held_out_of_each(observations: object, fits: Sequence[Fit], processes: object) -> list[HeldOut]:
+        asked.append(fits)
+        return [HeldOut(1.0, 0.0)] * len(fits)
+
+    monkeypatch.setattr(claims, "held_out_of_each", held_out_of_each)
+    rig = chain()
+    observations = observed(rig, chain_modes(11, NORMAL, added(Mass, 2.0, {"m3.z": 1.0})))
+    ranking = rank(observations, fit_base(observations, Model()), list_hypotheses(rig, GENERIC), 1)
+    first = judge(observations, ranking, ranking.ranked[0], SETTINGS)
+    second = replace(ranking.ranked[1], gain=first.gain - BEATEN - 0.1)
+    assert first.claimed
+    assert len(asked) == 1
+    for doubt, beaten in (("", True), ("doubted", False)):
+        judged = judge(observations, ranking, second, SETTINGS, better=[replace(first, doubt=doubt)])
+        assert (judged.doubt == claims.FAR_BEHIND) is beaten
+    near = replace(second, gain=first.gain - BEATEN + 0.1)
+    assert judge(observations, ranking, near, SETTINGS, better=[first]).doubt != claims.FAR_BEHIND
 
 
 def test_learned_scatters_are_those_of_the_laboratory() -> None:

@@ -40,7 +40,7 @@ def test_finalists_are_learned_and_compared_with_the_learned_base(monkeypatch: p
 
     monkeypatch.setattr(finals, "_learned", learn)
     monkeypatch.setattr(finals, "_crossed", cross)
-    found = found_of(a=60.0, b=50.0, c=-139.0, d=-140.0, e=-141.0, f=-150.0, g=-200.0)
+    found = found_of(a=215.0, b=205.0, c=16.0, d=15.0, e=14.0, f=5.0, g=-45.0)
     promising = [(hypothesis("g"), fit("g", 20.0))]
     told = finals_of(NO_DATA, fit("base", 10.0), list(found.values()), promising, 1, (), True)
     asked = [(name, True) for name in ("base", "a", "b", "c", "d", "g")]
@@ -50,15 +50,24 @@ def test_finalists_are_learned_and_compared_with_the_learned_base(monkeypatch: p
     assert told.base.log_evidence == 14.0
     gains = {r.hypothesis.label: (r.gain, r.final) for r in told.ranked}
     assert list(gains) == ["b", "a", "g", "c", "d", "e", "f"]
-    assert gains["b"] == (50.0 + 30.0 - 14.0, True)
+    assert gains["b"] == (205.0 + 30.0 - 14.0, True)
     assert gains["g"] == (9.0, True)
-    assert gains["e"] == (-141.0 + 3.0 - 14.0, True)
-    assert gains["f"] == (-160.0, False)
+    assert gains["e"] == (14.0 + 3.0 - 14.0, True)
+    assert gains["f"] == (-5.0, False)
     close = list(found_of(a=13.0, b=12.8, c=12.6, d=12.4, e=12.0, f=11.5).values())
     told = finals_of(NO_DATA, fit("base", 10.0), close, [], 1, (), True)
     last = told.ranked[-1]  # at wide scatters ahead of nothing by 1.5, no finalist by 1
     assert (last.hypothesis.label, last.gain) == ("f", told.ranked[-2].gain) == ("f", 1.0)
     assert finals_of(NO_DATA, fit("base", 10.0), [], [], 1, (), True).ranked == ()
+
+
+def test_scatters_are_learned_of_three_and_of_what_gains_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finals, "_learned", lambda o, past_barriers, one: one.posterior)
+    monkeypatch.setattr(finals, "_crossed", lambda o, sources, one: one.posterior)
+    for evidence, expected in ((10.0, "abc"), (8.05, "abcd")):
+        order = list(found_of(a=9.0, b=8.5, c=8.2, d=8.1, e=8.0).values())
+        told = finals_of(NO_DATA, fit("base", evidence), order, [], 1, (), True)
+        assert [r.hypothesis.label for r in told.ranked if r.final] == list(expected)
 
 
 def test_beside_a_base_model_that_explains_the_data_nothing_is_led_past_its_barriers_again(
@@ -117,6 +126,14 @@ def test_scatters_are_learned_again_where_another_start_leads_further(
     assert asked == [0.7]
     value = 4.0
     assert _crossed(NO_DATA, [elsewhere], mine) is mine.posterior
+    # what has met it, at the same scatters, is no other start
+    value, near = 9.0, with_model("b", Parabola(("part",), ()), [0.14])
+    asked.clear()
+    assert _crossed(NO_DATA, [near], mine) is mine.posterior
+    near.posterior.scatters["part"] = 1.06
+    monkeypatch.setattr(finals, "refined", lambda o, model, x, scatters, steps: fit("a", steps, x=x))
+    monkeypatch.setattr(finals, "learned", lambda o, one, past_barriers: fit("a", 9.0))
+    assert _crossed(NO_DATA, [near], mine).log_evidence == 9.0
 
 
 def test_what_promises_most_beside_learned_scatters_begins_at_its_size(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from written_fits import NO_DATA, Parabola, fit, hypothesis, score, with_model
+from written_fits import NO_DATA, PENALTY, Parabola, fit, hypothesis, score, with_model
 
 from ema_pipeline.diagnose import first_fits
 from ema_pipeline.diagnose.first_fits import (
@@ -137,27 +137,28 @@ def test_the_first_fit_begins_at_half_the_size_that_its_score_tells(
 
 
 def test_sizes_far_out_and_small_ones_are_tried_where_modes_have_no_partner() -> None:
-    """Of effects of one linear size, with parts that are not bent; the best that makes matters better is kept."""
+    """Of effects of one linear size, with parts that are not bent; the best that gives a mode a partner is kept."""
     base = with_model("base", Parabola(("part",), ()), [0.4])
 
-    def asked(label: str, at: float, **kind: Any) -> Any:
+    def asked(label: str, at: float, partner_from: float = np.inf, **kind: Any) -> Any:
         names = ("part", f"{label}.s1")
-        problem = Parabola(names, names[1:], np.array([0.0, at]))
+        problem = Parabola(names, names[1:], np.array([0.0, at]), partner_from)
         problem.unknowns = Unknowns(names, np.ones(2), ("part", ""), np.full(2, -20.0), np.full(2, 9.0))
         models[label] = with_model(label, problem, [0.0, 0.0]).model
         return hypothesis(label, **kind)
 
     models: dict[str, Any] = {}
-    law = asked("law", 8.0)
+    law = asked("law", 8.0, 3.0)
     law.placed.effect.linear = False
     everything = [
-        asked("far", 7.0),
-        asked("below", -14.0),
-        asked("beyond its range", 20.0),
-        asked("none", 0.001),
-        asked("small", 0.025),
-        asked("two", 8.0, sizes=2),
-        asked("extends", 8.0, extends=True),
+        asked("far", 7.0, 3.0),
+        asked("below", -14.0, -5.0),
+        asked("beyond its range", 20.0, 3.0),
+        asked("makes matters worse", 0.0, 15.0),
+        asked("gives none a partner", 8.0),
+        asked("small", 0.025, 0.02),
+        asked("two", 8.0, 3.0, sizes=2),
+        asked("extends", 8.0, 3.0, extends=True),
         law,
     ]
     data: Any = SimpleNamespace(scatters={})
@@ -168,13 +169,13 @@ def test_sizes_far_out_and_small_ones_are_tried_where_modes_have_no_partner() ->
         "below": -15.0,
         "beyond its range": 8.0,
     }
-    assert found["far"].gain == pytest.approx(0.5 * (7.0**2 - 1.0) / 30.0**2)
+    assert found["far"].gain == pytest.approx(PENALTY + 0.5 * (7.0**2 - 1.0) / 30.0**2)
 
 
 def test_sizes_that_give_modes_a_partner_are_tried_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
     base = with_model("base", Parabola(("part",), ()), [0.4])
     names = ("part", "a.s1")
-    problem = Parabola(names, names[1:], np.array([0.0, 5.8]))
+    problem = Parabola(names, names[1:], np.array([0.0, 5.8]), 5.0)
     problem.unknowns = Unknowns(names, np.ones(2), ("part", ""), np.full(2, -20.0), np.full(2, 9.0))
     asked: list[Any] = []
 

@@ -392,7 +392,8 @@ def test_the_search_for_a_limit_ends_at_the_size_that_gains_enough(
     def least(most: float, gain: float = 8.0, sigmas: float = 2.0) -> float:
         problem = SimpleNamespace(unknowns=SimpleNamespace(upper=np.array([most])))
         nothing = Residuals(np.zeros(0), np.zeros((0, 1)))
-        return Power(problem, np.zeros(1), 0, {}, nothing, None, sigma, linear).least(gain, sigmas)  # type: ignore[arg-type]
+        slope = np.zeros(0)
+        return Power(problem, np.zeros(1), 0, {}, nothing, slope, None, sigma, linear).least(gain, sigmas)  # type: ignore[arg-type]
 
     assert least(np.inf) == pytest.approx(true, rel=0.12 / power)
     assert least(0.5 * true) == (np.inf if 0.5**power < 0.9 else 0.5 * true)

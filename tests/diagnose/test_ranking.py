@@ -137,7 +137,7 @@ def test_the_base_and_the_best_begin_again_at_what_the_best_of_all_knows(
 
 def test_a_better_fit_is_kept_and_the_same_start_not_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
     mine = with_model("a", Parabola(("part", "a.s"), ("a.s",)), [0.1, 0.3], 5.0)
-    sources = [with_model("b", Parabola(("part",), ()), [v]) for v in (0.1, 0.5, 0.7)]
+    sources = [with_model("b", Parabola(("part",), ()), [v]) for v in (0.14, 0.5, 0.7)]
     tried = []
 
     def refined(observations: object, model: Any, x: np.ndarray, steps: int) -> Fit:
@@ -263,6 +263,7 @@ def test_those_behind_in_short_fits_are_annealed_where_a_size_leads_modes_to_par
 
 def test_near_the_base_model_scores_tell_where_fits_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = Stages(monkeypatch)
+    stages.base.posterior.residuals.unexplained = 0  # type: ignore[misc]
     base, order, promising, known = stages.rank(stages.base, further=2, unpaired=2.0)
     assert base is stages.base
     assert known == ["learned"]
@@ -283,6 +284,7 @@ def test_what_promises_beside_narrow_shapes_is_a_finalist_whatever_was_one_befor
 ) -> None:
     """What is missing may have been learned as scatter."""
     stages = Stages(monkeypatch, bent)
+    stages.base.posterior.residuals.unexplained = 0  # type: ignore[misc]
     monkeypatch.setattr(ranking, "narrowed", lambda o, settled: fit("narrow", 0.0))
     _, _, promising, known = stages.rank(stages.base, further=2, unpaired=2.0)
     assert promising == ["more"] * (1 if bent else 2)
@@ -291,18 +293,30 @@ def test_what_promises_beside_narrow_shapes_is_a_finalist_whatever_was_one_befor
 
 
 @pytest.mark.parametrize(
-    ("error", "unpaired", "bent"), [(1.31, 2.0, False), (1.3, 1.9, False), (1.3, 2.0, True)]
+    ("error", "unexplained", "unpaired", "bent", "searched"),
+    [
+        (1.31, 0, 2.0, False, False),
+        (1.31, 0, 1.9, False, True),
+        (1.3, 1, 1.9, False, True),
+        (1.3, 1, 2.0, False, False),
+        (1.3, 0, 1.9, True, False),  # all that was surely measured is explained
+    ],
 )
 def test_a_base_model_that_is_stuck_or_bent_is_begun_again_with_all(
-    monkeypatch: pytest.MonkeyPatch, error: float, unpaired: float, bent: bool
+    monkeypatch: pytest.MonkeyPatch,
+    error: float,
+    unexplained: int,
+    unpaired: float,
+    bent: bool,
+    searched: bool,
 ) -> None:
     stages = Stages(monkeypatch, bent)
     stages.base.posterior.error = error  # type: ignore[misc]
+    stages.base.posterior.residuals.unexplained = unexplained  # type: ignore[misc]
     _, _, promising, known = stages.rank(stages.base, further=2, unpaired=unpaired)
     assert promising == []
     assert known == ["past barriers"]
     assert stages.asked[0][2] is False
-    lost = unpaired < 2.0
-    assert stages.asked[1] == ("first" if bent else f"annealed{int(lost)}", "a", 6)
+    assert stages.asked[1] == ("first" if bent else f"annealed{int(searched)}", "a", 6)
     assert stages.short
     assert stages.asked[7:] == [("again", 6, 5), ("freed", 6), ("again", 6, 12)]

@@ -420,7 +420,7 @@ def test_a_linearised_effect_is_one_of_many_where_a_better_one_is_doubted(
 
 
 def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (1.0, 9.0, 4.0, 2.0)]
+    ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (9.0, 4.0, 2.0, 1.0)]
     told = {NOTHING: 0.1}
     monkeypatch.setattr(rounds, "_with_relief", lambda o, ranking, settings: ranking)
     monkeypatch.setattr(
@@ -431,8 +431,9 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(
         rounds,
         "judge",
-        lambda o, ranking, r, settings, nothing: SimpleNamespace(
+        lambda o, ranking, r, settings, nothing, better: SimpleNamespace(
             gain=r.gain,
+            better=[j.gain for j in better],
             nothing=nothing,
             doubt="",
             claimed=True,
@@ -446,6 +447,7 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
     data: Any = None
     found = rounds.round_of(data, given, [], SETTINGS, 2)
     assert [(j.gain, j.nothing) for j in found.judged] == [(4.0, 0.1), (2.0, 0.1), (1.0, 0.1)]  # type: ignore[attr-defined]
+    assert [len(j.better) for j in found.judged] == [0, 1, 2]  # type: ignore[attr-defined]
     assert found.probabilities == told | {"n": 2}
     assert found.ranking is given
 
@@ -503,7 +505,7 @@ def judged_round(
     monkeypatch.setattr(
         rounds,
         "judge",
-        lambda o, ranking, r, settings, nothing: Judged(
+        lambda o, ranking, r, settings, nothing, better: Judged(
             r,
             names[r.hypothesis.label],
             r.gain,

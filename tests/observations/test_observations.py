@@ -386,7 +386,7 @@ def test_the_two_best_starts_that_did_not_meet_are_annealed_to_the_end(
     def anneal(problem: object, scatters: object, x: tuple[float, ...], schedule: object) -> SimpleNamespace:
         asked.append((tuple(x), schedule))
         cost = 10.0 * x[0] + x[1]
-        return SimpleNamespace(x=np.array(x), cost=cost, log_evidence=cost)
+        return SimpleNamespace(x=np.array(x), cost=cost, log_evidence=cost, prior_std=unknowns.std)
 
     monkeypatch.setattr(fitting, "anneal", anneal)
     starts = [(0.9, 0.0), (0.2, 0.0), (0.25, 0.0), (0.24, 0.4), (0.2, 0.6), (0.3, 0.0)]

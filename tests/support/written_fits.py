@@ -10,6 +10,8 @@ import numpy as np
 from ema_pipeline.inference import Residuals, Unknowns
 from ema_pipeline.observations.fitting import Fit
 
+PENALTY = 6.0
+"""Cost of a mode without a partner."""
 NO_DATA: Any = SimpleNamespace(linearised=False)
 
 
@@ -44,24 +46,36 @@ def score(gain: float, size: float = 0.0) -> Any:
 
 
 def fit(name: str, log_evidence: float, **more: Any) -> Fit:
-    posterior: Any = SimpleNamespace(log_evidence=log_evidence, scatters={}, x=np.zeros(1), **more)
+    known = {"scatters": {}, "x": np.zeros(1)} | more
+    posterior: Any = SimpleNamespace(log_evidence=log_evidence, **known)
     model: Any = SimpleNamespace(name=name)
     return Fit(model, posterior)
 
 
 class Parabola:
-    """A problem of two unknowns and sizes, the residual their distance from a point."""
+    """A problem of two unknowns and sizes, the residual their distance from a point.
 
-    def __init__(self, names: tuple[str, ...], sizes: tuple[str, ...], at: np.ndarray | None = None) -> None:
+    Where there is a `partner_from`, a mode has no partner until the last size is that or further out.
+    """
+
+    def __init__(
+        self,
+        names: tuple[str, ...],
+        sizes: tuple[str, ...],
+        at: np.ndarray | None = None,
+        partner_from: float | None = None,
+    ) -> None:
         scatter = tuple("part" if n.startswith("part") else "" for n in names)
         n = len(names)
         self.unknowns = Unknowns(names, np.ones(n), scatter, np.full(n, -1.9), np.full(n, 1.9))
         self.sizes = dict.fromkeys(sizes)
-        self.at = np.zeros(n) if at is None else at
+        self.at, self.partner_from = np.zeros(n) if at is None else at, partner_from
 
     def residuals(self, x: np.ndarray, scatters: object, **how: Any) -> Residuals:
         assert how == {"heat": 30.0, "derivatives": False}
-        return Residuals((x - self.at) / how["heat"], np.zeros((0, len(x))))
+        lost = self.partner_from is not None and x[-1] / self.partner_from < 1
+        penalty = PENALTY if lost else 0.0
+        return Residuals((x - self.at) / how["heat"], np.zeros((0, len(x))), penalty=penalty)
 
     def begun(self, x: np.ndarray, scatters: object) -> list[np.ndarray]:
         return []
@@ -75,7 +89,12 @@ class Parabola:
 
 def with_model(name: str, problem: Parabola, x: list[float], log_evidence: float = 0.0) -> Fit:
     posterior: Any = SimpleNamespace(
-        unknowns=problem.unknowns, x=np.array(x), log_evidence=log_evidence, scatters={"part": 1.0}, cost=5.0
+        unknowns=problem.unknowns,
+        x=np.array(x),
+        log_evidence=log_evidence,
+        scatters={"part": 1.0},
+        cost=5.0,
+        prior_std=np.ones(len(x)),
     )
     model: Any = SimpleNamespace(name=name, problem=lambda observations: problem)
     return Fit(model, posterior)
