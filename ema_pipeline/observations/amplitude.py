@@ -29,6 +29,7 @@ from ema_pipeline.observations.hit_residuals import (
     HitResiduals,
     hit_scatters,
 )
+from ema_pipeline.observations.hit_rows import HitRows
 from ema_pipeline.observations.mode_problem import ModeProblem
 from ema_pipeline.observations.mode_rows import SHAPE, stacked
 from ema_pipeline.observations.modes import ModeObservations
@@ -102,6 +103,12 @@ class AmplitudeObservations:
         )
         shape = dataclasses.replace(modes.scatters[SHAPE], least=_LEAST_SHAPE)
         self.scatters = {**modes.scatters, SHAPE: shape, **hit_scatters()}
+
+    @cached_property
+    def rows(self) -> tuple[HitRows, ...]:
+        """What is compared of the hits of every configuration."""
+        defaults = {name: s.default for name, s in self.scatters.items()}
+        return tuple(HitRows(h, defaults) for h in self.hits)
 
     def suited(self, effects: Sequence[PlacedEffect]) -> AmplitudeObservations:
         """See `Observations`."""
@@ -405,7 +412,7 @@ class AmplitudeProblem(EffectProblem):
         pairs = given[1] if isinstance(given[1], tuple) else (None,) * len(self.observations.hits)
         wide = np.pad(modes.jacobian, ((0, 0), (0, len(x) - count)))
         parts = [dataclasses.replace(modes, values=modes.values.copy(), jacobian=wide)]
-        for data, pair in zip(self.observations.hits, pairs, strict=True):
+        for k, (data, pair) in enumerate(zip(self.observations.hits, pairs, strict=True)):
             given_pair = pair if isinstance(pair, np.ndarray) else None
             paired = self.modes.paired(data.reference, x[:count], given_pair)
             if paired is None:
@@ -416,7 +423,7 @@ class AmplitudeProblem(EffectProblem):
             if self.observations.of_modes:
                 parts.append(Residuals(np.zeros(0), np.zeros((0, len(x))), matching=paired.match))
             else:
-                parts.append(hits.residuals(derivatives, by_sizes))
+                parts.append(hits.residuals(self.observations.rows[k], derivatives, by_sizes))
         return dataclasses.replace(
             stacked(parts, len(x)),
             matching=(modes.matching, tuple(p.matching for p in parts[1:])),

@@ -13,7 +13,6 @@ from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from ema_pipeline.inference import Residuals, Scatter
@@ -23,6 +22,13 @@ from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.observations.hit_data import HitData
 from ema_pipeline.observations.hit_march import Driven, marched_modes, parts
 from ema_pipeline.observations.hit_modes import Linear, changed_modes
+from ema_pipeline.observations.hit_rows import (
+    HIT_AIM,
+    HIT_DAMPING,
+    HIT_FREQUENCY,
+    HIT_QUADRATURE,
+    HitRows,
+)
 from ema_pipeline.observations.mode_problem import Paired
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE
 from ema_pipeline.observations.parts import DAMPING_SCATTER, part_key
@@ -31,10 +37,6 @@ if TYPE_CHECKING:
     from ema_pipeline.observations.amplitude import AmplitudeProblem
 
 DRIFT = "drift"
-HIT_FREQUENCY = "hit_frequency_scatter"
-HIT_DAMPING = "hit_damping_scatter"
-HIT_QUADRATURE = "hit_quadrature_scatter"
-HIT_AIM = "hit_aim_scatter"
 LINEARISATION = "linearisation"
 AMPLITUDE = "amplitude of all modes"
 """Unknown by whose exponential all amplitudes are multiplied."""
@@ -72,41 +74,29 @@ class HitResiduals:
         self.scale = problem.unknowns.index[AMPLITUDE]
         self.drift, self.left = problem.positions(data)
 
-    def residuals(self, derivatives: bool, by_sizes: bool = True) -> Residuals:
-        """Frequencies, damping ratios, then sizes in quadrature, each without its mean over a sheet's hits.
-
-        Of a size only the imaginary part counts, over the mean of the sheet: a hit that is aimed otherwise than the
-        others changes the real one. Its arc tangent counts: how far a weak mode is driven beyond what it was at first
-        no calculation tells well.
-        """
-        data, x = self.data, self.x
-        used = data.used  # whether the model has the mode or not: to leave it out must not pay
-        hit, mode = np.nonzero(used)
-        predicted = self.predicted
+    def residuals(self, rows: HitRows, derivatives: bool, by_sizes: bool = True) -> Residuals:
+        """All `rows` of the data, each without its mean over a sheet's hits."""
+        x, predicted, hit, mode = self.x, self.predicted, rows.hit, rows.mode
         told, slope = np.arctan(predicted[2]), np.ones_like(predicted)
         slope[2] = 1 / (1 + predicted[2] ** 2)
+        values = rows.measured - np.stack([*predicted[:2], told])[:, hit, mode]
+        values[0] -= x[self.drift][hit]
+        at_unit = rows.whitening(self.scatters, self.heat)
         jacobian = np.zeros((3 * len(hit) if derivatives else 0, len(x)))
         if derivatives:
             for i, change in self.changes.items() if by_sizes else ():
                 jacobian[:, i] = -(slope * change)[:, hit, mode].ravel()
-            rows = np.arange(3 * len(hit))
-            jacobian[rows[: len(hit)], self.drift[hit]] = -1.0
-            jacobian[rows, np.tile(self.left[hit, mode], 3)] = -(slope * predicted)[:, hit, mode].ravel()
-        log_damping = np.log(np.where(used, data.damping, 1.0))
-        turned = data.relative_size.imag
-        difference = np.stack([data.log_frequency, log_damping, np.arctan(turned)])
-        difference -= np.stack([*predicted[:2], told])
-        difference[0] -= x[self.drift][:, None]
-        values = difference[:, hit, mode]
-        damping_std = data.damping_std / np.where(used, data.damping, 1.0)
-        bent = 1 / (1 + turned**2)
-        own = np.stack([data.log_frequency_std, damping_std, data.quadrature_std * bent])
-        in_decay_rates = np.stack([data.usual_damping, *np.ones((2, len(data.modes)))])[:, None]
-        own = np.hypot(own, data.linearised_std * in_decay_rates) * data.irregularity
-        # not bent by the arc tangent: where aim alone excites a mode, its phase is anything
-        otherwise = data.otherwise * in_decay_rates
-        return self._whitened(
-            values, own[:, hit, mode], otherwise[:, hit, mode], jacobian, data.sheet[hit], mode
+            row = np.arange(3 * len(hit))
+            jacobian[row[: len(hit)], self.drift[hit]] = -1.0
+            jacobian[row, np.tile(self.left[hit, mode], 3)] = -(slope * predicted)[:, hit, mode].ravel()
+            jacobian = at_unit.whitened(jacobian)
+        return Residuals(
+            at_unit.whitened(values.ravel()),
+            jacobian,
+            at_unit.share,
+            at_unit.log_scale,
+            matching=self.paired.match,
+            projected=rows.groups,
         )
 
     @cached_property
@@ -267,53 +257,3 @@ class HitResiduals:
             return element
         factor = float(np.exp(row @ x[: len(row)]))
         return dataclasses.replace(element, stiffness=element.stiffness * factor)
-
-    def _whitened(
-        self,
-        values: NDArray[np.float64],
-        own: NDArray[np.float64],
-        otherwise: NDArray[np.float64],
-        jacobian: NDArray[np.float64],
-        sheet: NDArray[np.int64],
-        mode: NDArray[np.int64],
-    ) -> Residuals:
-        """Rows at unit σ, without what all hits of a sheet share: its mean has no prior."""
-        count = values.shape[1]
-        kinds = HIT_FREQUENCY, HIT_DAMPING, HIT_QUADRATURE
-        of = np.repeat(np.arange(len(kinds)), count)
-        aimed = otherwise.ravel()
-
-        def added(sizes: Mapping[str, float]) -> dict[str, NDArray[np.float64]]:
-            own_kind = {k: np.where(of == i, sizes[k], 0.0) ** 2 for i, k in enumerate(kinds)}
-            return {**own_kind, HIT_AIM: (sizes[HIT_AIM] * aimed) ** 2}
-
-        now = added(self.scatters)
-        usual = added({k: s.default for k, s in self.problem.observations.scatters.items()})
-        noise = own.ravel() ** 2
-        variance, default = noise + sum(now.values()), noise + sum(usual.values())
-        group = sheet * (int(mode.max(initial=0)) + 1) + mode
-        of_kind = np.arange(len(kinds))[:, None] * (group.max(initial=0) + 1)
-        group = np.unique(of_kind + group, return_inverse=True)[1].ravel()
-        sigma = np.sqrt(variance) * self.heat
-        r = _without_mean(values.ravel() / sigma, 1 / sigma, group)
-        j = jacobian
-        if len(jacobian):
-            j = _without_mean(jacobian / sigma[:, None], 1 / sigma, group)
-        scale = 0.5 * float(np.sum(np.log(variance / default)))
-        scale += 0.5 * float(
-            np.sum(np.log(np.bincount(group, 1 / variance) / np.bincount(group, 1 / default)))
-        )
-        share = {k: v / variance for k, v in now.items()}
-        groups = int(group.max(initial=-1)) + 1
-        return Residuals(r, j, share, scale, matching=self.paired.match, projected=groups)
-
-
-def _without_mean(
-    rows: NDArray[np.float64], weight: NDArray[np.float64], group: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Whitened rows less their weighted mean in every group."""
-    norm = np.bincount(group, weight**2)
-    flat = rows.reshape(len(rows), -1)
-    summed = scipy.sparse.csr_array((weight, (group, np.arange(len(rows)))), shape=(len(norm), len(rows)))
-    total = np.asarray(summed.dot(flat))
-    return np.asarray((flat - weight[:, None] * (total / norm[:, None])[group]).reshape(rows.shape))

@@ -41,6 +41,7 @@ from ema_pipeline.observations.hit_data import HitData, comparable
 from ema_pipeline.observations.hit_modes import Linear, changed_modes
 from ema_pipeline.observations.hit_reading import momentary_weights
 from ema_pipeline.observations.hit_residuals import AMPLITUDE
+from ema_pipeline.observations.hit_rows import HIT_AIM
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.size_map import LOG_STD, SizeMap
@@ -293,6 +294,28 @@ def test_a_generic_effect_is_asked_twice_the_evidence_that_linearisation_may_lea
     # hits in x alone do not tell the two apart, whatever is asked of them
     for hypothesis in (own, generic):
         assert claims.doubtful_evidence(observations, hypothesis, SETTINGS) == SETTINGS.linearised_claim
+
+
+def test_rows_of_hits_are_compared_without_what_a_sheet_shares() -> None:
+    """Against least squares with a free mean for every mode, kind and sheet; kept at each set of scatters."""
+    observations = synthetic()
+    (rows,), random = observations.rows, np.random.default_rng(5)
+    scatters = {name: s.start for name, s in observations.scatters.items()}
+    one = rows.whitening(scatters, 2.0)
+    assert rows.whitening(dict(scatters), 2.0) is one
+    assert rows.whitening(scatters, 1.0) is not one
+    assert rows.whitening(scatters | {HIT_AIM: 0.3}, 2.0) is not one
+    np.testing.assert_allclose(one.sigma, 2.0 * rows.whitening(scatters, 1.0).sigma)
+    assert rows.groups == 3 * len(STRUCK) * len(COORDINATES) == len(one.norm)
+    values = random.standard_normal(len(one.sigma)) * one.sigma
+    design = np.eye(rows.groups)[one.group] / one.sigma[:, None]
+    left = values / one.sigma - design @ np.linalg.lstsq(design, values / one.sigma, rcond=None)[0]
+    np.testing.assert_allclose(one.whitened(values), left, atol=1e-9)
+    both = np.stack([values, values + random.standard_normal(rows.groups)[one.group]], axis=1)
+    np.testing.assert_allclose(
+        one.whitened(both), np.stack([left, left], axis=1), atol=1e-6 * np.max(1 / one.sigma)
+    )
+    assert np.all(sum(one.share.values()) < 1)
 
 
 def test_a_scale_of_amplitudes_that_is_hardly_known_does_not_take_a_size_to_nothing(
