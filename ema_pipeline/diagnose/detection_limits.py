@@ -202,11 +202,9 @@ class _Shown:
                 usual - before.values if len(usual) == len(before.values) else np.zeros_like(before.values)
             )
         std = 1 / np.sqrt(max(gains.change(np.nan_to_num(usual)).total, 1e-300))
-        return (
-            None
-            if std > UNSEEN
-            else cls(problem, null, at, scatters, before, slope, gains, float(std), linear)
-        )
+        if std > UNSEEN:
+            return None
+        return cls(problem, null, at, scatters, before, slope, gains, float(std), linear)
 
     def least(self, gain: float, sigmas: float) -> float:
         """Unknown of the least size that gains so much in nine tests of ten; infinite where none does."""

@@ -97,10 +97,9 @@ def tried_sizes(
     hypotheses: Sequence[Hypothesis],
     processes: int | None,
 ) -> dict[str, Tried]:
-    """What gives modes without a partner one: the best size of every effect of one size that does, and makes matters
-    better.
+    """What gives modes without a partner one: the best such size of every effect of one size that makes matters better.
 
-    Of a mode that no effect of any size makes, no hypothesis says what it is: a record's own, say.
+    As good as a partner is that a mode of the model, which was not measured, leaves the band.
     """
     asked = [
         h
@@ -125,12 +124,13 @@ def tried_sizes(
                 return None
             return problem.residuals(x, scatters, heat=_GRID_HEAT, derivatives=False)
 
-        sizes = [*_SIZES, *problem.tuned(begin, unknowns.names[at])]
-        found = [(size, at_size(size)) for size in sizes]
         without = at_size(0.0)
-        fewer = [(r.cost, size) for size, r in found if r and without and r.penalty < without.penalty]
+        if without is None:  # it has no size of nothing
+            return Tried(0.0, -np.inf)
+        found = [(size, at_size(size)) for size in (*_SIZES, *problem.tuned(begin, unknowns.names[at]))]
+        fewer = [(r.cost, size) for size, r in found if r is not None and r.penalty < without.penalty]
         least, size = min(fewer, default=(np.inf, 0.0))
-        return Tried(size, without.cost - least if without else -np.inf)
+        return Tried(size, without.cost - least)
 
     found = zip(asked, spread(best, asked, processes), strict=True)
     return {h.label: tried for h, tried in found if tried.gain > 0}
