@@ -16,7 +16,7 @@ from ema_pipeline.diagnose.claims import evidence_beyond, sigmas_asked
 from ema_pipeline.diagnose.expected_gain import Change, ExpectedGain
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
 from ema_pipeline.diagnose.probability import needed
-from ema_pipeline.diagnose.score import UNSEEN, Marginal
+from ema_pipeline.diagnose.score import UNSEEN, Marginal, first_order_changes
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import DetectionLimit
 from ema_pipeline.effects.base import effect_of
@@ -84,12 +84,13 @@ def detection_limits(
     more = any(h.label not in had for h in asked)
     whole = ExpectedGain(fit.posterior, observations.scatters, Marginal(fit)) if more else None
     models = {h.label: fit.model if h.label in had else fit.model.plus(h.placed, h.scales) for h in asked}
-    slopes = _slopes(observations, fit, models, [h for h in asked if h.label not in had])
+    added = [h for h in asked if h.label not in had and not h.shown_by_less]
+    changes = first_order_changes(observations, fit, added, models)
 
     def limit(hypothesis: Hypothesis) -> float | None:
         label = hypothesis.label
         gains = None if label in had else whole
-        shown = _Shown.of(observations, fit, models[label], hypothesis, gains, slopes.get(label))
+        shown = _Shown.of(observations, fit, models[label], hypothesis, gains, changes.get(label))
         if shown is None:
             return None
         sigmas = sigmas_asked(observations, hypothesis, settings)
@@ -99,19 +100,6 @@ def detection_limits(
 
     found = zip(asked, spread(limit, asked, settings.processes), strict=True)
     return tuple(_under(name, h, size) for h, size in found if size is not None for name in h.names)
-
-
-def _slopes(
-    observations: Observations, fit: Fit, models: Mapping[str, Model], further: Sequence[Hypothesis]
-) -> dict[str, NDArray[np.float64]]:
-    """How the first sizes of effects that a fit does not have change its residuals, (m,) each, by label.
-
-    All at once; without those that have to be calculated one by one.
-    """
-    able = [h for h in further if not h.shown_by_less]
-    problems = [models[h.label].problem(observations) for h in able]
-    found = fit.model.problem(observations).first_order(fit.posterior, problems)
-    return {h.label: slopes[:, 0] for h, slopes in zip(able, found, strict=True) if slopes is not None}
 
 
 def _under(name: Name, hypothesis: Hypothesis, unknown: float) -> DetectionLimit:
@@ -168,12 +156,12 @@ class _Shown:
         model: Model,
         hypothesis: Hypothesis,
         gains: ExpectedGain | None,
-        slope: NDArray[np.float64] | None = None,
+        changes: NDArray[np.float64] | None = None,
     ) -> _Shown | None:
         """Of one hypothesis; None where these data carry no information on it.
 
-        `gains` is None for an effect that the fit has already: its gain is that on top of the rig without it. `slope`
-        is that of the fit's residuals by its size, where it is known.
+        `gains` is None for an effect that the fit has already: its gain is that on top of the rig without it.
+        `changes` are those of the fit's residuals by its sizes, (m, k), where they are known.
         """
         problem, scatters = model.problem(observations), fit.posterior.scatters
         null = transferred(fit.posterior, problem.unknowns)
@@ -182,7 +170,7 @@ class _Shown:
         null[at] = problem.unknowns.upper[at] if hypothesis.shown_by_less else 0.0
         null = problem.uninterpolated(null)
         before = fit.posterior.residuals
-        if slope is None:
+        if changes is None:
             before = problem.residuals(null, scatters, matching=before.matching)
         if gains is None:
             if _not_there(before, fit.posterior, at):
@@ -190,7 +178,7 @@ class _Shown:
             gains = _without(observations, fit, hypothesis, null, before)
         if len(before.values) != gains.marginal.count or not np.all(np.isfinite(before.values)):
             return None
-        slope = before.jacobian[:, at] if slope is None else slope
+        slope = before.jacobian[:, at] if changes is None else changes[:, 0]
         if hypothesis.shown_by_less:
             return cls(problem, null, at, scatters, before, slope, gains, 1.0, linear=False)
         linear, usual = hypothesis.placed.effect.linear, slope

@@ -103,7 +103,7 @@ def rank(
         unpaired if residuals.unexplained <= MOST_UNEXPLAINED else 0.0
     )
     tried = tried_sizes(observations, base, models, hypotheses, processes) if alone else {}
-    lost = bool(tried) or residuals.unexplained > 0
+    lost = bool(tried) or (alone and residuals.unexplained > 0)
     unseen = {label for label, score in promise.items() if score.std >= UNSEEN} - set(tried)
     hypotheses = [h for h in hypotheses if h.label not in unseen]
     stuck = lost or fails

@@ -88,9 +88,8 @@ def round_of(
     ranking = _with_relief(observations, ranking, settings)
     nothing = probabilities(ranking, hypotheses, settings, found)[NOTHING]
     judged: list[Judged] = []
-    for one in ranking.ranked:
-        if one.final:
-            judged.append(judge(observations, ranking, one, settings, nothing, judged))
+    for one in sorted((r for r in ranking.ranked if r.final), key=lambda r: -r.gain):
+        judged.append(judge(observations, ranking, one, settings, nothing, judged))
     return weighed(ranking, sorted(judged, key=lambda j: -j.gain), hypotheses, settings, found)
 
 

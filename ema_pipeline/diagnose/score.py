@@ -64,17 +64,13 @@ def scores(
     """
     marginal = Marginal(base)
     asked = [h for h in hypotheses if not h.size_cannot_be_zero]
-    problems = {
-        h.label: (models[h.label] if models else base.model.plus(h.placed, h.scales)).problem(observations)
-        for h in asked
-    }
-    at_once = base.model.problem(observations).first_order(base.posterior, [problems[h.label] for h in asked])
-    columns = {h.label: found for h, found in zip(asked, at_once, strict=True) if found is not None}
+    models = models or {h.label: base.model.plus(h.placed, h.scales) for h in asked}
+    columns = first_order_changes(observations, base, asked, models)
 
     def told(hypothesis: Hypothesis) -> tuple[NDArray[np.float64], float, float] | None:
         """Size, σ and gain; None where the effect changes what is compared."""
         label = hypothesis.label
-        problem, by_size = problems[label], columns.get(label)
+        problem, by_size = models[label].problem(observations), columns.get(label)
         at = [problem.unknowns.index[name] for name in problem.sizes if effect_of(name) == label]
         if by_size is None:
             start = transferred(base.posterior, problem.unknowns)
@@ -88,6 +84,18 @@ def scores(
     scored = {h.label: told(h) for h in asked if h.label in columns}
     scored |= zip([h.label for h in alone], spread(told, alone, processes, _WORTH), strict=True)
     return [Score(h, *one) for h in asked if (one := scored[h.label]) is not None]
+
+
+def first_order_changes(
+    observations: Observations, base: Fit, hypotheses: Sequence[Hypothesis], models: Mapping[str, Model]
+) -> dict[str, NDArray[np.float64]]:
+    """How the sizes of effects change the residuals of a model without them, (m, k) each, by label.
+
+    All at once; without those that have to be calculated one by one.
+    """
+    added = [models[h.label].problem(observations) for h in hypotheses]
+    found = base.model.problem(observations).first_order(base.posterior, added)
+    return {h.label: columns for h, columns in zip(hypotheses, found, strict=True) if columns is not None}
 
 
 class Marginal:

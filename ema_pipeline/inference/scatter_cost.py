@@ -31,8 +31,8 @@ class CostOverScatters:
 
     Attributes
     ----------
-    governed : list of ndarray of int, (k,)
-        By scatter that is learned: those of the kept unknowns whose prior it governs.
+    governed : list of ndarray of bool, (n_kept,)
+        By scatter that is learned: mask of the kept unknowns whose prior it governs.
     """
 
     def __init__(self, fit: Posterior, scatters: Mapping[str, Scatter], kept: NDArray[np.bool_]) -> None:

@@ -342,7 +342,7 @@ class HitData:
         in_both_orders = gains[..., a, b] + np.where(a == b, 0.0, gains[..., b, a])
         return np.ascontiguousarray(in_both_orders.reshape(-1, len(a)).T)
 
-    @property
+    @cached_property
     def motion_pairs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Numbers of two among `exponents`, every pair once, two of (pairs,)."""
         first, second = np.triu_indices(len(self.exponents))

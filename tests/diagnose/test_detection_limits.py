@@ -11,10 +11,10 @@ import pytest
 from imperfect_modes import NORMAL, chain, chain_modes
 from scipy.optimize import least_squares
 
-from ema_pipeline.diagnose.detection_limits import _Shown, _slopes, _under
+from ema_pipeline.diagnose.detection_limits import _Shown, _under
 from ema_pipeline.diagnose.expected_gain import ExpectedGain
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name, list_hypotheses
-from ema_pipeline.diagnose.score import Marginal
+from ema_pipeline.diagnose.score import Marginal, first_order_changes
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.effects.library import effect_library, shipped_effects
 from ema_pipeline.inference import Posterior, Residuals, Unknowns
@@ -156,7 +156,7 @@ def test_slopes_of_all_effects_at_once_are_those_of_each(label: str) -> None:
     hypotheses = list_hypotheses(rig, shipped_effects())
     (asked,) = (h for h in hypotheses if label in [n.label for n in h.names])
     models = {asked.label: Model().plus(asked.placed, asked.scales)}
-    at_once = _slopes(observations, fit, models, [asked])
+    at_once = first_order_changes(observations, fit, [asked], models)
     gains = ExpectedGain(fit.posterior, observations.scatters, Marginal(fit))
     given = (observations, fit, models[asked.label], asked, gains)
     alone, shared = _Shown.of(*given), _Shown.of(*given, at_once[asked.label])

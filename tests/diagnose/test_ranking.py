@@ -263,7 +263,6 @@ def test_those_behind_in_short_fits_are_annealed_where_a_size_leads_modes_to_par
 
 def test_near_the_base_model_scores_tell_where_fits_begin(monkeypatch: pytest.MonkeyPatch) -> None:
     stages = Stages(monkeypatch)
-    stages.base.posterior.residuals.unexplained = 0  # type: ignore[misc]
     base, order, promising, known = stages.rank(stages.base, further=2, unpaired=2.0)
     assert base is stages.base
     assert known == ["learned"]
@@ -284,7 +283,6 @@ def test_what_promises_beside_narrow_shapes_is_a_finalist_whatever_was_one_befor
 ) -> None:
     """What is missing may have been learned as scatter."""
     stages = Stages(monkeypatch, bent)
-    stages.base.posterior.residuals.unexplained = 0  # type: ignore[misc]
     monkeypatch.setattr(ranking, "narrowed", lambda o, settled: fit("narrow", 0.0))
     _, _, promising, known = stages.rank(stages.base, further=2, unpaired=2.0)
     assert promising == ["more"] * (1 if bent else 2)
@@ -298,7 +296,8 @@ def test_what_promises_beside_narrow_shapes_is_a_finalist_whatever_was_one_befor
         (1.31, 0, 2.0, False, False),
         (1.31, 0, 1.9, False, True),
         (1.3, 1, 1.9, False, True),
-        (1.3, 1, 2.0, False, False),
+        (1.31, 1, 2.0, False, False),
+        (1.3, 1, 2.0, True, False),
         (1.3, 0, 1.9, True, False),  # all that was surely measured is explained
     ],
 )

@@ -420,7 +420,7 @@ def test_a_linearised_effect_is_one_of_many_where_a_better_one_is_doubted(
 
 
 def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (9.0, 4.0, 2.0, 1.0)]
+    ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (1.0, 9.0, 4.0, 2.0)]
     told = {NOTHING: 0.1}
     monkeypatch.setattr(rounds, "_with_relief", lambda o, ranking, settings: ranking)
     monkeypatch.setattr(
