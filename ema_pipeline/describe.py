@@ -51,7 +51,7 @@ def describe(raw: Path, rig: str | None, pipeline: str | None, overrides: Iterab
 
 def describe_modes(file: Path, rig: str | None, pipeline: str | None, overrides: Iterable[str]) -> RunInfo:
     """Check a table of modes against its rig, before anything is written."""
-    from ema_pipeline.correlate.mode_table import read_mode_table
+    from ema_pipeline.exchange.mode_table import read_mode_table
 
     if rig is None:
         raise EmaError(f"{file}: a table of modes needs a model to compare with; name it with --rig")

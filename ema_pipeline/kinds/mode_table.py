@@ -12,7 +12,7 @@ from ema_pipeline.run.types import Progress, Run
 
 def _modes(run: Run, configuration: str, progress: Progress) -> ModalModel:
     from ema_pipeline.correlate.measured import to_modal_model
-    from ema_pipeline.correlate.mode_table import read_mode_table
+    from ema_pipeline.exchange.mode_table import read_mode_table
 
     measured = read_mode_table(Path(run.info.raw), run.require_model("modal"))
     return to_modal_model(measured[configuration])

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from ema_pipeline.correlate.measured import MeasuredModes, to_modal_model
-from ema_pipeline.correlate.mode_table import read_mode_table
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
+from ema_pipeline.exchange.mode_table import read_mode_table
 from ema_pipeline.exchange.tables import write_table
 from ema_pipeline.fit.parameters import fit_modes, fit_result
 from ema_pipeline.fit.settings import FitSettings
