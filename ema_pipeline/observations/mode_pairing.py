@@ -65,6 +65,24 @@ def turned(read: NDArray[np.float64] | NDArray[np.complex128]) -> NDArray[np.flo
     return np.asarray(np.real(read * np.exp(-0.5j * np.angle(np.sum(read**2, axis=0)))), float)
 
 
+def _with_rest(
+    to: NDArray[np.int64], data: ModeData, eigenvalues: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Pairs, and what is left of measured and undamped modes by frequency alone.
+
+    Damping turns undamped modes of nearly one frequency into each other, so that some resemble none that was measured.
+    """
+    alone = np.flatnonzero(to < 0)
+    free = np.setdiff1d(np.arange(len(eigenvalues)), to)
+    log = 0.5 * np.log(np.maximum(eigenvalues[free], 1e-12)) - np.log(2 * np.pi)
+    apart = np.abs(log[None, :] - data.log_frequency[alone, None])
+    which, rest = scipy.optimize.linear_sum_assignment(apart)
+    near = apart[which, rest] < _FREQUENCY_REACH
+    found = to.copy()
+    found[alone[which[near]]] = free[rest[near]]
+    return found
+
+
 @dataclass(frozen=True)
 class OwnDamping:
     """Undamped modes of a configuration whose damping ratios are unknowns of their own.
@@ -97,7 +115,7 @@ class OwnDamping:
         shapes : ndarray, (n_dofs, n)
         """
         read = self.along @ shapes[: self.along.shape[1]]
-        to = paired(self.data, np.sqrt(eigenvalues) / (2 * np.pi), read)
+        to = _with_rest(paired(self.data, np.sqrt(eigenvalues) / (2 * np.pi), read), self.data, eigenvalues)
         found = np.zeros((len(to), shapes.shape[1]))
         on = np.flatnonzero(to >= 0)
         found[on, to[on]] = 1.0

@@ -122,3 +122,15 @@ def test_damping_of_their_own_goes_to_the_undamped_modes_that_resemble_the_measu
     expected = np.zeros((3, 4))
     expected[0, 2] = expected[1, 0] = 1.0
     assert own.slopes(eigenvalues, shapes).tolist() == expected.tolist()
+
+
+def test_an_undamped_mode_that_resembles_none_has_the_damping_of_the_measured_one_that_is_left() -> None:
+    """Damping turned two of one frequency into each other: one measured shape is like neither. Far ones have none."""
+    between = np.array([0.0, 0.0, 1.0])
+    data = with_shapes([100.0, 104.0, 500.0], [UP, between, UP])
+    shapes = np.column_stack([UP, BENT, [0.0, 1.0, 0.0]])
+    eigenvalues = (2 * np.pi * np.array([99.5, 900.0, 108.0])) ** 2
+    assert paired(data, np.array([99.5, 900.0, 108.0]), shapes).tolist() == [0, -1, -1]
+    expected = np.zeros((3, 3))
+    expected[0, 0] = expected[1, 2] = 1.0
+    assert OwnDamping(data, np.eye(3)).slopes(eigenvalues, shapes).tolist() == expected.tolist()
