@@ -170,6 +170,46 @@ def _run(index: int) -> object:
         return _job(_items[index])
 
 
+@contextmanager
+def aside(job: Callable[[], R], processes: int | None = None) -> Iterator[Callable[[], R]]:
+    """Do a job in a forked process while the block goes on; what is given waits for what it returns.
+
+    It is done where that is asked for, in this process, where the system cannot fork or there is one process only. The
+    job goes over by forking, what it returns is pickled. What is not asked for is broken off at the end of the block.
+
+    Parameters
+    ----------
+    job : callable
+    processes : int or None
+        All that may work, this one among them; None stands for a process per processor.
+    """
+    if (processes or cores()) < 2 or not can_fork():
+        yield job
+        return
+    context = multiprocessing.get_context("fork")
+    mine, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_do, args=(lambda _, send: send(job()), None, theirs))
+    with workers_die_with_us():
+        process.start()
+    theirs.close()
+
+    def result() -> R:
+        try:
+            kind, content = mine.recv()
+        except EOFError:  # killed, for want of memory most likely
+            raise MemoryError("a worker process ended unexpectedly") from None
+        if kind == "failed":
+            raise content
+        return cast("R", content)
+
+    try:
+        yield result
+    finally:
+        process.kill()
+        process.join()
+        mine.close()
+
+
 Send = Callable[[Any], None]
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from ema_pipeline import keys, pipeline
 from ema_pipeline.errors import EmaError
-from ema_pipeline.processes import Send, side_by_side, spread
+from ema_pipeline.processes import Send, aside, side_by_side, spread
 from ema_pipeline.run.opening import describe_run, new_run, save_info
 from ema_pipeline.run.settings import PipelineSettings
 from ema_pipeline.run.types import Progress, Run
@@ -67,6 +67,45 @@ def test_the_first_item_that_fails_is_told_and_the_others_are_done() -> None:
     with pytest.raises(EmaError, match="b is wrong"):
         side_by_side(job, list("abdc"), 2, done.append)
     assert sorted(done) == ["a", "d"]
+
+
+@pytest.mark.parametrize("processes", [1, 2, None])
+def test_a_job_is_done_aside_while_this_process_goes_on(processes: int | None) -> None:
+    begun = time.monotonic()
+
+    def job() -> tuple[int, float, float]:
+        beginning = time.monotonic()
+        time.sleep(0.2)
+        return os.getpid(), beginning, time.monotonic()
+
+    with aside(job, processes) as result:
+        time.sleep(0.2)
+        middle = time.monotonic()
+        process, beginning, _ = result()
+    alone = processes == 1
+    assert (process == os.getpid()) is alone
+    assert begun <= beginning
+    assert (beginning >= middle) is alone
+
+
+def test_what_fails_aside_is_told_where_it_is_asked_for() -> None:
+    def job() -> None:
+        raise EmaError("no modes")
+
+    with aside(job, 2) as result, pytest.raises(EmaError, match="no modes"):
+        result()
+    killed = aside(lambda: os.kill(os.getpid(), signal.SIGKILL), 2)
+    with killed as result, pytest.raises(MemoryError, match="ended unexpectedly"):
+        result()
+
+
+def test_what_is_not_asked_for_is_broken_off() -> None:
+    begun = time.monotonic()
+    with aside(lambda: time.sleep(20), 2):
+        pass
+    with pytest.raises(ZeroDivisionError), aside(lambda: time.sleep(20), 2):
+        _ = 1 // 0
+    assert time.monotonic() - begun < 10
 
 
 def test_a_worker_that_is_killed_is_an_error_and_no_hang() -> None:
