@@ -60,6 +60,7 @@ def detection_limits(
     hypotheses: Sequence[Hypothesis],
     settings: DiagnoseSettings,
     some: Sequence[Hypothesis] | None = None,
+    found: int = 0,
 ) -> tuple[DetectionLimit, ...]:
     """Limit of every effect, from what the data say of its size beside everything uncertain.
 
@@ -77,6 +78,8 @@ def detection_limits(
     settings : DiagnoseSettings
     some : sequence of Hypothesis, optional
         Those that are asked about; all where left out.
+    found : int
+        Effects of the model that were claimed: beside them more is asked.
     """
     had = set(fit.model.labels)
     asked = hypotheses if some is None else some
@@ -94,12 +97,12 @@ def detection_limits(
         if shown is None:
             return None
         sigmas = sigmas_asked(observations, hypothesis, settings)
-        evidence = needed(hypothesis, hypotheses, settings, found=0)
+        evidence = needed(hypothesis, hypotheses, settings, max(found - (label in had), 0))
         evidence += evidence_beyond(observations, hypothesis, settings)
         return shown.largest(evidence) if hypothesis.shown_by_less else shown.least(evidence, sigmas)
 
-    found = zip(asked, spread(limit, asked, settings.processes), strict=True)
-    return tuple(_under(name, h, size) for h, size in found if size is not None for name in h.names)
+    told = zip(asked, spread(limit, asked, settings.processes), strict=True)
+    return tuple(_under(name, h, size) for h, size in told if size is not None for name in h.names)
 
 
 def _under(name: Name, hypothesis: Hypothesis, unknown: float) -> DetectionLimit:

@@ -26,6 +26,7 @@ from ema_pipeline.diagnose.types import (
     DOUBTFUL,
     NOTHING,
     Candidate,
+    DetectionLimit,
     Diagnosis,
     EffectSize,
     Ladder,
@@ -36,6 +37,7 @@ from ema_pipeline.diagnose.visible import nothing_visible
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Model
+from ema_pipeline.processes import aside
 from ema_pipeline.rigs.types import Rig
 
 _FAINT = 0.33
@@ -98,7 +100,12 @@ def diagnose(
     reached = explanation(found.observations, found.final, settings)
     explained = reached.explained
     verdict = verdict_of(found, settings, explained)
-    ladder = _ladder(found, settings)
+    limits: tuple[DetectionLimit, ...] = ()
+    with aside(lambda: _ladder(found, settings), settings.processes) as ladder_aside:
+        if explained:
+            already = len(first.claimed)
+            limits = detection_limits(first.observations, first.final, hypotheses, settings, found=already)
+        ladder = ladder_aside()
     errors = (ladder.rungs[0].error, ladder.rungs[-1].error)
     group = alike(found, settings)
     share = complete(*reached.telling) if explained else CLOSEST
@@ -110,7 +117,6 @@ def diagnose(
     begun = reached if start is found.final else explanation(first.observations, start, settings)
     probabilities = shared(found.rounds[0].probabilities, share, share if begun.explained else 0.0)
     nothing, limit = probabilities[NOTHING], found.final.posterior.error_limit(settings.error_limit)
-    limits = detection_limits(first.observations, first.final, hypotheses, settings) if explained else ()
     visible = math.nan
     if verdict == "adequate":
         visible = share * nothing_visible(first.rounds[0].ranking, found.rounds[0].probabilities, limits)
@@ -219,7 +225,8 @@ def _faint(
 ) -> list[Judged]:
     """Those that are far smaller than the least size that these data would show."""
     asked = [j.hypothesis for j in judged]
-    limits = detection_limits(found.observations, found.final, hypotheses, settings, asked)
+    already = len(found.claimed)
+    limits = detection_limits(found.observations, found.final, hypotheses, settings, asked, already)
     least = {(limit.label, limit.parameter): limit.size for limit in limits if not limit.largest}
     return [
         j

@@ -9,9 +9,10 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.diagnose.finals import PROMISING
 from ema_pipeline.diagnose.hypotheses import Hypothesis
-from ema_pipeline.diagnose.score import Score
-from ema_pipeline.inference import Posterior, Residuals, Unknowns
+from ema_pipeline.diagnose.score import Marginal, Score
+from ema_pipeline.inference import Posterior, Residuals, Unknowns, same_matching
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import (
     QUICK,
@@ -30,6 +31,10 @@ Schedule = tuple[tuple[float, int], ...]
 
 _SHORT = 8
 """Steps of a short fit."""
+_UNPROMISING = 3
+"""The same where sizes of a grid promise nothing."""
+_AS_GOOD = 0.02
+"""Log density by which a fit of no size may be behind the base model, which was fitted in more steps."""
 CONTINUED = 20
 """The same where the start is good but for unknowns that are new."""
 _HALF, _LITTLE = 1.0, 0.05
@@ -153,10 +158,14 @@ def first_fit(
     if begun is not None:
         return begun
     found = []
-    if score is not None and len(score.size) == 1:
+    if score is not None and (len(score.size) == 1 or (near and hypothesis.has_direction)):
         found.append(_from_score(observations, base, model, hypothesis, score))
-        if found[0].cost <= base.posterior.cost:
+        if _no_worse(found[0], base, score):
             return found[0]
+    elif near and hypothesis.size_cannot_be_zero:
+        gain, x = _best_to_first_order(observations, base, model, hypothesis)
+        if gain < PROMISING:
+            return refined(observations, model, x, steps=_UNPROMISING).posterior
     found.append(annealed_fit(observations, base, models, promise, {}, hypothesis, near))
     return max(found, key=lambda p: p.log_evidence)
 
@@ -260,15 +269,21 @@ def _from_score(
 
     Where the base model has bent the very part that the effect changes, half of the size on top of it goes too far.
     """
-    unknowns = model.problem(observations).unknowns
+    unknowns, placed = model.problem(observations).unknowns, hypothesis.placed
+    at = [unknowns.index[placed.parameter_name(p.name)] for p in placed.effect.parameters]
     found = []
     for largest in (_HALF, _LITTLE):
         x = transferred(base.posterior, unknowns)
-        x[unknowns.index[_first_size(hypothesis)]] = float(np.clip(0.5 * score.size[0], -largest, largest))
+        x[at] = [float(np.clip(0.5 * score.size[0], -largest, largest)), *score.size[1:]]
         found.append(refined(observations, model, unknowns.clipped(x), steps=steps).posterior)
-        if found[-1].cost <= base.posterior.cost:
+        if _no_worse(found[-1], base, score):
             break
     return max(found, key=lambda p: p.log_evidence)
+
+
+def _no_worse(found: Posterior, base: Fit, score: Score) -> bool:
+    """True where a fit makes matters no worse but by what the prior of sizes beside the first one costs."""
+    return found.cost <= base.posterior.cost + 0.5 * float(score.size[1:] @ score.size[1:]) + _AS_GOOD
 
 
 def _first_size(hypothesis: Hypothesis) -> str:
@@ -281,16 +296,43 @@ def _unbent(unknowns: Unknowns, x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where([bool(s) for s in unknowns.scatter], 0.0, x)
 
 
+def _best_to_first_order(
+    observations: Observations, base: Fit, model: Model, hypothesis: Hypothesis
+) -> tuple[float, NDArray[np.float64]]:
+    """What sizes of the grid gain at most where all that is uncertain follows to first order, and all unknowns there.
+
+    Where modes have other partners nothing is known of what follows.
+    """
+    problem, marginal, found = model.problem(observations), Marginal(base), base.posterior.residuals
+    begin = transferred(base.posterior, problem.unknowns)
+    best, at = -np.inf, begin
+    for sizes in _grid(hypothesis):
+        x = begin.copy()
+        x[[problem.unknowns.index[n] for n in sizes]] = list(sizes.values())
+        there = problem.residuals(problem.unknowns.clipped(x), base.posterior.scatters, derivatives=False)
+        as_before = same_matching(there.matching, found.matching)
+        gain = marginal.gained(there.values - found.values) if as_before else found.cost - there.cost
+        gain -= 0.5 * sum(u**2 for u in sizes.values())
+        if gain > best:
+            best, at = gain, x
+    return best, problem.unknowns.clipped(at)
+
+
+def _grid(hypothesis: Hypothesis) -> list[dict[str, float]]:
+    """Unknowns of its sizes on a grid."""
+    names = [hypothesis.placed.parameter_name(p.name) for p in hypothesis.placed.effect.parameters]
+    return [dict(zip(names, values, strict=True)) for values in product(_GRID, repeat=len(names))]
+
+
 def _best_of_grid(
     observations: Observations, problem: EffectProblem, begin: NDArray[np.float64], hypothesis: Hypothesis
 ) -> list[dict[str, float]]:
     """Sizes, by their unknowns, at which the modes that the effect adds lie nearest to measured ones."""
-    names = [hypothesis.placed.parameter_name(p.name) for p in hypothesis.placed.effect.parameters]
     scatters = wide(observations)
     tried = []
-    for values in product(_GRID, repeat=len(names)):
+    for sizes in _grid(hypothesis):
         x = begin.copy()
-        x[[problem.unknowns.index[n] for n in names]] = values
+        x[[problem.unknowns.index[n] for n in sizes]] = list(sizes.values())
         found = problem.residuals(problem.unknowns.clipped(x), scatters, heat=_GRID_HEAT, derivatives=False)
-        tried.append((found.cost, dict(zip(names, values, strict=True))))
+        tried.append((found.cost, sizes))
     return [start for _, start in sorted(tried, key=lambda pair: pair[0])[:_GRID_STARTS]]

@@ -90,6 +90,12 @@ class Hypothesis:
         return any(SizeMap.of(p, p.scale).logarithmic for p in self.placed.effect.parameters[:1])
 
     @property
+    def has_direction(self) -> bool:
+        """True where its other sizes say in which way the first one, which may be zero, acts in proportion to it."""
+        effect = self.placed.effect
+        return len(effect.parameters) > 1 and effect.linear and not self.size_cannot_be_zero
+
+    @property
     def shown_by_less(self) -> bool:
         """True where the effect shows the more the smaller its size is: teeth part where the motion exceeds it."""
         return self.placed.effect.parameters[0].null == float("inf")

@@ -33,7 +33,12 @@ def weight(hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:
 
 def null_prior(settings: DiagnoseSettings, found: int) -> float:
     """Prior probability that nothing is missing beside `found` effects."""
-    return settings.further_null_prior if found else settings.null_prior
+    return 1 - (1 - settings.further_null_prior) ** found if found else settings.null_prior
+
+
+def most_doubt(settings: DiagnoseSettings, found: int) -> float:
+    """Largest probability that nothing is missing beside `found` effects at which another one is claimed."""
+    return min(settings.doubt, settings.further_doubt) if found else settings.doubt
 
 
 def prior(
@@ -126,4 +131,5 @@ def needed(
 ) -> float:
     """Log evidence that one hypothesis has to gain to be claimed where all others gain nothing."""
     odds = null_prior(settings, found) / prior(hypothesis, hypotheses, settings, found)
-    return max(settings.claim, float(np.log((1 - settings.doubt) / settings.doubt * odds)))
+    doubt = most_doubt(settings, found)
+    return max(settings.claim, float(np.log((1 - doubt) / doubt * odds)))

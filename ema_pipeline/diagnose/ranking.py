@@ -35,7 +35,7 @@ from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, freed, learned, met, refined, unbent
-from ema_pipeline.processes import spread
+from ema_pipeline.processes import aside, spread
 
 Progress = Callable[[float, str], None]
 
@@ -95,7 +95,6 @@ def rank(
         Fits of hypotheses to the same data with fewer unknowns, from which theirs are begun.
     """
     models = {h.label: base.model.plus(h.placed, h.scales) for h in hypotheses}
-    promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models, processes)}
     residuals, fails = base.posterior.residuals, base.posterior.error > _EXPLAINED
     # a model that explains all that was surely measured needs no search for the sake of other modes
     explains = not fails and not residuals.unexplained
@@ -104,10 +103,17 @@ def rank(
     )
     tried = tried_sizes(observations, base, models, hypotheses, processes) if alone else {}
     lost = bool(tried) or (alone and residuals.unexplained > 0)
+    stuck = lost or fails
+
+    def settle() -> Posterior | None:
+        return None if stuck else learned(observations, base).posterior
+
+    with aside(settle, processes) as settled_aside:
+        promise = {s.hypothesis.label: s for s in scores(observations, base, hypotheses, models, processes)}
+        posterior = settled_aside()
+    settled = None if posterior is None else Fit(base.model, posterior)
     unseen = {label for label, score in promise.items() if score.std >= UNSEEN} - set(tried)
     hypotheses = [h for h in hypotheses if h.label not in unseen]
-    stuck = lost or fails
-    settled = None if stuck else learned(observations, base)
     near = settled is not None and unbent(observations, settled)
     pairing = _best_tried(tried, _PAIRING)
     among = _screened(hypotheses, promise, near)
@@ -130,15 +136,15 @@ def rank(
         # A few steps do not lead a mode of the model to a measured one that has no partner yet.
         leads = _best_tried({label: one for label, one in tried.items() if one.gain > PROMISING}, _ANNEALED)
         behind = short(chosen, processes)[_ANNEALED:]
-        known |= {h.label: posterior for h, posterior in behind if h.label not in leads}
+        known |= {h.label: fitted for h, fitted in behind if h.label not in leads}
     decided = False
     left = [h for h in chosen if h.label not in known]
     for batch in _batches(left, promise if lost else {}, pairing):
         if decided:
-            known |= {h.label: posterior for h, posterior in short(batch, processes)}
+            known |= {h.label: fitted for h, fitted in short(batch, processes)}
         asked = [h for h in batch if h.label not in known]
-        for hypothesis, posterior in zip(asked, spread(job, asked, processes), strict=True):
-            known[hypothesis.label] = posterior
+        for hypothesis, fitted in zip(asked, spread(job, asked, processes), strict=True):
+            known[hypothesis.label] = fitted
             progress(0.6 * len(known) / len(chosen), hypothesis.label)
         decided = lost and any(_decides(p, base) for p in known.values())
     found = {h.label: (h, Fit(models[h.label], known[h.label])) for h in chosen}
@@ -165,11 +171,13 @@ def rank(
 def _screened(hypotheses: Sequence[Hypothesis], promise: Mapping[str, Score], near: bool) -> list[Hypothesis]:
     """The rig's own hypotheses, and the generic ones that promise most.
 
-    Near the base model the score tells of the rig's own as well: those that promise nothing are left out, too. An
-    effect of several sizes (hysteresis) shows its kind at a finite size only, of which a score knows nothing.
+    Near the base model the score tells of the rig's own as well: those that promise nothing are left out, too, with
+    those that have a direction. Other effects of several sizes (hysteresis) show their kind at a finite size only, of
+    which a score knows nothing.
     """
     out: set[str] = set()
-    scored = [h for h in hypotheses if len(h.placed.effect.parameters) == 1 and h.label in promise]
+    scored = [h for h in hypotheses if h.label in promise]
+    scored = [h for h in scored if len(h.placed.effect.parameters) == 1 or (near and h.has_direction)]
     if not near:
         laws = [h.label for h in scored if h.begun and not h.placed.effect.linear]
         out |= set(sorted(laws, key=lambda label: -promise[label].gain)[_SCREENED_LAWS:])

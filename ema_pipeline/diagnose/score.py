@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.effects.base import effect_of
 from ema_pipeline.inference import lower_factor
-from ema_pipeline.observations.base import Observations
+from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import Fit, Model, transferred
 from ema_pipeline.processes import spread
 
@@ -20,6 +20,8 @@ UNSEEN = 1e6
 """1 σ of a size, in units of its prior, above which the data carry no information on it."""
 _WORTH = 40
 """Hypotheses from which processes are worth it: each takes some milliseconds."""
+_SMALL = 0.01
+"""Unknown of a first size in proportion to which the residuals change."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,8 @@ class Score:
     ----------
     hypothesis : Hypothesis
     size : ndarray, (k,)
-        Estimate of its unknowns, in units of their prior σ.
+        Estimate of its unknowns, in units of their prior σ; all but the first are those of the usual ones that gain
+        most, where they only matter beside it (the angle of a stiff axis).
     std : float
         1 σ of the first unknown from the data alone, everything else uncertain; infinite where they say nothing.
     gain : float
@@ -65,20 +68,41 @@ def scores(
     marginal = Marginal(base)
     asked = [h for h in hypotheses if not h.size_cannot_be_zero]
     models = models or {h.label: base.model.plus(h.placed, h.scales) for h in asked}
-    columns = first_order_changes(observations, base, asked, models)
+    columns = first_order_changes(observations, base, [h for h in asked if not h.has_direction], models)
+    matching, scatters = base.posterior.residuals.matching, base.posterior.scatters
 
     def told(hypothesis: Hypothesis) -> tuple[NDArray[np.float64], float, float] | None:
         """Size, σ and gain; None where the effect changes what is compared."""
         label = hypothesis.label
         problem, by_size = models[label].problem(observations), columns.get(label)
         at = [problem.unknowns.index[name] for name in problem.sizes if effect_of(name) == label]
+        start = transferred(base.posterior, problem.unknowns)
+        if hypothesis.has_direction:
+            return along_best(problem, start, at, hypothesis.starts())
         if by_size is None:
-            start = transferred(base.posterior, problem.unknowns)
-            matching = base.posterior.residuals.matching
-            by_size = problem.residuals(start, base.posterior.scatters, matching=matching).jacobian[:, at]
+            by_size = problem.residuals(start, scatters, matching=matching).jacobian[:, at]
         if len(by_size) != marginal.count:
             return None
         return marginal.score(by_size * marginal.weight[:, None], problem.unknowns.lower[at])
+
+    def along_best(
+        problem: EffectProblem,
+        begin: NDArray[np.float64],
+        at: Sequence[int],
+        starts: Sequence[Mapping[str, float]],
+    ) -> tuple[NDArray[np.float64], float, float] | None:
+        """The same of the first size beside those others, of some, with which it is seen and gains most."""
+        found = []
+        for start in starts:
+            x = begin.copy()
+            x[[problem.unknowns.index[name] for name in start]] = list(start.values())
+            x[at[0]] = _SMALL
+            there = problem.residuals(x, scatters, matching=matching, derivatives=False)
+            if len(there.values) == marginal.count:
+                change = (there.values - base.posterior.residuals.values) * marginal.weight / _SMALL
+                size, std, gain = marginal.score(change[:, None], problem.unknowns.lower[at[:1]])
+                found.append((np.concatenate([size, x[at[1:]]]), std, gain))
+        return max(found, key=lambda one: (one[1] < UNSEEN, one[2]), default=None)
 
     alone = [h for h in asked if h.label not in columns]
     scored = {h.label: told(h) for h in asked if h.label in columns}
@@ -139,6 +163,11 @@ class Marginal:
         weighted = change * self.weight
         moved = -scipy.linalg.cho_solve(self.factor, self.whitened.T @ weighted, check_finite=False)
         return weighted + self.whitened @ moved, moved
+
+    def gained(self, change: NDArray[np.float64]) -> float:
+        """Log density that a change of the residuals, (m,), gains when all that is uncertain has followed it."""
+        weighted = change * self.weight
+        return -float(self.at_maximum @ weighted) - 0.5 * float(weighted @ self.left(change)[0])
 
     def score(
         self, columns: NDArray[np.float64], lower: NDArray[np.float64]

@@ -13,6 +13,7 @@ from ema_pipeline.diagnose.backward import cannot_be_told, reconsidered
 from ema_pipeline.diagnose.claims import BY_OTHERS, Judged, judge
 from ema_pipeline.diagnose.first_fits import CONTINUED
 from ema_pipeline.diagnose.hypotheses import Hypothesis
+from ema_pipeline.diagnose.probability import most_doubt
 from ema_pipeline.diagnose.ranked import unbeaten
 from ema_pipeline.diagnose.ranking import CONTENDERS, rank
 from ema_pipeline.diagnose.rounds import Round, round_of, weighed
@@ -91,7 +92,7 @@ def select(
             before,
         )
         fitted.update({r.hypothesis.label: r.fit.posterior for r in ranking.ranked})
-        asked = _beside(settings, claimed) if observations.linearised else settings
+        asked = _beside(observations, settings, claimed)
         return round_of(observations, ranking, left, asked, len(claimed))
 
     ahead: Round | None = None
@@ -146,11 +147,14 @@ def _taken(observations: Observations, hypothesis: Hypothesis, claimed: Sequence
     )
 
 
-def _beside(settings: DiagnoseSettings, claimed: Sequence[Judged]) -> DiagnoseSettings:
+def _beside(
+    observations: Observations, settings: DiagnoseSettings, claimed: Sequence[Judged]
+) -> DiagnoseSettings:
     """What is asked of a further effect beside those that are claimed."""
-    gains = [j.gain for j in claimed if not j.hypothesis.placed.effect.linear]
+    gains = [j.gain for j in claimed if observations.linearised and not j.hypothesis.placed.effect.linear]
     left = settings.linearised * sum(gains) + (settings.linearised_claim if gains else 0.0)
-    return settings.model_copy(update={"claim": settings.claim + left})
+    doubt = most_doubt(settings, len(claimed))
+    return settings.model_copy(update={"claim": settings.claim + left, "doubt": doubt})
 
 
 def _tentative(observations: Observations, found: Round, settings: DiagnoseSettings) -> Judged | None:

@@ -21,7 +21,8 @@ class DiagnoseSettings(Settings):
         default=0.6,
         gt=0,
         lt=1,
-        description="The same once an effect was found: a model seldom misses two effects.",
+        description="The same once an effect was found: a model seldom misses two effects. Once n were "
+        "found it is 1 - (1 - p)ⁿ.",
     )
     doubt: float = Field(
         default=0.2,
@@ -29,6 +30,13 @@ class DiagnoseSettings(Settings):
         lt=1,
         description="Largest probability that nothing is missing at which an effect is still claimed; the more "
         "hypotheses there are, the more evidence one of them needs.",
+    )
+    further_doubt: float = Field(
+        default=0.05,
+        gt=0,
+        lt=1,
+        description="The same of a further effect beside those that are claimed: a wrong name beside a right one "
+        "spoils both.",
     )
     generic_prior: float = Field(
         default=0.3,

@@ -96,6 +96,7 @@ def test_an_effect_that_adds_modes_begins_at_the_best_of_a_grid() -> None:
     ("promised", "costs", "begun"),
     [
         (0.8, (5.0,), 0.4),
+        (0.8, (5.01,), 0.4),  # no size, in fewer steps than the base model had
         (4.0, (5.0,), 1.0),
         (0.8, (5.1, 4.9), 0.05),
         (-0.8, (5.1, 4.9), -0.05),

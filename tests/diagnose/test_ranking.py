@@ -49,6 +49,10 @@ def test_of_many_hypotheses_those_of_each_kind_are_fitted_that_promise_most() ->
     near = [h.label for h in _screened(everything, promise, near=True)]
     assert near[:16] == [*(f"own{k}" for k in range(2, 16)), "two sizes", "not scored"]
     assert near[16:] == [f"generic{k}" for k in (4, 5, 6, 7, 9, 10)]
+    directed = [hypothesis(k, sizes=2, directed=True) for k in ("promising", "not promising")]
+    promise |= {"promising": score(2.5), "not promising": score(-100.0)}
+    assert _screened([*own, *directed], promise, near=True) == [*own[3:], directed[0]]
+    assert _screened([*own, *directed], promise, near=False) == [*own, *directed]
     promise |= {h.label: score(1.0) for h in generic[4:]}
     assert len(_screened(everything, promise, near=True)) == 16 + 12
 
@@ -150,6 +154,14 @@ def test_a_better_fit_is_kept_and_the_same_start_not_tried_again(monkeypatch: py
     assert best.x.tolist() == [0.5, 0.3]
 
 
+LEARNED = 5.0
+"""Log evidence of a fit whose scatters are learned."""
+
+
+def named(one: Fit) -> str:
+    return "learned" if one.log_evidence == LEARNED else one.model.name  # type: ignore[attr-defined]
+
+
 class Stages:
     """Stands for every stage of `rank`, and keeps what it was asked."""
 
@@ -165,7 +177,7 @@ class Stages:
             if h.label != "f"
         ]
         monkeypatch.setattr(ranking, "scores", lambda *given: told)
-        monkeypatch.setattr(ranking, "learned", lambda o, one, past_barriers=True: fit("learned", 0.0))
+        monkeypatch.setattr(ranking, "learned", lambda o, one, past_barriers=True: fit("base", LEARNED))
         monkeypatch.setattr(ranking, "narrowed", lambda o, settled: None)
         monkeypatch.setattr(ranking, "unbent", lambda o, one: not bent)
         monkeypatch.setattr(ranking, "tried_sizes", self.tried_sizes)
@@ -192,7 +204,7 @@ class Stages:
                 base,
                 order,
                 list(promising),
-                [f.model.name for f in known] + ["past barriers"] * past_barriers,
+                [named(f) for f in known] + ["past barriers"] * past_barriers,
             ),
         )
         for h in self.hypotheses:
@@ -232,7 +244,7 @@ class Stages:
     def promising(
         self, o: object, settled: Any, others: Any, models: Any, further: int, processes: object
     ) -> Any:
-        self.asked.append(("promising", settled.model.name, [h.label for h in others], further))
+        self.asked.append(("promising", named(settled), [h.label for h in others], further))
         return ["more"]
 
     def rank(self, base: Fit, **given: Any) -> Any:

@@ -127,9 +127,21 @@ def test_a_further_effect_must_gain_a_share_of_what_those_gained_that_are_linear
         judged("mass@a", 1e3),
         judged("friction@b", 20.0, linear=False),
     ]
-    assert _beside(SETTINGS, claimed).claim == pytest.approx(3.5 + 0.1 * 70.0 + SETTINGS.linearised_claim)
-    assert _beside(SETTINGS, claimed[1:2]).claim == 3.5
-    assert _beside(SETTINGS, claimed).alike == SETTINGS.alike
+    levels: Any = SimpleNamespace(linearised=True)
+    asked = _beside(levels, SETTINGS, claimed)
+    assert asked.claim == pytest.approx(3.5 + 0.1 * 70.0 + SETTINGS.linearised_claim)
+    assert asked.alike == SETTINGS.alike
+    assert _beside(levels, SETTINGS, claimed[1:2]).claim == 3.5
+
+
+@pytest.mark.parametrize(("doubt", "beside"), [(0.2, 0.05), (0.03, 0.03)])
+def test_a_further_effect_must_be_surer(doubt: float, beside: float) -> None:
+    """A wrong name beside a right one spoils both."""
+    settings = SETTINGS.model_copy(update={"doubt": doubt})
+    modes: Any = SimpleNamespace(linearised=False)
+    assert _beside(modes, settings, []) == settings
+    asked = _beside(modes, settings, [judged("cubic@a", 50.0, linear=False)])
+    assert asked == settings.model_copy(update={"doubt": beside})
 
 
 def posterior_of(error: float) -> Any:

@@ -15,7 +15,9 @@ PENALTY = 6.0
 NO_DATA: Any = SimpleNamespace(linearised=False)
 
 
-def hypothesis(label: str, generic: bool = False, sizes: int = 1, extends: bool = False) -> Any:
+def hypothesis(
+    label: str, generic: bool = False, sizes: int = 1, extends: bool = False, directed: bool = False
+) -> Any:
     parameters = [SimpleNamespace(name=f"s{k + 1}") for k in range(sizes)]
     placed = SimpleNamespace(
         label=label,
@@ -28,6 +30,7 @@ def hypothesis(label: str, generic: bool = False, sizes: int = 1, extends: bool 
         generic=generic,
         placed=placed,
         size_cannot_be_zero=extends,
+        has_direction=directed,
         begun=(),
         starts=lambda: starts,
     )
