@@ -122,19 +122,21 @@ def tried_sizes(
         begin = _unbent(unknowns, transferred(base.posterior, unknowns))
         at = unknowns.index[_first_size(hypothesis)]
 
-        def at_size(size: float) -> Residuals | None:
+        def at_size(size: float) -> NDArray[np.float64]:
             x = begin.copy()
             x[at] = size
-            if unknowns.clipped(x)[at] != size:
-                return None
-            return problem.residuals(x, scatters, heat=_GRID_HEAT, derivatives=False)
+            return x
 
-        without = at_size(0.0)
-        if without is None:  # it has no size of nothing
+        def compared(size: float) -> Residuals:
+            return problem.residuals(at_size(size), scatters, heat=_GRID_HEAT, derivatives=False)
+
+        if unknowns.clipped(at_size(0.0))[at]:  # it has no size of nothing
             return Tried(0.0, -np.inf)
-        found = [(size, at_size(size)) for size in (*_SIZES, *problem.tuned(begin, unknowns.names[at]))]
-        fewer = [(r.cost, size) for size, r in found if r is not None and r.penalty < without.penalty]
-        least, size = min(fewer, default=(np.inf, 0.0))
+        without = compared(0.0)
+        sizes = [*_SIZES, *problem.tuned(begin, unknowns.names[at])]
+        sizes = [size for size in sizes if unknowns.clipped(at_size(size))[at] == size]
+        fewer = [s for s in sizes if problem.unpaired(at_size(s), scatters, _GRID_HEAT) < without.penalty]
+        least, size = min(((compared(s).cost, s) for s in fewer), default=(np.inf, 0.0))
         return Tried(size, without.cost - least)
 
     found = zip(asked, spread(best, asked, processes), strict=True)

@@ -225,6 +225,10 @@ class AmplitudeProblem(EffectProblem):
         x = self.modes.start(sizes)
         return np.concatenate([x, np.zeros(len(self.unknowns) - len(x))])
 
+    def unpaired(self, x: NDArray[np.float64], scatters: Mapping[str, float], heat: float = 1.0) -> float:
+        """See `EffectProblem`."""
+        return self.modes.unpaired(x[: len(self.modes.unknowns)], scatters, heat)
+
     def tuned(self, x: NDArray[np.float64], name: str) -> list[float]:
         """See `EffectProblem`."""
         return self.modes.tuned(x[: len(self.modes.unknowns)], name)

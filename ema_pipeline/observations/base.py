@@ -51,6 +51,10 @@ class EffectProblem(Problem, Protocol):
         """The nearest point to `x` at which nothing lies between what is calculated once for all."""
         return x
 
+    def unpaired(self, x: NDArray[np.float64], scatters: Mapping[str, float], heat: float = 1.0) -> float:
+        """`Residuals.penalty` at `x`: what modes without a partner cost."""
+        return self.residuals(x, scatters, heat=heat, derivatives=False).penalty
+
     def tuned(self, x: NDArray[np.float64], name: str) -> list[float]:
         """Unknowns of the size `name` at which a mode comes to where one was measured that has no partner at `x`."""
         return []

@@ -65,9 +65,7 @@ def turned(read: NDArray[np.float64] | NDArray[np.complex128]) -> NDArray[np.flo
     return np.asarray(np.real(read * np.exp(-0.5j * np.angle(np.sum(read**2, axis=0)))), float)
 
 
-def _with_rest(
-    to: NDArray[np.int64], data: ModeData, eigenvalues: NDArray[np.float64]
-) -> NDArray[np.int64]:
+def _with_rest(to: NDArray[np.int64], data: ModeData, eigenvalues: NDArray[np.float64]) -> NDArray[np.int64]:
     """Pairs, and what is left of measured and undamped modes by frequency alone.
 
     Damping turns undamped modes of nearly one frequency into each other, so that some resemble none that was measured.

@@ -269,6 +269,10 @@ class ModeProblem(EffectProblem):
             )
         return solution
 
+    def unpaired(self, x: NDArray[np.float64], scatters: Mapping[str, float], heat: float = 1.0) -> float:
+        """See `EffectProblem`: from modes and pairs alone."""
+        return sum(self.comparison(d, x, scatters, heat).unpaired() for d in self.observations.data)
+
     def tuned(self, x: NDArray[np.float64], name: str) -> list[float]:
         """See `EffectProblem`: of every measured mode without a partner the sizes that give it one of its shape."""
         at, found = self.unknowns.index[name], list[float]()

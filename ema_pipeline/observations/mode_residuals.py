@@ -181,14 +181,12 @@ class Comparison:
         )
         if np.any(self.data.whirling[on]):
             rows += (self._complex_shapes(solution, on, to, slopes),)
-        alone = np.flatnonzero(pairs.match < 0)
-        left = Alone.of(self.data, alone, self.scatters, self.defaults)
-        accounted = np.concatenate([to, hidden[hidden >= 0]])
+        left = self._alone(pairs.match)
         return Compared(
             rows=rows,
             match=pairs.match,
             log_scale=left.usual,
-            penalty=left.penalty + unseen(self.data, solution.frequency_hz, accounted),
+            penalty=left.penalty + self._unseen(solution, to, hidden),
             split=left.split,
             unexplained=left.unexplained,
             projected=len(on) + int(np.sum(self.data.whirling[on] | (hidden >= 0)))
@@ -196,15 +194,36 @@ class Comparison:
             else 0,
         )
 
+    def unpaired(self) -> float:
+        """`Residuals.penalty` with new pairs; infinite where the model has no modes."""
+        own = self.x[: len(self.model.unknowns)]
+        solution = self.model.modes(self.data.configuration, own, derivatives=False)[1]
+        if solution is None:
+            return float("inf")
+        match = self.matched(solution)
+        _, to, _, hidden = self._partners(solution, match)
+        return self._alone(match).penalty + self._unseen(solution, to, hidden)
+
+    def _alone(self, match: NDArray[np.int64]) -> Alone:
+        return Alone.of(self.data, np.flatnonzero(match < 0), self.scatters, self.defaults)
+
+    def _unseen(self, solution: EigenSolution, to: NDArray[np.int64], hidden: NDArray[np.int64]) -> float:
+        return unseen(self.data, solution.frequency_hz, np.concatenate([to, hidden[hidden >= 0]]))
+
+    def _partners(
+        self, solution: EigenSolution, match: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+        """Modes with a partner, these, what the sensors read of all the model's, and `hidden_partners`."""
+        on, read = np.flatnonzero(match >= 0), turned(self.readings.of(solution))
+        sensors = np.count_nonzero(self.data.seen[on], axis=1) * self.data.may_hide_another[on]
+        return on, match[on], read, hidden_partners(solution, match[on], sensors, read)
+
     def _pairs(self, solution: EigenSolution, matching: object) -> _Pairs:
         """Kept, since derivatives are mostly wanted where a trial step was found to lead."""
         if self._last is None or not self._last.are(matching):
             given = isinstance(matching, np.ndarray)
             match = np.asarray(matching) if given else self.matched(solution)
-            on, read = np.flatnonzero(match >= 0), turned(self.readings.of(solution))
-            to = match[on]
-            sensors = np.count_nonzero(self.data.seen[on], axis=1) * self.data.may_hide_another[on]
-            hidden = hidden_partners(solution, to, sensors, read)
+            on, to, read, hidden = self._partners(solution, match)
             known = self._known(on, hidden)
             groups = self._groups(solution, read, known, to)
             self._last = _Pairs(match, not given, to, hidden, read, known, groups)

@@ -36,6 +36,7 @@ from ema_pipeline.observations.fitting import (
     learned,
     refined,
     transferred,
+    wide,
 )
 from ema_pipeline.observations.hit_data import HitData, comparable
 from ema_pipeline.observations.hit_modes import Linear, changed_modes
@@ -184,6 +185,15 @@ def test_effects_twice_their_limit_are_claimed_and_those_of_half_of_it_are_not(l
             base = base_fit(observations)
             gains.append(fitted(observations, base, label)[1].log_evidence - base.log_evidence)
         assert all((g > settings.claim + settings.linearised_claim) is claimed for g in gains), gains
+
+
+def test_hits_add_nothing_to_what_modes_without_a_partner_cost() -> None:
+    observations = synthetic()
+    problem = Model().problem(observations)
+    x = problem.unknowns.clipped(40.0 * np.random.default_rng(1).standard_normal(len(problem.unknowns)))
+    for at in (problem.start(), x):
+        told = problem.residuals(at, wide(observations), heat=30.0, derivatives=False).penalty
+        assert problem.unpaired(at, wide(observations), 30.0) == told
 
 
 def test_nothing_is_claimed_where_only_drift_moves_the_modes() -> None:

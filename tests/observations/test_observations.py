@@ -22,7 +22,7 @@ from ema_pipeline.mechanics.assembly import Assembly, Damper, Gyroscopic, Mass, 
 from ema_pipeline.mechanics.modes import complex_modes
 from ema_pipeline.modal.assurance import mac
 from ema_pipeline.observations import fitting
-from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, model_with
+from ema_pipeline.observations.fitting import Fit, Model, fit_base, learned, model_with, wide
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.mode_problem import MIXING, ModeProblem
 from ema_pipeline.observations.mode_rows import SHAPE, SHAPE_NOISE
@@ -207,6 +207,22 @@ def test_shapes_that_hold_some_of_each_other_are_told_from_a_model_that_is_wrong
     pure = observed(rig, modes)
     alone = learned(pure, fit_base(pure, Model()))
     assert found.posterior.error == pytest.approx(alone.posterior.error, rel=0.15)
+
+
+def test_what_modes_without_a_partner_cost_is_told_from_pairs_alone() -> None:
+    """At points up to several prior 1 σ away, where modes lose their partners, annealed and not."""
+    rig, rng = planetary(), np.random.default_rng(2)
+    observations = observed(rig, planetary_modes(rig, 3, GOOD, Hidden({"sun-planet1 mesh": 0.4})))
+    problem, scatters = Model().problem(observations), wide(observations)
+    std = problem.unknowns.prior_std(scatters)
+    costs = set()
+    for far in (0.0, 1.0, 5.0, 15.0, 15.0):
+        x = problem.unknowns.clipped(far * std * rng.standard_normal(len(std)))
+        for heat in (1.0, 30.0):
+            told = problem.unpaired(x, scatters, heat)
+            assert told == problem.residuals(x, scatters, heat=heat, derivatives=False).penalty
+            costs.add(told)
+    assert len(costs) > 2
 
 
 # --- families and parts -----------------------------------------------------------------------------------

@@ -80,6 +80,9 @@ class Parabola:
         penalty = PENALTY if lost else 0.0
         return Residuals((x - self.at) / how["heat"], np.zeros((0, len(x))), penalty=penalty)
 
+    def unpaired(self, x: np.ndarray, scatters: object, heat: float) -> float:
+        return self.residuals(x, scatters, heat=heat, derivatives=False).penalty
+
     def begun(self, x: np.ndarray, scatters: object) -> list[np.ndarray]:
         return []
 
