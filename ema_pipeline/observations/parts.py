@@ -8,8 +8,9 @@ value of a mass or a stiffness is ever negative.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,12 +50,15 @@ class Dependence:
         Parameters among the unknowns.
     geometric : tuple of str
         Uncertain parameters that no element's value is a power of: with them the elements are built anew.
+    known : dict
+        What models of the rig have found of their effects, for others with the same ones.
     """
 
     unknowns: Unknowns
     elements: Mapping[str, Mapping[PartKey, NDArray[np.float64]]]
     families: tuple[str, ...]
     geometric: tuple[str, ...]
+    known: dict[object, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @cached_property
     def sole_parts(self) -> dict[str, tuple[str, float]]:

@@ -26,6 +26,9 @@ from ema_pipeline.observations.parts import DAMPING, DAMPING_SCATTER, Dependence
 from ema_pipeline.observations.size_map import LOG_STD, SizeMap
 from ema_pipeline.rigs.types import Rig
 
+_MOST_KNOWN = 1000
+"""Models of one rig of which the terms of their effects are kept: those of some rankings."""
+
 
 class RigModel:
     """A rig, with effects on top of it, as a function of unknowns.
@@ -222,17 +225,23 @@ class RigModel:
     def _effect_terms(self, configuration: str) -> EffectTerms | None:
         """How the terms depend on the effects' sizes; None where that is not known."""
         if configuration not in self._of_effects:
-            found = None
-            if not self.dependence.geometric:
-                host = self._base(configuration, np.zeros(0))
-                elements = self.dependence.elements[configuration]
-                each = []
-                for one in self.effects:
-                    sizes = tuple(self.sizes[one.parameter_name(p.name)] for p in one.effect.parameters)
-                    each.append(AddedTerms(host, elements, one, sizes))
-                found = EffectTerms.found(each, partial(self._assembled, configuration))
-            self._of_effects[configuration] = found
+            known, key = self.dependence.known, (configuration, self.effects, tuple(self.sizes.values()))
+            if key not in known:
+                if len(known) >= _MOST_KNOWN:
+                    known.clear()
+                known[key] = self._found_effect_terms(configuration)
+            self._of_effects[configuration] = known[key]
         return self._of_effects[configuration]
+
+    def _found_effect_terms(self, configuration: str) -> EffectTerms | None:
+        if self.dependence.geometric:
+            return None
+        host, elements = self._base(configuration, np.zeros(0)), self.dependence.elements[configuration]
+        each = []
+        for one in self.effects:
+            sizes = tuple(self.sizes[one.parameter_name(p.name)] for p in one.effect.parameters)
+            each.append(AddedTerms(host, elements, one, sizes))
+        return EffectTerms.found(each, partial(self._assembled, configuration))
 
     def assembly(
         self, configuration: str, shape: NDArray[np.float64], without: frozenset[int] = frozenset()
