@@ -186,18 +186,10 @@ def aside(job: Callable[[], R], processes: int | None = None) -> Iterator[Callab
     if (processes or cores()) < 2 or not can_fork():
         yield job
         return
-    context = multiprocessing.get_context("fork")
-    mine, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_do, args=(lambda _, send: send(job()), None, theirs))
-    with workers_die_with_us():
-        process.start()
-    theirs.close()
+    mine, process = _begun(lambda _, send: send(job()), None)
 
     def result() -> R:
-        try:
-            kind, content = mine.recv()
-        except EOFError:  # killed, for want of memory most likely
-            raise MemoryError("a worker process ended unexpectedly") from None
+        kind, content = _received(mine)
         if kind == "failed":
             raise content
         return cast("R", content)
@@ -234,7 +226,6 @@ def side_by_side(
     Exception
         What the first of the items that failed raised; the others are done to the end.
     """
-    context = multiprocessing.get_context("fork")
     left = list(enumerate(items))
     running: dict[Connection, tuple[int, ForkProcess]] = {}
     failed: dict[int, Exception] = {}
@@ -243,23 +234,13 @@ def side_by_side(
         while left or running:
             while left and len(running) < processes:
                 index, item = left.pop(0)
-                mine, theirs = context.Pipe(duplex=False)
-                process = context.Process(target=_do, args=(job, item, theirs))
-                with workers_die_with_us():
-                    process.start()
-                theirs.close()
+                mine, process = _begun(job, item)
                 running[mine] = (index, process)
             ready = wait(list(running))
             for connection, (index, process) in list(running.items()):
                 if connection not in ready:
                     continue
-                try:
-                    kind, content = connection.recv()
-                except EOFError:  # killed, for want of memory most likely
-                    kind, content = (
-                        "failed",
-                        MemoryError(f"a worker process ended unexpectedly ({items[index]})"),
-                    )
+                kind, content = _received(connection, f" ({items[index]})")
                 if kind == "told":
                     hear(content)
                     continue
@@ -274,6 +255,26 @@ def side_by_side(
             process.join()
     if failed:
         raise failed[min(failed)]
+
+
+def _begun(job: Callable[[Any, Send], None], item: Any) -> tuple[Connection, ForkProcess]:
+    """A forked process that does a job for one item, and where it is heard."""
+    context = multiprocessing.get_context("fork")
+    mine, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_do, args=(job, item, theirs))
+    with workers_die_with_us():
+        process.start()
+    theirs.close()
+    return mine, process
+
+
+def _received(connection: Connection, what: str = "") -> tuple[str, Any]:
+    """What a process says: "told", "done" or "failed", and with what; it fails where it ended without a word."""
+    try:
+        kind, content = connection.recv()
+    except EOFError:  # killed, for want of memory most likely
+        return "failed", MemoryError(f"a worker process ended unexpectedly{what}")
+    return kind, content
 
 
 def _do(job: Callable[[Any, Send], None], item: Any, to: Connection) -> None:

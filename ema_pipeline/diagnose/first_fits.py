@@ -250,13 +250,8 @@ def _starts(
             plans.append((begin, {_first_size(hypothesis): float(score.size[0])}))
         if tried is not None:
             plans.append((unbent, {_first_size(hypothesis): tried.unknown}))
-    found = []
-    for x, sizes in plans:
-        moved = x.copy()
-        for name, value in sizes.items():
-            moved[problem.unknowns.index[name]] = value
-        found.append(problem.unknowns.clipped(moved))
-    return found
+    unknowns = problem.unknowns
+    return [unknowns.clipped(unknowns.with_values(x, sizes)) for x, sizes in plans]
 
 
 def _from_score(
@@ -309,8 +304,7 @@ def _best_to_first_order(
     begin = transferred(base.posterior, problem.unknowns)
     best, at = -np.inf, begin
     for sizes in _grid(hypothesis):
-        x = begin.copy()
-        x[[problem.unknowns.index[n] for n in sizes]] = list(sizes.values())
+        x = problem.unknowns.with_values(begin, sizes)
         there = problem.residuals(problem.unknowns.clipped(x), base.posterior.scatters, derivatives=False)
         as_before = same_matching(there.matching, found.matching)
         gain = marginal.gained(there.values - found.values) if as_before else found.cost - there.cost
@@ -333,8 +327,7 @@ def _best_of_grid(
     scatters = wide(observations)
     tried = []
     for sizes in _grid(hypothesis):
-        x = begin.copy()
-        x[[problem.unknowns.index[n] for n in sizes]] = list(sizes.values())
+        x = problem.unknowns.with_values(begin, sizes)
         found = problem.residuals(problem.unknowns.clipped(x), scatters, heat=_GRID_HEAT, derivatives=False)
         tried.append((found.cost, sizes))
     return [start for _, start in sorted(tried, key=lambda pair: pair[0])[:_GRID_STARTS]]

@@ -94,8 +94,7 @@ def scores(
         """The same of the first size beside those others, of some, with which it is seen and gains most."""
         found = []
         for start in starts:
-            x = begin.copy()
-            x[[problem.unknowns.index[name] for name in start]] = list(start.values())
+            x = problem.unknowns.with_values(begin, start)
             x[at[0]] = _SMALL
             there = problem.residuals(x, scatters, matching=matching, derivatives=False)
             if len(there.values) == marginal.count:

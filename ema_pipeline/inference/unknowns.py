@@ -67,6 +67,12 @@ class Unknowns:
         """Prior 1 σ at these scatters, (n,)."""
         return self.std * np.array([scatters[s] if s else 1.0 for s in self.scatter])
 
+    def with_values(self, x: NDArray[np.float64], values: Mapping[str, float]) -> NDArray[np.float64]:
+        """`x` with other values of some unknowns, by name, (n,)."""
+        found = x.copy()
+        found[[self.index[name] for name in values]] = list(values.values())
+        return found
+
     def clipped(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """`x` within the bounds."""
         return np.clip(x, self.lower, self.upper)

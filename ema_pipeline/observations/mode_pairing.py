@@ -65,15 +65,17 @@ def turned(read: NDArray[np.float64] | NDArray[np.complex128]) -> NDArray[np.flo
     return np.asarray(np.real(read * np.exp(-0.5j * np.angle(np.sum(read**2, axis=0)))), float)
 
 
-def _with_rest(to: NDArray[np.int64], data: ModeData, eigenvalues: NDArray[np.float64]) -> NDArray[np.int64]:
+def _with_rest(to: NDArray[np.int64], data: ModeData, frequency_hz: NDArray[np.float64]) -> NDArray[np.int64]:
     """Pairs, and what is left of measured and undamped modes by frequency alone.
 
     Damping turns undamped modes of nearly one frequency into each other, so that some resemble none that was measured.
     """
     alone = np.flatnonzero(to < 0)
-    free = np.setdiff1d(np.arange(len(eigenvalues)), to)
-    log = 0.5 * np.log(np.maximum(eigenvalues[free], 1e-12)) - np.log(2 * np.pi)
-    apart = np.abs(log[None, :] - data.log_frequency[alone, None])
+    if not len(alone):
+        return to
+    free = np.setdiff1d(np.arange(len(frequency_hz)), to)
+    log = np.log(np.maximum(frequency_hz[free], 1e-6))
+    apart = np.abs(log[None] - data.log_frequency[alone, None])
     which, rest = scipy.optimize.linear_sum_assignment(apart)
     near = apart[which, rest] < _FREQUENCY_REACH
     found = to.copy()
@@ -113,7 +115,8 @@ class OwnDamping:
         shapes : ndarray, (n_dofs, n)
         """
         read = self.along @ shapes[: self.along.shape[1]]
-        to = _with_rest(paired(self.data, np.sqrt(eigenvalues) / (2 * np.pi), read), self.data, eigenvalues)
+        hz = np.sqrt(eigenvalues) / (2 * np.pi)
+        to = _with_rest(paired(self.data, hz, read), self.data, hz)
         found = np.zeros((len(to), shapes.shape[1]))
         on = np.flatnonzero(to >= 0)
         found[on, to[on]] = 1.0
