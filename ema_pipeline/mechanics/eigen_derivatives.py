@@ -124,16 +124,19 @@ class ModeDerivatives:
     damping_ratio : ndarray, (m, n)
     shapes : ndarray, (n_dofs, m, n)
         Complex where damping or an effect turns them; else those of the undamped ones.
-    reduced : ndarray, (m, m, n)
-        Of what the matrices are between modes of one group, whose diagonal holds their eigenvalues; 0 elsewhere. The
-        shapes of a group then stay in their place: between close modes a rotation is no linear function of anything,
-        while this matrix is.
+    reduced : ndarray, (q, n)
+        Of what the matrices are between modes of one group, where the diagonal holds their eigenvalues. The shapes of a
+        group then stay in their place: between close modes a rotation is no linear function of anything, while this
+        matrix is.
+    between : ndarray of int, (m, m)
+        Row of each pair of modes in `reduced`, -1 where they are of no group.
     """
 
     log_frequency: NDArray[np.float64]
     damping_ratio: NDArray[np.float64]
     shapes: NDArray[np.float64] | NDArray[np.complex128]
     reduced: NDArray[np.float64]
+    between: NDArray[np.int64]
 
     @classmethod
     def of(
@@ -160,13 +163,14 @@ class ModeDerivatives:
         if np.any(matrices.skew_by_shape):  # of no size yet, but shapes lag behind with it
             damped = DampedModes.uncoupled(solution.frequency_hz, solution.damping_ratio, solution.shapes)
             return cls._damped(matrices, solution, damped, modes, group)
-        log_frequency, weight, reduced = _undamped(matrices, solution, modes, group)
+        between = _numbered_pairs(group)
+        log_frequency, weight, reduced = _undamped(matrices, solution, modes, between)
         ratio = _damping(matrices, solution, modes, log_frequency, weight)
         log_frequency, ratio, weight, reduced = _with_ratios(
             matrices, modes, log_frequency, ratio, weight, reduced
         )
         shapes = (solution.shapes @ weight).transpose(1, 2, 0)
-        return cls(log_frequency.T, ratio.T, shapes, reduced.transpose(1, 2, 0))
+        return cls(log_frequency.T, ratio.T, shapes, np.ascontiguousarray(reduced.T), between)
 
     @classmethod
     def _damped(
@@ -178,7 +182,8 @@ class ModeDerivatives:
         group: NDArray[np.int64],
     ) -> ModeDerivatives:
         omega, phi = np.sqrt(solution.eigenvalues), solution.shapes
-        bare, weight, reduced = _undamped(matrices, solution, modes, group)
+        between = _numbered_pairs(group)
+        bare, weight, reduced = _undamped(matrices, solution, modes, between)
         log_frequency, ratio = damped.derivatives(matrices, modes, bare, weight, omega)
         turned = np.flatnonzero(damped.turned[modes])
         skew = np.flatnonzero(np.any(matrices.skew_by_shape, axis=(1, 2)))
@@ -194,20 +199,30 @@ class ModeDerivatives:
             matrices, modes, log_frequency, ratio, shapes, reduced
         )
         if len(turned):
-            bare, weight, _ = _undamped(matrices, solution, np.arange(len(omega)), np.full(len(omega), -1))
+            alone = _numbered_pairs(np.full(len(omega), -1))
+            bare, weight, _ = _undamped(matrices, solution, np.arange(len(omega)), alone)
             count = len(weight)
             order = [*range(at), *range(count, count + len(matrices.damping_log)), *range(at, count)]
             own = damped.derivatives_of(modes[turned], matrices, phi, omega, bare, weight)
             log_frequency[:, turned], ratio[:, turned] = own[0][:, order].T, own[1][:, order].T
             shapes[:, :, turned] = own[2][:, :, order].transpose(2, 1, 0)
-        return cls(log_frequency.T, ratio.T, shapes.transpose(1, 2, 0), reduced.transpose(1, 2, 0))
+        shapes = shapes.transpose(1, 2, 0)
+        return cls(log_frequency.T, ratio.T, shapes, np.ascontiguousarray(reduced.T), between)
+
+
+def _numbered_pairs(group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Pairs of modes of one group, numbered through; -1 for all others, (m, m)."""
+    of_one = (group[:, None] == group) & (group[:, None] >= 0)
+    found = np.full(of_one.shape, -1)
+    found[of_one] = np.arange(np.count_nonzero(of_one))
+    return found
 
 
 def _undamped(
-    matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64], group: NDArray[np.int64]
+    matrices: Matrices, solution: EigenSolution, modes: NDArray[np.int64], between: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Derivatives of ln f of undamped modes, (n_unknowns, m), of shapes as shares of all, (n_unknowns, n, m), and of
-    the matrix between modes of a group, (n_unknowns, m, m).
+    the matrix between the pairs of modes of a group, (n_unknowns, q).
     """
     stiffness, mass = (_forms(matrices, solution, modes, kind) for kind in (STIFFNESS, MASS))
     values = solution.eigenvalues[modes]
@@ -217,11 +232,10 @@ def _undamped(
     here = np.arange(len(modes))
     own = stiffness[:, modes, here] - values * mass[:, modes, here]
     weight[:, modes, here] = -0.5 * mass[:, modes, here]
-    reduced = np.zeros((len(weight), len(modes), len(modes)))
-    a, b = np.nonzero((group[:, None] == group) & (group[:, None] >= 0))
-    between = mass[:, modes[a], b]
-    reduced[:, a, b] = stiffness[:, modes[a], b] - 0.5 * (values[a] + values[b]) * between
-    weight[:, modes[a], b] = -0.5 * between
+    a, b = np.nonzero(between >= 0)
+    shared = mass[:, modes[a], b]
+    reduced = stiffness[:, modes[a], b] - 0.5 * (values[a] + values[b]) * shared
+    weight[:, modes[a], b] = -0.5 * shared
     return own / (2 * values), weight, reduced
 
 

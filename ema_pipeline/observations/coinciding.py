@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
+from ema_pipeline.observations.comparison_kernel import nearest_seen
 
 Real = NDArray[np.float64]
 
@@ -44,16 +45,11 @@ def hidden_partners(
     read : ndarray, (s, n)
         What the sensors read of all modes, in their modal scale.
     """
-    hz, width = solution.frequency_hz, solution.damping_ratio * solution.frequency_hz
-    distance = np.abs(hz[to, None] - hz)
-    distance[:, to] = np.inf
-    near = (distance < np.nan_to_num(width)[to, None]) & (sensors >= _FEWEST_SENSORS)[:, None]
-    if not np.any(near):
-        return np.full(len(to), -1)
+    width = np.nan_to_num(solution.damping_ratio * solution.frequency_hz)
     strength = np.sum(np.abs(read) ** 2, axis=0)
-    distance[~near | (strength < _SEEN * strength[to, None])] = np.inf
-    nearest = np.argmin(distance, axis=1)
-    return np.asarray(np.where(np.isfinite(distance[np.arange(len(to)), nearest]), nearest, -1), np.int64)
+    return np.asarray(
+        nearest_seen(solution.frequency_hz, width, to, sensors >= _FEWEST_SENSORS, strength, _SEEN), np.int64
+    )
 
 
 def directions(

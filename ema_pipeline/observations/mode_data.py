@@ -17,6 +17,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.modal.assurance import mac
 
 if TYPE_CHECKING:
+    from ema_pipeline.observations.known_shapes import KnownShapes
     from ema_pipeline.observations.without_partner import Alone
 
 _MIXED_STD = 0.1
@@ -125,6 +126,11 @@ class ModeData:
         return np.asarray(np.any(self.imaginary, axis=1) & ~self.double)
 
     @cached_property
+    def places_whirling(self) -> NDArray[np.int64]:
+        """These modes."""
+        return np.flatnonzero(self.whirling)
+
+    @cached_property
     def complex_shapes(self) -> NDArray[np.complex128]:
         """Shapes with the imaginary parts of `whirling` modes, 0 where not measured, (m, s)."""
         imaginary = 0.0 if self.imaginary is None else np.where(self.whirling[:, None], self.imaginary, 0.0)
@@ -133,6 +139,11 @@ class ModeData:
     @cached_property
     def costs_alone(self) -> dict[tuple[object, ...], Alone]:
         """Costs of modes without a partner that were calculated last, see `Alone.of`."""
+        return {}
+
+    @cached_property
+    def shapes_compared(self) -> dict[tuple[object, ...], KnownShapes]:
+        """Shapes of modes with a partner as they were compared last, see `KnownShapes.of`."""
         return {}
 
     @cached_property
@@ -198,6 +209,11 @@ class ModeData:
         apart = np.abs(self.log_frequency[:, None] - self.whole.log_frequency[left_out])
         near = apart < _NEAR * np.maximum(width[self.kept][:, None], width[left_out])
         return np.asarray(self.whole.may_hide_another[self.kept] & ~np.any(near, axis=1))
+
+    @cached_property
+    def sensors_for_another(self) -> NDArray[np.int64]:
+        """Sensors that tell whether another mode hides in one, (m,): 0 where none may."""
+        return np.asarray(np.count_nonzero(self.seen, axis=1) * self.may_hide_another, np.int64)
 
     @cached_property
     def mixes(self) -> tuple[tuple[int, int, float], ...]:

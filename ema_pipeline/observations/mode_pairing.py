@@ -8,6 +8,7 @@ import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
 
+from ema_pipeline.observations.comparison_kernel import likeness
 from ema_pipeline.observations.mode_data import ModeData
 
 _FREQUENCY_REACH = 0.1
@@ -40,22 +41,21 @@ def paired(
     log = np.log(np.maximum(frequency_hz, 1e-6))
     apart = np.abs(log[None] - data.log_frequency[:, None])
     if data.shapes.shape[1]:
-        real = turned(read)
-        cross = (data.known_shapes @ real) ** 2
-        norm = data.squares[:, None] * (data.seen @ real**2)
-        if np.any(whirl := data.whirling):
-            cross[whirl] = np.abs(np.conj(data.complex_shapes[whirl]) @ read) ** 2
-            norm[whirl] = data.squares[whirl, None] * (data.seen[whirl] @ np.abs(read) ** 2)
+        alike = likeness(data.known_shapes, data.squares, data.seen, turned(read))
+        if len(whirl := data.places_whirling):
+            cross = np.abs(np.conj(data.complex_shapes[whirl]) @ read) ** 2
+            norm = data.squares[whirl, None] * (data.seen[whirl] @ np.abs(read) ** 2)
+            alike[whirl] = cross / np.maximum(norm, 1e-300)
         reach = _FREQUENCY_REACH * (1 + 0.1 * (heat - 1))
-        cost = -cross / np.maximum(norm, 1e-300) + np.minimum(apart / reach, 3.0)
+        cost = np.minimum(apart / reach, 3.0) - alike
     else:
         # convex, so that close modes keep their order: two crossed pairs would cost as much as two straight ones
         cost = np.minimum(apart * (1 + apart) / _FREQUENCY_REACH_ALONE, 3.0) - 1.0
-    m = len(data)
-    leave = np.where(data.double, _LEAVE_DOUBLE, _LEAVE)
-    padded = np.concatenate([cost, np.repeat(leave[:, None], m, axis=1)], axis=1)
+    m, n = cost.shape
+    padded = np.empty((m, n + m))
+    padded[:, :n], padded[:, n:] = cost, np.where(data.double, _LEAVE_DOUBLE, _LEAVE)[:, None]
     column = scipy.optimize.linear_sum_assignment(padded)[1]
-    return np.where(column < cost.shape[1], column, -1)
+    return np.where(column < n, column, -1)
 
 
 def turned(read: NDArray[np.float64] | NDArray[np.complex128]) -> NDArray[np.float64]:

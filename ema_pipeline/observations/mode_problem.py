@@ -28,7 +28,7 @@ from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.first_order import FirstOrderModel
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_residuals import Comparison
-from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, stacked
+from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, whitened
 from ema_pipeline.observations.rig_model import RigModel
 from ema_pipeline.observations.sensing import Sensing
 from ema_pipeline.observations.size_map import SizeMap
@@ -395,8 +395,11 @@ class ModeProblem(EffectProblem):
     ) -> Residuals:
         """See `Problem`."""
         given = matching if isinstance(matching, tuple) else (None,) * len(self.observations.data)
-        parts = [
-            self.comparison(d, x, scatters, heat).residuals(m, derivatives)
+        found = [
+            self.comparison(d, x, scatters, heat).compared(m, derivatives)
             for d, m in zip(self.observations.data, given, strict=True)
         ]
-        return stacked(parts, len(x))
+        known = [f for f in found if f is not None]
+        if len(known) < len(found):
+            return Residuals(np.full(1, np.inf), np.zeros((1, len(x))), matching=given)
+        return whitened(known, scatters, self._defaults, len(x))

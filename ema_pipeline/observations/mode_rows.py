@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.inference import Residuals, tails
+from ema_pipeline.observations.comparison_kernel import number_blocks, whiten
 
 FREQUENCY = "frequency_scatter"
 SHAPE = "shape_scatter"
@@ -18,6 +19,7 @@ SHAPE_NOISE = "shape_noise"
 _SHAPE_REACH = 0.3
 _SPENT = 2.0
 """Values of a blurred shape that are spent on its factor and on how much of a hidden mode it holds."""
+_NONE, _NO_SLOPE = np.zeros(0), np.zeros((0, 0))
 
 
 def shape_unit(shapes: NDArray[np.float64] | NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -166,65 +168,54 @@ class Compared:
         return any(r.heat != 1.0 for r in self.rows)
 
 
-def _numbered(modes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Modes numbered through from 0, (k,)."""
-    steps = np.diff(modes)
-    if np.all(steps >= 0):  # nearly always: sorting takes ten times as long
-        return np.concatenate([np.zeros(1, np.int64), np.cumsum(steps > 0)])
-    return np.unique(modes, return_inverse=True)[1]
-
-
 def whitened(
-    found: Compared, scatters: Mapping[str, float], defaults: Mapping[str, float], n: int
+    found: Sequence[Compared], scatters: Mapping[str, float], defaults: Mapping[str, float], n: int
 ) -> Residuals:
-    """Differences in units of their standard uncertainties, `n` unknowns."""
-    total = sum(len(r) for r in found.rows)
-    derivatives = all(r.slope is not None for r in found.rows)
+    """Differences of all configurations in units of their standard uncertainties, `n` unknowns."""
+    rows = [(r, c) for c in found for r in c.rows if len(r)]
+    total = sum(len(r) for r, _ in rows)
+    derivatives = all(r.slope is not None for r, _ in rows)
     values, block, mode = np.empty(total), np.full(total, -1), np.full(total, -1)
     mixed, blurred = np.zeros(total, bool), np.zeros(total, bool)
     share: dict[str, NDArray[np.float64]] = {}
-    jacobian = np.zeros((total if derivatives else 0, n))
-    log_scale, at, blocks = 0.0, 0, 0
-    for r in found.rows:
-        if not len(r):
-            continue
+    jacobian = np.empty((total if derivatives else 0, n))
+    first = {id(c): sum(len(before.match) for before in found[:k]) for k, c in enumerate(found)}
+    log_scale, at, blocks = sum(c.log_scale for c in found), 0, 0
+    for r, c in rows:
         here = slice(at, at + len(r))
         at = here.stop
-        added, own = (scatters[r.scatter] * r.unit) ** 2, (r.noise_at(scatters) * r.own) ** 2
-        variance = own + added
-        usual = (r.noise_at(defaults) * r.own) ** 2 + (defaults[r.scatter] * r.unit) ** 2
-        log_scale += 0.5 * float(np.log(variance / usual).sum())
-        mode[here] = r.mode
-        if r.blur is not None and np.any(r.blur > 0):
-            blurred[here] = r.blur > 0
-            variance = variance + r.blur**2
-            log_scale += _usual_of_blurred(r, found.heated)
-        sigma = np.sqrt(variance) * r.heat
-        values[here] = r.difference / sigma
+        mode[here] = r.mode + first[id(c)]
+        blur = _NONE
+        if r.blur is not None:
+            blurred[here], blur = r.blur > 0, r.blur
+            log_scale += _usual_of_blurred(r, c.heated)
+        slope = r.slope if derivatives and r.slope is not None else _NO_SLOPE
+        of_noise, of_scatter = np.empty((2, len(slope)))
+        log_scale += whiten(
+            r.difference, r.own, r.unit, blur, slope, (r.noise_at(scatters), r.noise_at(defaults)),
+            (scatters[r.scatter], defaults[r.scatter]), r.heat, values[here], jacobian[here], of_noise, of_scatter,
+        )  # fmt: skip
         if r.sensor is not None:  # a shape may be wrong as a whole
-            number = _numbered(r.mode)
-            block[here] = number + blocks
-            blocks += int(number.max()) + 1
+            blocks += number_blocks(r.mode, blocks, block[here])
         if r.close is not None:
             mixed[here] = r.close
-        if derivatives and r.slope is not None:
-            for name, part in ((r.scatter, added), (r.noise, own)):
+        if derivatives:
+            for name, part in ((r.scatter, of_scatter), (r.noise, of_noise)):
                 if name:
                     if name not in share:
                         share[name] = np.zeros(total)
-                    share[name][here] = part / variance
-            np.divide(r.slope, -sigma[:, None], out=jacobian[here])
+                    share[name][here] = part
     return Residuals(
         values=values,
         jacobian=jacobian,
         share=share,
-        log_scale=log_scale + found.log_scale,
-        penalty=found.penalty,
-        matching=found.match,
-        unexplained=found.unexplained,
-        split=found.split,
-        projected=found.projected,
-        block=None if found.heated else block,  # far off everything is on the tail
+        log_scale=log_scale,
+        penalty=sum(c.penalty for c in found),
+        matching=tuple(c.match for c in found),
+        unexplained=sum(c.unexplained for c in found),
+        split=sum(c.split for c in found),
+        projected=sum(c.projected for c in found),
+        block=None if any(c.heated for c in found) else block,  # far off everything is on the tail
         mixed=mixed,
         mode=mode,
         blurred=blurred,

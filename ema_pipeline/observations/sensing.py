@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
+from ema_pipeline.observations.comparison_kernel import turn_slopes
+from ema_pipeline.observations.mode_pairing import turned
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,22 @@ class SensorReadings:
         self._gain = np.where(sensing.gain >= 0, np.exp(x[np.maximum(sensing.gain, 0)]), 1.0)
         cross = np.where(sensing.transverse >= 0, x[np.maximum(sensing.transverse, 0)], 0.0)
         self._rows = self._gain[:, None] * (sensing.along + np.sum(cross[..., None] * sensing.across, axis=0))
+        self._last: tuple[EigenSolution, NDArray[Any], NDArray[np.float64]] | None = None
 
     def of(self, solution: EigenSolution) -> NDArray[Any]:
-        """Of every mode, (s, n); complex where the modes are."""
-        shapes = solution.shapes if solution.damped is None else solution.damped.shapes
-        return np.asarray(self._rows @ shapes[: self._rows.shape[1]])
+        """Of every mode, (s, n); complex where the modes are. What was read last is kept."""
+        return self._read_of(solution)[1]
+
+    def turned(self, solution: EigenSolution) -> NDArray[np.float64]:
+        """The same, turned as measured shapes are, and made real."""
+        return self._read_of(solution)[2]
+
+    def _read_of(self, solution: EigenSolution) -> tuple[EigenSolution, NDArray[Any], NDArray[np.float64]]:
+        if self._last is None or self._last[0] is not solution:
+            shapes = solution.shapes if solution.damped is None else solution.damped.shapes
+            read = np.asarray(self._rows @ shapes[: self._rows.shape[1]])
+            self._last = solution, read, turned(read)
+        return self._last
 
     def slopes(
         self,
@@ -90,7 +103,9 @@ class SensorReadings:
         predicted = (self._rows @ shapes).T
         k, count = predicted.shape
         slope = np.zeros((k, count, self._unknowns), np.result_type(predicted, by_model))
-        read = self._rows @ by_model[:width].reshape(width, k * by_model.shape[2])
+        # complex numbers as pairs of real ones: half of the products
+        flat = np.ascontiguousarray(by_model[:width]).view(float).reshape(width, -1)
+        read = (self._rows @ flat).view(by_model.dtype)
         slope[:, :, : by_model.shape[2]] = read.reshape(count, k, by_model.shape[2]).transpose(1, 0, 2)
         has = np.flatnonzero(s.gain >= 0)
         slope[:, has, s.gain[has]] += predicted[:, has]
@@ -100,24 +115,18 @@ class SensorReadings:
         return slope
 
     def real_slopes(
-        self,
-        by_model: NDArray[np.float64] | NDArray[np.complex128],
-        solution: EigenSolution,
-        to: NDArray[np.int64],
+        self, slopes: NDArray[Any], solution: EigenSolution, to: NDArray[np.int64]
     ) -> NDArray[np.float64]:
-        """The same of shapes that are turned as measured ones are, and made real."""
-        slope = self.slopes(by_model, solution, to)
-        if solution.damped is not None and np.iscomplexobj(slope):
-            return turned_slopes(self.of(solution)[:, to].T, slope)
-        return np.real(slope)
+        """The same of shapes that are turned as measured ones are, and made real, from `slopes`."""
+        if solution.damped is not None and np.iscomplexobj(slopes):
+            return turned_slopes(self.of(solution)[:, to].T, slopes)
+        return np.ascontiguousarray(np.real(slopes))
 
 
 def turned_slopes(read: NDArray[np.complex128], slope: NDArray[np.complex128]) -> NDArray[np.float64]:
     """Derivatives of `mode_pairing.turned` shapes from those (k, s, n) of the complex ones (k, s), which turn the
     angle, too.
     """
-    square = np.sum(read**2, axis=1)
-    square = np.where(square == 0, 1.0, square)  # no sensor reads the mode: nothing turns
-    back = np.exp(-0.5j * np.angle(square))[:, None]
-    angle = np.imag(np.einsum("ks,ksn->kn", read, slope) / square[:, None])
-    return np.asarray(np.real(back[..., None] * slope) + np.imag(back * read)[..., None] * angle[:, None, :])
+    result = np.empty(slope.shape)
+    turn_slopes(np.ascontiguousarray(read, complex), np.ascontiguousarray(slope, complex), result)
+    return result

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.observations.close_modes import Groups, Slopes
+from ema_pipeline.observations.close_modes import Groups, Mixed, Slopes
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.sensing import turned_slopes
 
@@ -126,20 +126,22 @@ def test_derivatives_are_those_of_differences(modes: int) -> None:
     x = np.array([0.02, -0.01, 0.03, 0.1])
     found, (_, vectors) = at(x), frame(basis + np.einsum("j,jab->ab", x[:3], np.array(by)))
     square = (2 * np.pi * 100.0) ** 2
-    read, reduced = np.zeros((1, modes, 12, 4)), np.zeros((1, modes, modes, 4))
-    given = np.zeros((1, modes, 12, 4))
-    given[0, :, :, 3] = noise[1]
+    read, reduced = np.zeros((modes, 12, 4)), np.zeros((modes, modes, 3))
     for j in range(3):
-        read[0, :, :, j] = (shifted[j] @ vectors).T
-        reduced[0, :, :, j] = square * (vectors.T @ by[j] @ vectors)
-    slopes = found.slopes(Slopes(read, reduced, given))
+        read[:, :, j] = (shifted[j] @ vectors).T
+        reduced[:, :, j] = square * (vectors.T @ by[j] @ vectors)
+    slopes = Slopes(np.zeros((modes, 4)), read, np.zeros(read.shape))
+    at_last = np.array([[k, 3] for k in range(modes)])
+    members, between = np.arange(modes)[None], np.arange(modes**2).reshape(modes, modes)
+    # measured shapes are less what unknowns say they hold of others
+    found.turn_slopes(slopes, members, reduced.reshape(-1, 3), between, Mixed(at_last, -noise[1]))
     for j in range(4):
         h = np.zeros(4)
         h[j] = 1e-6
         ends = at(x - h), at(x + h)
         for name in ("log_frequency", "shapes", "turned"):
             change = (getattr(ends[1], name) - getattr(ends[0], name)) / 2e-6
-            expected = getattr(slopes, name)[..., j]
+            expected = getattr(slopes, name)[None, ..., j]
             np.testing.assert_allclose(expected, change, atol=1e-5 * np.max(np.abs(change)) + 1e-9)
 
 

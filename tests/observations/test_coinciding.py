@@ -125,7 +125,7 @@ def test_what_a_hidden_mode_adds_makes_a_difference_count_less_and_is_no_evidenc
     scatters, usual = {"shape": 0.0005, "noise": 0.1}, {"shape": 0.015, "noise": 1.0}
 
     def seen(one: Rows) -> Residuals:
-        return whitened(Compared((one,), np.zeros(1, int), 0.0, 0.0, 0.0, 0, 1), scatters, usual, 0)
+        return whitened([Compared((one,), np.zeros(1, int), 0.0, 0.0, 0.0, 0, 1)], scatters, usual, 0)
 
     sharp, blurred = seen(rows), seen(replace(rows, blur=np.full(4, 0.3)))
     usual_squares, none_left = (
