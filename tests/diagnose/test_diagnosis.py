@@ -19,7 +19,7 @@ from ema_pipeline import codec
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
 from ema_pipeline.diagnose.claims import judge, left_of_close_modes
 from ema_pipeline.diagnose.diagnosis import diagnose
-from ema_pipeline.diagnose.explained import at_usual_scatters
+from ema_pipeline.diagnose.explained import at_usual_scatters, explanation
 from ema_pipeline.diagnose.heldout import HeldOut, held_out
 from ema_pipeline.diagnose.hypotheses import list_hypotheses
 from ema_pipeline.diagnose.ranked import BEATEN
@@ -30,6 +30,7 @@ from ema_pipeline.diagnose.types import NOTHING, UNKNOWN, DetectionLimit, Diagno
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.inference import Posterior, Residuals, Unknowns
+from ema_pipeline.inference.posterior import error_limit
 from ema_pipeline.mechanics.assembly import Damper, Element, Mass, Spring
 from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned
 from ema_pipeline.observations.mode_data import prepare
@@ -303,6 +304,17 @@ def test_a_support_far_out_of_its_tolerance_is_named_by_its_parameter() -> None:
     assert first.label == "out_of_tolerance@sun_bearing_stiffness"
     size = first.parameters["relative_change"]
     assert size.value == pytest.approx(0.8, abs=max(0.1, 3 * size.std))
+
+
+def test_frequencies_that_scatter_more_than_usual_speak_against_a_model_that_follows_all_other_data() -> None:
+    """Three hundred entries of shapes hide it in the error of all data."""
+    rig = planetary()
+    aslant = added(Spring, 1e7, {"sun.x": 1.0, "sun.y": 1.0})  # no part of the rig couples x and y
+    observations = observed(rig, planetary_modes(rig, 1, GOOD, aslant, ("no_ring", "with_ring")))
+    told = explanation(observations, learned(observations, fit_base(observations, Model())), SETTINGS)
+    error, count = told.telling
+    assert told.fails
+    assert told.by_scatter == error < error_limit(count, SETTINGS.error_limit)
 
 
 def test_what_is_known_already_is_not_looked_for_again() -> None:
