@@ -247,7 +247,7 @@ def left_of_close_modes(base: Fit, mended: Fit) -> float:
     effect adds may be said to hide in one whose shape fits none.
     """
     # at the same scatters, whose cost is no difference
-    evidence = [fit.log_evidence + fit.posterior.scatter_cost for fit in (base, mended)]
+    evidence = [fit.posterior.evidence_at_scatters for fit in (base, mended)]
     before, after = (fit.posterior.residuals for fit in (base, mended))
     left = evidence[1] - evidence[0] - max(before.split - after.split, 0.0)
     of_before, of_after = before.mode_of_block, after.mode_of_block

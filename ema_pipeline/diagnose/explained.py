@@ -9,7 +9,7 @@ import numpy as np
 import scipy.special
 
 from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED, DiagnoseSettings
-from ema_pipeline.inference import Posterior, beyond
+from ema_pipeline.inference import beyond
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, part_reach, within_scatter
 from ema_pipeline.observations.mode_problem import MIXING
@@ -107,10 +107,11 @@ class Explanation:
 def explanation(observations: Observations, fit: Fit, settings: DiagnoseSettings) -> Explanation:
     """Hold a fitted model against the data."""
     p, limit = fit.posterior, settings.error_limit
-    usual, narrow = (at_usual_scatters(observations, fit, of) for of in (_OF_TESTS, (*_OF_TESTS, MIXING)))
+    usual = at_usual_scatters(observations, fit)
+    narrow = at_usual_scatters(observations, usual, (MIXING,))
     judged = within_scatter(observations, usual).posterior
     held = judged if narrow is usual else within_scatter(observations, narrow).posterior
-    wider = _evidence(p) - _evidence(held) > _GAINED
+    wider = p.evidence_at_scatters - held.evidence_at_scatters > _GAINED
     fails = wider or judged.fails(limit)
     by_scatter = 0.0
     if fails and narrow is not fit and not within_scatter(observations, fit).posterior.fails(limit):
@@ -136,11 +137,6 @@ def at_usual_scatters(observations: Observations, fit: Fit, of: Sequence[str] = 
     learned = fit.posterior.scatters
     capped = {n: min(value, usual.get(n, value)) for n, value in learned.items()}
     return fit if capped == learned else at_scatters(observations, fit, capped)
-
-
-def _evidence(found: Posterior) -> float:
-    """Logarithm of the evidence, whatever the scatters cost."""
-    return found.log_evidence + found.scatter_cost
 
 
 def outlying_damping(observations: Observations, fit: Fit) -> OutlyingDamping | None:

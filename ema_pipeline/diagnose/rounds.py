@@ -105,7 +105,7 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
     bounded = within_scatter(observations, ranking.base).posterior
     if bounded is p or not bounded.fails(settings.error_limit):
         return ranking
-    relief = p.log_evidence + p.scatter_cost - bounded.log_evidence - bounded.scatter_cost
+    relief = p.evidence_at_scatters - bounded.evidence_at_scatters
     parts = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, part_reach(observations, p)))]
 
     def explains(one: Ranked) -> bool:

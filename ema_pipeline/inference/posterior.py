@@ -94,13 +94,18 @@ class Posterior:
         """Posterior 1 σ, (n,)."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
-    @cached_property
+    @property
     def log_evidence(self) -> float:
         """Natural logarithm of the evidence, up to a constant that is the same for all models of the same data."""
+        return self.evidence_at_scatters - self.scatter_cost
+
+    @cached_property
+    def evidence_at_scatters(self) -> float:
+        """The same for these scatters, whatever they cost."""
         if not np.isfinite(self.cost):
             return -np.inf
         half_log_det = float(np.sum(np.log(np.diag(lower_factor(self._information())))))
-        return -self.cost - half_log_det - self.scatter_cost
+        return -self.cost - half_log_det
 
     @property
     def error(self) -> float:

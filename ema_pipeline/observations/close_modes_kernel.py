@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Real = NDArray[np.float64]
 
-INDEPENDENT = 0.05
+_INDEPENDENT = 0.05
 """Smallest eigenvalue of the correlation of shapes, model's or measured, that are told apart."""
 _SWEEPS, _ROUNDING = 12, 1e-15
 
@@ -121,12 +121,8 @@ def seen(read, measured, weight, frequency_hz, measured_hz, uncertain):  # type:
     inverse = np.zeros((groups, c, c, c))
     share, unit = np.zeros((groups, c, c)), np.zeros((groups, c, c))
     length, spread, axes = np.zeros((groups, c)), np.zeros((groups, c)), np.zeros((groups, c, c))
-    basis, matrix, distance = (
-        np.zeros((groups, c, c)),
-        np.zeros((groups, c, c)),
-        np.zeros((groups, c, c)),
-    )
-    log_frequency = np.zeros((groups, c))
+    basis, matrix = np.zeros((groups, c, c)), np.zeros((groups, c, c))
+    distance, log_frequency = np.zeros((groups, c, c)), np.zeros((groups, c))
     shapes, turned = np.zeros((groups, c, sensors)), np.zeros((groups, c, sensors))
     gram, alike, root, vectors = np.zeros((c, c)), np.zeros((c, c)), np.zeros((c, c)), np.zeros((c, c))
     values, pulled = np.zeros(c), np.zeros(c)
@@ -147,7 +143,7 @@ def seen(read, measured, weight, frequency_hz, measured_hz, uncertain):  # type:
                     size = np.sqrt(max(gram[a, a], 1e-300)) * np.sqrt(max(gram[b, b], 1e-300))
                     alike[a, b] = gram[a, b] / size
             _diagonal(alike, values, vectors)
-            independent = independent and values.min() > INDEPENDENT
+            independent = independent and values.min() > _INDEPENDENT
             if not independent:
                 break
             _inverted(gram, inverse[g, k])
@@ -167,7 +163,7 @@ def seen(read, measured, weight, frequency_hz, measured_hz, uncertain):  # type:
                 for a in range(c):
                     alike[k, i] += unit[g, k, a] * unit[g, i, a]
         _diagonal(alike, values, axes[g])
-        if not values.min() > INDEPENDENT:
+        if not values.min() > _INDEPENDENT:
             continue
         told[g] = True
         for k in range(c):
@@ -291,23 +287,19 @@ def add_slopes(  # type: ignore[no-untyped-def]
                 for j in range(n):
                     inner[a, b, j] = reduced[row, j] if j < model else 0.0
         _between(basis, inner, half, changed)
+        _add_times(matrix, turning, changed)
+        _add_by(turning, -matrix, changed)
+        # and what the sensors read of it
+        turn = matrix * distance
         for k in range(c):
             for i in range(c):
-                for a in range(c):
-                    _add(changed[k, i], matrix[k, a], turning[a, i])
-                    _add(changed[k, i], -matrix[a, i], turning[k, a])
-        # and what the sensors read of it
+                for j in range(n):
+                    inner[k, i, j] = distance[k, i] * changed[k, i, j]
         _clear(moved)
         _clear(rotated)
-        for a in range(c):
-            for k in range(c):
-                for i in range(c):
-                    _add(moved[a, k], basis[a, i], turning[i, k])
-                    _add(rotated[a, k], basis[a, i] * distance[i, k], changed[i, k])
-        for a in range(c):
-            for k in range(c):
-                for i in range(c):
-                    _add(rotated[a, k], matrix[i, k] * distance[i, k], moved[a, i])
+        _add_times(basis, turning, moved)
+        _add_times(basis, inner, rotated)
+        _add_by(moved, turn, rotated)
         for k in range(c):
             m = members[g, k]
             for j in range(n):
@@ -316,14 +308,14 @@ def add_slopes(  # type: ignore[no-untyped-def]
                 for j in range(n):
                     shapes[m, s, j] = 0.0
             for a in range(c):
-                turn = 0.0
+                held = 0.0
                 for i in range(c):
-                    turn += basis[a, i] * matrix[i, k] * distance[i, k]
+                    held += basis[a, i] * turn[i, k]
                 for s in range(sensors):
                     here = read[g, s, a]
                     for j in range(n):
                         shapes[m, s, j] += basis[a, k] * own[a, s, j] + here * moved[a, k, j]
-                        turned[m, s, j] += turn * own[a, s, j] + here * rotated[a, k, j]
+                        turned[m, s, j] += held * own[a, s, j] + here * rotated[a, k, j]
 
 
 @numba.njit(cache=True)
@@ -345,14 +337,27 @@ def _add(result, factor, what):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True)
 def _between(basis, inner, half, result):  # type: ignore[no-untyped-def]
     """basisᵀ·inner·basis for a matrix of arrays, (c, c, n), into `result`; `half` is overwritten."""
-    c = len(basis)
     _clear(half)
     _clear(result)
+    _add_by(inner, basis, half)
+    _add_times(basis.T.copy(), half, result)
+
+
+@numba.njit(cache=True)
+def _add_times(matrix, arrays, result):  # type: ignore[no-untyped-def]
+    """Add Σ_b matrix_ab arrays_bk, a matrix of arrays as the others are, (c, c, n)."""
+    c = len(matrix)
     for a in range(c):
         for k in range(c):
             for b in range(c):
-                _add(half[a, k], basis[b, k], inner[a, b])
-    for i in range(c):
+                _add(result[a, k], matrix[a, b], arrays[b, k])
+
+
+@numba.njit(cache=True)
+def _add_by(arrays, matrix, result):  # type: ignore[no-untyped-def]
+    """Add Σ_b arrays_ab matrix_bk."""
+    c = len(matrix)
+    for a in range(c):
         for k in range(c):
-            for a in range(c):
-                _add(result[i, k], basis[a, i], half[a, k])
+            for b in range(c):
+                _add(result[a, k], matrix[b, k], arrays[a, b])

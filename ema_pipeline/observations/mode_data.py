@@ -126,11 +126,6 @@ class ModeData:
         return np.asarray(np.any(self.imaginary, axis=1) & ~self.double)
 
     @cached_property
-    def places_whirling(self) -> NDArray[np.int64]:
-        """These modes."""
-        return np.flatnonzero(self.whirling)
-
-    @cached_property
     def complex_shapes(self) -> NDArray[np.complex128]:
         """Shapes with the imaginary parts of `whirling` modes, 0 where not measured, (m, s)."""
         imaginary = 0.0 if self.imaginary is None else np.where(self.whirling[:, None], self.imaginary, 0.0)

@@ -42,7 +42,7 @@ def paired(
     apart = np.abs(log[None] - data.log_frequency[:, None])
     if data.shapes.shape[1]:
         alike = likeness(data.known_shapes, data.squares, data.seen, turned(read))
-        if len(whirl := data.places_whirling):
+        if np.any(whirl := data.whirling):
             cross = np.abs(np.conj(data.complex_shapes[whirl]) @ read) ** 2
             norm = data.squares[whirl, None] * (data.seen[whirl] @ np.abs(read) ** 2)
             alike[whirl] = cross / np.maximum(norm, 1e-300)

@@ -172,19 +172,21 @@ def whitened(
     found: Sequence[Compared], scatters: Mapping[str, float], defaults: Mapping[str, float], n: int
 ) -> Residuals:
     """Differences of all configurations in units of their standard uncertainties, `n` unknowns."""
-    rows = [(r, c) for c in found for r in c.rows if len(r)]
-    total = sum(len(r) for r, _ in rows)
-    derivatives = all(r.slope is not None for r, _ in rows)
+    rows, modes = list[tuple[Rows, Compared, int]](), 0
+    for c in found:
+        rows += [(r, c, modes) for r in c.rows if len(r)]
+        modes += len(c.match)
+    total = sum(len(r) for r, _, _ in rows)
+    derivatives = all(r.slope is not None for r, _, _ in rows)
     values, block, mode = np.empty(total), np.full(total, -1), np.full(total, -1)
     mixed, blurred = np.zeros(total, bool), np.zeros(total, bool)
     share: dict[str, NDArray[np.float64]] = {}
     jacobian = np.empty((total if derivatives else 0, n))
-    first = {id(c): sum(len(before.match) for before in found[:k]) for k, c in enumerate(found)}
     log_scale, at, blocks = sum(c.log_scale for c in found), 0, 0
-    for r, c in rows:
+    for r, c, first in rows:
         here = slice(at, at + len(r))
         at = here.stop
-        mode[here] = r.mode + first[id(c)]
+        mode[here] = r.mode + first
         blur = _NONE
         if r.blur is not None:
             blurred[here], blur = r.blur > 0, r.blur

@@ -370,7 +370,8 @@ def test_a_base_model_that_fails_once_no_part_stands_out_counts_with_that_fit(
     def fit(log_evidence: float, error: float, bounded: Any = None, cosine: float = 0.96) -> Any:
         jacobian = np.array([[1.0, cosine], [0.0, np.sqrt(1 - cosine**2)]])
         posterior = SimpleNamespace(
-            log_evidence=log_evidence, scatter_cost=1.0, error=error, fails=lambda most: error > most,
+            log_evidence=log_evidence, evidence_at_scatters=log_evidence + 1.0, error=error,
+            fails=lambda most: error > most,
             residuals=SimpleNamespace(weighted=(None, jacobian)),
             unknowns=SimpleNamespace(names=("m1", "mass@m1.mass"), index={"m1": 0, "mass@m1.mass": 1}),
         )  # fmt: skip
