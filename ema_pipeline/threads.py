@@ -44,11 +44,12 @@ def share_cores(processes: int) -> None:
 A = TypeVar("A")
 R = TypeVar("R")
 
-_inner = threading.local()
+_at_work: set[int] = set()
+"""Threads of pools that work on an item, or wait for threads of their own that do."""
 
 
 def in_order(work: Callable[[A], R], items: Sequence[A]) -> Iterator[R]:
-    """``map(work, items)`` over a thread per processor; what threads call in turn stays in their thread.
+    """``map(work, items)`` over a thread per processor; what threads call in turn shares what others leave free.
 
     Worth it where NumPy or compiled loops do the work, which leave the other threads running.
     """
@@ -56,16 +57,25 @@ def in_order(work: Callable[[A], R], items: Sequence[A]) -> Iterator[R]:
     if n < 2:
         yield from map(work, items)
         return
-    with ThreadPoolExecutor(n, initializer=_enter) as pool:
-        yield from pool.map(work, items)
+    with ThreadPoolExecutor(n) as pool:
+        yield from pool.map(_seen_at_work(work), items)
 
 
-def _enter() -> None:
-    _inner.thread = True
+def _seen_at_work(work: Callable[[A], R]) -> Callable[[A], R]:
+    def seen(item: A) -> R:
+        me = threading.get_ident()
+        _at_work.add(me)
+        try:
+            return work(item)
+        finally:
+            _at_work.discard(me)
+
+    return seen
 
 
 def _free_cores() -> int:
-    return 1 if getattr(_inner, "thread", False) else cores()
+    """Processors for this thread and those that it starts, less one for every other thread that works."""
+    return max(1, cores() - len(_at_work - {threading.get_ident()}))
 
 
 Rows = Callable[[slice], object]
@@ -93,10 +103,10 @@ def over_rows(n_rows: int, numbers: int) -> Iterator[Callable[[Rows], None]]:
         yield at_once
         return
     edges = [n_rows * k // n for k in range(n + 1)]
-    with ThreadPoolExecutor(n, initializer=_enter) as pool:
+    with ThreadPoolExecutor(n) as pool:
 
         def in_blocks(work: Rows) -> None:
-            for _ in pool.map(work, [slice(a, b) for a, b in pairwise(edges)]):
+            for _ in pool.map(_seen_at_work(work), [slice(a, b) for a, b in pairwise(edges)]):
                 pass
 
         yield in_blocks

@@ -169,14 +169,36 @@ def test_rows_in_threads_and_in_one_are_the_same() -> None:
     assert np.array_equal(*sums)
 
 
-def test_what_threads_call_stays_in_their_thread() -> None:
+def test_threads_that_all_work_start_none_of_their_own() -> None:
     if cores() < 2:
         pytest.skip("one processor")
+    together = threading.Barrier(cores(), timeout=30)
 
     def inner(item: int) -> set[int]:
-        return set(in_order(lambda _: threading.get_ident(), range(8)))
+        together.wait()
+        threads = set(in_order(lambda _: threading.get_ident(), range(8)))
+        together.wait()
+        return threads
 
-    assert all(len(threads) == 1 for threads in in_order(inner, range(8)))
+    assert all(len(threads) == 1 for threads in in_order(inner, range(cores())))
+
+
+def test_a_thread_shares_its_work_with_those_that_have_none_left() -> None:
+    if cores() < 2:
+        pytest.skip("one processor")
+    together = threading.Barrier(cores(), timeout=30)
+
+    def alone(item: int) -> int:
+        return together.wait() + item  # all of its own threads are there, or the barrier breaks
+
+    def inner(item: int) -> list[int]:
+        if not item:
+            return []
+        time.sleep(0.2)  # until the others are done
+        return list(in_order(alone, [item] * cores()))
+
+    found = list(in_order(inner, [0] * cores() + [1]))[-1]
+    assert sorted(found) == [1 + k for k in range(cores())]
 
 
 def test_processes_beside_each_other_share_the_processors() -> None:

@@ -102,7 +102,7 @@ def linear_fit(window: Window, estimate: Estimate) -> tuple[FitData, SegmentFit]
     data, noise = local.data, local.noise
     for _ in range(2):
         weight = noise.weight(data.measured)
-        shapes = best_shapes(data, weight, estimate)
+        shapes = best_shapes(data, weight, estimate).shapes
         noise = measured_noise(data, local.hits, estimate, shapes, weight)
     solution = solve_linear(data, noise.weight(data.measured), estimate)
     nowhere = np.zeros(len(estimate.poles))

@@ -72,6 +72,46 @@ class Estimate:
 
 
 @dataclass(frozen=True)
+class LineSums:
+    """Weighted sums over lines of functions of frequency, of every FRF by itself.
+
+    Attributes
+    ----------
+    gram : ndarray, (n_frfs, n_columns, n_columns)
+        Re(Eᴴ W E).
+    moment : ndarray, (n_frfs, n_columns)
+        Re(Eᴴ W y).
+    power : ndarray, (n_frfs,)
+        yᴴ W y.
+    """
+
+    gram: Real
+    moment: Real
+    power: Real
+
+
+@dataclass(frozen=True)
+class BestShapes:
+    """Shapes that fit best for given poles and participations, without what a step of these needs.
+
+    Attributes
+    ----------
+    shapes : complex ndarray, (n_rows, n_modes)
+    normal : ndarray, (n_rows, 2·n_modes, 2·n_modes)
+        Normal matrix of the shapes.
+    cost : float
+        Weighted sum of squares of the residual.
+    sums : LineSums
+        Of mode columns, then residual ones.
+    """
+
+    shapes: Complex
+    normal: Real
+    cost: float
+    sums: LineSums
+
+
+@dataclass(frozen=True)
 class LinearSolution:
     """Shapes and residual terms that fit best for given poles and participations.
 
@@ -116,41 +156,36 @@ def mixing(participation: Complex) -> Real:
     return out.reshape(n_ref, 2 * n_modes, 2 * n_modes)
 
 
-def weighted_grams(columns: Complex, weight: Real, data: Complex) -> tuple[Real, Real, Real]:
-    """Re(Eᴴ W E), Re(Eᴴ W y) and yᴴ W y for every FRF.
+def weighted_grams(columns: Complex, weight: Real, data: Complex, first: int = 0) -> LineSums:
+    """Sums over all lines; of products of two columns only those with one from `first` on, the others are 0.
 
     Parameters
     ----------
     columns : complex ndarray, (n_columns, n_lines)
     weight : ndarray, (n_frfs, n_lines)
     data : complex ndarray, (n_frfs, n_lines)
-
-    Returns
-    -------
-    gram : ndarray, (n_frfs, n_columns, n_columns)
-    moment : ndarray, (n_frfs, n_columns)
-    power : ndarray, (n_frfs,)
-        yᴴ W y.
+    first : int, optional
     """
     n = len(columns)
-    upper = np.triu_indices(n)
-    packed = np.zeros((len(weight), len(upper[0])))
+    one, other = np.triu_indices(n)
+    one, other = one[other >= first], other[other >= first]
+    packed = np.zeros((len(weight), len(one)))
     moment, power = np.zeros((len(weight), n)), np.zeros(len(weight))
-    at_once = max(LINES_AT_ONCE, PRODUCTS_AT_ONCE // len(upper[0]))
+    at_once = max(LINES_AT_ONCE, PRODUCTS_AT_ONCE // max(len(one), 1))
     for start in range(0, columns.shape[1], at_once):  # small blocks stay in the cache
         block = slice(start, start + at_once)
         re, im = columns.real[:, block].copy(), columns.imag[:, block].copy()
-        of_pairs = np.empty((len(upper[0]), re.shape[1]))
-        products(re, im, of_pairs)
+        of_pairs = np.empty((len(one), re.shape[1]))
+        products(re, im, first, of_pairs)
         packed += weight[:, block] @ of_pairs.T
         known = np.ascontiguousarray(data[:, block])
         weighted = _parts(weight[:, block] * known)
         moment += weighted @ _parts(columns[:, block]).T
         power += np.einsum("fl,fl->f", weighted, _parts(known))
-    gram = np.empty((len(weight), n, n))
-    gram[:, upper[0], upper[1]] = packed
-    gram[:, upper[1], upper[0]] = packed
-    return gram, moment, power
+    gram = np.zeros((len(weight), n, n))
+    gram[:, one, other] = packed
+    gram[:, other, one] = packed
+    return LineSums(gram, moment, power)
 
 
 def solve_linear(data: FitData, weight: Real, estimate: Estimate) -> LinearSolution:
@@ -163,22 +198,35 @@ def solve_linear(data: FitData, weight: Real, estimate: Estimate) -> LinearSolut
         One over variance; 0 where not measured.
     estimate : Estimate
     """
+    return with_slopes(data, weight, estimate, best_shapes(data, weight, estimate))
+
+
+def best_shapes(data: FitData, weight: Real, estimate: Estimate) -> BestShapes:
+    """The shapes of `solve_linear` with their cost alone, in a third of its time."""
+    return _shapes_by_lines(data, _known(data, weight), _blocks(len(data.omega)), estimate)
+
+
+def with_slopes(data: FitData, weight: Real, estimate: Estimate, best: BestShapes) -> LinearSolution:
+    """All of `solve_linear` from the best shapes of the same data; a step that is not taken needs these alone."""
     m, each = len(estimate.poles), data.frf.shape[:2]
-    known, blocks = _known(data, weight), _blocks(len(data.omega))
-    gram, moment, power = _normal_equations(data, known, blocks, estimate, slopes=True)
+    residual, known = residual_columns(data.omega), _known(data, weight)
+    first = 2 * m + len(residual)
+
+    def columns(lines: slice) -> Complex:
+        of_modes, slopes = real_columns(data.omega[lines], estimate.poles, data.rest_s)
+        return np.concatenate([of_modes, residual[:, lines], slopes])
+
+    more = _line_sums(data, known, _blocks(len(data.omega)), columns, first)
+    more.gram[:, :first, :first] = best.sums.gram
+    order = np.r_[: 2 * m, first : first + 2 * m, 2 * m : first]  # residual columns last
+    sums = LineSums(more.gram[:, order[:, None], order], more.moment[:, order], more.power)
+    gram, moment, _ = _project_out(sums, 4 * m)
     gram, moment = gram.reshape(*each, 4 * m, 4 * m), moment.reshape(*each, 4 * m)
-    normal, right, solved = _solved(gram[:, :, : 2 * m, : 2 * m], moment[:, :, : 2 * m], estimate)
-    cost = float(power.sum() - np.einsum("oa,oa->", right, solved))
-    return LinearSolution(solved[:, 0::2] + 1j * solved[:, 1::2], gram, moment, normal, cost)
-
-
-def best_shapes(data: FitData, weight: Real, estimate: Estimate) -> Complex:
-    """The shapes of `solve_linear` alone, (n_rows, n_modes), at a third of its cost."""
-    return shapes_by_lines(data, _known(data, weight), _blocks(len(data.omega)), estimate)
+    return LinearSolution(best.shapes, gram, moment, best.normal, best.cost)
 
 
 def shapes_by_lines(data: FitData, known: Known, blocks: list[slice], estimate: Estimate) -> Complex:
-    """The same of many rows, whose data and weights are made some lines at a time.
+    """Best shapes of many rows, whose data and weights are made some lines at a time, (n_rows, n_modes).
 
     Parameters
     ----------
@@ -189,39 +237,40 @@ def shapes_by_lines(data: FitData, known: Known, blocks: list[slice], estimate: 
         All lines, in order.
     estimate : Estimate
     """
+    return _shapes_by_lines(data, known, blocks, estimate).shapes
+
+
+def _shapes_by_lines(data: FitData, known: Known, blocks: list[slice], estimate: Estimate) -> BestShapes:
     m, each = len(estimate.poles), data.frf.shape[:2]
-    gram, moment, _ = _normal_equations(data, known, blocks, estimate, slopes=False)
-    gram, moment = gram.reshape(*each, 2 * m, 2 * m), moment.reshape(*each, 2 * m)
-    solved = _solved(gram, moment, estimate)[2]
-    return np.asarray(solved[:, 0::2] + 1j * solved[:, 1::2])
-
-
-def _normal_equations(
-    data: FitData, known: Known, blocks: list[slice], estimate: Estimate, *, slopes: bool
-) -> tuple[Real, Real, Real]:
-    """Of every FRF by itself, for the columns of the modes and, with `slopes`, their derivatives by the poles."""
-    n_rows, n_ref, _ = data.frf.shape
     residual = residual_columns(data.omega)
-    n_modes, n_frfs = len(estimate.poles) * (4 if slopes else 2), n_rows * n_ref
-    n_columns = n_modes + len(residual)
-    gram, moment = np.zeros((n_frfs, n_columns, n_columns)), np.zeros((n_frfs, n_columns))
-    power = np.zeros(n_frfs)
 
-    def of_lines(block: slice) -> tuple[Real, Real, Real]:
-        where = data.omega[block], estimate.poles, data.rest_s
-        of_modes = real_columns(*where) if slopes else (mode_columns(*where),)
+    def columns(lines: slice) -> Complex:
+        of_modes = mode_columns(data.omega[lines], estimate.poles, data.rest_s)
+        return np.concatenate([of_modes, residual[:, lines]])
+
+    sums = _line_sums(data, known, blocks, columns)
+    gram, moment, power = _project_out(sums, 2 * m)
+    gram, moment = gram.reshape(*each, 2 * m, 2 * m), moment.reshape(*each, 2 * m)
+    normal, right, solved = _solved(gram, moment, estimate)
+    cost = float(power.sum() - np.einsum("oa,oa->", right, solved))
+    return BestShapes(solved[:, 0::2] + 1j * solved[:, 1::2], normal, cost, sums)
+
+
+def _line_sums(
+    data: FitData, known: Known, blocks: list[slice], columns: Callable[[slice], Complex], first: int = 0
+) -> LineSums:
+    """`weighted_grams` of all FRFs, with columns that are made some lines at a time."""
+    n_frfs = data.frf.shape[0] * data.frf.shape[1]
+
+    def of_lines(block: slice) -> LineSums:
         frf, weight = known(block)
-        return weighted_grams(
-            np.concatenate([*of_modes, residual[:, block]]),
-            weight.reshape(n_frfs, -1),
-            frf.reshape(n_frfs, -1),
-        )
+        return weighted_grams(columns(block), weight.reshape(n_frfs, -1), frf.reshape(n_frfs, -1), first)
 
-    for some in in_order(of_lines, blocks):
-        gram += some[0]
-        moment += some[1]
-        power += some[2]
-    return _project_out(gram, moment, power, n_modes)
+    parts = in_order(of_lines, blocks)
+    total = next(parts)
+    for some in parts:
+        total = LineSums(total.gram + some.gram, total.moment + some.moment, total.power + some.power)
+    return total
 
 
 def _solved(gram: Real, moment: Real, estimate: Estimate) -> tuple[Real, Real, Real]:
@@ -232,8 +281,9 @@ def _solved(gram: Real, moment: Real, estimate: Estimate) -> tuple[Real, Real, R
     return normal, right, solve_scaled(normal, right[..., None])[..., 0]
 
 
-def _project_out(gram: Real, moment: Real, power: Real, keep: int) -> tuple[Real, Real, Real]:
-    """Eliminate the columns after `keep` (the residual terms) from the normal equations."""
+def _project_out(sums: LineSums, keep: int) -> tuple[Real, Real, Real]:
+    """Gram matrices, moments and powers without the columns after `keep`, the residual terms."""
+    gram, moment, power = sums.gram, sums.moment, sums.power
     corner = gram[:, keep:, keep:]
     side = np.concatenate([gram[:, keep:, :keep], moment[:, keep:, None]], axis=-1)
     solved = solve_scaled(corner, side)
@@ -359,8 +409,6 @@ def residual_fit(data: FitData, weight: Real, modes: Complex) -> Complex:
     """Best residual terms for what the modes leave over, (n_rows, n_references, n_lines)."""
     columns = residual_columns(data.omega)
     n_lines = data.frf.shape[-1]
-    gram, moment, _ = weighted_grams(
-        columns, weight.reshape(-1, n_lines), (data.frf - modes).reshape(-1, n_lines)
-    )
-    coefficients = solve_scaled(gram, moment[..., None])[..., 0]
+    sums = weighted_grams(columns, weight.reshape(-1, n_lines), (data.frf - modes).reshape(-1, n_lines))
+    coefficients = solve_scaled(sums.gram, sums.moment[..., None])[..., 0]
     return _summed(coefficients, columns).reshape(data.frf.shape)

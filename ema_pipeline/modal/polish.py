@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import (
+    BestShapes,
     Estimate,
-    LinearSolution,
     Step,
+    best_shapes,
     free_participations,
     moved,
     newton_step,
     normalised,
-    solve_linear,
+    with_slopes,
 )
 
 Real = NDArray[np.float64]
@@ -118,7 +119,7 @@ def polish(
     start: Estimate,
     iterations: int = MAX_ITERATIONS,
     held: NDArray[np.bool_] | None = None,
-) -> tuple[Estimate, LinearSolution]:
+) -> tuple[Estimate, BestShapes]:
     """Descend on poles and participations, shapes and residual terms eliminated.
 
     Parameters
@@ -133,10 +134,14 @@ def polish(
 
     Returns
     -------
-    Estimate, LinearSolution
+    Estimate, BestShapes
         The best found; the start where no step improves it.
     """
-    return descend(start, partial(solve_linear, data, weight), newton_step, iterations, held)
+
+    def slope(estimate: Estimate, best: BestShapes) -> Step:
+        return newton_step(estimate, with_slopes(data, weight, estimate, best))
+
+    return descend(start, partial(best_shapes, data, weight), slope, iterations, held)
 
 
 def _fixed(estimate: Estimate, held: NDArray[np.bool_] | None) -> NDArray[np.bool_]:

@@ -104,7 +104,7 @@ def fit_segment(
     while True:
         weight = noise.weight(data.measured)
         before = estimate
-        estimate, solution = polish(data, weight, before, budget, held)
+        estimate, best = polish(data, weight, before, budget, held)
         strayed, places = peaks.strayed(before, estimate)
         if (strayed & ~held).any():
             strayed &= ~held
@@ -119,7 +119,7 @@ def fit_segment(
             if lost.any():
                 estimate, held = put_back(estimate, before, lost), held | lost
                 continue
-        noise = measured_noise(data, hits, estimate, solution.shapes, weight)
+        noise = measured_noise(data, hits, estimate, best.shapes, weight)
         del weight  # as large as half the data
         solution = solve_linear(data, noise.weight(data.measured), estimate)
         fit = SegmentFit(estimate, solution, noise, held, away)

@@ -191,10 +191,11 @@ def refined(
     `peaks` make one mode each, as single hits show; each of the `plain` ones makes a mode at least, and each of the
     `wanted` ones makes one whatever the tests on candidates say.
     """
-    parts: list[FittedModes] = []
     data = window.data
     everywhere = _shapes(window, sure)
-    for part, chart in zip(bands, charts, strict=True):
+
+    def of_part(at: tuple[SubBand, PoleSet]) -> FittedModes | None:
+        part, chart = at
         low, high = float(data.omega[part.first]), float(data.omega[part.stop - 1])
         near, also = between(sure.poles, low, high), between(weak.poles, low, high)
         inside = np.concatenate([sure.poles[near], weak.poles[also]])
@@ -205,7 +206,7 @@ def refined(
             and not len(asked.poles)
             and not between(inside, part.low, part.high).any()
         ):
-            continue
+            return None
         lines = replace(
             window.lines(part.first, part.stop), far=sure.take(~near), far_shapes=everywhere[:, ~near]
         )
@@ -214,12 +215,17 @@ def refined(
         fit = _fit_part(few, sure.take(near), weak.take(also), _voters(chart), search, iterations, peaks)
         fit = _with_peaks(few, fit, seen.absent(fit.estimate), _voters(chart), iterations, peaks)
         fit = _with_wanted(few, fit, asked.absent(fit.estimate), iterations, peaks)
-        if len(fit.estimate.poles) and compressible(data):
-            polished = _polished(few.data, fit)
-            del few, fit  # as large as what all rows then need
-            parts.append(_of_all_rows(lines, polished, part, iterations))
-        elif len(fit.estimate.poles):
-            parts.append(_of_these_rows(few.data, fit, part))
+        if not len(fit.estimate.poles):
+            return None
+        if not compressible(data):
+            return _of_these_rows(few.data, fit, part)
+        polished = _polished(few.data, fit)
+        del few, fit  # as large as what all rows then need
+        return _of_all_rows(lines, polished, part, iterations)
+
+    # of many rows one sub-band alone fills the memory, and what is done row by row keeps all processors busy
+    in_turn = map if compressible(data) else in_order
+    parts = [p for p in in_turn(of_part, list(zip(bands, charts, strict=True))) if p is not None]
     n_rows, n_ref = data.measured.shape
     empty = FittedModes(
         np.zeros(0, complex),
