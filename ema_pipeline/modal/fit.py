@@ -102,7 +102,7 @@ class BestShapes:
     cost : float
         Weighted sum of squares of the residual.
     sums : LineSums
-        Of mode columns, then residual ones.
+        Of residual columns, then those of the modes.
     """
 
     shapes: Complex
@@ -203,30 +203,29 @@ def solve_linear(data: FitData, weight: Real, estimate: Estimate) -> LinearSolut
 
 def best_shapes(data: FitData, weight: Real, estimate: Estimate) -> BestShapes:
     """The shapes of `solve_linear` with their cost alone, in a third of its time."""
-    return _shapes_by_lines(data, _known(data, weight), _blocks(len(data.omega)), estimate)
+    return shapes_by_lines(data, _known(data, weight), _blocks(len(data.omega)), estimate)
 
 
 def with_slopes(data: FitData, weight: Real, estimate: Estimate, best: BestShapes) -> LinearSolution:
     """All of `solve_linear` from the best shapes of the same data; a step that is not taken needs these alone."""
     m, each = len(estimate.poles), data.frf.shape[:2]
     residual, known = residual_columns(data.omega), _known(data, weight)
-    first = 2 * m + len(residual)
+    first = len(residual) + 2 * m
 
     def columns(lines: slice) -> Complex:
-        of_modes, slopes = real_columns(data.omega[lines], estimate.poles, data.rest_s)
-        return np.concatenate([of_modes, residual[:, lines], slopes])
+        return np.concatenate(
+            [residual[:, lines], *real_columns(data.omega[lines], estimate.poles, data.rest_s)]
+        )
 
-    more = _line_sums(data, known, _blocks(len(data.omega)), columns, first)
-    more.gram[:, :first, :first] = best.sums.gram
-    order = np.r_[: 2 * m, first : first + 2 * m, 2 * m : first]  # residual columns last
-    sums = LineSums(more.gram[:, order[:, None], order], more.moment[:, order], more.power)
-    gram, moment, _ = _project_out(sums, 4 * m)
+    sums = _line_sums(data, known, _blocks(len(data.omega)), columns, first)
+    sums.gram[:, :first, :first] = best.sums.gram
+    gram, moment, _ = _project_out(sums, len(residual))
     gram, moment = gram.reshape(*each, 4 * m, 4 * m), moment.reshape(*each, 4 * m)
     return LinearSolution(best.shapes, gram, moment, best.normal, best.cost)
 
 
-def shapes_by_lines(data: FitData, known: Known, blocks: list[slice], estimate: Estimate) -> Complex:
-    """Best shapes of many rows, whose data and weights are made some lines at a time, (n_rows, n_modes).
+def shapes_by_lines(data: FitData, known: Known, blocks: list[slice], estimate: Estimate) -> BestShapes:
+    """`best_shapes` of many rows, whose data and weights are made some lines at a time.
 
     Parameters
     ----------
@@ -237,19 +236,16 @@ def shapes_by_lines(data: FitData, known: Known, blocks: list[slice], estimate: 
         All lines, in order.
     estimate : Estimate
     """
-    return _shapes_by_lines(data, known, blocks, estimate).shapes
-
-
-def _shapes_by_lines(data: FitData, known: Known, blocks: list[slice], estimate: Estimate) -> BestShapes:
     m, each = len(estimate.poles), data.frf.shape[:2]
     residual = residual_columns(data.omega)
 
     def columns(lines: slice) -> Complex:
-        of_modes = mode_columns(data.omega[lines], estimate.poles, data.rest_s)
-        return np.concatenate([of_modes, residual[:, lines]])
+        return np.concatenate(
+            [residual[:, lines], mode_columns(data.omega[lines], estimate.poles, data.rest_s)]
+        )
 
     sums = _line_sums(data, known, blocks, columns)
-    gram, moment, power = _project_out(sums, 2 * m)
+    gram, moment, power = _project_out(sums, len(residual))
     gram, moment = gram.reshape(*each, 2 * m, 2 * m), moment.reshape(*each, 2 * m)
     normal, right, solved = _solved(gram, moment, estimate)
     cost = float(power.sum() - np.einsum("oa,oa->", right, solved))
@@ -281,15 +277,14 @@ def _solved(gram: Real, moment: Real, estimate: Estimate) -> tuple[Real, Real, R
     return normal, right, solve_scaled(normal, right[..., None])[..., 0]
 
 
-def _project_out(sums: LineSums, keep: int) -> tuple[Real, Real, Real]:
-    """Gram matrices, moments and powers without the columns after `keep`, the residual terms."""
+def _project_out(sums: LineSums, count: int) -> tuple[Real, Real, Real]:
+    """Gram matrices, moments and powers without the first columns, the residual terms."""
     gram, moment, power = sums.gram, sums.moment, sums.power
-    corner = gram[:, keep:, keep:]
-    side = np.concatenate([gram[:, keep:, :keep], moment[:, keep:, None]], axis=-1)
-    solved = solve_scaled(corner, side)
-    gram_out = gram[:, :keep, :keep] - np.matmul(side[:, :, :-1].transpose(0, 2, 1), solved[:, :, :-1])
-    moment_out = moment[:, :keep] - np.einsum("fka,fk->fa", side[:, :, :-1], solved[:, :, -1])
-    power_out = power - np.einsum("fk,fk->f", moment[:, keep:], solved[:, :, -1])
+    side = np.concatenate([gram[:, :count, count:], moment[:, :count, None]], axis=-1)
+    solved = solve_scaled(gram[:, :count, :count], side)
+    gram_out = gram[:, count:, count:] - np.matmul(side[:, :, :-1].transpose(0, 2, 1), solved[:, :, :-1])
+    moment_out = moment[:, count:] - np.einsum("fka,fk->fa", side[:, :, :-1], solved[:, :, -1])
+    power_out = power - np.einsum("fk,fk->f", side[:, :, -1], solved[:, :, -1])
     return gram_out, moment_out, power_out
 
 

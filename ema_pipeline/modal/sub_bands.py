@@ -256,7 +256,7 @@ def _shapes(window: Window, estimate: Estimate) -> Complex:
         some = window.lines(lines.start, lines.stop).near()
         return some.data.frf, some.noise.weight(some.data.measured)
 
-    return shapes_by_lines(window.data, known, window.data.line_blocks(), estimate)
+    return shapes_by_lines(window.data, known, window.data.line_blocks(), estimate).shapes
 
 
 def _fit_part(

@@ -176,7 +176,9 @@ def test_shapes_made_some_lines_at_a_time_are_those_of_all_lines_at_once() -> No
     poles = np.array([-1 + 120j, -2 + 180j])
     estimate = Estimate(poles, np.array([[1, 0.5j], [0.2, 1]]))
     blocks = [slice(k, min(k + 90, 700)) for k in range(0, 700, 90)]
-    found = shapes_by_lines(data, lambda lines: (frf[..., lines], weight[..., lines]), blocks, estimate)
+    found = shapes_by_lines(
+        data, lambda lines: (frf[..., lines], weight[..., lines]), blocks, estimate
+    ).shapes
     # the same by plain least squares of every row, residual terms of every FRF beside the shapes
     columns, residual = real_columns(omega, poles, 3.0)[0], residual_columns(omega)
     for o in range(5):
