@@ -17,6 +17,9 @@ _RINGING = 3.0
 """Friction that takes this many times the rate within a step rings from step to step, at half its strength."""
 
 _TOLERANCE = 1e-8
+_LAST, _SAME = 1e-5, 1e-10
+"""A Newton step of the rate, over the velocity of friction, after which tanh follows from two terms of its series; and
+relative change of a rate that leaves friction as it is."""
 _WILD = 1e30
 """A force, N, that no structure has."""
 
@@ -120,25 +123,26 @@ def _halves(rows: NDArray[np.complex128]) -> NDArray[np.float64]:
 
 
 @numba.njit(inline="always")
-def _gripped(free, own, limit, velocity):  # type: ignore[no-untyped-def]
-    """Friction at the end of a step that would end at the rate `free` without it and `own` less per newton.
+def _gripped(free, stop, before):  # type: ignore[no-untyped-def]
+    """Friction at the end of a step over its limit, from the rate that the step would end at without it.
 
-    In u = rate/velocity the equation is velocity·u - own·limit·tanh(u) = free, with own < 0: its left side rises and
-    bends downwards for u > 0, so that Newton steps from 0 never pass the root.
+    In u = rate/velocity the equation is u + stop·tanh(u) = free: its left side rises and bends downwards for u > 0, so
+    that a Newton step from anywhere does not end above the root. The first is from where the friction `before` puts it.
+    The root would be lower where tanh(u) were u, and where it were 1.
     """
-    if limit == 0.0:
-        return 0.0
-    resolved = max(velocity, -own * limit / _RINGING)
-    stop = -own * limit
-    aim = abs(free)
-    u, hold = 0.0, 0.0
+    aim, sign = (free, 1.0) if free > 0.0 else (-free, -1.0)
+    least = max(aim / (1.0 + stop), aim - stop)
+    u, hold = max(aim - sign * stop * before, least), 1.0
     for _ in range(_NEWTON):
-        error = aim - resolved * u - stop * hold
-        if not error > _TOLERANCE * _TOLERANCE * aim:
+        left = np.exp(-2.0 * u)  # tanh(u) is (1 - left)/(1 + left)
+        more, less = 1.0 + left, 1.0 - left
+        step = ((aim - u) * more - stop * less) * more / (more * more + 4.0 * stop * left)
+        if abs(step) < _LAST:
+            hold = less / more
+            hold += (1.0 - hold * hold) * step * (1.0 - hold * step)
             break
-        u += error / (resolved + stop * (1.0 - hold * hold))
-        hold = np.tanh(u)
-    return limit * hold if free > 0.0 else -limit * hold
+        u = max(u + step, least)
+    return sign * hold
 
 
 @numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
@@ -165,10 +169,17 @@ def _march(  # type: ignore[no-untyped-def]
     channels = outputs.shape[1]
     trace = forces.shape[3] > 0
     y = np.zeros(2 * size)
-    g, d, v = np.zeros(m), np.zeros(m), np.zeros(m)
+    g, d, v, solved = np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m)
+    # of friction: its velocity, and the rate that it takes over that
+    resolved, stop = np.ones(m), np.zeros(m)
     for a in range(count):
         turn, fade = decay[a].imag.copy(), decay[a].real.copy()
         push_re, push_im = begun[a, hits:].real.copy(), begun[a, hits:].imag.copy()
+        for j in range(m):
+            if laws[a, j, 0] == 1.0:
+                taken = -reach[a, m + j, hits + j] * laws[a, j, 1]
+                resolved[j] = max(laws[a, j, 2], taken / _RINGING)
+                stop[j] = taken / resolved[j]
         for h in range(hits):
             if failed[a]:
                 break
@@ -200,21 +211,27 @@ def _march(  # type: ignore[no-untyped-def]
                             dj += stretch[a, j, p] * y[p]
                     d[j], v[j] = dj, vj
                 worst = 0.0
+                solved[:] = np.inf
                 for _ in range(_NEWTON):
                     worst = 0.0
                     for j in range(m):
-                        dj, vj = d[j], v[j]
-                        for i in range(m):
-                            dj += reach[a, j, hits + i] * g[i]
-                            vj += reach[a, m + j, hits + i] * g[i]
                         kind = laws[a, j, 0]
                         n1, n2, n3 = laws[a, j, 1], laws[a, j, 2], laws[a, j, 3]
                         if kind == 1.0:
-                            own = reach[a, m + j, hits + j]
-                            found = _gripped(vj - own * g[j], own, n1, n2)
-                            error = found - g[j]
-                            g[j] = found
+                            free = v[j]
+                            for i in range(m):
+                                if i != j:
+                                    free += reach[a, m + j, hits + i] * g[i]
+                            found, error = g[j], 0.0
+                            if n1 != 0.0 and not abs(free - solved[j]) <= _SAME * abs(free):
+                                found = n1 * _gripped(free / resolved[j], stop[j], g[j] / n1)
+                                error = found - g[j]
+                                solved[j], g[j] = free, found
                         else:
+                            dj, vj = d[j], v[j]
+                            for i in range(m):
+                                dj += reach[a, j, hits + i] * g[i]
+                                vj += reach[a, m + j, hits + i] * g[i]
                             if kind == 0.0:
                                 found, by_d, by_v = _polynomial(dj, vj, n1, n2, n3)
                             else:

@@ -124,6 +124,9 @@ def parting(stretch: float, rate: float, k: float, preload: float, gap: float) -
 LAWS = (polynomial, friction, parting)
 """Laws without memory, which `mechanics.batch` and `mechanics.equivalent` compile."""
 POLYNOMIAL, FRICTION, PARTING = range(len(LAWS))
+AT_LARGER_MOTION = ((1, 2, 0), (-1, -1, 0), (0, -1, -1))
+"""Of each law, powers of a factor by which its three numbers change where it does the same, over the motion, as with
+all motions larger by that factor."""
 
 
 @dataclass(frozen=True)

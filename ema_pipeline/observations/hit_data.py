@@ -50,6 +50,29 @@ _CURVE = 3
 """Terms of a smooth curve in the logarithm of the amplitude; no more than there are force levels."""
 _HEARD = 0.1
 """Motion of a mode over that of the largest that moves in step with it, below which a hit does not tell its pole."""
+_FASTER = 1.5
+"""Most by which a mode's motion decays faster or slower in one hit than in most. The weight of each instant is that of
+the median decay; a hit read with nine times that would leave, next to a mode that moves in step, no motion to refer to.
+"""
+
+
+@dataclass(frozen=True)
+class Ringing:
+    """How modes ring on after the blow.
+
+    Attributes
+    ----------
+    omega : ndarray, (n_groups,)
+        Mean of the modes that move in step, rad/s.
+    in_step : ndarray, (m, n_groups)
+        1 where a mode belongs to a group.
+    motion : complex ndarray, (h, t, m)
+        Envelope of every mode about its group's frequency, over that just after the blow.
+    """
+
+    omega: Real
+    in_step: Real
+    motion: Complex
 
 
 @dataclass(frozen=True)
@@ -240,22 +263,23 @@ class HitData:
 
     @cached_property
     def relative_size(self) -> Complex:
-        """Size of every mode in every hit over the mean of its sheet, (h, m); 1 for a linear mode, well aimed."""
-        return np.asarray(np.where(self.used, self.size, self._mean_size) / self._mean_size)
+        """Size of every mode in every hit over `_reference_size`, (h, m); 1 for a linear mode, well aimed."""
+        return np.asarray(np.where(self.used, self.size, self._reference_size) / self._reference_size)
 
     @cached_property
     def quadrature_std(self) -> Real:
         """1 σ of the imaginary part of `relative_size` from noise and from what a model has wrong of it, (h, m)."""
-        noise = np.where(self.used, self.size_std, np.inf) / np.abs(self._mean_size)
+        noise = np.where(self.used, self.size_std, np.inf) / np.abs(self._reference_size)
         return np.asarray(np.hypot(noise, _TOLD * self.relative_size.imag))
 
     @cached_property
     def otherwise(self) -> Real:
-        """How far the size of every mode in every hit lies from the mean of its sheet in phase, over that mean, (h, m).
+        """How far `relative_size` of every mode in every hit lies from the mean of its sheet in phase, (h, m).
 
         Mostly by the aim of the hit: what is read then of a mode is the more a neighbour's.
         """
-        return np.asarray(np.abs(self.relative_size.real - 1))
+        mean = self._mean_over_sheet(self.size) / self._reference_size
+        return np.asarray(np.where(self.used, np.abs((self.relative_size - mean).real), 0.0))
 
     @cached_property
     def irregularity(self) -> Real:
@@ -302,11 +326,22 @@ class HitData:
         return sum(s.noise_only for s in both), sum(s.dof for s in both)
 
     @cached_property
-    def _mean_size(self) -> Complex:
-        """Mean of every hit's sheet, (h, m); 1 where no hit tells."""
-        size, std = np.where(self.used, self.size, 0.0), np.where(self.used, self.size_std, np.inf)
-        mean = means_of_sheets(size, std, self.sheet)
-        return np.where(mean == 0, 1.0, mean)
+    def _reference_size(self) -> Complex:
+        """Root mean square of the sizes in every hit's sheet, in their common phase, (h, m); 1 where no hit tells.
+
+        Not their mean: where aim alone excites a mode, hits do so with either sign, and their mean is nearly nothing,
+        of any phase.
+        """
+        of_squares = self._mean_over_sheet(self.size**2)
+        size = np.sqrt(self._mean_over_sheet(np.abs(self.size) ** 2).real)
+        phase = np.exp(0.5j * np.angle(of_squares))  # or the opposite
+        sign = np.where((self._mean_over_sheet(self.size) / phase).real < 0, -1.0, 1.0)
+        return np.where(size == 0, 1.0, sign * size * phase)
+
+    def _mean_over_sheet(self, values: Complex | Real) -> Complex:
+        """Mean over every hit's sheet, weighed as sizes are known, (h, m); 0 where no hit tells."""
+        std = np.where(self.used, self.size_std, np.inf)
+        return means_of_sheets(np.where(self.used, values, 0.0).astype(complex), std, self.sheet)
 
     @cached_property
     def weights(self) -> tuple[Real, Complex]:
@@ -322,6 +357,17 @@ class HitData:
             for s, w, (low, high) in zip(decay, self.omega, self.band_hz.tolist(), strict=True)
         ]
         return instants, np.stack(columns, axis=2)
+
+    @cached_property
+    def ringing(self) -> Ringing:
+        """Of all hits at the instants of `weights`."""
+        in_step = np.zeros((len(self.modes), len(self.groups)))
+        for k, group in enumerate(self.groups):
+            in_step[group, k] = 1.0
+        omega = self.omega @ in_step / in_step.sum(axis=0)
+        decay = np.clip(-self.poles.real, self.decay / _FASTER, self.decay * _FASTER)
+        turning = 1j * (self.poles.imag - in_step @ omega) - decay
+        return Ringing(omega, in_step, np.exp(turning[:, None] * self.weights[0][:, None]))
 
     @cached_property
     def product_gains(self) -> Complex:

@@ -32,10 +32,6 @@ _RIGID = 0.02
 _SETTLING_STEPS = 3
 _MOST_GIVEN = 5.0
 """Change of a stretch by its own force that is not worth a further step, most steps, and largest change allowed."""
-_FASTER = 1.5
-"""Most by which a mode's motion decays faster or slower in one hit than in most. The weight of each instant is that of
-the median decay; a hit read with nine times that would leave, next to a mode that moves in step, no motion to refer to.
-"""
 
 
 @dataclass(frozen=True)
@@ -103,26 +99,22 @@ def changed_modes(data: HitData, elements: Sequence[Nonlinear], linear: Linear) 
     total = np.zeros((2, *linear.displacement.shape), complex)
     if not elements:
         return total
-    (instants, weight), omega = data.weights, data.omega
-    centre = np.array([np.mean(omega[g]) for g in data.groups])
-    group_of = np.zeros(len(omega), np.int64)
-    for k, g in enumerate(data.groups):
-        group_of[g] = k
-    decay = np.clip(-data.poles.real, data.decay / _FASTER, data.decay * _FASTER)
-    turning = 1j * (data.poles.imag - centre[group_of]) - decay
-    z = linear.displacement[:, None] * np.exp(turning[:, None] * instants[:, None])  # (h, t, m)
-    paths = [np.stack([z[..., g] @ v[g] for g in data.groups], axis=-1) for v in linear.along]
-    motions = [Motions(np.abs(p).reshape(-1, len(centre)), centre) for p in paths]
+    ringing = data.ringing
+    centre, step = ringing.omega, ringing.in_step
+    z = linear.displacement[:, None] * ringing.motion  # (h, t, m)
+    along = np.concatenate([v[:, None] * step for v in linear.along], axis=1)
+    paths = np.split((z.reshape(-1, len(step)) @ along), len(elements), axis=1)
+    motions = [Motions(np.abs(p), centre) for p in paths]
     offsets = settled_offsets(elements, motions, linear.flexibility)
-    still = np.abs(z) < _STILL
+    force = np.zeros(z.shape, complex)
     for i, (element, motion) in enumerate(zip(elements, motions, strict=True)):
         stiffness = _settled_stiffness(element, motion, offsets[i], linear.elsewhere[i])
-        force = (stiffness.reshape(paths[i].shape) * paths[i])[..., group_of]
-        ratio = np.where(still, 0.0, force / np.where(still, 1.0, z))
-        weighed = (ratio.transpose(2, 0, 1) @ weight.transpose(2, 1, 0)).transpose(2, 1, 0)
-        total += 0.5j * linear.along[i] / omega * weighed
+        force += linear.along[i] * ((stiffness * paths[i]) @ step.T).reshape(z.shape)
         total += _of_products(data, element, linear.along[i], linear.displacement)
-    return total
+    still = np.abs(z) < _STILL
+    ratio = np.where(still, 0.0, force / np.where(still, 1.0, z))
+    weighed = (ratio.transpose(2, 0, 1) @ data.weights[1].transpose(2, 1, 0)).transpose(2, 1, 0)
+    return total + 0.5j / data.omega * weighed
 
 
 def _of_products(data: HitData, element: Nonlinear, along: Real, displacement: Complex) -> Complex:
@@ -155,5 +147,9 @@ def _settled_stiffness(element: Nonlinear, motion: Motions, offset: Real, elsewh
 def _given_way(stiffness: Complex, elsewhere: Real) -> Complex:
     """Stretch over that of the linear model, within `_MOST_GIVEN`."""
     inverse = 1 + stiffness * elsewhere
-    size = np.abs(inverse)
-    return np.asarray(1 / (inverse / np.maximum(size, 1e-12) * np.clip(size, 1 / _MOST_GIVEN, _MOST_GIVEN)))
+    square = inverse.real**2 + inverse.imag**2
+    if np.min(square, initial=1.0) < _MOST_GIVEN**-2 or np.max(square, initial=1.0) > _MOST_GIVEN**2:
+        size = np.sqrt(square)
+        inverse *= np.clip(size, 1 / _MOST_GIVEN, _MOST_GIVEN) / np.maximum(size, 1e-12)
+        square = inverse.real**2 + inverse.imag**2
+    return np.asarray(inverse.conj() / square)

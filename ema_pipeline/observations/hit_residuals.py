@@ -29,6 +29,7 @@ from ema_pipeline.observations.hit_rows import (
     HIT_QUADRATURE,
     HitRows,
 )
+from ema_pipeline.observations.larger_motions import as_larger_motions
 from ema_pipeline.observations.mode_problem import Paired
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE
 from ema_pipeline.observations.parts import DAMPING_SCATTER, part_key
@@ -40,6 +41,8 @@ DRIFT = "drift"
 LINEARISATION = "linearisation"
 AMPLITUDE = "amplitude of all modes"
 """Unknown by whose exponential all amplitudes are multiplied."""
+_FINE_STEP = 1e-6
+"""Step of the differences of elements' numbers by sizes, in units of their prior σ."""
 _REMEMBERED = 16
 """Last points at which the shifts are kept: a step is tried without derivatives, then taken with them."""
 
@@ -107,16 +110,34 @@ class HitResiduals:
     @cached_property
     def changes(self) -> dict[int, NDArray[np.float64]]:
         """Derivatives of `predicted` by sizes and by the scale of amplitudes, by their position."""
-        x, moved, left = self.x, self.moved(self.x), np.exp(self.x[self.left])
-        found = {}
-        for i in (*self.problem.nonlinear_sizes, self.scale):
-            if i == self.scale and not np.any(moved):
-                continue
-            ahead = x.copy()
-            step = self.problem.step(i, x)
-            ahead[i] += step if ahead[i] + step <= self.problem.unknowns.upper[i] else -step
-            found[i] = self._read(left * (self.moved(ahead) - moved) / (ahead[i] - x[i]))
+        sizes = self.problem.nonlinear_sizes
+        found = {i: self._change(i) for i in sizes}
+        if np.any(self.predicted):
+            alike = self._as_larger_motions(sizes)
+            by_scale = (
+                self._change(self.scale) if alike is None else np.tensordot(alike, [*found.values()], 1)
+            )
+            found[self.scale] = by_scale
         return found
+
+    def _as_larger_motions(self, sizes: Sequence[int]) -> NDArray[np.float64] | None:
+        """See `larger_motions.as_larger_motions`."""
+        points = [self.x, *(self._ahead(i, _FINE_STEP) for i in sizes)]
+        elements, *changed = (self._assembly(x).nonlinear for x in points)
+        steps = [(x - self.x)[i] for x, i in zip(points[1:], sizes, strict=True)]
+        return as_larger_motions(elements, changed, steps)
+
+    def _change(self, i: int) -> NDArray[np.float64]:
+        """Derivative of `predicted` by the unknown at position `i`."""
+        ahead = self._ahead(i, self.problem.step(i, self.x))
+        change = (self.moved(ahead) - self.moved(self.x)) / (ahead - self.x)[i]
+        return self._read(np.exp(self.x[self.left]) * change)
+
+    def _ahead(self, i: int, step: float) -> NDArray[np.float64]:
+        """The unknowns a step on in one of them, or back where it would leave its range."""
+        ahead = self.x.copy()
+        ahead[i] += step if ahead[i] + step <= self.problem.unknowns.upper[i] else -step
+        return ahead
 
     def shift_reference(self, modes: Residuals, derivatives: bool) -> None:
         """Move the model's values behind the residuals of the level's modes to where its hits find them.

@@ -344,13 +344,26 @@ def test_a_scale_of_amplitudes_that_is_hardly_known_does_not_take_a_size_to_noth
     assert abs(posterior.x[i]) > 5.0 * claims._std_of_first(found)
 
 
-def test_derivatives_by_sizes_are_those_of_small_differences() -> None:
+@pytest.mark.parametrize(
+    ("label", "sizes", "near"),
+    [
+        ("bearing_cubic@hub", {"stiffness": 1e11}, 0.01),
+        ("dry_friction@hub", {"force": 0.3, "velocity": 0.02}, 0.01),
+        (
+            "hysteresis@hub",
+            {"stiffness": 4e4, "force": 2.0, "shape": 0.3, "exponent": 1.5},
+            0.1,
+        ),  # by interpolation in a table
+    ],
+)
+def test_derivatives_by_sizes_are_those_of_small_differences(
+    label: str, sizes: dict[str, float], near: float
+) -> None:
     """Those of the level's modes as well, which an effect this strong moves in the softest hits."""
-    size = 1e11
-    observations = synthetic([PolynomialSpring(f"c{a}", {f"hub.{a}": 1.0}, cubic=size) for a in "xy"])
-    problem = observations.problem((parse_effect("bearing_cubic@hub", RIG),), {})
+    observations = synthetic([PolynomialSpring(f"c{a}", {f"hub.{a}": 1.0}, cubic=1e11) for a in "xy"])
+    problem = observations.problem((parse_effect(label, RIG),), {})
     scatters = {n: s.start for n, s in observations.scatters.items()}
-    x = problem.start({"bearing_cubic@hub.stiffness": size})
+    x = problem.start({f"{label}.{name}": size for name, size in sizes.items()})
     left = [i for i, n in enumerate(problem.unknowns.names) if n.startswith("linearisation")]
     x[left] = 0.2 * np.random.default_rng(0).standard_normal(len(left))
     here = problem.residuals(x, scatters)
@@ -365,7 +378,7 @@ def test_derivatives_by_sizes_are_those_of_small_differences() -> None:
         ]
         slope = (values[0] - values[1]) / 2e-5
         for rows in (slice(count), slice(count, None)):
-            close = 0.01 * np.abs(slope[rows]).max() + 1e-9
+            close = near * np.abs(slope[rows]).max() + 1e-5  # rounding
             np.testing.assert_allclose(here.jacobian[rows, i], slope[rows], atol=close)
 
 
