@@ -12,6 +12,7 @@ from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED, DiagnoseSettings
 from ema_pipeline.inference import beyond
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, part_reach, within_scatter
+from ema_pipeline.observations.hit_residuals import LINEARISATION
 from ema_pipeline.observations.mode_problem import MIXING
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE
 from ema_pipeline.observations.parts import DAMPING_SCATTER
@@ -30,6 +31,9 @@ _BY_CHANCE = 0.005
 """Probability by which damping ratios may scatter as they do and no damper be missing."""
 _OF_SCATTER = 0.5
 """Share of its variance from which a damping ratio tells of their scatter, and not of the test."""
+_LINEARISED = 0.1
+"""1 σ that equivalent linearisation leaves open of a damping ratio, over that of all else, from which it tells of
+neither: friction is found with a half of its force, and what it damps then seems damped by something else."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +153,8 @@ def outlying_damping(observations: Observations, fit: Fit) -> OutlyingDamping | 
     share = p.residuals.share.get(DAMPING_SCATTER)
     if share is None or DAMPING_SCATTER not in observations.scatters:
         return None
-    on = share > _OF_SCATTER
+    by_linearisation = p.residuals.jacobian * np.where(p.unknowns.governed(LINEARISATION), p.prior_std, 0.0)
+    on = (share > _OF_SCATTER) & (np.linalg.norm(by_linearisation, axis=1) < _LINEARISED)
     count = int(np.sum(on))
     if not count:  # a scatter that is stated to be none has no share
         return None

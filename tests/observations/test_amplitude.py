@@ -13,7 +13,7 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose import claims, rounds
 from ema_pipeline.diagnose.detection_limits import detection_limits
 from ema_pipeline.diagnose.diagnosis import diagnose
-from ema_pipeline.diagnose.explained import explanation
+from ema_pipeline.diagnose.explained import explanation, outlying_damping
 from ema_pipeline.diagnose.heldout import HeldOut
 from ema_pipeline.diagnose.hypotheses import Hypothesis, Name
 from ema_pipeline.diagnose.ranking import rank
@@ -41,10 +41,11 @@ from ema_pipeline.observations.fitting import (
 from ema_pipeline.observations.hit_data import HitData, comparable
 from ema_pipeline.observations.hit_modes import Linear, changed_modes
 from ema_pipeline.observations.hit_reading import momentary_weights
-from ema_pipeline.observations.hit_residuals import AMPLITUDE
+from ema_pipeline.observations.hit_residuals import AMPLITUDE, LINEARISATION
 from ema_pipeline.observations.hit_rows import HIT_AIM
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
+from ema_pipeline.observations.parts import DAMPING_SCATTER
 from ema_pipeline.observations.size_map import LOG_STD, SizeMap
 from ema_pipeline.rigs.isolator import isolator
 
@@ -608,6 +609,31 @@ def test_poles_that_move_far_are_read_less_well_than_near_ones() -> None:
         assert np.all((std > least) & (std < most)), far
         assert np.max(there.linearised_std[hits.level == 0]) < 1e-3
         assert there.moves[0] == pytest.approx(far, rel=0.1)
+
+
+def test_damping_that_friction_moves_speaks_for_no_damper_that_is_missing() -> None:
+    """Linearised, half of its force is found: what is left of its damping is no scatter of other damping."""
+    observations = synthetic([DryFriction(f"f{a}", {f"hub.{a}": 1.0}, 0.3) for a in "xy"])
+    model = Model((parse_effect("dry_friction@hub", RIG),), {})
+    start = model.problem(observations).start({"dry_friction@hub.force": 0.3})
+    fit = refined(observations, model, start, {n: s.start for n, s in observations.scatters.items()})
+    posterior, residuals = fit.posterior, fit.posterior.residuals
+    rows = np.flatnonzero(residuals.share[DAMPING_SCATTER] > 0)
+    left = posterior.unknowns.governed(LINEARISATION)
+    moved = np.linalg.norm(residuals.jacobian[rows][:, left] * posterior.prior_std[left], axis=1)
+    assert np.min(moved) < 0.05
+    assert np.max(moved) > 0.2
+
+    def outlying(row: int) -> bool:
+        """Whether it speaks against the model that one mode is damped far more than it says."""
+        values = residuals.values.copy()
+        values[rows] = 0.1
+        values[row] = 6.0
+        changed = replace(posterior, residuals=replace(residuals, values=values))
+        return outlying_damping(observations, replace(fit, posterior=changed)) is not None
+
+    assert outlying(rows[np.argmin(moved)])
+    assert not outlying(rows[np.argmax(moved)])
 
 
 def test_hits_of_one_level_cannot_be_compared() -> None:
