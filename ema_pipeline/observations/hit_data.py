@@ -20,6 +20,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.levels.scatter import Scatter
 from ema_pipeline.levels.sizes import means_of_sheets
 from ema_pipeline.levels.types import HitModes, Pulses
+from ema_pipeline.mechanics.batch import fine_force
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.observations.hit_reading import LAST, drive_gains, momentary_weights
 from ema_pipeline.observations.mode_data import ModeData, prepare
@@ -50,6 +51,8 @@ _CURVE = 3
 """Terms of a smooth curve in the logarithm of the amplitude; no more than there are force levels."""
 _HEARD = 0.1
 """Motion of a mode over that of the largest that moves in step with it, below which a hit does not tell its pole."""
+_QUIET_S = 0.01
+"""Time after every blow in which what is left of its force at steps between samples rings off, s."""
 _FASTER = 1.5
 """Most by which a mode's motion decays faster or slower in one hit than in most. The weight of each instant is that of
 the median decay; a hit read with nine times that would leave, next to a mode that moves in step, no motion to refer to.
@@ -357,6 +360,19 @@ class HitData:
             for s, w, (low, high) in zip(decay, self.omega, self.band_hz.tolist(), strict=True)
         ]
         return instants, np.stack(columns, axis=2)
+
+    def blows(self, substeps: int) -> Real:
+        """Forces of all hits, and for `_QUIET_S` after, at steps between which they run straight, N, (h, n_steps)."""
+        if substeps not in self._blows:
+            assert self.pulses is not None
+            after = int(_QUIET_S * self.pulses.sample_rate_hz)
+            self._blows[substeps] = fine_force(np.pad(self.pulses.force_n, ((0, 0), (0, after))), substeps)[1]
+        return self._blows[substeps]
+
+    @cached_property
+    def _blows(self) -> dict[int, Real]:
+        """Those that were asked for."""
+        return {}
 
     @cached_property
     def ringing(self) -> Ringing:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from scipy.fft import rfft
 
 from ema_pipeline.levels.differences import smooth_terms
-from ema_pipeline.mechanics.batch import fine_force
 from ema_pipeline.mechanics.laws import FRICTION, PARTING, Nonlinear
 from ema_pipeline.observations.hit_data import HitData
 
@@ -29,9 +28,9 @@ _PHASE = 0.4
 """Phase, in rad, by which the highest mode may turn in one step."""
 _SLOWEST = 2 * np.pi * 1e-2
 """Rigid-body modes are held by springs so soft that no record sees them, rad/s."""
-_BLOW_S, _LONGER, _FADED = 0.01, 3.0, 0.02
-"""Time that is marched at least, s, and factor by which it is extended until no force is left in its last third; of
-friction, which only fades, no more than this share of each hit's largest."""
+_LONGER, _FADED = 3.0, 0.02
+"""Factor by which the time that is marched is extended until no force is left in its last third; of friction, which
+only fades, no more than this share of each hit's largest."""
 _STEPS, _LEFT = 3, 0.1
 """Steps of the fit that reads a mode anew about what it found, and least share of its size that a step may leave."""
 _STILL = 1e-300
@@ -136,11 +135,11 @@ def marched_modes(
     result = np.zeros((2, *displacement.shape), complex)
     if not np.any(forces):
         return result
-    spectra, by_response = _spectra(data, forces, step), any(map(rubs, elements))
+    (spectra, begin), by_response = _spectra(data, forces, step), any(map(rubs, elements))
     for r in np.flatnonzero(driven.match >= 0):
         low, high = data.band_hz[r].tolist()
         lines = np.arange(low, high, data.line_hz)
-        own = spectra[:, :, np.rint(lines / data.line_hz).astype(int)]
+        own = spectra[:, :, np.rint(lines / data.line_hz).astype(int)] * np.exp(-2j * np.pi * lines * begin)
         drive = 1j / data.omega[r] * np.einsum("j,hjl->hl", driven.stretch[:, driven.match[r]], own)
         s = 2j * np.pi * lines + data.window_decay - complex(-data.decay[r], data.omega[r])
         weight = np.abs(s) if by_response else np.ones(len(s))
@@ -162,24 +161,23 @@ def _forces(data: HitData, elements: Sequence[Nonlinear], driven: Driven) -> tup
     rows = np.concatenate([moved, moved * poles])[None]
     laws = np.array([[e.law for e in elements]], dtype=float)
     nothing = np.zeros((1, 0, len(poles)), complex), np.zeros((1, 0, len(elements)))
-    hits, whole = len(pulses.force_n), int(rate / data.line_hz)
+    blows, hits, whole = data.blows(substeps), len(pulses.force_n), int(rate / data.line_hz)
     found: Real = np.zeros((hits, len(elements), 0))
     faded = _FADED if any(map(rubs, elements)) else 0.0
-    left, count = np.arange(hits), pulses.force_n.shape[1] + int(_BLOW_S * rate)
+    left, count = np.arange(hits), (blows.shape[1] - 1) // substeps + 1
     while len(left):
         count = min(count, whole)
-        force = np.zeros((len(left), count))
-        cut = min(count, pulses.force_n.shape[1])
-        force[:, :cut] = driven.scale * pulses.force_n[left, :cut]
+        force = np.zeros((len(left), (count - 1) * substeps + 1))
+        cut = min(force.shape[1], blows.shape[1])
+        force[:, :cut] = driven.scale * blows[left, :cut]
         inputs = np.concatenate([driven.struck[left], -driven.stretch])[None].astype(complex)
-        straight = fine_force(force, substeps)[1]
         marched = march(
             laws,
             poles[None],
             inputs,
             rows,
             *nothing,
-            straight,
+            force,
             1 / (rate * substeps),
             substeps,
             trace=True,
@@ -187,7 +185,9 @@ def _forces(data: HitData, elements: Sequence[Nonlinear], driven: Driven) -> tup
         if marched.failed.any():
             return None, 0.0
         forces = marched.forces[0]
-        found = np.pad(found, ((0, 0), (0, 0), (0, forces.shape[2] - found.shape[2])))
+        earlier = found
+        found = np.zeros((hits, len(elements), forces.shape[2]))
+        found[:, :, : earlier.shape[2]] = earlier
         found[left] = forces
         late = _largest(forces[:, :, forces.shape[2] * 2 // 3 :]) > faded * _largest(forces)
         left = left[late] if count < whole else left[:0]
@@ -200,21 +200,21 @@ def _largest(forces: Real) -> Real:
     return np.asarray(np.abs(forces).max(axis=(1, 2), initial=0.0))
 
 
-def _spectra(data: HitData, forces: Real, step: float) -> Complex:
-    """Of forces at steps, under the exponential window, at the lines of the FRFs; time counts from the peak."""
+def _spectra(data: HitData, forces: Real, step: float) -> tuple[Complex, float]:
+    """Of forces at steps, under the exponential window, at the lines of the FRFs, as if they began at once; and when
+    they do, counted from the peak, s.
+    """
     pulses = data.pulses
     assert pulses is not None
     substeps = round(1 / (pulses.sample_rate_hz * step))
     samples = -(-forces.shape[2] // substeps)
-    padded = np.pad(forces, ((0, 0), (0, 0), (0, samples * substeps - forces.shape[2])))
-    means = padded.reshape(*forces.shape[:2], samples, substeps).mean(axis=3)
+    filled = np.zeros((*forces.shape[:2], samples * substeps))
+    filled[:, :, : forces.shape[2]] = forces
+    means = filled.reshape(*forces.shape[:2], samples, substeps).mean(axis=3)
     time = (np.arange(samples) + 0.5 * (substeps - 1) / substeps - pulses.peak) / pulses.sample_rate_hz
     whole = round(pulses.sample_rate_hz / data.line_hz)
-    spectra = (
-        np.asarray(rfft(means * np.exp(-data.window_decay * time), whole, axis=2)) / pulses.sample_rate_hz
-    )
-    lines = np.arange(spectra.shape[2]) * data.line_hz
-    return np.asarray(spectra * np.exp(-2j * np.pi * lines * time[0]))
+    spectra = rfft(means * np.exp(-data.window_decay * time), whole, axis=2) / pulses.sample_rate_hz
+    return np.asarray(spectra, np.complex128), float(time[0])
 
 
 def _read(
@@ -234,7 +234,7 @@ def _read(
     weight : ndarray, (n_lines,)
         Of each line, over one constant.
     """
-    smooth = np.linalg.qr((weight * smooth_terms(len(s))).T)[0].T
+    smooth = np.linalg.qr((weight * smooth_terms(len(s))).T)[0].T.astype(complex)
     still = np.abs(displacement) < _STILL
     size = np.where(still, 1.0, displacement)
     driven = np.where(still[:, None], 0.0, drive) / s / size[:, None]
@@ -254,10 +254,11 @@ def _read(
     return pole, now - begun
 
 
-def _step(s: Complex, lines: Complex, smooth: Real, weight: Real) -> tuple[Complex, Complex]:
+def _step(s: Complex, lines: Complex, smooth: Complex, weight: Real) -> tuple[Complex, Complex]:
     """Coefficients of 1/s² and 1/s in weighted lines, smooth terms beside them, each (h,)."""
-    one, two, rest = (c - (c @ smooth.T) @ smooth for c in (weight * s**-2, weight / s, weight * lines))
-    a, d = (np.sum(np.abs(c) ** 2, axis=1) for c in (one, two))
+    second = weight / s
+    one, two, rest = (c - (c @ smooth.T) @ smooth for c in (second / s, second, weight * lines))
+    a, d = (np.sum(c.real**2 + c.imag**2, axis=1) for c in (one, two))
     b = np.sum(one.conj() * two, axis=1)
     right = [np.sum(c.conj() * rest, axis=1) for c in (one, two)]
     determinant = a * d - np.abs(b) ** 2
