@@ -65,8 +65,17 @@ class Scatter:
     def __init__(
         self, values: Real, variance: Real, sheet: Integers, terms: tuple[Real, ...], shared: bool
     ) -> None:
-        self._values, self._variance, self._sheet = values, variance, sheet
-        self._terms, self.shared = terms, shared
+        self.shared, self._range, self._most = shared, float(np.ptp(values)), float(np.max(variance))
+        ones = np.asarray(sheet[:, None] == np.unique(sheet), dtype=float)
+        columns = np.column_stack([ones if shared else np.ones(len(values)), *terms])
+        blocks = [np.arange(len(values))] if shared else [np.flatnonzero(of) for of in ones.T]
+        # of every block; lines of nothing fill them to one length
+        self._count, longest = len(values), max(map(len, blocks))
+        self._values, self._variance = np.zeros((len(blocks), longest)), np.ones((len(blocks), longest))
+        self._columns = np.zeros((len(blocks), longest, columns.shape[1]))
+        for k, block in enumerate(blocks):
+            self._values[k, : len(block)], self._variance[k, : len(block)] = values[block], variance[block]
+            self._columns[k, : len(block)] = columns[block]
         self.noise_only, self.dof = self._chi_square(0.0)
 
     def extra(self, usual: Usual) -> float:
@@ -81,7 +90,7 @@ class Scatter:
         from scipy.optimize import brentq  # only where scatter exceeds the noise
 
         target = self.noise_only / shrunk
-        top = float(np.ptp(self._values)) ** 2 + float(self._variance.max())
+        top = self._range**2 + self._most
         while self._chi_square(top)[0] > target:
             top *= 10
         return float(brentq(lambda extra: self._chi_square(extra)[0] - target, 0.0, top, rtol=1e-4))
@@ -89,17 +98,13 @@ class Scatter:
     def _chi_square(self, extra: float) -> tuple[float, int]:
         """Sum of squares of what the terms leave over, at unit noise, and its degrees of freedom."""
         root = 1.0 / np.sqrt(self._variance + extra)
-        values, sheets = root * self._values, np.unique(self._sheet)
-        if self.shared:
-            means = np.asarray(self._sheet[:, None] == sheets[None], dtype=float)
-            return _left_over(values, root[:, None] * np.column_stack([means, *self._terms]))
-        total, dof = 0.0, 0
-        for s in sheets:
-            of = self._sheet == s
-            columns = np.column_stack([np.ones(int(of.sum())), *(t[of] for t in self._terms)])
-            part, free = _left_over(values[of], root[of, None] * columns)
-            total, dof = total + part, dof + free
-        return total, dof
+        values, columns = root * self._values, root[..., None] * self._columns
+        size = np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), 1e-300)
+        basis, strength, _ = np.linalg.svd(columns / size, full_matrices=False)
+        kept = strength > _TOLERANCE
+        share = np.where(kept, np.einsum("bnk,bn->bk", basis, values), 0.0)
+        rest = values - np.einsum("bnk,bk->bn", basis, share)
+        return float(np.sum(rest**2)), self._count - int(np.sum(kept))
 
 
 def usual_scatter(scatters: Iterable[Scatter]) -> Usual:
@@ -138,12 +143,3 @@ def _log_density(ratio: Real, dof: Real, of_divisor: float) -> Real:
     return np.asarray(
         constant + xlogy(n / 2 - 1, ratio) - ((n + m) / 2 * np.log(m + n * ratio) + betaln(n / 2, m / 2))
     )
-
-
-def _left_over(values: Real, columns: Real) -> tuple[float, int]:
-    """Sum of squares of values beyond columns, and its degrees of freedom."""
-    size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    basis, strength, _ = np.linalg.svd(columns / size, full_matrices=False)
-    basis = basis[:, strength > _TOLERANCE]
-    rest = values - basis @ (basis.T @ values)
-    return float(rest @ rest), len(values) - basis.shape[1]
