@@ -9,7 +9,6 @@ on one point count: whatever a linear model has wrong is alike in all of them.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 
@@ -18,9 +17,10 @@ from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.inference import Apart, Posterior, Residuals, Unknowns, joined
+from ema_pipeline.observations.amplitude_starts import begun, sized_anew
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.hit_data import HitData, comparable
-from ema_pipeline.observations.hit_lattice import LEAST, SPACING, MarchedHits, on_lattice
+from ema_pipeline.observations.hit_lattice import LEAST, MarchedHits, on_lattice
 from ema_pipeline.observations.hit_march import rubs, steps_to_end
 from ema_pipeline.observations.hit_residuals import (
     AMPLITUDE,
@@ -34,7 +34,7 @@ from ema_pipeline.observations.mode_problem import ModeProblem
 from ema_pipeline.observations.mode_rows import SHAPE, stacked
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.rig_model import RigModel
-from ema_pipeline.observations.size_map import LOG_STD, SizeMap
+from ema_pipeline.observations.size_map import SizeMap
 
 AMPLITUDE_STD = 0.02
 """1 σ of the logarithm of all amplitudes: the sensors' calibration, less what their number averages out."""
@@ -57,16 +57,6 @@ _STEP, _MARCHED_STEP = 1e-3, 1e-2
 """Steps of the differences by sizes, in units of their prior σ."""
 _BEYOND = 3.0
 """Growth of what linearisation leaves out per decay rate by which a pole moves: it is of first order in that."""
-_DECADES = 6.0
-_ALONG, _ACROSS, _FINE = 19, 3, 41
-"""Sizes that are tried to begin with: their range, and their number for an effect's first size and the others; of teeth
-for their preload alone."""
-_LOWEST = 3
-"""Most of them that fits begin at."""
-_FACTORS = tuple(np.geomspace(1.0, 32.0, 6))
-"""Of the linearised size of what is calculated in full: sizes from which fits begin."""
-_BESIDE = (-2, -1, 1, 2)
-"""Places of the lattice about these that are tried, too: between two sizes of the grid others may fit far better."""
 
 
 class AmplitudeObservations:
@@ -317,85 +307,16 @@ class AmplitudeProblem(EffectProblem):
         return -_MARCHED_STEP * (1.0 if self.sizes[name].logarithmic else max(float(x[i]), LEAST))
 
     def begun(self, x: NDArray[np.float64], scatters: Mapping[str, float]) -> list[NDArray[np.float64]]:
-        """`x` with the sizes of the effect added last at the best of a grid; nothing where it is linear.
+        """See `EffectProblem`: nothing where the effect added last is linear."""
+        return begun(self, x, scatters)
 
-        From far off there is often no slope that leads to the right size: teeth that never part, friction that locks,
-        and a quadratic spring of no size change nothing. Rows far off count by their logarithm: what other unknowns
-        will take up must not outweigh what most rows say. Of teeth, whose rows go up and down with the size, some
-        lowest points count, once all else has followed.
-        """
-        last = self.model.effects[-1] if self.model.effects else None
-        if last is None or last.effect.linear or not self.observations.hits:
-            return []
-        names = [last.parameter_name(p.name) for p in last.effect.parameters]
-        at = [self.unknowns.index[n] for n in names]
-        marched = set(at) <= set(self.marched_sizes)
-        counts = (_FINE, *[1] * (len(names) - 1)) if marched else (_ALONG, *[_ACROSS] * (len(names) - 1))
-        grids = [_grid(self.sizes[n], count) for n, count in zip(names, counts, strict=True)]
-        matching = self.residuals(x, scatters, derivatives=False).matching
-
-        def tried(values: Sequence[float]) -> tuple[float, NDArray[np.float64]]:
-            trial = x.copy()
-            trial[at] = values
-            if marched:
-                trial = self.uninterpolated(trial)
-            found = self.residuals(trial, scatters, matching=matching, derivatives=marched, by_sizes=False)
-            if marched:
-                return 0.5 * self._followed(found, trial, scatters, at), trial
-            return 0.5 * float(np.sum(np.log1p(found.values**2)) + np.sum(np.square(values))), trial
-
-        places = list(itertools.product(*grids))
-        tries = [tried(values) for values in places]
-        costs = np.array([cost for cost, _ in tries])
-        if not marched:
-            return [tries[int(np.argmin(costs))][1]] if np.isfinite(min(costs)) else [x]
-        around = np.concatenate([[np.inf], costs, [np.inf]])
-        lowest = np.flatnonzero((around[1:-1] < around[:-2]) & (around[1:-1] < around[2:]))
-        best = []
-        for i in sorted(lowest, key=lambda i: costs[i])[:_LOWEST]:
-            near = [(places[i][0] + k * SPACING, *places[i][1:]) for k in _BESIDE]
-            best.append(min([tries[i], *map(tried, near)], key=lambda one: one[0]))
-        return [trial for _, trial in sorted(best, key=lambda one: one[0])] or [x]
+    def sized_anew(self, x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+        """See `EffectProblem`."""
+        return sized_anew(self, x)
 
     def uninterpolated(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """See `EffectProblem`: with the lengths of teeth on the lattice of marched hits."""
         return on_lattice(self, x)
-
-    def sized_anew(self, x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """See `EffectProblem`: multiples of the first size of what is calculated in full, its other sizes as usual."""
-        starts = [x]
-        for effect in self.effects:
-            if effect.label not in self.observations.rubbing:
-                continue
-            i, *others = (
-                self.unknowns.index[effect.parameter_name(p.name)] for p in effect.effect.parameters
-            )
-            size, usual, tried = self.sizes[self.unknowns.names[i]], self.start()[others], []
-            for start, factor in itertools.product(starts, _FACTORS):
-                trial = start.copy()
-                trial[i] = size.of_coordinate(factor * size.coordinate(start[i]))
-                trial[others] = usual
-                tried.append(self.unknowns.clipped(trial))
-            starts = tried
-        return starts
-
-    def _followed(
-        self, found: Residuals, x: NDArray[np.float64], scatters: Mapping[str, float], held: Sequence[int]
-    ) -> float:
-        """Twice the cost once all unknowns but those `held` have followed in one step.
-
-        What is seen of a structure at any force is what the teeth leave of it: its parts are not where the linear model
-        found them.
-        """
-        prior = self.unknowns.prior_std(scatters)
-        free = np.setdiff1d(np.arange(len(x)), held)
-        jacobian = found.jacobian[:, free] * prior[free]
-        at = x[free] / prior[free]
-        slope = jacobian.T @ found.values + at
-        normal = jacobian.T @ jacobian + np.eye(len(free))
-        return float(
-            found.values @ found.values + np.sum((x / prior) ** 2) - slope @ np.linalg.solve(normal, slope)
-        )
 
     def residuals(
         self,
@@ -433,18 +354,6 @@ class AmplitudeProblem(EffectProblem):
             matching=(modes.matching, tuple(p.matching for p in parts[1:])),
             apart=Apart(len(modes.values), modes.projected, count, rough=bool(self._nonlinear)),
         )
-
-
-def _grid(size: SizeMap, points: int) -> NDArray[np.float64]:
-    """Unknowns of a size to try: evenly over `_DECADES` decades of it, of both signs where it has two."""
-    low, high = size.bounds
-    if size.logarithmic:
-        reach = 0.5 * _DECADES * np.log(10) / LOG_STD
-        grid = np.linspace(-reach, reach, points) if points > 1 else np.zeros(1)
-    else:
-        one = np.logspace(1 - _DECADES, 1, points)
-        grid = np.concatenate([one, -one])
-    return np.asarray(grid[(grid >= low) & (grid <= high)])
 
 
 def _left_name(data: HitData, sheet: int, mode: int) -> str:

@@ -27,7 +27,8 @@ from ema_pipeline.mechanics.laws import DryFriction, Nonlinear, PartingSpring, P
 from ema_pipeline.mechanics.marching import element_rows
 from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.observations import amplitude
-from ema_pipeline.observations.amplitude import AmplitudeObservations, AmplitudeProblem, _grid
+from ema_pipeline.observations.amplitude import AmplitudeObservations, AmplitudeProblem
+from ema_pipeline.observations.amplitude_starts import _followed, _grid, _while_hopeful
 from ema_pipeline.observations.fitting import (
     Fit,
     Model,
@@ -147,7 +148,7 @@ def test_sizes_that_are_tried_count_once_all_else_has_followed() -> None:
     right = np.concatenate([found.values, x / std])
     step = np.linalg.lstsq(np.delete(rows, held, axis=1), -right)[0]
     left = right + np.delete(rows, held, axis=1) @ step
-    assert problem._followed(found, x, scatters, held) == pytest.approx(float(left @ left))
+    assert _followed(problem, found, x, scatters, held) == pytest.approx(float(left @ left))
     assert np.max(np.abs(step)) > 1e-3
 
 
@@ -473,6 +474,23 @@ def test_sizes_are_tried_over_six_decades_of_both_signs_where_there_are_two() ->
     expected = np.linspace(-reach, reach, 5)
     np.testing.assert_allclose(_grid(times, 5), expected[(expected >= low) & (expected <= high)])
     assert _grid(times, 1).tolist() == [0.0]
+
+
+def test_preloads_are_tried_from_the_largest_down_to_where_nothing_leads_anywhere() -> None:
+    asked = []
+
+    def tried(values: Sequence[float]) -> tuple[float, np.ndarray]:
+        (size,) = values
+        asked.append(size)
+        return costs[int(size)], np.array(values)
+
+    places = [(float(k),) for k in range(10)]
+    costs = [0.0, 9e3, 9e3, 9e3, 9e3, 500.0, 9e3, 9e3, 300.0, 310.0]  # two in a row are no end
+    found = _while_hopeful(tried, places)
+    assert asked == [9, 8, 7, 6, 5, 4, 3, 2]
+    assert [float(x[0]) for _, x in found] == [2, 3, 4, 5, 6, 7, 8, 9]
+    costs = list(np.linspace(0.0, 900.0, 10))
+    assert len(_while_hopeful(tried, places)) == 10
 
 
 def test_modes_within_four_decay_rates_move_in_step() -> None:
