@@ -223,7 +223,11 @@ def _selected(
 def _faint(
     found: Selection, judged: Sequence[Judged], hypotheses: Sequence[Hypothesis], settings: DiagnoseSettings
 ) -> list[Judged]:
-    """Those that are far smaller than the least size that these data would show."""
+    """Those that are far smaller than the least size that these data would show.
+
+    That is stated with other sizes as usual: friction shows half the force at half the rate as well.
+    """
+    judged = [j for j in judged if j.hypothesis.placed.effect.linear or len(j.named.sizes) == 1]
     asked = [j.hypothesis for j in judged]
     already = len(found.claimed)
     limits = detection_limits(found.observations, found.final, hypotheses, settings, asked, already)

@@ -477,16 +477,33 @@ def test_no_modes_at_all_are_refused_or_called_too_few() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "limit", "largest", "dropped"),
-    [(0.9, 3.0, False, True), (-0.9, 3.0, False, True), (1.1, 3.0, False, False), (0.9, 3.0, True, False),
-     (0.9, np.inf, False, False)],
+    ("size", "limit", "largest", "linear", "two_sizes", "dropped"),
+    [(0.9, 3.0, False, True, False, True), (-0.9, 3.0, False, True, False, True),
+     (1.1, 3.0, False, True, False, False), (0.9, 3.0, True, True, False, False),
+     (0.9, np.inf, False, True, False, False), (0.9, 3.0, False, True, True, True),
+     (0.9, 3.0, False, False, False, True), (0.9, 3.0, False, False, True, False)],
 )  # fmt: skip
 def test_what_is_far_too_small_to_be_seen_is_not_claimed(
-    monkeypatch: pytest.MonkeyPatch, size: float, limit: float, largest: bool, dropped: bool
+    monkeypatch: pytest.MonkeyPatch,
+    size: float,
+    limit: float,
+    largest: bool,
+    linear: bool,
+    two_sizes: bool,
+    dropped: bool,
 ) -> None:
-    """The selection is made once more without it, and the reader is told."""
-    one, other = (SimpleNamespace(label=f"spring@{place}") for place in ("m1", "m2"))
+    """The selection is made once more without it, and the reader is told.
+
+    Of two sizes of an effect that depends on the amplitude, the limit of one says nothing at another value of the
+    other.
+    """
+
+    def placed(linear: bool) -> Any:
+        return SimpleNamespace(effect=SimpleNamespace(linear=linear))
+
+    one, other = (SimpleNamespace(label=f"spring@{place}", placed=placed(linear)) for place in ("m1", "m2"))
     sizes = {"stiffness": EffectSize(size, 0.1, "N/m")}
+    sizes |= {"rate": EffectSize(1.0, 0.1, "m/s")} if two_sizes else {}
     named = SimpleNamespace(label=one.label, sizes=sizes)
     asked: list[list[str]] = []
 
@@ -502,5 +519,6 @@ def test_what_is_far_too_small_to_be_seen_is_not_claimed(
     found, told = diagnosis._selected(nothing, nothing, [one, other], nothing, nothing)
     assert asked == [["spring@m1", "spring@m2"], *([["spring@m2"]] if dropped else [])]
     assert bool(found.claimed) is not dropped
-    text = f"Not claimed: spring at m1, stiffness {size:.4g} ± 0.1 N/m. "
+    rate = ", rate 1 ± 0.1 m/s" if two_sizes else ""
+    text = f"Not claimed: spring at m1, stiffness {size:.4g} ± 0.1 N/m{rate}. "
     assert told == ([f"{text}Of such a size these data would show nothing."] if dropped else [])
