@@ -13,6 +13,7 @@ from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.maxima import prominent_peaks
 
 Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 MAX_PEAKS = 7
 """Peaks per sub-band."""
@@ -113,3 +114,8 @@ def _cuts(omega: Real, smooth: Real, peaks: NDArray[np.int64], a: int, b: int) -
         first = stop = int(np.clip((a + b) // 2, a + MIN_LINES, b - MIN_LINES))
     cut = first + int(np.argmin(smooth[first : stop + 1]))
     return [*_cuts(omega, smooth, peaks, a, cut), cut, *_cuts(omega, smooth, peaks, cut, b)]
+
+
+def between(poles: Complex, low: float, high: float) -> NDArray[np.bool_]:
+    """True for poles between two frequencies, rad/s."""
+    return np.asarray((poles.imag >= low) & (poles.imag < high))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.assurance import mpc
-from ema_pipeline.modal.bands import SubBand, indicator, split
+from ema_pipeline.modal.bands import SubBand, between, indicator, split
 from ema_pipeline.modal.compress import Window
 from ema_pipeline.modal.data import FEW_AT_ONCE, FitData, analysis_band, arrange
 from ema_pipeline.modal.drift.plain import plain_peaks
@@ -19,6 +19,7 @@ from ema_pipeline.modal.fit import (
     residual_fit,
     synthesis,
 )
+from ema_pipeline.modal.fitted_modes import FittedModes
 from ema_pipeline.modal.left_out import left_out, sentences
 from ema_pipeline.modal.noise import Noise, fit_law, flat_law, second_difference_power
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, seeded
@@ -26,15 +27,7 @@ from ema_pipeline.modal.pole_tracks import link, votes
 from ema_pipeline.modal.poles import PoleSet
 from ema_pipeline.modal.scaling import scale_shapes, scaling_note
 from ema_pipeline.modal.settings import ModalSettings
-from ema_pipeline.modal.sub_bands import (
-    FittedModes,
-    between,
-    candidates,
-    first_guess,
-    refined,
-    tracked,
-    whole,
-)
+from ema_pipeline.modal.sub_bands import candidates, first_guess, refined, tracked, whole
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
 from ema_pipeline.processes import release_memory
 from ema_pipeline.threads import in_order, single_blas_thread
