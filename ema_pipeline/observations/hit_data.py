@@ -22,8 +22,8 @@ from ema_pipeline.levels.sizes import means_of_sheets
 from ema_pipeline.levels.types import HitModes, Pulses
 from ema_pipeline.mechanics.batch import fine_force
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.observations.hit_reading import LAST, drive_gains, momentary_weights
 from ema_pipeline.observations.mode_data import ModeData, prepare
+from ema_pipeline.observations.ringing import Ringing
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -33,9 +33,6 @@ _IN_STEP = 4.0
 """Distance of poles, in decay rates, within which modes move in step while they are observed: at this distance the
 weight of one mode's force in the other's pole, 1/|1 - jΔω/2σ|², is 0.2."""
 
-_FIRST = 0.03
-"""First instant, in units of 1/2σ of the fastest mode."""
-_PER_EFOLD = 1.1
 _TOLD = 0.15
 """1 σ of a change of a size that a model tells, over that change: it knows neither every hit's aim nor all modes."""
 _FAR, _FAR_STD = 0.5, 0.5
@@ -53,29 +50,6 @@ _HEARD = 0.1
 """Motion of a mode over that of the largest that moves in step with it, below which a hit does not tell its pole."""
 _QUIET_S = 0.01
 """Time after every blow in which what is left of its force at steps between samples rings off, s."""
-_FASTER = 1.5
-"""Most by which a mode's motion decays faster or slower in one hit than in most. The weight of each instant is that of
-the median decay; a hit read with nine times that would leave, next to a mode that moves in step, no motion to refer to.
-"""
-
-
-@dataclass(frozen=True)
-class Ringing:
-    """How modes ring on after the blow.
-
-    Attributes
-    ----------
-    omega : ndarray, (n_groups,)
-        Mean of the modes that move in step, rad/s.
-    in_step : ndarray, (m, n_groups)
-        1 where a mode belongs to a group.
-    motion : complex ndarray, (h, t, m)
-        Envelope of every mode about its group's frequency, over that just after the blow.
-    """
-
-    omega: Real
-    in_step: Real
-    motion: Complex
 
 
 @dataclass(frozen=True)
@@ -347,19 +321,9 @@ class HitData:
         return means_of_sheets(np.where(self.used, values, 0.0).astype(complex), std, self.sheet)
 
     @cached_property
-    def weights(self) -> tuple[Real, Complex]:
-        """Instants after the blow, (t,), and the weight of each in what is read of every mode, (2, t, m).
-
-        See `hit_reading.momentary_weights`.
-        """
-        decay = self.decay + self.window_decay
-        first, last = np.log(0.5 * _FIRST / decay.max()), np.log(0.5 * LAST / decay.min())
-        instants = np.exp(np.linspace(first, last, int(_PER_EFOLD * (last - first)) + 2))
-        columns = [
-            momentary_weights(instants, complex(-s, w), np.arange(low, high, self.line_hz))
-            for s, w, (low, high) in zip(decay, self.omega, self.band_hz.tolist(), strict=True)
-        ]
-        return instants, np.stack(columns, axis=2)
+    def ringing(self) -> Ringing:
+        """How the modes ring on after every blow."""
+        return Ringing(self)
 
     def blows(self, substeps: int) -> Real:
         """Forces of all hits, and for `_QUIET_S` after, at steps between which they run straight, N, (h, n_steps)."""
@@ -373,48 +337,6 @@ class HitData:
     def _blows(self) -> dict[int, Real]:
         """Those that were asked for."""
         return {}
-
-    @cached_property
-    def ringing(self) -> Ringing:
-        """Of all hits at the instants of `weights`."""
-        in_step = np.zeros((len(self.modes), len(self.groups)))
-        for k, group in enumerate(self.groups):
-            in_step[group, k] = 1.0
-        omega = self.omega @ in_step / in_step.sum(axis=0)
-        decay = np.clip(-self.poles.real, self.decay / _FASTER, self.decay * _FASTER)
-        turning = 1j * (self.poles.imag - in_step @ omega) - decay
-        return Ringing(omega, in_step, np.exp(turning[:, None] * self.weights[0][:, None]))
-
-    @cached_property
-    def product_gains(self) -> Complex:
-        """What is read of every mode where the product of two motions drives it, (pairs, 2m).
-
-        Of `motion_pairs`, in both orders; poles, then sizes of all modes. See `hit_reading.drive_gains`.
-        """
-        together = self.exponents[:, None] + self.exponents - self.window_decay
-        poles = self.exponents[: len(self.modes)] - self.window_decay
-        gains = np.stack(
-            [
-                drive_gains(together, pole, np.arange(low, high, self.line_hz))
-                for pole, (low, high) in zip(poles, self.band_hz.tolist(), strict=True)
-            ],
-            axis=1,
-        )
-        a, b = self.motion_pairs
-        in_both_orders = gains[..., a, b] + np.where(a == b, 0.0, gains[..., b, a])
-        return np.ascontiguousarray(in_both_orders.reshape(-1, len(a)).T)
-
-    @cached_property
-    def motion_pairs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Numbers of two among `exponents`, every pair once, two of (pairs,)."""
-        first, second = np.triu_indices(len(self.exponents))
-        return first, second
-
-    @cached_property
-    def exponents(self) -> Complex:
-        """Poles of all modes, then their conjugates, 1/s, (2m,)."""
-        pole = 1j * self.omega - self.decay
-        return np.concatenate([pole, pole.conj()])
 
 
 def prepare_hits(

@@ -185,14 +185,19 @@ def _forces(data: HitData, elements: Sequence[Nonlinear], driven: Driven) -> tup
         if marched.failed.any():
             return None, 0.0
         forces = marched.forces[0]
-        earlier = found
-        found = np.zeros((hits, len(elements), forces.shape[2]))
-        found[:, :, : earlier.shape[2]] = earlier
+        found = _lengthened(found, forces.shape[2])
         found[left] = forces
         late = _largest(forces[:, :, forces.shape[2] * 2 // 3 :]) > faded * _largest(forces)
         left = left[late] if count < whole else left[:0]
         count = int(_LONGER * count)
     return found, 1 / (rate * substeps)
+
+
+def _lengthened(forces: Real, steps: int) -> Real:
+    """With nothing after them, (h, n_elements, steps)."""
+    longer = np.zeros((*forces.shape[:2], steps))
+    longer[:, :, : forces.shape[2]] = forces
+    return longer
 
 
 def _largest(forces: Real) -> Real:
@@ -208,9 +213,7 @@ def _spectra(data: HitData, forces: Real, step: float) -> tuple[Complex, float]:
     assert pulses is not None
     substeps = round(1 / (pulses.sample_rate_hz * step))
     samples = -(-forces.shape[2] // substeps)
-    filled = np.zeros((*forces.shape[:2], samples * substeps))
-    filled[:, :, : forces.shape[2]] = forces
-    means = filled.reshape(*forces.shape[:2], samples, substeps).mean(axis=3)
+    means = _lengthened(forces, samples * substeps).reshape(*forces.shape[:2], samples, substeps).mean(axis=3)
     time = (np.arange(samples) + 0.5 * (substeps - 1) / substeps - pulses.peak) / pulses.sample_rate_hz
     whole = round(pulses.sample_rate_hz / data.line_hz)
     spectra = rfft(means * np.exp(-data.window_decay * time), whole, axis=2) / pulses.sample_rate_hz

@@ -113,7 +113,7 @@ def changed_modes(data: HitData, elements: Sequence[Nonlinear], linear: Linear) 
         total += _of_products(data, element, linear.along[i], linear.displacement)
     still = np.abs(z) < _STILL
     ratio = np.where(still, 0.0, force / np.where(still, 1.0, z))
-    weighed = (ratio.transpose(2, 0, 1) @ data.weights[1].transpose(2, 1, 0)).transpose(2, 1, 0)
+    weighed = (ratio.transpose(2, 0, 1) @ ringing.weights[1].transpose(2, 1, 0)).transpose(2, 1, 0)
     return total + 0.5j / data.omega * weighed
 
 
@@ -123,8 +123,8 @@ def _of_products(data: HitData, element: Nonlinear, along: Real, displacement: C
         return np.zeros((2, *displacement.shape), complex)
     stretch = 0.5 * along * displacement
     both = np.concatenate([stretch, stretch.conj()], axis=1)
-    a, b = data.motion_pairs
-    driven = (both[:, a] * both[:, b]) @ data.product_gains
+    a, b = data.ringing.motion_pairs
+    driven = (both[:, a] * both[:, b]) @ data.ringing.product_gains
     driven = driven.reshape(len(both), 2, -1).transpose(1, 0, 2)
     still = np.abs(displacement) < _STILL
     relative = np.where(still, 0.0, driven / np.where(still, 1.0, displacement))
