@@ -497,11 +497,8 @@ def test_what_is_far_too_small_to_be_seen_is_not_claimed(
     Of two sizes of an effect that depends on the amplitude, the limit of one says nothing at another value of the
     other.
     """
-
-    def placed(linear: bool) -> Any:
-        return SimpleNamespace(effect=SimpleNamespace(linear=linear))
-
-    one, other = (SimpleNamespace(label=f"spring@{place}", placed=placed(linear)) for place in ("m1", "m2"))
+    placed = SimpleNamespace(effect=SimpleNamespace(linear=linear))
+    one, other = (SimpleNamespace(label=f"spring@{place}", placed=placed) for place in ("m1", "m2"))
     sizes = {"stiffness": EffectSize(size, 0.1, "N/m")}
     sizes |= {"rate": EffectSize(1.0, 0.1, "m/s")} if two_sizes else {}
     named = SimpleNamespace(label=one.label, sizes=sizes)

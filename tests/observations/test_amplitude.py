@@ -347,19 +347,20 @@ def test_a_scale_of_amplitudes_that_is_hardly_known_does_not_take_a_size_to_noth
 
 
 @pytest.mark.parametrize(
-    ("label", "sizes", "near"),
+    ("label", "sizes", "near", "rounding"),
     [
-        ("bearing_cubic@hub", {"stiffness": 1e11}, 0.01),
-        ("dry_friction@hub", {"force": 0.3, "velocity": 0.02}, 0.01),
+        ("bearing_cubic@hub", {"stiffness": 1e11}, 0.01, 1e-9),
+        ("dry_friction@hub", {"force": 0.3, "velocity": 0.02}, 0.01, 1e-9),
         (
             "hysteresis@hub",
             {"stiffness": 4e4, "force": 2.0, "shape": 0.3, "exponent": 1.5},
             0.1,
+            1e-5,
         ),  # by interpolation in a table
     ],
 )
 def test_derivatives_by_sizes_are_those_of_small_differences(
-    label: str, sizes: dict[str, float], near: float
+    label: str, sizes: dict[str, float], near: float, rounding: float
 ) -> None:
     """Those of the level's modes as well, which an effect this strong moves in the softest hits."""
     observations = synthetic([PolynomialSpring(f"c{a}", {f"hub.{a}": 1.0}, cubic=1e11) for a in "xy"])
@@ -380,7 +381,7 @@ def test_derivatives_by_sizes_are_those_of_small_differences(
         ]
         slope = (values[0] - values[1]) / 2e-5
         for rows in (slice(count), slice(count, None)):
-            close = near * np.abs(slope[rows]).max() + 1e-5  # rounding
+            close = near * np.abs(slope[rows]).max() + rounding
             np.testing.assert_allclose(here.jacobian[rows, i], slope[rows], atol=close)
 
 

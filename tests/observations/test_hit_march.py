@@ -204,7 +204,7 @@ def test_hits_in_which_one_mode_scatters_about_any_smooth_curve_are_known_less_w
     assert np.all(data.irregularity < 1.5)  # as they part, and are read, smoothly
     mode = int(np.flatnonzero(data.used[:6].all(axis=0))[0])
     astray = data.damping.copy()
-    noise = 12 * np.hypot(data.damping_std[:6, mode], data.linearised_std[:6, mode] * astray[:6, mode])
+    noise = 9 * np.hypot(data.damping_std[:6, mode], data.linearised_std[:6, mode] * astray[:6, mode])
     astray[:6, mode] += noise * np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
     factor = replace(data, damping=astray).irregularity
     assert np.all(factor[:6, mode] > 1.5)
