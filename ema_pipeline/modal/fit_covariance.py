@@ -2,8 +2,8 @@
 
 Where the interval of a mode begins. Later steps, in their order:
 
-1. `sub_bands`: where many points are struck, variances are raised to the scatter between points; the step that the fit
-   would still take is added.
+1. `fitted_modes`: where many points are struck, variances are raised to the scatter between points; the step that the
+   fit would still take is added.
 2. `identify`: a pole that is held at its peak gets the scatter over hits there, and half the way that the fit would
    have gone; variances of poles become those of frequency and damping ratio.
 3. `hit_to_hit`: of one hit, the scatter that it cannot show; of many, how far frequencies move from hit to hit, and a
