@@ -4,7 +4,7 @@ model."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from operator import is_
 
 import numpy as np
@@ -46,14 +46,32 @@ class Selection:
     observations: Observations
 
 
+@dataclass(frozen=True)
+class Earlier:
+    """What a selection from the same data with fewer unknowns has shown.
+
+    Attributes
+    ----------
+    leading : tuple of Hypothesis
+        What was claimed, and what came near it in the last round.
+    rounds : int
+        Rounds in which these led.
+    fitted : dict of str to Posterior
+        Fits of hypotheses.
+    """
+
+    leading: tuple[Hypothesis, ...] = ()
+    rounds: int = 0
+    fitted: Mapping[str, Posterior] = field(default_factory=dict)
+
+
 def select(
     observations: Observations,
     known: Model,
     hypotheses: Sequence[Hypothesis],
     settings: DiagnoseSettings,
     progress: Progress = lambda share, text: None,
-    first: Sequence[Hypothesis] = (),
-    before: Mapping[str, Posterior] | None = None,
+    earlier: Earlier = Earlier(),
 ) -> Selection:
     """Add effects one by one while the data support them, once more with unknowns that what was added calls for.
 
@@ -65,10 +83,8 @@ def select(
     hypotheses : sequence of Hypothesis
     settings : DiagnoseSettings
     progress : callable
-    first : sequence of Hypothesis
-        What is asked about at first, where it is known what leads; all where it is empty.
-    before : dict of str to Posterior, optional
-        Fits of hypotheses to the same data with fewer unknowns.
+    earlier : Earlier
+        Where it is known what leads, nothing else is asked about, unless that leads nowhere.
     """
     plain, observations = observations, observations.suited(known.effects)
     base = start = _fitted(observations, plain, known)
@@ -78,18 +94,21 @@ def select(
     rivals: dict[str, tuple[Judged, ...]] = {}
     fitted: dict[str, Posterior] = {}
 
-    def ask(base: Fit, claimed: Sequence[Judged], rounds: Sequence[Round]) -> Round:
+    def ask(
+        base: Fit, claimed: Sequence[Judged], rounds: Sequence[Round], among: Sequence[Hypothesis] = ()
+    ) -> Round:
         left = [h for h in hypotheses if not _taken(observations, h, claimed)]
+        labels = {h.label for h in among}
         done, part = len(rounds) / (settings.most_effects + 1), 1 / (settings.most_effects + 1)
         ranking = rank(
             observations,
             base,
-            first if first and not claimed else left,
+            [h for h in left if h.label in labels] or left,
             settings.processes,
             lambda share, text: progress(done + share * part, text),
             settings.further_finalists,
             rounds[-1].ranking.unpaired if rounds else 0.0,
-            before,
+            earlier.fitted,
         )
         fitted.update({r.hypothesis.label: r.fit.posterior for r in ranking.ranked})
         asked = _beside(observations, settings, claimed)
@@ -97,8 +116,12 @@ def select(
 
     ahead: Round | None = None
     while True:
-        found, ahead = ahead or ask(base, claimed, rounds), None
+        leading = earlier.leading if len(claimed) < earlier.rounds and ahead is None else ()
+        found, ahead = ahead or ask(base, claimed, rounds, leading), None
         leader = _tentative(observations, found, settings)
+        if leading and found.best is None and leader is None:
+            found = ask(base, claimed, rounds)
+            leader = _tentative(observations, found, settings)
         if leader is not None and len(claimed) + 1 < settings.most_effects:
             base = fit_base(observations, leader.ranked.fit.model, leader.ranked.fit)
             further = ask(base, [*claimed, leader], [*rounds, found])
@@ -112,9 +135,10 @@ def select(
         added = next(j for j in near if j.claimed)  # a rival alone does not pass the conditions of a claim
         suited = observations.suited(added.ranked.fit.model.effects)
         if suited is not observations:
-            leading = [j.hypothesis for j in claimed]
-            leading += [r.hypothesis for r in unbeaten(found.ranking.ranked[:CONTENDERS], lambda r: r.gain)]
-            return select(suited, known, hypotheses, settings, progress, leading, fitted)
+            led = [j.hypothesis for j in claimed]
+            led += [r.hypothesis for r in unbeaten(found.ranking.ranked[:CONTENDERS], lambda r: r.gain)]
+            known_so_far = Earlier(tuple(led), len(claimed) + 1, fitted)
+            return select(suited, known, hypotheses, settings, progress, known_so_far)
         claimed.append(added)
         rivals[added.hypothesis.label] = found.judged
         if len(claimed) > 1:

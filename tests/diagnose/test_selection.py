@@ -265,8 +265,9 @@ def test_linear_effects_at_the_place_of_a_linearised_one_are_not_asked_about(
     assert [asked for asked, _ in steps.asked[1:]] == [["cubic@x", "loss@x", "loss@y"]]
 
 
+@pytest.mark.parametrize("leads", [True, False])
 def test_what_was_claimed_is_asked_about_again_with_unknowns_that_a_later_claim_calls_for(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, leads: bool
 ) -> None:
     a, b, c = judged("a@x", 20.0), judged("b@x", 9.0), judged("c@x", 1.0, "weak")
     steps = Steps(monkeypatch, [[a], [b], [c]])
@@ -285,18 +286,26 @@ def test_what_was_claimed_is_asked_about_again_with_unknowns_that_a_later_claim_
         )
         for k, of in ((1, (a, b)), (2, (b, c)))
     }
-    found = steps.select([j.hypothesis for j in (a, b, c)], SETTINGS, [])
+    asked_round = steps.round
+
+    def round_of(observations: Any, ranking: Any, among: Any, settings: Any, found: int) -> Any:
+        nothing = not leads and len(steps.asked) == 3
+        return asked_round(observations, ranking, among, settings, 2 if nothing else found)
+
+    monkeypatch.setattr(selection, "round_of", round_of)
+    d = judged("d@x", 0.5, "weak")
+    found = steps.select([j.hypothesis for j in (a, b, c, d)], SETTINGS, [])
+    led = ["a@x", "b@x", "c@x"]  # what was claimed first, and what led when more unknowns were called for
+    again = [] if leads else [[*led, "d@x"]]  # of all, where that leads nowhere
     assert [asked for asked, _ in steps.asked] == [
-        ["a@x", "b@x", "c@x"],
-        ["b@x", "c@x"],
-        ["a@x", "b@x", "c@x"],  # what was claimed first, and what led when more unknowns were called for
-        ["b@x", "c@x"],
-        ["c@x"],
-    ]
+        [*led, "d@x"], ["b@x", "c@x", "d@x"],
+        led, *again, ["b@x", "c@x"],
+        ["c@x", "d@x"],
+    ]  # fmt: skip
     assert found.claimed == (a, b)
     assert found.observations is more
     fitted = {"a@x": "a@x 1", "b@x": "b@x 2", "c@x": "c@x 2"}  # where fits of the first pass ended
-    assert steps.before == [None, None, fitted, fitted, fitted]
+    assert steps.before == [{}, {}, *[fitted] * (3 + len(again))]
 
 
 def as_judged(label: str, gain: float, doubt: str) -> Judged:
