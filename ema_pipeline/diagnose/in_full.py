@@ -34,13 +34,15 @@ def fit_in_full(observations: Observations, fit: Fit, processes: int | None = 1)
     Processes share the starts, None for one per processor.
     """
     model, posterior = fit.model, fit.posterior
-    full = observations.in_full(model.effects, posterior)
-    if full is observations:
+    both = observations.in_full(model.effects, posterior)
+    if both is None:
         return observations, fit
+    full, linearised = both
+    before = refined(linearised, model, posterior.x, posterior.scatters)
     starts = model.problem(full).sized_anew(posterior.x)
 
     def job(x: NDArray[np.float64]) -> Posterior:
         return refined(full, model, x, posterior.scatters).posterior
 
     final = Fit(model, max(spread(job, starts, processes), key=lambda one: one.log_evidence))
-    return (full, final) if final.log_evidence > fit.log_evidence - _BEHIND else (observations, fit)
+    return (full, final) if final.log_evidence > before.log_evidence - _BEHIND else (observations, fit)

@@ -74,6 +74,8 @@ class AmplitudeObservations:
         Of the fit whose structure stands for all where hits are marched; each structure its own where left out.
     rubbing : dict of str to set of str
         Effects whose hits are marched as those of teeth are, and the names of their elements, by label.
+    cut_off : bool
+        True where friction damps: modes with many times the usual damping are known less well.
     """
 
     linearised = True
@@ -85,9 +87,10 @@ class AmplitudeObservations:
         of_modes: bool = False,
         marched: MarchedHits | None = None,
         rubbing: Mapping[str, frozenset[str]] | None = None,
+        cut_off: bool = False,
     ) -> None:
         self.modes, self.hits, self.of_modes, self.marched = modes, tuple(hits), of_modes, marched
-        self.rubbing = dict(rubbing or {})
+        self.rubbing, self.cut_off = dict(rubbing or {}), cut_off
         self.level_dependent = any(
             h.level_dependent and not modes.rig.assembly(h.configuration).nonlinear for h in hits
         )
@@ -98,7 +101,7 @@ class AmplitudeObservations:
     def rows(self) -> tuple[HitRows, ...]:
         """What is compared of the hits of every configuration."""
         defaults = {name: s.default for name, s in self.scatters.items()}
-        return tuple(HitRows(h, defaults) for h in self.hits)
+        return tuple(HitRows(h, defaults, self.cut_off) for h in self.hits)
 
     def suited(self, effects: Sequence[PlacedEffect]) -> AmplitudeObservations:
         """See `Observations`."""
@@ -106,19 +109,24 @@ class AmplitudeObservations:
 
     def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> AmplitudeObservations:
         """See `Observations`: hits are marched about the structure of this fit."""
-        return self._about(effects, found, self.rubbing)
+        return self._about(effects, found, self.rubbing, self.cut_off)
 
-    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> AmplitudeObservations:
+    def in_full(
+        self, effects: Sequence[PlacedEffect], found: Posterior
+    ) -> tuple[AmplitudeObservations, AmplitudeObservations] | None:
         """See `Observations`: hits are marched where there is friction, which equivalent linearisation finds too small.
 
         Friction ends a decay, and holds a body once it rests: no small change of a pole. Tests whose records would take
         minutes for one size are left as they are.
         """
         if any(h.pulses is None for h in self.hits) or sum(map(steps_to_end, self.hits)) > _MOST_STEPS:
-            return self
+            return None
         rubbing = {e.label: self._friction_of(e) for e in effects if not e.effect.linear}
         rubbing = {label: names for label, names in rubbing.items() if names}
-        return self if rubbing.keys() <= self.rubbing.keys() else self._about(effects, found, rubbing)
+        if rubbing.keys() <= self.rubbing.keys():
+            return None
+        full, plain = (self._about(effects, found, of, cut_off=True) for of in (rubbing, self.rubbing))
+        return full, plain
 
     def _friction_of(self, effect: PlacedEffect) -> frozenset[str]:
         """Names of the elements that an effect adds, where all of them that depend on the amplitude are friction."""
@@ -127,9 +135,13 @@ class AmplitudeObservations:
         return frozenset(e.name for e in added) if all(rubs(e) for e in added) else frozenset()
 
     def _about(
-        self, effects: Sequence[PlacedEffect], found: Posterior, rubbing: Mapping[str, frozenset[str]]
+        self,
+        effects: Sequence[PlacedEffect],
+        found: Posterior,
+        rubbing: Mapping[str, frozenset[str]],
+        cut_off: bool,
     ) -> AmplitudeObservations:
-        plain = AmplitudeObservations(self.modes, self.hits, self.of_modes, rubbing=rubbing)
+        plain = AmplitudeObservations(self.modes, self.hits, self.of_modes, rubbing=rubbing, cut_off=cut_off)
         return plain._of(self.modes, self.hits, self.of_modes, MarchedHits(plain, effects, found))
 
     def _of(
@@ -140,7 +152,9 @@ class AmplitudeObservations:
         marched: MarchedHits | None = None,
     ) -> AmplitudeObservations:
         """Some of the data, known in the same way."""
-        return AmplitudeObservations(modes, hits, of_modes, marched or self.marched, self.rubbing)
+        return AmplitudeObservations(
+            modes, hits, of_modes, marched or self.marched, self.rubbing, self.cut_off
+        )
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> AmplitudeProblem:
         """See `Observations`."""

@@ -103,9 +103,11 @@ class Observations(Protocol):
         """The same data, with what takes long found about a fit with these effects. Often the same object."""
         ...
 
-    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> Observations:
-        """The same data, with what these effects do calculated in full about a fit with them, where it is known to
-        first order only. Often the same object.
+    def in_full(
+        self, effects: Sequence[PlacedEffect], found: Posterior
+    ) -> tuple[Observations, Observations] | None:
+        """The data with what these effects do calculated in full about a fit with them, and as well as these are known
+        then with what they do to first order; None where nothing is known to first order only.
         """
         ...
 

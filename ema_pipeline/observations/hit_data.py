@@ -38,6 +38,8 @@ _TOLD = 0.15
 _FAR, _FAR_STD = 0.5, 0.5
 """Distance of a pole from that of the softest hits, in decay rates, at which half of the relative error is reached that
 a shift read from a decay has against one of first order; and that error of far ones, 1 σ."""
+_HEAVILY = 3.0
+"""Damping ratio over the usual one from which friction may be what damps: by itself it hardly scatters so far."""
 _UNLIKELY = 1e-3
 """Probability of hits that scatter so far about a smooth curve, below which their standard deviations are too small."""
 _FEW = 0.2
@@ -228,6 +230,16 @@ class HitData:
         The pole moves while it is read: by half a width and more, what is read is no mean of the momentary pole.
         """
         return np.asarray(_FAR_STD * self._moved**2 / (self._moved + _FAR))
+
+    @cached_property
+    def cut_off_std(self) -> Real:
+        """1 σ of what is read of modes that are damped many times as much as most, in their decay rates, (m,).
+
+        Where friction damps a mode so, what rings is no decay that one pole describes.
+        """
+        usual = _HEAVILY * float(np.median(self.usual_damping))
+        beyond = np.maximum(self.usual_damping / usual - 1, 0.0)
+        return np.asarray(_FAR_STD * beyond**2 / (beyond + _FAR) * usual / self.usual_damping)
 
     @cached_property
     def moves(self) -> tuple[float, float]:

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
 
-from ema_pipeline.levels.differences import smooth_terms
 from ema_pipeline.mechanics.laws import FRICTION, PARTING, Nonlinear
 from ema_pipeline.observations.hit_data import HitData
+from ema_pipeline.observations.hit_reading import line_weights, read_of_drive
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -31,9 +31,6 @@ _SLOWEST = 2 * np.pi * 1e-2
 _LONGER, _FADED = 3.0, 0.02
 """Factor by which the time that is marched is extended until no force is left in its last third; of friction, which
 only fades, no more than this share of each hit's largest."""
-_STEPS, _LEFT = 3, 0.1
-"""Steps of the fit that reads a mode anew about what it found, and least share of its size that a step may leave."""
-_STILL = 1e-300
 
 
 def parts(element: Nonlinear) -> bool:
@@ -63,8 +60,8 @@ class Driven:
         Of all modes of the model, rad/s and 1/s.
     stretch : ndarray, (n_elements, n)
         Of every element in each mass-normalised shape.
-    struck : ndarray, (h, n)
-        Motion of each hit's point along the blow in each shape.
+    struck : real or complex ndarray, (h, n)
+        Motion of each hit's point along the blow in each shape; complex where it starts with another phase.
     match : ndarray of int, (m,)
         Mode of the model that each hit mode is; -1 for none.
     scale : float
@@ -74,13 +71,19 @@ class Driven:
     omega: Real
     decay: Real
     stretch: Real
-    struck: Real
+    struck: Real | Complex
     match: Integers
     scale: float
 
     @classmethod
     def of(
-        cls, data: HitData, stretch: Real, struck: Real, match: Integers, eigenvalues: Real, scale: float
+        cls,
+        data: HitData,
+        stretch: Real,
+        struck: Real | Complex,
+        match: Integers,
+        eigenvalues: Real,
+        scale: float,
     ) -> Driven:
         """With the poles that were measured where the hits tell them, and the usual damping elsewhere.
 
@@ -88,7 +91,7 @@ class Driven:
         ----------
         data : HitData
         stretch : ndarray, (n_elements, n)
-        struck : ndarray, (h, n)
+        struck : real or complex ndarray, (h, n)
         match : ndarray of int, (m,)
         eigenvalues : ndarray, (n,)
             (rad/s)².
@@ -124,10 +127,6 @@ def marched_modes(
     -----
     In the envelope z of a mode with pole λ a force f along v adds (j/ω)(v·φ)∫f(τ)exp(-λτ)dτ. Its spectrum is that of
     the force over jω - λ.
-
-    A fit of single hits weighs lines by one over the noise that it finds. What friction cuts off a decay is no single
-    pole's: it is left over where the response is large, and is taken for noise there, so that lines weigh by one over
-    the response. Without these weights friction of 0.1 N came out as 0.05 N on a simulated rig.
     """
     forces, step = _forces(data, elements, driven)
     if forces is None:
@@ -135,16 +134,20 @@ def marched_modes(
     result = np.zeros((2, *displacement.shape), complex)
     if not np.any(forces):
         return result
-    (spectra, begin), by_response = _spectra(data, forces, step), any(map(rubs, elements))
+    spectra, begin = _spectra(data, forces, step)
+    weighed = any(map(rubs, elements))
+    sheets = data.sheet if weighed else np.zeros_like(data.sheet)
     for r in np.flatnonzero(driven.match >= 0):
         low, high = data.band_hz[r].tolist()
         lines = np.arange(low, high, data.line_hz)
         own = spectra[:, :, np.rint(lines / data.line_hz).astype(int)] * np.exp(-2j * np.pi * lines * begin)
         drive = 1j / data.omega[r] * np.einsum("j,hjl->hl", driven.stretch[:, driven.match[r]], own)
         s = 2j * np.pi * lines + data.window_decay - complex(-data.decay[r], data.omega[r])
-        weight = np.abs(s) if by_response else np.ones(len(s))
-        pole, size = _read(s, drive, displacement[:, r], data.decay[r], weight)
-        result[0, :, r], result[1, :, r] = pole, size
+        for sheet in np.unique(sheets):
+            on = np.flatnonzero(sheets == sheet)
+            heard = on[data.used[on, r]]
+            weight = line_weights(s, drive[heard], displacement[heard, r]) if weighed else np.ones(len(s))
+            result[:, on, r] = read_of_drive(s, drive[on], displacement[on, r], data.decay[r], weight)
     return result
 
 
@@ -218,51 +221,3 @@ def _spectra(data: HitData, forces: Real, step: float) -> tuple[Complex, float]:
     whole = round(pulses.sample_rate_hz / data.line_hz)
     spectra = rfft(means * np.exp(-data.window_decay * time), whole, axis=2) / pulses.sample_rate_hz
     return np.asarray(spectra, np.complex128), float(time[0])
-
-
-def _read(
-    s: Complex, drive: Complex, displacement: Complex, decay: float, weight: Real
-) -> tuple[Complex, Complex]:
-    """Change of the pole, 1/s, and of ln of the size that a fit reads of driven lines, each (h,).
-
-    Parameters
-    ----------
-    s : complex ndarray, (n_lines,)
-        jω - λ.
-    drive : complex ndarray, (h, n_lines)
-        Spectrum of what drives the envelope.
-    displacement : complex ndarray, (h,)
-        Size that was read with the drive.
-    decay : float
-    weight : ndarray, (n_lines,)
-        Of each line, over one constant.
-    """
-    smooth = np.linalg.qr((weight * smooth_terms(len(s))).T)[0].T.astype(complex)
-    still = np.abs(displacement) < _STILL
-    size = np.where(still, 1.0, displacement)
-    driven = np.where(still[:, None], 0.0, drive) / s / size[:, None]
-    pole, grown = _step(s[None], driven, smooth, weight)
-    begun = 1.0 - grown  # what was there without the drive, over what was read
-    lines = begun[:, None] / s + driven
-    pole = np.where(np.abs(pole) < decay, pole, pole / np.maximum(np.abs(pole), _STILL) * decay)
-    now = np.ones(len(size), complex)
-    for _ in range(_STEPS):
-        apart = s - pole[:, None]
-        moved, more = _step(apart, lines - now[:, None] / apart, smooth, weight)
-        near = (np.abs(moved) <= decay) & (np.abs(now + more) > _LEFT)
-        pole, now = (
-            pole + np.where(near, moved / np.where(near, now, 1.0), 0.0),
-            now + np.where(near, more, 0.0),
-        )
-    return pole, now - begun
-
-
-def _step(s: Complex, lines: Complex, smooth: Complex, weight: Real) -> tuple[Complex, Complex]:
-    """Coefficients of 1/s² and 1/s in weighted lines, smooth terms beside them, each (h,)."""
-    second = weight / s
-    one, two, rest = (c - (c @ smooth.T) @ smooth for c in (second / s, second, weight * lines))
-    a, d = (np.sum(c.real**2 + c.imag**2, axis=1) for c in (one, two))
-    b = np.sum(one.conj() * two, axis=1)
-    right = [np.sum(c.conj() * rest, axis=1) for c in (one, two)]
-    determinant = a * d - np.abs(b) ** 2
-    return (d * right[0] - b * right[1]) / determinant, (a * right[1] - b.conj() * right[0]) / determinant

@@ -15,12 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.dof import Dof
 from ema_pipeline.inference import Residuals, Scatter
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.laws import Nonlinear, Spring
 from ema_pipeline.mechanics.marching import element_rows
+from ema_pipeline.observations.hit_aim import as_aimed
 from ema_pipeline.observations.hit_data import HitData
-from ema_pipeline.observations.hit_march import Driven, marched_modes, parts
+from ema_pipeline.observations.hit_march import Driven, marched_modes, parts, rubs
 from ema_pipeline.observations.hit_modes import Linear, changed_modes
 from ema_pipeline.observations.hit_rows import (
     HIT_AIM,
@@ -248,11 +250,21 @@ class HitResiduals:
         if lattice is not None:
             return lattice.changes(data, self.problem, x)
         assert data.pulses is not None
-        rows = self.problem.model.sensor_rows(data.configuration, data.pulses.struck)
-        struck = rows @ self.paired.solution.shapes[: rows.shape[1]]
         scale = float(np.exp(x[self.scale]))
+        struck: NDArray[np.float64] | NDArray[np.complex128] = self._motion_of(data.pulses.struck)
+        if any(map(rubs, elements)):
+            beside = self.problem.modes.directions_across
+            across = [
+                self._motion_of([Dof(d.body, one) for one in beside(d.point)]) for d in data.pulses.struck
+            ]
+            struck = as_aimed(data, np.real(struck), across, displacement, match, scale)
         driven = Driven.of(data, stretch, struck, match, self.paired.solution.eigenvalues, scale)
         return marched_modes(data, elements, driven, displacement)
+
+    def _motion_of(self, dofs: Sequence[Dof]) -> NDArray[np.float64]:
+        """Motion along some DOFs in each shape of the model, (k, n)."""
+        rows = self.problem.model.sensor_rows(self.data.configuration, dofs)
+        return np.asarray(rows @ self.paired.solution.shapes[: rows.shape[1]])
 
     def _assembly(self, x: NDArray[np.float64]) -> Assembly:
         model = self.problem.model
@@ -263,8 +275,7 @@ class HitResiduals:
     ) -> NDArray[np.complex128]:
         """Amplitude of each modal coordinate just after each blow, as the sensors saw it, (h, m)."""
         data = self.data
-        reading = self.problem.model.sensor_rows(data.configuration, data.dofs)
-        seen = reading @ self.paired.solution.shapes[: reading.shape[1], match[on]]
+        seen = self._motion_of(data.dofs)[:, match[on]]
         factor = np.einsum("om,mo->m", seen, data.shapes[on]) / np.maximum(np.sum(seen**2, axis=0), 1e-300)
         result = np.zeros(data.motion.shape, complex)
         result[:, on] = np.nan_to_num(data.motion[:, on]) * factor * np.exp(x[self.scale])

@@ -72,6 +72,8 @@ class HitRows:
     data : HitData
     defaults : dict of str to float
         Scatters as they are stated, to which the price of wider ones refers.
+    cut_off : bool
+        True where friction damps: modes with many times the usual damping are known less well.
 
     Attributes
     ----------
@@ -81,7 +83,7 @@ class HitRows:
         ln f, ln ζ and the arc tangent of the size in quadrature.
     """
 
-    def __init__(self, data: HitData, defaults: Mapping[str, float]) -> None:
+    def __init__(self, data: HitData, defaults: Mapping[str, float], cut_off: bool = False) -> None:
         self._defaults, used = dict(defaults), data.used
         self.hit, self.mode = np.nonzero(used)
         at = (slice(None), self.hit, self.mode)
@@ -90,7 +92,8 @@ class HitRows:
         bent = 1 / (1 + turned**2)
         own = np.stack([data.log_frequency_std, data.damping_std / usual, data.quadrature_std * bent])
         in_decay_rates = np.stack([data.usual_damping, *np.ones((2, len(data.modes)))])[:, None]
-        own = np.hypot(own, data.linearised_std * in_decay_rates) * data.irregularity
+        left = np.hypot(data.linearised_std, data.cut_off_std) if cut_off else data.linearised_std
+        own = np.hypot(own, left * in_decay_rates) * data.irregularity
         self._noise = own[at].ravel() ** 2
         # not bent by the arc tangent: where aim alone excites a mode, its phase is anything
         self._otherwise = (data.otherwise * in_decay_rates)[at].ravel()

@@ -173,9 +173,8 @@ class LoopObservations:
         """See `Observations`."""
         return self
 
-    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> LoopObservations:
+    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> None:
         """See `Observations`."""
-        return self
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> LoopProblem:
         """See `Observations`."""

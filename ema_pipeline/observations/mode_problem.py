@@ -156,7 +156,7 @@ class ModeProblem(EffectProblem):
         gains = {name: std for name, std in gains.items() if std > 0}
         across: dict[str, float] = {}
         for s, c in sensors.items():
-            others, off = self._directions_across(s), c.off_direction
+            others, off = self.directions_across(s), c.off_direction
             if c.transverse > 0 or off:
                 std = float(np.hypot(c.transverse / np.sqrt(max(len(others), 1)), off))
                 across |= {_transverse(s, d): std for d in others}
@@ -174,7 +174,7 @@ class ModeProblem(EffectProblem):
             ),
         )
 
-    def _directions_across(self, sensor: str) -> tuple[str, ...]:
+    def directions_across(self, sensor: str) -> tuple[str, ...]:
         """Directions whose motion a sensor also reads; for one on the rim the radius, wherever it is."""
         body, _, direction = sensor.rpartition(".")
         for frame in _FRAMES:
@@ -214,7 +214,7 @@ class ModeProblem(EffectProblem):
             gain[i] = self.unknowns.index.get(
                 _calibration(dof.point, self.observations.channel(dof.point)), -1
             )
-            for k, direction in enumerate(self._directions_across(dof.point)):
+            for k, direction in enumerate(self.directions_across(dof.point)):
                 other = Dof(dof.body, direction)
                 transverse[k, i] = self.unknowns.index.get(_transverse(dof.point, direction), -1)
                 if transverse[k, i] >= 0 and self.observations.has(d.configuration, other):

@@ -112,9 +112,8 @@ class ModeObservations:
         """See `Observations`."""
         return self
 
-    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> ModeObservations:
+    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> None:
         """See `Observations`."""
-        return self
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> ModeProblem:
         """See `Observations`."""

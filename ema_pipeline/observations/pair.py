@@ -107,9 +107,8 @@ class PairObservations:
         """See `Observations`."""
         return self
 
-    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> PairObservations:
+    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> None:
         """See `Observations`."""
-        return self
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> PairProblem:
         """See `Observations`."""

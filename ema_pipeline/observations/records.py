@@ -284,9 +284,8 @@ class RecordObservations:
         """See `Observations`."""
         return self
 
-    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> RecordObservations:
+    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> None:
         """See `Observations`."""
-        return self
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> RecordProblem:
         """See `Observations`."""

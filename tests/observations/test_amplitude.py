@@ -43,7 +43,7 @@ from ema_pipeline.observations.hit_data import HitData, comparable
 from ema_pipeline.observations.hit_modes import Linear, changed_modes
 from ema_pipeline.observations.hit_reading import momentary_weights
 from ema_pipeline.observations.hit_residuals import AMPLITUDE, LINEARISATION
-from ema_pipeline.observations.hit_rows import HIT_AIM
+from ema_pipeline.observations.hit_rows import HIT_AIM, HitRows
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.parts import DAMPING_SCATTER
@@ -628,6 +628,23 @@ def test_poles_that_move_far_are_read_less_well_than_near_ones() -> None:
         assert np.all((std > least) & (std < most)), far
         assert np.max(there.linearised_std[hits.level == 0]) < 1e-3
         assert there.moves[0] == pytest.approx(far, rel=0.1)
+
+
+def test_modes_that_friction_damps_heavily_are_read_less_well_where_it_is_calculated_in_full() -> None:
+    observations = synthetic()
+    hits, factor = observations.hits[0], np.ones(len(observations.hits[0].modes))
+    defaults = {name: s.default for name, s in observations.scatters.items()}
+    assert not np.any(hits.cut_off_std)
+    for times, least, most in ((2.9, 0.0, 0.0), (6.0, 0.15, 0.2), (20.0, 0.35, 0.5)):
+        factor[1] = times
+        there = replace(hits, damping=hits.damping * factor)
+        assert np.all(there.cut_off_std[[0, 2, 3]] == 0.0)
+        assert least <= there.cut_off_std[1] <= most, times
+        own, cut = (HitRows(there, defaults, cut_off=c).whitening(defaults, 1.0).sigma for c in (False, True))
+        hit, mode = np.nonzero(there.used)
+        variance = (cut**2 - own**2).reshape(3, -1)[1]  # of damping ratios
+        added = np.where(mode == 1, there.cut_off_std[1] * there.irregularity[hit, mode], 0.0)
+        np.testing.assert_allclose(variance, added**2, rtol=1e-6, atol=1e-12)
 
 
 def test_damping_that_friction_moves_speaks_for_no_damper_that_is_missing() -> None:
