@@ -125,7 +125,12 @@ class AmplitudeObservations:
         rubbing = {label: names for label, names in rubbing.items() if names}
         if rubbing.keys() <= self.rubbing.keys():
             return None
-        full, plain = (self._about(effects, found, of, cut_off=True) for of in (rubbing, self.rubbing))
+        of = {h.configuration: h for h in self.hits}
+        modes = self.modes.with_data(
+            [of[d.configuration].rubbing(d) if d.configuration in of else d for d in self.modes.data]
+        )
+        known = self._of(modes, self.hits, self.of_modes)
+        full, plain = (known._about(effects, found, names, cut_off=True) for names in (rubbing, self.rubbing))
         return full, plain
 
     def _friction_of(self, effect: PlacedEffect) -> frozenset[str]:

@@ -237,9 +237,20 @@ class HitData:
 
         Where friction damps a mode so, what rings is no decay that one pole describes.
         """
-        usual = _HEAVILY * float(np.median(self.usual_damping))
-        beyond = np.maximum(self.usual_damping / usual - 1, 0.0)
-        return np.asarray(_FAR_STD * beyond**2 / (beyond + _FAR) * usual / self.usual_damping)
+        beyond = np.maximum(self._heavily - 1, 0.0)
+        return np.asarray(_FAR_STD * beyond**2 / (beyond + _FAR) / self._heavily)
+
+    @cached_property
+    def _heavily(self) -> Real:
+        """Damping ratio of every mode over the largest that is not friction's, (m,)."""
+        return np.asarray(self.usual_damping / (_HEAVILY * np.median(self.usual_damping)))
+
+    def rubbing(self, modes: ModeData) -> ModeData:
+        """The modes of `reference`, with damping ratios that say little where they are mostly friction's."""
+        std = modes.log_damping_std.copy()
+        of_friction = np.where(self._heavily > 1, np.log(_HEAVILY * self._heavily), 0.0)
+        std[self.modes] = np.hypot(std[self.modes], of_friction)
+        return replace(modes, log_damping_std=std)
 
     @cached_property
     def moves(self) -> tuple[float, float]:
