@@ -253,13 +253,16 @@ class HitResiduals:
         scale = float(np.exp(x[self.scale]))
         struck: NDArray[np.float64] | NDArray[np.complex128] = self._motion_of(data.pulses.struck)
         if any(map(rubs, elements)):
-            beside = self.problem.modes.directions_across
-            across = [
-                self._motion_of([Dof(d.body, one) for one in beside(d.point)]) for d in data.pulses.struck
-            ]
+            across = [self._motion_of(self._across(d)) for d in data.pulses.struck]
             struck = as_aimed(data, np.real(struck), across, displacement, match, scale)
         driven = Driven.of(data, stretch, struck, match, self.paired.solution.eigenvalues, scale)
         return marched_modes(data, elements, driven, displacement)
+
+    def _across(self, struck: Dof) -> list[Dof]:
+        """Directions in which a blow that is off its own moves the body, too."""
+        modes = self.problem.modes
+        others = [Dof(struck.body, one) for one in modes.directions_across(struck.point)]
+        return [d for d in others if modes.observations.has(self.data.configuration, d)]
 
     def _motion_of(self, dofs: Sequence[Dof]) -> NDArray[np.float64]:
         """Motion along some DOFs in each shape of the model, (k, n)."""
