@@ -109,7 +109,7 @@ class AmplitudeObservations:
 
     def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> AmplitudeObservations:
         """See `Observations`: hits are marched about the structure of this fit."""
-        return self._about(effects, found, self.rubbing, self.cut_off)
+        return self._about(effects, found, self.rubbing)
 
     def in_full(
         self, effects: Sequence[PlacedEffect], found: Posterior
@@ -127,11 +127,10 @@ class AmplitudeObservations:
             return None
         of = {h.configuration: h for h in self.hits}
         modes = self.modes.with_data(
-            [of[d.configuration].rubbing(d) if d.configuration in of else d for d in self.modes.data]
+            [of[d.configuration].with_friction(d) if d.configuration in of else d for d in self.modes.data]
         )
-        known = self._of(modes, self.hits, self.of_modes)
-        full, plain = (known._about(effects, found, names, cut_off=True) for names in (rubbing, self.rubbing))
-        return full, plain
+        known = AmplitudeObservations(modes, self.hits, self.of_modes, cut_off=True)
+        return known._about(effects, found, rubbing), known._about(effects, found, self.rubbing)
 
     def _friction_of(self, effect: PlacedEffect) -> frozenset[str]:
         """Names of the elements that an effect adds, where all of them that depend on the amplitude are friction."""
@@ -140,13 +139,11 @@ class AmplitudeObservations:
         return frozenset(e.name for e in added) if all(rubs(e) for e in added) else frozenset()
 
     def _about(
-        self,
-        effects: Sequence[PlacedEffect],
-        found: Posterior,
-        rubbing: Mapping[str, frozenset[str]],
-        cut_off: bool,
+        self, effects: Sequence[PlacedEffect], found: Posterior, rubbing: Mapping[str, frozenset[str]]
     ) -> AmplitudeObservations:
-        plain = AmplitudeObservations(self.modes, self.hits, self.of_modes, rubbing=rubbing, cut_off=cut_off)
+        plain = AmplitudeObservations(
+            self.modes, self.hits, self.of_modes, rubbing=rubbing, cut_off=self.cut_off
+        )
         return plain._of(self.modes, self.hits, self.of_modes, MarchedHits(plain, effects, found))
 
     def _of(

@@ -70,7 +70,7 @@ def _per_unit(data: HitData, on: Integers) -> Complex:
     pulses = data.pulses
     assert pulses is not None
     time = (np.arange(pulses.force_n.shape[1]) - pulses.peak) / pulses.sample_rate_hz
-    poles = 1j * data.omega[on] - data.decay[on]
+    poles = data.ringing.exponents[on]
     impulse = pulses.force_n @ np.exp(-time[:, None] * poles) / pulses.sample_rate_hz
     return np.asarray(-1j / data.omega[on] * impulse, np.complex128)
 

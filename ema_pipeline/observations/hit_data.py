@@ -229,7 +229,7 @@ class HitData:
 
         The pole moves while it is read: by half a width and more, what is read is no mean of the momentary pole.
         """
-        return np.asarray(_FAR_STD * self._moved**2 / (self._moved + _FAR))
+        return _far_std(self._moved)
 
     @cached_property
     def cut_off_std(self) -> Real:
@@ -237,18 +237,18 @@ class HitData:
 
         Where friction damps a mode so, what rings is no decay that one pole describes.
         """
-        beyond = np.maximum(self._heavily - 1, 0.0)
-        return np.asarray(_FAR_STD * beyond**2 / (beyond + _FAR) / self._heavily)
+        times = self._times_usual / _HEAVILY
+        return _far_std(np.maximum(times - 1, 0.0)) / times
 
     @cached_property
-    def _heavily(self) -> Real:
-        """Damping ratio of every mode over the largest that is not friction's, (m,)."""
-        return np.asarray(self.usual_damping / (_HEAVILY * np.median(self.usual_damping)))
+    def _times_usual(self) -> Real:
+        """Damping ratio of every mode over the median of all, (m,)."""
+        return np.asarray(self.usual_damping / np.median(self.usual_damping))
 
-    def rubbing(self, modes: ModeData) -> ModeData:
+    def with_friction(self, modes: ModeData) -> ModeData:
         """The modes of `reference`, with damping ratios that say little where they are mostly friction's."""
         std = modes.log_damping_std.copy()
-        of_friction = np.where(self._heavily > 1, np.log(_HEAVILY * self._heavily), 0.0)
+        of_friction = np.where(self._times_usual > _HEAVILY, np.log(self._times_usual), 0.0)
         std[self.modes] = np.hypot(std[self.modes], of_friction)
         return replace(modes, log_damping_std=std)
 
@@ -360,6 +360,11 @@ class HitData:
     def _blows(self) -> dict[int, Real]:
         """Those that were asked for."""
         return {}
+
+
+def _far_std(distance: Real) -> Real:
+    """1 σ of what one pole reads of a decay that is so many decay rates off, in these."""
+    return np.asarray(_FAR_STD * distance**2 / (distance + _FAR))
 
 
 def prepare_hits(

@@ -251,10 +251,11 @@ class HitResiduals:
             return lattice.changes(data, self.problem, x)
         assert data.pulses is not None
         scale = float(np.exp(x[self.scale]))
-        struck: NDArray[np.float64] | NDArray[np.complex128] = self._motion_of(data.pulses.struck)
+        stated = self._motion_of(data.pulses.struck)
+        struck: NDArray[np.float64] | NDArray[np.complex128] = stated
         if any(map(rubs, elements)):
             across = [self._motion_of(self._across(d)) for d in data.pulses.struck]
-            struck = as_aimed(data, np.real(struck), across, displacement, match, scale)
+            struck = as_aimed(data, stated, across, displacement, match, scale)
         driven = Driven.of(data, stretch, struck, match, self.paired.solution.eigenvalues, scale)
         return marched_modes(data, elements, driven, displacement)
 

@@ -645,7 +645,7 @@ def test_modes_that_friction_damps_heavily_are_read_less_well_where_it_is_calcul
         variance = (cut**2 - own**2).reshape(3, -1)[1]  # of damping ratios
         added = np.where(mode == 1, there.cut_off_std[1] * there.irregularity[hit, mode], 0.0)
         np.testing.assert_allclose(variance, added**2, rtol=1e-6, atol=1e-12)
-        modes = there.rubbing(there.reference)
+        modes = there.with_friction(there.reference)
         left = np.sqrt(modes.log_damping_std**2 - there.reference.log_damping_std**2)
         np.testing.assert_allclose(left, np.where(factor > 3, np.log(factor), 0.0), atol=1e-3)
 
