@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -117,7 +117,7 @@ def test_a_ladder_of_whole_records_does_not_depend_on_the_number_of_processes(tm
     fits = [refined(windows, m, m.problem(windows).start()) for m in models]
     searched = ladder_of(windows, fits)
     alone, shared = (whole_ladder(whole, LIBRARY, searched, processes) for processes in (1, 2))
-    assert alone == shared
+    np.testing.assert_equal(asdict(alone), asdict(shared))  # holds NaN, which no comparison finds equal
     assert "windows" not in alone.note
     assert alone.rungs[-1].error < 0.2 * alone.rungs[0].error
     assert np.isfinite(alone.rungs[-1].heldout_error)
