@@ -15,7 +15,15 @@ from ema_pipeline.diagnose.ranked import Ranked, Ranking, unbeaten
 from ema_pipeline.diagnose.score import scores
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, Model, learned, met, refined, transferred, unbent
+from ema_pipeline.observations.fitting import (
+    Fit,
+    Model,
+    learned,
+    met,
+    refined,
+    transferred,
+    within_scatter,
+)
 from ema_pipeline.observations.mode_rows import SHAPE
 from ema_pipeline.processes import spread
 
@@ -84,15 +92,18 @@ def with_promising(
 ) -> Ranking:
     """The ranking with what promises and gains something beside its learned scatters, and was behind at wide ones.
 
-    `wide` is the base model at those, beside which all but the finalists are.
+    On top of a base model that is bent to the data little does, so there it has to beside a model that is not.
+
+    Parameters
+    ----------
+    wide : Fit
+        The base model at wide scatters, beside which all but the finalists are.
     """
-    base, final = ranking.base, [r for r in ranking.ranked if r.final]
-    if not unbent(observations, base):
-        return ranking
-    taken = {r.hypothesis.label for r in final}
+    base, straight = ranking.base, within_scatter(observations, ranking.base)
+    taken = {r.hypothesis.label for r in ranking.ranked if r.final}
     others = [h for h in hypotheses if h.label not in taken]
-    found = promising_fits(observations, base, others, models, 0, processes)
-    more = [(h, fit) for h, fit in found if fit.log_evidence > base.log_evidence + PROMISING]
+    found = promising_fits(observations, straight, others, models, 0, processes)
+    more = [(h, fit) for h, fit in found if fit.log_evidence > straight.log_evidence + PROMISING]
     if not more:
         return ranking
     order = [(r.hypothesis, r.fit) for r in ranking.ranked]

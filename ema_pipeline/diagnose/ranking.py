@@ -34,7 +34,7 @@ from ema_pipeline.diagnose.score import UNSEEN, Score, scores
 from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, freed, learned, met, refined, unbent
+from ema_pipeline.observations.fitting import Fit, freed, learned, met, refined, unbent, within_scatter
 from ema_pipeline.processes import aside, spread
 
 Progress = Callable[[float, str], None]
@@ -159,7 +159,8 @@ def rank(
     if settled is None:
         ranking = finals_of(observations, base, order, (), processes, (), past_barriers=True)
         return with_promising(observations, base, ranking, hypotheses, models, processes)
-    promising = promising_fits(observations, settled, others, models, further, processes) if near else []
+    straight = within_scatter(observations, settled)  # itself, but for one that is bent
+    promising = promising_fits(observations, straight, others, models, further if near else 0, processes)
     bases = [settled] if near else []
     narrow = narrowed(observations, settled)
     if narrow is not None:

@@ -16,6 +16,7 @@ from ema_pipeline.diagnose.claims import (
     drops_to,
     judge,
 )
+from ema_pipeline.diagnose.explained import MOST_GAINED
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import named
 from ema_pipeline.diagnose.probability import probabilities
@@ -94,7 +95,8 @@ def round_of(
 
 
 def _with_relief(observations: Observations, ranking: Ranking, settings: DiagnoseSettings) -> Ranking:
-    """The ranking in which a base model that fails once no part stands out has the evidence of that fit.
+    """The ranking in which a base model that fails once no part stands out, or loses much evidence with them, has the
+    evidence of that fit.
 
     Left alone, the scatter of a few parts grows until none stands out, and the evidence of a base model that bends
     one part is hardly behind that of the model with what is missing there. An effect that changes just what a part
@@ -103,9 +105,9 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
     """
     p = ranking.base.posterior
     bounded = within_scatter(observations, ranking.base).posterior
-    if bounded is p or not bounded.fails(settings.error_limit):
-        return ranking
     relief = p.evidence_at_scatters - bounded.evidence_at_scatters
+    if bounded is p or not (bounded.fails(settings.error_limit) or relief > MOST_GAINED):
+        return ranking
     parts = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, part_reach(observations, p)))]
 
     def explains(one: Ranked) -> bool:

@@ -173,7 +173,8 @@ def test_what_promises_most_beside_learned_scatters_begins_at_its_size(
 
 
 @pytest.mark.parametrize(
-    ("evidence", "bent", "added"), [(4.1, False, True), (3.9, False, False), (4.1, True, False)]
+    ("evidence", "bent", "added"),
+    [(4.1, False, True), (3.9, False, False), (-10.9, True, True), (-11.1, True, False)],
 )
 def test_what_was_behind_at_wide_scatters_and_gains_beside_learned_ones_is_a_finalist(
     monkeypatch: pytest.MonkeyPatch, evidence: float, bent: bool, added: bool
@@ -197,7 +198,8 @@ def test_what_was_behind_at_wide_scatters_and_gains_beside_learned_ones_is_a_fin
     ) -> Any:
         return now, [h.label for h, _ in order], found, known, past_barriers
 
-    monkeypatch.setattr(finals, "unbent", lambda o, one: not bent)
+    straight = fit("bounded", -12.0) if bent else base
+    monkeypatch.setattr(finals, "within_scatter", lambda o, one: straight)
     monkeypatch.setattr(finals, "promising_fits", promising)
     monkeypatch.setattr(finals, "finals_of", final_ranking)
     b, c = hypothesis("b"), first.ranked[1].hypothesis
@@ -205,7 +207,7 @@ def test_what_was_behind_at_wide_scatters_and_gains_beside_learned_ones_is_a_fin
     if not added:
         assert found is first
         return
-    assert asked == [(base, ["b", "c"], 0)]
+    assert asked == [(straight, ["b", "c"], 0)]
     assert found == (wide, ["a", "c"], [(b, more)], (base,), False)
 
 

@@ -180,6 +180,7 @@ class Stages:
         monkeypatch.setattr(ranking, "learned", lambda o, one, past_barriers=True: fit("base", LEARNED))
         monkeypatch.setattr(ranking, "narrowed", lambda o, settled: None)
         monkeypatch.setattr(ranking, "unbent", lambda o, one: not bent)
+        monkeypatch.setattr(ranking, "within_scatter", lambda o, one: fit("bounded", 0.0) if bent else one)
         monkeypatch.setattr(ranking, "tried_sizes", self.tried_sizes)
         monkeypatch.setattr(ranking, "_screened", self.screened)
         monkeypatch.setattr(ranking, "short_fits", self.short_fits)
@@ -297,7 +298,7 @@ def test_what_promises_beside_narrow_shapes_is_a_finalist_whatever_was_one_befor
     stages = Stages(monkeypatch, bent)
     monkeypatch.setattr(ranking, "narrowed", lambda o, settled: fit("narrow", 0.0))
     _, _, promising, known = stages.rank(stages.base, further=2, unpaired=2.0)
-    assert promising == ["more"] * (1 if bent else 2)
+    assert promising == ["more", "more"]
     assert stages.asked[-1] == ("promising", "narrow", ["a", "b", "c", "d", "e", "f"], 0)
     assert known == (["learned", "past barriers"] if bent else ["learned", "learned"])
 
@@ -325,9 +326,11 @@ def test_a_base_model_that_is_stuck_or_bent_is_begun_again_with_all(
     stages.base.posterior.error = error  # type: ignore[misc]
     stages.base.posterior.residuals.unexplained = unexplained  # type: ignore[misc]
     _, _, promising, known = stages.rank(stages.base, further=2, unpaired=unpaired)
-    assert promising == []
     assert known == ["past barriers"]
     assert stages.asked[0][2] is False
     assert stages.asked[1] == ("first" if bent else f"annealed{int(searched)}", "a", 6)
     assert stages.short
-    assert stages.asked[7:] == [("again", 6, 5), ("freed", 6), ("again", 6, 12)]
+    assert stages.asked[7:10] == [("again", 6, 5), ("freed", 6), ("again", 6, 12)]
+    # on top of one that is bent little promises anything, so that no part of it stands out first
+    assert promising == ["more"] * bent
+    assert stages.asked[10:] == [("promising", "bounded", ["f"], 0)] * bent
