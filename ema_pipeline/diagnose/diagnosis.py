@@ -182,8 +182,9 @@ def _told(
 def _worth_a_word(
     candidates: Sequence[Candidate], explained: bool, nothing: float, limit: float
 ) -> tuple[str, str]:
-    """The best candidate and why it is not claimed, where it may well be right or would explain the data alone."""
-    for c in candidates[:1]:
+    """What gains most, and why it is not claimed, where it may well be right or would explain the data alone."""
+    claimed = [c for c in candidates if c.claimed]
+    for c in claimed[:1] or sorted(candidates, key=lambda c: -c.log_evidence)[:1]:
         if (explained and not c.claimed and nothing < DOUBTFUL) or c.would_explain(limit):
             return c.label, c.why
     return "", ""
@@ -249,7 +250,9 @@ def _candidates(
     hypotheses: Sequence[Hypothesis],
     final: Mapping[str, EffectSize],
 ) -> tuple[Candidate, ...]:
-    """What is claimed, in the order in which it was added, with sizes of the final model; then the best of the rest."""
+    """What is claimed, in the order in which it was added, with sizes of the final model; then the best of the rest, the
+    most probable first.
+    """
     last = found.rounds[min(len(found.claimed), len(found.rounds)) - 1] if found.claimed else found.rounds[0]
     mine = []
     for k, j in enumerate(found.claimed):
@@ -268,7 +271,8 @@ def _candidates(
     rest = [j for j in last.judged if j.named.label not in taken]
     rest.sort(key=lambda j: (j not in group, -j.gain))
     others = [_candidate(j, last.probabilities.get(j.named.label, 0.0), False) for j in rest]
-    return (*mine, *others)[: max(settings.candidates, len(mine) + len(group))]
+    others = others[: max(settings.candidates, len(mine) + len(group)) - len(mine)]
+    return (*mine, *sorted(others, key=lambda c: -c.probability))
 
 
 def _candidate(j: Judged, probability: float, claimed: bool) -> Candidate:

@@ -89,6 +89,14 @@ def probabilities(
     return told | {NOTHING: float(shares[-1])}
 
 
+def divided_as(rivals: Mapping[str, float], told: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities in which `NOTHING` has that of `told`, and effects share the rest as they do in `rivals`."""
+    shares, rest = (math.fsum(p for name, p in of.items() if name != NOTHING) for of in (rivals, told))
+    if not shares:
+        return dict(told)
+    return {name: p * rest / shares for name, p in rivals.items()} | {NOTHING: told[NOTHING]}
+
+
 def complete(error: float, count: int) -> float:
     """Probability that a model which explains the data lacks nothing that the library lacks, by its error.
 

@@ -19,7 +19,7 @@ from ema_pipeline.diagnose.claims import (
 from ema_pipeline.diagnose.explained import MOST_GAINED
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import named
-from ema_pipeline.diagnose.probability import probabilities
+from ema_pipeline.diagnose.probability import divided_as, probabilities
 from ema_pipeline.diagnose.ranked import Ranked, Ranking
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import NOTHING
@@ -144,7 +144,8 @@ def weighed(
 ) -> Round:
     """The round in which nothing is claimed that others speak against, or that may as well be nothing.
 
-    Of the evidence only what is believed counts: verdict and probabilities agree.
+    Of the evidence only what is believed counts: verdict and probabilities agree. What rests on close modes is a doubt
+    whether anything is missing; among rivals it is evidence like any other for one that is claimed all the same.
     """
     least = _least_believed(judged, settings)
     believed = _without_linearisation(ranking, settings) | {j.named.label: j.believed for j in judged}
@@ -152,7 +153,9 @@ def weighed(
     nothing = doubt_of_nothing(told[NOTHING], settings)
     doubts = [_against(j, judged, least) or _too_little(j, nothing) if j.claimed else "" for j in judged]
     judged = [replace(j, doubt=doubt) if doubt else j for j, doubt in zip(judged, doubts, strict=True)]
-    return Round(ranking, tuple(judged), told)
+    among = believed | {j.named.label: j.gain - j.linearisation for j in judged if j.claimed}
+    rivals = probabilities(ranking, hypotheses, settings, found, among, least)
+    return Round(ranking, tuple(judged), divided_as(rivals, told))
 
 
 def _against(one: Judged, judged: Sequence[Judged], least: float) -> str:
