@@ -25,6 +25,7 @@ from ema_pipeline.observations.fitting import (
     transferred,
     wide,
 )
+from ema_pipeline.observations.parts import FREE_STD
 from ema_pipeline.processes import spread
 
 Schedule = tuple[tuple[float, int], ...]
@@ -50,6 +51,8 @@ _GRID_HEAT = 30.0
 _SIZES = (-15.0, -8.0, -4.0, -2.0, -1.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 15.0)
 """The same for effects of one size where measured modes have no partner: a size that gives them one may be far out, or
 small where it lifts a mode from 0 Hz."""
+_FAR = 0.5
+"""Prior σ from its nominal value beyond which a free parameter is far from it."""
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _UNHEATED: Schedule = ((1.0, 6), (1.0, 14))
 """Where starts are given. Heated, the data weigh less than the prior, which takes the first size to nothing, where the
@@ -191,6 +194,8 @@ def annealed_fit(
     begin = transferred(base.posterior, problem.unknowns)
     label = hypothesis.label
     starts = _starts(observations, problem, hypothesis, begin, promise.get(label), tried.get(label), near)
+    if base.posterior.residuals.unexplained and not hypothesis.size_cannot_be_zero:
+        starts += _from_nominal(problem, hypothesis, begin)
     return annealed(observations, model, starts, schedule).posterior
 
 
@@ -252,6 +257,23 @@ def _starts(
             plans.append((unbent, {_first_size(hypothesis): tried.unknown}))
     unknowns = problem.unknowns
     return [unknowns.clipped(unknowns.with_values(x, sizes)) for x, sizes in plans]
+
+
+def _from_nominal(
+    problem: EffectProblem, hypothesis: Hypothesis, begin: NDArray[np.float64]
+) -> list[NDArray[np.float64]]:
+    """A point with everything but earlier sizes at its nominal value, where a free parameter is far from it.
+
+    A base model that has lost a measured mode may have moved it so far for the sake of the others that no fit leads
+    back: a soil ten times too stiff took the lowest mode out of reach.
+    """
+    unknowns, nominal = problem.unknowns, problem.start()
+    known = [unknowns.index[name] for name in problem.sizes]
+    nominal[known] = begin[known]
+    free = (unknowns.std >= FREE_STD[0]) & np.array([not s for s in unknowns.scatter])
+    if not np.any(np.abs(nominal - begin)[free] > _FAR * unknowns.std[free]):
+        return []
+    return [unknowns.clipped(unknowns.with_values(nominal, hypothesis.starts()[0]))]
 
 
 def _from_score(

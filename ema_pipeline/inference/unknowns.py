@@ -73,6 +73,16 @@ class Unknowns:
         found[[self.index[name] for name in values]] = list(values.values())
         return found
 
+    def only(self, kept: Sequence[int]) -> Unknowns:
+        """Some of them, by their positions."""
+        return Unknowns(
+            tuple(self.names[i] for i in kept),
+            self.std[kept],
+            tuple(self.scatter[i] for i in kept),
+            self.lower[kept],
+            self.upper[kept],
+        )
+
     def clipped(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """`x` within the bounds."""
         return np.clip(x, self.lower, self.upper)

@@ -155,7 +155,7 @@ class LoopObservations:
         rows = {k: r for k, r in whole.elements[self.isolator.configuration].items() if k in mine}
         kept = [i for i, _ in enumerate(whole.families) if any(r[i] for r in rows.values())]
         return Dependence(
-            Unknowns.plain([whole.families[i] for i in kept], whole.unknowns.std[kept]),
+            whole.unknowns.only(kept),
             {self.isolator.configuration: {k: r[kept] for k, r in rows.items()}},
             tuple(whole.families[i] for i in kept),
             (),

@@ -7,7 +7,7 @@ value of a mass or a stiffness is ever negative.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -114,7 +114,9 @@ def dependence(rig: Rig) -> Dependence:
     families = tuple(exponents)
     names = (*families, *(f"{key[1]} ({key[0].__name__.lower()})" for key in parts))
     unknowns = joined(
-        Unknowns.plain(families, [prior_std(rig.parameters[f]) for f in families]),
+        Unknowns.plain(
+            families, [prior_std(rig.parameters[f]) for f in families], "", *_bounds(rig, families)
+        ),
         *(
             Unknowns.plain((name,), std, MASS_SCATTER if key[0] is Mass else PART_SCATTER)
             for name, (key, std) in zip(names[len(families) :], parts.items(), strict=True)
@@ -132,6 +134,14 @@ def prior_std(parameter: Parameter) -> float:
     if not 0 < parameter.minimum < parameter.maximum < np.inf:
         return _UNBOUNDED_STD
     return float(np.clip(np.log(parameter.maximum / parameter.minimum) / 4, *FREE_STD))
+
+
+def _bounds(rig: Rig, names: Sequence[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Least and largest logarithms of parameters over their nominal values, (n,); infinite where there are none."""
+    of = [rig.parameters[name] for name in names]
+    with np.errstate(divide="ignore"):
+        lower = [np.log(max(p.minimum, 0.0) / p.value) for p in of]
+    return np.array(lower), np.array([np.log(p.maximum / p.value) for p in of])
 
 
 def _powers(

@@ -13,7 +13,9 @@ from ema_pipeline.diagnose import first_fits
 from ema_pipeline.diagnose.first_fits import (
     Tried,
     _best_of_grid,
+    _from_nominal,
     _starts,
+    annealed_fit,
     continued_fit,
     first_fit,
     short_fits,
@@ -58,6 +60,35 @@ def test_fits_begin_at_usual_sizes_and_once_with_parts_that_are_not_bent() -> No
     np.testing.assert_array_equal(told, [*starts, [0.4, 0.5, 0.07]])
     near = _starts(NO_DATA, problem, hypothesis("a"), begin, near=True)  # the base model has bent nothing
     np.testing.assert_array_equal(near, starts[:2])
+
+
+def test_where_a_free_parameter_is_far_off_one_fit_begins_at_nominal_values() -> None:
+    """Earlier effects keep their sizes; what has a scatter or a narrow prior is no free parameter."""
+    problem: Any = Parabola(("part", "free", "known", "earlier.s1", "a.s1"), ("earlier.s1", "a.s1"))
+    problem.unknowns.std[:] = [1.0, 1.2, 0.05, 1.0, 1.0]
+    one = hypothesis("a")
+    found = _from_nominal(problem, one, np.array([0.4, 0.61, 0.5, 0.7, 0.0]))
+    np.testing.assert_array_equal(found, [[0.0, 0.0, 0.0, 0.7, 0.5]])
+    assert _from_nominal(problem, one, np.array([1.4, 0.59, 0.5, 0.7, 0.0])) == []
+
+
+@pytest.mark.parametrize(("lost", "starts"), [(0, 3), (1, 4)])
+def test_nominal_values_are_tried_where_the_base_model_has_lost_a_mode(
+    monkeypatch: pytest.MonkeyPatch, lost: int, starts: int
+) -> None:
+    base = with_model("base", Parabola(("free",), ()), [1.5])
+    base.posterior.residuals = SimpleNamespace(unexplained=lost)  # type: ignore[misc]
+    model = with_model("a", Parabola(("free", "a.s1"), ("a.s1",)), [0.0, 0.0]).model
+    asked: list[Any] = []
+
+    def annealed(observations: object, of: object, begun: list[np.ndarray], schedule: object) -> Any:
+        asked.extend(begun)
+        return with_model("a", Parabola((), ()), [])
+
+    monkeypatch.setattr(first_fits, "annealed", annealed)
+    annealed_fit(NO_DATA, base, {"a": model}, {}, {}, hypothesis("a"))
+    assert len(asked) == starts
+    assert (asked[-1].tolist() == [0.0, 0.5]) is bool(lost)
 
 
 def test_where_sizes_are_given_one_fit_begins_where_that_of_the_base_model_did() -> None:

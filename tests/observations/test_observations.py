@@ -255,6 +255,21 @@ def test_every_part_of_a_rig_has_a_deviation_of_its_own(name: str) -> None:
                 assert np.sum(row[governed] == 1.0) == 1, element.name
 
 
+def test_parameters_stay_within_their_bounds() -> None:
+    rig = planetary()
+    name = next(iter(dependence(rig).families))
+    for least, most in ((0.5, 4.0), (0.0, np.inf)):
+        value = rig.parameters[name].value
+        stated = replace(rig.parameters[name], minimum=least * value, maximum=most * value)
+        bounded = ParametricRig(
+            rig.name, rig.configurations, {**rig.parameters, name: stated}, lambda c, v: rig.assembly(c, v)
+        )
+        unknowns = dependence(bounded).unknowns
+        i = unknowns.index[name]
+        assert np.exp(unknowns.lower[i]) == pytest.approx(least)
+        assert np.exp(unknowns.upper[i]) == pytest.approx(most)
+
+
 def test_one_body_has_one_mass_whichever_way_it_moves() -> None:
     known = dependence(planetary())
     names = [n for n in known.unknowns.names if n.startswith("planet1 mass")]

@@ -101,6 +101,7 @@ def with_model(name: str, problem: Parabola, x: list[float], log_evidence: float
         scatters={"part": 1.0},
         cost=5.0,
         prior_std=np.ones(len(x)),
+        residuals=SimpleNamespace(unexplained=0),
     )
     model: Any = SimpleNamespace(name=name, problem=lambda observations: problem)
     return Fit(model, posterior)
