@@ -180,7 +180,15 @@ def set_effects(
             if before is not None:
                 save_info(store, before)
             raise
+        _drop_diagnosis_of_another_model(run)
     return run
+
+
+def _drop_diagnosis_of_another_model(run: Run) -> None:
+    """Without an effect that the diagnosis found in the model, nothing that it says holds."""
+    on_top_of = run.store.find("diagnose", ALL, "on_top_of", tuple[str, ...]) or ()
+    if not set(on_top_of) <= set(run.info.effects):
+        run.store.keep([stage for stage in stages_of(run) if stage != "diagnose"])
 
 
 def _take_ladder(run: Run, effect_files: tuple[str, ...]) -> None:

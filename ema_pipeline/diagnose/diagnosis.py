@@ -250,9 +250,7 @@ def _candidates(
     hypotheses: Sequence[Hypothesis],
     final: Mapping[str, EffectSize],
 ) -> tuple[Candidate, ...]:
-    """What is claimed, in the order in which it was added, with sizes of the final model; then the best of the rest, the
-    most probable first.
-    """
+    """What is claimed, as it was added, with sizes of the final model; then the best others, most probable first."""
     last = found.rounds[min(len(found.claimed), len(found.rounds)) - 1] if found.claimed else found.rounds[0]
     mine = []
     for k, j in enumerate(found.claimed):

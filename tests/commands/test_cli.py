@@ -180,6 +180,23 @@ def test_an_effect_is_added_under_a_changed_setting_and_removed_and_the_ladder_s
     assert f"{effect}.stiffness" not in summary["fit"]["parameters"]
 
 
+def test_a_diagnosis_of_a_model_is_dropped_with_an_effect_that_it_had(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(results, out)
+    effect = "shaft_torsion@carrier"
+    for verb in (("add", out, effect), ("diagnose", out)):
+        assert ema(capsys, *verb)[0] == 0
+    assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["diagnosis"]["on_top_of"] == [
+        effect
+    ]
+    assert ema(capsys, "remove", out, effect)[0] == 0
+    assert "diagnosis" not in json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    code, text, _ = ema(capsys, "ladder", out)
+    assert (code, "shaft torsion" in text) == (0, False)
+
+
 def test_an_effect_that_does_not_exist_is_refused_and_changes_nothing(
     results: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
