@@ -13,6 +13,7 @@ from ema_pipeline.levels.sizes import (
     MISREAD,
     not_of_aim,
     plain,
+    plain_damping,
     relative_sizes,
     sizes_at_levels,
     unknown,
@@ -101,4 +102,6 @@ def hit_trends(found: HitPoles, level: Integers, far: NDArray[np.bool_]) -> HitT
             sizes, quadratures, zip(*elsewhere, strict=True), at_levels, far, strict=True
         )
     )
-    return HitTrends(poles[:n_modes], poles[n_modes:], told, at_levels)
+    log_force = np.log(found.force_n)
+    damping = tuple(plain_damping(t, d, log_force) for t, d in zip(poles[n_modes:], decay, strict=True))
+    return HitTrends(poles[:n_modes], damping, told, at_levels)

@@ -19,6 +19,9 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Integers = NDArray[np.int64]
 
+PLAIN_DAMPING = 0.01
+"""Least change of a damping ratio from the softest to the hardest hits that is claimed, over the ratio. The pulses of
+two tips, one ten times as long as the other, change what is read of it by some thousandths."""
 PLAIN_SIZE = 0.1
 """Least change from the softest to the hardest hits that is claimed, over the mode's size where it answers most. A
 hammer whose reading bends, or a hand that aims otherwise when it strikes harder, changes sizes by some per cent."""
@@ -101,6 +104,11 @@ def plain(trend: Trend, size: Real) -> Trend:
     """The test's result, without significance where the size changes by too little to tell of the structure."""
     known = size[np.isfinite(size)]
     return trend if known.size and np.ptp(known) >= PLAIN_SIZE else unknown(trend)
+
+
+def plain_damping(trend: Trend, damping_ratio: float, log_force: Real) -> Trend:
+    """The same where a damping ratio changes by too little over all forces, given as ln(force), (n_hits,)."""
+    return trend if abs(trend.slope) * np.ptp(log_force) >= PLAIN_DAMPING * damping_ratio else unknown(trend)
 
 
 def not_of_aim(trend: Trend, quadrature: Trend, elsewhere: Sequence[Trend]) -> Trend:

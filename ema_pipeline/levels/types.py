@@ -70,7 +70,7 @@ class ModeLevels:
         `LevelStudy.inputs`.
     frequency_p, damping_p : float
         Probability of a trend as clear as this where nothing depends on the level, from single hits (from
-        decays where there is one level); NaN where unknown.
+        decays where there is one level); NaN where unknown, or damping changes by too little.
     depends : bool
         True where frequency, damping or size moves with the level beyond what scatter explains, all modes' tests
         taken into account.

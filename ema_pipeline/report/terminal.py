@@ -103,7 +103,9 @@ def levels_tables(study: LevelStudy, modal: ModalModel, title: str = "") -> Rend
                 text_table(sizes, "Size in the FRFs by force level, 1 where it is the same in all hits"),
             ]
         parts.append(_line("p: probability of a trend as clear as this where nothing depends on the force;"))
-        parts.append(_line("–: not tested, or a size that changes by less than a tenth."))
+        parts.append(
+            _line("–: not tested, or damping that changes by less than 1 %, or a size by less than 10 %.")
+        )
     failed = [v for v in study.verdicts if not v.passes]
     if failed:
         parts += [_line(""), _line("Other signs:"), *(_line(f"! {v.message}") for v in failed)]

@@ -20,9 +20,10 @@ from ema_pipeline.ingest.records import HitSamples, cut_hit
 from ema_pipeline.levels import LevelSettings, LevelStudy, study_levels
 from ema_pipeline.levels.sentences import flagged
 from ema_pipeline.levels.single import single_hits
-from ema_pipeline.levels.sizes import relative_sizes, sizes_at_levels
+from ema_pipeline.levels.sizes import plain_damping, relative_sizes, sizes_at_levels
 from ema_pipeline.levels.trend import (
     Samples,
+    Trend,
     clearest,
     combined,
     holm,
@@ -235,6 +236,16 @@ def test_the_trend_test_finds_what_moves_and_tells_how_far() -> None:
     assert found.slope > 0
     shift, shift_std = shifts(values, std, sheet, level, found)
     assert abs(shift[2] - 1.0) < 4 * shift_std[2] + 0.15  # the hand's scatter moves the force itself
+
+
+def test_damping_that_hardly_changes_is_no_trend_however_clear_it_is() -> None:
+    """As of 1.222 and 1.225 % under two hammers: their pulses differ, and not the structure."""
+    log_force = np.log([30.0, 60.0, 300.0])
+    clear = Trend(1e-6, 1.1 * 0.0001 / np.log(10), 0.0)
+    assert plain_damping(clear, 0.01, log_force) is clear
+    slight = Trend(1e-6, -0.9 * 0.0001 / np.log(10), 0.0)
+    assert plain_damping(slight, 0.01, log_force).p == 0.5
+    assert np.isnan(plain_damping(Trend(np.nan, np.nan, 0.0), 0.01, log_force).p)
 
 
 def test_one_hit_at_each_of_two_forces_cannot_tell_a_trend_from_scatter() -> None:
