@@ -75,7 +75,7 @@ def several_levels(study: LevelStudy, modal: ModalModel, settings: LevelSettings
         )
     if not study.level_dependent:
         return (
-            f"Nothing moves with the force of the hits from {forces}: {len(tested)} modes tested, p = "
+            f"Nothing moves with the force of the hits at {forces}: {len(tested)} modes tested, p = "
             f"{study.p_value:.2g}, false alarms {100 * settings.false_alarm:.2g} %."
         )
     words = "; ".join(f"mode {m.mode + 1}: {move_text(study, m)}" for m in moving[:3])

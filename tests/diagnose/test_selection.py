@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -517,10 +518,11 @@ def test_nothing_is_claimed_where_its_probability_without_doubtful_evidence_is_t
 def judged_round(
     monkeypatch: pytest.MonkeyPatch,
     found: list[tuple[str, float, str]],
-    left: float = np.inf,
+    left: float | Mapping[str, float] = np.inf,
     settings: DiagnoseSettings = SETTINGS,
 ) -> Round:
     """A round of hypotheses with what they gain, what speaks against them, and what is left without close modes."""
+    left_of = left if isinstance(left, Mapping) else dict.fromkeys((label for label, _, _ in found), left)
     doubts = {label: doubt for label, _, doubt in found}
     names = {label: SimpleNamespace(label=label, advantage=0.0) for label, _, _ in found}
     fit: Any = None
@@ -541,7 +543,7 @@ def judged_round(
             fit,
             doubts[r.hypothesis.label],
             3.5,  # type: ignore[arg-type]
-            left,
+            left_of[r.hypothesis.label],
         ),
     )
     data: Any = None
@@ -561,6 +563,22 @@ def test_one_of_two_effects_counts_with_what_both_gain_though_the_other_one_is_c
         ("spring@x", 66.0, False),
     ]
     assert told.probabilities["mass@x"] > 0.999
+
+
+def test_what_a_claim_gains_from_close_modes_counts_among_rivals_and_not_against_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A spring that gained 178, 161 without close modes, was claimed beside one of 171 that had 81 %."""
+    gains = [("spring@x", 12.0, ""), ("spring@y", 8.0, ""), ("mass@x", 11.0, "weak")]
+    told = judged_round(
+        monkeypatch, gains, {"spring@x": 5.0, "spring@y": np.inf, "mass@x": 1.0}
+    ).probabilities
+    prior = 0.7 / 3
+    beside = prior * (np.exp(5.0) + np.exp(8.0) + np.exp(1.0))
+    assert told[NOTHING] == pytest.approx(0.3 / (0.3 + beside))
+    among = np.exp(12.0) + np.exp(8.0) + np.exp(1.0)
+    for name, gain in (("spring@x", 12.0), ("spring@y", 8.0), ("mass@x", 1.0)):
+        assert told[name] == pytest.approx((1 - told[NOTHING]) * np.exp(gain) / among)
 
 
 @pytest.mark.parametrize("doubt", [PREDICTED_WORSE, NO_LESS_ERROR])
