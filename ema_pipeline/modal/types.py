@@ -35,6 +35,10 @@ class CircleFit:
         Damping ratio from each pair of points on either side of resonance.
     residual : float
         Root-mean-square distance of the points from the circle over its radius.
+    diameter : complex
+        From the point opposite to resonance to the resonance point.
+    damping_in_frf : float
+        Damping ratio by which the points sweep the circle: an exponential window's share is still in it.
     """
 
     output: Dof
@@ -49,6 +53,8 @@ class CircleFit:
     damping_std: float
     pair_damping: NDArray[np.float64]
     residual: float
+    diameter: complex
+    damping_in_frf: float
 
 
 @dataclass(frozen=True)

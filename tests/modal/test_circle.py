@@ -20,6 +20,7 @@ from ema_pipeline.modal.circle import (
     circle_fits,
     fit_circle,
     identify_by_circle,
+    on_circle,
 )
 from ema_pipeline.modal.circle.geometry import algebraic_circle, geometric_circle
 from ema_pipeline.modal.circle.identify import rank_one
@@ -230,6 +231,22 @@ def test_three_modes_in_1_percent_noise_with_the_window_taken_off(decay: float) 
         assert abs(found.frequency_hz - mode.frequency_hz) < 0.02 * half_width
         assert found.damping_ratio == pytest.approx(mode.damping_ratio, rel=0.02)
         assert np.median(circles[0].pair_damping) == pytest.approx(mode.damping_ratio, rel=0.02)
+
+
+@pytest.mark.parametrize("decay", [0.0, 1.5])
+@pytest.mark.parametrize("bandwidths", [0.25, 3.0])
+def test_a_frequency_lies_where_the_frf_has_it_however_coarse_the_lines(
+    bandwidths: float, decay: float
+) -> None:
+    poles = poles_of(np.array([40.0]), np.array([0.01]))
+    seen = poles - decay
+    step = bandwidths * -2 * seen[0].real / (2 * np.pi)
+    f = 40.0 + step * (np.arange(-9, 10) + 0.3)
+    frfs = frf_set(f, accelerance(f, seen, np.ones((1, 1)), 1), 1 / step, decay=decay)
+    (circles,) = circle_fits(frfs, modal_model(frfs, poles, np.ones((1, 1))))
+    for at in 40.0 * (1 + 0.01 * np.array([-1.0, 0.0, 1.0])):
+        expected = accelerance(np.array([at]), seen, np.ones((1, 1)), 1)[0, 0, 0] / (2j * np.pi * at)
+        assert abs(on_circle(circles[0], at) - expected) < 0.02 * circles[0].radius
 
 
 def test_taking_neighbours_off_is_more_truthful() -> None:

@@ -100,6 +100,27 @@ def test_every_model_has_its_frfs_differences_and_name(run: RunResults) -> None:
     assert len(model["frfs"][name][0]["own"]["outputs"]) == len(c.frfs.outputs)
 
 
+def test_pole_is_marked_at_the_same_place_however_few_lines_there_are(run: RunResults) -> None:
+    c = run.configurations[0]
+    assert c.modal is not None
+    thin = [
+        replace(
+            m,
+            circles=tuple(
+                replace(x, frequency_hz=x.frequency_hz[::4], points=x.points[::4]) for x in m.circles
+            ),
+        )
+        for m in c.modal.modes
+    ]
+    sparse = replace(run, configurations=(replace(c, modal=replace(c.modal, modes=tuple(thin))),))
+    marks = [
+        [x["mark"] for m in measured_data(r)["configurations"][0]["modes"] for x in m["circles"]]
+        for r in (run, sparse)
+    ]
+    assert None not in marks[0]
+    assert marks[0] == marks[1]
+
+
 def test_names_from_files_are_text_in_page_and_data(run: RunResults) -> None:
     c = run.configurations[0]
     assert c.frfs is not None

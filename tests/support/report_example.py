@@ -118,19 +118,24 @@ def circle(modes: list[Mode], mode: Mode, out: int, inp: int, dofs: tuple[Dof, .
     x, y, c = np.linalg.lstsq(a, np.abs(h) ** 2, rcond=None)[0]
     radius = np.sqrt(c + (x / 2) ** 2 + (y / 2) ** 2)
     pairs = mode.damping_ratio * (1 + 0.05 * rng.normal(size=60))
+    centre = complex(x / 2, y / 2)
+    sweep = 1 / (1 + 1j * (f / mode.frequency_hz - mode.frequency_hz / f) / (2 * mode.damping_ratio)) - 0.5
+    turned = complex(np.sum((h - centre) * sweep.conj()))
     return CircleFit(
         dofs[out],
         dofs[inp],
         f,
         h,
-        complex(x / 2, y / 2),
+        centre,
         float(radius),
         mode.frequency_hz * (1 + 2e-4 * float(rng.normal())),
         0.03,
         float(pairs.mean()),
         float(pairs.std()),
         pairs,
-        float(np.std(np.abs(h - complex(x / 2, y / 2)) - radius) / radius),
+        float(np.std(np.abs(h - centre) - radius) / radius),
+        2 * float(radius) * turned / abs(turned),
+        mode.damping_ratio,
     )
 
 

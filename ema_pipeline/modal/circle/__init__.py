@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from ema_pipeline.modal.circle.compare import CircleAverage, attach_circles, average
     from ema_pipeline.modal.circle.fit import SdofCircle, fit_circle
     from ema_pipeline.modal.circle.identify import identify_by_circle
-    from ema_pipeline.modal.circle.modes import circle_fits
+    from ema_pipeline.modal.circle.modes import circle_fits, on_circle
     from ema_pipeline.modal.circle.settings import CircleSettings
 else:
     __getattr__ = lazy_names(
@@ -21,6 +21,7 @@ else:
             "fit_circle": "fit",
             "identify_by_circle": "identify",
             "circle_fits": "modes",
+            "on_circle": "modes",
             "CircleSettings": "settings",
         },
     )
@@ -34,4 +35,5 @@ __all__ = [
     "circle_fits",
     "fit_circle",
     "identify_by_circle",
+    "on_circle",
 ]

@@ -193,7 +193,19 @@ def to_circle_fit(circle: SdofCircle, frfs: FrfSet, data: Mobilities, row: int) 
         damping_std=circle.damping_std * w_seen / w_n,
         pair_damping=(circle.pair_damping * w_seen - decay) / w_n,
         residual=circle.residual,
+        diameter=circle.diameter,
+        damping_in_frf=circle.damping_ratio,
     )
+
+
+def on_circle(circle: CircleFit, frequency_hz: float) -> complex:
+    """Where a frequency lies on a fitted circle, (m/s)/N.
+
+    The fitted sweep says where. Angles of the measured lines cannot: from one coarse line to the next the circle may be
+    swept by more than half a turn, and which way is then not seen.
+    """
+    x = sweep(np.array(frequency_hz), circle.natural_frequency_hz, circle.damping_in_frf)
+    return complex(circle.centre + circle.diameter * (1 / (1 + 1j * x) - 0.5))
 
 
 def without_window(frequency_hz: float, damping_ratio: float, decay_rad_s: float) -> tuple[float, float]:

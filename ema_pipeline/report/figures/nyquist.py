@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from ema_pipeline.modal.circle import on_circle
 from ema_pipeline.modal.types import CircleFit, ModalModel
 from ema_pipeline.report.numbers import format_percent, format_value, plain
 from ema_pipeline.report.style import (
@@ -100,7 +101,7 @@ def _panel(ax: Axes, circle: CircleFit, pole_hz: float, calibrated: bool) -> Non
     ax.plot(z.real, z.imag, "o-", color=MEASURED, ms=3.2, lw=0.4, label="measured lines")
     _mark(ax, circle, circle.natural_frequency_hz, scale, "*", PURPLE, 11, "most rapid sweep (circle)")
     _mark(ax, circle, pole_hz, scale, "D", "#000000", 6, "frequency of the pole", hollow=True)
-    half = np.array([1 - circle.damping_ratio, 1 + circle.damping_ratio]) * circle.natural_frequency_hz
+    half = np.array([1 - circle.damping_in_frf, 1 + circle.damping_in_frf]) * circle.natural_frequency_hz
     for f, label in zip(half, ("half-power points", "_"), strict=True):
         _mark(ax, circle, float(f), scale, "s", GREEN, 5, label)
     _equal_limits(ax, z, centre, radius)
@@ -183,12 +184,11 @@ def _mark(
     label: str,
     hollow: bool = False,
 ) -> None:
-    """Mark a frequency on the circle, at the angle of the data interpolated there."""
+    """Mark a frequency on the circle, within the lines measured."""
     lines = circle.frequency_hz
     if lines.size < 2 or not lines[0] <= f <= lines[-1]:
         return
-    angle = np.interp(f, lines, np.unwrap(np.angle(circle.points - circle.centre)))
-    at = (circle.centre + circle.radius * np.exp(1j * angle)) * scale
+    at = on_circle(circle, f) * scale
     ax.plot(
         at.real,
         at.imag,

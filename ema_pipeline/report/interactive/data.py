@@ -19,6 +19,7 @@ from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.mechanics.partial_fractions import partial_fractions
 from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
 from ema_pipeline.modal.assurance import auto_mac
+from ema_pipeline.modal.circle import on_circle
 from ema_pipeline.modal.types import CircleFit, ModalModel, Mode
 from ema_pipeline.report.diagnosis import label_words, rung_words
 from ema_pipeline.report.interactive.loops import loop_model_names, loops_data, loss_data
@@ -163,8 +164,7 @@ def _circle(mode: Mode, circle: CircleFit) -> dict[str, Any]:
     mark = None
     lines = circle.frequency_hz
     if lines.size > 1 and lines[0] <= mode.frequency_hz <= lines[-1]:
-        angle = np.interp(mode.frequency_hz, lines, np.unwrap(np.angle(circle.points - circle.centre)))
-        at = circle.centre + circle.radius * np.exp(1j * angle)
+        at = on_circle(circle, mode.frequency_hz)
         mark = [at.real, at.imag]
     return {
         "name": f"{circle.output.point} ← {circle.input.point}",
