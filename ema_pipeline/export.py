@@ -8,7 +8,7 @@ from pathlib import Path
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import replace_file
 from ema_pipeline.fit.types import FitResult
-from ema_pipeline.kinds import kind_of
+from ema_pipeline.kinds import kind_of, stages_of
 from ema_pipeline.pipeline import ShowStage
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.run.types import Run
@@ -35,9 +35,14 @@ def save_rig(run: Run, file: Path) -> None:
     Raises
     ------
     EmaError
-        If nothing has been fitted yet, the file exists already, or it cannot be written.
+        If the model is not fitted to modes, nothing has been fitted yet, the file exists already, or it cannot be
+        written.
     """
     from ema_pipeline.fit.saved_rig import saved_rig
+
+    if "fit" not in stages_of(run):
+        words = kind_of(run.info).words
+        raise EmaError(f"{file}: models of {words} are not saved; copy the values that 'ema fit' shows")
 
     fit = run.store.load("fit", ALL, "fit", FitResult)
     if file.exists():

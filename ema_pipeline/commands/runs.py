@@ -130,24 +130,38 @@ def fit(
     verbose: Verbose = False,
     json: Json = False,
 ) -> None:
-    """Fit the model's parameters to the modes of OUT, and show them."""
+    """Fit the model's parameters to what was measured in OUT, and show them."""
     from ema_pipeline.export import save_rig
     from ema_pipeline.job import run_on
+    from ema_pipeline.kinds import require_judge, stages_of
     from ema_pipeline.report import terminal
+    from ema_pipeline.run.opening import existing_run
     from ema_pipeline.stages.results import load_results
 
     with progress(quiet) as show_stage:
-        run, _ = run_on(out, ["fit"], set_ or [], show_stage, effect_file or [])
-    run.require_model("fit")
+        # loops and simulated records have no fit of their own: every model of a ladder is one
+        to_modes = "fit" in stages_of(existing_run(out, effect_file or []))
+        stage = "fit" if to_modes else "ladder"
+        run, _ = run_on(out, [stage], set_ or [], show_stage, effect_file or [])
+    require_judge(run, "fit")
     if save is not None:
         save_rig(run, save)
-    found = load_results(run).fit
     if json:
         show_json(_content(run))
-    elif not quiet and found is not None:
-        show(terminal.fit_table(found))
-        if save is not None:
-            show(f"Wrote {save}; use it with --rig {save}")
+        return
+    if quiet:
+        return
+    results = load_results(run)
+    if results.fit is not None:
+        show(terminal.fit_table(results.fit))
+    elif results.current_rung is not None:
+        stated = {} if run.model is None else run.model.parameters
+        units = {name: p.unit for name, p in stated.items()}
+        show(terminal.rung_table(results.current_rung, units))
+    else:
+        show(f"The model in use has not been fitted yet; '{program()} diagnose {out}' does that.")
+    if save is not None:
+        show(f"Wrote {save}; use it with --rig {save}")
 
 
 def report(

@@ -97,6 +97,11 @@ def standing(found: Diagnosis, candidate: Candidate) -> str:
     return "less likely"
 
 
+def effects_words(labels: Sequence[str]) -> str:
+    """Effects of a model in a row, e.g. ``spring at sun + cubic spring at ring.x``."""
+    return " + ".join(map(label_words, labels))
+
+
 def rung_words(before: Sequence[str], effects: Sequence[str]) -> str:
     """What a rung adds, e.g. ``+ mesh stiffness loss at sun-planet1``."""
     if not effects:

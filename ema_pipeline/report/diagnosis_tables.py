@@ -8,12 +8,14 @@ from collections.abc import Mapping, Sequence
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import (
     EXTRA_COORDINATE,
+    NOT_DETERMINED,
     OUT_OF_TOLERANCE,
     Candidate,
     DetectionLimit,
     Diagnosis,
     EffectSize,
     Ladder,
+    Rung,
 )
 from ema_pipeline.effects.base import effect_of
 from ema_pipeline.report.diagnosis import (
@@ -129,6 +131,17 @@ def ladder_table(ladder: Ladder) -> Table:
         before = rung.effects
     head = ("model", "size (±1σ)", "error, σ", "held out, σ", "modes left", "ln evidence")
     return Table(head, tuple(rows), frozenset({2, 3, 4, 5}))
+
+
+def rung_table(rung: Rung, units: Mapping[str, str]) -> Table:
+    """One row per fitted parameter of one model, those of effects last; `units` where the rung has none."""
+    names = sorted(rung.parameters, key=lambda name: "@" in name)
+    rows = []
+    for name in names:
+        size = rung.parameters[name]
+        value = format_value(size.value, size.std, size.unit or units.get(name, ""))
+        rows.append(Row((words(name), value if size.determined else NOT_DETERMINED)))
+    return Table(("parameter", "fitted (±1σ)"), tuple(rows), frozenset())
 
 
 def detection_table(found: Diagnosis) -> Table:

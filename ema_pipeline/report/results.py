@@ -9,7 +9,7 @@ from ema_pipeline.check_result import CheckResult
 from ema_pipeline.choices import NO_CHOICES, Choices
 from ema_pipeline.correlate.types import Comparison, Pairing
 from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
-from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.diagnose.types import Diagnosis, Ladder, Rung
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit, Transducer
@@ -160,6 +160,12 @@ class RunResults:
         """True where effects, hits or modes were added or taken out since the diagnosis was made."""
         then, now = (self.diagnosed_on, self.diagnosed_choices), (self.added, self.choices)
         return self.diagnosis is not None and now != then
+
+    @property
+    def current_rung(self) -> Rung | None:
+        """The model in use as a ladder has it; None where no ladder holds just its effects."""
+        rungs = () if self.shown_ladder is None else self.shown_ladder.rungs
+        return next((r for r in rungs if r.effects == self.added), None)
 
     @property
     def shown_ladder(self) -> Ladder | None:

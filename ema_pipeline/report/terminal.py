@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from rich import box
 from rich.console import Console, ConsoleOptions, Group, RenderableType
@@ -17,7 +17,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from ema_pipeline.correlate.types import Comparison
-from ema_pipeline.diagnose.types import Diagnosis, Ladder
+from ema_pipeline.diagnose.types import Diagnosis, Ladder, Rung
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.levels.types import LevelStudy
@@ -173,6 +173,16 @@ def fit_table(fit: FitResult) -> RenderableType:
     return Group(
         text_table(source, "Parameters; shift: in tolerances"),
         _line(f"error {plain(fit.error, 3)} over {fit.data_count} data, ε {plain(fit.frequency_error, 3)}"),
+    )
+
+
+def rung_table(rung: Rung, units: Mapping[str, str]) -> RenderableType:
+    """Fitted parameters of one model of a ladder; `units` of those that the ladder knows none of."""
+    model = f"the model with {diagnosis.effects_words(rung.effects)}" if rung.effects else "the base model"
+    return Group(
+        _heading(f"Parameters of {model}"),
+        text_table(diagnosis_tables.rung_table(rung, units), ""),
+        _line(f"error {plain(rung.error, 3)}"),
     )
 
 

@@ -270,6 +270,9 @@ def test_hysteresis_tests_run_through_the_same_command(
     assert "viscous damping" in text
     found = json.loads((out / "summary.json").read_text(encoding="utf-8"))["configurations"]["default"]
     assert found["parameters"]["stiffness"]["value"] == pytest.approx(PRINTED["stiffness"], rel=0.03)
+    shown = ema(capsys, "fit", out)[1]
+    assert "Parameters of the base model" in shown
+    assert re.search(r"stiffness +[\d.]+ ± [\d.]+ kN/m", shown)
     assert ema(capsys, "report", out, "--plots")[0] == 0
     assert {p.suffix for p in (out / "plots").iterdir()} == {".png", ".svg"}
 

@@ -49,6 +49,29 @@ def test_a_hidden_cubic_spring_is_named_with_its_size(tmp_path: Path) -> None:
     assert abs(mass["value"] - 2.0) < 3 * mass["std"]
 
 
+@pytest.mark.slow
+def test_fitted_parameters_are_shown_of_the_model_in_use_and_of_no_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raw = write_oscillator(tmp_path / "raw", lambda x, v: 3e9 * x**3, samples=(1024, 512))
+    (tmp_path / "rig.toml").write_text(RIG)
+    out, stages = tmp_path / "out", 'stages=["ingest", "frf", "modal", "ladder", "report"]'
+    assert command(capsys, "run", raw, "--rig", tmp_path / "rig.toml", "--out", out, "--set", stages)[0] == 0
+    code, text, _ = command(capsys, "fit", out)
+    assert (code, text) == (0, f"The model in use has not been fitted yet; 'ema diagnose {out}' does that.\n")
+    assert command(capsys, "add", out, "cubic_spring@mass.x")[0] == 0
+    code, text, _ = command(capsys, "fit", out)
+    assert code == 0
+    shown = json.loads((out / "summary.json").read_text())["ladder"][-1]["parameters"]
+    assert all(name.split("@")[0].replace("_", " ") in text.replace("_", " ") for name in shown)
+    assert "GN/m³" in text
+    code, text, err = command(capsys, "fit", out, "--save", tmp_path / "saved.toml")
+    assert code == 1
+    assert "are not saved; copy the values that 'ema fit' shows" in err
+    assert command(capsys, "remove", out, "cubic_spring@mass.x")[0] == 0
+    assert "has not been fitted yet" in command(capsys, "fit", out)[1]
+
+
 def test_without_a_rig_the_modes_are_the_linear_model_and_a_linear_one_is_adequate(tmp_path: Path) -> None:
     raw = write_oscillator(tmp_path / "raw", lambda x, v: 0.0, samples=(1536, 1024))
     found = _run(raw, tmp_path / "out")
