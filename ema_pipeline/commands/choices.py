@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ema_pipeline.commands.options import EffectFiles, Json, Out, Quiet
-from ema_pipeline.commands.screen import program, progress, show, show_json
+from ema_pipeline.commands.screen import on_folder, progress, show, show_json
 
 if TYPE_CHECKING:
     from ema_pipeline.choosing import Change
@@ -94,4 +94,5 @@ def _change(out: Path, change: Change, effect_files: list[str], quiet: bool, jso
         show(f"{unmoved} modes stayed within a twentieth of their uncertainty.")
     show(error_words(before, after) or "Nothing has changed.")
     if results.diagnosis_is_old:
-        show(f"The diagnosis is older than this change; repeat it: {program()} diagnose {out}")
+        again = on_folder("diagnose", out, results.effect_files)
+        show(f"The diagnosis is older than this change; repeat it: {again}")

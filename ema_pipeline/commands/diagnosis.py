@@ -11,7 +11,7 @@ import typer
 
 from ema_pipeline.commands.interrupts import go_on_with
 from ema_pipeline.commands.options import EffectFiles, Json, Out, Overrides, Quiet
-from ema_pipeline.commands.screen import program, progress, show, show_summary
+from ema_pipeline.commands.screen import on_folder, program, progress, show, show_summary
 from ema_pipeline.errors import EmaError
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def diagnose(
     if json:
         show_summary(load_results(run), "diagnosis", "ladder")
         return
-    show(terminal.diagnosis_screen(found, str(out), program(), suspicions(results)))
+    show(terminal.diagnosis_screen(found, str(out), program(), suspicions(results), results.effect_files))
     if auto and supported:
         _show_ladder(run)
 
@@ -129,4 +129,5 @@ def _show_ladder(run: Run, json: bool = False) -> None:
         show("The model has no added effects. What the diagnosis proposes:")
         show(terminal.ladder_screen(results.diagnosis.ladder))
     else:
-        show(f"The model has no added effects. '{program()} diagnose {folder}' says what it may be missing.")
+        again = on_folder("diagnose", folder, results.effect_files)
+        show(f"The model has no added effects. '{again}' says what it may be missing.")

@@ -13,7 +13,7 @@ import typer
 
 from ema_pipeline.commands.interrupts import go_on_with
 from ema_pipeline.commands.options import EffectFiles, Json, Out, Overrides, Quiet, RigOption, Verbose
-from ema_pipeline.commands.screen import program, progress, show, show_json
+from ema_pipeline.commands.screen import on_folder, program, progress, show, show_json
 
 if TYPE_CHECKING:
     from ema_pipeline.run.types import Run
@@ -159,7 +159,8 @@ def fit(
         units = {name: p.unit for name, p in stated.items()}
         show(terminal.rung_table(results.current_rung, units))
     else:
-        show(f"The model in use has not been fitted yet; '{program()} diagnose {out}' does that.")
+        again = on_folder("diagnose", out, results.effect_files)
+        show(f"The model in use has not been fitted yet; '{again}' does that.")
     if save is not None:
         show(f"Wrote {save}; use it with --rig {save}")
 
@@ -248,7 +249,8 @@ def view(
     from ema_pipeline.view.server import serve
 
     Store.existing(out)
-    go_on_with(f"view {shlex.quote(str(out))}")  # what was changed on the page is kept
+    files = [word for file in effect_file or [] for word in ("--effect-file", file)]
+    go_on_with(shlex.join(["view", str(out), *files]))  # what was changed on the page is kept
     serve(out, effect_file or [], port, ready)
 
 

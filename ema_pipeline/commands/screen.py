@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -33,7 +34,8 @@ def show(what: Any) -> None:
     console = Console(highlight=False, soft_wrap=False)
     # Cleaned only once rendered: before, names cannot be distinguished from the colours that rich puts around them.
     rendered = [Segment(printable(s.text), s.style, s.control) for s in console.render(what)]
-    console.print(Segments(rendered), end="")
+    # rendered to fit already, but for commands to copy, which are never cut
+    console.print(Segments(rendered), end="", crop=False)
 
 
 def program() -> str:
@@ -43,6 +45,14 @@ def program() -> str:
     if called.name != "ema" or not called.is_file() or (found and Path(found).samefile(called)):
         return "ema"
     return os.path.relpath(called) if called.is_relative_to(Path.cwd()) else str(called)
+
+
+def on_folder(verb: str, out: Path, effect_files: Sequence[str] = ()) -> str:
+    """A command on a results folder as the user can type it."""
+    from ema_pipeline.report.commands import command
+
+    typed = command(verb, str(out), effect_files=effect_files)
+    return typed.replace("ema ", f"{shlex.quote(program())} ", 1)
 
 
 def show_json(content: Any) -> None:

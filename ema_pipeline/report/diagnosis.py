@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Mapping, Sequence
 
 from ema_pipeline.diagnose.sentences import label_text, probability_text
@@ -16,6 +15,7 @@ from ema_pipeline.diagnose.types import (
     EffectSize,
     Ladder,
 )
+from ema_pipeline.report.commands import command
 from ema_pipeline.report.numbers import format_value, plain, prefixed, words
 
 NOTHING = "nothing"
@@ -264,7 +264,9 @@ def _named(found: Diagnosis) -> str:
     return named or "nothing"
 
 
-def next_commands(found: Diagnosis, out: str = "OUT", added: Sequence[str] = ()) -> tuple[str, ...]:
+def next_commands(
+    found: Diagnosis, out: str = "OUT", added: Sequence[str] = (), effect_files: Sequence[str] = ()
+) -> tuple[str, ...]:
     """What a user would type next.
 
     Parameters
@@ -274,19 +276,22 @@ def next_commands(found: Diagnosis, out: str = "OUT", added: Sequence[str] = ())
         Results folder as the user would type it.
     added : sequence of str
         Labels that are in the model already.
+    effect_files : sequence of str
+        Files with the user's own effects.
     """
-    folder = shlex.quote(out) if out else "OUT"
+
+    def on_folder(verb: str, *words: str, files: Sequence[str] = effect_files) -> str:
+        return command(verb, out, *words, effect_files=files)
+
     if found.verdict == "effect":
         new = [c.label for c in claimed(found) if c.label not in added]
-        return (f"ema add {folder} {' '.join(new)}", f"ema ladder {folder}") if new else ()
+        return (on_folder("add", *new), on_folder("ladder")) if new else ()
     if found.verdict == "ambiguous":
         # one of them, the user's choice: each line stands for itself
         sure = [c.label for c in undisputed(found) if c.label not in added]
-        return tuple(
-            f"ema add {folder} {' '.join([*sure, c.label])}" for c in alike(found) if c.label not in added
-        )
+        return tuple(on_folder("add", *sure, c.label) for c in alike(found) if c.label not in added)
     if found.verdict == "unknown_effect":
-        return (f"ema compare {folder}", f"ema diagnose {folder} --effect-file my_effect.py")
+        return on_folder("compare"), on_folder("diagnose", files=(*effect_files, "my_effect.py"))
     return ()
 
 

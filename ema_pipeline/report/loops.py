@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +13,7 @@ from ema_pipeline.files import replace_file
 from ema_pipeline.loops.summary import summary, terminal_lines
 from ema_pipeline.loops.types import Estimate, IsolatorResult, Loop, LoopModel
 from ema_pipeline.report import diagnosis, summary_files
+from ema_pipeline.report.commands import command
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.results import LoopResults, RunResults
 from ema_pipeline.report.tables import Row, Table
@@ -38,9 +38,10 @@ def run_screen(isolators: Mapping[str, IsolatorResult], results: RunResults, out
     if results.diagnosis is not None:
         added = results.ladder.rungs[-1].effects if results.ladder is not None else ()
         lines += ["", diagnosis.compact(results.diagnosis), results.diagnosis.summary]
-        commands = diagnosis.next_commands(results.diagnosis, out, added)
-        lines += ["", "Next:", *(f"  {c}" for c in commands)] if commands else []
-        lines += [] if commands else ["", f"Next:\n  ema compare {shlex.quote(out)}"]
+        files = results.effect_files
+        commands = diagnosis.next_commands(results.diagnosis, out, added, files)
+        commands = commands or (command("compare", out, effect_files=files),)
+        lines += ["", "Next:", *(f"  {c}" for c in commands)]
     return "\n".join(lines)
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import UNKNOWN, Diagnosis, Rung
 from ema_pipeline.report import diagnosis
+from ema_pipeline.report.commands import command
 from ema_pipeline.report.effect_places import EffectPlaces, effect_places
 from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.results import RunResults
@@ -66,10 +66,13 @@ def page_top(results: RunResults) -> PageTop:
     found = results.diagnosis
     if found is None:
         return PageTop(_heading_without_diagnosis(results), "", _tiles(results))
-    commands = list(diagnosis.next_commands(found, results.folder, results.added))
+    folder, files = results.folder, results.effect_files
+    commands = list(diagnosis.next_commands(found, folder, results.added, files))
     if results.added:
-        folder = shlex.quote(results.folder) if results.folder else "OUT"
-        commands = [*commands, f"ema diagnose {folder}", f"ema remove {folder} {results.added[-1]}"]
+        commands += [
+            command("diagnose", folder, effect_files=files),
+            command("remove", folder, results.added[-1], effect_files=files),
+        ]
     known = PageTop("", "", _tiles(results), commands=tuple(commands), drawing=_drawing(results))
     if results.diagnosis_is_old:
         told = "The diagnosis below is older than this change; repeat it to see what is still missing."

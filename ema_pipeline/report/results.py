@@ -130,6 +130,9 @@ class RunResults:
         Of a test of force-displacement loops.
     sensitivities : tuple of CheckResult
         Channels whose scale or sign the model contradicts, see `fit.sensitivities`.
+    effect_files : tuple of str
+        Files with the user's own effects that were named in this call, as a user would type them. No command that is
+        shown names another one, since results may come from a stranger.
     """
 
     title: str
@@ -154,6 +157,7 @@ class RunResults:
     not_diagnosed: str = ""
     hysteresis: tuple[HysteresisLoop, ...] = ()
     loops: LoopResults | None = None
+    effect_files: tuple[str, ...] = ()
 
     @property
     def diagnosis_is_old(self) -> bool:

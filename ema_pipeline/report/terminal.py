@@ -187,7 +187,11 @@ def rung_table(rung: Rung, units: Mapping[str, str]) -> RenderableType:
 
 
 def diagnosis_screen(
-    found: Diagnosis, out: str = "OUT", program: str = "ema", suspicions: Sequence[str] = ()
+    found: Diagnosis,
+    out: str = "OUT",
+    program: str = "ema",
+    suspicions: Sequence[str] = (),
+    effect_files: Sequence[str] = (),
 ) -> RenderableType:
     """Verdict, candidates, what cannot be told apart, what to measure and what to type next.
 
@@ -200,6 +204,8 @@ def diagnosis_screen(
         The command ``ema`` as the user would type it.
     suspicions : sequence of str
         Sensors that cannot be right; they come first.
+    effect_files : sequence of str
+        Files with the user's own effects, as the user would type them.
     """
     parts: list[RenderableType] = [_line(f"! {text}") for text in suspicions]
     parts += [_heading(diagnosis.heading(found)), _line(found.summary)]
@@ -226,7 +232,7 @@ def diagnosis_screen(
     if found.notes:
         parts += [_line(""), _line("Remarks on the data:"), *(_line(f"! {n}") for n in found.notes)]
     if not suspicions:
-        commands = diagnosis.next_commands(found, out)
+        commands = diagnosis.next_commands(found, out, (), effect_files)
         parts += _commands([c.replace("ema ", f"{shlex.quote(program)} ", 1) for c in commands])
     return Group(*parts)
 
@@ -279,8 +285,13 @@ def _heading(text: str) -> Safe:
 
 
 def _commands(lines: Sequence[str]) -> list[RenderableType]:
-    """Commands to copy, one a line."""
-    return [_line(""), _line("Next:"), *(_line(f"  {line}") for line in lines)] if lines else []
+    """Commands to copy, each on one line however long it is."""
+    return [_line(""), _line("Next:"), *(_whole(f"  {line}") for line in lines)] if lines else []
+
+
+def _whole(text: str) -> Safe:
+    """A line that is never broken; the terminal lets it run on below."""
+    return Safe(lambda clean, rigid: Text(clean(text), no_wrap=True, overflow="ignore"))
 
 
 def _line(text: str) -> Safe:

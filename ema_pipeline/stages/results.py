@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import TypeVar, cast
 
 from ema_pipeline.check_result import CheckResult
@@ -97,11 +98,18 @@ def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
         choices=run.info.choices,
         diagnosed_choices=diagnosed_choices(run),
         folder=str(run.store.folder),
+        effect_files=tuple(map(_typed, filter(run.named_files.__contains__, run.settings.effect_files))),
         provenance=provenance(run),
         settings={
             name: _flat(json.loads(s.model_dump_json())) for name, s in run.settings.by_stage().items()
         },
     )
+
+
+def _typed(file: str) -> str:
+    """A file as the user would type it from here."""
+    here = Path.cwd()
+    return str(Path(file).relative_to(here)) if Path(file).is_relative_to(here) else file
 
 
 def _diagnosis(run: Run) -> Diagnosis | None:

@@ -8,7 +8,6 @@ import hashlib
 import json
 import math
 import os
-import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -18,6 +17,7 @@ from typing import Any
 
 from ema_pipeline.choices import options_between
 from ema_pipeline.errors import EmaError
+from ema_pipeline.report.commands import command
 from ema_pipeline.report.moved_modes import Seen, error_words, seen
 from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.results import RunResults
@@ -317,23 +317,26 @@ class Session:
 
     def _log(self, was: RunResults, now: RunResults, job: Job | None = None) -> None:
         """The commands that lead from one list of effects, and from one set of choices, to the other."""
-        folder, before, after = shlex.quote(str(self.folder)), was.added, now.added
+        before, after = was.added, now.added
+
+        def on_folder(verb: str, *words: str) -> str:
+            return command(verb, str(self.folder), *words, effect_files=self._effect_files)
+
         self.commands += [
-            f"ema {verb} {folder} {option} {shlex.quote(name)}"
-            for verb, option, name in options_between(was.choices, now.choices)
+            on_folder(verb, option, name) for verb, option, name in options_between(was.choices, now.choices)
         ]
         if job is not None and job.verb == "diagnose":
-            self.commands.append(f"ema diagnose {folder}")
+            self.commands.append(on_folder("diagnose"))
             return
         if job is not None and job.verb == "remove":
-            self.commands.append(f"ema remove {folder} {shlex.quote(job.label)}")
+            self.commands.append(on_folder("remove", job.label))
             return
         common = 0
         while common < min(len(before), len(after)) and before[common] == after[common]:
             common += 1
-        self.commands += [f"ema remove {folder} {shlex.quote(x)}" for x in reversed(before[common:])]
+        self.commands += [on_folder("remove", x) for x in reversed(before[common:])]
         if after[common:]:
-            self.commands.append(f"ema add {folder} {' '.join(shlex.quote(x) for x in after[common:])}")
+            self.commands.append(on_folder("add", *after[common:]))
 
     def _stamp(self) -> tuple[int, int]:
         found = (self.folder / "ema.h5").stat()

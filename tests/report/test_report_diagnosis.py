@@ -16,6 +16,7 @@ import report_example as example
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from ema_pipeline.commands.screen import show
 from ema_pipeline.diagnose import sentences
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import (
@@ -133,7 +134,7 @@ def page(results: RunResults) -> str:
 
 def printed(renderable: object, width: int = 80, encoding: str = "utf-8") -> str:
     file = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
-    Console(file=file, width=width, no_color=True, highlight=False).print(renderable)
+    Console(file=file, width=width, no_color=True, highlight=False).print(renderable, crop=False)
     file.flush()
     assert isinstance(file.buffer, io.BytesIO)
     return file.buffer.getvalue().decode(encoding)
@@ -259,6 +260,32 @@ def test_commands_add_what_is_claimed_and_leave_out_what_is_in_the_model() -> No
     assert diagnosis.next_commands(found("effect"), "r", added=(CRACK,)) == ()
     assert diagnosis.next_commands(found("ambiguous"), "r") == (f"ema add r {CRACK}", f"ema add r {OTHER}")
     assert diagnosis.next_commands(found("adequate"), "r") == ()
+
+
+def test_commands_are_neither_broken_nor_cut_on_a_narrow_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    show(terminal.diagnosis_screen(found("effect"), 20 * "long/"))
+    lines = capsys.readouterr().out.splitlines()
+    assert f"  ema add {20 * 'long/'} {CRACK}" in lines
+    assert sum(len(line) > 80 for line in lines) == 2
+
+
+def test_every_command_shown_names_the_files_whose_code_it_needs(run: RunResults) -> None:
+    files = ("my film.py",)
+    named = " --effect-file 'my film.py'"
+    mine = replace(run, effect_files=files)
+    assert next_lines(mine, "out", "ema") == (f"ema add out {CRACK}{named}",)
+    assert next_lines(replace(mine, added=(CRACK,)), "out", "ema") == (f"ema diagnose out{named}",)
+    for results in (mine, replace(mine, added=(CRACK,))):
+        shown = page_top.page_top(results).commands
+        assert shown
+        assert all(text.endswith(named) for text in shown)
+    screen = printed(terminal.diagnosis_screen(found("effect"), "out", effect_files=files))
+    assert f"  ema add out {CRACK}{named}\n  ema ladder out{named}\n" in screen
+    unknown = diagnosis.next_commands(found("unknown_effect"), "r", (), files)
+    assert unknown == (f"ema compare r{named}", f"ema diagnose r{named} --effect-file my_effect.py")
 
 
 def test_rung_says_what_it_adds_with_its_size_and_not_the_rigs_parameters() -> None:

@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 
 from ema_pipeline.cli import app
 from ema_pipeline.errors import EmaError
-from ema_pipeline.run.opening import load_info, save_info
+from ema_pipeline.run.opening import existing_run, load_info, save_info
+from ema_pipeline.stages.results import load_results
 from ema_pipeline.store import Store
 
 EFFECT = """
@@ -83,6 +84,19 @@ def test_a_file_that_is_named_in_the_call_runs(results: Path, tmp_path: Path) ->
     assert info is not None
     assert json.loads(info.pipeline)["effect_files"] == [str(file)]
     assert list(info.effect_hashes) == [str(file)]
+
+
+def test_commands_shown_name_files_that_the_user_has_named_and_no_other(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "film.py"
+    file.write_text(EFFECT.format(marker=str(tmp_path / "it_ran")), encoding="utf-8")
+    pipeline = json.loads(load_info(Store(results)).pipeline) | {"effect_files": [str(file)]}  # type: ignore[union-attr]
+    out = received(results, tmp_path, pipeline=json.dumps(pipeline))
+    assert load_results(existing_run(out)).effect_files == ()
+    assert load_results(existing_run(out, [str(file)])).effect_files == (str(file),)
+    monkeypatch.chdir(tmp_path)
+    assert load_results(existing_run(out, ["film.py"])).effect_files == ("film.py",)
 
 
 def test_a_pipeline_file_cannot_make_code_run(tmp_path: Path) -> None:
