@@ -102,6 +102,11 @@ def effects_words(labels: Sequence[str]) -> str:
     return " + ".join(map(label_words, labels))
 
 
+def model_words(labels: Sequence[str]) -> str:
+    """A model by its effects, in a sentence."""
+    return f"the model with {effects_words(labels)}" if labels else "the base model"
+
+
 def rung_words(before: Sequence[str], effects: Sequence[str]) -> str:
     """What a rung adds, e.g. ``+ mesh stiffness loss at sun-planet1``."""
     if not effects:

@@ -178,9 +178,8 @@ def fit_table(fit: FitResult) -> RenderableType:
 
 def rung_table(rung: Rung, units: Mapping[str, str]) -> RenderableType:
     """Fitted parameters of one model of a ladder; `units` of those that the ladder knows none of."""
-    model = f"the model with {diagnosis.effects_words(rung.effects)}" if rung.effects else "the base model"
     return Group(
-        _heading(f"Parameters of {model}"),
+        _heading(f"Parameters of {diagnosis.model_words(rung.effects)}"),
         text_table(diagnosis_tables.rung_table(rung, units), ""),
         _line(f"error {plain(rung.error, 3)}"),
     )
