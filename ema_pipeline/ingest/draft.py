@@ -16,6 +16,7 @@ from ema_pipeline.files import replace_file
 from ema_pipeline.ingest.derived import derived_channels
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE
 from ema_pipeline.ingest.file_size_limits import ReadLimits
+from ema_pipeline.ingest.load import COARSEST_RATE
 from ema_pipeline.ingest.readers import read_raw, reader_of
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord
 from ema_pipeline.ingest.swap import is_pulse
@@ -199,9 +200,10 @@ def _known_unit(channel: RawChannel) -> Unit | None:
 
 
 def _rate_lines(found: list[_Found]) -> list[str]:
-    rates = sorted({f.raw.sample_rate_hz for f in found if f.raw.sample_rate_hz is not None})
+    told = [f.raw for f in found if f.raw.rate_tolerance <= COARSEST_RATE]
+    rates = sorted({raw.sample_rate_hz for raw in told if raw.sample_rate_hz is not None})
     if not rates:
-        return ["# sample_rate_hz =    # CHECK: the files do not state it; fill it in and remove the '#'"]
+        return ["# sample_rate_hz =    # CHECK: the files do not tell it; fill it in and remove the '#'"]
     if rates[-1] / rates[0] - 1 > 1e-4:
         return [
             f"# CHECK: the files differ in sample rate ({rates[0]:.10g} to {rates[-1]:.10g} Hz); split them"

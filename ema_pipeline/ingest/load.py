@@ -37,6 +37,9 @@ LARGEST_WINDOW = float(-np.log(np.finfo(np.float32).tiny))
 RATE_TOLERANCE = 1e-4
 """Relative difference up to which two statements of a sample rate mean the same."""
 
+COARSEST_RATE = 0.01
+"""Relative uncertainty from which on rounded time stamps do not tell a sample rate by themselves."""
+
 
 @dataclass(frozen=True)
 class ScaledChannels:
@@ -240,6 +243,11 @@ def _sample_rate(test: TestDescription, raw: RawRecord, where: str) -> float:
     stated, found = test.sample_rate_hz, raw.sample_rate_hz
     if stated is None and found is None:
         raise EmaError(f"{where}: states no sample rate; add sample_rate_hz to {test.file}")
+    if stated is None and raw.rate_tolerance > COARSEST_RATE:
+        raise EmaError(
+            f"{where}: its time stamps are too coarse to tell the sample rate ({found:.4g} Hz to within "
+            f"{raw.rate_tolerance:.1%}); add sample_rate_hz to {test.file}"
+        )
     tolerance = max(RATE_TOLERANCE, raw.rate_tolerance)
     if stated is not None and found is not None and abs(found / stated - 1) > tolerance:
         raise EmaError(

@@ -248,6 +248,32 @@ def test_times_rounded_to_a_tenth_of_a_millisecond_do_not_contradict_the_stated_
     assert load(folder).sample_rate_hz == RATE
 
 
+@pytest.mark.parametrize(
+    ("speed", "said"),
+    [(1.0, ""), (0.5, "sample rate is 4096 Hz in the file but 2048 Hz in ")],
+)
+def test_stamps_in_milliseconds_are_held_against_the_stated_rate(
+    tmp_path: Path, speed: float, said: str
+) -> None:
+    folder = make_test(tmp_path)
+    rows = [
+        f"{speed * i / RATE:.3f},{a:.9g},{b:.9g}" for i, (a, b) in enumerate(zip(*DATA.values(), strict=True))
+    ]
+    (folder / "hit1.csv").write_text("time,hammer,tip\n" + "\n".join(rows))
+    if said:
+        assert said in message_of(folder)
+    else:
+        assert load(folder).sample_rate_hz == RATE
+
+
+def test_stamps_too_coarse_for_a_rate_ask_for_one(tmp_path: Path) -> None:
+    folder = make_test(tmp_path, DESCRIPTION.replace("sample_rate_hz = 2048", ""))
+    rows = [f"{i / RATE:.1f},{a:.9g},{b:.9g}" for i, (a, b) in enumerate(zip(*DATA.values(), strict=True))]
+    (folder / "hit1.csv").write_text("time,hammer,tip\n" + "\n".join(rows))
+    assert "time stamps are too coarse to tell the sample rate" in message_of(folder)
+    assert "add sample_rate_hz" in message_of(folder)
+
+
 def test_channels_of_different_length_are_refused(tmp_path: Path) -> None:
     import h5py
 

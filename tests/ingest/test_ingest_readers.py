@@ -297,6 +297,20 @@ def test_hdf5_datasets_in_groups_with_a_time_vector(tmp_path: Path) -> None:
     check(path, rtol=0)
 
 
+def test_hdf5_times_in_milliseconds_do_not_contradict_the_stated_rate(tmp_path: Path) -> None:
+    path = tmp_path / "hit.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["sample_rate_hz"] = RATE
+        file["time"] = np.round(np.arange(SAMPLES) / RATE, 3)
+        for name, samples in DATA.items():
+            file[name] = samples
+    check(path)
+    with h5py.File(path, "a") as file:
+        file.attrs["sample_rate_hz"] = 2 * RATE
+    with pytest.raises(EmaError, match="contradicts itself"):
+        read_raw(path)
+
+
 def test_hdf5_step_attribute_and_named_columns(tmp_path: Path) -> None:
     path = tmp_path / "hit.h5"
     with h5py.File(path, "w") as file:

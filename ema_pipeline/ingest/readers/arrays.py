@@ -18,6 +18,7 @@ from ema_pipeline.ingest.readers.timebase import (
     is_time_name,
     is_uniform_ramp,
     rate_from_times,
+    time_rounding,
     time_unit_scale,
     whole_rate,
 )
@@ -119,7 +120,7 @@ def assemble(
         numbers = values.astype(np.float64, copy=False)
         if values.ndim == 1 and is_time_name(array.name):
             scale = time_unit_scale(array.name, _text(array.attributes, _UNIT_KEYS))
-            rates.add(label, rate_from_times(numbers * scale))
+            rates.add(label, rate_from_times(numbers * scale), time_rounding(numbers * scale))
         elif values.ndim == 1:
             columns.append(_Column(array.path, numbers, array.attributes))
         elif values.ndim == 2:
@@ -144,7 +145,7 @@ def assemble(
     }
     if len(channels) < len(columns):
         raise EmaError("two channels have the same name; rename one in the file")
-    return RawRecord(channels=channels, sample_rate_hz=rates.value, notes=tuple(notes))
+    return RawRecord(channels, rates.value, tuple(notes), rates.tolerance)
 
 
 class _Rates:
@@ -152,6 +153,7 @@ class _Rates:
 
     def __init__(self) -> None:
         self.value: float | None = None
+        self.tolerance = 0.0
         self._source = ""
 
     def read(self, label: str, attributes: Mapping[str, Any]) -> None:
@@ -172,16 +174,16 @@ class _Rates:
                 )
             self.add(label, value if plain in _RATE_KEYS else whole_rate(value, 1e-9))
 
-    def add(self, label: str, rate: float | None) -> None:
+    def add(self, label: str, rate: float | None, tolerance: float = 0.0) -> None:
         if rate is None:
             return
-        if self.value is None:
-            self.value, self._source = rate, label
-        elif abs(rate / self.value - 1) > 1e-4:
+        if self.value is not None and abs(rate / self.value - 1) > max(1e-4, tolerance, self.tolerance):
             raise EmaError(
                 f"contradicts itself: sample rate {self.value:.10g} Hz ({self._source}) "
                 f"and {rate:.10g} Hz ({label}); correct the file"
             )
+        if self.value is None or tolerance < self.tolerance:
+            self.value, self.tolerance, self._source = rate, tolerance, label
 
 
 def _number_of(text: str) -> float:

@@ -24,6 +24,12 @@ _INDEX_NAME = re.compile(
 _SHORTEST_STEP = 1e-300
 """s; one divided by less is no number."""
 
+_FEWEST_STAMPS = 6
+"""Different time stamps; fewer show no pattern."""
+
+_UNEVEN = 1.5
+"""Boards that stamp whole blocks of samples do not stamp them quite evenly: this many times the usual is no fault."""
+
 
 def is_time_name(name: str) -> bool:
     """True for the usual names of a time column."""
@@ -58,12 +64,13 @@ def time_unit_scale(name: str, unit: str | None) -> float:
 def rate_from_times(times: NDArray[np.float64]) -> float | None:
     """Sample rate of a time axis (n,) in seconds.
 
-    Times may be rounded, even to more than one sample; then the axis is too coarse and None is returned.
+    Times may be rounded, even to more than one sample; see `time_rounding` for what that does to the rate. None
+    where they are too coarse to tell it.
 
     Raises
     ------
     EmaError
-        Where time does not rise, or jumps (lost samples).
+        Where time does not rise, jumps (lost samples) or stands (repeated ones).
     """
     if times.size < 3:
         return None
@@ -72,24 +79,74 @@ def rate_from_times(times: NDArray[np.float64]) -> float | None:
     steps = np.diff(times)
     span = times[-1] - times[0]
     mean = span / (times.size - 1)
+    if span == 0 and not steps.any():
+        raise EmaError(
+            f"time stands still at {times[0]:.6g} s; export again with more digits, or without time"
+        )
     if mean <= 0 or np.any(steps < 0):
         raise EmaError(f"time runs backwards at sample {int(np.argmax(steps <= 0)) + 1}; export again")
     if np.any(steps == 0):
-        return None
+        return _rate_of_equal_times(times)
     step = float(np.median(steps))
     worst = int(np.argmax(np.abs(steps - step)))
     if abs(steps[worst] - step) > 0.5 * step:
-        raise EmaError(
-            f"time jumps by {steps[worst]:.6g} s at sample {worst + 1} where {step:.6g} s is the step: "
-            "samples are missing; export the record again without gaps"
-        )
+        raise _gap(float(steps[worst]), worst + 1, step)
     return whole_rate(mean, max(1e-9, time_rounding(times)))
+
+
+def _rate_of_equal_times(times: NDArray[np.float64]) -> float | None:
+    """The same where several samples have one time: it was rounded, or rows were written twice.
+
+    Rounding to significant digits is coarser later in the record, so that each stamp is held against those beside it:
+    it stands for as many samples as fill the step to the next one, or one more.
+    """
+    first = np.flatnonzero(np.diff(times, prepend=-math.inf))
+    if first.size < _FEWEST_STAMPS:
+        return None
+    step = float(np.polyfit(np.arange(times.size), times - times[0], 1)[0])
+    rows, jumps = np.diff(first, append=times.size), np.diff(times[first])
+    before, after = np.append(jumps[0], jumps), np.append(jumps, jumps[-1])
+    wide = jumps - step * (_UNEVEN * np.maximum(rows[:-1], rows[1:]) + 1)
+    if np.any(wide > 0):
+        at = int(np.argmax(wide))
+        raise _gap(float(jumps[at]), int(first[at + 1]), float(np.median(jumps)))
+    widest = np.maximum(before, after)
+    most = np.floor(_UNEVEN * widest / step + 1)
+    # Stamps a sample apart that are no round numbers are finer than a sample.
+    most[(widest < _UNEVEN * step) & ~_is_power_of_ten(widest)] = 1
+    least = np.minimum(before, after) / (_UNEVEN * step) - 1
+    least[[0, -1]] = 0  # the record may begin and end amid the samples of a stamp
+    if np.any(rows > most):
+        at = int(np.argmax(rows - most))
+        raise EmaError(
+            f"time stands still at {times[first[at]]:.6g} s for {rows[at]} samples from sample {first[at]} on: rows "
+            "are repeated; export the record again"
+        )
+    if np.any(rows < least):
+        at = int(np.argmin(rows - least))
+        raise EmaError(
+            f"time {times[first[at]]:.6g} s has {rows[at]} samples where {widest[at] / step:.0f} are usual: samples "
+            "are missing; export the record again without gaps"
+        )
+    return whole_rate(step, time_rounding(times))
+
+
+def _is_power_of_ten(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.asarray(np.abs(values / 10.0 ** np.round(np.log10(values)) - 1) < 1e-2)
+
+
+def _gap(jump: float, sample: int, step: float) -> EmaError:
+    return EmaError(
+        f"time jumps by {jump:.6g} s at sample {sample} where {step:.6g} s is the step: "
+        "samples are missing; export the record again without gaps"
+    )
 
 
 def time_rounding(times: NDArray[np.float64]) -> float:
     """Relative uncertainty of the rate of a time axis (n,) whose values were rounded when written.
 
-    Rounding scatters each step; over the whole span it all but vanishes, unless the record is short.
+    Rounding scatters each step; over the whole span it all but vanishes, unless the record is short or the rounding
+    coarse.
     """
     if times.size < 3 or times[-1] <= times[0]:
         return 0.0

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, clean_unit
-from ema_pipeline.ingest.readers.timebase import rate_from_times, whole_rate
+from ema_pipeline.ingest.readers.timebase import rate_from_times, time_rounding, whole_rate
 
 NAME = "UFF58"
 
@@ -56,6 +56,7 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
     limits.check_channels(sum(block.number == 58 for block in blocks))
     channels: dict[str, RawChannel] = {}
     rates: list[float] = []
+    rounding = 0.0
     notes: list[str] = []
     extract = pyuff.datasets.dataset_58._extract58
     for order, block in enumerate(blocks, start=1):
@@ -71,7 +72,7 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
         samples, times = _body(data, block, header, name, extract, notes)
         step = float(header["abscissa_inc"])
         if times is not None:
-            rate = rate_from_times(times)
+            rate, rounding = rate_from_times(times), max(rounding, time_rounding(times))
         else:
             rate = whole_rate(step, _ABSCISSA_ROUNDING) if step > 0 else None
         if rate is not None:
@@ -81,12 +82,12 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
         )
     if not channels:
         raise EmaError("holds no time histories (data set 58 with function type 1); export the time data")
-    if rates and max(rates) / min(rates) - 1 > 1e-4:
+    if rates and max(rates) / min(rates) - 1 > max(1e-4, rounding):
         raise EmaError(
             f"its channels differ in sample rate ({min(rates):.10g} and {max(rates):.10g} Hz); "
             "export them with one rate"
         )
-    return RawRecord(channels, rates[0] if rates else None, tuple(notes))
+    return RawRecord(channels, rates[0] if rates else None, tuple(notes), rounding)
 
 
 def _find_blocks(data: bytes) -> list[_Block]:
