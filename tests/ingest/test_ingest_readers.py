@@ -493,9 +493,10 @@ X_Value\thammer\ttip\tComment
 """
 
 
-def lvm_text(rows: int = SAMPLES) -> str:
-    body = [f"{i / RATE:.9f}\t{DATA['hammer'][i]:.17g}\t{DATA['tip'][i]:.17g}" for i in range(rows)]
-    return LVM_HEAD.format(n=SAMPLES, dt=1 / RATE) + "\n".join(body) + "\n"
+def lvm_text(rows: int = SAMPLES, times: np.ndarray | None = None, step: float = 1 / RATE) -> str:
+    times = np.arange(SAMPLES) / RATE if times is None else times
+    body = [f"{times[i]:.9f}\t{DATA['hammer'][i]:.17g}\t{DATA['tip'][i]:.17g}" for i in range(rows)]
+    return LVM_HEAD.format(n=SAMPLES, dt=step) + "\n".join(body) + "\n"
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
@@ -505,6 +506,43 @@ def test_lvm_keeps_its_units_in_any_encoding(tmp_path: Path, encoding: str) -> N
     check(path, format_name="LVM")
     assert {n: c.unit for n, c in read_raw(path).channels.items()} == {"hammer": "N", "tip": "m/s²"}
     assert list(tmp_path.iterdir()) == [path]  # no pickles beside the data
+
+
+@pytest.mark.parametrize(
+    ("times", "step", "said"),
+    [
+        (np.arange(SAMPLES) / 4096, 1 / RATE, "header states 2048 Hz and its time column X_Value 4096 Hz"),
+        (np.arange(SAMPLES)[::-1] / RATE, 1 / RATE, "time runs backwards at sample 1"),
+        (
+            np.arange(SAMPLES) / RATE + 0.3 * (np.arange(SAMPLES) > 1500),
+            1 / RATE,
+            "time jumps by 0.300488 s at sample 1501",
+        ),
+        (np.arange(SAMPLES) / RATE, 0.0, "states Delta_X = 0 s, which is no time step"),
+        (np.arange(SAMPLES) / RATE, -1 / RATE, "states Delta_X = -0.000488281 s"),
+    ],
+)
+def test_an_lvm_whose_times_contradict_its_step_is_refused(
+    tmp_path: Path, times: np.ndarray, step: float, said: str
+) -> None:
+    path = tmp_path / "hit.lvm"
+    path.write_text(lvm_text(times=times, step=step), encoding="utf-8")
+    with pytest.raises(EmaError) as caught:
+        read_raw(path)
+    assert said in str(caught.value)
+
+
+def test_lvm_times_may_be_rounded_left_blank_or_stand_alone(tmp_path: Path) -> None:
+    path = tmp_path / "hit.lvm"
+    path.write_text(lvm_text(times=np.round(np.arange(SAMPLES) / RATE, 3)), encoding="utf-8")
+    check(path)
+    path.write_text(lvm_text(times=np.full(SAMPLES, np.nan)).replace("nan\t", "\t"), encoding="utf-8")
+    check(path)
+    text = lvm_text()
+    path.write_text(
+        "".join(x for x in text.splitlines(True) if not x.startswith("Delta_X")), encoding="utf-8"
+    )
+    check(path)
 
 
 # --- damaged and foreign files ----------------------------------------------------------------------------

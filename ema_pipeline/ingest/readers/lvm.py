@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, clean_unit, split_unit
 from ema_pipeline.ingest.readers.text import decode
-from ema_pipeline.ingest.readers.timebase import rate_from_times, whole_rate
+from ema_pipeline.ingest.readers.timebase import rate_from_times, time_rounding, whole_rate
 
 NAME = "LVM"
 
@@ -35,7 +36,9 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
     table = np.atleast_2d(segment["data"])
     names = [str(n).strip() for n in segment["Channel names"]]
     units = _per_column(segment.get("Y_Unit_Label"), names)
-    steps = [s for s in segment.get("Delta_X", []) if isinstance(s, int | float) and s > 0]
+    steps = [s for s in segment.get("Delta_X", []) if isinstance(s, int | float) and s == s]
+    if steps and not min(steps) > 0:
+        raise EmaError(f"states Delta_X = {min(steps):g} s, which is no time step; correct the file")
     stated = [s for s in segment.get("Samples", []) if isinstance(s, int | float) and s > 0]
     if stated and table.shape[0] > max(stated):
         raise EmaError(
@@ -48,10 +51,11 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
             "the file is cut short, copy or export it again"
         )
     channels: dict[str, RawChannel] = {}
-    times = None
+    times: list[NDArray[np.float64]] = []
     for i, name in enumerate(names):
         if name == "X_Value":
-            times = table[:, i] if times is None else times
+            if not np.all(np.isnan(table[:, i])):  # a column that was left blank says nothing
+                times.append(table[:, i])
         elif name and name != "Comment" and i < table.shape[1]:
             plain, unit = split_unit(name)
             if plain in channels:
@@ -59,8 +63,18 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
             channels[plain] = RawChannel(np.ascontiguousarray(table[:, i]), unit or clean_unit(units[i]))
     if len(set(steps)) > 1:
         raise EmaError(f"its channels differ in Delta_X ({min(steps):g} and {max(steps):g} s); use one rate")
-    rate = whole_rate(steps[0], 1e-6) if steps else None if times is None else rate_from_times(times)
-    return RawRecord(channels, rate)
+    rate, tolerance = (whole_rate(steps[0], 1e-6), 0.0) if steps else (None, 0.0)
+    for axis in times:
+        measured, rounding = rate_from_times(axis), time_rounding(axis)
+        if rate is None:
+            rate, tolerance = measured, rounding
+        elif measured is not None and abs(measured / rate - 1) > max(1e-3, rounding, tolerance):
+            source = "its header" if steps else "another time column"
+            raise EmaError(
+                f"contradicts itself: {source} states {rate:.10g} Hz and its time column X_Value "
+                f"{measured:.10g} Hz; correct the file"
+            )
+    return RawRecord(channels, rate, rate_tolerance=tolerance)
 
 
 def _per_column(labels: Any, names: list[str]) -> list[Any]:
