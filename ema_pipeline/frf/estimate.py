@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from scipy.fft import rfft
 from scipy.ndimage import uniform_filter1d
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import ChannelQuality, merged
 from ema_pipeline.frf.checks import check_frfs
 from ema_pipeline.frf.parts import joined
 from ema_pipeline.frf.settings import FrfSettings
+from ema_pipeline.frf.signs import HitLines, check_signs, strongest_lines
 from ema_pipeline.frf.types import FrfSet, unknown
 from ema_pipeline.frf.warp import WarpedTransform
 from ema_pipeline.frf.windows import Windows, decay_rate
@@ -104,7 +106,8 @@ def estimate_frfs(
     with ThreadPoolExecutor(settings.threads) as pool:
         for hit in hits:
             total = totals.setdefault(hit.hit.part, _Total())
-            _accumulate(total.sheet_of(hit), hit, settings, shifts, pool)
+            single = total.pairs if coherence else None
+            _accumulate(total.sheet_of(hit), hit, settings, shifts, pool, single)
         parts = {
             name: _finish(total, total.first, settings, pool, coherence)
             for name, total in totals.items()
@@ -113,7 +116,15 @@ def estimate_frfs(
     if not parts:
         raise EmaError("no accepted hit: there is nothing to estimate FRFs from; see the hits' verdicts")
     frfs = joined(parts)
-    return replace(frfs, verdicts=check_frfs(frfs, settings)) if coherence else frfs
+    if not coherence:
+        return frfs
+    signs = [v for name, part in parts.items() for v in _signs(totals[name], part)]
+    return replace(frfs, verdicts=(*signs, *check_frfs(frfs, settings)))
+
+
+def _signs(total: _Total, frfs: FrfSet) -> list[CheckResult]:
+    low, high = np.searchsorted(frfs.frequency_hz, frfs.band_hz)
+    return check_signs(total.pairs, total.outputs, total.quantities, (int(low), int(high)))
 
 
 @dataclass
@@ -140,6 +151,7 @@ class _Total:
     delays: dict[str, list[float]] = field(default_factory=dict)
     channels: dict[str, ChannelQuality] = field(default_factory=dict)
     hammer: ChannelQuality | None = None
+    pairs: dict[tuple[str, str], HitLines] = field(default_factory=dict)
     first: HitSamples | None = None
 
     def sheet_of(self, hit: HitSamples) -> _Sheet:
@@ -215,9 +227,14 @@ class _Total:
 
 
 def _accumulate(
-    sheet: _Sheet, hit: HitSamples, settings: FrfSettings, shifts: Shifts | None, pool: ThreadPoolExecutor
+    sheet: _Sheet,
+    hit: HitSamples,
+    settings: FrfSettings,
+    shifts: Shifts | None,
+    pool: ThreadPoolExecutor,
+    pairs: dict[tuple[str, str], HitLines] | None,
 ) -> None:
-    """Add one hit to the sums; blocks of channels go to the threads."""
+    """Add one hit to the sums, and its FRFs at a few lines to `pairs`; blocks of channels go to the threads."""
     shift = None if shifts is None else shifts(hit)
     moved = shift is not None and bool(np.any(shift))
     windows = Windows(hit, settings, offsets=moved)
@@ -240,6 +257,12 @@ def _accumulate(
         if (signs[rows] < 0).any():
             product *= signs[rows, None]
         sheet.cross[rows] += product
+        if pairs is not None:
+            for point, cross in zip(sheet.outputs[rows], product, strict=True):
+                key = (point, sheet.impact)
+                if key not in pairs:
+                    pairs[key] = HitLines(strongest_lines(cross))
+                pairs[key].add(f"{hit.hit.file}#{hit.hit.number}", cross, power)
         parts = response.view(np.float64)
         np.multiply(parts, parts, out=parts)
         sheet.auto[rows] += parts[:, 0::2]

@@ -77,7 +77,7 @@ class FrfSet:
         variance_lines : ndarray of int, (n_outputs, n_inputs), or None
         Neighbouring lines over which the noise power of `variance` was averaged; None where each stands for itself.
     verdicts : tuple of CheckResult
-            Checks that need several hits or several points: coherence, driving point, reciprocity.
+            Checks that need several hits or several points: signs of hits, coherence, driving point, reciprocity.
     """
 
     frequency_hz: NDArray[np.float64]
