@@ -24,6 +24,7 @@ from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE, TestDescription
 from ema_pipeline.job import run_raw
 from ema_pipeline.names import check_name
+from ema_pipeline.number_text import format_percent
 from ema_pipeline.pipeline import ShowStage
 from ema_pipeline.run.measured import measured_frfs, measured_modes
 from ema_pipeline.run.opening import existing_run
@@ -243,7 +244,7 @@ def _check_one_state(modes: Sequence[CommonMode]) -> None:
     if worst.p < LEVEL:
         raise EmaError(
             f"'{worst.a}' and '{worst.b}' are not of one state: the mode at {worst.frequency_a:.5g} Hz of '{worst.a}' "
-            f"is at {worst.frequency_b:.5g} Hz in '{worst.b}' ({100 * worst.change:+.2g} ± {100 * worst.std:.2g} %); "
+            f"is at {worst.frequency_b:.5g} Hz in '{worst.b}' ({format_percent(worst.change, worst.std)}); "
             "merge tests between which nothing changed, or say with --tolerance how far set-ups may differ"
         )
 

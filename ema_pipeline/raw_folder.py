@@ -13,6 +13,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Hit
+from ema_pipeline.number_text import format_value
 from ema_pipeline.run.settings import PipelineSettings, load_pipeline, toml_value
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def _loop_lines(test: TestDescription, settings: PipelineSettings) -> Iterator[s
         yield (
             f"{loop.name}: {loop.cycles} cycles at {loop.frequency_hz:.4g} Hz, amplitude {loop.amplitude_m:.3g} m, "
             f"force up to {np.max(np.abs(loop.force)):.3g} N, "
-            f"{loop.energy_j:.3g} ± {loop.energy_std_j:.2g} J lost per cycle"
+            f"{format_value(loop.energy_j, loop.energy_std_j, 'J')} lost per cycle"
         )
 
 

@@ -6,8 +6,10 @@ import math
 
 from ema_pipeline.changes.modes import LEVEL, ModeChange
 from ema_pipeline.changes.two_tests import Changes
-from ema_pipeline.diagnose.sentences import label_text, probability_text
-from ema_pipeline.report.numbers import format_percent, format_value
+from ema_pipeline.diagnose.sentences import label_text, probability_text, size_text
+from ema_pipeline.diagnose.types import Diagnosis
+from ema_pipeline.number_text import format_percent, format_value
+from ema_pipeline.report.diagnosis_tables import detection_table
 from ema_pipeline.report.tables import Row, Table
 
 
@@ -45,14 +47,21 @@ def change_lines(found: Changes) -> list[str]:
     where = " in A, not in B" if found.physics.reverse else ""
     lines = []
     for c in found.physics.claimed:
-        sizes = ", ".join(
-            f"{name} {format_value(s.value, s.std, s.unit)}" for name, s in c.parameters.items()
-        )
+        sizes = size_text(c.parameters)
         same = f", the same as {', '.join(map(label_text, c.equivalents))}" if c.equivalents else ""
         lines.append(
             f"{label_text(c.label)}{where}, {sizes} (probability {probability_text(c.probability)}{same})"
         )
     return lines
+
+
+def limits_text(diagnosis: Diagnosis) -> str:
+    """The least sizes of effects that two tests would show."""
+    told = []
+    for effect, size, best, _ in (row.cells for row in detection_table(diagnosis).rows):
+        named = effect if effect.endswith(size) else f"{effect} {size}"  # a mass is not of a "mass mass"
+        told.append(f"{named} {'from ' if best[0].isdigit() else ''}{best}")  # or "up to …", "no size"
+    return f"These tests would show, nine times in ten: {'; '.join(told)}"
 
 
 def notes(found: Changes) -> list[str]:

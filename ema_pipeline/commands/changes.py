@@ -13,7 +13,6 @@ from ema_pipeline.commands.screen import progress, show, show_json
 if TYPE_CHECKING:
     from rich.table import Table as Screen
 
-    from ema_pipeline.diagnose.types import Diagnosis
     from ema_pipeline.observations.pair import RepeatSettings
     from ema_pipeline.report.tables import Table
 
@@ -47,7 +46,7 @@ def changes(
     modes are matched and compared one by one.
     """
     from ema_pipeline.changes.page import write_page
-    from ema_pipeline.changes.tables import notes, short_modes_table, verdict_text
+    from ema_pipeline.changes.tables import limits_text, notes, short_modes_table, verdict_text
     from ema_pipeline.changes.two_tests import changes_content, compare_runs, open_test, write_changes
 
     repeats = _repeats(repeat or [])
@@ -68,7 +67,7 @@ def changes(
     elif not quiet:
         show(verdict_text(found))
         if found.physics is not None and found.physics.diagnosis.detection_limits and found.verdict == "same":
-            show(_limits(found.physics.diagnosis))
+            show(limits_text(found.physics.diagnosis))
         show(_screen(short_modes_table(found)))
         for line in notes(found):
             show(line)
@@ -83,15 +82,6 @@ def _repeats(texts: list[str]) -> RepeatSettings:
     pairs = [text.partition("=") for text in texts]
     return parse(
         RepeatSettings, {name.strip(): toml_value(value.strip()) for name, _, value in pairs}, "--repeat"
-    )
-
-
-def _limits(diagnosis: Diagnosis) -> str:
-    from ema_pipeline.report.diagnosis_tables import detection_table
-
-    rows = detection_table(diagnosis).rows
-    return "These tests would show, nine times in ten: " + "; ".join(
-        f"{row.cells[0]} {row.cells[1]} from {row.cells[2]}" for row in rows
     )
 
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from ema_pipeline.diagnose.explained import Explanation, OutlyingDamping, OutlyingPart
 from ema_pipeline.diagnose.types import NOT_DETERMINED, EffectSize, VerdictWord
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
+from ema_pipeline.number_text import format_value
 
 _SHOWN = 3
 """Parts that a sentence names."""
@@ -37,14 +38,17 @@ def probability_text(p: float) -> str:
 
 
 def size_text(sizes: Mapping[str, EffectSize]) -> str:
-    """``fraction 0.350 ± 0.002, …``."""
-    return ", ".join(f"{n.rpartition('.')[2]} {_one_size(s)}" for n, s in sizes.items())
+    """``fraction 0.3500 ± 0.0020, …``."""
+    return ", ".join(f"{_own_name(n)} {value_text(s)}" for n, s in sizes.items())
 
 
-def _one_size(s: EffectSize) -> str:
-    if not s.determined:
-        return NOT_DETERMINED
-    return f"{s.value:.4g} ± {s.std:.2g}{'' if s.unit in ('', '1') else ' ' + s.unit}"
+def _own_name(name: str) -> str:
+    return name.rpartition(".")[2].replace("_", " ")
+
+
+def value_text(s: EffectSize) -> str:
+    """A size with its uncertainty and unit, or that the data do not determine it."""
+    return format_value(s.value, s.std, s.unit) if s.determined else NOT_DETERMINED
 
 
 def summary(

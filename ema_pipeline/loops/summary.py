@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from ema_pipeline.loops.types import Estimate, IsolatorResult
+from ema_pipeline.number_text import format_value, plain
 
 
 def terminal_lines(result: IsolatorResult) -> list[str]:
@@ -20,7 +21,7 @@ def terminal_lines(result: IsolatorResult) -> list[str]:
         verdict = "" if line.possible else "  cannot be"
         lines.append(
             f"energy over frequency at {1e3 * line.amplitude_m:.3g} mm: "
-            f"c = {c.value:.4g} ± {c.std:.2g} N·s/m{verdict}"
+            f"c = {format_value(c.value, c.std, 'N·s/m')}{verdict}"
         )
     lines.append(
         "loop, energy per cycle measured, by one set of parameters, by parameters of its own; loss factor:"
@@ -28,8 +29,8 @@ def terminal_lines(result: IsolatorResult) -> list[str]:
     each = zip(result.loops, result.fits, result.alone, result.loss, strict=True)
     for loop, fit, alone, loss in each:
         lines.append(
-            f"  {loop.name}: {loop.energy_j:.4g} ± {loop.energy_std_j:.2g} J, {fit.energy_j:.4g} J, "
-            f"{alone.energy_j:.4g} J; η = {loss.value:.3g} ± {loss.std:.2g}"
+            f"  {loop.name}: {format_value(loop.energy_j, loop.energy_std_j, 'J')}, {plain(fit.energy_j)} J, "
+            f"{plain(alone.energy_j)} J; η = {format_value(loss.value, loss.std)}"
         )
     lines += [f"! {flag}" for flag in result.flags]
     lines += [f"- {note}" for note in result.notes]
@@ -92,7 +93,7 @@ def _line(name: str, e: Estimate) -> str:
     words = name.replace("_", " ")
     if math.isnan(e.value):
         return f"{words}: {e.note}"
-    value = f"{words} = {e.value:.5g} ± {e.std:.2g} {e.unit if e.unit != '1' else ''}".rstrip()
+    value = f"{words} = {format_value(e.value, e.std, e.unit)}"
     return f"{value} ({e.note})" if e.note else value
 
 

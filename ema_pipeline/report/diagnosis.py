@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from ema_pipeline.diagnose.sentences import label_text, probability_text
+from ema_pipeline.diagnose.sentences import label_text, probability_text, value_text
 from ema_pipeline.diagnose.types import (
-    NOT_DETERMINED,
     OUT_OF_TOLERANCE,
     Candidate,
     DetectionLimit,
@@ -16,7 +15,7 @@ from ema_pipeline.diagnose.types import (
     Ladder,
 )
 from ema_pipeline.report.commands import command
-from ema_pipeline.report.numbers import format_value, plain, prefixed, words
+from ema_pipeline.report.numbers import plain, prefixed, words
 
 NOTHING = "nothing"
 _COUNTS = {2: "Two", 3: "Three", 4: "Four", 5: "Five", 6: "Six"}
@@ -80,10 +79,7 @@ def leading(found: Diagnosis) -> tuple[Candidate, ...]:
 
 def size_words(parameters: Mapping[str, EffectSize], between: str = "; ") -> str:
     """Sizes with their uncertainty, e.g. ``fraction 0.3500 ± 0.0020``."""
-    return between.join(
-        f"{words(n)} {format_value(s.value, s.std, s.unit) if s.determined else NOT_DETERMINED}"
-        for n, s in parameters.items()
-    )
+    return between.join(f"{words(n)} {value_text(s)}" for n, s in parameters.items())
 
 
 def standing(found: Diagnosis, candidate: Candidate) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,8 @@ def test_an_unchanged_rig_is_the_same_with_limits(
     assert 0 < limits["mass@m2"] < 0.03
     assert "The same within what these tests can show" in said
     assert "These tests would show, nine times in ten: " in said
+    assert re.search(r"[ ;]mass from 0\.\d+ kg", " ".join(said.split()))
+    assert "mass mass" not in " ".join(said.split())
 
 
 def test_derivatives_of_the_pair_are_exact(root: Path) -> None:

@@ -32,6 +32,7 @@ from ema_pipeline.effects.library import parse_effect, shipped_effects
 from ema_pipeline.inference import Posterior, Residuals, Unknowns
 from ema_pipeline.inference.posterior import error_limit
 from ema_pipeline.mechanics.assembly import Damper, Element, Mass, Spring
+from ema_pipeline.number_text import format_value
 from ema_pipeline.observations.fitting import Fit, Model, at_scatters, fit_base, learned
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
@@ -516,6 +517,6 @@ def test_what_is_far_too_small_to_be_seen_is_not_claimed(
     found, told = diagnosis._selected(nothing, nothing, [one, other], nothing, nothing)
     assert asked == [["spring@m1", "spring@m2"], *([["spring@m2"]] if dropped else [])]
     assert bool(found.claimed) is not dropped
-    rate = ", rate 1 ± 0.1 m/s" if two_sizes else ""
-    text = f"Not claimed: spring at m1, stiffness {size:.4g} ± 0.1 N/m{rate}. "
+    rate = ", rate 1.00 ± 0.10 m/s" if two_sizes else ""
+    text = f"Not claimed: spring at m1, stiffness {format_value(size, 0.1, 'N/m')}{rate}. "
     assert told == ([f"{text}Of such a size these data would show nothing."] if dropped else [])

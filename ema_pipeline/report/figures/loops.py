@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ema_pipeline.loops.types import IsolatorResult, Loop, LoopFit, LoopModel
+from ema_pipeline.number_text import format_value
 from ema_pipeline.report.style import (
     GREY,
     LINES,
@@ -141,7 +142,7 @@ def energy_figure(result: IsolatorResult) -> Figure:
     ax.set_ylabel("energy per cycle, J")
     for i, line in enumerate(result.energy):
         c = line.damping
-        text = f"{1e3 * line.amplitude_m:.3g} mm: c = {c.value:.3g} ± {c.std:.2g} N·s/m"
+        text = f"{1e3 * line.amplitude_m:.3g} mm: c = {format_value(c.value, c.std, 'N·s/m')}"
         if not line.possible:
             text += ", cannot be"
         colour = SERIES[i % len(SERIES)]
