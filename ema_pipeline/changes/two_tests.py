@@ -103,16 +103,22 @@ def open_test(
 
 
 def compare_runs(
-    a: Run, b: Run, progress: Progress = lambda share, text: None, repeat: RepeatSettings | None = None
+    a: Run,
+    b: Run,
+    progress: Progress = lambda share, text: None,
+    repeat: RepeatSettings | None = None,
+    by_rig: bool = True,
 ) -> Changes:
-    """What changed from one run to another; physically where both have a rig."""
+    """What changed from one run to another; physically where both have a rig that is to be used."""
     of_a, of_b = measured_modes(a), measured_modes(b)
     if not any(c in of_b for c in of_a):
         raise EmaError(
             f"{a.store.folder} and {b.store.folder}: no configuration in common ({', '.join(of_a)}; "
             f"{', '.join(of_b)}); compare tests of the same configurations"
         )
-    physics = physical_change(a, b, progress, repeat) if a.rig is not None and b.rig is not None else None
+    physics = None
+    if by_rig and a.rig is not None and b.rig is not None:
+        physics = physical_change(a, b, progress, repeat)
     return Changes(a.info.raw, b.info.raw, mode_changes(of_a, of_b), physics)
 
 

@@ -16,6 +16,17 @@ if TYPE_CHECKING:
     from ema_pipeline.observations.pair import RepeatSettings
     from ema_pipeline.report.tables import Table
 
+NO_RIG = "none"
+
+RigOrNone = Annotated[
+    str | None,
+    typer.Option(
+        "--rig",
+        "-r",
+        metavar="RIG",
+        help="Name of a rig, or a rig file (.toml); the tests' own if left out; 'none' compares mode by mode.",
+    ),
+]
 TestA = Annotated[Path, typer.Argument(metavar="A", help="Results folder or raw folder.")]
 TestB = Annotated[Path, typer.Argument(metavar="B", help="Results folder or raw folder.")]
 
@@ -23,7 +34,7 @@ TestB = Annotated[Path, typer.Argument(metavar="B", help="Results folder or raw 
 def changes(
     a: TestA,
     b: TestB,
-    rig: RigOption = None,
+    rig: RigOrNone = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for the answer; results/changes_A_B if left out."),
@@ -42,23 +53,24 @@ def changes(
 ) -> None:
     """Say what changed from test A to test B: effect, place, size, or 'the same within what these tests can show'.
 
-    With a rig both tests are fitted as one problem, in which parts, sensors and calibration are the same. Without one
-    modes are matched and compared one by one.
+    With a rig, by --rig or of the tests themselves, both are fitted as one problem, in which parts, sensors and
+    calibration are the same. Without one modes are matched and compared one by one.
     """
     from ema_pipeline.changes.page import write_page
     from ema_pipeline.changes.tables import limits_text, notes, short_modes_table, verdict_text
     from ema_pipeline.changes.two_tests import changes_content, compare_runs, open_test, write_changes
 
-    repeats = _repeats(repeat or [])
+    repeats, by_rig = _repeats(repeat or []), rig != NO_RIG
+    rig = rig if by_rig else None
     folder = out or Path("results") / f"changes_{a.resolve().name}_{b.resolve().name}"
     with progress(quiet) as show_stage:
         run_a = open_test(a, rig, folder / "A", show_stage, effect_file or [])
         run_b = open_test(b, rig, folder / "B", show_stage, effect_file or [])
         if show_stage is None:
-            found = compare_runs(run_a, run_b, repeat=repeats)
+            found = compare_runs(run_a, run_b, repeat=repeats, by_rig=by_rig)
         else:
             with show_stage("changes") as report_progress:
-                found = compare_runs(run_a, run_b, report_progress, repeats)
+                found = compare_runs(run_a, run_b, report_progress, repeats, by_rig)
     folder.mkdir(parents=True, exist_ok=True)
     written = write_changes(found, folder)
     page = write_page(found, run_a, run_b, folder)

@@ -101,6 +101,15 @@ def test_an_unchanged_rig_is_the_same_with_limits(
     assert "mass mass" not in " ".join(said.split())
 
 
+def test_the_rig_of_the_tests_is_left_out_on_request(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Both results have a rig; with none, modes are compared one by one."""
+    before, after = _results(root, "before"), _results(root, "after")
+    found = _told(capsys, before, after, "--rig", "none", "--out", root / "by_modes")
+    assert found["verdict"] == "changed"
+    assert found["changes"] == []
+    assert "diagnosis" not in found
+
+
 def test_derivatives_of_the_pair_are_exact(root: Path) -> None:
     """By all unknowns, against differences; the sum of the log scale is that of the joint covariance."""
     from ema_pipeline.effects.library import parse_effect
