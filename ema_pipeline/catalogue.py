@@ -11,6 +11,7 @@ from pydantic.fields import FieldInfo
 from ema_pipeline.describe import checked_rig
 from ema_pipeline.rigs import model_modes
 from ema_pipeline.run.settings import PipelineSettings
+from ema_pipeline.simulate.settings import SimulationSettings
 
 
 def list_model_modes(rig: str, configuration: str | None) -> dict[str, list[dict[str, Any]]]:
@@ -54,6 +55,11 @@ def list_effects(rig: str, effect_files: Iterable[str] = ()) -> list[dict[str, A
 def list_settings(prefix: str = "") -> list[dict[str, Any]]:
     """Every setting of a pipeline whose dotted name starts with `prefix`: name, default, what it may be, why."""
     return [s for s in _settings(PipelineSettings, "") if s["name"].startswith(prefix)]
+
+
+def list_simulation_settings() -> list[dict[str, Any]]:
+    """Every setting of a simulated test, in the same way."""
+    return list(_settings(SimulationSettings, ""))
 
 
 def _settings(model: type[BaseModel], above: str) -> Iterator[dict[str, Any]]:

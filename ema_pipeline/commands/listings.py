@@ -9,7 +9,10 @@ from typing import Annotated
 import typer
 
 from ema_pipeline.commands.options import EffectFiles, Json, RigOption
-from ema_pipeline.commands.screen import show, show_json
+from ema_pipeline.commands.screen import program, show, show_json
+
+_SIMULATE = "simulate"
+"""Names the settings of ``ema simulate``, which are no pipeline's."""
 
 
 def rigs(json: Json = False) -> None:
@@ -37,17 +40,21 @@ def effects(rig: RigOption = None, effect_file: EffectFiles = None, json: Json =
 
 def settings(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="Only settings whose name starts so, e.g. 'frf'.")
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="Only settings whose name starts so, e.g. 'frf'; 'simulate': those of 'ema simulate'.",
+        ),
     ] = "",
     json: Json = False,
 ) -> None:
-    """List every setting of a pipeline: name, default, what it may be, and why."""
-    from ema_pipeline.catalogue import list_settings
+    """List every setting of a pipeline, or of a simulated test: name, default, what it may be, and why."""
+    from ema_pipeline.catalogue import list_settings, list_simulation_settings
     from ema_pipeline.errors import EmaError, did_you_mean
 
-    listed = list_settings(name)
+    listed = list_simulation_settings() if name == _SIMULATE else list_settings(name)
     if not listed:
-        known = {s["name"].partition(".")[0] for s in list_settings()}
+        known = {_SIMULATE, *(s["name"].partition(".")[0] for s in list_settings())}
         raise EmaError(f"no setting starts with '{name}'{did_you_mean(name, known)}")
     if json:
         show_json({"settings": listed})
@@ -55,6 +62,8 @@ def settings(
     from ema_pipeline.report.listings import settings_list
 
     show(settings_list(listed))
+    if not name:
+        show(f"Settings of simulated tests: {program()} settings {_SIMULATE}")
 
 
 def model(

@@ -63,7 +63,11 @@ def simulate(
     impact: Annotated[list[str] | None, typer.Option("--impact", help="DOF that is struck.")] = None,
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Setting of the test, e.g. sample_rate_hz=25600."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Setting of the test, e.g. sample_rate_hz=25600; all: ema settings simulate.",
+        ),
     ] = None,
     format_: Annotated[str, typer.Option("--format", help="uff, csv, hdf5, mat, wav or tdms.")] = "uff",
     seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,

@@ -618,6 +618,18 @@ def test_every_setting_is_listed_with_its_default_its_values_and_why(
     assert "did you mean 'modal'" in err
 
 
+def test_settings_of_a_simulated_test_are_listed_as_simulate_takes_them(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    code, out, _ = ema(capsys, "settings", "simulate", "--json")
+    listed = {s["name"]: s for s in json.loads(out)["settings"]}
+    assert code == 0
+    assert {"hits", "contact_s", "part_scatter", "rig_seed"} <= listed.keys()
+    assert listed["hits"]["default"] == 2
+    assert [name for name, s in listed.items() if not s["description"]] == []
+    assert "ema settings simulate" in " ".join(ema(capsys, "settings")[1].split())
+
+
 def test_check_fits_80_columns_with_units_and_clauses_and_fails_where_a_point_has_no_good_hit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
