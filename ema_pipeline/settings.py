@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
@@ -67,6 +68,7 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
             raise EmaError(f"{where}: key '{path}' is missing; add it") from None
         message = first["msg"].removeprefix("Value error, ")
         message = message.replace("valid tuple", "list in [ ]").replace("Tuple", "List")
+        message = re.sub(r"a valid dictionary( or instance of \w+)?", "a table of keys and values", message)
         shown = _shown(first.get("input"))
         raise EmaError(f"{where}: {path or 'file'} = {shown}: {message}") from None
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 
-from ema_pipeline.rigs.entries import Number, NumberOrName, ParameterEntry
+from ema_pipeline.rigs.entries import Number, NumberOrName, ParameterOrNumber
 from ema_pipeline.rigs.types import MODAL_DAMPING_SCATTER
 from ema_pipeline.settings import Settings
 from ema_pipeline.toml_lines import Location
@@ -137,7 +137,7 @@ class ElementRigFile(Settings):
     modal_damping_scatter: float = Field(
         MODAL_DAMPING_SCATTER, ge=0, le=3, description="1 sigma of ln(damping ratio) from mode to mode"
     )
-    parameters: dict[str, ParameterEntry] = Field({}, description="values with unit and tolerance")
+    parameters: dict[str, ParameterOrNumber] = Field({}, description="values, with unit and tolerance")
     masses: tuple[ElementEntry, ...] = Field(min_length=1, description="masses, kg")
     springs: tuple[SpringEntry, ...] = Field((), description="springs, N/m")
     dampers: tuple[ElementEntry, ...] = Field((), description="viscous dampers, N·s/m")

@@ -59,6 +59,18 @@ class ParameterEntry(Settings):
     free: bool | None = Field(None, description="true where the data alone must determine the parameter")
 
 
+def _number_is_a_value(given: object) -> object:
+    """``sun_mass = 2.0`` is short for ``sun_mass = { value = 2.0 }``."""
+    if isinstance(given, dict | ParameterEntry):
+        return given
+    if isinstance(given, bool) or not isinstance(given, int | float):
+        raise ValueError("give a number, or a table such as { value = 2.0, unit = 'kg', tolerance = 0.1 }")
+    return {"value": given}
+
+
+ParameterOrNumber = Annotated[ParameterEntry, BeforeValidator(_number_is_a_value)]
+
+
 def parsed(model: type[M], data: dict[str, Any]) -> M:
     """A rig file's content as `model`.
 

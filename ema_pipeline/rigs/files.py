@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.rigs.base import RigKind
 from ema_pipeline.rigs.element_entries import ElementRigFile
 from ema_pipeline.rigs.elements import rig_from_elements
-from ema_pipeline.rigs.entries import Mistake, ParameterEntry, merged, parsed
+from ema_pipeline.rigs.entries import Mistake, ParameterOrNumber, merged, parsed
 from ema_pipeline.rigs.types import Parameter, Rig
 from ema_pipeline.settings import Settings
 from ema_pipeline.toml_lines import key_lines, line_of
@@ -29,18 +29,10 @@ class DerivedRigFile(Settings):
         None, min_length=1, description="name of this rig; that of its base where left out"
     )
     geometry: dict[str, int] = Field({}, description="counts, e.g. planets = 3")
-    parameters: dict[str, ParameterEntry] = Field({}, description="values that differ from the base")
+    parameters: dict[str, ParameterOrNumber] = Field({}, description="values that differ from the base")
     modal_damping_scatter: float | None = Field(
         None, ge=0, le=3, description="1 sigma of ln(damping ratio) from mode to mode"
     )
-
-    @field_validator("parameters", mode="before")
-    @classmethod
-    def _number_is_a_value(cls, given: object) -> object:
-        """``sun_mass = 2.0`` is short for ``sun_mass = { value = 2.0 }``."""
-        if not isinstance(given, dict):
-            return given
-        return {k: v if isinstance(v, dict) else {"value": v} for k, v in given.items()}
 
 
 def read_rig_file(path: Path, kinds: Mapping[str, RigKind]) -> Rig:

@@ -167,6 +167,8 @@ def test_without_axes_a_plot_makes_a_figure_of_its_own(lines: SimpleNamespace) -
 def test_a_rig_built_in_python_is_fitted_like_one_from_a_file(lines: SimpleNamespace) -> None:
     stiffness = {"value": 2e5, "unit": "N/m", "tolerance": 0.10}
     mass = {"value": 5.0, "unit": "kg", "tolerance": 0.01}
+    plain = ema.Rig.of_elements("r", parameters={"m": 5.0}, masses=[{"at": "a.x", "value": "m"}])
+    assert plain.parameters["m"].value == 5.0
     built = ema.Rig.of_elements(
         "my frame",
         parameters={**{f"k{n}": stiffness for n in (1, 2, 3)}, **{f"m{n}": mass for n in (1, 2, 3)}},
@@ -197,6 +199,7 @@ def test_a_rig_built_in_python_is_fitted_like_one_from_a_file(lines: SimpleNames
         (lambda x: x.test.frfs({"frf.estimater": "H2"}), "did you mean 'frf.estimator'|estimator"),
         (lambda x: ema.run(x.raw, rig=x.rig), "rig file"),
         (lambda x: ema.Rig.of_elements("r", masses=[{"at": "a.x", "valu": 1.0}]), "valu"),
+        (lambda x: ema.Rig.of_elements("r", parameters={"m": "2 kg"}, masses=[]), "give a number, or a table such as"),
         (lambda x: ema.open(x.raw), "holds no ema.h5"),
     ],
 )  # fmt: skip

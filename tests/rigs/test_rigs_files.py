@@ -121,6 +121,15 @@ def test_rig_from_scratch_is_made_of_elements(tmp_path: Path) -> None:
     np.testing.assert_allclose(soft, rig.system("free").stiffness / 2)
 
 
+def test_a_parameter_of_a_rig_from_scratch_may_be_a_bare_number(tmp_path: Path) -> None:
+    stated = load_rig(write(tmp_path, ELEMENTS.replace(', unit = "N/m", tolerance = 0.1', "")))
+    bare = load_rig(
+        write(tmp_path, ELEMENTS.replace('{ value = 1e5, unit = "N/m", tolerance = 0.1 }', "1e5"))
+    )
+    assert bare.parameters == stated.parameters
+    assert bare.parameters["link"].value == 1e5
+
+
 def test_a_body_that_moves_in_two_directions_has_one_mass_that_deviates_as_one(tmp_path: Path) -> None:
     more = """
 [[masses]]
@@ -269,7 +278,12 @@ MISTAKES = [
     ("min = 1e6, max = 1e9", "min = 1e9, max = 1e6", 7, "has min 1e+09 N/m above max 1e+06 N/m"),
     ("free = true", 'free = "yes"', 7, "sun_planet_mesh_stiffness.free = 'yes'"),
     ("planet2_mass", "planet9_mass", 8, "'parameters.planet9_mass'"),
-    ("sun_mass = 2.2", 'sun_mass = "2.2"', 9, "parameters.sun_mass.value = '2.2'"),
+    (
+        "sun_mass = 2.2",
+        'sun_mass = "2.2"',
+        9,
+        "parameters.sun_mass = '2.2': give a number, or a table such as { value = 2.0",
+    ),
     ("sun_mass = 2.2", "sun_mass = 0", 9, "'sun_mass' = 0 kg: give a mass above 0"),
     ("sun_mass = 2.2", "carrier_mass = 2.2", 9, "not valid TOML: Cannot overwrite a value in 'carrier_mass"),
     ("sun_mass = 2.2", "modal_damping_ratio = 1.5", 9, "'modal_damping_ratio' = 1.5 lies outside"),
@@ -320,6 +334,18 @@ ELEMENT_MISTAKES = [
     ("value = 1e5", "value = 1e300", 4, "parameters.link.value = 1e+300: give 0"),
     ('"top.x" = 1.0', '"top.x" = 1e300', 20, "dampers.0.row.top.x = 1e+300: give 0"),
     ("[parameters]", "modal_damping_scatter = true\n[parameters]", 3, "modal_damping_scatter = true"),
+    (
+        '{ value = 1e5, unit = "N/m", tolerance = 0.1 }',
+        "[1e5]",
+        4,
+        "parameters.link = [100000.0]: give a number, or",
+    ),
+    (
+        "[parameters]\nlink",
+        "parameters = 3\n#",
+        3,
+        "parameters = 3: Input should be a table of keys and values",
+    ),
     ("[parameters]", '[parameters]\n"" = { value = 1.0 }', 4, "parameter '' has no name; give it one"),
 ]
 
