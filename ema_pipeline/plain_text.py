@@ -23,6 +23,19 @@ def printable(text: str) -> str:
     return _SUSPECT.sub(_escaped, text)
 
 
+_KIND = re.compile(r"(?P<name>.*\b(?P<kind>mass|spring|damper)\b.*) \((?P=kind)\)")
+
+
+def part_words(name: str) -> str:
+    """A part's name for reading, with its kind only where the name does not say it.
+
+    >>> part_words("b3 mass (mass)"), part_words("link (spring)")
+    ('b3 mass', 'link (spring)')
+    """
+    found = _KIND.fullmatch(name)
+    return found["name"] if found else name
+
+
 def has_control_characters(text: str) -> bool:
     """True for text with characters that show nothing, among them line breaks and tabs."""
     return printable(text) != text or any(c in text for c in "\t\n")

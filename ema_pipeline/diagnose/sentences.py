@@ -9,6 +9,7 @@ from ema_pipeline.diagnose.explained import Explanation, OutlyingDamping, Outlyi
 from ema_pipeline.diagnose.types import NOT_DETERMINED, EffectSize, VerdictWord
 from ema_pipeline.effects.out_of_tolerance import ID as OUT_OF_TOLERANCE
 from ema_pipeline.number_text import format_value
+from ema_pipeline.plain_text import part_words
 
 _SHOWN = 3
 """Parts that a sentence names."""
@@ -43,7 +44,7 @@ def size_text(sizes: Mapping[str, EffectSize]) -> str:
 
 
 def _own_name(name: str) -> str:
-    return name.rpartition(".")[2].replace("_", " ")
+    return part_words(name.rpartition(".")[2]).replace("_", " ")
 
 
 def value_text(s: EffectSize) -> str:
@@ -149,7 +150,7 @@ def standing_out(parts: Sequence[OutlyingPart]) -> str:
     """Parts that deviate more than similar ones scatter; empty without any."""
     if not parts:
         return ""
-    named = ", ".join(f"{p.name} {100 * p.deviation:+.0f} %" for p in parts[:_SHOWN])
+    named = ", ".join(f"{part_words(p.name)} {100 * p.deviation:+.0f} %" for p in parts[:_SHOWN])
     scatter = 100 * max(p.others for p in parts[:_SHOWN])
     return (
         f"To follow the data the model must let parts deviate further than similar ones, which scatter by "

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from ema_pipeline.number_text import below, format_percent, format_value, plain, prefixed, signed
+from ema_pipeline.plain_text import part_words
 
 __all__ = ["below", "format_percent", "format_value", "plain", "prefixed", "signed", "slug", "words"]
 
 
 def words(name: str) -> str:
     """Names for reading: ``sun_planet_mesh_stiffness`` → ``sun planet mesh stiffness``."""
-    return name.replace("_", " ")
+    return part_words(name).replace("_", " ")
 
 
 def slug(text: str) -> str:

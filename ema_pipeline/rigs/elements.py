@@ -68,7 +68,7 @@ def rig_from_elements(file: ElementRigFile) -> Rig:
         name=file.name,
         configurations=file.configurations,
         parameters=parameters,
-        build=partial(_build, file),
+        build=partial(_build, file, _names(file)),
         uses=partial(_uses, file),
         modal_damping_scatter=file.modal_damping_scatter,
     )
@@ -220,18 +220,66 @@ def _uses(file: ElementRigFile, configuration: str, name: str) -> bool:
     )
 
 
-def _build(file: ElementRigFile, configuration: str, values: Mapping[str, float]) -> Assembly:
+_WORDS = {"masses": "mass", "springs": "spring", "dampers": "damper"}
+_MOST_ENDS = 3
+"""DOFs of a row that a name can hold."""
+
+
+def _names(file: ElementRigFile) -> dict[Location, str]:
+    """Names of all elements: their own, or their places; a number where two of one configuration would share one."""
+    directions: dict[str, set[str]] = {}
+    for entry in file.masses:
+        body, _, direction = (entry.at or "").rpartition(".")
+        directions.setdefault(body, set()).add(direction)
+    names = {where: entry.name for where, entry in file.entries() if entry.name}
+    taken = [(entry.name, entry) for _, entry in file.entries() if entry.name]
+    for where, entry in file.entries():
+        if entry.name:
+            continue
+        place, number = _place_name(where, entry, directions), 1
+        name = place
+        while any(name == other and _together(file, entry, e) for other, e in taken):
+            number += 1
+            name = f"{place} {number}"
+        names[where] = name
+        taken.append((name, entry))
+    return names
+
+
+def _together(file: ElementRigFile, a: ElementEntry, b: ElementEntry) -> bool:
+    """True where two elements are there in the same configuration."""
+    return any(file.present(a, c) and file.present(b, c) for c in file.configurations)
+
+
+def _place_name(where: Location, entry: ElementEntry, directions: Mapping[str, set[str]]) -> str:
+    """``b3 mass`` of a body that moves in one direction; else ``b3 mass x``, ``slab-b1 spring x``."""
+    section, index = str(where[0]), int(where[1])
+    ends = [entry.at] if entry.at else list(entry.between or entry.row or ())
+    if section not in _WORDS or len(ends) > _MOST_ENDS:
+        return f"{_WORDS.get(section, section)} {index + 1}"
+    word = _WORDS[section]
+    places = [end.rpartition(".") for end in ends]
+    along = {direction for _, _, direction in places}
+    if len(along) > 1:
+        return f"{'-'.join(end.replace('.', ' ') for end in ends)} {word}"
+    place = "-".join(body for body, _, _ in places)
+    name = word if place == word else f"{place} {word}"
+    (direction,) = along
+    only = section == "masses" and direction in ALONG and len(directions.get(place, ())) == 1
+    return name if only else f"{name} {direction}"
+
+
+def _build(
+    file: ElementRigFile, names: Mapping[Location, str], configuration: str, values: Mapping[str, float]
+) -> Assembly:
     sensors = _sensors(file)
     elements: list[Element] = []
-    numbers: Counter[str] = Counter()
     dofs: dict[str, None] = {}
     bodies = _bodies(file, configuration)
     for where, entry in file.entries():
         if not file.present(entry, configuration):
             continue
-        section = str(where[0])
-        numbers[section] += 1
-        element = _element(section, numbers[section], entry, _row(entry, sensors, where), values, sensors)
+        element = _element(str(where[0]), names[where], entry, _row(entry, sensors, where), values, sensors)
         if isinstance(element, Mass) and (body := _body(entry)) and bodies[body] > 1:
             element = replace(element, part=f"{body[0]} mass")
         elements.append(element)
@@ -257,15 +305,13 @@ def _bodies(file: ElementRigFile, configuration: str) -> Counter[_Body | None]:
 
 def _element(
     section: str,
-    number: int,
+    name: str,
     entry: ElementEntry,
     row: Row,
     values: Mapping[str, float],
     sensors: Mapping[str, Row],
 ) -> Element:
     v = {key: values[x] if isinstance(x, str) else x for key, x in entry.numbers.items()}
-    words = {"masses": "mass", "springs": "spring", "dampers": "damper"}
-    name = entry.name or f"{words.get(section, section)} {number}"
     if section == "masses":
         return Mass(name, row, v["value"])
     if section == "springs":

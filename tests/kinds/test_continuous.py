@@ -44,7 +44,7 @@ def test_a_hidden_cubic_spring_is_named_with_its_size(tmp_path: Path) -> None:
     assert (two["use"], two["unit"], two["samples"]) == ("held_out", "m", 1024 - 50)
     assert two["relative"] < 0.008
     assert two["rmse"] < 0.2 * two["rmse_without_effects"]
-    mass = found["ladder"][-1]["parameters"]["mass 1 (mass)"]
+    mass = found["ladder"][-1]["parameters"]["mass (mass)"]
     assert mass["unit"] == "kg"
     assert abs(mass["value"] - 2.0) < 3 * mass["std"]
 

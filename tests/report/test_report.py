@@ -21,7 +21,7 @@ from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.report import plots as report_plots
 from ema_pipeline.report import style, summary, tables, terminal
 from ema_pipeline.report.html import bokeh_script, report_html, write_report
-from ema_pipeline.report.numbers import format_percent, format_value, signed
+from ema_pipeline.report.numbers import format_percent, format_value, signed, words
 from ema_pipeline.report.plots import figure_specs, write_plots
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.run_screen import RunScreen
@@ -82,6 +82,12 @@ def test_values_are_rounded_to_two_figures_of_their_uncertainty(
     value: float, std: float, unit: str, expected: str
 ) -> None:
     assert format_value(value, std, unit) == expected
+
+
+def test_a_part_is_called_what_it_is_once() -> None:
+    assert words("b3 mass (mass)") == "b3 mass"
+    assert words("base mass x (mass)") == "base mass x"
+    assert words("sun_bearing x (spring)") == "sun bearing x (spring)"
 
 
 def test_percentages_and_signs_read_as_people_write_them() -> None:

@@ -148,7 +148,59 @@ value = 1e5
     rig = load_rig(write(tmp_path, ELEMENTS + more))
     masses = [e for e in rig.assembly("free").elements if isinstance(e, Mass)]
     assert [m.part for m in masses] == ["top mass", "", "top mass", "", ""]
-    assert {"top mass (mass)", "mass 2 (mass)", "mass 4 (mass)"} <= set(dependence(rig).unknowns.names)
+    assert {"top mass (mass)", "base mass x (mass)", "base mass y (mass)"} <= set(
+        dependence(rig).unknowns.names
+    )
+
+
+def test_elements_without_a_name_are_named_by_their_place(tmp_path: Path) -> None:
+    text = """
+configurations = ["soft", "hard"]
+[[masses]]
+at = "b1.x"
+value = 1.0
+[[masses]]
+at = "b2.x"
+value = 2.0
+[[masses]]
+name = "block"
+at = "b2.y"
+value = 2.5
+[[masses]]
+row = { "b1.x" = 1.0, "b2.x" = -1.0 }
+value = 0.1
+[[springs]]
+at = "b1.x"
+value = 1e5
+configurations = ["soft"]
+[[springs]]
+at = "b1.x"
+value = 1e6
+configurations = ["hard"]
+[[springs]]
+between = ["b1.x", "b2.x"]
+value = 1e5
+[[springs]]
+between = ["b1.x", "b2.x"]
+value = 1e4
+[[springs]]
+name = "b2 spring y"
+at = "b2.y"
+value = 1e5
+[[springs]]
+at = "b2.y"
+value = 1e4
+[[dampers]]
+row = { "b1.x" = 1.0, "b2.y" = -1.0 }
+value = 5.0
+"""
+    rig = load_rig(write(tmp_path, text))
+    expected = [
+        "b1 mass", "b2 mass x", "block", "b1-b2 mass x", "b1 spring x", "b1-b2 spring x", "b1-b2 spring x 2",
+        "b2 spring y", "b2 spring y 2", "b1 x-b2 y damper",
+    ]  # fmt: skip
+    for configuration in rig.configurations:
+        assert [e.name for e in rig.assembly(configuration).elements] == expected
 
 
 def test_a_row_may_name_its_dofs_with_or_without_quotes(tmp_path: Path) -> None:

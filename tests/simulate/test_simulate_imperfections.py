@@ -374,7 +374,7 @@ def test_every_rig_can_be_imperfect(tmp_path: Path, rig: str | int, effect: str 
     first = next(iter(truth["configurations"].values()))["records"][0]
     assert len(first["aim_deg"]) == len(first["frequency_factor"]) == 2
     if rig == str(tmp_path / "own.toml"):
-        assert {"a mass", "b mass", "spring 3"} <= set(drawn["parts"])
+        assert {"a mass", "b mass", "a-b spring x"} <= set(drawn["parts"])
 
 
 def test_each_imperfection_leaves_the_others_and_the_noise_as_they_are(tmp_path: Path) -> None:
