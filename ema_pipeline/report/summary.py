@@ -19,6 +19,8 @@ __all__ = ["cautions", "fails", "findings", "identified_words", "stiffnesses"]
 
 TOLD = 6
 """Narrowed parameters that are named."""
+_SAME_ERROR = 1.01
+"""The ladder's error over the fit's up to which both are the same, but for where their searches end."""
 
 
 def findings(results: RunResults) -> tuple[str, ...]:
@@ -45,6 +47,7 @@ def findings(results: RunResults) -> tuple[str, ...]:
             f"The fit uses {fit.data_count} data; its error is {plain(fit.error, 3)}, "
             f"the error function ε is {plain(fit.frequency_error, 3)}."
         )
+        lines += _other_error(results, fit)
         lines += _narrowed(fit)
     if compared is not None and math.isfinite(compared.error):
         size = plain(compared.error, 3)
@@ -80,6 +83,22 @@ def changed_words(results: RunResults) -> str:
     before = " and ".join(diagnosis.label_words(x) for x in results.diagnosed_on)
     of = f"the model with {before}" if before else "the base model"
     return f"{now}; the diagnosis is of {of}: 'ema diagnose' repeats it."
+
+
+def _other_error(results: RunResults, fit: FitResult) -> list[str]:
+    """Why the ladder states another error than the fit for the same model; nothing where it does not."""
+    ladder = results.shown_ladder
+    rung = next((r for r in ladder.rungs if r.effects == results.added), None) if ladder else None
+    if ladder is None or rung is None or not diagnosis.of_modes(ladder):
+        return []
+    if not rung.error > _SAME_ERROR * fit.error:
+        return []
+    of_hits = any(c.levels is not None and c.levels.hit_modes is not None for c in results.configurations)
+    hits = ", and single hits count, too" if of_hits else ""
+    return [
+        f"Diagnosis and ladder state an error of {plain(rung.error, 3)} for this model: in them no part deviates "
+        f"further than similar ones scatter{hits}."
+    ]
 
 
 def stiffnesses(fit: FitResult) -> tuple[ParameterEstimate, ...]:

@@ -307,6 +307,15 @@ def test_size_of_a_parameter_out_of_tolerance_is_found_under_the_parameters_name
     assert cells[1] == "sun bearing stiffness 2.00 ± 0.10 MN/m"
 
 
+def test_another_error_of_the_ladder_for_the_fitted_model_is_explained(run: RunResults) -> None:
+    assert run.fit is not None
+    for error, told in ((3.1, False), (2.0, True)):
+        lines = summary.findings(replace(run, fit=replace(run.fit, error=error)))
+        mine = [line for line in lines if "state an error of 3.10 for this model" in line]
+        assert len(mine) == told
+        assert not any("single hits" in line for line in mine)
+
+
 def test_findings_begin_with_the_diagnosis(run: RunResults) -> None:
     first = summary.findings(run)[0]
     assert first.startswith("Diagnosis: missing: mesh stiffness loss at sun-planet1, fraction 0.340 ± 0.010")
