@@ -32,6 +32,7 @@ _ERROR_WORDS = (
     "error: root mean square of (measurement - model)/σ, about 1 where the model explains the data; "
     "held out: the same on data that the fit has not seen"
 )
+_EPSILON_WORDS = "ε: the error function of the source papers, sum of ((measured − model)/model frequency)² over the paired modes"
 _ASCII = str.maketrans(
     {
         "±": "+/-",
@@ -154,6 +155,7 @@ def comparison_tables(compared: Comparison) -> RenderableType:
             f"Model against measurement: {plain(compared.error, 3)} σ root mean square, "
             f"ε {plain(compared.frequency_error, 3)}"
         ),
+        _line(_EPSILON_WORDS),
         text_table(
             _renamed(tables.differences_table(compared).picked(columns), heads),
             "Per mode, (measured − model)/σ",
@@ -173,6 +175,7 @@ def fit_table(fit: FitResult) -> RenderableType:
     return Group(
         text_table(source, "Parameters; shift: in tolerances"),
         _line(f"error {plain(fit.error, 3)} over {fit.data_count} data, ε {plain(fit.frequency_error, 3)}"),
+        _line(_EPSILON_WORDS),
     )
 
 

@@ -439,6 +439,14 @@ def _printed(renderable: object, width: int, encoding: str = "utf-8") -> str:
     return file.buffer.getvalue().decode(encoding)
 
 
+def test_fit_and_comparison_say_what_epsilon_is(run: RunResults) -> None:
+    assert run.fit is not None
+    assert run.comparison is not None
+    for table in (terminal.fit_table(run.fit), terminal.comparison_tables(run.comparison)):
+        told = " ".join(_printed(table, 80).split())
+        assert told.count("ε: the error function of the source papers, sum of ((measured − model)") == 1
+
+
 def _tables(run: RunResults) -> list[object]:
     c = run.configurations[0]
     assert c.modal is not None
