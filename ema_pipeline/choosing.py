@@ -15,7 +15,7 @@ from ema_pipeline.modal.chosen import REACH, nearest_mode, pole_of_chart
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.pipeline import ShowStage, run_stages
 from ema_pipeline.run.measured import modes_of_structure
-from ema_pipeline.run.opening import existing_run, new_run, save_info
+from ema_pipeline.run.opening import existing_run, load_info, new_run, save_info
 from ema_pipeline.run.types import Run
 from ema_pipeline.store import Store
 
@@ -53,13 +53,16 @@ def change_choices(
         raise EmaError(f"{folder}: a test of {kind.words} has no hits and no modes to choose")
     store = Store(folder)
     with store.lock():
-        before, choices = run.info, change(run)
-        save_info(store, dataclasses.replace(before, choices=choices))
-        run = new_run(store, dataclasses.replace(before, choices=choices), effect_files)
+        before, info = load_info(store), dataclasses.replace(run.info, choices=change(run))
+        run = new_run(store, info, effect_files)
+        if effect_files:
+            _ = run.library  # a file that is not right is refused before anything is written
+        save_info(store, info)
         try:
             run_stages(run, stages_after(run), show)
         except BaseException:  # interrupted, or nothing left to analyse: the choice is not kept
-            save_info(store, before)
+            if before is not None:
+                save_info(store, before)
             raise
     return run
 

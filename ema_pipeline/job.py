@@ -81,10 +81,10 @@ def run_raw(
         ).library  # a file that is not right is refused before anything is written
     with _tidy(out), store.lock():
         info = _with_decisions_of(store, info)
-        save_info(store, info)
-        run = new_run(store, info, effect_files)
-        store.keep(stages_of(run))  # an earlier run may have had a model, or been of another kind of test
-        return run, run_stages(run, run.settings.stages, show)
+        with _described(store, info):
+            run = new_run(store, info, effect_files)
+            store.keep(stages_of(run))  # an earlier run may have had a model, or been of another kind of test
+            return run, run_stages(run, run.settings.stages, show)
 
 
 def run_on(
@@ -94,7 +94,7 @@ def run_on(
     show: ShowStage | None = None,
     effect_files: Iterable[str] = (),
 ) -> tuple[Run, list[str]]:
-    """Run single stages on a results folder; settings changed by `overrides` stay changed there.
+    """Run single stages on a results folder; settings changed by `overrides` stay changed there unless a stage fails.
 
     Raises
     ------
@@ -105,10 +105,11 @@ def run_on(
     info = existing_run(folder, effect_files).info
     store = Store(folder)
     settings = override(stored_settings(store, info), overrides, folder)
-    with store.lock():
-        info = dataclasses.replace(info, pipeline=settings.model_dump_json())
-        save_info(store, info)
-        run = new_run(store, info, effect_files)
+    info = dataclasses.replace(info, pipeline=settings.model_dump_json())
+    run = new_run(store, info, effect_files)
+    if effect_files:
+        _ = run.library  # a file that is not right is refused before anything is written
+    with store.lock(), _described(store, info):
         return run, run_stages(run, stages, show)
 
 
@@ -235,6 +236,24 @@ def _with_decisions_of(store: Store, info: RunInfo) -> RunInfo:
     if before.rig == info.rig:
         info = dataclasses.replace(info, effects=before.effects)
     return dataclasses.replace(info, choices=before.choices.among(info.configurations))
+
+
+@contextlib.contextmanager
+def _described(store: Store, info: RunInfo) -> Iterator[None]:
+    """Keep the run's description; its settings and effect files are taken back if a stage fails with them.
+
+    An interrupted run keeps them and goes on with them.
+    """
+    before = load_info(store) if store.path.is_file() else None
+    save_info(store, info)
+    try:
+        yield
+    except Exception:
+        if before is not None and before == dataclasses.replace(
+            info, pipeline=before.pipeline, effect_hashes=before.effect_hashes, versions=before.versions
+        ):
+            save_info(store, before)
+        raise
 
 
 @contextlib.contextmanager

@@ -11,7 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 from ema_pipeline.cli import app
+from ema_pipeline.describe import describe_modes
 from ema_pipeline.errors import EmaError
+from ema_pipeline.job import run_on, run_raw
 from ema_pipeline.run.opening import existing_run, load_info, save_info
 from ema_pipeline.stages.results import load_results
 from ema_pipeline.store import Store
@@ -121,3 +123,53 @@ def test_an_effect_file_that_ends_the_program_is_one_clear_line(tmp_path: Path) 
     )
     assert isinstance(done.exception, EmaError)
     assert "does not run: SystemExit" in str(done.exception)
+
+
+@pytest.mark.parametrize("verb", ["fit", "diagnose", "add", "exclude"])
+def test_an_effect_file_that_is_refused_is_not_remembered(results: Path, tmp_path: Path, verb: str) -> None:
+    file = tmp_path / "film.py"
+    file.write_text("x = 1\n", encoding="utf-8")
+    out = received(results, tmp_path)
+    more = {"add": ["spring@sun.y"], "exclude": ["--mode", "62.5"]}.get(verb, [])
+    before = load_info(Store(out))
+    done = CliRunner().invoke(app, [verb, str(out), *more, "--effect-file", str(file)])
+    assert "defines no EFFECT" in str(done.exception)
+    assert load_info(Store(out)) == before
+    done = CliRunner().invoke(app, ["fit", str(out)])
+    assert done.exit_code == 0, done.exception
+
+
+@pytest.mark.parametrize("stopped_by", [EmaError("it does not work"), KeyboardInterrupt()])
+def test_settings_are_kept_unless_a_stage_fails_with_them(
+    results: Path, tmp_path: Path, stopped_by: BaseException, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise stopped_by
+
+    out = received(results, tmp_path)
+    before = load_info(Store(out))
+    monkeypatch.setattr("ema_pipeline.stages.fit.work", fails)
+    with pytest.raises(type(stopped_by)):
+        run_on(out, ["fit"], ["fit.frequency_std_assumed=0.02"])
+    assert (load_info(Store(out)) == before) is isinstance(stopped_by, EmaError)
+
+
+def test_settings_of_a_run_that_fails_are_taken_back(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise EmaError("it does not work")
+
+    out = received(results, tmp_path)
+    before = load_info(Store(out))
+    assert before is not None
+    monkeypatch.setattr("ema_pipeline.stages.fit.work", fails)
+    with pytest.raises(EmaError, match="does not work"):
+        run_raw(
+            Path(before.raw),
+            "planetary",
+            out,
+            overrides=['stages=["modal", "ladder", "fit"]', "fit.frequency_std_assumed=0.02"],
+            describe_source=describe_modes,
+        )
+    assert load_info(Store(out)) == before
