@@ -28,7 +28,7 @@ from ema_pipeline.mechanics.laws import (
     PolynomialSpring,
     check_element,
 )
-from ema_pipeline.mechanics.modes import eigen_solution
+from ema_pipeline.mechanics.rounding import lost_to_rounding, said_of_lost
 from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.element_entries import ElementEntry, ElementRigFile, NonlinearEntry
 from ema_pipeline.rigs.entries import Mistake, merged
@@ -74,9 +74,17 @@ def rig_from_elements(file: ElementRigFile) -> Rig:
     )
     for configuration in file.configurations:
         try:
-            eigen_solution(rig.system(configuration))
+            assembly = rig.assembly(configuration)
+            lost = lost_to_rounding(assembly)
         except EmaError as error:
             raise Mistake(_suspect(file, parameters, str(error)), str(error)) from None
+        if lost is not None:
+            there = [x for x in file.entries() if file.present(x[1], configuration)]
+            where, element = there[assembly.elements.index(lost)]
+            number = element.value
+            raise Mistake(
+                ("parameters", number) if isinstance(number, str) else (*where, "value"), said_of_lost(lost)
+            )
     return rig
 
 

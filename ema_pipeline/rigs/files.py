@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import re
 import tomllib
 from collections.abc import Mapping
@@ -12,6 +13,7 @@ from typing import Any
 from pydantic import Field
 
 from ema_pipeline.errors import EmaError, did_you_mean
+from ema_pipeline.mechanics.rounding import lost_to_rounding, said_of_lost
 from ema_pipeline.rigs.base import RigKind
 from ema_pipeline.rigs.element_entries import ElementRigFile
 from ema_pipeline.rigs.elements import rig_from_elements
@@ -119,8 +121,26 @@ def _derived(file: DerivedRigFile, kinds: Mapping[str, RigKind]) -> Rig:
             raise Mistake(("parameters", name), f"unknown key 'parameters.{name}'{hint}")
         changed[name] = merged(default, entry)
     rig = kind.make(geometry, changed)
+    _check_rounding(rig, changed, defaults)
     stated: dict[str, Any] = {"name": file.name, "modal_damping_scatter": file.modal_damping_scatter}
     stated = {key: value for key, value in stated.items() if value is not None}
     if stated and dataclasses.is_dataclass(rig) and not isinstance(rig, type):
         return dataclasses.replace(rig, **stated)
     return rig
+
+
+def _check_rounding(rig: Rig, changed: Mapping[str, Parameter], defaults: Mapping[str, Parameter]) -> None:
+    """Mistake where a stiffness or a mass hides the lowest modes: the number furthest from its default."""
+
+    def decades(name: str) -> float:
+        usual, given = defaults[name].value if name in defaults else 1.0, changed[name].value
+        return abs(math.log10(abs(given / usual))) if given and usual else 0.0
+
+    suspect = ("parameters", max(changed, key=decades, default=""))
+    for configuration in rig.configurations:
+        try:
+            lost = lost_to_rounding(rig.assembly(configuration))
+        except EmaError as error:
+            raise Mistake(suspect, str(error)) from None
+        if lost is not None:
+            raise Mistake(suspect, said_of_lost(lost))

@@ -338,6 +338,12 @@ MISTAKES = [
     ),
     ("sun_mass = 2.2", "sun_mass = 0", 9, "'sun_mass' = 0 kg: give a mass above 0"),
     ("sun_mass = 2.2", "carrier_mass = 2.2", 9, "not valid TOML: Cannot overwrite a value in 'carrier_mass"),
+    (
+        "sun_mass = 2.2",
+        "sun_mass = 1e-20",
+        9,
+        "'sun mass y' = 1e-20 is so small that the model's lowest modes",
+    ),
     ("sun_mass = 2.2", "modal_damping_ratio = 1.5", 9, "'modal_damping_ratio' = 1.5 lies outside"),
 ]
 
@@ -384,6 +390,14 @@ ELEMENT_MISTAKES = [
     ("value = 1e6", "value = 1e300", 17, "value = 1e+300: give 0, or a number from 1e-30 to 1e+30 in size"),
     ("value = 1e6", "value = 1e6\nloss_factor = true", 18, "springs.1.loss_factor = true: give a number"),
     ("value = 1e5", "value = 1e300", 4, "parameters.link.value = 1e+300: give 0"),
+    ("value = 1e5", "value = 1e20", 4, "'link' = 1e+20 is so large that the model's lowest modes are lost"),
+    ('value = "link"', "value = 1e18", 14, "'link' = 1e+18 is so large"),
+    (
+        "value = 3.0",
+        "value = 1e-20",
+        10,
+        "'mass 2' = 1e-20 is so small that the model's lowest modes are lost",
+    ),
     ('"top.x" = 1.0', '"top.x" = 1e300', 20, "dampers.0.row.top.x = 1e+300: give 0"),
     ("[parameters]", "modal_damping_scatter = true\n[parameters]", 3, "modal_damping_scatter = true"),
     (

@@ -1,0 +1,90 @@
+"""Models whose lowest modes are lost to rounding, and the element to blame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.mechanics.assembly import Assembly, Mass, Nonlinear, Row, Spring
+from ema_pipeline.mechanics.modes import eigen_solution
+
+SPAN = 1e12
+"""Largest over smallest ω² that a model may have. The eigenvalues' rounding is some 1e-16 of the largest, so that
+beyond this the lowest frequencies err by more than a measurement does, and from 1e14 on they are gone."""
+
+LOWEST_HZ = 0.01
+"""No test shows a mode below: it is the rigid body on its suspension, and its frequency need not be right."""
+
+Weighted = tuple[str, Row, float]
+
+
+def lost_to_rounding(assembly: Assembly) -> Mass | Spring | Nonlinear | None:
+    """The spring or mass beside which a mode that is no rigid-body mode is too low to be computed; None where all are.
+
+    Raises
+    ------
+    EmaError
+        As `eigen_solution`.
+    """
+    values, shapes = eigen_solution(assembly.system())
+    least = values[-1] / SPAN
+    if values[0] > least:
+        return None
+    springs = [(e.name, e.row, _stiffness(e)) for e in assembly.elements if isinstance(e, Spring | Nonlinear)]
+    springs = [s for s in springs if s[2] != 0.0]
+    if any(k < 0 for _, _, k in springs):  # springs may cancel, so that what is rigid cannot be counted
+        rigid = int(np.sum(values == 0.0))
+    else:
+        rigid = _rigid_body_modes([row for _, row, _ in springs], assembly.dofs)
+    if rigid == len(values) or values[rigid] > least:
+        return None
+    # Summed spring by spring, energies keep what the matrix has lost.
+    low = [dict(zip(assembly.dofs, s, strict=True)) for s in shapes[:, values <= least].T]
+    if all(sum(_energies(springs, shape)) < (2 * np.pi * LOWEST_HZ) ** 2 for shape in low):
+        return None
+    highest = dict(zip(assembly.dofs, shapes[:, -1], strict=True))
+    masses = [(e.name, e.row, e.value) for e in assembly.elements if isinstance(e, Mass)]
+    (spring, far), (mass, near) = _unlike(springs, highest), _unlike(masses, highest)
+    found = assembly.named(spring if far >= near else mass)
+    assert isinstance(found, Mass | Spring | Nonlinear)
+    return found
+
+
+def said_of_lost(element: Mass | Spring | Nonlinear) -> str:
+    """What is wrong with the element that `lost_to_rounding` found, and what to do."""
+    if isinstance(element, Mass):
+        what, remedy = f"{element.value:g} is so small", "give a larger mass, or leave the coordinate out"
+    else:
+        what = f"{_stiffness(element):g} is so large"
+        remedy = "give a smaller stiffness, or make one body of the two"
+    return f"'{element.name}' = {what} that the model's lowest modes are lost to rounding; {remedy}"
+
+
+def _stiffness(element: Spring | Nonlinear) -> float:
+    return element.stiffness if isinstance(element, Spring) else element.tangent_stiffness
+
+
+def _rigid_body_modes(rows: Sequence[Row], dofs: Sequence[str]) -> int:
+    """Number of motions that stretch no spring, whatever its stiffness."""
+    index = {d: i for i, d in enumerate(dofs)}
+    unit: NDArray[np.float64] = np.zeros((len(rows), len(dofs)))
+    for i, row in enumerate(rows):
+        for dof, value in row.items():
+            unit[i, index[dof]] = value
+        unit[i] /= max(float(np.linalg.norm(unit[i])), 1e-300)
+    values = np.linalg.eigvalsh(unit.T @ unit)
+    return int(np.sum(values <= 64 * len(dofs) * np.finfo(float).eps * max(float(values[-1]), 1e-300)))
+
+
+def _unlike(elements: Sequence[Weighted], shape: Mapping[str, float]) -> tuple[str, float]:
+    """The element with most energy in a mode, and how many decades it is from what is usual of its kind."""
+    decades = np.log10([abs(weight) for *_, weight in elements])
+    most = int(np.argmax(np.abs(_energies(elements, shape))))
+    return elements[most][0], float(abs(decades[most] - np.median(decades)))
+
+
+def _energies(elements: Sequence[Weighted], shape: Mapping[str, float]) -> list[float]:
+    """Twice the energy of each element in a mode."""
+    return [weight * sum(c * shape[d] for d, c in row.items()) ** 2 for _, row, weight in elements]
