@@ -130,6 +130,10 @@ def _from_csv(text: str, path: Path, rig: Rig | None) -> dict[str, Configuration
     if "frequency_hz" not in columns:
         raise EmaError(f"{path}: has no column 'frequency_hz'{did_you_mean('frequency_hz', columns)}")
     shapes = {c: m for c in columns if (m := _SHAPE.match(c))}
+    read = [f"{shapes[c]['dof']} {shapes[c]['part'] or 're'}" if c in shapes else c for c in columns]
+    twice = next((c for c, what in zip(columns, read, strict=True) if read.count(what) > 1), None)
+    if twice is not None:
+        raise EmaError(f"{path}: line 1: column '{twice}' is there twice; keep one of the two")
     for column in columns:
         if column not in ("configuration", *_NUMBERS, *_PASSED_OVER) and column not in shapes:
             hint = did_you_mean(column, ("configuration", *_NUMBERS))

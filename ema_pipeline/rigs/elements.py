@@ -53,6 +53,9 @@ def rig_from_elements(file: ElementRigFile) -> Rig:
             raise Mistake(("parameters", name), f"parameter '{name}' has no value; add value = …")
         unit = _unit_of(file, name, entry.unit)
         parameters[name] = merged(Parameter(name, entry.value, unit), entry)
+    if "modal_damping_ratio" in parameters and "modal_damping_ratio" in file.model_fields_set:
+        said = f"modal_damping_ratio = {file.modal_damping_ratio:g} is given at the top as well; keep one of the two"
+        raise Mistake(("parameters", "modal_damping_ratio"), said)
     if "modal_damping_ratio" not in parameters:
         parameters["modal_damping_ratio"] = Parameter(
             "modal_damping_ratio", file.modal_damping_ratio, "1", 0.3, 0.0, 0.5
@@ -177,11 +180,19 @@ def _check_element(
             raise Mistake((*location, key), f"{key} '{number}' is no parameter{hint}")
     if entry.lacks is not None:
         raise Mistake(location, f"key '{entry.lacks}' is missing; add it")
-    value = parameters[entry.value].value if isinstance(entry.value, str) else entry.value
+    values = {k: parameters[x].value if isinstance(x, str) else x for k, x in entry.numbers.items()}
+    value = values["value"]
     if location[0] == "masses" and value <= 0:
         raise Mistake((*location, "value"), f"value = {value:g} kg: give a mass above 0")
     if location[0] == "dampers" and value < 0:
         raise Mistake((*location, "value"), f"value = {value:g} N·s/m: a damper cannot be negative")
+    if isinstance(entry, NonlinearEntry) and entry.law == "friction" and value < 0:
+        raise Mistake(
+            (*location, "value"), f"value = {value:g} N: friction cannot be negative; give 0 or more"
+        )
+    if (loss := values.get("loss_factor", 0.0)) < 0:
+        said = f"loss_factor = {loss:g}: a loss factor cannot be negative; give 0 or more"
+        raise Mistake((*location, "loss_factor"), said)
     for name in entry.configurations:
         if name not in file.configurations:
             hint = did_you_mean(name, file.configurations)
@@ -361,12 +372,10 @@ def _row(entry: ElementEntry, sensors: Mapping[str, Row], location: Location) ->
     if entry.at is not None:
         return _place(entry.at, sensors, here)
     assert entry.between is not None
-    row = difference(*(_place(text, sensors, here) for text in entry.between))
-    if not any(row.values()):
-        raise Mistake(
-            (*location, "between"),
-            f"between '{entry.between[0]}' and itself there is no stretch; name two places",
-        )
+    first, second = entry.between
+    row = difference(_place(first, sensors, here), _place(second, sensors, here))
+    if _parsed_dof(first, here).point == _parsed_dof(second, here).point or not any(row.values()):
+        raise Mistake(here, f"between '{first}' and '{second}' there is no stretch; name two places")
     return row
 
 
