@@ -222,8 +222,8 @@ def next_lines(results: RunResults, out: str, program: str) -> tuple[str, ...]:
     if suspicions(results):
         raw, rig = results.provenance.get("raw folder", "RAW"), results.provenance.get("rig", "none")
         model = "" if rig == "none" else f" --rig {shlex.quote(rig)}"
-        files = "".join(f" --effect-file {shlex.quote(file)}" for file in results.effect_files)
-        again = f"run {shlex.quote(raw)}{model} --out {shlex.quote(out)}{files}"
+        named = "".join(f" --effect-file {shlex.quote(file)}" for file in results.effect_files)
+        again = f"run {shlex.quote(raw)}{model} --out {shlex.quote(out)}{named}"
         return (f"correct test.toml, then {shlex.quote(program)} {again}",)
     if results.diagnosis is None:
         return ()
