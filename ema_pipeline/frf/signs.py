@@ -104,7 +104,8 @@ def check_signs(
         One for each pair with two hits that is neither weak at its sensor nor beside its blow, which would have
         either sign; its value is the lowest correlation of a hit with the others.
     """
-    kept = {pair: found.frfs(band) for pair, found in pairs.items()}
+    # in an order of their own: threads found them in any
+    kept = {pair: pairs[pair].frfs(band) for pair in sorted(pairs)}
     # Mean square over the hits, not of their average, which hits of opposite sign cancel.
     level = {pair: _largest(frfs, force) for pair, (frfs, force) in kept.items()}
     verdicts = []
