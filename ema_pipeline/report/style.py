@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, ParamSpec
 
 import matplotlib
@@ -16,6 +16,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import ArrayLike
 from PIL import Image
+
+from ema_pipeline.report.shown_band import shown_to
 
 # Okabe & Ito (2008), "Color universal design": told apart with every common colour vision deficiency.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -158,9 +160,12 @@ def frequency_axis(ax: Axes, low_hz: float, high_hz: float, log: bool, label: bo
 
 
 def frequency_range(
-    band_hz: tuple[float, float], modes_hz: ArrayLike, lines_hz: ArrayLike
+    band_hz: tuple[float, float], modes_hz: ArrayLike, lines_hz: ArrayLike, others_hz: Iterable[float] = ()
 ) -> tuple[float, float, bool]:
-    """Range to show, and whether it needs a logarithmic axis (modes over more than one decade)."""
+    """Range to show, and whether it needs a logarithmic axis (modes over more than one decade).
+
+    `others_hz` are to be seen beside the modes.
+    """
     modes = np.asarray(modes_hz, dtype=float)
     lines = np.asarray(lines_hz, dtype=float)
     low, high = (float(b) if np.isfinite(b) else 0.0 for b in band_hz)
@@ -168,6 +173,7 @@ def frequency_range(
         high = float(lines[-1])
     if modes.size:
         low, high = min(low, 0.9 * float(modes.min())), max(high, 1.03 * float(modes.max()))
+        high = shown_to(high, [*modes.tolist(), *others_hz])
     low = max(low, 0.0)
     log = bool(modes.size and modes.max() > 8 * modes.min() > 0)
     if log:

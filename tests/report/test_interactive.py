@@ -7,6 +7,7 @@ import json
 import re
 import zlib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +17,11 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.mechanics.frf import receptance
 from ema_pipeline.mechanics.partial_fractions import partial_fractions
 from ema_pipeline.mechanics.system import LinearSystem
+from ema_pipeline.modal.types import LeftOut, StabilisationChart
+from ema_pipeline.report.figures.frf import frf_overview
+from ema_pipeline.report.figures.modes import stabilisation_chart
 from ema_pipeline.report.html import report_html, script_json
-from ema_pipeline.report.interactive.data import measured_data, model_data
+from ema_pipeline.report.interactive.data import measured_data, model_data, shown_up_to
 from ema_pipeline.report.interactive.packing import DECADES, packed_frfs
 from ema_pipeline.report.results import RunResults
 
@@ -119,6 +123,71 @@ def test_pole_is_marked_at_the_same_place_however_few_lines_there_are(run: RunRe
     ]
     assert None not in marks[0]
     assert marks[0] == marks[1]
+
+
+def few_modes(run: RunResults, below_hz: float) -> RunResults:
+    """The first configuration with its modes below a frequency only, and with no pole but theirs."""
+    c = run.configurations[0]
+    assert c.modal is not None
+    low = tuple(m for m in c.modal.modes if m.frequency_hz < below_hz)
+    chart = c.modal.chart
+    mine = (chart.selected >= 0) & (chart.selected < len(low))
+    chart = StabilisationChart(
+        chart.order[mine],
+        chart.frequency_hz[mine],
+        chart.damping_ratio[mine],
+        chart.stable[mine],
+        chart.selected[mine],
+    )
+    modal = replace(c.modal, modes=low, left_out=(), chart=chart)
+    return RunResults("few modes", configurations=(replace(c, modal=modal, pairing=None),))
+
+
+def test_figures_over_frequency_end_soon_after_the_modes_and_what_looks_like_one(run: RunResults) -> None:
+    low = few_modes(run, 200.0)
+    (c,) = low.configurations
+    assert c.modal is not None
+    highest = c.modal.modes[-1].frequency_hz
+    assert c.modal.band_hz[1] > 4 * highest
+    (found,) = measured_data(low)["configurations"]
+    assert found["shown_to"] == pytest.approx(2 * highest)
+    assert (
+        found["frfs"]["start"] + found["frfs"]["step"] * found["frfs"]["lines"] > 4 * highest
+    )  # all is kept
+    for figure in (stabilisation_chart(c.modal, c.frfs), frf_overview(c.frfs, c.modal)):
+        assert figure.axes[0].get_xlim()[1] == pytest.approx(2 * highest, rel=0.01)
+    peak = LeftOut(1.5 * highest, 0.01, "peak", "doubtful")
+    seen = replace(c, modal=replace(c.modal, left_out=(peak,)))
+    (found,) = measured_data(replace(low, configurations=(seen,)))["configurations"]
+    assert found["shown_to"] == pytest.approx(3 * highest)
+    assert measured_data(run)["configurations"][0]["shown_to"] == shown_up_to(run.configurations[0])
+
+
+def test_axis_begins_with_the_modes_and_the_legend_has_what_the_chart_has(
+    browser, run: RunResults, tmp_path: Path
+) -> None:
+    low = few_modes(run, 200.0)
+    page = tmp_path / "report.html"
+    page.write_text(report_html(low), encoding="utf-8")
+    tab = browser.new_page()
+    tab.goto(page.as_uri())
+    for figure in ("frf", "stab"):
+        shown = tab.locator(f".bk[data-figure={figure}]")
+        shown.scroll_into_view_if_needed()
+        tab.wait_for_selector(f"[data-figure={figure}][data-state=shown]", timeout=30_000)
+    find = "Bokeh.documents.find(d => d.get_model_by_name('{0}'))"
+    axis = f"{find.format('frf.x')}.get_model_by_name('frf.x')"
+    highest = low.configurations[0].modal.modes[-1].frequency_hz  # type: ignore[union-attr]
+    assert tab.evaluate(f"{axis}.end") == pytest.approx(2 * highest, rel=1e-3)
+    tab.evaluate(f"{axis}.end = 1e4; {axis}.reset()")
+    assert tab.evaluate(f"{axis}.end") == pytest.approx(2 * highest, rel=1e-3)
+    assert "measured up to" in tab.locator("#frf-note").inner_text()
+    entries = (
+        f"Array.from({find.format('stab.x')}._all_models.values()).filter(m => m.type === 'LegendItem' && m.visible)"
+        ".map(m => m.label.value)"
+    )
+    assert set(tab.evaluate(entries)) == {"mode indicator (log)", "stands for a mode"}
+    tab.close()
 
 
 def test_names_from_files_are_text_in_page_and_data(run: RunResults) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ema_pipeline.frf.overview import cmif
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.report.shown_band import places
 from ema_pipeline.report.style import (
     LINES,
     MEASURED,
@@ -59,7 +60,8 @@ def frf_sheet(frfs: FrfSet, modal: ModalModel | None, picks: Sequence[tuple[int,
         **margins(figure, top=0.62),
     )
     modes = [m.frequency_hz for m in modal.modes] if modal else []
-    low, high, log = frequency_range(modal.band_hz if modal else frfs.band_hz, modes, frfs.frequency_hz)
+    band = modal.band_hz if modal else frfs.band_hz
+    low, high, log = frequency_range(band, modes, frfs.frequency_hz, places(modal))
     f = frfs.frequency_hz
     shown = (f >= low) & (f <= high) & (f > 0)
     accelerance = frfs.accelerance()
@@ -114,7 +116,8 @@ def frf_overview(frfs: FrfSet, modal: ModalModel | None) -> Figure:
     grid = figure.add_gridspec(2, 1, hspace=0.14, height_ratios=(1, 1.1), **margins(figure, top=0.62))
     top, bottom = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
     modes = [m.frequency_hz for m in modal.modes] if modal else []
-    low, high, log = frequency_range(modal.band_hz if modal else frfs.band_hz, modes, frfs.frequency_hz)
+    band = modal.band_hz if modal else frfs.band_hz
+    low, high, log = frequency_range(band, modes, frfs.frequency_hz, places(modal))
     f = frfs.frequency_hz
     shown = (f >= low) & (f <= high) & (f > 0)
     h = frfs.accelerance()[..., shown]

@@ -12,6 +12,7 @@ from ema_pipeline.frf.overview import cmif
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report.figures.frf import accelerance_unit
+from ema_pipeline.report.shown_band import places
 from ema_pipeline.report.style import (
     BLUE,
     GREY,
@@ -39,7 +40,8 @@ def stabilisation_chart(modal: ModalModel, frfs: FrfSet | None) -> Figure:
     ax = figure.add_subplot(grid[0])
     chart = modal.chart
     modes = [m.frequency_hz for m in modal.modes]
-    low, high, log = frequency_range(modal.band_hz, modes, modal.frequency_hz)
+    seen = (*places(modal), *chart.frequency_hz[chart.stable].tolist())
+    low, high, log = frequency_range(modal.band_hz, modes, modal.frequency_hz, seen)
     frequency_axis(ax, low, high, log)
     if frfs is not None:
         back = ax.twinx()
@@ -66,6 +68,8 @@ def stabilisation_chart(modal: ModalModel, frfs: FrfSet | None) -> Figure:
         (chosen, "^", VERMILLION, 3.8, VERMILLION, "votes for a mode"),
     ):
         keep = keep & inside
+        if not keep.any():
+            continue
         ax.plot(
             chart.frequency_hz[keep],
             chart.order[keep],
@@ -115,7 +119,7 @@ def modes_overview(modal: ModalModel) -> Figure:
     z, z_std = (
         100 * np.array([getattr(m, a) for m in modal.modes]) for a in ("damping_ratio", "damping_std")
     )
-    low, high, log = frequency_range(modal.band_hz, f, modal.frequency_hz)
+    low, high, log = frequency_range(modal.band_hz, f, modal.frequency_hz, places(modal))
     top.errorbar(
         f,
         z,

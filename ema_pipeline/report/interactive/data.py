@@ -28,6 +28,7 @@ from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.numbers import format_percent, format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.shapes import shape_pair
+from ema_pipeline.report.shown_band import places, shown_to
 
 CIRCLES = 4
 """Nyquist circles of a mode that are shown."""
@@ -120,6 +121,7 @@ def _measured(c: ConfigurationResults, points: int | None) -> dict[str, Any]:
     if c.frfs is not None:
         high = shown_up_to(c)
         found["frfs"] = packed_frfs(c.frfs, high, points)
+        found["shown_to"] = shown_to(high, places(c.modal))
         found["cmif"] = packed_cmif(c.frfs, high)
     if c.modal is not None:
         modal = c.modal
@@ -141,7 +143,7 @@ def _measured(c: ConfigurationResults, points: int | None) -> dict[str, Any]:
 
 
 def shown_up_to(c: ConfigurationResults) -> float:
-    """Highest frequency that FRFs are shown at, Hz."""
+    """Highest frequency that FRFs are kept at, Hz; figures begin with less of it, see `shown_band`."""
     assert c.frfs is not None
     ends = [c.frfs.band_hz[1]] if c.modal is None else [c.modal.band_hz[1]]
     if c.modal is not None and c.modal.modes:

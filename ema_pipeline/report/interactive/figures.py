@@ -208,7 +208,7 @@ def nyquist() -> Any:
     dots = made.scatter("re", "im", source=points, color=AFTER, size=7, legend_label="measured lines")
     stars = made.scatter(
         "re", "im", source=marks, marker="diamond", size=14, fill_color=None, line_color=INK, line_width=2,
-        legend_label="pole",
+        legend_label="pole", name="nyquist.pole",
     )  # fmt: skip
     stars.glyph.tags = [INK_TAG]
     hover(made, [dots], ("f", "@f{0.000} Hz"))
@@ -240,6 +240,7 @@ def stabilisation(log_x: bool = False) -> Any:
                 "f",
                 "order",
                 source=data,
+                name=f"stab.poles.{key}",
                 marker=marker,
                 size=6,
                 line_color=color,

@@ -28,12 +28,12 @@ function EmaFigures(page) {
         var lines = c.modes.map(function (m) { return m.f; });
         columns("frf", "frf.modes", { f: lines, text: lines.map(function (_, i) { return String(i + 1); }) });
         markMode();
-        var low = Infinity, sizes = Array.prototype.slice.call(rowed.magnitude).sort(function (a, b) { return a - b; });
-        var high = sizes[sizes.length - 1] * 2, end = all.f[all.f.length - 1];
+        var start = lines.length ? Math.max(all.f[0], 0.4 * Math.min.apply(null, lines)) : all.f[0], end = Math.min(c.shown_to, all.f[all.f.length - 1]);
+        var low = Infinity, sizes = Array.prototype.filter.call(rowed.magnitude, function (_, i) { return all.f[i] >= start && all.f[i] <= end; }).sort(function (a, b) { return a - b; });
+        var high = sizes[sizes.length - 1] * 2;
         low = sizes[Math.floor(0.005 * sizes.length)] / 2;
         if (banded && quiet.length) { quiet.sort(function (a, b) { return a - b; }); low = Math.min(low, quiet[Math.floor(0.02 * quiet.length)] / 3); }
         low = Math.max(low, high * 1e-7);
-        var start = lines.length ? Math.max(all.f[0], 0.4 * Math.min.apply(null, lines)) : all.f[0];
         if (documents.frf.shownFor !== c.name) { set("frf", "frf.x", { start: start, end: end }); documents.frf.shownFor = c.name; }
         set("frf", "frf.log.y", { start: low, end: high });
         set("frf", "frf.lin.y", { start: 0, end: high / 1.9 });
@@ -96,6 +96,7 @@ function EmaFigures(page) {
       columns("nyquist", "nyquist.points", circle ? { re: scaled(circle.re), im: scaled(circle.im), f: circle.f } : empty(["re", "im", "f"]));
       columns("nyquist", "nyquist.circle", circle ? { re: angle.map(function (a) { return k1 * (circle.centre[0] + circle.radius * Math.cos(a)); }), im: angle.map(function (a) { return k1 * (circle.centre[1] + circle.radius * Math.sin(a)); }) } : empty(["re", "im"]));
       columns("nyquist", "nyquist.marks", circle && circle.mark ? { re: [k1 * circle.mark[0]], im: [k1 * circle.mark[1]], text: ["pole"] } : empty(["re", "im", "text"]));
+      shown("nyquist", "nyquist.pole", Boolean(circle && circle.mark));
     },
     stab: function () {
       var c = currentConfiguration(), chart = c && c.chart;
@@ -106,7 +107,10 @@ function EmaFigures(page) {
           g.f.push(chart.f[k]); g.order.push(order); g.damping.push(chart.damping[k]);
         });
       }
-      Object.keys(groups).forEach(function (key) { columns("stab", "stab." + key, groups[key]); });
+      Object.keys(groups).forEach(function (key) {
+        columns("stab", "stab." + key, groups[key]);
+        shown("stab", "stab.poles." + key, groups[key].f.length > 0);
+      });
       var top = chart ? 1.08 * Math.max.apply(null, chart.order.concat([1])) : 10, cmif = c && c.cmif;
       set("stab", "stab.y", { start: 0, end: top });
       var places = (c ? c.modes.map(function (m) { return m.f; }) : []).concat(chart ? chart.f : []).filter(function (f) { return f > 0; });

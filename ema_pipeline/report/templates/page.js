@@ -20,7 +20,9 @@ var EmaPage = (function () {
   /* Figures: embedded when they come near, filled by the names of their models. */
   function set(figure, name, properties) {
     var model = documents[figure] && documents[figure].get_model_by_name(name);
-    if (model) { model.setv(properties); }
+    if (!model) { return; }
+    model.setv(properties);
+    if ("start" in properties) { model.setv({ reset_start: properties.start, reset_end: properties.end }); } /* where the toolbar's reset leads */
   }
   function columns(figure, name, values) { set(figure, name, { data: values }); }
   function style(figure) {
@@ -127,8 +129,13 @@ var EmaPage = (function () {
     options(byId("frf-input"), inputs.map(function (i) { return c.frfs.inputs[i]; }), inputs.indexOf(chosen.input));
     var note = byId("frf-note"), hits = c.frfs.pairs.filter(function (p) { return p[0] === chosen.output && p[1] === chosen.input; })[0][2];
     var some = c.frfs.pairs.length < c.frfs.total ? "; " + c.frfs.pairs.length + " of " + c.frfs.total + " FRFs are kept in this page" : "";
-    note.textContent = c.name + ": " + c.frfs.outputs[chosen.output] + " ← " + c.frfs.inputs[chosen.input] + ", " + (hits === 1 ? "one " + c.frfs.average + ": no coherence, no scatter" : "mean of " + hits + " " + c.frfs.average + "s") + some + said(c.frfs.levels);
+    note.textContent = c.name + ": " + c.frfs.outputs[chosen.output] + " ← " + c.frfs.inputs[chosen.input] + ", " + (hits === 1 ? "one " + c.frfs.average + ": no coherence, no scatter" : "mean of " + hits + " " + c.frfs.average + "s") + some + rest(c) + said(c.frfs.levels);
     refill(["frf"]);
+  }
+  /* Where the measurement goes on beyond the modes, which the figure begins with. */
+  function rest(c) {
+    var last = c.frfs.start + (c.frfs.lines - 1) * c.frfs.step;
+    return c.shown_to < 0.99 * last ? "; shown up to " + Number(c.shown_to.toPrecision(3)) + " Hz, measured up to " + Number(last.toPrecision(4)) + " Hz: the tools beside it zoom and pan" : "";
   }
   function said(levels) { return levels ? ". Shaded: noise, 1σ of the mean; hatched: nonlinear distortion, 1σ of one realisation; triangles and squares: distortion at odd and even lines that carry no force." : ""; }
   function empty(names) { var out = {}; names.forEach(function (n) { out[n] = []; }); return out; }
