@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 MINIMUM_FLAT = 3
 """A top of fewer samples may be flat by chance."""
 
+MANY_FLAT = 8
+"""Samples at one extreme value, in runs, that are no chance either."""
+
 SIGNIFICANT = 30
 """Excursions of fewer noise deviations have no top to speak of."""
 
@@ -36,6 +39,17 @@ def flat_top_share(samples: NDArray[np.float64], noise: float) -> float:
     """
     middle = float(np.median(samples))
     return max(_side(samples - middle, noise), _side(middle - samples, noise))
+
+
+def stands_at_top(samples: NDArray[np.float64]) -> bool:
+    """True where the highest or the lowest value is held to the last digit, again and again, as noise never does."""
+    for top in (samples.max(), samples.min()):
+        held = np.concatenate([[False], samples == top, [False]])
+        edges = np.flatnonzero(np.diff(held))
+        runs = edges[1::2] - edges[::2]
+        if runs[runs >= MINIMUM_FLAT].sum() >= MANY_FLAT:
+            return True
+    return False
 
 
 def _side(x: NDArray[np.float64], noise: float) -> float:

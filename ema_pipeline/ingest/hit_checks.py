@@ -12,7 +12,7 @@ from scipy.fft import next_fast_len, rfft
 
 from ema_pipeline.check_result import CheckResult, Consequence, judged
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.clipping import flat_top_share
+from ema_pipeline.ingest.clipping import flat_top_share, stands_at_top
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.hits import align_hits, find_hits, trim_hits
 from ema_pipeline.ingest.pulse import Pulse, find_pulse, find_second_impact, noise_of, step_of
@@ -31,7 +31,8 @@ SURE_FLAT_TOP = 0.85
 """Flatter tops are clipped whatever else is known; 1 in 1600 channels of weak signals lies between the two limits."""
 
 FAR_BELOW_SCALE = 0.25
-"""No input clips below this share of its full scale: a sensor's own supply ends at half the usual input range."""
+"""No input clips below this share of its full scale: a sensor's own supply ends at half the usual input range. What is
+flat there all the same was clipped before the input, or the full scale is not the one stated."""
 
 EXCEEDED = 2.0
 """A level that the same channel exceeds this many times in another hit is not where it clips."""
@@ -127,7 +128,8 @@ def _without_false_clipping(
         if any(v.check == "clipping" and not v.passes for v in hit.verdicts):
             record = records[index]
             verdicts = tuple(
-                replace(v, passes=True, message="") if exceeded(v, hit, record) else v for v in hit.verdicts
+                replace(v, value=0.0, passes=True, message="") if exceeded(v, hit, record) else v
+                for v in hit.verdicts
             )
             kept.append(replace(hit, verdicts=verdicts))
         else:
@@ -257,9 +259,18 @@ def _flat_top(
     samples: NDArray[np.float64], full_scale: float, name: str, consequence: Consequence, noise: float
 ) -> CheckResult:
     share = flat_top_share(samples, noise)
-    far_below = float(max(samples.max(), -samples.min())) < FAR_BELOW_SCALE * full_scale
-    passes = share < FLAT_TOP_LIMIT or (np.isfinite(full_scale) and far_below)
+    used = float(max(samples.max(), -samples.min())) / full_scale
+    far_below = 0 < used < FAR_BELOW_SCALE
+    if far_below and FLAT_TOP_LIMIT <= share < SURE_FLAT_TOP:
+        share = 0.0  # undecided: nothing clips there
+    passes = share < FLAT_TOP_LIMIT
     fault = f"{name} is clipped: its tops are flat; use a lower gain or hit softer"
+    if far_below:
+        fault = (
+            f"{name} is clipped at {used:.2%} of its full scale: its tops are flat; look for a saturated amplifier, or "
+            "correct the full scale in test.toml"
+        )
+        consequence = consequence if stands_at_top(samples) else "warn"
     return judged("clipping", share, FLAT_TOP_LIMIT, passes, OVERLOAD, consequence, fault, channel=name)
 
 

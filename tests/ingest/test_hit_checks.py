@@ -142,6 +142,50 @@ def test_clipped_response_loses_its_channel_only(noise: float) -> None:
         assert hit.rejected_channels == {"a0"}
 
 
+@pytest.mark.parametrize(("noise", "rejected"), [(0.0, {"a0"}), (1e-3, set())])
+@pytest.mark.parametrize("times", [1.5, 100.0])
+def test_a_flat_top_far_below_the_stated_full_scale_is_told_and_taken_out_where_it_is_one_value(
+    noise: float, rejected: set[str], times: float
+) -> None:
+    record = clean()
+    responses = record.responses.copy()
+    level = 0.3 * float(np.abs(responses[0]).max())
+    added = noise * level * np.random.default_rng(0).standard_normal(responses.shape[1])
+    responses[0] = np.clip(responses[0], -level, level) + added
+    full = replace(record.channels[0], full_scale=times * level)
+    hit = checked(replace(record, responses=responses, channels=(full, record.channels[1])))
+    found = verdict(hit, "clipping", "a0")
+    assert not found.passes
+    assert found.value > found.limit
+    assert ("of its full scale" in found.message) == (times > 4)
+    assert hit.rejected_channels == (rejected if times > 4 else {"a0"})
+    assert verdict(hit, "clipping", "a1").passes
+
+
+@pytest.mark.parametrize("full_scale", [np.inf, 100.0])
+def test_rounded_tops_far_below_full_scale_are_left_in_peace(full_scale: float) -> None:
+    record = clean()
+    x = np.asarray(record.responses)
+    level = 0.5 * np.abs(x[0]).max()
+    rounded = np.stack([x[0] / (1 + np.abs(x[0] / level) ** 8) ** (1 / 8), x[1]])
+    full = replace(record.channels[0], full_scale=full_scale * level)
+    found = verdict(
+        checked(replace(record, responses=rounded, channels=(full, record.channels[1]))), "clipping", "a0"
+    )
+    assert found.passes == (full_scale < np.inf)
+    assert found.passes == (found.value < found.limit)
+
+
+def test_coarse_steps_of_a_converter_are_no_flat_tops() -> None:
+    for seed in range(40):
+        record = clean(seed)
+        x = np.asarray(record.responses)
+        step = np.abs(x).max() / (12 + seed)
+        full = tuple(replace(c, full_scale=400 * step) for c in record.channels)
+        hit = checked(replace(record, responses=np.round(x / step) * step, channels=full))
+        assert all(v.passes and v.value < v.limit for v in hit.verdicts if v.check == "clipping")
+
+
 @pytest.mark.parametrize(("harder", "clipped"), [(0.7, True), (3.0, False)])
 def test_rounded_tops_are_clipped_unless_the_channel_goes_far_beyond_them_in_another_record(
     harder: float, clipped: bool
