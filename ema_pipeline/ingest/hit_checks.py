@@ -15,6 +15,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.clipping import flat_top_share, stands_at_top
 from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.hits import align_hits, find_hits, trim_hits
+from ema_pipeline.ingest.lost_samples import SHORTEST, lost_stretch
 from ema_pipeline.ingest.pulse import Pulse, find_pulse, find_second_impact, noise_of, step_of
 from ema_pipeline.ingest.records import Hit, Record, ResponseChannel
 from ema_pipeline.threads import in_order
@@ -183,6 +184,7 @@ def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> 
     ]
     if record.force_calibrated:
         verdicts.append(_force_peak(hit.peak_force, name))
+    verdicts += _lost(force, step_of(force), name, "reject_hit", pulse.peak, rate)
     # Before the first hit of a record the structure is at rest: what is there is noise and hum.
     rest = pulse.start if hit.start == 0 and hit.number == 0 else 0
 
@@ -274,6 +276,23 @@ def _flat_top(
     return judged("clipping", share, FLAT_TOP_LIMIT, passes, OVERLOAD, consequence, fault, channel=name)
 
 
+def _lost(
+    samples: NDArray[np.float64], step: float, name: str, consequence: Consequence, peak: int, rate: float
+) -> list[CheckResult]:
+    """A verdict only where samples were lost."""
+    start, stop = lost_stretch(samples, step)
+    if start == stop:
+        return []
+    fault = (
+        f"{name} stands at {samples[start]:.4g} for {stop - start} samples, {(start - peak) / rate:+.4g} to "
+        f"{(stop - peak) / rate:+.4g} s from the blow, amid a signal: samples were lost; export or record again"
+    )
+    verdict = judged(
+        "lost samples", stop - start, SHORTEST, False, "", consequence, fault, channel=name, unit="samples"
+    )
+    return [verdict]
+
+
 def _force_level(pulse: Pulse, noise: float, name: str, settings: HitSettings) -> CheckResult:
     ratio = min(pulse.height / noise, 1e12) if noise > 0 else 1e12
     passes = ratio >= settings.trigger_noise
@@ -320,6 +339,7 @@ def _check_response(
     noise = noise_of(samples, step)
     return [
         dead,
+        *_lost(samples, step, channel.name, "reject_channel", pulse.peak, rate),
         _overload(samples, channel.full_scale, channel.name, "reject_channel", pulse.peak, rate, settings),
         _flat_top(samples, channel.full_scale, channel.name, "reject_channel", noise),
         _decay(channel.name, samples, pulse, rest, noise, settings),

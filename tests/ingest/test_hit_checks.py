@@ -314,3 +314,47 @@ def test_a_record_without_a_blow_is_left_out_while_the_others_go_on(factor: floa
     assert [h.file for h in hits] == [good.file, "dead.csv", "second.csv"]
     assert [h.accepted for h in hits] == [True, False, True]
     assert "no hit found on hammer channel" in hits[1].reason
+
+
+def lost(hit: Hit) -> dict[str, str]:
+    return {v.channel: v.message for v in hit.verdicts if v.check == "lost samples"}
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_a_block_that_was_lost_amid_a_signal_is_named_with_its_place(held: bool) -> None:
+    record = clean()
+    peak = int(np.argmax(record.force))
+    cut = slice(peak + 800, peak + 1100)
+    responses = np.asarray(record.responses).copy()
+    responses[0, cut] = responses[0, cut.start - 1] if held else 0.0
+    hit = checked(replace(record, responses=responses))
+    assert list(lost(hit)) == ["a0"]
+    assert hit.accepted
+    assert hit.rejected_channels == {"a0"}
+    if not held:
+        assert "a0 stands at 0 for 300 samples, +0.0625 to +0.08594 s from the blow" in lost(hit)["a0"]
+    force = record.force.copy()
+    force[cut] = 0.0
+    hit = checked(replace(record, force=force))
+    assert list(lost(hit)) == ["hammer"]
+    assert not hit.accepted
+
+
+def test_what_stands_still_before_the_blow_behind_the_decay_or_within_a_step_was_not_lost() -> None:
+    record = clean()
+    peak = int(np.argmax(record.force))
+    x = np.asarray(record.responses)
+    before, behind = x.copy(), x.copy()
+    before[:, : peak - 20] = 0.0
+    behind[:, peak + 900 :] = 0.0
+    coarse = np.round(x / np.abs(x).max() * 12) * np.abs(x).max() / 12
+    t = np.arange(x.shape[1]) / RATE
+    slow = np.round(20 * np.exp(-4 * t) * np.sin(2 * np.pi * 5 * t)) * np.ones((2, 1))
+    assert max(np.diff(np.flatnonzero(np.diff(slow[0])))) > 300
+    for responses in (x, before, behind, coarse, slow):
+        assert lost(checked(replace(record, responses=responses))) == {}
+    windowed = record.force - np.median(record.force)
+    windowed[: peak - 100] = windowed[peak + 100 :] = 0.0
+    assert lost(checked(replace(record, force=windowed))) == {}
+    twice = windowed + np.roll(windowed, 2000)
+    assert lost(checked(replace(record, force=twice))) == {}
