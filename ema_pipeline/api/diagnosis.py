@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ema_pipeline.api import arguments
+from ema_pipeline.api.arguments import expect
 from ema_pipeline.api.display import Report, axes_or_new
 from ema_pipeline.api.fits import Fit, checked, fitted
 from ema_pipeline.api.frfs import Frfs
@@ -110,7 +112,7 @@ class Diagnosis(Report):
         EmaError
             For effects or places that the rig does not have.
         """
-        return fitted(self._work.with_effects(adding(effects)(self._work.info.effects)))
+        return fitted(self._work.with_effects(adding(arguments.effects(effects))(self._work.info.effects)))
 
     def ladder(self) -> Ladder:
         """The base model and what the data support on top of it."""
@@ -182,9 +184,12 @@ def diagnose(
     >>> [bool(rung.error < 2) for rung in better.ladder().rungs]
     [False, True]
     """
+    expect("modes", modes, Modes, "modes, as ema.identify(frfs) gives them")
+    expect("frfs", frfs, (Frfs, type(None)), "FRFs, as test.frfs() gives them, or nothing")
+    added = adding(arguments.effects(effects))(())
     if frfs is not None and tuple(frfs) != tuple(modes):
         raise EmaError(
             f"the FRFs are of {', '.join(frfs)}, the modes of {', '.join(modes)}; give those of one test"
         )
-    work = checked(modes, rig, settings, effect_files).with_effects(adding(effects)(()))
+    work = checked(modes, rig, settings, effect_files).with_effects(added)
     return Diagnosis(work.run("diagnose").store.load("diagnose", ALL, "diagnosis", types.Diagnosis), work)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ema_pipeline.api import arguments
+from ema_pipeline.api.arguments import expect
 from ema_pipeline.api.display import Report, axes_or_new
 from ema_pipeline.api.ladder import Ladder
 from ema_pipeline.api.modes import Modes
@@ -119,11 +121,11 @@ class Fit(Report):
         EmaError
             For effects or places that the rig does not have.
         """
-        return fitted(self._work.with_effects(adding(effects)(self.effects)))
+        return fitted(self._work.with_effects(adding(arguments.effects(effects))(self.effects)))
 
     def remove(self, effect: str) -> Fit:
         """The model without an effect that was added."""
-        return fitted(self._work.with_effects(removing(effect)(self.effects)))
+        return fitted(self._work.with_effects(removing(*arguments.effects([effect]))(self.effects)))
 
     def ladder(self) -> Ladder:
         """The base model and every added effect, each with its error on the data fitted and held out.
@@ -194,9 +196,10 @@ def fit(
     >>> list(fit.table().columns[:3])
     ['parameter', 'value', 'std']
     """
+    added = adding(arguments.effects(effects))(())
     work = checked(modes, rig, settings, effect_files)
     work.run("diagnose")
-    return fitted(work.with_effects(adding(effects)(())))
+    return fitted(work.with_effects(added))
 
 
 def checked(
@@ -209,6 +212,7 @@ def checked(
     EmaError
         If the rig does not know a DOF that was measured.
     """
+    expect("modes", modes, Modes, "modes, as ema.identify(frfs) gives them")
     work = modes._work.with_rig(rig, settings, effect_files)
     model = work.look().rig
     assert model is not None

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.api.arguments import expect, path
 from ema_pipeline.api.display import Report, axes_or_new
 from ema_pipeline.api.frfs import Frfs
 from ema_pipeline.api.work import Settings, Work, overrides
@@ -195,6 +196,7 @@ def identify(frfs: Frfs, *, settings: Settings | None = None) -> Modes:
     >>> modes.shapes.shape
     (3, 3)
     """
+    expect("frfs", frfs, Frfs, "FRFs, as test.frfs() gives them")
     work = frfs._work.with_settings(settings)
     work.run("modal", "levels")
     return modes_of(work)
@@ -215,7 +217,7 @@ def read_modes(file: str | Path, rig: str | Path) -> Modes:
     EmaError
         Whatever is wrong with the table, in one line.
     """
-    work = Work.new(describe_modes(Path(file), str(rig), None, overrides(None)))
+    work = Work.new(describe_modes(path("file", file), str(rig), None, overrides(None)))
     work.run("modal")
     return modes_of(work)
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ema_pipeline.api.arguments import path
 from ema_pipeline.api.continuous import ContinuousTest
 from ema_pipeline.api.display import Report, axes_or_new
 from ema_pipeline.api.frfs import Frfs, frfs_of
@@ -153,7 +154,7 @@ def read(
     >>> bool(test.records["default"][0].force.max() > 100)  # N
     True
     """
-    info = describe(Path(raw), None, None if pipeline is None else str(pipeline), overrides(settings))
+    info = describe(path("raw", raw), None, None if pipeline is None else str(pipeline), overrides(settings))
     kind = kind_of(info)
     if "frf" not in kind.measures:
         raise EmaError(f"{raw}: holds {kind.words}, which have no FRFs; use ema.run({str(raw)!r})")

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ema_pipeline.api import arguments
 from ema_pipeline.api.diagnosis import Diagnosis
 from ema_pipeline.api.display import Report
 from ema_pipeline.api.fits import Fit, fitted
@@ -111,12 +112,12 @@ class Results(Report):
 
     def add(self, *effects: str) -> Results:
         """Add effects ``id@place`` to the model in the folder, refit, and write its report again."""
-        change_effects(self.folder, adding(effects), effect_files=self._effect_files)
+        change_effects(self.folder, adding(arguments.effects(effects)), effect_files=self._effect_files)
         return open(self.folder, effect_files=self._effect_files)
 
     def remove(self, effect: str) -> Results:
         """Take an added effect out of the model in the folder again."""
-        change_effects(self.folder, removing(effect), effect_files=self._effect_files)
+        change_effects(self.folder, removing(*arguments.effects([effect])), effect_files=self._effect_files)
         return open(self.folder, effect_files=self._effect_files)
 
     def exclude(self, *, hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Results:
@@ -130,12 +131,12 @@ class Results(Report):
         modes : sequence of str
             ``"configuration:hertz"``, to within 1 %.
         """
-        change_choices(self.folder, excluding(hits, modes), effect_files=self._effect_files)
+        change_choices(self.folder, excluding(*_named(hits, modes)), effect_files=self._effect_files)
         return open(self.folder, effect_files=self._effect_files)
 
     def include(self, *, hits: Sequence[str] = (), modes: Sequence[str] = ()) -> Results:
         """Take modes in from the stabilisation chart, or what was excluded; parameters are those of `exclude`."""
-        change_choices(self.folder, including(hits, modes), effect_files=self._effect_files)
+        change_choices(self.folder, including(*_named(hits, modes)), effect_files=self._effect_files)
         return open(self.folder, effect_files=self._effect_files)
 
     def table(self) -> pd.DataFrame:
@@ -162,6 +163,14 @@ class Results(Report):
         from ema_pipeline.report.summary import findings
 
         return [self.everything.title, *findings(self.everything)]
+
+
+def _named(hits: Sequence[str], modes: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Hits and modes as texts."""
+    return (
+        arguments.texts("hits", hits, "a list of texts 'configuration/file#number'"),
+        arguments.texts("modes", modes, "a list of texts 'configuration:hertz'"),
+    )
 
 
 def run(
@@ -211,9 +220,9 @@ def run(
             "a rig built in Python cannot be kept with the results; give run() a rig file, or use read(), identify() "
             "and diagnose()"
         )
-    raw = Path(raw)
-    folder = Path(out) if out is not None else Path("results") / raw.resolve().name
-    files = [str(file) for file in effect_files]
+    raw = arguments.path("raw", raw)
+    folder = arguments.path("out", out) if out is not None else Path("results") / raw.resolve().name
+    files = arguments.effect_files(effect_files)
     run_raw(
         raw,
         None if rig is None else str(rig),
@@ -240,6 +249,7 @@ def open(out: str | Path, *, effect_files: Iterable[str | Path] = ()) -> Results
     EmaError
         If the folder holds no results, or they cannot be read.
     """
-    files = tuple(str(file) for file in effect_files)
-    found = existing_run(Path(out), files)
-    return Results(Path(out), load_results(found), found, files)
+    files = arguments.effect_files(effect_files)
+    folder = arguments.path("out", out)
+    found = existing_run(folder, files)
+    return Results(folder, load_results(found), found, files)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ema_pipeline.api.arguments import plain
 from ema_pipeline.api.display import Report
 from ema_pipeline.describe import checked_rig
 from ema_pipeline.errors import EmaError
@@ -73,7 +74,7 @@ class Rig(Report, ParametricRig):
         from ema_pipeline.rigs.entries import Mistake, parsed
 
         try:
-            return _as_rig(rig_from_elements(parsed(ElementRigFile, {"name": name, **_tuples(keys)})))
+            return _as_rig(rig_from_elements(parsed(ElementRigFile, {"name": name, **plain(keys)})))
         except Mistake as mistake:
             where = ".".join(str(step) for step in mistake.location)
             raise EmaError(f"rig '{name}'{f', {where}' if where else ''}: {mistake}") from None
@@ -132,12 +133,3 @@ def load_rig(name_or_path: str | Path) -> Rig:
 
 def _as_rig(rig: Any) -> Rig:
     return Rig(**{f.name: getattr(rig, f.name) for f in fields(ParametricRig)})
-
-
-def _tuples(value: Any) -> Any:
-    """Lists as TOML's reader gives them."""
-    if isinstance(value, dict):
-        return {k: _tuples(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_tuples(v) for v in value]
-    return value

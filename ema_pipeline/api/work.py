@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ema_pipeline.api import arguments
+from ema_pipeline.api.arguments import expect, plain, texts
 from ema_pipeline.describe import checked_rig, rig_text
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.files import link_or_copy
@@ -35,7 +37,15 @@ Settings = Mapping[str, object]
 
 def overrides(settings: Settings | None) -> list[str]:
     """The settings as the command line takes them."""
-    return [f"{name}={json.dumps(value)}" for name, value in (settings or {}).items()]
+    if settings is None:
+        return []
+    wanted = "settings by their dotted name, e.g. {'frf.estimator': 'H2'}"
+    expect("settings", settings, Mapping, wanted)
+    texts("settings", settings, wanted)
+    try:
+        return [f"{name}={json.dumps(plain(value))}" for name, value in settings.items()]
+    except TypeError as error:
+        raise EmaError(f"settings: a value is no number, text or list of these ({error})") from None
 
 
 @dataclass(frozen=True)
@@ -92,9 +102,10 @@ class Work:
 
     def with_settings(self, settings: Settings | None) -> Work:
         """The same results with other settings for what is computed from here on."""
-        if not settings:
+        changes = overrides(settings)
+        if not changes:
             return self
-        changed = override(stored_settings(self.store, self.info), overrides(settings), "settings")
+        changed = override(stored_settings(self.store, self.info), changes, "settings")
         info = dataclasses.replace(self.info, pipeline=changed.model_dump_json())
         return dataclasses.replace(Work.copy_of(self.store, info, self.effect_files), rig=self.rig)
 
@@ -112,6 +123,7 @@ class Work:
             If there is no such configuration.
         """
         names = self.info.configurations
+        expect("configuration", configuration, str, f"the name of a configuration, e.g. '{names[0]}'")
         if configuration not in names:
             raise EmaError(f"no configuration '{configuration}'{did_you_mean(configuration, names)}")
         info = dataclasses.replace(self.info, configurations=(configuration,))
@@ -127,7 +139,9 @@ class Work:
         EmaError
             If the rig does not have the configurations or the DOFs that were measured.
         """
-        files = tuple(str(Path(file).resolve()) for file in effect_files)
+        files = tuple(str(Path(file).resolve()) for file in arguments.effect_files(effect_files))
+        if not hasattr(rig, "assembly"):
+            expect("rig", rig, (str, Path), "a rig, the name of one or a rig file")
         named = isinstance(rig, str | Path)
         key = (str(rig) if named else id(rig), tuple(overrides(settings)), files)
         if key not in self.models:

@@ -116,22 +116,23 @@ def merged(default: Parameter, given: ParameterEntry) -> Parameter:
             f"tolerances are relative: 10 % is 0.10",
         )
     free = given.free if given.free is not None else default.free and given.tolerance is None
+    minimum = default.minimum if given.min is None else factor * given.min
+    maximum = default.maximum if given.max is None else factor * given.max
+    if minimum > maximum:
+        raise Mistake(
+            (*here, "max" if given.max is not None else "min"),
+            f"parameter '{name}' has min {minimum:g}{unit} above max {maximum:g}{unit}; exchange them",
+        )
     result = Parameter(
         name=name,
         value=default.value if given.value is None else factor * given.value,
         unit=default.unit,
         tolerance=default.tolerance if given.tolerance is None else given.tolerance,
-        minimum=default.minimum if given.min is None else factor * given.min,
-        maximum=default.maximum if given.max is None else factor * given.max,
+        minimum=minimum,
+        maximum=maximum,
         free=free,
         scatter=default.scatter if given.scatter is None else given.scatter,
     )
-    if result.minimum > result.maximum:
-        raise Mistake(
-            (*here, "max" if given.max is not None else "min"),
-            f"parameter '{name}' has min {result.minimum:g}{unit} above max {result.maximum:g}{unit}; "
-            "exchange them",
-        )
     if not result.minimum <= result.value <= result.maximum:
         raise Mistake(
             (*here, "value"),

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
+from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.mechanics.system import LinearSystem
 
@@ -48,6 +51,22 @@ class Parameter:
     maximum: float = float("inf")
     free: bool = False
     scatter: float | None = None
+
+    def __post_init__(self) -> None:
+        for key in ("value", "tolerance", "minimum", "maximum"):
+            number = getattr(self, key)
+            if isinstance(number, bool) or not isinstance(number, Real) or math.isnan(number):
+                raise EmaError(f"parameter '{self.name}': {key} = {number!r}: give a number")
+        if math.isinf(self.value):
+            raise EmaError(f"parameter '{self.name}': value = {self.value:g}: give a finite number")
+        if not 0 <= self.tolerance < math.inf:
+            raise EmaError(
+                f"parameter '{self.name}': tolerance = {self.tolerance:g}: give 0 or more, relative, 1 σ"
+            )
+        if self.minimum > self.maximum:
+            raise EmaError(
+                f"parameter '{self.name}': minimum {self.minimum:g} is above maximum {self.maximum:g}; exchange them"
+            )
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from ema_pipeline.loops.simulate import PRINTED, write_sine_tests
 from ema_pipeline.simulate import simulate_campaign
 
 EFFECT = "spring@storey2"
-MODULES = ("diagnosis", "fits", "frfs", "ladder", "modes", "records", "results", "rigs")
+MODULES = ("arguments", "diagnosis", "fits", "frfs", "ladder", "modes", "records", "results", "rigs")
 
 
 @pytest.fixture(scope="module")
@@ -201,6 +201,28 @@ def test_a_rig_built_in_python_is_fitted_like_one_from_a_file(lines: SimpleNames
         (lambda x: ema.Rig.of_elements("r", masses=[{"at": "a.x", "valu": 1.0}]), "valu"),
         (lambda x: ema.Rig.of_elements("r", parameters={"m": "2 kg"}, masses=[]), "give a number, or a table such as"),
         (lambda x: ema.open(x.raw), "holds no ema.h5"),
+        (lambda _: ema.read(None), "raw: give a path, not None"),
+        (lambda x: ema.run(x.raw, out=5), "out: give a path, not 5"),
+        (lambda _: ema.open(None), "out: give a path, not None"),
+        (lambda _: ema.identify(None), "frfs: give FRFs, as test.frfs.. gives them, not None"),
+        (lambda x: ema.fit(None, x.modes), "rig: give a rig, .* not None"),
+        (lambda x: ema.fit(x.rig, x.frfs), "modes: give modes, as ema.identify.frfs. gives them, not Frfs"),
+        (lambda x: ema.fit(x.rig, x.modes, effects="spring@base"), "effects: give texts .* not 'spring@base'"),
+        (lambda x: ema.fit(x.rig, x.modes, effect_files="a.py"), "effect_files: give a list of paths, not 'a.py'"),
+        (lambda x: ema.diagnose(x.rig, None, x.frfs), "modes: give modes"),
+        (lambda x: ema.diagnose(x.rig, x.modes, x.modes), "frfs: give FRFs, .* not Modes"),
+        (lambda x: x.found.add(None), "effects: give texts such as 'spring@base', not None"),
+        (lambda x: x.found.add([EFFECT]), "effects: give texts such as 'spring@base', not ..spring@storey2"),
+        (lambda x: x.fit.remove(None), "effects: give texts"),
+        (lambda x: x.frfs[0], "configuration: give the name of a configuration, e.g. 'default', not 0"),
+        (lambda x: x.modes[0], "configuration: give the name"),
+        (lambda x: x.test.frfs(settings="x"), "settings: give settings by their dotted name, .* not 'x'"),
+        (lambda x: x.test.frfs({"frf.estimator": object()}), "settings: a value is no number, text or list"),
+        (lambda _: ema.Parameter("k", float("nan"), "N/m"), "parameter 'k': value = nan: give a number"),
+        (lambda _: ema.Parameter("k", "1", "N/m"), "parameter 'k': value = '1': give a number"),
+        (lambda _: ema.Parameter("k", float("inf"), "N/m"), "give a finite number"),
+        (lambda _: ema.Parameter("k", 1.0, "N/m", tolerance=-0.1), "tolerance = -0.1: give 0 or more"),
+        (lambda _: ema.Parameter("k", 1.0, "N/m", minimum=3.0, maximum=2.0), "exchange them"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_one_clear_line(lines: SimpleNamespace, call: object, message: str) -> None:
@@ -208,6 +230,30 @@ def test_what_is_wrong_is_one_clear_line(lines: SimpleNamespace, call: object, m
     with pytest.raises(ema.EmaError, match=message) as told:
         call(lines)
     assert "\n" not in str(told.value)
+
+
+def test_hits_and_modes_to_exclude_are_lists_of_texts(results: Path) -> None:
+    opened = ema.open(results)
+    with pytest.raises(ema.EmaError, match=r"hits: give a list of texts .* not 'default/a.h5#1'"):
+        opened.exclude(hits="default/a.h5#1")
+    with pytest.raises(ema.EmaError, match="modes: give a list of texts 'configuration:hertz', not 5"):
+        opened.exclude(modes=[5])
+    with pytest.raises(ema.EmaError, match="modes: give a list of texts"):
+        opened.include(modes=None)
+
+
+def test_numbers_of_numpy_are_numbers() -> None:
+    def block(mass: object, stiffness: object) -> float:
+        rig = ema.Rig.of_elements(
+            "block",
+            parameters={"k": {"value": stiffness}},
+            masses=[{"at": "b.x", "value": mass}],
+            springs=[{"at": "b.x", "value": "k"}],
+        )
+        return float(rig.table()["frequency_hz"].iloc[0])
+
+    assert block(np.int64(2), np.float32(8e4)) == block(2, 8e4)
+    assert ema.Parameter("k", np.float32(2.0), "N/m", minimum=np.int64(1)).value == 2.0
 
 
 def test_a_campaign_is_asked_by_configuration() -> None:
