@@ -58,24 +58,29 @@ def _why_not_solvable(system: LinearSystem) -> str:
     return f"the model's mass matrix is not positive around '{dof}': give this coordinate a mass above 0"
 
 
-def damping_ratios(system: LinearSystem) -> NDArray[np.float64]:
-    """Damping ratio of every normal mode, (n,), from the diagonal of the modal damping matrix.
+def damping_ratios(
+    system: LinearSystem, frequency_hz: NDArray[np.float64], shapes: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Damping ratio of every normal mode of `normal_modes`, (n,), from the diagonal of the modal damping matrix.
 
     ζ_r = φᵀCφ/(2ω_r) + φᵀDφ/(2ω_r²) + modal damping ratio; exact where damping does not couple modes, first
     order otherwise (`complex_modes` is exact). Rigid-body modes have 0.
     """
-    values, shapes = eigen_solution(system)
-    omega = np.sqrt(values)
-    viscous = np.einsum("ir,ij,jr->r", shapes, system.damping, shapes)
-    structural = np.einsum("ir,ij,jr->r", shapes, system.structural, shapes)
-    ratio = np.zeros(len(values))
+    omega = 2 * np.pi * frequency_hz
+    viscous, structural = _modal(system.damping, shapes), _modal(system.structural, shapes)
+    ratio = np.zeros(len(omega))
     elastic = omega > 0
     ratio[elastic] = (
         viscous[elastic] / (2 * omega[elastic])
-        + structural[elastic] / (2 * values[elastic])
+        + structural[elastic] / (2 * omega[elastic] ** 2)
         + system.modal_damping_ratio
     )
     return ratio
+
+
+def _modal(matrix: NDArray[np.float64], shapes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Diagonal of φᵀ·matrix·φ, (n,)."""
+    return np.asarray(np.sum(shapes * (matrix @ shapes), axis=0)) if matrix.any() else np.zeros(len(shapes.T))
 
 
 def total_damping(system: LinearSystem) -> NDArray[np.float64]:

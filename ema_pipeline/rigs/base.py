@@ -129,7 +129,7 @@ def modes_of(rig: Rig, system: LinearSystem) -> tuple[ModelMode, ...]:
     frequency_hz, shapes = normal_modes(system)
     families, shapes = rig.classify(system, frequency_hz, shapes)
     if not np.any(system.damping) and not np.any(system.structural):
-        ratios = damping_ratios(system)
+        ratios = damping_ratios(system, frequency_hz, shapes)
         return tuple(
             ModelMode(i, float(frequency_hz[i]), float(ratios[i]), families[i], shapes[:, i].copy())
             for i in range(len(families))
