@@ -32,7 +32,15 @@ _ERROR_WORDS = (
     "error: root mean square of (measurement - model)/σ, about 1 where the model explains the data; "
     "held out: the same on data that the fit has not seen"
 )
-_EPSILON_WORDS = "ε: the error function of the source papers, sum of ((measured − model)/model frequency)² over the paired modes"
+_EPSILON_WORDS = (
+    "ε: the error function of the source papers, the sum over the paired modes of "
+    "((measured − model)/model frequency)²"
+)
+_COMPARISON_WORDS = (
+    "σ: the test's own scatter and what was learned of the model's. Root mean square: the error of the fit, in which "
+    "parts deviate as far as the data ask and a shape that is wrong as a whole counts little; in the ladder parts "
+    "deviate no further than similar ones scatter, so its error may be larger."
+)
 _ASCII = str.maketrans(
     {
         "±": "+/-",
@@ -155,6 +163,7 @@ def comparison_tables(compared: Comparison) -> RenderableType:
             f"Model against measurement: {plain(compared.error, 3)} σ root mean square, "
             f"ε {plain(compared.frequency_error, 3)}"
         ),
+        _line(_COMPARISON_WORDS),
         _line(_EPSILON_WORDS),
         text_table(
             _renamed(tables.differences_table(compared).picked(columns), heads),

@@ -439,6 +439,13 @@ def _printed(renderable: object, width: int, encoding: str = "utf-8") -> str:
     return file.buffer.getvalue().decode(encoding)
 
 
+def test_comparison_says_that_its_error_is_that_of_the_fit(run: RunResults) -> None:
+    assert run.comparison is not None
+    told = " ".join(_printed(terminal.comparison_tables(run.comparison), 80).split())
+    assert "Root mean square: the error of the fit" in told
+    assert "in the ladder parts deviate no further than similar ones scatter" in told
+
+
 def test_fit_and_comparison_say_what_epsilon_is(run: RunResults) -> None:
     assert run.fit is not None
     assert run.comparison is not None
