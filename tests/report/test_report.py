@@ -451,7 +451,7 @@ def test_fit_and_comparison_say_what_epsilon_is(run: RunResults) -> None:
     assert run.comparison is not None
     for table in (terminal.fit_table(run.fit), terminal.comparison_tables(run.comparison)):
         told = " ".join(_printed(table, 80).split())
-        assert told.count("ε: the error function of the source papers, sum of ((measured − model)") == 1
+        assert told.count("ε: the error function of the source papers, the sum over the paired modes") == 1
 
 
 def _tables(run: RunResults) -> list[object]:

@@ -415,7 +415,7 @@ ELEMENT_MISTAKES = [
         "value = 3.0",
         "value = 1e-20",
         10,
-        "'mass 2' = 1e-20 is so small that the model's lowest modes are lost",
+        "'base mass' = 1e-20 is so small that the model's lowest modes are lost",
     ),
     ('"top.x" = 1.0', '"top.x" = 1e300', 20, "dampers.0.row.top.x = 1e+300: give 0"),
     ("[parameters]", "modal_damping_scatter = true\n[parameters]", 3, "modal_damping_scatter = true"),
