@@ -31,6 +31,9 @@ LARGEST_VOLTAGE = 1000.0
 LARGEST_VALUE = 1e15
 """SI units; far beyond every force and motion, and its square is still far from the largest number."""
 
+SMALLEST_VALUE = 1e-25
+"""SI units; a channel of less holds no force or motion that was ever measured, and powers of it vanish in rounding."""
+
 LARGEST_WINDOW = float(-np.log(np.finfo(np.float32).tiny))
 """Decay rate times length of a record; a stronger window leaves at its end what single precision cannot hold."""
 
@@ -307,7 +310,7 @@ def _check_finite(samples: NDArray[np.float64], rate: float, where: str) -> None
 def _check_believable(
     samples: NDArray[np.float64], rate: float, factor: float, in_volts: float | None, where: str
 ) -> None:
-    """Refuse values that no converter can have recorded; a single one would drown all others."""
+    """Refuse values that no converter can have recorded; a single large one would drown all others."""
     at = int(np.argmax(np.abs(samples)))
     largest = abs(float(samples[at]))
     if in_volts is not None and largest * in_volts > LARGEST_VOLTAGE:
@@ -319,6 +322,11 @@ def _check_believable(
         raise EmaError(
             f"{where}: {samples[at]:.4g} at sample {at} ({at / rate:.4g} s) is beyond all measurement once scaled "
             f"(factor {factor:.4g}); correct unit and sensitivity_mv, or export the record again"
+        )
+    if 0 < largest < SMALLEST_VALUE / max(abs(factor), np.finfo(float).tiny):
+        raise EmaError(
+            f"{where}: {samples[at]:.4g} at sample {at} ({at / rate:.4g} s) is its largest value, below all "
+            f"measurement once scaled (factor {factor:.4g}); correct unit and sensitivity_mv, or export it again"
         )
 
 

@@ -334,6 +334,23 @@ def test_values_that_are_no_numbers_are_refused_with_their_time(tmp_path: Path, 
     assert f"hit.h5: channel 'tip': {value} at sample 1024 (0.5 s), 1 such in all" in message_of(folder)
 
 
+@pytest.mark.parametrize(
+    ("name", "factor", "refused"),
+    [("tip", 1e-100, True), ("hammer", 1e-320, True), ("tip", 1e-12, False), ("tip", 0.0, False)],
+)
+def test_values_below_all_measurement_are_refused_but_not_a_silent_channel(
+    tmp_path: Path, name: str, factor: float, refused: bool
+) -> None:
+    folder = make_test(tmp_path)
+    write_csv(folder / "hit1.csv", {**DATA, name: factor * DATA[name]})
+    if refused:
+        message = message_of(folder)
+        assert f"hit1.csv: channel '{name}': " in message
+        assert "below all measurement once scaled" in message
+    else:
+        load(folder)
+
+
 def test_a_record_of_fewer_than_64_samples_is_refused(tmp_path: Path) -> None:
     folder = make_test(tmp_path)
     write_csv(folder / "hit1.csv", {n: x[:63] for n, x in DATA.items()})
