@@ -575,6 +575,28 @@ def damaged(kind: str, folder: Path) -> Path:
         with TdmsWriter(str(path)) as writer:
             writer.write_segment([ChannelObject("run", n, x) for n, x in DATA.items()])
         path.write_bytes(path.read_bytes()[:9000])
+    elif kind == "no_data.wav":
+        wavfile.write(path, int(RATE), DATA["tip"].astype(np.float32))
+        content = path.read_bytes()
+        end = content.index(b"data")
+        path.write_bytes(content[:4] + struct.pack("<I", end - 8) + content[8:end])
+    elif kind == "odd_type.tdms":
+        from nptdms import ChannelObject, TdmsWriter
+
+        with TdmsWriter(str(path)) as writer:
+            writer.write_segment([ChannelObject("run", n, x) for n, x in DATA.items()])
+        content = path.read_bytes()
+        at = content.index(b"'hammer'") + 8
+        path.write_bytes(content[: at + 4] + b"rats" + content[at + 8 :])
+    elif kind == "header.mat":
+        scipy.io.savemat(path, DATA, appendmat=False)
+        path.write_bytes(path.read_bytes()[:100])
+    elif kind == "headless.lvm":
+        path.write_text(LVM_HEAD.partition("Channels")[0].strip())
+    elif kind == "digits.csv":
+        lines = table_text(",").splitlines()
+        lines[700] = lines[700].rsplit(",", 1)[0] + ",\u0661\u0662"
+        path.write_text("\n".join(lines), encoding="utf-8")
     elif kind == "half.lvm":
         path.write_text(lvm_text(1000), encoding="utf-8")
     elif kind == "half.gz":
@@ -616,6 +638,11 @@ DAMAGE = {
     "half.mat": "cannot be read as MAT",
     "half.wav": "cut short",
     "half.tdms": "cut short",
+    "no_data.wav": "cannot be read as WAV; the file is damaged or cut short",
+    "odd_type.tdms": "cannot be read as TDMS; the file is damaged or cut short",
+    "header.mat": "cannot be read as MAT; the file is damaged or cut short",
+    "headless.lvm": "has no segment of samples under a header: it is damaged or cut short",
+    "digits.csv": "line 701, channel 'tip': '\u0661\u0662' is not a number",
     "half.lvm": "holds 1000 of the 2048 samples",
     "half.gz": "cannot be unpacked",
     "prose": "unknown format",

@@ -18,6 +18,7 @@ from ema_pipeline.files import check_regular
 from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers import hdf5, lvm, mat, tdms, text, uff, wav
 from ema_pipeline.ingest.readers.apart import read_apart
+from ema_pipeline.ingest.readers.failures import words_of
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord
 
 __all__ = ["READERS", "RawChannel", "RawRecord", "Reader", "read_raw", "reader_of"]
@@ -131,10 +132,10 @@ def _read(path: Path, head: bytes, shown: str, limits: ReadLimits) -> RawRecord:
         ) from None
     except Exception as error:
         # Third-party readers raise anything on damaged files; the user gets one line whatever it is.
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:120]
+        reason = words_of(error)
         raise EmaError(
-            f"{shown}: cannot be read as {reader.NAME} ({reason}); the file is damaged or cut short, "
-            "copy or export it again"
+            f"{shown}: cannot be read as {reader.NAME}{f' ({reason})' if reason else ''}; the file is damaged or cut "
+            "short, copy or export it again"
         ) from error
     if not record.channels:
         why = f" ({'; '.join(record.notes[:3])})" if record.notes else ""

@@ -14,6 +14,7 @@ import numpy as np
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.file_size_limits import ReadLimits
+from ema_pipeline.ingest.readers.failures import words_of
 from ema_pipeline.ingest.readers.raw import RawRecord, StoredSamples, held_open
 from ema_pipeline.processes import die_with_parent
 
@@ -60,7 +61,7 @@ def _answer(request: dict[str, Any]) -> tuple[dict[str, Any], RawRecord | None]:
             "export it again, or allow it with --set ingest.unpack_ratio"
         }, None
     except Exception as error:  # readers raise anything on damaged files
-        return {"failure": (str(error).strip().splitlines() or [type(error).__name__])[0][:200]}, None
+        return {"failure": words_of(error)}, None
     return _described(record), record
 
 

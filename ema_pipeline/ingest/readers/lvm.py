@@ -27,7 +27,12 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
     import lvm_read
 
     # Decoded here: lvm_read drops what is not UTF-8, which turns m/s² into m/s.
-    content = lvm_read.read_str(decode(path.read_bytes()))
+    try:
+        content = lvm_read.read_str(decode(path.read_bytes()))
+    except ValueError:
+        raise EmaError(
+            "has no segment of samples under a header: it is damaged or cut short, copy or export it again"
+        ) from None
     if content["Segments"] != 1:
         raise EmaError(f"holds {content['Segments']} segments; export each as its own file")
     segment = content[0]

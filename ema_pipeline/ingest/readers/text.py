@@ -30,7 +30,7 @@ from ema_pipeline.units import find_unit
 
 NAME = "CSV/TXT"
 
-_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][+-]?\d+)?")
+_NUMBER = re.compile(r"[+-]?([0-9]+([.,][0-9]*)?|[.,][0-9]+)([eEdD][+-]?[0-9]+)?")
 _NOT_A_NUMBER = {
     "nan",
     "-nan",
@@ -51,7 +51,7 @@ _LONGEST_FOOTER = 1000
 _CELLS_AT_ONCE = 2_000_000
 """Cells that are parsed together; one that is odd slows only those beside it."""
 
-_CLOCK = re.compile(r"\d{1,4}[-/.:]\d{1,2}[-/.:]\d{1,4}.*")
+_CLOCK = re.compile(r"[0-9]{1,4}[-/.:][0-9]{1,2}[-/.:][0-9]{1,4}.*")
 
 
 @dataclass(frozen=True)
