@@ -11,10 +11,7 @@ from ema_pipeline.commands.options import EffectFiles, Json, Quiet, RigOption
 from ema_pipeline.commands.screen import progress, show, show_json
 
 if TYPE_CHECKING:
-    from rich.table import Table as Screen
-
     from ema_pipeline.observations.pair import RepeatSettings
-    from ema_pipeline.report.tables import Table
 
 NO_RIG = "none"
 
@@ -59,6 +56,7 @@ def changes(
     from ema_pipeline.changes.page import write_page
     from ema_pipeline.changes.tables import limits_text, notes, short_modes_table, verdict_text
     from ema_pipeline.changes.two_tests import changes_content, compare_runs, open_test, write_changes
+    from ema_pipeline.report.terminal import text_table
 
     repeats, by_rig = _repeats(repeat or []), rig != NO_RIG
     rig = rig if by_rig else None
@@ -80,7 +78,7 @@ def changes(
         show(verdict_text(found))
         if found.physics is not None and found.physics.diagnosis.detection_limits and found.verdict == "same":
             show(limits_text(found.physics.diagnosis))
-        show(_screen(short_modes_table(found)))
+        show(text_table(short_modes_table(found), "Modes: A and B"))
         for line in notes(found):
             show(line)
         show(f"Report: {page}; {written}")
@@ -95,18 +93,6 @@ def _repeats(texts: list[str]) -> RepeatSettings:
     return parse(
         RepeatSettings, {name.strip(): toml_value(value.strip()) for name, _, value in pairs}, "--repeat"
     )
-
-
-def _screen(table: Table) -> Screen:
-    from rich import box
-    from rich.table import Table as Screen
-
-    made = Screen(box=box.SIMPLE)
-    for k, name in enumerate(table.head):
-        made.add_column(name, justify="right" if k in table.numeric else "left", overflow="fold")
-    for row in table.rows:
-        made.add_row(*row.cells)
-    return made
 
 
 def mac(

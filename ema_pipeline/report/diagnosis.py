@@ -93,6 +93,12 @@ def standing(found: Diagnosis, candidate: Candidate) -> str:
     return "less likely"
 
 
+def parameter_words(name: str) -> str:
+    """A parameter in words, e.g. ``spring at sun, stiffness`` for ``spring@sun.stiffness``."""
+    label, dot, size = name.rpartition(".")
+    return f"{label_words(label)}, {words(size)}" if dot and "@" in label else words(name)
+
+
 def effects_words(labels: Sequence[str]) -> str:
     """Effects of a model in a row, e.g. ``spring at sun + cubic spring at ring.x``."""
     return " + ".join(map(label_words, labels))

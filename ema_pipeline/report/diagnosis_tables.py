@@ -24,6 +24,7 @@ from ema_pipeline.report.diagnosis import (
     limit_words,
     limits_by_effect,
     of_modes,
+    parameter_words,
     reasons,
     rung_words,
     size_words,
@@ -140,7 +141,7 @@ def rung_table(rung: Rung, units: Mapping[str, str]) -> Table:
     for name in names:
         size = rung.parameters[name]
         value = format_value(size.value, size.std, size.unit or units.get(name, ""))
-        rows.append(Row((words(name), value if size.determined else NOT_DETERMINED)))
+        rows.append(Row((parameter_words(name), value if size.determined else NOT_DETERMINED)))
     return Table(("parameter", "fitted (±1σ)"), tuple(rows), frozenset())
 
 

@@ -90,12 +90,12 @@ class RunScreen:
 
 def _fitted(table: Table, clean: Clean, console: Console, options: ConsoleOptions) -> RenderableType:
     """The table of modes; without the model's frequencies, which the differences tell, where that is too wide."""
-    built = build_table(table, "", clean, True, ruled=False)
+    built = build_table(table, "", clean, ruled=False)
     needed = Measurement.get(console, options.update(max_width=10_000), built).maximum
     if needed <= options.max_width or _MODEL_HZ not in table.head:
         return built
     left = [k for k, name in enumerate(table.head) if name != _MODEL_HZ]
-    return build_table(table.picked(left), "", clean, True, ruled=False)
+    return build_table(table.picked(left), "", clean, ruled=False)
 
 
 def _fitting(blocks: Sequence[list[str]], room: int) -> list[list[str]]:

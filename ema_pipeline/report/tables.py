@@ -13,6 +13,7 @@ from ema_pipeline.ingest.records import Hit
 from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.modal.types import ModalModel, Mode
 from ema_pipeline.report.cautions import fails
+from ema_pipeline.report.diagnosis import parameter_words
 from ema_pipeline.report.numbers import (
     below,
     format_percent,
@@ -119,7 +120,7 @@ def parameters_table(fit: FitResult) -> Table:
         rows.append(
             Row(
                 (
-                    words(p.name),
+                    parameter_words(p.name),
                     format_value(p.value, p.std, p.unit),
                     f"{low} … {high}{tail}",
                     "free" if p.free else format_value(p.nominal, p.prior_std, p.unit),

@@ -11,8 +11,8 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from rich import box
+from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, Group, RenderableType
-from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -146,18 +146,9 @@ def verdict_table(hits: Sequence[Hit], title: str = "Hits") -> RenderableType:
 
 def comparison_tables(compared: Comparison) -> RenderableType:
     """Differences per mode in units of σ, and the worst DOFs and FRF bands."""
-    several = len({m.configuration for m in compared.modes}) > 1
-    columns = ((0,) if several else ()) + (1, 2, 3, 4, 5, 8, 9, 10)
-    heads = (("config",) if several else ()) + (
-        "mode",
-        "measured, Hz",
-        "model, Hz",
-        "diff. %",
-        "freq.",
-        "damping",
-        "MAC",
-        "shape",
-    )
+    heads = ("mode", "measured, Hz", "model, Hz", "diff. %", "freq.", "damping", "MAC", "shape")
+    every = tables.differences_table(compared)
+    names = list(dict.fromkeys(m.configuration for m in compared.modes))
     parts: list[RenderableType] = [
         _line(
             f"Model against measurement: {plain(compared.error, 3)} σ root mean square, "
@@ -165,11 +156,13 @@ def comparison_tables(compared: Comparison) -> RenderableType:
         ),
         _line(_COMPARISON_WORDS),
         _line(_EPSILON_WORDS),
-        text_table(
-            _renamed(tables.differences_table(compared).picked(columns), heads),
-            "Per mode, (measured − model)/σ",
-        ),
     ]
+    for name in names:
+        title = f"{name}: " if len(names) > 1 else ""
+        own = tables.Table(every.head, tuple(r for r in every.rows if r.cells[0] == name), every.numeric)
+        table = _renamed(own.picked((1, 2, 3, 4, 5, 8, 9, 10)), heads)
+        parts += [_line("")] if title else []
+        parts.append(text_table(table, f"{title}per mode, (measured − model)/σ"))
     if compared.dofs:
         parts += [_line(""), text_table(tables.worst_dofs_table(compared), "DOFs that differ most")]
     if compared.bands:
@@ -265,20 +258,13 @@ def ladder_screen(ladder: Ladder) -> RenderableType:
 
 
 class Safe:
-    """A table or line that suits the console: +/- where it has no ±, loose where it is narrow.
+    """A line or table that suits the console: +/- where it has no ±, and made for its width."""
 
-    In a rigid table numbers are never broken over lines; where that does not fit the width, a loose one
-    breaks them at their blanks rather than lose a digit.
-    """
-
-    def __init__(self, build: Callable[[Clean, bool], RenderableType]) -> None:
+    def __init__(self, build: Callable[[Clean, int], RenderableType]) -> None:
         self._build = build
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RenderableType]:
-        clean = console_text(console)
-        rigid = self._build(clean, True)
-        needed = Measurement.get(console, options.update(max_width=10_000), rigid).minimum
-        yield rigid if needed <= options.max_width else self._build(clean, False)
+        yield self._build(console_text(console), options.max_width)
 
 
 def console_text(console: Console) -> Clean:
@@ -292,7 +278,7 @@ def _to_ascii(text: str) -> str:
 
 
 def _heading(text: str) -> Safe:
-    return Safe(lambda clean, rigid: Text(clean(text), style="bold"))
+    return Safe(lambda clean, width: Text(clean(text), style="bold"))
 
 
 def _commands(lines: Sequence[str]) -> list[RenderableType]:
@@ -302,11 +288,11 @@ def _commands(lines: Sequence[str]) -> list[RenderableType]:
 
 def _whole(text: str) -> Safe:
     """A line that is never broken; the terminal lets it run on below."""
-    return Safe(lambda clean, rigid: Text(clean(text), no_wrap=True, overflow="ignore"))
+    return Safe(lambda clean, width: Text(clean(text), no_wrap=True, overflow="ignore"))
 
 
 def _line(text: str) -> Safe:
-    return Safe(lambda clean, rigid: Text(clean(text)))
+    return Safe(lambda clean, width: Text(clean(text)))
 
 
 def _renamed(source: tables.Table, head: tuple[str, ...]) -> tables.Table:
@@ -316,15 +302,20 @@ def _renamed(source: tables.Table, head: tuple[str, ...]) -> tables.Table:
 
 def text_table(source: tables.Table, title: str) -> Safe:
     """A table for the terminal, or for any other place with letters of one width."""
-    return Safe(lambda clean, rigid: build_table(source, title, clean, rigid))
+    return Safe(lambda clean, width: build_table(source, title, clean, width))
 
 
 def build_table(
-    source: tables.Table, title: str, clean: Clean, rigid: bool, *, ruled: bool = True
+    source: tables.Table, title: str, clean: Clean, width: int | None = None, *, ruled: bool = True
 ) -> RichTable:
-    """A table for rich; `rigid` keeps numbers whole, `ruled` draws a line under the head."""
+    """A table for rich; `ruled` draws a line under the head.
+
+    Within `width` numbers and values are never broken over lines; where that does not fit, they are broken at their
+    blanks rather than lose a digit. Without it every cell stays on its lines.
+    """
     # a column of remarks that nobody made is only noise
     kept = [k for k in range(len(source.head)) if not source.rows or any(r.cells[k] for r in source.rows)]
+    widths = None if width is None else _widths(source, kept, clean, width - 1 - 2 * len(kept))
     table = RichTable(
         title=Text(clean(title), style="bold") if title else None,
         title_justify="left",
@@ -335,20 +326,45 @@ def build_table(
         padding=(0, 1, 0, 0),
     )
     table.add_column("", width=1, no_wrap=True)
-    for k in kept:
-        numeric = k in source.numeric
-        longest = max((len(line) for r in source.rows for line in r.cells[k].splitlines()), default=0)
-        short = longest <= _SHORT
-        value = any(
-            "±" in r.cells[k] and (r.cells[k][:1].isdigit() or longest <= _VALUE) for r in source.rows
-        )
+    for n, k in enumerate(kept):
         table.add_column(
             Text(clean(source.head[k])),
-            justify="right" if numeric else "left",
-            no_wrap=rigid and (numeric or value or short),
+            justify="right" if k in source.numeric else "left",
+            width=None if widths is None else widths[n],
+            no_wrap=width is None,
             overflow="fold",
         )
     for row in source.rows:
         cells = [Text(clean(row.cells[k])) for k in kept]
         table.add_row(Text("!" if row.alert else " "), *cells, style="bold yellow" if row.alert else None)
     return table
+
+
+def _widths(source: tables.Table, kept: Sequence[int], clean: Clean, room: int) -> list[int] | None:
+    """Widths of columns that fill no more than the room; None where words would have to be broken."""
+    most, least, loose = [], [], []
+    for k in kept:
+        cells = [line for r in source.rows for line in clean(r.cells[k]).splitlines()]
+        head = clean(source.head[k])
+        longest = max(map(cell_len, cells), default=0)
+        words = max(map(cell_len, " ".join([head, *cells]).split()), default=1)
+        value = any(
+            "±" in r.cells[k] and (r.cells[k][:1].isdigit() or longest <= _VALUE) for r in source.rows
+        )
+        whole = k in source.numeric or value or longest <= _SHORT
+        most.append(max(longest, cell_len(head)))
+        least.append(max(longest, words) if whole else words)
+        loose.append(words)
+    for narrowest in (least, loose):
+        if sum(narrowest) <= room:
+            return _narrowed(most, narrowest, room)
+    return None
+
+
+def _narrowed(widths: list[int], least: Sequence[int], room: int) -> list[int]:
+    """The widest columns give way first."""
+    widths = list(widths)
+    while sum(widths) > room:
+        give = [k for k in range(len(widths)) if widths[k] > least[k]]
+        widths[max(give, key=widths.__getitem__)] -= 1
+    return widths

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,6 +14,9 @@ from bench import ema, write_bench
 
 from ema_pipeline.changes.modes import mode_changes
 from ema_pipeline.changes.physics import pair_observations
+from ema_pipeline.changes.tables import short_modes_table
+from ema_pipeline.changes.two_tests import Changes
+from ema_pipeline.commands.screen import show
 from ema_pipeline.correlate.matching import match_modes
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
@@ -19,6 +24,7 @@ from ema_pipeline.job import run_raw
 from ema_pipeline.observations.fitting import Model, fit_base
 from ema_pipeline.observations.mode_rows import Rows
 from ema_pipeline.observations.pair import _conditional
+from ema_pipeline.report.terminal import text_table
 
 TESTS = {"before": (1, ()), "again": (2, ()), "after": (3, ("mass@m2:mass=0.06",))}
 
@@ -206,6 +212,24 @@ def test_a_mode_of_one_test_alone_is_said() -> None:
     assert [m.mode_a for m in found.modes] == [1]
     assert found.only_a == (("default", 2, 20.0),)
     assert found.only_b == (("default", 2, 30.0),)
+
+
+def test_table_of_changes_keeps_values_whole_on_80_columns(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a, b = (
+        _modes([21.5694, 49.451, 108.465], SHAPES, 3e-4),
+        _modes([21.42, 49.41, 107.4], SHAPES[::-1][:3], 3e-4),
+    )
+    found = mode_changes({"with_ring": a, "no_ring": a}, {"with_ring": b, "no_ring": b})
+    table = short_modes_table(cast("Changes", SimpleNamespace(modes=found)))
+    monkeypatch.setenv("COLUMNS", "80")
+    show(text_table(table, "Modes: A and B"))
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80
+    assert table.rows
+    for row in table.rows:
+        assert re.search(r" +".join(map(re.escape, row.cells[:5])), text)
 
 
 def test_false_changes_are_as_rare_as_stated() -> None:

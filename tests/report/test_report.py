@@ -483,6 +483,43 @@ def test_terminal_tables_fit_the_width_and_keep_numbers_whole(run: RunResults, w
     assert all(format_value(m.frequency_hz, m.frequency_std_hz) in text for m in c.modal.modes)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_comparison_of_two_configurations_is_whole_on_80_columns(run: RunResults, encoding: str) -> None:
+    compared = run.comparison
+    assert compared is not None
+    text = _printed(terminal.comparison_tables(compared), 80, encoding)
+    assert max(len(line) for line in text.splitlines()) <= 80
+    assert "no_ring: per mode" in text
+    assert "with_ring: per mode" in text
+    heads = [
+        line for line in text.splitlines() if {"damping", "MAC", "shape"} <= set(re.split(r"[ |]+", line))
+    ]
+    assert len(heads) == 2
+    for m in compared.modes:
+        value = format_value(m.measured_frequency_hz, m.frequency_std_hz)
+        assert value.replace("±", "±" if encoding == "utf-8" else "+/-") in text
+
+
+def test_names_of_fitted_parameters_are_broken_between_words_only(run: RunResults) -> None:
+    assert run.fit is not None
+    (first, *_) = run.fit.parameters.values()
+    effect = replace(first, name="mesh_stiffness_loss@sun-planet1.fraction")
+    fit = replace(run.fit, parameters={**run.fit.parameters, effect.name: effect})
+    for width in (80, 70):
+        words = _printed(terminal.fit_table(fit), width).split()
+        assert {"stiffness", "loss", "sun-planet1,", "fraction"} <= set(words)
+
+
+@pytest.mark.parametrize("width", [80, 45, 32])
+def test_a_table_gives_way_where_it_has_blanks_and_loses_nothing(width: int) -> None:
+    rows = (tables.Row(("one long remark that wraps", "12.345 ± 0.067", "frequency, shape"), False),)
+    source = tables.Table(("what is said", "value in A, Hz", "changed"), rows, frozenset({1}))
+    text = _printed(terminal.text_table(source, ""), width)
+    assert max(len(line) for line in text.splitlines()) <= width
+    assert {"remark", "12.345", "0.067", "frequency,", "shape"} <= set(text.split())
+    assert ("12.345 ± 0.067" in text) == (width >= 45)
+
+
 def test_terminal_tables_print_where_only_ascii_is_known(run: RunResults) -> None:
     text = "".join(_printed(t, 80, "ascii") for t in _tables(run))
     assert "9.98 +/- 0.31 MN/m" in text
