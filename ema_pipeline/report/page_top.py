@@ -118,10 +118,11 @@ def _tiles(results: RunResults) -> tuple[Tile, ...]:
         return (Tile("error", plain(error, 3), "", "about 1 where the model explains the data"),)
     first, last = ends
     changed = first is not last
+    then = "; then with what is proposed" if changed and last.effects != results.added else ""
     tiles = [
         Tile(
             "error", plain(first.error, 3), plain(last.error, 3) if changed else "",
-            "root mean square of (measured − model)/σ: about 1 where the model explains the data",
+            f"root mean square of (measured − model)/σ: about 1 where the model explains the data{then}",
         ),
         Tile(
             "error held out", plain(first.heldout_error, 3), plain(last.heldout_error, 3) if changed else "",

@@ -18,6 +18,7 @@ from typing import Any
 from ema_pipeline.choices import options_between
 from ema_pipeline.errors import EmaError
 from ema_pipeline.report.commands import command
+from ema_pipeline.report.diagnosis import effects_words, model_words
 from ema_pipeline.report.moved_modes import Seen, error_words, seen
 from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.results import RunResults
@@ -290,6 +291,13 @@ class Session:
             return "Done."
         first, last = ladder.rungs[0], ladder.rungs[-1]
         held = f"held out {plain(first.heldout_error, 3)} → {plain(last.heldout_error, 3)}"
+        added = self.results.added
+        if last.effects != added:  # the diagnosis's ladder: nothing of it is in the model
+            proposed = effects_words([x for x in last.effects if x not in added])
+            return (
+                f"In use: {model_words(added)}, error {plain(first.error, 3)}. "
+                f"With {proposed}, as proposed, it would be {plain(last.error, 3)} ({held})."
+            )
         return f"Error {plain(first.error, 3)} → {plain(last.error, 3)}, {held}."
 
     def _load_once(self) -> None:

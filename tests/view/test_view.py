@@ -8,6 +8,7 @@ import shlex
 import shutil
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from ema_pipeline.job import change_effects, removing, run_raw
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.simulate.campaign import simulate_campaign
 from ema_pipeline.store import Store
+from ema_pipeline.view.session import Job, Session
 from ema_pipeline.view.snapshots import FOLDER, Snapshots
 
 HOSTILE = "<img src=x onerror=document.title=1>"
@@ -155,6 +157,30 @@ def test_undone_state_is_the_file_that_was_there_before(out: Path) -> None:
     assert not len(kept)
 
 
+# what is said
+
+
+def test_outcome_of_a_diagnosis_says_which_model_is_in_use_and_what_is_only_proposed(results: Path) -> None:
+    told = Session(results)._outcome(Job("diagnose", ""))
+    assert re.fullmatch(
+        r"In use: the base model, error [\d.]+\. With mass at b, as proposed, it would be [\d.]+ \(held out .*\)\.",
+        told,
+    )
+
+
+def test_commands_name_the_effect_files_of_the_page(results: Path) -> None:
+    session = Session(results)
+    session._effect_files = ("film.py",)
+    was = session.results
+    session._log(was, replace(was, added=("film@b", CULPRIT)))
+    session._log(was, was, Job("diagnose", ""))
+    named = "--effect-file film.py"
+    assert session.commands == [
+        f"ema add {results} film@b {CULPRIT} {named}",
+        f"ema diagnose {results} {named}",
+    ]
+
+
 # in a browser
 
 
@@ -185,6 +211,10 @@ def test_click_on_the_effect_and_the_error_falls_in_every_tab(browser, page: Pag
     expect(tab.locator("#page_top h2")).to_contain_text("Missing: mass at b", timeout=20_000)
     assert existing_run(out).info.effects == ()
     expect(tab.locator("#undo")).to_be_disabled()
+
+    tab.locator("#add-form button").click()
+    expect(tab.locator("#status")).to_contain_text("Type an effect and its place, e.g. ")
+    expect(tab.locator("#add-label")).to_be_focused()
 
     tab.locator("#add-label").fill("no_such@thing")
     tab.locator("#add-form button").click()

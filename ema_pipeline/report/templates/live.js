@@ -61,14 +61,17 @@
     buttons();
     update();
   }
+  function wanted(field, text) { byId("status").textContent = text; field.focus(); }
   document.addEventListener("click", function (e) {
     var b = e.target.closest("button.act");
     if (b && b.dataset.verb) { ask(b.dataset.verb, b.dataset.label); }
   });
   if (byId("add-form")) {
     byId("add-form").addEventListener("submit", function (e) {
+      var field = byId("add-label"), first = document.querySelector("#addable option");
       e.preventDefault();
-      if (byId("add-label").value.trim()) { ask("add", byId("add-label").value.trim()); byId("add-label").value = ""; }
+      if (field.value.trim()) { ask("add", field.value.trim()); field.value = ""; return; }
+      wanted(field, "Type an effect and its place" + (first ? ", e.g. " + first.value : "") + ", or choose one from the list of the field.");
     });
   }
   if (byId("include-form")) {
@@ -76,7 +79,8 @@
     byId("include-form").addEventListener("submit", function (e) {
       var hertz = byId("include-hertz").value.trim();
       e.preventDefault();
-      if (hertz && EmaPage.configuration()) { ask("include_mode", EmaPage.configuration() + ":" + hertz); byId("include-hertz").value = ""; }
+      if (!hertz) { wanted(byId("include-hertz"), "Type the frequency of a mode in Hz, or click a pole of the chart."); return; }
+      if (EmaPage.configuration()) { ask("include_mode", EmaPage.configuration() + ":" + hertz); byId("include-hertz").value = ""; }
     });
   }
   byId("copy-commands").addEventListener("click", function (e) { EmaPage.copied(e.target, state.commands.join("\n") + "\n"); });
