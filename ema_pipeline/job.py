@@ -141,11 +141,31 @@ def change_effects(
     Raises
     ------
     EmaError
-        For effects or places that do not exist; nothing is changed then.
+        For effects or places that do not exist, and a model that cannot be fitted; nothing is changed then.
     """
     effect_files = tuple(effect_files)
-    set_effects(folder, change, overrides, show, effect_files)
-    return run_on(folder, AFTER_EFFECTS, (), show, effect_files)[0]
+    with taken_back_if_it_fails(folder, effect_files):
+        set_effects(folder, change, overrides, show, effect_files)
+        return run_on(folder, AFTER_EFFECTS, (), show, effect_files)[0]
+
+
+@contextlib.contextmanager
+def taken_back_if_it_fails(folder: Path, effect_files: Iterable[str] = ()) -> Iterator[None]:
+    """Leave a results folder with the model that it had if `set_effects` or what follows it fails.
+
+    What was not replaced is not computed again. An interrupted change is kept and can be finished.
+    """
+    store = Store(folder)
+    before = load_info(store) if store.path.is_file() else None
+    try:
+        yield
+    except Exception:
+        if before is not None and load_info(store) != before:
+            with store.lock(), contextlib.suppress(EmaError):  # it is the error of the change that is told
+                save_info(store, before)
+                there = [stage for stage in ("ladder", *AFTER_EFFECTS) if store.key(stage)]
+                run_stages(new_run(store, before, effect_files), there)
+        raise
 
 
 def set_effects(

@@ -92,22 +92,22 @@ def _change(
     json: bool,
 ) -> None:
     """Change the effects of the model; the ladder is the answer, fit and report follow."""
-    from ema_pipeline.job import AFTER_EFFECTS, run_on, set_effects
+    from ema_pipeline.job import AFTER_EFFECTS, run_on, set_effects, taken_back_if_it_fails
     from ema_pipeline.report.diagnosis import model_words
     from ema_pipeline.report.numbers import plain
     from ema_pipeline.stages.results import load_results
 
-    with progress(quiet) as show_stage:
-        run = set_effects(out, change, overrides, show_stage, effect_files)
-    if not quiet and (
-        json or run.info.effects
-    ):  # a ladder of what is only proposed would be taken for the model
-        _show_ladder(run, json)
-    files = [word for file in effect_files for word in ("--effect-file", file)]
-    stages = (shlex.join([stage, str(out), *files]) for stage in AFTER_EFFECTS)
-    go_on_with(f" && {program()} ".join(stages))
-    with progress(quiet) as show_stage:
-        run, _ = run_on(out, AFTER_EFFECTS, [], show_stage, effect_files)
+    with taken_back_if_it_fails(out, effect_files):
+        with progress(quiet) as show_stage:
+            run = set_effects(out, change, overrides, show_stage, effect_files)
+        # a ladder of what is only proposed would be taken for the model
+        if not quiet and (json or run.info.effects):
+            _show_ladder(run, json)
+        files = [word for file in effect_files for word in ("--effect-file", file)]
+        stages = (shlex.join([stage, str(out), *files]) for stage in AFTER_EFFECTS)
+        go_on_with(f" && {program()} ".join(stages))
+        with progress(quiet) as show_stage:
+            run, _ = run_on(out, AFTER_EFFECTS, [], show_stage, effect_files)
     if not quiet and not json:
         results = load_results(run, synthesis=False)
         model, report = model_words(results.added), run.store.folder / "report.html"

@@ -12,6 +12,7 @@ import numpy as np
 from ema_pipeline.effects.base import Effect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly
+from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.rigs.entries import LARGEST
 from ema_pipeline.rigs.types import Rig
 
@@ -98,6 +99,10 @@ def _check_at(effect: Effect, assembly: Assembly, place: str, path: Path) -> Non
                 f"{where} makes the {name} {largest:.3g} at its start values; keep it below {LARGEST:g}: correct "
                 "edit or start"
             )
+    try:
+        eigen_solution(started)
+    except EmaError as error:
+        raise EmaError(f"{where}: at its start values {error}") from None
 
 
 def _fault(error: BaseException, effect: Effect, path: Path) -> str:

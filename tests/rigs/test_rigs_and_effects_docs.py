@@ -151,6 +151,12 @@ def test_a_test_is_simulated_with_the_effect_of_a_file(
             "SystemExit: 7",
         ),
         ('values["stiffness"]', '1e300 * values["stiffness"]', 10, "makes the stiffness 1e+305 at its start"),
+        (
+            'values["stiffness"]',
+            '-1e9 * values["stiffness"]',
+            10,
+            "at its start values the model's stiffness is",
+        ),
     ],
 )
 def test_mistakes_in_an_effect_file_are_told_with_line_and_remedy_before_anything_is_computed(

@@ -13,8 +13,10 @@ from typer.testing import CliRunner
 from ema_pipeline.cli import app
 from ema_pipeline.describe import describe_modes
 from ema_pipeline.errors import EmaError
-from ema_pipeline.job import run_on, run_raw
+from ema_pipeline.job import adding, run_on, run_raw, set_effects
 from ema_pipeline.run.opening import existing_run, load_info, save_info
+from ema_pipeline.run.types import Progress, Run
+from ema_pipeline.stages import fit
 from ema_pipeline.stages.results import load_results
 from ema_pipeline.store import Store
 
@@ -137,6 +139,33 @@ def test_an_effect_file_that_is_refused_is_not_remembered(results: Path, tmp_pat
     assert load_info(Store(out)) == before
     done = CliRunner().invoke(app, ["fit", str(out)])
     assert done.exit_code == 0, done.exception
+
+
+@pytest.mark.parametrize("first", [(), ("spring@sun.y",)])
+def test_effects_are_taken_back_where_the_model_with_them_cannot_be_fitted(
+    results: Path, tmp_path: Path, first: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = received(results, tmp_path)
+    if first:
+        set_effects(out, adding(first))
+        run_on(out, ["fit"])
+    before, ladder = load_info(Store(out)), CliRunner().invoke(app, ["ladder", str(out)]).output
+    file = tmp_path / "film.py"
+    file.write_text(EFFECT.format(marker=str(tmp_path / "it_ran")), encoding="utf-8")
+    work = fit.work
+
+    def fails(run: Run, configuration: str, progress: Progress) -> dict[str, object]:
+        if "film@sun.x" in run.info.effects:
+            raise EmaError("the model's stiffness is negative")
+        return work(run, configuration, progress)
+
+    monkeypatch.setattr("ema_pipeline.stages.fit.work", fails)
+    done = CliRunner().invoke(app, ["add", str(out), "film@sun.x", "--effect-file", str(file)])
+    assert "stiffness is negative" in str(done.exception)
+    assert load_info(Store(out)) == before
+    assert CliRunner().invoke(app, ["ladder", str(out)]).output == ladder
+    again = CliRunner().invoke(app, ["fit", str(out)])
+    assert again.exit_code == 0, again.exception
 
 
 @pytest.mark.parametrize("stopped_by", [EmaError("it does not work"), KeyboardInterrupt()])
