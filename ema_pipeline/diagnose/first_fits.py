@@ -21,11 +21,11 @@ from ema_pipeline.observations.fitting import (
     Model,
     annealed,
     best_refined,
+    nominal,
     refined,
     transferred,
     wide,
 )
-from ema_pipeline.observations.parts import FREE_STD
 from ema_pipeline.processes import spread
 
 Schedule = tuple[tuple[float, int], ...]
@@ -51,8 +51,6 @@ _GRID_HEAT = 30.0
 _SIZES = (-15.0, -8.0, -4.0, -2.0, -1.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 15.0)
 """The same for effects of one size where measured modes have no partner: a size that gives them one may be far out, or
 small where it lifts a mode from 0 Hz."""
-_FAR = 0.5
-"""Prior σ from its nominal value beyond which a free parameter is far from it."""
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _UNHEATED: Schedule = ((1.0, 6), (1.0, 14))
 """Where starts are given. Heated, the data weigh less than the prior, which takes the first size to nothing, where the
@@ -262,18 +260,13 @@ def _starts(
 def _from_nominal(
     problem: EffectProblem, hypothesis: Hypothesis, begin: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
-    """A point with everything but earlier sizes at its nominal value, where a free parameter is far from it.
-
-    A base model that has lost a measured mode may have moved it so far for the sake of the others that no fit leads
-    back: a soil ten times too stiff took the lowest mode out of reach.
-    """
-    unknowns, nominal = problem.unknowns, problem.start()
-    known = [unknowns.index[name] for name in problem.sizes]
-    nominal[known] = begin[known]
-    free = (unknowns.std >= FREE_STD[0]) & np.array([not s for s in unknowns.scatter])
-    if not np.any(np.abs(nominal - begin)[free] > _FAR * unknowns.std[free]):
-        return []
-    return [unknowns.clipped(unknowns.with_values(nominal, hypothesis.starts()[0]))]
+    """The first size at `nominal` values."""
+    x = nominal(problem, begin)
+    return (
+        []
+        if x is None
+        else [problem.unknowns.clipped(problem.unknowns.with_values(x, hypothesis.starts()[0]))]
+    )
 
 
 def _from_score(

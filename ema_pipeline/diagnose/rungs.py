@@ -22,6 +22,7 @@ from ema_pipeline.observations.fitting import (
     fit_base,
     learned,
     made_up_of,
+    nominal,
     transferred,
     within_scatter,
 )
@@ -148,8 +149,12 @@ def _best_of(observations: Observations, model: Model, before: Fit) -> Fit:
     if begun:
         return best_refined(observations, model, begun, scatters)
     fits = []
-    for factor in (1.0, 0.3, -0.5):
-        x = transferred(before.posterior, problem.unknowns, problem.start())
+    start = transferred(before.posterior, problem.unknowns, problem.start())
+    plans = [(factor, start) for factor in (1.0, 0.3, -0.5)]
+    if before.posterior.residuals.unexplained:
+        plans += [(1.0, x) for x in [nominal(problem, start)] if x is not None]
+    for factor, begin in plans:
+        x = begin.copy()
         for name in new:
             i = problem.unknowns.index[name]
             x[i] = factor * x[i] if x[i] else 0.3 * factor

@@ -26,7 +26,7 @@ from ema_pipeline.inference import (
 from ema_pipeline.inference.bounded import FURTHEST
 from ema_pipeline.inference.maximise import ANNEALING
 from ema_pipeline.observations.base import EffectProblem, Observations
-from ema_pipeline.observations.parts import MASS_SCATTER, PART_SCATTER
+from ema_pipeline.observations.parts import FREE_STD, MASS_SCATTER, PART_SCATTER
 from ema_pipeline.rigs.types import Rig
 
 PARTS = (PART_SCATTER, MASS_SCATTER)
@@ -47,6 +47,8 @@ _RACE_STEPS = 8
 _MET = 0.05
 """Distance, in units of the prior 1 σ, up to which two fits have met."""
 
+_FAR = 0.5
+"""Prior σ from its nominal value beyond which a free parameter is far from it."""
 _FREE_STARTS = (0.0, 1.2, -1.2)
 """Start values of the logarithm of a free parameter: a decade to either side of its nominal value is reached."""
 _MOST_FREE = 2
@@ -142,6 +144,20 @@ def transferred(
         if name in known:
             x[i] = posterior.x[known[name]]
     return unknowns.clipped(x)
+
+
+def nominal(problem: EffectProblem, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Everything but the effects' sizes at its nominal value, (n,); None where no free parameter is far from it at `x`.
+
+    A model that has lost a measured mode may have moved one so far for the sake of the others that no fit leads back: a
+    soil ten times too stiff took the lowest mode out of reach.
+    """
+    unknowns, found = problem.unknowns, problem.start()
+    known = [unknowns.index[name] for name in problem.sizes]
+    found[known] = x[known]
+    free = (unknowns.std >= FREE_STD[0]) & np.array([not s for s in unknowns.scatter])
+    far = np.any(np.abs(found - x)[free] > _FAR * unknowns.std[free])
+    return found if far else None
 
 
 def made_up_of(problem: EffectProblem, name: str) -> dict[str, float]:

@@ -166,7 +166,7 @@ class Problem:
         return np.array([0.0, 0.6, 0.0])
 
     def begun(self, x: np.ndarray, scatters: object) -> list[np.ndarray]:
-        assert x.tolist() == [0.25, 0.6, 0.0]
+        assert x.tolist()[1:] == [0.6, 0.0]
         return list(self._begun)
 
 
@@ -175,7 +175,10 @@ def test_a_further_effect_begins_at_several_sizes_and_the_best_is_kept(
 ) -> None:
     before: Any = SimpleNamespace(
         posterior=SimpleNamespace(
-            unknowns=Unknowns.plain(("known",), 1.0), x=np.array([0.25]), scatters={"s": 1.0}
+            unknowns=Unknowns.plain(("known",), 1.0),
+            x=np.array([0.25]),
+            scatters={"s": 1.0},
+            residuals=SimpleNamespace(unexplained=0),
         )
     )
     model: Any = SimpleNamespace(problem=lambda data: Problem())
@@ -183,7 +186,7 @@ def test_a_further_effect_begins_at_several_sizes_and_the_best_is_kept(
 
     def anneal(problem: object, scatters: object, x: np.ndarray, schedule: object) -> Any:
         tried.append(x.tolist())
-        return SimpleNamespace(log_evidence=(5.0, 9.0, 7.0)[len(tried) - 1], x=x)
+        return SimpleNamespace(log_evidence=(5.0, 9.0, 7.0, 6.0)[(len(tried) - 1) % 4], x=x)
 
     monkeypatch.setattr(rungs, "anneal", anneal)
     best = _best_of(NO_DATA, model, before)
@@ -197,6 +200,14 @@ def test_a_further_effect_begins_at_several_sizes_and_the_best_is_kept(
     )
     assert _best_of(NO_DATA, led, before) == (led, [[1.0, 2.0, 3.0]], {"s": 1.0})  # type: ignore[comparison-overlap]
     assert len(tried) == 3
+    tried.clear()
+    before.posterior.residuals.unexplained = (
+        1  # a lost mode: once with a free parameter that is far off where it was
+    )
+    before.posterior.x[:] = 0.6
+    _best_of(NO_DATA, model, before)
+    np.testing.assert_allclose(tried[-1], [0.0, 0.6, 0.3])
+    assert len(tried) == 4
 
 
 def test_every_rung_begins_at_the_one_before_and_the_last_is_learned(monkeypatch: pytest.MonkeyPatch) -> None:
