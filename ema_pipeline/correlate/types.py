@@ -118,6 +118,27 @@ class BandDifference:
 
 
 @dataclass(frozen=True)
+class ModeAlone:
+    """A measured mode that is none of the fitted model's, and takes no part in the differences.
+
+    Attributes
+    ----------
+    configuration : str
+    measured : int
+        Its index.
+    measured_frequency_hz : float
+    model_frequency_hz, mac : float
+        Of the model's mode of its shape; NaN where there is none.
+    """
+
+    configuration: str
+    measured: int
+    measured_frequency_hz: float
+    model_frequency_hz: float
+    mac: float
+
+
+@dataclass(frozen=True)
 class Comparison:
     """Where model and measurement differ.
 
@@ -128,7 +149,7 @@ class Comparison:
         (frequencies, dampings, shapes); about 1 where the model explains the data as well as they can tell.
     frequency_error : float
         The error function ε = Σ((ω_measured - ω_model)/ω_model)² over the pairs.
-    modes, dofs, bands : tuples
+    modes, dofs, bands, alone : tuples
     """
 
     error: float
@@ -136,3 +157,4 @@ class Comparison:
     modes: tuple[ModeDifference, ...]
     dofs: tuple[DofDifference, ...]
     bands: tuple[BandDifference, ...]
+    alone: tuple[ModeAlone, ...]

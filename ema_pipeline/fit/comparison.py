@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.settings import CompareSettings
-from ema_pipeline.correlate.types import BandDifference, Comparison, DofDifference, ModeDifference, Pairing
+from ema_pipeline.correlate.types import (
+    BandDifference,
+    Comparison,
+    DofDifference,
+    ModeAlone,
+    ModeDifference,
+    Pairing,
+)
 from ema_pipeline.fit.parameters import FittedModes
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.mechanics.frf import receptance
@@ -42,7 +49,7 @@ def compare(
     -------
     Comparison
         Differences are measurement minus model over the standard uncertainty, which holds the test's own scatter and
-        what was learned of damping and of the model itself; `error` is the fit's. Modes without a partner take no part.
+        what was learned of damping and of the model itself; `error` is the fit's. Modes without a partner are `alone`.
     """
     settings = settings or CompareSettings()
     rows = fitted.problem.rows(fitted.posterior.residuals)
@@ -61,6 +68,7 @@ def compare(
         modes=tuple(d for r in rows if (d := _mode_difference(fitted, r, measured, pairings)) is not None),
         dofs=tuple(_dof_differences(fitted, rows)),
         bands=tuple(bands),
+        alone=tuple(_alone(fitted, measured, pairings)),
     )
 
 
@@ -185,6 +193,21 @@ def _mode_difference(
         mac=mac,
         shape_z=float(np.sqrt(np.mean(shape**2))) if len(shape) else float("nan"),
     )
+
+
+def _alone(
+    fitted: FittedModes, measured: Mapping[str, MeasuredModes], pairings: Mapping[str, Pairing]
+) -> list[ModeAlone]:
+    """Measured modes that the fit gave no partner; one of the same shape may be far off in frequency."""
+    matching, found = fitted.posterior.residuals.matching, list[ModeAlone]()
+    assert isinstance(matching, tuple)
+    for data, match in zip(fitted.observations.data, matching, strict=True):
+        name = data.configuration
+        for k in np.flatnonzero(match < 0).tolist():
+            pair = next((p for p in pairings[name].pairs if p.measured == k), None)
+            hz, mac = (np.nan, np.nan) if pair is None else (pair.model_frequency_hz, pair.mac)
+            found.append(ModeAlone(name, k, float(measured[name].frequency_hz[k]), hz, mac))
+    return found
 
 
 def _dof_differences(fitted: FittedModes, rows: Sequence[ModeRows]) -> list[DofDifference]:

@@ -6,6 +6,7 @@ deserve a look start with ``!``.
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +24,7 @@ from ema_pipeline.ingest.records import Hit
 from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report import diagnosis, diagnosis_tables, levels, tables
-from ema_pipeline.report.numbers import plain
+from ema_pipeline.report.numbers import plain, signed
 
 Clean = Callable[[str], str]
 _SHORT = 15
@@ -163,11 +164,28 @@ def comparison_tables(compared: Comparison) -> RenderableType:
         table = _renamed(own.picked((1, 2, 3, 4, 5, 8, 9, 10)), heads)
         parts += [_line("")] if title else []
         parts.append(text_table(table, f"{title}per mode, (measured − model)/σ"))
+    if compared.alone:
+        parts += [_line(""), *(_line(f"! {text}") for text in _alone(compared))]
     if compared.dofs:
         parts += [_line(""), text_table(tables.worst_dofs_table(compared), "DOFs that differ most")]
     if compared.bands:
         parts += [_line(""), text_table(tables.worst_bands_table(compared), "FRF bands that differ most")]
     return Group(*parts)
+
+
+def _alone(compared: Comparison) -> list[str]:
+    """Measured modes that the fitted model does not have: they differ most, and stand in no table of differences."""
+    found = []
+    for m in compared.alone:
+        hz = plain(m.measured_frequency_hz, 5)
+        text = f"{m.configuration}: mode {m.measured + 1}, {hz} Hz, is none of the model's"
+        if math.isfinite(m.model_frequency_hz):
+            off = signed(100 * (m.measured_frequency_hz / m.model_frequency_hz - 1), 1)
+            text += (
+                f": that of its shape is at {plain(m.model_frequency_hz, 5)} Hz ({off} %, MAC {m.mac:.2f})"
+            )
+        found.append(text)
+    return found
 
 
 def fit_table(fit: FitResult) -> RenderableType:

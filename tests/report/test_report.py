@@ -16,6 +16,7 @@ import report_example as example
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from ema_pipeline.correlate.types import ModeAlone
 from ema_pipeline.frf.overview import cmif, representative_frfs
 from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.report import plots as report_plots
@@ -444,6 +445,16 @@ def test_comparison_says_that_its_error_is_that_of_the_fit(run: RunResults) -> N
     told = " ".join(_printed(terminal.comparison_tables(run.comparison), 80).split())
     assert "Root mean square: the error of the fit" in told
     assert "in the ladder parts deviate no further than similar ones scatter" in told
+
+
+def test_comparison_names_modes_that_the_model_does_not_have(run: RunResults) -> None:
+    assert run.comparison is not None
+    alone = (ModeAlone("no_ring", 0, 26.357, 21.33, 0.998), ModeAlone("no_ring", 4, 107.98, np.nan, np.nan))
+    told = " ".join(_printed(terminal.comparison_tables(replace(run.comparison, alone=alone)), 80).split())
+    assert "! no_ring: mode 1, 26.357 Hz, is none of the model's: that of its shape is at 21.330 Hz" in told
+    assert "(+23.6 %, MAC 1.00)" in told
+    assert "! no_ring: mode 5, 107.98 Hz, is none of the model's " in told
+    assert "none of the model's" not in _printed(terminal.comparison_tables(run.comparison), 80)
 
 
 def test_fit_and_comparison_say_what_epsilon_is(run: RunResults) -> None:

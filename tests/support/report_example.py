@@ -488,7 +488,7 @@ def comparison(configurations: tuple[ConfigurationResults, ...]) -> Comparison:
                     )
                     for a, b in itertools.pairwise(edges)
                 ]
-    return Comparison(2.7, 0.0123, tuple(modes), tuple(dofs), tuple(bands))
+    return Comparison(2.7, 0.0123, tuple(modes), tuple(dofs), tuple(bands), ())
 
 
 def planetary_run(lines: int = 4097) -> RunResults:
