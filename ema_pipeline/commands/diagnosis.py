@@ -92,6 +92,8 @@ def _change(
     json: bool,
 ) -> None:
     """Change the effects of the model; the ladder is the answer, fit and report follow."""
+    from rich.text import Text
+
     from ema_pipeline.job import AFTER_EFFECTS, run_on, set_effects, taken_back_if_it_fails
     from ema_pipeline.report.diagnosis import model_words
     from ema_pipeline.report.numbers import plain
@@ -112,7 +114,8 @@ def _change(
         results = load_results(run, synthesis=False)
         model, report = model_words(results.added), run.store.folder / "report.html"
         error = "" if results.fit is None else f" (error {plain(results.fit.error, 3)})"
-        show(f"Fit, comparison and report now use {model}{error}: {report}")
+        show(Text(f"Fit, comparison and report now use {model}{error}."))
+        show(f"Report: {report}")
 
 
 def ladder(out: Out, effect_file: EffectFiles = None, json: Json = False) -> None:

@@ -179,7 +179,7 @@ def test_an_effect_is_added_under_a_changed_setting_and_removed_and_the_ladder_s
     assert code == 0
     report = re.escape(str(out / "report.html"))
     assert re.fullmatch(
-        rf"Fit, comparison and report now use the base model \(error [\d.]+\): {report}\n", text
+        rf"Fit, comparison and report now use the base model \(error [\d.]+\)\.\nReport: {report}\n", text
     )
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert f"{effect}.stiffness" not in summary["fit"]["parameters"]
