@@ -55,8 +55,7 @@ def change_choices(
     with store.lock():
         before, info = load_info(store), dataclasses.replace(run.info, choices=change(run))
         run = new_run(store, info, effect_files)
-        if effect_files:
-            _ = run.library  # a file that is not right is refused before anything is written
+        run.check_effect_files()
         save_info(store, info)
         try:
             run_stages(run, stages_after(run), show)

@@ -75,10 +75,7 @@ def run_raw(
     info = (describe_source or describe)(raw, rig, pipeline, overrides)
     store, effect_files = Store(out), tuple(effect_files)
     info = with_effect_files(store, info, effect_files)
-    if effect_files:
-        _ = new_run(
-            store, info, effect_files
-        ).library  # a file that is not right is refused before anything is written
+    new_run(store, info, effect_files).check_effect_files()
     with _tidy(out), store.lock():
         info = _with_decisions_of(store, info)
         with _described(store, info):
@@ -107,8 +104,7 @@ def run_on(
     settings = override(stored_settings(store, info), overrides, folder)
     info = dataclasses.replace(info, pipeline=settings.model_dump_json())
     run = new_run(store, info, effect_files)
-    if effect_files:
-        _ = run.library  # a file that is not right is refused before anything is written
+    run.check_effect_files()
     with store.lock(), _described(store, info):
         return run, run_stages(run, stages, show)
 

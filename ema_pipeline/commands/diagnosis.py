@@ -95,6 +95,7 @@ def _change(
     from rich.text import Text
 
     from ema_pipeline.job import AFTER_EFFECTS, run_on, set_effects, taken_back_if_it_fails
+    from ema_pipeline.report.commands import naming
     from ema_pipeline.report.diagnosis import model_words
     from ema_pipeline.report.numbers import plain
     from ema_pipeline.stages.results import load_results
@@ -105,8 +106,7 @@ def _change(
         # a ladder of what is only proposed would be taken for the model
         if not quiet and (json or run.info.effects):
             _show_ladder(run, json)
-        files = [word for file in effect_files for word in ("--effect-file", file)]
-        stages = (shlex.join([stage, str(out), *files]) for stage in AFTER_EFFECTS)
+        stages = (shlex.join([stage, str(out), *naming(effect_files)]) for stage in AFTER_EFFECTS)
         go_on_with(f" && {program()} ".join(stages))
         with progress(quiet) as show_stage:
             run, _ = run_on(out, AFTER_EFFECTS, [], show_stage, effect_files)

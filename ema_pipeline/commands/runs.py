@@ -245,12 +245,13 @@ def view(
         serve_hits(out, point or (), hits, poll, port, ready)
         show(f"Next: {program()} run {out}")
         return
+    from ema_pipeline.report.commands import naming
     from ema_pipeline.store import Store
     from ema_pipeline.view.server import serve
 
     Store.existing(out)
-    files = [word for file in effect_file or [] for word in ("--effect-file", file)]
-    go_on_with(shlex.join(["view", str(out), *files]))  # what was changed on the page is kept
+    # what was changed on the page is kept
+    go_on_with(shlex.join(["view", str(out), *naming(effect_file or [])]))
     serve(out, effect_file or [], port, ready)
 
 

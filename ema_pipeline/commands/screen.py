@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import shutil
 import sys
 import time
@@ -49,10 +48,9 @@ def program() -> str:
 
 def on_folder(verb: str, out: Path, effect_files: Sequence[str] = ()) -> str:
     """A command on a results folder as the user can type it."""
-    from ema_pipeline.report.commands import command
+    from ema_pipeline.report.commands import command, typed
 
-    typed = command(verb, str(out), effect_files=effect_files)
-    return typed.replace("ema ", f"{shlex.quote(program())} ", 1)
+    return typed(command(verb, str(out), effect_files=effect_files), program())
 
 
 def show_json(content: Any) -> None:

@@ -19,5 +19,14 @@ def command(verb: str, out: str, *words: str, effect_files: Sequence[str] = ()) 
     effect_files : sequence of str
         Files with the user's own effects: their code runs only where a command names them.
     """
-    named = [word for file in effect_files for word in ("--effect-file", file)]
-    return " ".join(["ema", verb, *map(shlex.quote, [out or "OUT", *words, *named])])
+    return shlex.join(["ema", verb, out or "OUT", *words, *naming(effect_files)])
+
+
+def naming(effect_files: Sequence[str]) -> list[str]:
+    """The words that name files with the user's own effects."""
+    return [word for file in effect_files for word in ("--effect-file", file)]
+
+
+def typed(shown: str, program: str) -> str:
+    """A command with ``ema`` as the user can type it."""
+    return shown.replace("ema ", f"{shlex.quote(program)} ", 1)

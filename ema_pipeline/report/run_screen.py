@@ -19,7 +19,7 @@ from ema_pipeline.modal.chosen import EXCLUDED
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import Weight, cautions, left_out, suspicions
-from ema_pipeline.report.commands import command
+from ema_pipeline.report.commands import command, naming, typed
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.numbers import below, format_percent, format_value, plain, signed
 from ema_pipeline.report.results import ConfigurationResults, RunResults
@@ -222,8 +222,8 @@ def next_lines(results: RunResults, out: str, program: str) -> tuple[str, ...]:
     if suspicions(results):
         raw, rig = results.provenance.get("raw folder", "RAW"), results.provenance.get("rig", "none")
         model = "" if rig == "none" else f" --rig {shlex.quote(rig)}"
-        named = "".join(f" --effect-file {shlex.quote(file)}" for file in results.effect_files)
-        again = f"run {shlex.quote(raw)}{model} --out {shlex.quote(out)}{named}"
+        named = shlex.join(["--out", out, *naming(results.effect_files)])
+        again = f"run {shlex.quote(raw)}{model} {named}"
         return (f"correct test.toml, then {shlex.quote(program)} {again}",)
     if results.diagnosis is None:
         return ()
@@ -231,7 +231,7 @@ def next_lines(results: RunResults, out: str, program: str) -> tuple[str, ...]:
     commands = diagnosis.next_commands(results.diagnosis, out, results.added, files)
     if results.diagnosis_is_old:
         commands = (command("diagnose", out, effect_files=files),)
-    return tuple(c.replace("ema ", f"{shlex.quote(program)} ", 1) for c in commands[:1])
+    return tuple(typed(c, program) for c in commands[:1])
 
 
 def modes_table(results: RunResults) -> Table:

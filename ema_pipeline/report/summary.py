@@ -87,8 +87,7 @@ def changed_words(results: RunResults) -> str:
 
 def _other_error(results: RunResults, fit: FitResult) -> list[str]:
     """Why the ladder states another error than the fit for the same model; nothing where it does not."""
-    ladder = results.shown_ladder
-    rung = next((r for r in ladder.rungs if r.effects == results.added), None) if ladder else None
+    ladder, rung = results.shown_ladder, results.current_rung
     if ladder is None or rung is None or not diagnosis.of_modes(ladder):
         return []
     if not rung.error > _SAME_ERROR * fit.error:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import re
-import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from rich import box
@@ -17,13 +16,14 @@ from rich.console import Console, ConsoleOptions, Group, RenderableType
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from ema_pipeline.correlate.types import Comparison
+from ema_pipeline.correlate.types import Comparison, percent_off
 from ema_pipeline.diagnose.types import Diagnosis, Ladder, Rung
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.report import diagnosis, diagnosis_tables, levels, tables
+from ema_pipeline.report.commands import typed
 from ema_pipeline.report.numbers import plain, signed
 
 Clean = Callable[[str], str]
@@ -180,7 +180,7 @@ def _alone(compared: Comparison) -> list[str]:
         hz = plain(m.measured_frequency_hz, 5)
         text = f"{m.configuration}: mode {m.measured + 1}, {hz} Hz, is none of the model's"
         if math.isfinite(m.model_frequency_hz):
-            off = signed(100 * (m.measured_frequency_hz / m.model_frequency_hz - 1), 1)
+            off = signed(percent_off(m.measured_frequency_hz, m.model_frequency_hz), 1)
             text += (
                 f": that of its shape is at {plain(m.model_frequency_hz, 5)} Hz ({off} %, MAC {m.mac:.2f})"
             )
@@ -255,7 +255,7 @@ def diagnosis_screen(
         parts += [_line(""), _line("Remarks on the data:"), *(_line(f"! {n}") for n in found.notes)]
     if not suspicions:
         commands = diagnosis.next_commands(found, out, (), effect_files)
-        parts += _commands([c.replace("ema ", f"{shlex.quote(program)} ", 1) for c in commands])
+        parts += _commands([typed(c, program) for c in commands])
     return Group(*parts)
 
 

@@ -109,6 +109,11 @@ class Run:
                 )
         return effect_library(self.settings.effect_files, self.rig)
 
+    def check_effect_files(self) -> None:
+        """Refuse a file named in this call that is not right, before anything is written."""
+        if self.named_files:
+            _ = self.library
+
     def effect_hashes(self) -> str:
         """Fingerprint of the files with the user's own effects."""
         return " ".join(
