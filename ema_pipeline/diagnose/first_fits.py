@@ -261,12 +261,8 @@ def _from_nominal(
     problem: EffectProblem, hypothesis: Hypothesis, begin: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
     """The first size at `nominal` values."""
-    x = nominal(problem, begin)
-    return (
-        []
-        if x is None
-        else [problem.unknowns.clipped(problem.unknowns.with_values(x, hypothesis.starts()[0]))]
-    )
+    unknowns, sizes = problem.unknowns, hypothesis.starts()[0]
+    return [unknowns.clipped(unknowns.with_values(x, sizes)) for x in nominal(problem, begin)]
 
 
 def _from_score(

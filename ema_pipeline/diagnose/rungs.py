@@ -152,7 +152,7 @@ def _best_of(observations: Observations, model: Model, before: Fit) -> Fit:
     start = transferred(before.posterior, problem.unknowns, problem.start())
     plans = [(factor, start) for factor in (1.0, 0.3, -0.5)]
     if before.posterior.residuals.unexplained:
-        plans += [(1.0, x) for x in [nominal(problem, start)] if x is not None]
+        plans += [(1.0, x) for x in nominal(problem, start)]
     for factor, begin in plans:
         x = begin.copy()
         for name in new:

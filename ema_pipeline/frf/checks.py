@@ -31,11 +31,12 @@ PEAK_SHARE = 0.01
 """Lines with at least this share of the largest |FRF|² are judged: zeros of the force blow up the rest."""
 
 NODE_LEVEL = 0.1
-"""An FRF below this share of the strongest at its sensor is near a node: its noise tells little."""
+"""An FRF below this share of the strongest at its sensor is near a node: its noise and its sign tell little."""
 
 OBLIQUE_LEVEL = 0.2
 """Oblique blows and transverse sensitivity make responses of up to this share of the largest one to the same blow. Such
-a response varies with the direction of every blow, and says nothing of how well the others repeat."""
+a response varies with the direction of every blow, and says nothing of how well the others repeat, or
+of their signs."""
 
 STRONG_LEVEL = 0.4
 """Cross FRFs above this share of their driving points are ruled by the structure, not by oblique blows, whose part may

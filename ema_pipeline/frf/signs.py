@@ -10,14 +10,9 @@ from numpy.typing import NDArray
 
 from ema_pipeline.check_result import CheckResult, judged
 from ema_pipeline.dof import Dof
+from ema_pipeline.frf.checks import NODE_LEVEL, OBLIQUE_LEVEL
 
 SIGN = "sign"
-
-NODE_LEVEL = 0.1
-"""An FRF below this share of the strongest at its sensor is near a node: its sign tells little."""
-
-OBLIQUE_LEVEL = 0.2
-"""Oblique blows make responses of up to this share of the largest one to the same blow, with the sign of the angle."""
 
 OPPOSITE = -0.7
 """Correlation of two hits from which on they are opposite. Noise makes them independent, and a resonance that has moved

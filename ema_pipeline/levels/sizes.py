@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.levels.single import HitPoles
-from ema_pipeline.levels.trend import Trend
+from ema_pipeline.levels.trend import NO_TREND, Trend
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -30,9 +30,6 @@ hammer whose reading bends, or a hand that aims otherwise when it strikes harder
 MISREAD = 0.2
 """Change of a mode's pole, in decay rates, that is read of a hit whose size differs from the mean of its sheet by all
 of it: aimed otherwise, it shows more of the neighbours."""
-
-NO_TREND = 0.5
-"""P value of a change that is not plain: one that speaks neither for nor against any other test's."""
 
 
 def relative_sizes(found: HitPoles) -> tuple[Complex, Real, Real]:

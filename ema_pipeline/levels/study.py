@@ -21,7 +21,6 @@ from ema_pipeline.threads import cores
 if TYPE_CHECKING:
     from ema_pipeline.ingest.records import Hit, HitSamples
     from ema_pipeline.levels.single import HitPoles
-    from ema_pipeline.levels.trend import Trend
     from ema_pipeline.modal.circle.settings import CircleSettings
     from ema_pipeline.modal.types import ModalModel
 
@@ -279,7 +278,7 @@ def _tested(
             modes[k] if far else _with_scatter(modes[k], found, level, r),
             amplitude_m=_amplitudes(found, level, r, modes[k].amplitude_m.shape),
             frequency_p=frequency[r].p,
-            damping_p=_told(damping[r]),
+            damping_p=damping[r].shown_p,
             depends=any(both) or grows,
             trend=trend_words(both[0], slope, both[1], damping[r].slope, grows, size[r].slope),
             frequency_shift_hz=shift[0],
@@ -288,16 +287,9 @@ def _tested(
             damping_shift_std=damping_shift[1],
             size=tests.level_sizes[r][0],
             size_std=tests.level_sizes[r][1],
-            size_p=_told(size[r]),
+            size_p=size[r].shown_p,
         )
     return tuple(out), tests.p_value, _hit_modes(found, base, level, modal, frfs)
-
-
-def _told(trend: Trend) -> float:
-    """The p value as it is shown: none where the change was too small to be tested."""
-    from ema_pipeline.levels.sizes import NO_TREND
-
-    return float("nan") if trend.p == NO_TREND else trend.p
 
 
 def _hit_modes(found: HitPoles, base: Integers, level: Integers, modal: ModalModel, frfs: FrfSet) -> HitModes:

@@ -75,6 +75,10 @@ class Samples:
         )
 
 
+NO_TREND = 0.5
+"""P value of a change that is not plain: one that speaks neither for nor against any other test's."""
+
+
 @dataclass(frozen=True)
 class Trend:
     """Result of the test.
@@ -92,6 +96,11 @@ class Trend:
     p: float
     slope: float
     extra_std: float
+
+    @property
+    def shown_p(self) -> float:
+        """P value as it is shown: NaN where the change was too small to be tested."""
+        return float("nan") if self.p == NO_TREND else self.p
 
 
 NOTHING = Trend(float("nan"), float("nan"), 0.0)

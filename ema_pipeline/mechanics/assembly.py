@@ -31,6 +31,7 @@ __all__ = [
     "Spring",
     "combination",
     "difference",
+    "row_matrix",
 ]
 
 
@@ -173,10 +174,10 @@ class Assembly:
         damping = _sum_of_squares([e.row for e in dampers], [e.coefficient for e in dampers], index)
         for e in self.elements:
             if isinstance(e, Gyroscopic):
-                a, b = _rows([e.a, e.b], index)
+                a, b = row_matrix([e.a, e.b], index)
                 damping += e.coefficient * (np.outer(a, b) - np.outer(b, a))
         places = list(self.sensors)
-        sensors = dict(zip(places, _rows([self.sensors[p] for p in places], index), strict=True))
+        sensors = dict(zip(places, row_matrix([self.sensors[p] for p in places], index), strict=True))
         return LinearSystem(
             dofs=self.dofs,
             mass=mass,
@@ -202,7 +203,8 @@ def combination(*terms: tuple[float, Row]) -> Row:
     return total
 
 
-def _rows(rows: Sequence[Row], index: Mapping[str, int]) -> NDArray[np.float64]:
+def row_matrix(rows: Sequence[Row], index: Mapping[str, int]) -> NDArray[np.float64]:
+    """Rows over the coordinates, whose positions `index` tells, (m, n)."""
     matrix = np.zeros((len(rows), len(index)))
     for i, row in enumerate(rows):
         for dof, value in row.items():
@@ -216,5 +218,5 @@ def _sum_of_squares(
     rows: Sequence[Row], weights: Sequence[float], index: Mapping[str, int]
 ) -> NDArray[np.float64]:
     """Σ w·v·vᵀ, (n, n)."""
-    v = _rows(rows, index)
+    v = row_matrix(rows, index)
     return np.asarray(v.T @ (np.asarray(weights, dtype=float)[:, None] * v))

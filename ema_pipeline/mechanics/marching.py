@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.mechanics.assembly import Assembly
+from ema_pipeline.mechanics.assembly import Assembly, row_matrix
 from ema_pipeline.mechanics.laws import Nonlinear, check_element
 from ema_pipeline.mechanics.time_response import TimeResponse, recursion, state_space
 
@@ -155,11 +155,7 @@ def _solve(
 
 def element_rows(assembly: Assembly, elements: Sequence[Nonlinear]) -> NDArray[np.float64]:
     """Rows of elements over the coordinates, (m, n)."""
-    rows = np.zeros((len(elements), len(assembly.dofs)))
-    for i, element in enumerate(elements):
-        for dof, value in element.row.items():
-            rows[i, assembly.dofs.index(dof)] = value
-    return rows
+    return row_matrix([e.row for e in elements], {d: i for i, d in enumerate(assembly.dofs)})
 
 
 def interpolated(forces: NDArray[np.float64], substeps: int) -> NDArray[np.float64]:

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 
-from ema_pipeline.mechanics.assembly import Assembly, Mass, Nonlinear, Row, Spring
+from ema_pipeline.mechanics.assembly import Assembly, Mass, Nonlinear, Row, Spring, row_matrix
 from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.mechanics.system import LinearSystem
 
@@ -80,12 +79,8 @@ def _stiffness(element: Spring | Nonlinear) -> float:
 
 def _rigid_body_modes(rows: Sequence[Row], dofs: Sequence[str]) -> int:
     """Number of motions that stretch no spring, whatever its stiffness."""
-    index = {d: i for i, d in enumerate(dofs)}
-    unit: NDArray[np.float64] = np.zeros((len(rows), len(dofs)))
-    for i, row in enumerate(rows):
-        for dof, value in row.items():
-            unit[i, index[dof]] = value
-        unit[i] /= max(float(np.linalg.norm(unit[i])), 1e-300)
+    unit = row_matrix(rows, {d: i for i, d in enumerate(dofs)})
+    unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-300)
     values = np.linalg.eigvalsh(unit.T @ unit)
     return int(np.sum(values <= 64 * len(dofs) * np.finfo(float).eps * max(float(values[-1]), 1e-300)))
 

@@ -146,8 +146,8 @@ def transferred(
     return unknowns.clipped(x)
 
 
-def nominal(problem: EffectProblem, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """Everything but the effects' sizes at its nominal value, (n,); None where no free parameter is far from it at `x`.
+def nominal(problem: EffectProblem, x: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """A point with everything but the effects' sizes at its nominal value, (n,), where a free parameter is far from it.
 
     A model that has lost a measured mode may have moved one so far for the sake of the others that no fit leads back: a
     soil ten times too stiff took the lowest mode out of reach.
@@ -157,7 +157,7 @@ def nominal(problem: EffectProblem, x: NDArray[np.float64]) -> NDArray[np.float6
     found[known] = x[known]
     free = (unknowns.std >= FREE_STD[0]) & np.array([not s for s in unknowns.scatter])
     far = np.any(np.abs(found - x)[free] > _FAR * unknowns.std[free])
-    return found if far else None
+    return [found] if far else []
 
 
 def made_up_of(problem: EffectProblem, name: str) -> dict[str, float]:
