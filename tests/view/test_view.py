@@ -298,6 +298,30 @@ def test_a_pole_of_the_chart_that_is_clicked_is_the_one_to_include(browser, stil
     context.close()
 
 
+def test_a_figure_that_is_drawn_moves_nothing_below_it(browser, still: tuple[Page, str]) -> None:
+    context, tab = with_cookie(browser, still)
+    places = tab.locator("[data-figure]")
+    heights = "all => all.map(e => [e.dataset.figure, e.getBoundingClientRect().height])"
+    before = places.evaluate_all(heights)
+    shown = [k for k in range(places.count()) if places.nth(k).is_visible()]
+    for k in shown:
+        places.nth(k).scroll_into_view_if_needed()
+        places.nth(k).locator("canvas").first.wait_for(state="attached", timeout=20_000)
+    assert len(shown) >= 6
+    assert places.evaluate_all(heights) == before
+    assert tab.faults == []
+    context.close()
+
+
+def test_a_click_that_the_server_does_not_answer_is_told(browser, still: tuple[Page, str]) -> None:
+    context, tab = with_cookie(browser, still)
+    tab.route("**/action", lambda route: route.abort())
+    tab.locator("button[data-verb=exclude_mode]").first.click()
+    tab.locator("#status", has_text="did not take that").wait_for(timeout=20_000)
+    assert tab.faults == []
+    context.close()
+
+
 def test_server_stopped_amid_a_refit_leaves_the_folder_as_it_was(page: Page, out: Path) -> None:
     before = (out / "ema.h5").read_bytes()
     own = {

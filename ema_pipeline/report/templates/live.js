@@ -6,7 +6,8 @@
   function json(url) { return fetch(url, { credentials: "same-origin" }).then(function (r) { if (!r.ok) { throw new Error(r.status); } return r.json(); }); }
   function ask(verb, label) {
     return fetch("/action", { method: "POST", credentials: "same-origin", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ verb: verb, label: label || "" }) })
-      .then(function (r) { return r.ok ? null : r.json().then(function (e) { byId("status").textContent = e.error; }); });
+      .then(function (r) { return r.ok ? null : r.json().then(function (e) { byId("status").textContent = e.error; }); },
+        function () { byId("status").textContent = "The server did not take that: has 'ema view' ended?"; });
   }
   /* What was typed or focused stays where the part of the page is made anew. */
   function replaceParts(parts) {
