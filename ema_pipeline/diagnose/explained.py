@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.special
+from numpy.typing import NDArray
 
 from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED, DiagnoseSettings
-from ema_pipeline.inference import beyond
+from ema_pipeline.inference import Posterior, beyond
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, at_scatters, part_reach, within_scatter
 from ema_pipeline.observations.hit_residuals import LINEARISATION
@@ -137,10 +138,22 @@ def at_usual_scatters(observations: Observations, fit: Fit, of: Sequence[str] = 
 
     Scatters that are learned, those `of` these names, take up what a model lacks.
     """
-    usual = {n: observations.scatters[n].default for n in of if n in observations.scatters}
+    usual = {n: _usual_scatter(observations, n) for n in of if n in observations.scatters}
     learned = fit.posterior.scatters
     capped = {n: min(value, usual.get(n, value)) for n, value in learned.items()}
     return fit if capped == learned else at_scatters(observations, fit, capped)
+
+
+def with_usual_scatters(observations: Observations, fit: Fit) -> Fit:
+    """The fit with neither frequencies, shapes nor damping ratios further from the model's than usual."""
+    return at_usual_scatters(observations, fit, (*_OF_TESTS, DAMPING_SCATTER))
+
+
+def explains_by_scatter(observations: Observations, fit: Fit, settings: DiagnoseSettings) -> bool:
+    """True where frequencies, shapes or damping ratios scatter more than usual, and the data are not explained else."""
+    usual = at_usual_scatters(observations, fit)
+    fails = usual is not fit and within_scatter(observations, usual).posterior.fails(settings.error_limit)
+    return fails or outlying_damping(observations, fit) is not None
 
 
 def outlying_damping(observations: Observations, fit: Fit) -> OutlyingDamping | None:
@@ -149,21 +162,43 @@ def outlying_damping(observations: Observations, fit: Fit) -> OutlyingDamping | 
     Damping follows no law, so its scatter is learned. That alone would hide a damper which the library lacks: of seven
     such dampers in simulated tests, six were taken for scatter.
     """
-    p = fit.posterior
-    share = p.residuals.share.get(DAMPING_SCATTER)
-    if share is None or DAMPING_SCATTER not in observations.scatters:
+    if DAMPING_SCATTER not in observations.scatters:
         return None
+    p = fit.posterior
+    usual = _usual_scatter(observations, DAMPING_SCATTER)
+    squares = np.concatenate((_squares_of_ratios(p, usual), _squares_of_own_damping(p, usual)))
+    count, total = len(squares), float(np.sum(squares))
+    if not count or scipy.special.chdtrc(count, total) > _BY_CHANCE:
+        return None
+    return OutlyingDamping(usual * float(np.sqrt(total / count)), usual)
+
+
+def _usual_scatter(observations: Observations, name: str) -> float:
+    """The largest value of a scatter that is usual."""
+    default = observations.scatters[name].default
+    return max(default, _USUAL_DAMPING_SCATTER) if name == DAMPING_SCATTER else default
+
+
+def _squares_of_ratios(p: Posterior, usual: float) -> NDArray[np.float64]:
+    """Squares of damping ratios that tell of their scatter, over their variances at the usual one."""
+    share = p.residuals.share.get(DAMPING_SCATTER)
+    if share is None:  # a scatter that is stated to be none has no share
+        return np.zeros(0)
     by_linearisation = p.residuals.jacobian * np.where(p.unknowns.governed(LINEARISATION), p.prior_std, 0.0)
     on = (share > _OF_SCATTER) & (np.linalg.norm(by_linearisation, axis=1) < _LINEARISED)
-    count = int(np.sum(on))
-    if not count:  # a scatter that is stated to be none has no share
-        return None
-    usual = max(_USUAL_DAMPING_SCATTER, observations.scatters[DAMPING_SCATTER].default)
     variance = 1 - share[on] + share[on] * (usual / p.scatters[DAMPING_SCATTER]) ** 2
-    squares = float(np.sum(p.residuals.values[on] ** 2 / variance))
-    if scipy.special.chdtrc(count, squares) > _BY_CHANCE:
-        return None
-    return OutlyingDamping(usual * float(np.sqrt(squares / count)), usual)
+    return np.asarray(p.residuals.values[on] ** 2 / variance)
+
+
+def _squares_of_own_damping(p: Posterior, usual: float) -> NDArray[np.float64]:
+    """The same of modes whose damping is an unknown of its own."""
+    own = np.flatnonzero(p.unknowns.governed(DAMPING_SCATTER))
+    if not len(own):
+        return np.zeros(0)
+    told = 1 - (p.std[own] / p.prior_std[own]) ** 2  # the share of it that the data tell
+    own, told = own[told > _OF_SCATTER], told[told > _OF_SCATTER]
+    variance = told * (p.std[own] ** 2 + told * usual**2)
+    return np.asarray(p.x[own] ** 2 / variance)
 
 
 def outlying_parts(observations: Observations, fit: Fit) -> tuple[OutlyingPart, ...]:

@@ -54,6 +54,12 @@ def spread_fits(
     return [Fit(fit.model, p) for fit, p in zip(fits, spread(job, fits, processes, least), strict=True)]
 
 
+def leading(order: Sequence[tuple[Hypothesis, Fit]], base: Fit) -> list[tuple[Hypothesis, Fit]]:
+    """What is a finalist by its fit at wide scatters, best first."""
+    gaining = (pair for pair in order[_AT_LEAST:FINALISTS] if pair[1].log_evidence > base.log_evidence)
+    return [*order[:_AT_LEAST], *gaining]
+
+
 def promising_fits(
     observations: Observations,
     settled: Fit,
@@ -137,10 +143,7 @@ def finals_of(
     `known` are fits of the base model whose scatters are learned already. Fits are led past barriers, but for those
     that begin beside a base model that was.
     """
-    best = [
-        *order[:_AT_LEAST],
-        *(o for o in order[_AT_LEAST:FINALISTS] if o[1].log_evidence > base.log_evidence),
-    ]
+    best = leading(order, base)
     rest = order[len(best) :]
     near = unbeaten(best, lambda pair: pair[1].log_evidence)
     far = best[len(near) :]

@@ -11,10 +11,10 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 
 from ema_pipeline.diagnose.finals import (
-    FINALISTS,
     PROMISING,
     finals_of,
     known_from,
+    leading,
     narrowed,
     promising_fits,
     spread_fits,
@@ -155,7 +155,8 @@ def rank(
     base, found = _begun_again(observations, base, found, processes, _contenders(found), steps=12)
     progress(0.8, "scatter of parts and channels")
     order = sorted(found.values(), key=lambda pair: -pair[1].log_evidence)
-    others = [h for h in hypotheses if h.label not in {best.label for best, _ in order[:FINALISTS]}]
+    taken = {best.label for best, _ in leading(order, base)}
+    others = [h for h in hypotheses if h.label not in taken]
     if settled is None:
         ranking = finals_of(observations, base, order, (), processes, (), past_barriers=True)
         return with_promising(observations, base, ranking, hypotheses, models, processes)

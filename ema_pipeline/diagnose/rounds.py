@@ -16,7 +16,12 @@ from ema_pipeline.diagnose.claims import (
     drops_to,
     judge,
 )
-from ema_pipeline.diagnose.explained import MOST_GAINED
+from ema_pipeline.diagnose.explained import (
+    MOST_GAINED,
+    explains_by_scatter,
+    outlying_damping,
+    with_usual_scatters,
+)
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.naming import named
 from ema_pipeline.diagnose.probability import divided_as, probabilities
@@ -25,7 +30,7 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import NOTHING
 from ema_pipeline.inference import beyond
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import part_reach, within_scatter
+from ema_pipeline.observations.fitting import Fit, part_reach, within_scatter
 
 _PARALLEL = 0.95
 """Cosine of what an effect and what a part change from which they are the same place."""
@@ -87,6 +92,7 @@ def round_of(
 ) -> Round:
     """Judge the finalists of a ranking, beside `found` effects."""
     ranking = _with_relief(observations, ranking, settings)
+    ranking = _at_usual_scatters(observations, ranking, settings)
     nothing = probabilities(ranking, hypotheses, settings, found)[NOTHING]
     judged: list[Judged] = []
     for one in sorted((r for r in ranking.ranked if r.final), key=lambda r: -r.gain):
@@ -122,6 +128,33 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
         for r in ranking.ranked
     ]
     return replace(ranking, ranked=tuple(sorted(ranked, key=lambda r: -r.gain)))
+
+
+def _at_usual_scatters(observations: Observations, ranking: Ranking, settings: DiagnoseSettings) -> Ranking:
+    """The ranking at usual scatters of frequencies, shapes and damping ratios where larger ones alone let the base
+    model explain the data.
+
+    Left alone, they grow until they hold what is missing about as well as it can be held. What explains the data with
+    the usual ones is helped to the difference.
+    """
+    if not explains_by_scatter(observations, ranking.base, settings):
+        return ranking
+    lost_by_base = _lost(ranking.base, with_usual_scatters(observations, ranking.base))
+
+    def relieved(one: Ranked) -> Ranked:
+        held = with_usual_scatters(observations, one.fit) if one.final else one.fit
+        fails = within_scatter(observations, held).posterior.fails(settings.error_limit)
+        if not one.final or fails or outlying_damping(observations, held) is not None:
+            return one
+        return replace(one, gain=one.gain + max(lost_by_base - _lost(one.fit, held), 0.0))
+
+    ranked = sorted(map(relieved, ranking.ranked), key=lambda r: -r.gain)
+    return replace(ranking, ranked=tuple(ranked))
+
+
+def _lost(fit: Fit, held: Fit) -> float:
+    """Log evidence that a fit loses where something is held, whatever that costs."""
+    return fit.posterior.evidence_at_scatters - held.posterior.evidence_at_scatters
 
 
 def _changes(one: Ranked, parts: Sequence[str]) -> bool:

@@ -19,7 +19,7 @@ from ema_pipeline import codec
 from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
 from ema_pipeline.diagnose.claims import judge, left_of_close_modes
 from ema_pipeline.diagnose.diagnosis import diagnose
-from ema_pipeline.diagnose.explained import at_usual_scatters, explanation
+from ema_pipeline.diagnose.explained import at_usual_scatters, explanation, outlying_damping
 from ema_pipeline.diagnose.heldout import HeldOut, held_out
 from ema_pipeline.diagnose.hypotheses import list_hypotheses
 from ema_pipeline.diagnose.ranked import BEATEN
@@ -219,6 +219,23 @@ def test_a_damper_is_not_taken_for_scatter_of_damping_by_a_library_without_dampe
     assert "The damping ratios scatter by 1" in found.summary
     assert "more than the 50 %" in found.summary
     assert of_chain(22, library=only).verdict == "adequate"
+
+
+@pytest.mark.parametrize(("scatter", "outlying"), [(0.4, False), (1.6, True)])
+def test_damping_that_scatters_too_much_is_told_whether_it_is_what_is_left_or_an_unknown(
+    scatter: float, outlying: bool
+) -> None:
+    rig = chain()
+    observations = observed(rig, chain_modes(4, replace(NORMAL, damping=scatter)))
+    model = Model((parse_effect("damper@m3", rig, library=GENERIC),))
+    suited = observations.suited(model.effects)
+    assert suited.own_damping
+    assert not observations.own_damping
+    fits = [learned(o, fit_base(o, Model())) for o in (observations, suited)]
+    told = [outlying_damping(o, fit) for o, fit in zip((observations, suited), fits, strict=True)]
+    assert [one is not None for one in told] == [outlying, outlying]
+    if outlying:
+        assert told[1].scatter == pytest.approx(told[0].scatter, rel=0.05)
 
 
 def test_a_model_that_only_a_larger_scatter_than_usual_explains_fails() -> None:

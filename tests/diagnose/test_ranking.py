@@ -274,8 +274,13 @@ def test_those_behind_in_short_fits_are_annealed_where_a_size_leads_modes_to_par
     assert [asked[1] for asked in stages.asked if asked[0].startswith("annealed")] == list(annealed)
 
 
-def test_near_the_base_model_scores_tell_where_fits_begin(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("evidence", "others"), [(0.9, ["f"]), (1.1, ["e", "f"])])
+def test_near_the_base_model_scores_tell_where_fits_begin(
+    monkeypatch: pytest.MonkeyPatch, evidence: float, others: list[str]
+) -> None:
+    """The fifth at wide scatters, which gains nothing there, may promise something beside learned ones all the same."""
     stages = Stages(monkeypatch)
+    stages.base.posterior.log_evidence = evidence  # type: ignore[misc]
     base, order, promising, known = stages.rank(stages.base, further=2, unpaired=2.0)
     assert base is stages.base
     assert known == ["learned"]
@@ -287,7 +292,7 @@ def test_near_the_base_model_scores_tell_where_fits_begin(monkeypatch: pytest.Mo
         True,
     )  # what cannot be seen is left out
     assert stages.asked[1] == ("first", "a", 6)
-    assert stages.asked[7:] == [("freed", 6), ("again", 6, 12), ("promising", "learned", ["f"], 2)]
+    assert stages.asked[7:] == [("freed", 6), ("again", 6, 12), ("promising", "learned", others, 2)]
 
 
 @pytest.mark.parametrize("bent", [False, True])

@@ -420,6 +420,46 @@ def test_a_base_model_that_fails_once_no_part_stands_out_counts_with_that_fit(
     assert found.base is base
 
 
+def test_where_larger_scatters_alone_explain_the_data_effects_are_compared_at_the_usual_ones(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Those that need no more than these are helped to what the base model loses there, less what they lose."""
+
+    def fit(evidence: float, held: float, error: float = 1.0, damped: bool = False) -> Any:
+        def posterior(told: float) -> Any:
+            return SimpleNamespace(evidence_at_scatters=told, fails=lambda most: error > most)
+
+        usual = SimpleNamespace(posterior=posterior(held), damped=damped)
+        return SimpleNamespace(posterior=posterior(evidence), usual=usual, damped=True)
+
+    def ranked(label: str, gain: float, of: Any, final: bool = True) -> Ranked:
+        return Ranked(SimpleNamespace(label=label), of, gain, final)  # type: ignore[arg-type]
+
+    base, needs_more = fit(60.0, 54.0), True
+    monkeypatch.setattr(rounds, "explains_by_scatter", lambda o, one, settings: needs_more and one is base)
+    monkeypatch.setattr(rounds, "with_usual_scatters", lambda o, one: one.usual)
+    monkeypatch.setattr(rounds, "outlying_damping", lambda o, one: one if one.damped else None)
+    monkeypatch.setattr(rounds, "within_scatter", lambda o, one: one)
+    given = Ranking(
+        base,
+        (
+            ranked("fails", 3.3, fit(63.3, 62.0, error=1.51)),
+            ranked("explains", 3.2, fit(63.2, 63.0)),
+            ranked("damping scatters", 3.1, fit(63.1, 63.0, damped=True)),
+            ranked("loses more", 3.0, fit(63.0, 56.9)),
+            ranked("no finalist", 2.0, fit(62.0, 62.0), final=False),
+        ),
+    )
+    data: Any = None
+    found = rounds._at_usual_scatters(data, given, SETTINGS)
+    assert [r.hypothesis.label for r in found.ranked][:2] == ["explains", "fails"]
+    gains = {r.hypothesis.label: r.gain for r in found.ranked}
+    assert gains.pop("explains") == pytest.approx(3.2 + 6.0 - 0.2)
+    assert gains == {"fails": 3.3, "damping scatters": 3.1, "loses more": 3.0, "no finalist": 2.0}
+    needs_more = False
+    assert rounds._at_usual_scatters(data, given, SETTINGS) is given
+
+
 def replaced(one: Any, **changes: Any) -> Any:
     """`replace` for what stands for a dataclass, too."""
     if isinstance(one, SimpleNamespace):
