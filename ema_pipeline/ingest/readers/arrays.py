@@ -61,12 +61,16 @@ class NamedArray:
 
 @dataclass(frozen=True)
 class _Column:
-    """One vector on its way to becoming a channel; `axis_rate` where it came with its own axis."""
+    """One vector on its way to becoming a channel.
+
+    `axis_rate` where it came with its own axis; `matrix` is the path of the matrix that it is a column of.
+    """
 
     path: tuple[str, ...]
     samples: Samples
     attributes: Mapping[str, Any]
     axis_rate: float | None = None
+    matrix: tuple[str, ...] | None = None
 
 
 def assemble(
@@ -132,9 +136,8 @@ def assemble(
     columns = _without_housekeeping(columns, notes)
     columns, axis_rate = _one_axis(columns, rates.value, notes)
     rates.add("axis columns", axis_rate)
-    column_names = column_names if len(column_names) == len(columns) else ()
-    unit_names = unit_names if len(unit_names) == len(columns) else ()
-    names = column_names or _shortest_unique([c.path for c in columns])
+    unit_names = _listed(unit_names, columns)
+    names = _listed(column_names, columns) or _shortest_unique([c.path for c in columns])
     channels = {
         name: RawChannel(
             samples=column.samples,
@@ -186,6 +189,18 @@ class _Rates:
             self.value, self.tolerance, self._source = rate, tolerance, label
 
 
+def _listed(texts: tuple[str, ...], columns: list[_Column]) -> tuple[str, ...]:
+    """The texts of a list beside a matrix, one for each of its columns; none where nothing says what they belong to.
+
+    Variables of their own come in the order of their file, which need not be that of a list.
+    """
+    if len({c.matrix for c in columns}) != 1 or columns[0].matrix is None:
+        return ()
+    if columns[0].axis_rate is not None and len(texts) == len(columns) + 1:
+        texts = texts[1:]  # the first is that of the axis
+    return texts if len(texts) == len(columns) and all(texts) else ()
+
+
 def _number_of(text: str) -> float:
     """The number that a text states, of hertz where it names a unit; NaN for other text."""
     try:
@@ -218,6 +233,7 @@ def _split_matrix(array: NamedArray, numbers: NDArray[np.float64]) -> list[_Colu
             samples=np.ascontiguousarray(table[:, i]),
             attributes={"unit": units[i]} if units else {},
             axis_rate=axis_rate,
+            matrix=array.path,
         )
         for i, name in enumerate(names)
     ]

@@ -1,0 +1,84 @@
+"""Record files that are laid out otherwise than most: read as they are, or refused in words that say why."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+from ingest_example import DESCRIPTION, RATE, SAMPLES, hammer_test, make_test, write_uff
+from numpy.testing import assert_allclose
+from scipy.io import wavfile
+
+from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.description import read_description
+from ema_pipeline.ingest.load import load_record
+from ema_pipeline.ingest.readers import read_raw
+
+DATA = hammer_test()
+
+
+def check(path: Path, rate: float | None = RATE) -> None:
+    raw = read_raw(path)
+    assert raw.sample_rate_hz == (None if rate is None else pytest.approx(rate))
+    for name, samples in DATA.items():
+        assert_allclose(raw.channels[name].samples, samples, rtol=1e-6, atol=1e-6)
+
+
+def matlab_73(path: Path, write: Callable[[h5py.File], None]) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, value in {**DATA, "fs": np.array([RATE])}.items():
+            file[name] = value.reshape(1, -1)
+            file[name].attrs["MATLAB_class"] = np.bytes_("double")
+        write(file)
+    with path.open("r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64, Created on: Thu Apr  9 2026".ljust(124))
+        raw.write(struct.pack("<HH", 0x0200, 0x4D49))
+
+
+def cell(file: h5py.File, name: str, items: list[h5py.Reference]) -> None:
+    file[name] = np.array([items], dtype=h5py.ref_dtype)
+    file[name].attrs["MATLAB_class"] = np.bytes_("cell")
+
+
+# --- names and units that stand in lists of their own ------------------------------------------------------
+
+
+def test_a_list_of_names_beside_variables_of_their_own_renames_none_of_them(tmp_path: Path) -> None:
+    """HDF5 sorts its datasets by name, a list has its own order: the channels would be exchanged."""
+    path = tmp_path / "hit.h5"
+    values = {"hammer": DATA["hammer"], "a1": DATA["tip"]}
+    with h5py.File(path, "w") as file:
+        for name, samples in values.items():
+            file[name] = samples
+        file["channel_names"] = ["hammer", "a1"]
+        file["units"] = ["N", "g"]
+    raw = read_raw(path)
+    for name, samples in values.items():
+        assert_allclose(raw.channels[name].samples, samples)
+        assert raw.channels[name].unit is None
+
+
+def test_names_of_the_columns_of_a_matrix_may_include_its_time_axis(tmp_path: Path) -> None:
+    path = tmp_path / "hit.mat"
+    table = np.column_stack([np.arange(SAMPLES) / RATE, *DATA.values()])
+    names = np.array(["time", *DATA], dtype=object)
+    scipy.io.savemat(path, {"data": table, "names": names, "units": np.array(["s", "N", "g"], dtype=object)})
+    check(path)
+    assert [c.unit for c in read_raw(path).channels.values()] == ["N", "g"]
+
+
+# --- MAT --------------------------------------------------------------------------------------------------
+
+
+# --- HDF5 and TDMS ----------------------------------------------------------------------------------------
+
+
+# --- UFF and WAV ------------------------------------------------------------------------------------------
+
+
+# --- from the file to the test ----------------------------------------------------------------------------
