@@ -78,6 +78,22 @@ def test_names_of_the_columns_of_a_matrix_may_include_its_time_axis(tmp_path: Pa
 # --- HDF5 and TDMS ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("index", ["rubbish", "of a shorter recording"])
+def test_the_index_file_beside_a_tdms_file_is_not_believed(tmp_path: Path, index: str) -> None:
+    from nptdms import ChannelObject, TdmsWriter
+
+    path = tmp_path / "hit.tdms"
+    for samples in (SAMPLES // 4, SAMPLES):
+        with TdmsWriter(str(path), index_file=samples < SAMPLES) as writer:
+            channels = [
+                ChannelObject("g", n, x[:samples], {"wf_increment": 1 / RATE}) for n, x in DATA.items()
+            ]
+            writer.write_segment(channels)
+    if index == "rubbish":
+        path.with_suffix(".tdms_index").write_bytes(b"rubbish")
+    check(path)
+
+
 # --- UFF and WAV ------------------------------------------------------------------------------------------
 
 

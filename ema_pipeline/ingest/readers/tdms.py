@@ -31,7 +31,8 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
     from nptdms.log import log_manager
 
     log_manager.set_level(logging.ERROR)  # its warnings would land on the user's screen; we raise instead
-    with TdmsFile.open(str(path)) as file:
+    # Opened here: by its path, the library would believe an index file beside it, of whatever recording that is.
+    with path.open("rb") as stored, TdmsFile.open(stored) as file:
         if file.file_status.incomplete_final_segment:
             raise EmaError("is cut short: its last segment is incomplete; copy or export it again")
         channels = [c for group in file.groups() for c in group.channels() if len(c) and _is_numeric(c)]
