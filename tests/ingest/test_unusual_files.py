@@ -78,6 +78,39 @@ def test_names_of_the_columns_of_a_matrix_may_include_its_time_axis(tmp_path: Pa
 # --- HDF5 and TDMS ----------------------------------------------------------------------------------------
 
 
+def test_hdf5_groups_of_different_rates_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "hit.h5"
+    with h5py.File(path, "w") as file:
+        for i, (name, samples) in enumerate(DATA.items()):
+            file[f"{name}_data/{name}"] = samples
+            file[f"{name}_data"].attrs["fs"] = RATE * (1 + i)
+    with pytest.raises(
+        EmaError, match=r"sample rate 2048 Hz \(group 'hammer_data'\) and 4096 Hz \(group 'tip_"
+    ):
+        read_raw(path)
+
+
+def test_hdf5_rates_of_groups_without_samples_give_way_to_that_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "hit.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["fs"] = RATE
+        file.create_group("camera").attrs["fs"] = 25.0
+        for name, samples in DATA.items():
+            file[f"data/{name}"] = samples
+    check(path)
+
+
+def test_tdms_groups_of_different_rates_are_refused(tmp_path: Path) -> None:
+    from nptdms import ChannelObject, GroupObject, TdmsWriter
+
+    path = tmp_path / "hit.tdms"
+    with TdmsWriter(str(path)) as writer:
+        groups = [GroupObject(n, {"fs": RATE * (1 + i)}) for i, n in enumerate(DATA)]
+        writer.write_segment([*groups, *(ChannelObject(n, n, x) for n, x in DATA.items())])
+    with pytest.raises(EmaError, match=r"sample rate 2048 Hz \(group 'hammer'\) and 4096 Hz \(group 'tip'\)"):
+        read_raw(path)
+
+
 @pytest.mark.parametrize("index", ["rubbish", "of a shorter recording"])
 def test_the_index_file_beside_a_tdms_file_is_not_believed(tmp_path: Path, index: str) -> None:
     from nptdms import ChannelObject, TdmsWriter

@@ -75,7 +75,7 @@ class _Column:
 
 def assemble(
     arrays: Sequence[NamedArray],
-    file_attributes: Mapping[str, Any] | None = None,
+    attributes: Mapping[str, Mapping[str, Any]] | None = None,
     limits: ReadLimits | None = None,
 ) -> RawRecord:
     """Sort named arrays into channels, time axes and sample rates.
@@ -91,7 +91,8 @@ def assemble(
     """
     limits = limits or ReadLimits()
     rates = _Rates()
-    rates.read("file attributes", file_attributes or {})
+    for source, stated in (attributes or {}).items():
+        rates.read(source, stated)
     column_names: tuple[str, ...] = ()
     unit_names: tuple[str, ...] = ()
     columns: list[_Column] = []

@@ -49,18 +49,24 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
     import h5py
 
     arrays: list[NamedArray] = []
-    attributes: dict[str, Any] = {}
+    groups: dict[tuple[str, ...], Mapping[str, Any]] = {}
     with h5py.File(path, "r") as file:
-        attributes.update(small_attributes(file))
+        attributes = dict(small_attributes(file))
         budget, stored = Budget(path, limits), StoredFile(path)
         for at, item in walk(file, limits):
             if isinstance(item, h5py.Group):
-                attributes = {**small_attributes(item), **attributes}
+                groups[at] = small_attributes(item)
             elif item.dtype.names is None and item.shape is not None:
                 found = _array(stored, at, item, budget)
                 if found is not None:
                     arrays.append(found)
-    return assemble(arrays, attributes, limits)
+    holders = {a.path[:depth] for a in arrays for depth in range(1, len(a.path)) if np.size(a.values) > 1}
+    for at in [
+        at for at in groups if at not in holders
+    ]:  # what stands apart from the samples may speak of the whole file
+        attributes = {**groups[at], **attributes}
+    stated = {f"group '{'/'.join(at)}'": groups[at] for at in groups if at in holders}
+    return assemble(arrays, {"file attributes": attributes, **stated}, limits)
 
 
 def _array(stored: StoredFile, at: tuple[str, ...], item: h5py.Dataset, budget: Budget) -> NamedArray | None:

@@ -43,16 +43,10 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
                 f"states {stated} bytes of samples, more than the whole file has; copy or export it again"
             )
         arrays = [NamedArray((c.group_name, c.name), np.asarray(c[:]), dict(c.properties)) for c in channels]
-        return assemble(arrays, {**file.properties, **_group_properties(file)}, limits)
+        groups = {f"group '{group.name}'": dict(group.properties) for group in file.groups()}
+        return assemble(arrays, {"file properties": dict(file.properties), **groups}, limits)
 
 
 def _is_numeric(channel: Any) -> bool:
     kind = getattr(channel.data_type, "nptype", None)
     return kind is not None and np.dtype(kind).kind in "fiuc" and bool(channel.data_type.size)
-
-
-def _group_properties(file: object) -> dict[str, object]:
-    merged: dict[str, object] = {}
-    for group in file.groups():  # type: ignore[attr-defined]
-        merged.update(group.properties)
-    return merged
