@@ -78,6 +78,17 @@ def test_names_of_the_columns_of_a_matrix_may_include_its_time_axis(tmp_path: Pa
 # --- HDF5 and TDMS ----------------------------------------------------------------------------------------
 
 
+def test_hdf5_attributes_that_hold_nothing_are_no_damage(tmp_path: Path) -> None:
+    path = tmp_path / "hit.h5"
+    with h5py.File(path, "w") as file:
+        for name, samples in DATA.items():
+            file[name] = samples
+            file[name].attrs["unit"] = h5py.Empty("S10")
+        file.attrs["sample_rate_hz"] = h5py.Empty("f8")
+        file["tip"].attrs["fs"] = RATE
+    check(path)
+
+
 def test_hdf5_groups_of_different_rates_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "hit.h5"
     with h5py.File(path, "w") as file:

@@ -142,11 +142,13 @@ def _below(
 
 
 def small_attributes(item: h5py.Group | h5py.Dataset) -> Mapping[str, Any]:
-    """Attributes of a reasonable size; others say nothing that is looked for."""
+    """Attributes of a reasonable size that hold something; others say nothing that is looked for."""
+    import h5py
+
     found = {}
     for name in item.attrs:
         described = item.attrs.get_id(name)
         size = int(np.prod(described.shape or (1,))) * described.dtype.itemsize
-        if size <= _LARGEST_ATTRIBUTE:
-            found[name] = item.attrs[name]
+        if size <= _LARGEST_ATTRIBUTE and not isinstance(value := item.attrs[name], h5py.Empty):
+            found[name] = value
     return found
