@@ -89,6 +89,17 @@ def test_hdf5_attributes_that_hold_nothing_are_no_damage(tmp_path: Path) -> None
     check(path)
 
 
+def test_hdf5_tables_have_a_channel_per_column(tmp_path: Path) -> None:
+    path = tmp_path / "hit.h5"
+    table = np.zeros(SAMPLES, dtype=[("time", "f8"), ("hammer", "f8"), ("tip", "f4"), ("note", "S4")])
+    table["time"] = np.arange(SAMPLES) / RATE
+    for name, samples in DATA.items():
+        table[name] = samples
+    with h5py.File(path, "w") as file:
+        file["data"] = table
+    check(path)
+
+
 def test_hdf5_groups_of_different_rates_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "hit.h5"
     with h5py.File(path, "w") as file:

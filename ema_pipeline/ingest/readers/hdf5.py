@@ -56,7 +56,9 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
         for at, item in walk(file, limits):
             if isinstance(item, h5py.Group):
                 groups[at] = small_attributes(item)
-            elif item.dtype.names is None and item.shape is not None:
+            elif item.shape is not None and item.dtype.names is not None:
+                arrays.extend(_fields(at, item, budget))
+            elif item.shape is not None:
                 found = _array(stored, at, item, budget)
                 if found is not None:
                     arrays.append(found)
@@ -81,6 +83,16 @@ def _array(stored: StoredFile, at: tuple[str, ...], item: h5py.Dataset, budget: 
         values = item.asstr(errors="replace")[()] if item.size <= _MOST_TEXTS else None
     # An h5py string array may come back as a plain str; numpy makes both arrays.
     return None if values is None else NamedArray(at, np.asarray(values), small_attributes(item))
+
+
+def _fields(at: tuple[str, ...], item: h5py.Dataset, budget: Budget) -> list[NamedArray]:
+    """The columns of a table; those of a spectrum's real and imaginary parts are none."""
+    budget.take(item)
+    if item.ndim != 1 or {name.casefold() for name in item.dtype.names} >= {"real", "imag"}:
+        return []
+    rows, attributes = item[()], small_attributes(item)
+    numbers = [name for name in rows.dtype.names if rows.dtype[name].kind in "fiu"]
+    return [NamedArray((*at, name), rows[name], attributes if name == numbers[0] else {}) for name in numbers]
 
 
 class Budget:
