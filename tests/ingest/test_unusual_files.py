@@ -75,6 +75,50 @@ def test_names_of_the_columns_of_a_matrix_may_include_its_time_axis(tmp_path: Pa
 # --- MAT --------------------------------------------------------------------------------------------------
 
 
+def test_mat_5_structs_within_structs(tmp_path: Path) -> None:
+    path = tmp_path / "hit.mat"
+    scipy.io.savemat(path, {"test": {"signals": DATA, "setup": {"fs": RATE}}})
+    check(path)
+
+
+@pytest.mark.parametrize("what", ["no reference", "struct", "odd characters", "text beyond the BMP"])
+def test_mat_73_cells_of_anything_do_no_harm(tmp_path: Path, what: str) -> None:
+    def write(file: h5py.File) -> None:
+        if what == "no reference":
+            cell(file, "names", [h5py.Reference(), h5py.Reference()])
+        elif what == "struct":
+            cell(file, "names", [file.create_group("#refs#/a").ref])
+        elif what == "odd characters":
+            file["#refs#/a"] = np.array([[2**31]], dtype=np.uint32)
+            cell(file, "names", [file["#refs#/a"].ref])
+        else:
+            file["#refs#/a"] = np.frombuffer("\N{GRINNING FACE}".encode("utf-16-le"), "<u2")
+            cell(file, "names", [file["#refs#/a"].ref])
+
+    path = tmp_path / "hit.mat"
+    matlab_73(path, write)
+    check(path)
+
+
+@pytest.mark.parametrize("version", ["5", "7.3"])
+def test_vectors_in_a_cell_are_named_as_what_was_left_out(tmp_path: Path, version: str) -> None:
+    path = tmp_path / "hit.mat"
+    if version == "5":
+        vectors = np.empty(2, dtype=object)
+        vectors[:] = list(DATA.values())
+        scipy.io.savemat(path, {"data": vectors, "fs": RATE})
+    else:
+
+        def write(file: h5py.File) -> None:
+            for name in DATA:
+                file.move(name, f"#refs#/{name}")
+            cell(file, "data", [file[f"#refs#/{name}"].ref for name in DATA])
+
+        matlab_73(path, write)
+    with pytest.raises(EmaError, match=r"'data' is a cell or struct array and is left out; save its vectors"):
+        read_raw(path)
+
+
 # --- HDF5 and TDMS ----------------------------------------------------------------------------------------
 
 

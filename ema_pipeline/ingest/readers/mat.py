@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ APART = "mat"
 _HEADER_BYTES = 128
 _PACKED = 15  # miCOMPRESSED
 _LONGEST_TEXT = 10_000
+_CHARACTER_BYTES = 2
 
 _NUMERIC = {"double", "single", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64"}
 
@@ -34,29 +36,45 @@ def recognise(path: Path, head: bytes) -> bool:
 
 
 def read(path: Path, limits: ReadLimits) -> RawRecord:
-    """Read every numeric variable, and the fields of structs one level down."""
+    """Read every numeric variable, and the fields of structs."""
     with path.open("rb") as file:
         newer = file.read(10) == b"MATLAB 7.3"
-    arrays = _read_73(path, limits) if newer else _read_5(path, limits)
-    return assemble(_with_label_units(arrays), limits=limits)
+    arrays, packed = _read_73(path, limits) if newer else _read_5(path, limits)
+    record = assemble(_with_label_units(arrays), limits=limits)
+    notes = tuple(
+        f"'{'/'.join(steps)}' is a cell or struct array and is left out; save its vectors as variables"
+        for steps in packed
+    )
+    return replace(record, notes=record.notes + notes)
 
 
-def _read_5(path: Path, limits: ReadLimits) -> list[NamedArray]:
+def _read_5(path: Path, limits: ReadLimits) -> tuple[list[NamedArray], list[tuple[str, ...]]]:
+    """What the variables and the fields of structs hold, and the paths of arrays of arrays or structs."""
     from scipy.io import loadmat
 
     _check_variables(path, limits)
     arrays: list[NamedArray] = []
-    for name, value in loadmat(str(path), struct_as_record=False).items():
-        if name.startswith("__"):
-            continue
+    packed: list[tuple[str, ...]] = []
+    left: list[tuple[tuple[str, ...], Any]] = [
+        ((name,), value)
+        for name, value in loadmat(str(path), struct_as_record=False).items()
+        if not name.startswith("__")
+    ]
+    while left:
+        steps, value = left.pop(0)
         values = np.asarray(value)
-        struct: Any = values.ravel()[0] if values.dtype == object and values.size == 1 else None
-        if hasattr(struct, "_fieldnames"):
-            for field in struct._fieldnames:
-                arrays.append(NamedArray((name, field), np.asarray(getattr(struct, field))))
+        items = values.ravel() if values.dtype == object else np.empty(0)
+        if items.size == 1 and hasattr(items[0], "_fieldnames"):
+            left[:0] = [((*steps, field), getattr(items[0], field)) for field in items[0]._fieldnames]
+        elif any(hasattr(x, "_fieldnames") or _is_vector(x) for x in items):
+            packed.append(steps)
         else:
-            arrays.append(NamedArray((name,), values))
-    return arrays
+            arrays.append(NamedArray(steps, values))
+    return arrays, packed
+
+
+def _is_vector(item: Any) -> bool:
+    return isinstance(item, np.ndarray) and item.dtype.kind in "fiu" and item.size > 1
 
 
 def _check_variables(path: Path, limits: ReadLimits) -> None:
@@ -78,10 +96,12 @@ def _check_variables(path: Path, limits: ReadLimits) -> None:
             file.seek(start + length)
 
 
-def _read_73(path: Path, limits: ReadLimits) -> list[NamedArray]:
+def _read_73(path: Path, limits: ReadLimits) -> tuple[list[NamedArray], list[tuple[str, ...]]]:
+    """The same of a file of version 7.3."""
     import h5py
 
     arrays: list[NamedArray] = []
+    packed: list[tuple[str, ...]] = []
     with h5py.File(path, "r") as file:
         budget = Budget(path, limits)
         for steps, item in walk(file, limits):
@@ -95,17 +115,34 @@ def _read_73(path: Path, limits: ReadLimits) -> list[NamedArray]:
                 arrays.append(NamedArray(steps, item[()].T))
             elif kind == "char" and item.dtype.kind == "u":
                 arrays.append(NamedArray(steps, np.asarray(_characters(item))))
-            elif kind == "cell" and item.dtype == h5py.ref_dtype:
+            elif item.dtype == h5py.ref_dtype:
                 limits.check_channels(item.size)
-                texts = [_characters(file[reference]) for reference in np.ravel(item[()])]
+                if any(_is_packed(file[reference]) for reference in np.ravel(item[()]) if reference):
+                    packed.append(steps)
+                    continue
+                texts = [
+                    _characters(file[reference]) if reference else "" for reference in np.ravel(item[()])
+                ]
                 arrays.append(NamedArray(steps, np.asarray(texts)))
-    return arrays
+    return arrays, packed
+
+
+def _is_packed(item: Any) -> bool:
+    """True for the vectors and structs that a cell or a struct array holds."""
+    if not hasattr(item, "dtype"):
+        return True
+    return item.dtype.kind in "fi" and (item.size or 0) > 1
 
 
 def _characters(dataset: Any) -> str:
-    if dataset.size > _LONGEST_TEXT:
+    """The text of a character array; none of anything else that a cell may hold."""
+    import h5py
+
+    if not isinstance(dataset, h5py.Dataset) or dataset.dtype.kind != "u" or not dataset.size:
         return ""
-    return "".join(chr(int(code)) for code in np.ravel(dataset[()]) if dataset.dtype.kind == "u")
+    if dataset.size > _LONGEST_TEXT or dataset.dtype.itemsize > _CHARACTER_BYTES:
+        return ""
+    return np.ravel(dataset[()]).astype("<u2").tobytes().decode("utf-16-le", errors="replace")
 
 
 def _with_label_units(arrays: list[NamedArray]) -> list[NamedArray]:
