@@ -196,4 +196,25 @@ def test_the_index_file_beside_a_tdms_file_is_not_believed(tmp_path: Path, index
 # --- UFF and WAV ------------------------------------------------------------------------------------------
 
 
+def test_uff_with_half_the_bytes_of_its_doubles_is_no_single_precision(tmp_path: Path) -> None:
+    path = tmp_path / "hit.uff"
+    write_uff(path, DATA, binary=True)
+    content = path.read_bytes()
+    twice = content.replace(b"         4      2048", b"         4      4096")
+    assert twice.count(b"4      4096") == 2
+    path.write_bytes(twice)
+    with pytest.raises(EmaError, match=r"channel 'hammer' stores 16384 bytes for 4096 samples; .* damaged"):
+        read_raw(path)
+
+
+def test_uff_channels_that_start_at_different_times_are_refused(tmp_path: Path) -> None:
+    early, late = tmp_path / "early.uff", tmp_path / "late.uff"
+    write_uff(early, {"hammer": DATA["hammer"]}, binary=False)
+    write_uff(late, {"tip": DATA["tip"]}, binary=False, x=0.25 + np.arange(SAMPLES) / RATE)
+    path = tmp_path / "hit.uff"
+    path.write_bytes(early.read_bytes() + late.read_bytes())
+    with pytest.raises(EmaError, match=r"start at different times \('hammer' at 0 s, 'tip' at 0\.25 s\)"):
+        read_raw(path)
+
+
 # --- from the file to the test ----------------------------------------------------------------------------

@@ -29,6 +29,9 @@ _TIME_RESPONSE = (0, 1)  # function types: general, time response
 _DIRECTIONS = {1: "x", 2: "y", 3: "z", 4: "rx", 5: "ry", 6: "rz"}
 _ABSCISSA_ROUNDING = 5.1e-6  # steps are written with six digits (E13.5)
 _IEEE = 2
+_DOUBLE = 4
+_MOST_LATE = 0.5
+"""Samples; channels that start further apart are no record of one moment."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
     limits.check_channels(sum(block.number == 58 for block in blocks))
     channels: dict[str, RawChannel] = {}
     rates: list[float] = []
+    starts: list[float] = []
     rounding = 0.0
     notes: list[str] = []
     extract = pyuff.datasets.dataset_58._extract58
@@ -77,6 +81,7 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
             rate = whole_rate(step, _ABSCISSA_ROUNDING) if step > 0 else None
         if rate is not None:
             rates.append(rate)
+        starts.append(float(header["abscissa_min"]) if times is None or not times.size else float(times[0]))
         channels[name] = RawChannel(
             samples, clean_unit(header["ordinate_axis_units_lab"]), _dof(header, "rsp"), _dof(header, "ref")
         )
@@ -86,6 +91,13 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
         raise EmaError(
             f"its channels differ in sample rate ({min(rates):.10g} and {max(rates):.10g} Hz); "
             "export them with one rate"
+        )
+    late = max(starts) - min(starts)
+    if rates and late * min(rates) > _MOST_LATE + _ABSCISSA_ROUNDING * max(map(abs, starts)) * min(rates):
+        first, last = list(channels)[int(np.argmin(starts))], list(channels)[int(np.argmax(starts))]
+        raise EmaError(
+            f"its channels start at different times ('{first}' at {min(starts):.6g} s, '{last}' at "
+            f"{max(starts):.6g} s); export them from one moment on"
         )
     return RawRecord(channels, rates[0] if rates else None, tuple(notes), rounding)
 
@@ -144,10 +156,11 @@ def _body(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     points = int(header["num_pts"])
     even = int(header["abscissa_spacing"]) != 0
+    double = int(header["ord_data_type"]) == _DOUBLE
     if block.binary:
         body = data[block.body : block.stop]
         samples, times = _binary(body, header, points, even, name)
-        if even and header["ord_data_type"] == 2 and len(body) >= 8 * points:
+        if even and not double and len(body) >= 8 * points:
             notes.append(f"'{name}' is labelled single precision but stored in double")
     else:
         try:
@@ -181,7 +194,8 @@ def _binary(
         (False, 16): [("x", "f8"), ("y", "f8")],
     }
     layout = layouts.get((even, width))
-    if layout is None or rest:
+    halved = layout is not None and layout[-1][1] == "f4" and int(header["ord_data_type"]) == _DOUBLE
+    if layout is None or rest or halved:
         raise EmaError(
             f"channel '{name}' stores {len(body)} bytes for {points} samples; the file is damaged, "
             "copy or export it again"
