@@ -273,6 +273,9 @@ def _find_channel(name: str, raw: RawRecord, where: str) -> RawChannel:
     same = [known for known in raw.channels if known.casefold() == name.casefold()]
     close = did_you_mean(name, raw.channels)
     hint = f"did you mean '{same[0]}'? " if same else f"{close.strip(' ()')}; " if "mean" in close else ""
+    why = next((note for note in raw.notes if f"'{name}'" in note or f"/{name}'" in note), None)
+    if why is not None:
+        raise EmaError(f"{where}: has no channel '{name}': {why}; export it as numbers over time")
     shown = ", ".join(list(raw.channels)[:30])
     more = f" and {len(raw.channels) - 30} more" if len(raw.channels) > 30 else ""
     raise EmaError(

@@ -217,4 +217,26 @@ def test_uff_channels_that_start_at_different_times_are_refused(tmp_path: Path) 
         read_raw(path)
 
 
+def test_a_wav_that_ends_within_a_sample_says_nothing_of_the_program(tmp_path: Path) -> None:
+    path = tmp_path / "hit.wav"
+    wavfile.write(path, int(RATE), np.column_stack(list(DATA.values())).astype(np.float32))
+    content = bytearray(path.read_bytes())
+    size = content.index(b"data") + 4
+    content[size : size + 4] = struct.pack("<I", SAMPLES * 8 - 4)
+    path.write_bytes(content[:-4])
+    with pytest.raises(EmaError) as refused:
+        read_raw(path)
+    assert str(refused.value).endswith(
+        "hit.wav: cannot be read as WAV; the file is damaged or cut short, copy or export it again"
+    )
+
+
 # --- from the file to the test ----------------------------------------------------------------------------
+
+
+def test_a_channel_that_a_reader_left_out_says_why(tmp_path: Path) -> None:
+    folder = make_test(tmp_path, DESCRIPTION, "hit.mat")
+    scipy.io.savemat(folder / "hit.mat", {"hammer": DATA["hammer"], "tip": DATA["tip"] + 1j, "fs": RATE})
+    test = read_description(folder)
+    with pytest.raises(EmaError, match=r"has no channel 'tip': 'tip' is complex .* left out; export it as"):
+        load_record(test, test.records[0])

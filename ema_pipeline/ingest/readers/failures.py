@@ -27,6 +27,6 @@ _OF_THE_PROGRAM = (
 def words_of(error: Exception) -> str:
     """The first line of its text; empty where that speaks of the program and not of the file."""
     lines = str(error).strip().splitlines()
-    if not lines or isinstance(error, _OF_THE_PROGRAM) or "b'" in lines[0]:
+    if not lines or isinstance(error, _OF_THE_PROGRAM) or any(w in lines[0] for w in ("b'", "reshape")):
         return ""
     return lines[0][:_LONGEST]
