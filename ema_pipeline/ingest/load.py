@@ -228,6 +228,7 @@ def _open(
     raw = read_raw(path, limits)
     rate = _sample_rate(test, raw, str(path))
     found = {c.name: _find_channel(c.name, raw, str(path)) for c in test.channels}
+    _check_distinct(found, str(path))
     _check_lengths(found, str(path))
     sources = {}
     with held_open(found[test.channels[0].name].samples):
@@ -282,6 +283,17 @@ def _find_channel(name: str, raw: RawRecord, where: str) -> RawChannel:
         f"{where}: has no channel '{name}' ({hint}the file holds: {shown}{more}); "
         "correct the name in test.toml"
     )
+
+
+def _check_distinct(found: dict[str, RawChannel], where: str) -> None:
+    """Refuse two names that lead to one channel of the file, which would count as two sensors."""
+    names: dict[int, str] = {}
+    for name, channel in found.items():
+        other = names.setdefault(id(channel), name)
+        if other != name:
+            raise EmaError(
+                f"{where}: '{other}' and '{name}' are one channel of the file; correct the name in test.toml"
+            )
 
 
 def _check_lengths(found: dict[str, RawChannel], where: str) -> None:

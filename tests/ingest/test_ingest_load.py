@@ -429,3 +429,13 @@ def test_importing_ingest_loads_no_heavy_reader() -> None:
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "[]"
+
+
+def test_two_names_of_one_channel_are_no_two_sensors(tmp_path: Path) -> None:
+    second = (
+        '[[channels]]\nname = "tip [m/s^2]"\nquantity = "acceleration"\nunit = "m/s^2"\ndof = "root.z"\n\n'
+    )
+    folder = make_test(tmp_path, DESCRIPTION.replace("[[records]]", second + "[[records]]"))
+    assert "hit1.csv: 'tip' and 'tip [m/s^2]' are one channel of the file; correct the name" in message_of(
+        folder
+    )
