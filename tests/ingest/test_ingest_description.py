@@ -274,3 +274,10 @@ def test_every_description_of_the_test_data_is_understood(test_data: Path) -> No
     for root in roots:
         campaign = read_campaign(root)
         assert all(t.records and t.channels for t in campaign.tests)
+
+
+@pytest.mark.parametrize("value", ["2025-03-31", "10:00:00"])
+def test_dates_in_the_wrong_place_are_shown_as_they_were_written(tmp_path: Path, value: str) -> None:
+    folder = make_test(tmp_path, DESCRIPTION.replace('title = "Beam"', f"title = {value}"))
+    with pytest.raises(EmaError, match=rf"test\.toml: title = {value}: Input should be a valid string"):
+        read_description(folder)
