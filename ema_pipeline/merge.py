@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import scipy.stats
+import tomlkit
 
 from ema_pipeline.correlate.matching import match_modes
 from ema_pipeline.correlate.measured import MeasuredModes
@@ -41,7 +41,6 @@ LEVEL = 0.01
 
 _MEASURING = 'stages=["ingest", "hits", "frf", "modal"]'
 _JOINING = 'stages=["ingest", "hits", "frf"]'
-_OWN_KEY = re.compile(r"^[ \t]*(part|band_hz)[ \t]*=[^\n]*\n", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -286,8 +285,10 @@ def _copy(part: Part, folder: Path) -> None:
 
 def _with_part(text: str, part: Part) -> str:
     """The description with the part's name and band in front of its other keys."""
-    top, bracket, rest = re.split(r"(^[ \t]*\[)", text, maxsplit=1, flags=re.MULTILINE)
+    description = tomlkit.parse(text)
+    for key in ("part", "band_hz"):
+        description.pop(key, None)
     source = "stated" if part.test.band_hz is not None else "the band of its force spectrum"
     low, high = part.band_hz
     own = f'part = "{part.name}"\nband_hz = [{low:.6g}, {high:.6g}]  # {source}\n'
-    return own + _OWN_KEY.sub("", top) + bracket + rest
+    return own + tomlkit.dumps(description)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.frf.parts import gain_ratios, joined
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.merge import merge
 from ema_pipeline.run.measured import measured_frfs, measured_modes
 from ema_pipeline.run.opening import existing_run
@@ -349,3 +351,26 @@ def test_merge_takes_results_folders(tips: Path, run_of: dict[str, Path], tmp_pa
     assert [p.name for p in merged.parts] == ["soft", "hard"]
     assert (tmp_path / "both" / "hard" / "test.toml").is_file()
     assert (tmp_path / "both" / "rig.toml").is_file()
+
+
+def test_descriptions_in_brackets_and_over_several_lines_are_merged(tips: Path, tmp_path: Path) -> None:
+    """Keys and tables may stand as TOML allows; what is written can be read again."""
+    for name in ("soft", "hard"):
+        shutil.copytree(tips / name, tmp_path / name)
+        file = tmp_path / name / "test.toml"
+        keys = tomllib.loads(file.read_text(encoding="utf-8"))
+        band = "[20.0,\n  700.0\n]" if name == "soft" else "[20.0,\n  2000.0\n]"
+        lines = [f"band_hz = {band}", f'title = """\n[{name}]"""', "sample_rate_hz = 5120"]
+        lines += [
+            f"{table} = [{', '.join(_inline(x) for x in keys[table])}]" for table in ("channels", "records")
+        ]
+        file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    merge([tmp_path / "soft", tmp_path / "hard"], tmp_path / "both")
+    tests = {t.part: t for t in read_campaign(tmp_path / "both").tests}
+    assert set(tests) == {"soft", "hard"}
+    assert tests["soft"].title == "[soft]"
+    assert tests["soft"].band_hz == (20.0, 700.0)
+
+
+def _inline(table: dict[str, Any]) -> str:
+    return "{" + ", ".join(f"{key} = {json.dumps(value)}" for key, value in table.items()) + "}"
