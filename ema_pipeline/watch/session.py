@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import Array
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
@@ -18,7 +23,7 @@ from ema_pipeline.ingest.readers import read_raw
 from ema_pipeline.ingest.records import HitSamples
 from ema_pipeline.plain_text import printable
 from ema_pipeline.report.numbers import plain
-from ema_pipeline.toml_text import parse_toml
+from ema_pipeline.toml_text import parse_toml, read_toml_text
 from ema_pipeline.watch.arrivals import Arrival
 from ema_pipeline.watch.judge import JudgedRecord, judge_record
 
@@ -134,11 +139,10 @@ class Session:
     def _list(self, entry: RecordDescription) -> None:
         """Add a record to test.toml."""
         self._entries[entry.file] = entry
-        text = self.test.file.read_text(encoding="utf-8-sig").rstrip("\n")
+        text = read_toml_text(self.test.file).rstrip("\n")
         if entry.file in _listed(text):
             return  # by hand meanwhile, or by another watch on this folder
-        file, impact = json.dumps(entry.file, ensure_ascii=False), json.dumps(str(entry.impact))
-        replace_file(self.test.file, f"{text}\n\n[[records]]\nfile = {file}\nimpact = {impact}\n")
+        replace_file(self.test.file, _with_record(text, entry))
 
     def _samples(self, impact: Dof | None) -> list[HitSamples]:
         """Good hits on a point so far."""
@@ -196,6 +200,18 @@ class Session:
     def missing(self) -> list[str]:
         """Records that test.toml lists and that are not there."""
         return [name for name in self._entries if not (self.folder / name).exists()]
+
+
+def _with_record(text: str, entry: RecordDescription) -> str:
+    """A description with one record more: a table at its end, or an item where the records stand in brackets."""
+    if re.search(r"^[ \t]*records[ \t]*=", text, re.MULTILINE):
+        with suppress(TOMLKitError):
+            description = tomlkit.parse(text)
+            if isinstance(records := description.get("records"), Array):
+                records.append(tomlkit.item({"file": entry.file, "impact": str(entry.impact)}, records))
+                return tomlkit.dumps(description).rstrip("\n") + "\n"
+    file, impact = json.dumps(entry.file, ensure_ascii=False), json.dumps(str(entry.impact))
+    return f"{text}\n\n[[records]]\nfile = {file}\nimpact = {impact}\n"
 
 
 def _listed(text: str) -> set[object]:

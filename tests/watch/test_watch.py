@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 from bench import ema, write_bench
 
+from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.description import read_description
+from ema_pipeline.watch.arrivals import Arrival
 from ema_pipeline.watch.live import judged_files
 from ema_pipeline.watch.session import Session, Told
 
@@ -202,3 +205,33 @@ def test_a_folder_without_channels_is_said_so(tmp_path: Path, capsys: pytest.Cap
         code, _, err = ema(capsys, "watch", folder, "--idle", "1")
         assert code == 1
         assert len(err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("listed", ["records = []", "records = [\n  # none yet\n]"])
+def test_records_in_brackets_are_added_to_in_brackets(source: Path, tmp_path: Path, listed: str) -> None:
+    """A table at the end would make the file unreadable."""
+    folder = _channels(source, tmp_path / "live")
+    text = (folder / "test.toml").read_text(encoding="utf-8")
+    (folder / "test.toml").write_text(listed + "\n" + text, encoding="utf-8")
+    files = sorted(source.glob("*.csv"))[:2]
+    for file in files:
+        shutil.copy(file, folder / file.name)
+    session = Session(folder)
+    for file in files:
+        assert session.take(Arrival(folder / file.name, time.time())).good
+    test = read_description(folder)
+    assert [r.file for r in test.records] == [f.name for f in files]
+    assert [str(r.impact) for r in test.records] == ["m1.x", "m1.x"]
+
+
+def test_a_description_that_is_saved_in_another_encoding_meanwhile_is_one_line(
+    source: Path, tmp_path: Path
+) -> None:
+    folder = _channels(source, tmp_path / "live")
+    session = Session(folder)
+    with (folder / "test.toml").open("ab") as text:
+        text.write("# für alle\n".encode("latin-1"))
+    file = min(source.glob("*.csv"))
+    shutil.copy(file, folder / file.name)
+    with pytest.raises(EmaError, match=r"test\.toml: line \d+ is not UTF-8 text; save the file as UTF-8"):
+        session.take(Arrival(folder / file.name, time.time()))
