@@ -231,6 +231,24 @@ def test_a_wav_that_ends_within_a_sample_says_nothing_of_the_program(tmp_path: P
     )
 
 
+@pytest.mark.parametrize(("empty", "shown"), [("", "blank"), ("NaN", "'NaN'")])
+@pytest.mark.parametrize(("delimiter", "decimal"), [(",", "."), (";", ","), (";", ".")])
+def test_a_column_without_any_number_is_named(
+    tmp_path: Path, empty: str, shown: str, delimiter: str, decimal: str
+) -> None:
+    rows = [["time", "hammer", "mid", "tip"]]
+    rows += [
+        [f"{i / RATE:.7f}".replace(".", decimal), f"{i % 7}{decimal}5", empty, f"{i % 3}{decimal}25"]
+        for i in range(99)
+    ]
+    path = tmp_path / "hit.csv"
+    path.write_text("\n".join(delimiter.join(r) for r in rows) + "\n", encoding="utf-8")
+    with pytest.raises(
+        EmaError, match=rf"hit\.csv: line 51: column 3 is {shown}, no number; export its values"
+    ):
+        read_raw(path)
+
+
 # --- from the file to the test ----------------------------------------------------------------------------
 
 

@@ -149,7 +149,27 @@ def _find_table(lines: Lines) -> tuple[Dialect, int]:
         while first > 0 and _starts_like_table(lines[first - 1], dialect, width):
             first -= 1
         return dialect, first
+    _check_empty_column(lines)
     raise EmaError("no table of numbers found; export a header row and one column of numbers per channel")
+
+
+def _check_empty_column(lines: Lines) -> None:
+    """Say so where all that the middle of the table lacks is the numbers of a column."""
+    middle = lines[len(lines) // 2]
+    for delimiter in (";", "\t", ","):
+        dialect = Dialect(delimiter, "." if delimiter == "," else ",")
+        cells = dialect.split(middle.replace(".", dialect.decimal))
+        bad = [i for i, cell in enumerate(cells) if cell == "" or cell.casefold() in _NOT_A_NUMBER]
+        if (
+            bad
+            and len(cells) - len(bad) > 1
+            and all(dialect.is_number(cell) for i, cell in enumerate(cells) if i not in bad)
+        ):
+            shown = f"'{cells[bad[0]]}'" if cells[bad[0]] else "blank"
+            raise EmaError(
+                f"line {lines.number(len(lines) // 2)}: column {bad[0] + 1} is {shown}, no number; export its "
+                "values or leave the column out"
+            )
 
 
 def _dialect_of(line: str) -> Dialect | None:
