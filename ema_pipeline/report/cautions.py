@@ -10,6 +10,7 @@ from enum import IntEnum
 from ema_pipeline.check_result import CheckResult
 from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
 from ema_pipeline.frf.channel_faults import SENSITIVITY
+from ema_pipeline.frf.signs import SIGN
 from ema_pipeline.modal.types import GROWS
 from ema_pipeline.report.numbers import below, format_value, plain, words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
@@ -134,7 +135,9 @@ def _of_configuration(c: ConfigurationResults) -> Iterator[tuple[Weight, str]]:
             yield Weight.SCALE, f"the {what} is not calibrated: FRFs and shapes have no absolute scale"
         for v in c.frfs.verdicts:
             if not v.passes and not _of_sensor(v):
-                yield Weight.SCATTER, v.message or f"{v.check} fails"
+                # Hits of opposite sign cancel each other: modes vanish that all of them show.
+                weight = Weight.SENSOR if v.check == SIGN else Weight.SCATTER
+                yield weight, v.message or f"{v.check} fails"
         singles = int((c.frfs.hits == 1).sum())
         if singles:
             rests = "FRF rests" if singles == 1 else "FRFs rest"

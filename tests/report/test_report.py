@@ -16,8 +16,10 @@ import report_example as example
 from matplotlib.figure import Figure
 from rich.console import Console
 
+from ema_pipeline.check_result import judged
 from ema_pipeline.correlate.types import ModeAlone
 from ema_pipeline.frf.overview import cmif, representative_frfs
+from ema_pipeline.frf.signs import SIGN
 from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.report import plots as report_plots
 from ema_pipeline.report import style, summary, tables, terminal
@@ -417,6 +419,17 @@ def test_misfit_is_the_first_caution_even_where_values_are_identified(run: RunRe
     assert "does not explain" not in " ".join(summary.cautions(run))
     poor = replace(run, fit=replace(run.fit, error=55.6))
     assert summary.cautions(poor)[0].startswith("The model does not explain the data (error 55.6)")
+
+
+def test_hits_of_opposite_sign_which_make_modes_vanish_are_the_first_caution(run: RunResults) -> None:
+    c = run.configurations[0]
+    assert c.frfs is not None
+    told = "hits of a.x over b.x have opposite signs (2.csv#0 and 1.csv#0)"
+    found = judged(SIGN, -1.0, -0.7, False, "", "warn", told, channel="a.x over b.x")
+    odd = replace(c, frfs=replace(c.frfs, verdicts=(*c.frfs.verdicts, found)))
+    assert summary.cautions(replace(run, configurations=(odd, *run.configurations[1:])))[0].endswith(
+        f"{told}."
+    )
 
 
 def test_cautions_of_one_kind_are_counted_rather_than_all_written_out(run: RunResults) -> None:
