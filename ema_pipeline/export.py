@@ -100,6 +100,9 @@ def export_results(out: Path, folder: Path, effect_files: Iterable[str] = ()) ->
     from ema_pipeline.run.measured import measured_frfs, modes_of_structure
 
     run = existing_run(out, effect_files)
+    kind = kind_of(run.info)
+    if "modal" not in kind.measures:
+        raise EmaError(f"{out}: {kind.words} have neither FRFs nor modes to export; see summary.json")
     measured = measured_frfs(run)
     written = []
     try:

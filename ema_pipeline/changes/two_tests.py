@@ -59,6 +59,21 @@ class Changes:
         return "changed" if self.physics.claimed else "same"
 
 
+def check_answer_folder(folder: Path) -> None:
+    """Refuse a folder whose own report the answer would take the place of, and what is no folder.
+
+    Raises
+    ------
+    EmaError
+    """
+    if folder.exists() and not folder.is_dir():
+        raise EmaError(f"{folder}: is no folder; name another with --out")
+    if (folder / RESULTS_FILE).is_file():
+        raise EmaError(
+            f"{folder}: holds the results of a test, whose report would be lost; name another with --out"
+        )
+
+
 def open_test(
     path: Path,
     rig: str | None,
@@ -86,13 +101,13 @@ def open_test(
     """
     if (path / RESULTS_FILE).is_file():
         run = existing_run(path, effect_files)
-        kind = kind_of(run.info)
-        if "modal" not in kind.measures:
-            raise EmaError(f"{path}: {kind.words} have no modes; compare hammer tests")
         if rig is not None:
             run = dataclasses.replace(run, built_rig=checked_rig(rig))
     else:
         run, _ = run_raw(path, rig, into, None, [MEASURING], show, effect_files=effect_files)
+    kind = kind_of(run.info)
+    if "modal" not in kind.measures:
+        raise EmaError(f"{path}: {kind.words} have no modes; compare hammer tests")
     for name in run.info.configurations:
         if not run.store.key("modal", name):
             raise EmaError(f"{path}: has no modes of '{name}'; run 'ema run' to its end")

@@ -21,6 +21,7 @@ from ema_pipeline.correlate.matching import match_modes
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.job import run_raw
+from ema_pipeline.loops.simulate import PRINTED, write_sine_tests
 from ema_pipeline.observations.fitting import Model, fit_base
 from ema_pipeline.observations.mode_rows import Rows
 from ema_pipeline.observations.pair import _conditional
@@ -291,3 +292,30 @@ def test_wrong_tests_are_said_in_one_line(
     code, _, err = ema(capsys, "changes", before, before, "--rig", "planetary", "-o", tmp_path / "o")
     assert code == 1
     assert "is not one of rig 'planetary'" in err
+
+
+def test_the_answer_does_not_take_the_place_of_a_tests_own_report(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = _results(root, "before")
+    (tmp_path / "note.txt").write_text("mine", encoding="utf-8")
+    for out, why in ((before, "holds the results of a test"), (tmp_path / "note.txt", "is no folder")):
+        code, _, err = ema(capsys, "changes", before, before, "--rig", "none", "--out", out)
+        assert code == 1
+        assert why in err
+        assert err.endswith("name another with --out\n")
+    assert not (before / "changes.json").exists()
+
+
+def test_loops_have_no_modes_to_compare_or_export(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raw, out = tmp_path / "loops", tmp_path / "out"
+    write_sine_tests(raw, PRINTED)
+    code, _, err = ema(capsys, "changes", _results(root, "before"), raw, "--out", tmp_path / "answer")
+    assert code == 1
+    assert "force-displacement loops have no modes; compare hammer tests" in err
+    assert ema(capsys, "run", raw, "--out", out, "--set", 'stages=["loops"]')[0] == 0
+    code, _, err = ema(capsys, "export", out)
+    assert code == 1
+    assert "force-displacement loops have neither FRFs nor modes to export" in err
