@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import sys
@@ -48,6 +49,9 @@ STAGE_HELP = {
 """Stages that can be run alone, and what each does."""
 
 
+_DISK_IS_FULL = {errno.ENOSPC, errno.EDQUOT}
+
+
 def main() -> None:
     """Entry point: every problem with data or settings is one line on stderr and exit code 1."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # see ema_pipeline.threads
@@ -69,13 +73,22 @@ def main() -> None:
         os._exit(1)
     except MemoryError:
         _stop("ema: there is not enough memory; close other programs, or analyse fewer records at once", 1)
-    except OSError as error:
-        if error.errno is None:
-            _stop_for_crash(error)
-        where = f"{error.filename}: " if error.filename else ""
-        _stop(f"ema: {where}{reason(error)}; check the disk's free space and the folder's rights", 1)
     except Exception as error:
-        _stop_for_crash(error)
+        refused = _refused_by_system(error)
+        if refused is None:
+            _stop_for_crash(error)
+        where = f"{refused.filename}: " if refused.filename else ""
+        _stop(f"ema: {where}{reason(refused)}; check the disk's free space and the folder's rights", 1)
+
+
+def _refused_by_system(error: Exception) -> OSError | None:
+    """What the system refused, also where a library puts an error of its own in place of a full disk's."""
+    if isinstance(error, OSError):
+        return None if error.errno is None else error
+    inner: BaseException | None = error
+    while inner is not None and not (isinstance(inner, OSError) and inner.errno in _DISK_IS_FULL):
+        inner = inner.__cause__ or inner.__context__
+    return inner
 
 
 def _end_interrupted() -> NoReturn:

@@ -119,6 +119,8 @@ def cannot_write(path: Path | str, error: OSError) -> EmaError:
 
 def reason(error: BaseException) -> str:
     """Why the system refused, in a few words."""
+    if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list):
+        return str(error.args[0][0][-1]).removesuffix(f": {error.args[0][0][0]!r}")  # the first of many files
     text = getattr(error, "strerror", None) or str(error).split("\n")[0]
     return text or type(error).__name__
 

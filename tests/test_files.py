@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
 from pathlib import Path
 
 import pytest
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.files import ScratchFile, read_bounded, replace_file, replacing
+from ema_pipeline.files import ScratchFile, read_bounded, reason, replace_file, replacing
 
 
 def test_a_file_is_replaced_whole(tmp_path: Path) -> None:
@@ -65,3 +66,8 @@ def test_a_scratch_file_keeps_its_failure_until_it_is_asked(tmp_path: Path) -> N
         file.check()
     assert file.write(b"abc") == 3  # HDF5 may go on as if nothing had happened
     file.close()
+
+
+def test_a_folder_that_cannot_be_copied_says_why_of_its_first_file() -> None:
+    text = "[Errno 28] No space left on device"
+    assert reason(shutil.Error([("a/b", "c/b", text), ("a/d", "c/d", text)])) == text

@@ -277,3 +277,20 @@ def test_a_full_disk_is_one_line_wherever_it_is_met(
     code, _, err = ema(capsys, "check", tmp_path)
     assert code == 1
     assert "truth.json: No space left on device" in one_line(err)
+
+
+def test_a_full_disk_that_a_library_meets_is_no_fault_of_the_program(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """pyuff raises a bare Exception in its place."""
+
+    def fail(*_: object) -> None:
+        try:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        except OSError:
+            raise Exception("Error writing data-set #58")  # noqa: B904
+
+    monkeypatch.setattr("ema_pipeline.raw_folder.check_records", fail)
+    code, _, err = ema(capsys, "check", tmp_path)
+    assert code == 1
+    assert "No space left on device; check the disk's free space" in one_line(err)
