@@ -127,6 +127,7 @@ class Diagnosis(Report):
         blocks = [
             *self._headline(),
             candidates if found.candidates else "",
+            diagnosis.sigma_words(found),
             *diagnosis.reasons(found),
             *diagnosis.group_words(found),
             diagnosis.detection_words(found),

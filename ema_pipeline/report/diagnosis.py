@@ -214,6 +214,16 @@ def noise_words(ladder: Ladder) -> str:
     )
 
 
+def sigma_words(found: Diagnosis) -> str:
+    """Why the error without an effect differs from candidate to candidate; empty where it does not."""
+    if len({plain(c.error_before, 3) for c in found.candidates} | {plain(found.error, 3)}) < 2:
+        return ""
+    return (
+        "σ includes the scatter of parts and sensors that is learned with each effect, and differs from row to row: "
+        "compare rows by their probability, not by their error."
+    )
+
+
 def hits_words(ladder: Ladder) -> str:
     """How the last rung's simulated hits fare against the base model's, in a sentence; empty without any."""
     if not ladder.force_n or len(ladder.rungs) < 2:

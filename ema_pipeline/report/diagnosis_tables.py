@@ -20,67 +20,22 @@ from ema_pipeline.diagnose.types import (
 from ema_pipeline.effects.base import effect_of
 from ema_pipeline.report.diagnosis import (
     label_words,
-    leading,
     limit_words,
     limits_by_effect,
     of_modes,
     parameter_words,
-    reasons,
     rung_words,
     size_words,
-    standing,
 )
 from ema_pipeline.report.numbers import format_value, plain, words
 from ema_pipeline.report.tables import Row, Table
 
 
 def candidates_table(found: Diagnosis) -> Table:
-    """One row per candidate, and last what stays where nothing is missing.
+    """The candidates as they fit 80 columns: errors after adding each; last those where nothing is missing.
 
-    `reasons` holds why the leading ones were suspected.
+    `diagnosis.sigma_words` says why errors of two rows are not comparable.
     """
-    told = leading(found) if reasons(found) else ()
-    rows = [
-        Row(
-            (
-                words(c.effect),
-                words(c.at),
-                size_words(c.parameters),
-                probability_text(c.probability),
-                standing(found, c),
-                _change(c.error_before, c.error_after),
-                _change(c.heldout_error_before, c.heldout_error_after),
-                _why_words(c, c in told),
-            ),
-            _stands_out(found, c),
-        )
-        for c in found.candidates
-    ]
-    rows.append(
-        Row(
-            (
-                "nothing missing at all",
-                "",
-                "",
-                probability_text(found.null_probability),
-                "",
-                plain(found.error, 3),
-                plain(found.heldout_error, 3),
-                "The model as it is.",
-            ),
-        )
-    )
-    head = ("effect", "where", "size (±1σ)", "probability", "data say", "error, σ", "held out, σ", "why")
-    return Table(head, tuple(rows), frozenset({3, 5, 6}))
-
-
-def _why_words(c: Candidate, told: bool) -> str:
-    """Why a candidate is suspected or not claimed."""
-    return "see above" if told else c.why
-
-
-def short_candidates_table(found: Diagnosis) -> Table:
-    """The candidates as they fit 80 columns: errors after adding each."""
     rows = [
         Row(
             (
@@ -209,11 +164,6 @@ def localisation_table(found: Diagnosis) -> Table:
 
 def _stands_out(found: Diagnosis, c: Candidate) -> bool:
     return c.claimed or any(c.label in group for group in found.indistinguishable)
-
-
-def _change(before: float, after: float) -> str:
-    """``3.10 → 1.02``; a dash where there is nothing after."""
-    return f"{plain(before, 3)} → {plain(after, 3)}" if math.isfinite(after) else "–"
 
 
 def _own_sizes(

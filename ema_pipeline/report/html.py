@@ -251,6 +251,7 @@ def _diagnosis(results: RunResults) -> dict[str, Any]:
             "error": plain(found.error, 3),
             "held": plain(found.heldout_error, 3),
         },
+        "sigma": diagnosis.sigma_words(found),
         "localisation": diagnosis_tables.localisation_table(found) if found.localisation else None,
         "scatter": diagnosis_tables.scatter_table(found.ladder) if found.ladder.scatters else None,
         "detection": diagnosis_tables.detection_table(found) if found.detection_limits else None,

@@ -92,7 +92,8 @@ def _text(results: RunResults) -> Iterator[str]:
         if c.modal is not None:
             yield from _shown(terminal.modes_table(c.modal, f"Modes, {c.name}"))
     if results.diagnosis is not None:
-        yield from _table(diagnosis_tables.short_candidates_table(results.diagnosis), "What may be missing")
+        yield from _table(diagnosis_tables.candidates_table(results.diagnosis), "What may be missing")
+        yield from _wrapped(diagnosis.sigma_words(results.diagnosis))
     if results.shown_ladder is not None:
         yield from _table(diagnosis_tables.ladder_table(results.shown_ladder), "Ladder of models")
         yield from _wrapped(diagnosis.noise_words(results.shown_ladder))

@@ -30,9 +30,9 @@ Clean = Callable[[str], str]
 _SHORT = 15
 _VALUE = 32
 _ERROR_WORDS = (
-    "error: root mean square of (measurement - model)/σ, about 1 where the model explains the data; "
-    "held out: the same on data that the fit has not seen"
+    "error: root mean square of (measurement - model)/σ, about 1 where the model explains the data"
 )
+_HELD_OUT_WORDS = "held out: the same on data that the fit has not seen"
 _EPSILON_WORDS = (
     "ε: the error function of the source papers, the sum over the paired modes of "
     "((measured − model)/model frequency)²"
@@ -234,9 +234,10 @@ def diagnosis_screen(
     if found.candidates:
         parts += [
             _line(""),
-            text_table(diagnosis_tables.short_candidates_table(found), "What may be missing"),
+            text_table(diagnosis_tables.candidates_table(found), "What may be missing"),
         ]
-        parts.append(_line(_ERROR_WORDS))
+        parts.append(_line(f"{_ERROR_WORDS}; {_HELD_OUT_WORDS}"))
+        parts += [_line(text) for text in (diagnosis.sigma_words(found),) if text]
     for text in diagnosis.reasons(found):
         parts += [_line(""), _line(text)]
     if unexplained := diagnosis.unexplained_words(found.ladder):
@@ -267,7 +268,7 @@ def ladder_screen(ladder: Ladder) -> RenderableType:
         told.insert(0, "left: measured modes that the model does not explain")
     parts: list[RenderableType] = [
         text_table(_renamed(diagnosis_tables.ladder_table(ladder), heads), "Ladder of models"),
-        _line("; ".join([_ERROR_WORDS, *told])),
+        _line("; ".join([_ERROR_WORDS, _HELD_OUT_WORDS, *told])),
         _line(diagnosis.noise_words(ladder)),
     ]
     if ladder.note:

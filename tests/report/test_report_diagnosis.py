@@ -483,6 +483,17 @@ def test_report_lists_the_candidates_with_size_probability_and_drop(run: RunResu
     assert "Where the misfit sits" not in text
 
 
+def test_errors_without_an_effect_that_differ_by_row_are_explained(run: RunResults) -> None:
+    assert run.diagnosis is not None
+    told = "σ includes the scatter of parts and sensors that is learned with each effect"
+    first, *others = run.diagnosis.candidates
+    one = replace(run.diagnosis, candidates=(first, *(replace(c, error_before=2.18) for c in others)))
+    assert told in flowing(printed(terminal.diagnosis_screen(one)))
+    assert told in page(replace(run, diagnosis=one))
+    assert told not in flowing(printed(terminal.diagnosis_screen(run.diagnosis)))
+    assert told not in page(run)
+
+
 def test_an_adequate_model_with_a_likely_candidate_says_which_and_why_it_is_not_claimed() -> None:
     best = ("spring@m2.x", "Not claimed: its size is within 2 standard deviations of zero.")
     doubtful = sentences.summary("adequate", [], (1.2, 1.2), 0.04, best)
