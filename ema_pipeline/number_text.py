@@ -108,4 +108,7 @@ def signed(value: float, decimals: int = 1) -> str:
 
 
 def _minus(text: str) -> str:
+    """With a true minus sign, and none before zero."""
+    if "e" not in text and float(text) == 0:
+        text = text.removeprefix("-")
     return text.replace("-", "−") if "e" not in text else text

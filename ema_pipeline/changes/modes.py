@@ -15,6 +15,9 @@ from ema_pipeline.significance import holm
 
 LEVEL = 0.01
 """Chance of any false change among all that are compared."""
+_ALIKE = 0.2
+"""Share of the common shift by which the change of a single mode may differ from it, beside its own noise: temperature moves
+modes of unlike parts by shares that differ a little, a mass or a spring by shares from nothing to its full effect."""
 _DRAWS = 2000
 """Random shapes of which the MAC of one and the same shape is known."""
 
@@ -78,6 +81,24 @@ class ModeChange:
 
 
 @dataclass(frozen=True)
+class CommonShift:
+    """Relative change of all frequencies of a configuration.
+
+    Attributes
+    ----------
+    relative, std : float
+        Weighted mean and its 1 σ, which includes how much the modes differ in it.
+    alike : bool
+        True where every mode changed by that share, within its noise and a fifth of the share; only then it is a
+        shift common to all.
+    """
+
+    relative: float
+    std: float
+    alike: bool
+
+
+@dataclass(frozen=True)
 class ModeChanges:
     """All modes of two tests.
 
@@ -86,15 +107,14 @@ class ModeChanges:
     modes : tuple of ModeChange
     only_a, only_b : tuple of (str, int, float)
         Modes without a partner: configuration, number, frequency in Hz.
-    common_shift : dict of str to (float, float)
-        By configuration: relative change of all frequencies together, weighted, and its 1 σ, which holds how much the
-        modes differ in it.
+    common_shift : dict of str to CommonShift
+        By configuration; none with fewer than two modes of known uncertainty.
     """
 
     modes: tuple[ModeChange, ...]
     only_a: tuple[tuple[str, int, float], ...]
     only_b: tuple[tuple[str, int, float], ...]
-    common_shift: dict[str, tuple[float, float]]
+    common_shift: dict[str, CommonShift]
 
     @property
     def changed(self) -> bool:
@@ -109,14 +129,15 @@ def mode_changes(a: Mapping[str, MeasuredModes], b: Mapping[str, MeasuredModes])
     without being a change of the structure: temperature, mounting, suspension.
     """
     modes: list[ModeChange] = []
-    only_a, only_b, shifts = [], [], {}
+    only_a, only_b, shifts = [], [], dict[str, CommonShift]()
     for c in (c for c in a if c in b):
         first, second = a[c], b[c]
         match = match_modes(first, second)
         found = _of_configuration(c, first, second, match)
         modes += found
-        if len(found) > 1:
-            shifts[c] = _common_shift(found)
+        shift = _common_shift(found)
+        if shift is not None:
+            shifts[c] = shift
         only_a += [(c, int(k) + 1, float(first.frequency_hz[k])) for k in np.flatnonzero(match < 0)]
         left = np.setdiff1d(np.arange(len(second)), match)
         only_b += [(c, int(k) + 1, float(second.frequency_hz[k])) for k in left]
@@ -200,17 +221,19 @@ def _of_one_shape(
     return float(np.quantile(found, LEVEL)), float((1 + np.sum(found <= value)) / (_DRAWS + 1))
 
 
-def _common_shift(modes: list[ModeChange]) -> tuple[float, float]:
+def _common_shift(modes: list[ModeChange]) -> CommonShift | None:
     """Weighted mean of the relative changes, its 1 σ by how much they differ or by their own σ, whichever is larger."""
-    values = np.array([m.frequency_change for m in modes])
+    values = np.array([m.frequency_change for m in modes]).reshape(-1, 2)
     known = np.isfinite(values[:, 1]) & (values[:, 1] > 0)
     if np.sum(known) < 2:
-        return float("nan"), float("nan")
+        return None
     change, std = values[known].T
     weight = std**-2.0
     mean = float(np.sum(weight * change) / np.sum(weight))
     chi2 = float(np.sum(weight * (change - mean) ** 2)) / (len(change) - 1)
-    return mean, float(np.sqrt(max(chi2, 1.0) / np.sum(weight)))
+    noise = scipy.stats.norm.isf(0.5 * LEVEL / len(change)) * std
+    alike = bool(np.all(np.abs(change - mean) <= _ALIKE * abs(mean) + noise))
+    return CommonShift(mean, float(np.sqrt(max(chi2, 1.0) / np.sum(weight))), alike)
 
 
 def _adjusted(modes: list[ModeChange]) -> list[ModeChange]:

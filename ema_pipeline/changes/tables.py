@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 
-from ema_pipeline.changes.modes import LEVEL, ModeChange
+from ema_pipeline.changes.modes import LEVEL, ModeChange, ModeChanges
 from ema_pipeline.changes.two_tests import Changes
 from ema_pipeline.diagnose.sentences import label_text, probability_text, size_text
 from ema_pipeline.diagnose.types import Diagnosis
-from ema_pipeline.number_text import format_percent, format_value
+from ema_pipeline.number_text import format_percent, format_value, plain, signed
 from ema_pipeline.report.diagnosis_tables import detection_table
 from ema_pipeline.report.tables import Row, Table
+
+_SHIFTED = 3.0
+"""Standard deviations from which a shift of all frequencies is one."""
 
 
 def verdict_text(found: Changes) -> str:
@@ -67,9 +70,8 @@ def limits_text(diagnosis: Diagnosis) -> str:
 def notes(found: Changes) -> list[str]:
     """What a reader should know beside the verdict."""
     lines = []
-    for c, (value, std) in found.modes.common_shift.items():
-        if math.isfinite(value):
-            lines.append(f"{c}: all frequencies together moved by {format_percent(value, std)}.")
+    for c in found.modes.common_shift:
+        lines.append(f"{c}: {_shift_text(found.modes, c)}.")
     for name, lone in (("A", found.modes.only_a), ("B", found.modes.only_b)):
         if lone:
             told = ", ".join(f"{c} mode {k} at {f:.2f} Hz" for c, k, f in lone[:6])
@@ -79,6 +81,18 @@ def notes(found: Changes) -> list[str]:
         "suspension) are not included and appear as changes."
     )
     return lines
+
+
+def _shift_text(found: ModeChanges, configuration: str) -> str:
+    """How the frequencies of a configuration moved: by one share, each by its own, or not at all."""
+    shift = found.common_shift[configuration]
+    size = format_percent(shift.relative, shift.std)
+    if not shift.alike:
+        each = [100 * m.frequency_change[0] for m in found.modes if m.configuration == configuration]
+        return f"frequencies changed by {signed(min(each), 2)} to {signed(max(each), 2)} %, not all by the same share"
+    if abs(shift.relative) < _SHIFTED * shift.std:
+        return f"no shift common to all frequencies ({size})"
+    return f"all frequencies moved by the same share, {size}, as with a change of temperature"
 
 
 def modes_table(found: Changes) -> Table:
@@ -99,7 +113,7 @@ def short_modes_table(found: Changes) -> Table:
         cells = _mode_cells(m)
         own, other = f"{m.mode_a}", f"{m.mode_b}"
         name = f"{m.configuration + ' ' if several else ''}{own if own == other else f'{own} → {other}'}"
-        rows.append(Row((name, cells[3], cells[4], cells[7], cells[9], cells[12]), alert=bool(m.changed)))
+        rows.append(Row((name, plain(m.frequency_a, 6), cells[4], cells[7], cells[9], cells[12]), alert=bool(m.changed)))
     head = ("mode", "frequency in A, Hz", "change, %", "change of damping, %", "MAC", "changed")
     return Table(head, tuple(rows), frozenset({1, 2, 3, 4}))
 

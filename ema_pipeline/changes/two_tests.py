@@ -169,7 +169,7 @@ def changes_content(found: Changes) -> dict[str, Any]:
     content["modes"] = [_mode(m) for m in found.modes.modes]
     content["only_a"] = [_lone(m) for m in found.modes.only_a]
     content["only_b"] = [_lone(m) for m in found.modes.only_b]
-    content["common_shift"] = {c: {"relative": v, "std": s} for c, (v, s) in found.modes.common_shift.items()}
+    content["common_shift"] = {c: dataclasses.asdict(s) for c, s in found.modes.common_shift.items()}
     return dict(finite(content))
 
 

@@ -14,7 +14,7 @@ from bench import ema, write_bench
 
 from ema_pipeline.changes.modes import mode_changes
 from ema_pipeline.changes.physics import pair_observations
-from ema_pipeline.changes.tables import short_modes_table
+from ema_pipeline.changes.tables import notes, short_modes_table
 from ema_pipeline.changes.two_tests import Changes
 from ema_pipeline.commands.screen import show
 from ema_pipeline.correlate.matching import match_modes
@@ -213,6 +213,20 @@ def test_a_mode_of_one_test_alone_is_said() -> None:
     assert [m.mode_a for m in found.modes] == [1]
     assert found.only_a == (("default", 2, 20.0),)
     assert found.only_b == (("default", 2, 30.0),)
+
+
+@pytest.mark.parametrize(
+    ("hz", "said"),
+    [
+        ([9.97, 19.94, 29.92], "all frequencies moved by the same share, −0.289"),  # warmer
+        ([10.0, 19.4, 29.9], "frequencies changed by −3.00 to 0.00 %, not all by the same share"),  # a mass
+        ([10.0002, 19.9997, 30.0003], "no shift common to all frequencies ("),
+    ],
+)
+def test_only_a_shift_that_all_modes_share_is_called_common(hz: list[float], said: str) -> None:
+    found = mode_changes({"default": _modes([10.0, 20.0, 30.0], SHAPES)}, {"default": _modes(hz, SHAPES)})
+    assert found.common_shift["default"].alike == ("not all" not in said)
+    assert f"default: {said}" in notes(cast("Changes", SimpleNamespace(modes=found)))[0]
 
 
 def test_table_of_changes_keeps_values_whole_on_80_columns(
