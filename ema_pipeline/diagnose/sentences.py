@@ -153,6 +153,6 @@ def standing_out(parts: Sequence[OutlyingPart]) -> str:
     named = ", ".join(f"{part_words(p.name)} {100 * p.deviation:+.0f} %" for p in parts[:_SHOWN])
     scatter = 100 * max(p.others for p in parts[:_SHOWN])
     return (
-        f"To follow the data the model must let parts deviate further than similar ones, which scatter by "
-        f"{scatter:.1f} % (1 σ): {named}."
+        f"To follow the data the model must let parts deviate further than similar ones do: {named}. The others alone "
+        f"scatter by {scatter:.1f} % (1 σ); the learned scatter includes these parts."
     )

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from ema_pipeline.commands.screen import show
 from ema_pipeline.diagnose import sentences
+from ema_pipeline.diagnose.explained import OutlyingPart
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import (
     NOTHING,
@@ -492,6 +493,12 @@ def test_errors_without_an_effect_that_differ_by_row_are_explained(run: RunResul
     assert told in page(replace(run, diagnosis=one))
     assert told not in flowing(printed(terminal.diagnosis_screen(run.diagnosis)))
     assert told not in page(run)
+
+
+def test_scatter_of_the_other_parts_is_not_taken_for_the_learned_one() -> None:
+    said = sentences.standing_out([OutlyingPart("sun_planet_mesh_stiffness[1]", 0.23, 0.014)])
+    assert said.startswith("To follow the data the model must let parts deviate further than similar ones do: sun")
+    assert "+23 %. The others alone scatter by 1.4 % (1 σ); the learned scatter includes these parts." in said
 
 
 def test_an_adequate_model_with_a_likely_candidate_says_which_and_why_it_is_not_claimed() -> None:
