@@ -7,12 +7,20 @@ import math
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 _PREFIXED_UNITS = frozenset({"N", "N/m", "N·s/m", "N*s/m", "N s/m", "N/m^3", "N/m³", "m"})
 
+_GRAMS_BELOW_KG = 0.1
+"""Masses of bodies are given in kg, those of sensors and of added masses in g."""
+
 
 def prefixed(magnitude: float, unit: str) -> tuple[float, str]:
     """Factor and unit that bring `magnitude` between 1 and 1000, e.g. ``(1e-6, "MN/m")`` for 1e7 N/m.
 
-    Units that are not usually written with a prefix (Hz, kg, %) are left alone.
+    Masses below 0.1 kg are in g. Units that are not usually written with a prefix (Hz, %) are left alone.
+
+    >>> prefixed(0.0123, "kg")
+    (1000.0, 'g')
     """
+    if unit == "kg" and 0 < abs(magnitude) < _GRAMS_BELOW_KG:
+        return 1e3, "g"
     if unit not in _PREFIXED_UNITS or not math.isfinite(magnitude) or magnitude == 0:
         return 1.0, unit
     power = 3 * math.floor(math.log10(abs(magnitude)) / 3 + 1e-12)

@@ -15,6 +15,7 @@ from ema_pipeline.diagnose.types import NOTHING, VerdictWord
 from ema_pipeline.dof import Dof
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution
 from ema_pipeline.mechanics.system import LinearSystem, sensor_row
+from ema_pipeline.number_text import prefixed
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit
 from ema_pipeline.observations.mode_rows import FREQUENCY, SHAPE
@@ -93,7 +94,8 @@ def _options(observations: ModeObservations, first: Fit, second: Fit) -> list[Op
             if dof in systems[1].dofs and not dof.endswith(".u"):
                 mass = _ADDED_SHARE * float(systems[0].mass[i, i])
                 gap = _frequency_gap(systems, data.band_hz, dof, mass) / frequency_std
-                options.append(Option(f"A mass of {mass:.2g} kg added at {dof} ({data.configuration})", gap))
+                scale, unit = prefixed(mass, "kg")
+                options.append(Option(f"A mass of {scale * mass:.2g} {unit} added at {dof} ({data.configuration})", gap))
     return sorted(options, key=lambda o: -o.separation)
 
 
