@@ -16,8 +16,8 @@ from ema_pipeline.significance import holm
 LEVEL = 0.01
 """Chance of any false change among all that are compared."""
 _ALIKE = 0.2
-"""Share of the common shift by which the change of a single mode may differ from it, beside its own noise: temperature moves
-modes of unlike parts by shares that differ a little, a mass or a spring by shares from nothing to its full effect."""
+"""Share of the common shift by which the change of a single mode may differ from it, beside its own noise: temperature
+moves modes of unlike parts by shares that differ a little, a mass or a spring by shares from nothing to its full effect."""
 _DRAWS = 2000
 """Random shapes of which the MAC of one and the same shape is known."""
 

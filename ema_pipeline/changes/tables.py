@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from ema_pipeline.changes.matrices import MacMatrix
 from ema_pipeline.changes.modes import LEVEL, ModeChange, ModeChanges
 from ema_pipeline.changes.two_tests import Changes
 from ema_pipeline.diagnose.sentences import label_text, probability_text, size_text
@@ -113,7 +114,8 @@ def short_modes_table(found: Changes) -> Table:
         cells = _mode_cells(m)
         own, other = f"{m.mode_a}", f"{m.mode_b}"
         name = f"{m.configuration + ' ' if several else ''}{own if own == other else f'{own} → {other}'}"
-        rows.append(Row((name, plain(m.frequency_a, 6), cells[4], cells[7], cells[9], cells[12]), alert=bool(m.changed)))
+        short = (name, plain(m.frequency_a, 6), cells[4], cells[7], cells[9], cells[12])
+        rows.append(Row(short, alert=bool(m.changed)))
     head = ("mode", "frequency in A, Hz", "change, %", "change of damping, %", "MAC", "changed")
     return Table(head, tuple(rows), frozenset({1, 2, 3, 4}))
 
@@ -147,3 +149,13 @@ def _p(value: float) -> str:
 
 def _mac(value: float) -> str:
     return "–" if math.isnan(value) else f"{value:.3f}" if value < 0.999 else f"{value:.5f}"
+
+
+def mac_table(matrix: MacMatrix) -> Table:
+    """Frequencies of A down, those of the other across; a dash at a model mode that no sensor sees."""
+    rows = (
+        Row((plain(hz, 5), *("–" if math.isnan(v) else f"{v:.2f}" for v in row)))
+        for hz, row in zip(matrix.rows_hz, matrix.values, strict=True)
+    )
+    head = ("Hz", *(plain(hz, 5) for hz in matrix.columns_hz))
+    return Table(head, tuple(rows), frozenset(range(len(head))))

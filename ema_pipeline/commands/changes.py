@@ -112,7 +112,9 @@ def mac(
     import tempfile
 
     from ema_pipeline.changes.matrices import mac_with_model, mac_with_test
+    from ema_pipeline.changes.tables import mac_table
     from ema_pipeline.changes.two_tests import open_test
+    from ema_pipeline.report.terminal import matrix_table
 
     with tempfile.TemporaryDirectory(prefix="ema-mac-") as scratch, progress(True) as show_stage:
         run_a = open_test(a, rig, Path(scratch) / "A", show_stage)
@@ -123,16 +125,5 @@ def mac(
     if json:
         show_json({"configurations": [m.content() for m in found]})
         return
-    from rich import box
-    from rich.table import Table as Screen
-
     for m in found:
-        table = Screen(
-            title=f"MAC, {m.configuration}: A down, {m.other} across", title_justify="left", box=box.SIMPLE
-        )
-        table.add_column("Hz", justify="right")
-        for hz in m.columns_hz:
-            table.add_column(f"{hz:.2f}", justify="right")
-        for hz, row in zip(m.rows_hz, m.values, strict=True):
-            table.add_row(f"{hz:.2f}", *(f"{v:.2f}" for v in row))
-        show(table)
+        show(matrix_table(mac_table(m), f"MAC, {m.configuration}: A down, {m.other} across"))

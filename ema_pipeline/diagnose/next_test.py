@@ -95,7 +95,8 @@ def _options(observations: ModeObservations, first: Fit, second: Fit) -> list[Op
                 mass = _ADDED_SHARE * float(systems[0].mass[i, i])
                 gap = _frequency_gap(systems, data.band_hz, dof, mass) / frequency_std
                 scale, unit = prefixed(mass, "kg")
-                options.append(Option(f"A mass of {scale * mass:.2g} {unit} added at {dof} ({data.configuration})", gap))
+                text = f"A mass of {scale * mass:.2g} {unit} added at {dof} ({data.configuration})"
+                options.append(Option(text, gap))
     return sorted(options, key=lambda o: -o.separation)
 
 

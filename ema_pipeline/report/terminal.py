@@ -29,9 +29,7 @@ from ema_pipeline.report.numbers import plain, signed
 Clean = Callable[[str], str]
 _SHORT = 15
 _VALUE = 32
-_ERROR_WORDS = (
-    "error: root mean square of (measurement - model)/σ, about 1 where the model explains the data"
-)
+_ERROR_WORDS = "error: root mean square of (measurement - model)/σ, about 1 where the model explains the data"
 _HELD_OUT_WORDS = "held out: the same on data that the fit has not seen"
 _EPSILON_WORDS = (
     "ε: the error function of the source papers, the sum over the paired modes of "
@@ -322,6 +320,31 @@ def _renamed(source: tables.Table, head: tuple[str, ...]) -> tables.Table:
 def text_table(source: tables.Table, title: str) -> Safe:
     """A table for the terminal, or for any other place with letters of one width."""
     return Safe(lambda clean, width: build_table(source, title, clean, width))
+
+
+def matrix_table(source: tables.Table, title: str) -> Safe:
+    """A table with as many columns as there are modes: below one another as many at a time as the width holds.
+
+    The first column stands in every block.
+    """
+    return Safe(lambda clean, width: Group(*_blocks(source, title, clean, width)))
+
+
+def _blocks(source: tables.Table, title: str, clean: Clean, width: int) -> Iterator[RenderableType]:
+    needed = [
+        2 + max(cell_len(clean(text)) for text in (source.head[k], *(r.cells[k] for r in source.rows)))
+        for k in range(len(source.head))
+    ]
+    last, room, block = len(source.head) - 1, width - 1 - needed[0], list[int]()
+    for k in range(1, last + 1):
+        block.append(k)
+        if k < last and sum(needed[n] for n in (*block, k + 1)) <= room:
+            continue
+        part = f", columns {block[0]} to {k} of {last}" if len(block) < last else ""
+        yield Text(clean(title + part), style="bold")
+        yield build_table(source.picked((0, *block)), "", clean, width)
+        yield Text("")
+        block = []
 
 
 def build_table(

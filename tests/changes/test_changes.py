@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from bench import ema, write_bench
 
+from ema_pipeline.changes.matrices import MacMatrix
 from ema_pipeline.changes.modes import mode_changes
 from ema_pipeline.changes.physics import pair_observations
-from ema_pipeline.changes.tables import notes, short_modes_table
+from ema_pipeline.changes.tables import mac_table, notes, short_modes_table
 from ema_pipeline.changes.two_tests import Changes
 from ema_pipeline.commands.screen import show
 from ema_pipeline.correlate.matching import match_modes
@@ -25,7 +26,7 @@ from ema_pipeline.loops.simulate import PRINTED, write_sine_tests
 from ema_pipeline.observations.fitting import Model, fit_base
 from ema_pipeline.observations.mode_rows import Rows
 from ema_pipeline.observations.pair import _conditional
-from ema_pipeline.report.terminal import text_table
+from ema_pipeline.report.terminal import matrix_table, text_table
 
 TESTS = {"before": (1, ()), "again": (2, ()), "after": (3, ("mass@m2:mass=0.06",))}
 
@@ -293,6 +294,26 @@ def test_mac_of_tests_and_of_the_model(root: Path, capsys: pytest.CaptureFixture
         assert values.shape == (3, 3)
         assert np.diag(values).min() > 0.95
         assert ema(capsys, "mac", *arguments)[0] == 0
+
+
+def test_mac_of_many_modes_is_whole_on_80_columns(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In blocks of columns, each with the frequencies of A."""
+    hz = np.linspace(1401.25, 1434.5, 23)
+    values = np.eye(23)
+    values[:, 0] = np.nan
+    monkeypatch.setenv("COLUMNS", "80")
+    show(matrix_table(mac_table(MacMatrix("no_ring", "B", hz, hz, values)), "MAC"))
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 80
+    assert "…" not in text
+    assert text.count(" 1.00") == 22
+    assert text.count(" –") == 23
+    titles = re.findall(r"MAC, columns (\d+) to (\d+) of 23", text)
+    assert len(titles) == 3
+    assert [int(a) for a, _ in titles] == [1, *(int(b) + 1 for _, b in titles[:-1])]
+    assert titles[-1][1] == "23"
 
 
 def test_wrong_tests_are_said_in_one_line(

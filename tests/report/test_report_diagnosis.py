@@ -497,7 +497,9 @@ def test_errors_without_an_effect_that_differ_by_row_are_explained(run: RunResul
 
 def test_scatter_of_the_other_parts_is_not_taken_for_the_learned_one() -> None:
     said = sentences.standing_out([OutlyingPart("sun_planet_mesh_stiffness[1]", 0.23, 0.014)])
-    assert said.startswith("To follow the data the model must let parts deviate further than similar ones do: sun")
+    assert said.startswith(
+        "To follow the data the model must let parts deviate further than similar ones do: sun"
+    )
     assert "+23 %. The others alone scatter by 1.4 % (1 σ); the learned scatter includes these parts." in said
 
 
