@@ -17,7 +17,7 @@ LEVEL = 0.01
 """Chance of any false change among all that are compared."""
 _ALIKE = 0.2
 """Share of the common shift by which the change of a single mode may differ from it, beside its own noise: temperature
-moves modes of unlike parts by shares that differ a little, a mass or a spring by shares from nothing to its full effect."""
+moves modes of unlike parts by nearly the same share, a mass or a spring by shares from nothing to its full effect."""
 _DRAWS = 2000
 """Random shapes of which the MAC of one and the same shape is known."""
 
