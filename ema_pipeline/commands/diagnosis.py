@@ -51,7 +51,8 @@ def diagnose(
     if json:
         show_summary(load_results(run), "diagnosis", "ladder")
         return
-    show(terminal.diagnosis_screen(found, str(out), program(), suspicions(results), results.effect_files))
+    files, added = results.effect_files, run.info.effects
+    show(terminal.diagnosis_screen(found, str(out), program(), suspicions(results), files, added))
     if auto and supported:
         _show_ladder(run)
 

@@ -212,6 +212,7 @@ def diagnosis_screen(
     program: str = "ema",
     suspicions: Sequence[str] = (),
     effect_files: Sequence[str] = (),
+    added: Sequence[str] = (),
 ) -> RenderableType:
     """Verdict, candidates, what cannot be told apart, what to measure and what to type next.
 
@@ -226,6 +227,8 @@ def diagnosis_screen(
         Sensors that cannot be right; they come first.
     effect_files : sequence of str
         Files with the user's own effects, as the user would type them.
+    added : sequence of str
+        Labels that are in the model.
     """
     parts: list[RenderableType] = [_line(f"! {text}") for text in suspicions]
     parts += [_heading(diagnosis.heading(found)), _line(found.summary)]
@@ -253,7 +256,7 @@ def diagnosis_screen(
     if found.notes:
         parts += [_line(""), _line("Remarks on the data:"), *(_line(f"! {n}") for n in found.notes)]
     if not suspicions:
-        commands = diagnosis.next_commands(found, out, (), effect_files)
+        commands = diagnosis.next_commands(found, out, added, effect_files)
         parts += _commands([typed(c, program) for c in commands])
     return Group(*parts)
 

@@ -610,6 +610,20 @@ def test_ladder_screen_shows_the_error_falling() -> None:
     assert "0.010 % of frequency" in flowing(text)
 
 
+def test_next_command_of_the_page_is_what_is_left_to_do(run: RunResults) -> None:
+    """After a change the diagnosis again; not once it has been repeated."""
+
+    def commands(verdict: VerdictWord, **changes: object) -> tuple[str, ...]:
+        results = replace(run, diagnosis=found(verdict), folder="out", **changes)  # type: ignore[arg-type]
+        return page_top.page_top(results).commands
+
+    again = ("ema diagnose out", f"ema remove out {CRACK}")
+    assert commands("effect", added=(CRACK,)) == again
+    assert commands("ambiguous", added=(CRACK,)) == again  # and not its equivalent on top of it
+    assert commands("adequate", added=(CRACK,), diagnosed_on=(CRACK,)) == ()
+    assert commands("effect", added=(OTHER,), diagnosed_on=(OTHER,))[0] == f"ema add out {CRACK}"
+
+
 def test_next_command_can_be_pasted_and_is_not_told_twice(run: RunResults) -> None:
     assert next_lines(run, "out", ".venv/bin/ema") == (f".venv/bin/ema add out {CRACK}",)
     taken = replace(run, added=(CRACK,))
