@@ -170,6 +170,7 @@ def page_context(
         "sweeps": tables.sweeps_table(fit) if fit and fit.sweeps else None,
         "stepwise": _stepwise(results),
         "differences": tables.differences_table(compared) if compared else None,
+        "alone": tables.alone_table(compared) if compared and compared.alone else None,
         "worst_dofs": tables.worst_dofs_table(compared) if compared and compared.dofs else None,
         "worst_bands": tables.worst_bands_table(compared) if compared and compared.bands else None,
         "loops": None if results.loops is None else loops_context(results, results.loops),

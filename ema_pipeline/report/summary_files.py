@@ -76,7 +76,10 @@ def choices_summary(choices: Choices) -> dict[str, list[str]]:
 
 
 def _comparison(compared: Comparison) -> dict[str, Any]:
-    """Differences by mode and by DOF; modes count from 1, `_z` are in standard uncertainties."""
+    """Differences by mode and by DOF; modes count from 1, `_z` are in standard uncertainties.
+
+    `alone` are measured modes that the model does not have, with its mode of the same shape.
+    """
     modes = [
         {
             "configuration": m.configuration,
@@ -98,6 +101,17 @@ def _comparison(compared: Comparison) -> dict[str, Any]:
         "frequency_error": compared.frequency_error,
         "modes": modes,
         "dofs": [asdict(d) for d in compared.dofs],
+        "alone": [
+            {
+                "configuration": m.configuration,
+                "mode": m.measured + 1,
+                "frequency_hz": m.measured_frequency_hz,
+                "model_frequency_hz": m.model_frequency_hz,
+                "frequency_difference_percent": percent_off(m.measured_frequency_hz, m.model_frequency_hz),
+                "mac": m.mac,
+            }
+            for m in compared.alone
+        ],
     }
 
 

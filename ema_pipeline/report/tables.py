@@ -205,6 +205,24 @@ def differences_table(compared: Comparison) -> Table:
     return Table(head, tuple(rows), frozenset(range(1, 11)))
 
 
+def alone_table(compared: Comparison) -> Table:
+    """Measured modes that the fitted model does not have, with the model's mode of the same shape."""
+    rows = []
+    for m in compared.alone:
+        known = math.isfinite(m.model_frequency_hz)
+        cells = (
+            m.configuration,
+            str(m.measured + 1),
+            plain(m.measured_frequency_hz, 5),
+            plain(m.model_frequency_hz, 5),
+            signed(percent_off(m.measured_frequency_hz, m.model_frequency_hz) if known else math.nan, 1),
+            f"{m.mac:.2f}" if math.isfinite(m.mac) else "–",
+        )
+        rows.append(Row(cells, True))
+    head = ("configuration", "mode", "measured, Hz", "model mode of its shape, Hz", "difference, %", "MAC")
+    return Table(head, tuple(rows), frozenset(range(1, 6)))
+
+
 def worst_dofs_table(compared: Comparison, count: int = 8) -> Table:
     """The DOFs with the largest shape difference."""
     dofs = sorted((d for d in compared.dofs if math.isfinite(d.z)), key=lambda d: -d.z)[:count]

@@ -22,13 +22,14 @@ from ema_pipeline.frf.overview import cmif, representative_frfs
 from ema_pipeline.frf.signs import SIGN
 from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.report import plots as report_plots
-from ema_pipeline.report import style, summary, tables, terminal
+from ema_pipeline.report import style, summary, summary_files, tables, terminal
 from ema_pipeline.report.html import bokeh_script, report_html, write_report
 from ema_pipeline.report.numbers import format_percent, format_value, signed, words
 from ema_pipeline.report.plots import figure_specs, write_plots
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.run_screen import RunScreen
 from ema_pipeline.report.shapes import missing_words, shape_pair
+from ema_pipeline.report.summary_files import finite
 from ema_pipeline.rigs import drawing_of
 
 UNIT = re.compile(r", (1|%|°|Hz|N/m|σ|\(?[\w²/]|10[⁰¹²³⁴⁵⁶⁷⁸⁹⁻]+|MN/m|kg)")
@@ -467,11 +468,24 @@ def test_comparison_says_that_its_error_is_that_of_the_fit(run: RunResults) -> N
 def test_comparison_names_modes_that_the_model_does_not_have(run: RunResults) -> None:
     assert run.comparison is not None
     alone = (ModeAlone("no_ring", 0, 26.357, 21.33, 0.998), ModeAlone("no_ring", 4, 107.98, np.nan, np.nan))
-    told = " ".join(_printed(terminal.comparison_tables(replace(run.comparison, alone=alone)), 80).split())
+    with_alone = replace(run, comparison=replace(run.comparison, alone=alone))
+    assert with_alone.comparison is not None
+    told = " ".join(_printed(terminal.comparison_tables(with_alone.comparison), 80).split())
     assert "! no_ring: mode 1, 26.357 Hz, is none of the model's: that of its shape is at 21.330 Hz" in told
     assert "(+23.6 %, MAC 1.00)" in told
     assert "! no_ring: mode 5, 107.98 Hz, is none of the model's " in told
     assert "none of the model's" not in _printed(terminal.comparison_tables(run.comparison), 80)
+    first, second = finite(summary_files.summary(with_alone))["comparison"]["alone"]
+    assert (first["mode"], first["frequency_hz"], first["model_frequency_hz"]) == (1, 26.357, 21.33)
+    assert first["frequency_difference_percent"] == pytest.approx(23.57, abs=0.01)
+    assert second == {
+        "configuration": "no_ring", "mode": 5, "frequency_hz": 107.98, "model_frequency_hz": None,
+        "frequency_difference_percent": None, "mac": None,
+    }  # fmt: skip
+    caption = "Measured modes that the fitted model does not have"
+    page = report_html(with_alone)
+    assert re.search(r"26\.357</td><td[^>]*>21\.330</td><td[^>]*>\+23\.6</td>", page[page.index(caption) :])
+    assert caption not in report_html(run)
 
 
 def test_fit_and_comparison_say_what_epsilon_is(run: RunResults) -> None:
