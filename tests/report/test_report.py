@@ -496,6 +496,14 @@ def test_fit_and_comparison_say_what_epsilon_is(run: RunResults) -> None:
         assert told.count("ε: the error function of the source papers, the sum over the paired modes") == 1
 
 
+def test_epsilon_of_the_curves_is_not_taken_for_that_of_the_fit(run: RunResults) -> None:
+    """Curves: the lowest modes and the nearest frequencies; the fitted model: all pairs."""
+    assert run.fit is not None
+    text = " ".join(report_html(run).split())
+    assert "over the lowest modes, each with the nearest model frequency, against one stiffness" in text
+    assert f"over the paired modes of all configurations, ε = {run.fit.frequency_error:.3g}." in text
+
+
 def _tables(run: RunResults) -> list[object]:
     c = run.configurations[0]
     assert c.modal is not None
