@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import inspect
 import io
 import os
 import sys
@@ -157,6 +158,16 @@ for _verb in (
 ):
     app.command()(_verb)
 app.add_typer(series.series, name="series")
+
+
+def _flowing(text: str) -> str:
+    """A docstring as help that is broken where the screen ends and not where the source does."""
+    return "\n\n".join(" ".join(paragraph.split()) for paragraph in inspect.cleandoc(text).split("\n\n"))
+
+
+for _command in (*app.registered_commands, *series.series.registered_commands):
+    if _command.callback is not None:
+        _command.help = _flowing(_command.help or _command.callback.__doc__ or "")
 
 
 if __name__ == "__main__":

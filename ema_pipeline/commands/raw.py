@@ -49,7 +49,8 @@ def simulate(
     out: Annotated[Path, typer.Argument(metavar="RAW", help="Folder to write.")],
     rig: Annotated[str, typer.Option("--rig", "-r", metavar="RIG", help="Rig, or a rig file.")] = "planetary",
     configuration: Annotated[
-        list[str] | None, typer.Option("--configuration", "-c", help="Configuration; all if left out.")
+        list[str] | None,
+        typer.Option("--configuration", "-c", metavar="NAME", help="Configuration; all if left out."),
     ] = None,
     effect: Annotated[
         list[str] | None,
@@ -59,8 +60,12 @@ def simulate(
     value: Annotated[
         list[str] | None, typer.Option("--value", metavar="NAME=VALUE", help="True value of a parameter.")
     ] = None,
-    sensor: Annotated[list[str] | None, typer.Option("--sensor", help="DOF of a sensor.")] = None,
-    impact: Annotated[list[str] | None, typer.Option("--impact", help="DOF that is struck.")] = None,
+    sensor: Annotated[
+        list[str] | None, typer.Option("--sensor", metavar="DOF", help="DOF of a sensor.")
+    ] = None,
+    impact: Annotated[
+        list[str] | None, typer.Option("--impact", metavar="DOF", help="DOF that is struck.")
+    ] = None,
     set_: Annotated[
         list[str] | None,
         typer.Option(

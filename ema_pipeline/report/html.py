@@ -272,7 +272,9 @@ def _candidate(results: RunResults, c: Any) -> dict[str, Any]:
         "standing": diagnosis.standing(found, c),
         "before": plain(c.error_before, 3),
         "error": plain(c.error_after, 3),
-        "held": f"{plain(c.heldout_error_before, 3)} → {plain(c.heldout_error_after, 3)}",
+        "held": f"{plain(c.heldout_error_before, 3)} → {plain(c.heldout_error_after, 3)}"
+        if math.isfinite(c.heldout_error_after)
+        else "–",
         "claimed": c.claimed,
         "why": c.why,
         "in_model": c.label in results.added,
