@@ -15,7 +15,8 @@ from ema_pipeline.modal.chosen import REACH, nearest_mode, pole_of_chart
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.pipeline import ShowStage, run_stages
 from ema_pipeline.run.measured import modes_of_structure
-from ema_pipeline.run.opening import existing_run, load_info, new_run, save_info
+from ema_pipeline.run.opening import existing_run, new_run
+from ema_pipeline.run.rollback import everything_taken_back
 from ema_pipeline.run.types import Run
 from ema_pipeline.store import Store
 
@@ -44,7 +45,7 @@ def change_choices(
     Raises
     ------
     EmaError
-        For hits and modes that do not exist; nothing is changed then.
+        For hits and modes that do not exist, and where too little is left to analyse; nothing is changed then.
     """
     effect_files = tuple(effect_files)
     run = existing_run(folder, effect_files)
@@ -53,16 +54,11 @@ def change_choices(
         raise EmaError(f"{folder}: a test of {kind.words} has no hits and no modes to choose")
     store = Store(folder)
     with store.lock():
-        before, info = load_info(store), dataclasses.replace(run.info, choices=change(run))
+        info = dataclasses.replace(run.info, choices=change(run))
         run = new_run(store, info, effect_files)
         run.check_effect_files()
-        save_info(store, info)
-        try:
+        with everything_taken_back(store, info):
             run_stages(run, stages_after(run), show)
-        except BaseException:  # interrupted, or nothing left to analyse: the choice is not kept
-            if before is not None:
-                save_info(store, before)
-            raise
     return run
 
 

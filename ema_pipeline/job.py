@@ -13,14 +13,8 @@ from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.keys import Keys
 from ema_pipeline.kinds import require_judge, stages_of
 from ema_pipeline.pipeline import ShowStage, run_stages
-from ema_pipeline.run.opening import (
-    existing_run,
-    load_info,
-    new_run,
-    save_info,
-    stored_settings,
-    with_effect_files,
-)
+from ema_pipeline.run.opening import existing_run, load_info, new_run, stored_settings, with_effect_files
+from ema_pipeline.run.rollback import everything_taken_back, settings_taken_back
 from ema_pipeline.run.settings import override
 from ema_pipeline.run.types import Run, RunInfo
 from ema_pipeline.store import ALL, Store
@@ -78,7 +72,7 @@ def run_raw(
     new_run(store, info, effect_files).check_effect_files()
     with _tidy(out), store.lock():
         info = _with_decisions_of(store, info)
-        with _described(store, info):
+        with settings_taken_back(store, info):
             run = new_run(store, info, effect_files)
             store.keep(stages_of(run))  # an earlier run may have had a model, or been of another kind of test
             return run, run_stages(run, run.settings.stages, show)
@@ -105,7 +99,7 @@ def run_on(
     info = dataclasses.replace(info, pipeline=settings.model_dump_json())
     run = new_run(store, info, effect_files)
     run.check_effect_files()
-    with store.lock(), _described(store, info):
+    with store.lock(), settings_taken_back(store, info):
         return run, run_stages(run, stages, show)
 
 
@@ -139,41 +133,23 @@ def change_effects(
     EmaError
         For effects or places that do not exist, and a model that cannot be fitted; nothing is changed then.
     """
-    effect_files = tuple(effect_files)
-    with taken_back_if_it_fails(folder, effect_files):
-        set_effects(folder, change, overrides, show, effect_files)
-        return run_on(folder, AFTER_EFFECTS, (), show, effect_files)[0]
+    with changed_effects(folder, change, overrides, show, effect_files) as run:
+        run_stages(run, AFTER_EFFECTS, show)
+    return run
 
 
 @contextlib.contextmanager
-def taken_back_if_it_fails(folder: Path, effect_files: Iterable[str] = ()) -> Iterator[None]:
-    """Leave a results folder with the model that it had if `set_effects` or what follows it fails.
-
-    What was not replaced is not computed again. An interrupted change is kept and can be finished.
-    """
-    store = Store(folder)
-    before = load_info(store) if store.path.is_file() else None
-    try:
-        yield
-    except Exception:
-        if before is not None and load_info(store) != before:
-            with store.lock(), contextlib.suppress(EmaError):  # it is the error of the change that is told
-                save_info(store, before)
-                there = [stage for stage in ("ladder", *AFTER_EFFECTS) if store.key(stage)]
-                run_stages(new_run(store, before, effect_files), there)
-        raise
-
-
-def set_effects(
+def changed_effects(
     folder: Path,
     change: Callable[[tuple[str, ...]], tuple[str, ...]],
     overrides: Iterable[str] = (),
     show: ShowStage | None = None,
     effect_files: Iterable[str] = (),
-) -> Run:
-    """Change the effects that were added to the model and measure its ladder; `AFTER_EFFECTS` is left to be run.
+) -> Iterator[Run]:
+    """Change the effects that were added to the model and measure its ladder; `AFTER_EFFECTS` is left to the block.
 
-    Parameters and errors are those of `change_effects`.
+    If anything fails, in the block too, the results folder is as it was. Interrupted in the block, the change is kept
+    and can be finished. Parameters and errors are those of `change_effects`.
     """
     effect_files = tuple(effect_files)
     run = existing_run(folder, effect_files)
@@ -187,18 +163,13 @@ def set_effects(
         run = new_run(store, info, effect_files)
         judge = require_judge(run, "add")
         judge.check_model(run)  # before anything is written
-        before = load_info(store)
-        save_info(store, info)
-        try:
+        with everything_taken_back(store, info) as under_way:
             if judge.ladder_of_diagnosis:
                 _take_ladder(run, effect_files)
             run_stages(run, ("ladder",), show)
-        except BaseException:  # interrupted, or no such ladder: the model stays as it was
-            if before is not None:
-                save_info(store, before)
-            raise
-        _drop_diagnosis_of_another_model(run)
-    return run
+            _drop_diagnosis_of_another_model(run)
+            under_way.resumable = True
+            yield run
 
 
 def _drop_diagnosis_of_another_model(run: Run) -> None:
@@ -252,24 +223,6 @@ def _with_decisions_of(store: Store, info: RunInfo) -> RunInfo:
     if before.rig == info.rig:
         info = dataclasses.replace(info, effects=before.effects)
     return dataclasses.replace(info, choices=before.choices.among(info.configurations))
-
-
-@contextlib.contextmanager
-def _described(store: Store, info: RunInfo) -> Iterator[None]:
-    """Keep the run's description; its settings and effect files are taken back if a stage fails with them.
-
-    An interrupted run keeps them and goes on with them.
-    """
-    before = load_info(store) if store.path.is_file() else None
-    save_info(store, info)
-    try:
-        yield
-    except Exception:
-        if before is not None and before == dataclasses.replace(
-            info, pipeline=before.pipeline, effect_hashes=before.effect_hashes, versions=before.versions
-        ):
-            save_info(store, before)
-        raise
 
 
 @contextlib.contextmanager

@@ -307,7 +307,10 @@ class Store:
     def _tidy(self) -> None:
         """Remove what killed processes left behind, and the files of results that were replaced."""
         for left_over in self.folder.glob(".*.[0-9]*.tmp"):
-            left_over.unlink(missing_ok=True)
+            if left_over.is_dir() and not left_over.is_symlink():
+                shutil.rmtree(left_over, ignore_errors=True)
+            else:
+                left_over.unlink(missing_ok=True)
         folder = self.folder / PARTS_FOLDER
         if not folder.is_dir() or folder.is_symlink():
             return

@@ -37,6 +37,7 @@ from ema_pipeline.report.results import RunResults
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.simulate.campaign import simulate_campaign
 from ema_pipeline.stages.results import load_results
+from ema_pipeline.store import LOCK_FILE
 
 pytestmark = pytest.mark.usefixtures("without_figures")
 
@@ -126,6 +127,22 @@ def test_the_last_modes_of_a_configuration_cannot_be_excluded(out: Path) -> None
         change_choices(out, excluding(modes=every))
     assert results(out).choices == before.choices
     assert len(frequencies(out)) == len(every)
+
+
+@pytest.mark.parametrize("stopped_by", [EmaError("it does not work"), KeyboardInterrupt()])
+def test_a_choice_that_fails_or_is_interrupted_leaves_results_and_report_as_they_were(
+    out: Path, stopped_by: BaseException, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stops(*_: object) -> None:
+        raise stopped_by
+
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name != LOCK_FILE}
+    every_hz = frequencies(out)
+    monkeypatch.setattr("ema_pipeline.stages.fit.work", stops)
+    with pytest.raises(type(stopped_by)):
+        change_choices(out, excluding(modes=[f"{every_hz[1]:.1f}"]))
+    after = {path: path.read_bytes() for path in out.rglob("*") if path.is_file() and path.name != LOCK_FILE}
+    assert after == before
 
 
 def test_results_whose_fit_failed_have_no_pairs_of_modes_that_are_gone(out: Path) -> None:

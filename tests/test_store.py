@@ -22,7 +22,7 @@ from ema_pipeline import codec
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
 from ema_pipeline.run.opening import load_info
-from ema_pipeline.store import ALL, Store, _holder
+from ema_pipeline.store import ALL, LOCK_FILE, Store, _holder
 
 
 @dataclass(frozen=True)
@@ -389,6 +389,14 @@ def test_files_of_replaced_and_of_never_linked_results_are_removed(tmp_path: Pat
         store.save("frf", ALL, "small", "{}", 0.1, result=np.zeros(3))
     assert parts(tmp_path) == []
     assert_array_equal(store.load("frf", ALL, "result", np.ndarray), np.zeros(3))
+
+
+def test_what_killed_processes_left_behind_is_removed(tmp_path: Path) -> None:
+    (tmp_path / ".report.html.123.tmp").touch()
+    (tmp_path / ".before.123.tmp").mkdir()
+    (tmp_path / ".before.123.tmp" / "ema.h5").touch()
+    with Store(tmp_path).lock():
+        assert [path.name for path in tmp_path.iterdir()] == [LOCK_FILE]
 
 
 def test_a_large_result_that_is_gone_counts_as_not_computed(tmp_path: Path) -> None:

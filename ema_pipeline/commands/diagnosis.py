@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -95,22 +96,24 @@ def _change(
     """Change the effects of the model; the ladder is the answer, fit and report follow."""
     from rich.text import Text
 
-    from ema_pipeline.job import AFTER_EFFECTS, run_on, set_effects, taken_back_if_it_fails
+    from ema_pipeline.job import AFTER_EFFECTS, changed_effects
+    from ema_pipeline.pipeline import run_stages
     from ema_pipeline.report.commands import naming
     from ema_pipeline.report.diagnosis import model_words
     from ema_pipeline.report.numbers import plain
     from ema_pipeline.stages.results import load_results
 
-    with taken_back_if_it_fails(out, effect_files):
+    with ExitStack() as under_way:
         with progress(quiet) as show_stage:
-            run = set_effects(out, change, overrides, show_stage, effect_files)
+            changed = changed_effects(out, change, overrides, show_stage, effect_files)
+            run = under_way.enter_context(changed)
+        stages = (shlex.join([stage, str(out), *naming(effect_files)]) for stage in AFTER_EFFECTS)
+        go_on_with(f" && {program()} ".join(stages))
         # a ladder of what is only proposed would be taken for the model
         if not quiet and (json or run.info.effects):
             _show_ladder(run, json)
-        stages = (shlex.join([stage, str(out), *naming(effect_files)]) for stage in AFTER_EFFECTS)
-        go_on_with(f" && {program()} ".join(stages))
         with progress(quiet) as show_stage:
-            run, _ = run_on(out, AFTER_EFFECTS, [], show_stage, effect_files)
+            run_stages(run, AFTER_EFFECTS, show_stage)
     if not quiet and not json:
         results = load_results(run, synthesis=False)
         model, report = model_words(results.added), run.store.folder / "report.html"

@@ -12,11 +12,11 @@ from pathlib import Path
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import link_or_copy
+from ema_pipeline.run.rollback import bring_back_files, keep_files
 from ema_pipeline.store import PARTS_FOLDER, RESULTS_FILE, Store
 
 FOLDER = ".view-"
 """Begins the name of a server's folder of snapshots; its process number follows."""
-FILES = (RESULTS_FILE, "summary.json", "modes.csv", "report.html")
 
 
 class Snapshots:
@@ -52,9 +52,7 @@ class Snapshots:
         (place / PARTS_FOLDER).mkdir()
         for part in Store(self._folder).parts():
             link_or_copy(part, place / PARTS_FOLDER / part.name)
-        for name in FILES:
-            if (self._folder / name).is_file():
-                link_or_copy(self._folder / name, place / name)
+        keep_files(self._folder, place)
         self._kept.append(place)
         for old in self._kept[: -self._most]:
             shutil.rmtree(old, ignore_errors=True)
@@ -69,14 +67,12 @@ class Snapshots:
             If another process is writing to the folder, or the snapshot is gone.
         """
         place = self._kept[-1]
-        if not (place / FILES[0]).is_file():
+        if not (place / RESULTS_FILE).is_file():
             raise EmaError(f"{place}: the earlier state is gone; take the change back with 'ema remove'")
         with Store(self._folder).lock():
             for part in (place / PARTS_FOLDER).iterdir():
                 os.replace(part, self._folder / PARTS_FOLDER / part.name)
-            for name in reversed(FILES):  # the store last: until then the folder is in its later state
-                if (place / name).is_file():
-                    os.replace(place / name, self._folder / name)
+            bring_back_files(self._folder, place)
         self.drop()
 
     def drop(self) -> None:

@@ -13,12 +13,14 @@ from typer.testing import CliRunner
 from ema_pipeline.cli import app
 from ema_pipeline.describe import describe_modes
 from ema_pipeline.errors import EmaError
-from ema_pipeline.job import adding, run_on, run_raw, set_effects
+from ema_pipeline.files import replace_file
+from ema_pipeline.job import adding, change_effects, changed_effects, run_on, run_raw
+from ema_pipeline.pipeline import run_stages
 from ema_pipeline.run.opening import existing_run, load_info, save_info
 from ema_pipeline.run.types import Progress, Run
 from ema_pipeline.stages import fit
 from ema_pipeline.stages.results import load_results
-from ema_pipeline.store import Store
+from ema_pipeline.store import ALL, LOCK_FILE, Store
 
 EFFECT = """
 from pathlib import Path
@@ -51,6 +53,12 @@ def received(results: Path, folder: Path, **changes: object) -> Path:
     assert info is not None
     save_info(store, dataclasses.replace(info, **changes))
     return out
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    """What every file of a results folder holds, but for that of its lock."""
+    files = (path for path in out.rglob("*") if path.is_file() and path.name != LOCK_FILE)
+    return {str(path.relative_to(out)): path.read_bytes() for path in files}
 
 
 def with_effect_file(results: Path, folder: Path, file: Path) -> Path:
@@ -147,8 +155,8 @@ def test_effects_are_taken_back_where_the_model_with_them_cannot_be_fitted(
 ) -> None:
     out = received(results, tmp_path)
     if first:
-        set_effects(out, adding(first))
-        run_on(out, ["fit"])
+        with changed_effects(out, adding(first)) as run:
+            run_stages(run, ["fit"])
     before, ladder = load_info(Store(out)), CliRunner().invoke(app, ["ladder", str(out)]).output
     file = tmp_path / "film.py"
     file.write_text(EFFECT.format(marker=str(tmp_path / "it_ran")), encoding="utf-8")
@@ -166,6 +174,48 @@ def test_effects_are_taken_back_where_the_model_with_them_cannot_be_fitted(
     assert CliRunner().invoke(app, ["ladder", str(out)]).output == ladder
     again = CliRunner().invoke(app, ["fit", str(out)])
     assert again.exit_code == 0, again.exception
+
+
+@pytest.mark.parametrize("verb", ["add", "remove"])
+def test_a_change_of_effects_that_fails_leaves_diagnosis_results_and_report_as_they_were(
+    results: Path, tmp_path: Path, verb: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, effect = received(results, tmp_path), "spring@sun.y"
+    if verb == "remove":
+        done = CliRunner().invoke(app, ["add", str(out), effect])
+        assert done.exit_code == 0, done.exception
+    # made with an effect that the changed model does not have: the change drops it
+    Store(out).save(
+        "diagnose", ALL, "key", "{}", 0.1, on_top_of=(effect if verb == "remove" else "mass@sun",)
+    )
+    before = contents(out)
+
+    def fails(*_: object) -> None:
+        assert not Store(out).key("diagnose")
+        replace_file(out / "summary.json", "of a model that is taken back")
+        raise EmaError("the report cannot be drawn")
+
+    monkeypatch.setattr("ema_pipeline.stages.report.work", fails)
+    done = CliRunner().invoke(app, [verb, str(out), effect])
+    assert "cannot be drawn" in str(done.exception)
+    assert contents(out) == before
+
+
+@pytest.mark.parametrize(("stage", "kept"), [("ladder", False), ("fit", True)])
+def test_an_interrupted_change_of_effects_is_kept_once_its_ladder_stands(
+    results: Path, tmp_path: Path, stage: str, kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = received(results, tmp_path)
+    before = contents(out)
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"ema_pipeline.stages.{stage}.work", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        change_effects(out, adding(["spring@sun.y"]))
+    assert (contents(out) != before) is kept
+    assert existing_run(out).info.effects == (("spring@sun.y",) if kept else ())
 
 
 @pytest.mark.parametrize("stopped_by", [EmaError("it does not work"), KeyboardInterrupt()])
