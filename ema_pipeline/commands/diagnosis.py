@@ -97,10 +97,10 @@ def _change(
     from rich.text import Text
 
     from ema_pipeline.job import AFTER_EFFECTS, changed_effects
+    from ema_pipeline.number_text import plain
     from ema_pipeline.pipeline import run_stages
     from ema_pipeline.report.commands import naming
     from ema_pipeline.report.diagnosis import model_words
-    from ema_pipeline.report.numbers import plain
     from ema_pipeline.stages.results import load_results
 
     with ExitStack() as under_way:

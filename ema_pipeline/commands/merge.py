@@ -54,7 +54,7 @@ def _table(merged: Merged) -> Screen:
     from rich import box
     from rich.table import Table as Screen
 
-    from ema_pipeline.report.numbers import plain
+    from ema_pipeline.number_text import plain
 
     table = Screen(box=box.SIMPLE)
     for name in ("part", "band, Hz", "points", "sensors", "modes"):
@@ -70,7 +70,7 @@ def _table(merged: Merged) -> Screen:
 def _lines(merged: Merged) -> list[str]:
     import math
 
-    from ema_pipeline.report.numbers import format_percent, plain
+    from ema_pipeline.number_text import format_percent, plain
 
     low, high = (plain(v) for v in merged.frfs.band_hz)
     pairs = int((merged.frfs.hits > 0).sum())

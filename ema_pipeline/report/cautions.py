@@ -12,7 +12,8 @@ from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
 from ema_pipeline.frf.channel_faults import SENSITIVITY
 from ema_pipeline.frf.signs import SIGN
 from ema_pipeline.modal.types import GROWS
-from ema_pipeline.report.numbers import below, format_value, plain, words
+from ema_pipeline.number_text import below, format_value, plain
+from ema_pipeline.report.name_text import words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC
 

@@ -14,8 +14,9 @@ from ema_pipeline.diagnose.types import (
     EffectSize,
     Ladder,
 )
+from ema_pipeline.number_text import plain, prefixed
 from ema_pipeline.report.commands import command
-from ema_pipeline.report.numbers import plain, prefixed, words
+from ema_pipeline.report.name_text import words
 
 NOTHING = "nothing"
 _COUNTS = {2: "Two", 3: "Three", 4: "Four", 5: "Five", 6: "Six"}

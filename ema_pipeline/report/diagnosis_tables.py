@@ -18,6 +18,7 @@ from ema_pipeline.diagnose.types import (
     Rung,
 )
 from ema_pipeline.effects.base import effect_of
+from ema_pipeline.number_text import format_value, plain
 from ema_pipeline.report.diagnosis import (
     label_words,
     limit_words,
@@ -27,7 +28,7 @@ from ema_pipeline.report.diagnosis import (
     rung_words,
     size_words,
 )
-from ema_pipeline.report.numbers import format_value, plain, words
+from ema_pipeline.report.name_text import words
 from ema_pipeline.report.tables import Row, Table
 
 

@@ -13,12 +13,13 @@ from ema_pipeline.choices import NO_CHOICES, HitChoice, ModeChoice, options_betw
 from ema_pipeline.correlate.types import ModeDifference
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.files import replace_file
+from ema_pipeline.number_text import format_percent, format_value, plain, signed
 from ema_pipeline.report import diagnosis, diagnosis_tables, levels, summary, tables
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.loops import loops_context
 from ema_pipeline.report.moved_modes import Seen, error_words, moved_table, still
 from ema_pipeline.report.moving_shapes import moving_shapes
-from ema_pipeline.report.numbers import format_percent, format_value, plain, signed, slug, words
+from ema_pipeline.report.name_text import slug, words
 from ema_pipeline.report.page_top import page_top
 from ema_pipeline.report.pages import page_templates
 from ema_pipeline.report.results import ConfigurationResults, RunResults

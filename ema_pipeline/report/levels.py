@@ -10,7 +10,7 @@ import numpy as np
 from ema_pipeline.levels.sentences import move_text
 from ema_pipeline.levels.types import LevelStudy, ModeLevels
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.report.numbers import format_percent, format_value, plain
+from ema_pipeline.number_text import format_percent, format_value, plain
 from ema_pipeline.report.tables import Row, Table
 
 

@@ -12,9 +12,10 @@ import numpy as np
 from ema_pipeline.files import replace_file
 from ema_pipeline.loops.summary import summary, terminal_lines
 from ema_pipeline.loops.types import Estimate, IsolatorResult, Loop, LoopModel
+from ema_pipeline.number_text import format_value, plain
 from ema_pipeline.report import diagnosis, summary_files
 from ema_pipeline.report.commands import command
-from ema_pipeline.report.numbers import format_value, plain, words
+from ema_pipeline.report.name_text import words
 from ema_pipeline.report.results import LoopResults, RunResults
 from ema_pipeline.report.tables import Row, Table
 

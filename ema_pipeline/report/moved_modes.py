@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from ema_pipeline.report.numbers import plain
+from ema_pipeline.number_text import plain
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.tables import Row, Table
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ema_pipeline.report.numbers import format_percent, format_value, slug
+from ema_pipeline.number_text import format_percent, format_value
+from ema_pipeline.report.name_text import slug
 from ema_pipeline.report.results import ConfigurationResults
 from ema_pipeline.report.shapes import drawing_for, missing_words, shape_pair
 from ema_pipeline.rigs.drawing import Body, Drawing, Motion

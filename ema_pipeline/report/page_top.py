@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import UNKNOWN, Diagnosis, Rung
+from ema_pipeline.number_text import plain
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import suspicions
 from ema_pipeline.report.commands import command
 from ema_pipeline.report.effect_places import EffectPlaces, effect_places
-from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.shapes import drawing_for
 

@@ -28,7 +28,7 @@ from ema_pipeline.report.figures import (
     traces,
 )
 from ema_pipeline.report.levels import has_to_say
-from ema_pipeline.report.numbers import slug
+from ema_pipeline.report.name_text import slug
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.shapes import drawing_for
 

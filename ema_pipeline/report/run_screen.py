@@ -17,11 +17,11 @@ from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import Candidate, Diagnosis
 from ema_pipeline.modal.chosen import EXCLUDED
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.number_text import below, format_percent, format_value, plain, signed
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import Weight, cautions, left_out, suspicions
 from ema_pipeline.report.commands import command, naming, typed
 from ema_pipeline.report.levels import has_to_say
-from ema_pipeline.report.numbers import below, format_percent, format_value, plain, signed
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.simulation import error_lines
 from ema_pipeline.report.summary import changed_words

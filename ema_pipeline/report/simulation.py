@@ -6,8 +6,8 @@ import base64
 from typing import Any
 
 from ema_pipeline.diagnose.hysteresis_loop import HysteresisLoop
+from ema_pipeline.number_text import format_value, plain
 from ema_pipeline.observations.free_run import RecordError
-from ema_pipeline.report.numbers import format_value, plain
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.tables import Row, Table
 

@@ -12,17 +12,10 @@ from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.modal.types import ModalModel, Mode
+from ema_pipeline.number_text import below, format_percent, format_value, plain, prefixed, signed
 from ema_pipeline.report.cautions import fails
 from ema_pipeline.report.diagnosis import parameter_words
-from ema_pipeline.report.numbers import (
-    below,
-    format_percent,
-    format_value,
-    plain,
-    prefixed,
-    signed,
-    words,
-)
+from ema_pipeline.report.name_text import words
 from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC
 
 

@@ -22,9 +22,9 @@ from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.levels.types import LevelStudy
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.number_text import plain, signed
 from ema_pipeline.report import diagnosis, diagnosis_tables, levels, tables
 from ema_pipeline.report.commands import typed
-from ema_pipeline.report.numbers import plain, signed
 
 Clean = Callable[[str], str]
 _SHORT = 15

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from ema_pipeline.report.numbers import plain, words
+from ema_pipeline.number_text import plain
+from ema_pipeline.report.name_text import words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.tables import Row, Table
 

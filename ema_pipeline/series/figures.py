@@ -9,7 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ema_pipeline.report.numbers import prefixed
+from ema_pipeline.number_text import prefixed
 from ema_pipeline.report.style import BLACK, BLUE, GREY, VERMILLION, margins, new_figure, styled
 from ema_pipeline.series.acceptance_limits import Range
 from ema_pipeline.series.features import DAMPING, FREQUENCY, PARAMETER, Features

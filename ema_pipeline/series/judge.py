@@ -10,7 +10,7 @@ import pandas as pd
 import scipy.stats
 
 from ema_pipeline.diagnose.sentences import label_text, probability_text
-from ema_pipeline.report.numbers import format_value, plain
+from ema_pipeline.number_text import format_value, plain
 from ema_pipeline.series.acceptance_limits import Limits, Range, reference_modes
 from ema_pipeline.series.database import SeriesDatabase, rows_of
 from ema_pipeline.series.features import DAMPING, FREQUENCY, MAC, Features, features_of, modes_of_tests

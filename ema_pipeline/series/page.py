@@ -14,7 +14,7 @@ import pandas as pd
 
 from ema_pipeline.diagnose.sentences import label_text, probability_text
 from ema_pipeline.files import replace_file
-from ema_pipeline.report.numbers import format_value, plain
+from ema_pipeline.number_text import format_value, plain
 from ema_pipeline.report.pages import page_templates
 from ema_pipeline.report.style import png
 from ema_pipeline.report.tables import Row, Table

@@ -9,8 +9,8 @@ import pandas as pd
 from rich import box
 from rich.table import Table
 
+from ema_pipeline.number_text import format_value, plain
 from ema_pipeline.observations.parts import DAMPING as MODAL_DAMPING
-from ema_pipeline.report.numbers import format_value, plain
 from ema_pipeline.series.compare import Comparison
 from ema_pipeline.series.database import rows_of
 from ema_pipeline.series.features import DAMPING

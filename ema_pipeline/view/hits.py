@@ -16,7 +16,7 @@ from starlette.responses import HTMLResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.report.numbers import plain
+from ema_pipeline.number_text import plain
 from ema_pipeline.report.pages import page_templates
 from ema_pipeline.view.serving import Listeners, Started, script, serve_guarded, started_soon
 from ema_pipeline.watch.judge import LEAST_COHERENCE, JudgedRecord

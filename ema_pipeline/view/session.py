@@ -17,10 +17,10 @@ from typing import Any
 
 from ema_pipeline.choices import options_between
 from ema_pipeline.errors import EmaError
+from ema_pipeline.number_text import plain
 from ema_pipeline.report.commands import command
 from ema_pipeline.report.diagnosis import effects_words, model_words
 from ema_pipeline.report.moved_modes import Seen, error_words, seen
-from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.run.measured import modes_key
 from ema_pipeline.run.opening import existing_run

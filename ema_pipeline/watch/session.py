@@ -21,8 +21,8 @@ from ema_pipeline.ingest.description import RecordDescription, TestDescription, 
 from ema_pipeline.ingest.draft import impact_of
 from ema_pipeline.ingest.readers import read_raw
 from ema_pipeline.ingest.records import HitSamples
+from ema_pipeline.number_text import plain
 from ema_pipeline.plain_text import printable
-from ema_pipeline.report.numbers import plain
 from ema_pipeline.toml_text import parse_toml, read_toml_text
 from ema_pipeline.watch.arrivals import Arrival
 from ema_pipeline.watch.judge import JudgedRecord, judge_record

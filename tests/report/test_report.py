@@ -21,10 +21,11 @@ from ema_pipeline.correlate.types import ModeAlone
 from ema_pipeline.frf.overview import cmif, representative_frfs
 from ema_pipeline.frf.signs import SIGN
 from ema_pipeline.modal.circle.compare import average
+from ema_pipeline.number_text import format_percent, format_value, signed
 from ema_pipeline.report import plots as report_plots
 from ema_pipeline.report import style, summary, summary_files, tables, terminal
 from ema_pipeline.report.html import bokeh_script, report_html, write_report
-from ema_pipeline.report.numbers import format_percent, format_value, signed, words
+from ema_pipeline.report.name_text import words
 from ema_pipeline.report.plots import figure_specs, write_plots
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.run_screen import RunScreen

@@ -34,10 +34,10 @@ from ema_pipeline.diagnose.types import (
     VerdictWord,
 )
 from ema_pipeline.fit.types import ErrorSweep
+from ema_pipeline.number_text import below
 from ema_pipeline.report import diagnosis, diagnosis_tables, page_top, run_screen, summary, tables, terminal
 from ema_pipeline.report.figures.diagnosis import ladder_errors, where_it_fails
 from ema_pipeline.report.html import bokeh_script, report_html
-from ema_pipeline.report.numbers import below
 from ema_pipeline.report.plots import figure_specs
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.run_screen import next_lines

@@ -19,10 +19,10 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from ema_pipeline.correlate.types import Comparison, ModeDifference, Unpaired
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import Diagnosis, Ladder, Rung
+from ema_pipeline.number_text import plain
 from ema_pipeline.report.diagnosis import NOTHING, label_words, rung_words
 from ema_pipeline.report.figures.comparison import severity, worst_per_body
 from ema_pipeline.report.figures.shapes import draw_rig
-from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.style import (
     BLACK,
     BLUE,

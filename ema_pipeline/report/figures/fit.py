@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
-from ema_pipeline.report.numbers import format_value, plain, prefixed, words
+from ema_pipeline.number_text import format_value, plain, prefixed
+from ema_pipeline.report.name_text import words
 from ema_pipeline.report.style import (
     BLACK,
     GREY,

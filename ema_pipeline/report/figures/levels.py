@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.levels.types import DecayCurve, LevelStudy, ModeLevels
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.report.numbers import plain
+from ema_pipeline.number_text import plain
 from ema_pipeline.report.style import (
     BLUE,
     GREY,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.modal.circle import on_circle
 from ema_pipeline.modal.types import CircleFit, ModalModel
-from ema_pipeline.report.numbers import format_percent, format_value, plain
+from ema_pipeline.number_text import format_percent, format_value, plain
 from ema_pipeline.report.style import (
     GREEN,
     GREY,

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ema_pipeline.diagnose.types import Ladder, Rung, TimeTrace
+from ema_pipeline.number_text import plain
 from ema_pipeline.report.diagnosis import label_words
-from ema_pipeline.report.numbers import plain
 from ema_pipeline.report.style import BLACK, BLUE, GREY, VERMILLION, WIDTH_IN, margins, new_figure, styled
 
 _UNITS = {"acceleration": "m/s²", "velocity": "m/s", "displacement": "m"}

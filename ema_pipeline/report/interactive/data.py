@@ -21,11 +21,12 @@ from ema_pipeline.mechanics.system import LinearSystem, sensor_rows
 from ema_pipeline.modal.assurance import auto_mac
 from ema_pipeline.modal.circle import on_circle
 from ema_pipeline.modal.types import CircleFit, ModalModel, Mode
+from ema_pipeline.number_text import format_percent, format_value, plain
 from ema_pipeline.report.diagnosis import label_words, rung_words
 from ema_pipeline.report.interactive.loops import loop_model_names, loops_data, loss_data
 from ema_pipeline.report.interactive.packing import POINTS, packed_cmif, packed_frfs
 from ema_pipeline.report.levels import has_to_say
-from ema_pipeline.report.numbers import format_percent, format_value, plain, words
+from ema_pipeline.report.name_text import words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.shapes import shape_pair
 from ema_pipeline.report.shown_band import places, shown_to

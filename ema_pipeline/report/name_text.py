@@ -1,11 +1,8 @@
-"""What the pages and screens show of numbers (`ema_pipeline.number_text`) and of names."""
+"""Names of parts, quantities and configurations: for reading, and as parts of file names and HTML ids."""
 
 from __future__ import annotations
 
-from ema_pipeline.number_text import below, format_percent, format_value, plain, prefixed, signed
 from ema_pipeline.plain_text import part_words
-
-__all__ = ["below", "format_percent", "format_value", "plain", "prefixed", "signed", "slug", "words"]
 
 
 def words(name: str) -> str:
