@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.ingest.readers.timebase import rate_from_times, time_rounding, time_unit_scale
+from ema_pipeline.ingest.readers.timebase import rate_from_times, time_unit_scale
 
 
 def test_rounding_is_the_largest_step_off_the_median_over_the_span() -> None:
     # steps of 1, 1 and 1.2: 0.2 off over 3.2
-    assert time_rounding(np.array([0.0, 1.0, 2.0, 3.2])) == pytest.approx(0.2 / 3.2)
-    assert time_rounding(np.array([0.0, 1.0, 2.1])) == pytest.approx(0.05 / 2.1)
-    assert time_rounding(np.array([0.0, 1.0])) == 0.0
-    assert time_rounding(np.array([3.0, 2.0, 1.0])) == 0.0
+    assert rate_from_times(np.array([0.0, 1.0, 2.0, 3.2]))[1] == pytest.approx(0.2 / 3.2)
+    assert rate_from_times(np.array([0.0, 1.0, 2.1]))[1] == pytest.approx(0.05 / 2.1)
+    assert rate_from_times(np.array([0.0, 1.0])) == (None, 0.0)
 
 
 def test_the_rate_of_an_axis_is_its_intervals_over_its_span() -> None:
-    assert rate_from_times(np.arange(11) * 0.25 + 7.0) == pytest.approx(4.0)
+    assert rate_from_times(np.arange(11) * 0.25 + 7.0) == (pytest.approx(4.0), 0.0)
 
 
 @pytest.mark.parametrize(
@@ -72,8 +71,9 @@ def test_stamps_rounded_to_more_than_a_sample_give_the_rate_to_within_their_roun
     times: np.ndarray, rate: float
 ) -> None:
     assert np.any(np.diff(times) == 0)
-    found = rate_from_times(times)
-    assert found == pytest.approx(rate, rel=time_rounding(times))
+    found, uncertainty = rate_from_times(times)
+    assert uncertainty == np.max(np.abs(np.diff(times) - np.median(np.diff(times)))) / np.ptp(times)
+    assert found == pytest.approx(rate, rel=uncertainty)
 
 
 @pytest.mark.parametrize(
@@ -108,4 +108,4 @@ def test_missing_and_repeated_rows_are_found_although_stamps_are_equal(times: np
 
 
 def test_a_handful_of_different_stamps_tells_no_rate() -> None:
-    assert rate_from_times(np.floor(TIMES)) is None
+    assert rate_from_times(np.floor(TIMES))[0] is None

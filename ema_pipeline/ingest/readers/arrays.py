@@ -18,7 +18,6 @@ from ema_pipeline.ingest.readers.timebase import (
     is_time_name,
     is_uniform_ramp,
     rate_from_times,
-    time_rounding,
     time_unit_scale,
     whole_rate,
 )
@@ -125,7 +124,7 @@ def assemble(
         numbers = values.astype(np.float64, copy=False)
         if values.ndim == 1 and is_time_name(array.name):
             scale = time_unit_scale(array.name, _text(array.attributes, _UNIT_KEYS))
-            rates.add(label, rate_from_times(numbers * scale), time_rounding(numbers * scale))
+            rates.add(label, *rate_from_times(numbers * scale))
         elif values.ndim == 1:
             columns.append(_Column(array.path, numbers, array.attributes))
         elif values.ndim == 2:
@@ -214,7 +213,7 @@ def _split_matrix(array: NamedArray, numbers: NDArray[np.float64]) -> list[_Colu
     table = numbers if numbers.shape[0] >= numbers.shape[1] else numbers.T
     axis_rate = None
     if is_uniform_ramp(table[:, 0]):
-        axis_rate = rate_from_times(table[:, 0])
+        axis_rate, _ = rate_from_times(table[:, 0])
         table = table[:, 1:]
     count = table.shape[1]
     given = _texts(_lookup(array.attributes, _NAME_KEYS))

@@ -12,7 +12,7 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, clean_unit, split_unit
 from ema_pipeline.ingest.readers.text import decode
-from ema_pipeline.ingest.readers.timebase import rate_from_times, time_rounding, whole_rate
+from ema_pipeline.ingest.readers.timebase import rate_from_times, whole_rate
 
 NAME = "LVM"
 
@@ -70,7 +70,7 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
         raise EmaError(f"its channels differ in Delta_X ({min(steps):g} and {max(steps):g} s); use one rate")
     rate, tolerance = (whole_rate(steps[0], 1e-6), 0.0) if steps else (None, 0.0)
     for axis in times:
-        measured, rounding = rate_from_times(axis), time_rounding(axis)
+        measured, rounding = rate_from_times(axis)
         if rate is None:
             rate, tolerance = measured, rounding
         elif measured is not None and abs(measured / rate - 1) > max(1e-3, rounding, tolerance):

@@ -23,7 +23,6 @@ from ema_pipeline.ingest.readers.timebase import (
     is_time_name,
     is_uniform_ramp,
     rate_from_times,
-    time_rounding,
     time_unit_scale,
 )
 from ema_pipeline.units import find_unit
@@ -331,8 +330,7 @@ def _channels(table: NDArray[np.float64], preamble: Preamble) -> RawRecord:
             channels[name] = RawChannel(samples, unit)
     tolerance = 0.0
     if times is not None:
-        measured = rate_from_times(times)
-        rounding = time_rounding(times)
+        measured, rounding = rate_from_times(times)
         if rate is None:
             rate, tolerance = measured, rounding
         elif measured is not None and abs(measured / rate - 1) > max(1e-3, rounding):

@@ -61,11 +61,17 @@ def time_unit_scale(name: str, unit: str | None) -> float:
     return 1.0
 
 
-def rate_from_times(times: NDArray[np.float64]) -> float | None:
-    """Sample rate of a time axis (n,) in seconds.
+def rate_from_times(times: NDArray[np.float64]) -> tuple[float | None, float]:
+    """Sample rate of a time axis (n,) in seconds, and the relative uncertainty that rounding leaves it.
 
-    Times may be rounded, even to more than one sample; see `time_rounding` for what that does to the rate. None
-    where they are too coarse to tell it.
+    Times may be rounded, even to more than one sample. That scatters each step; over the whole span it all but
+    vanishes, unless the record is short or the rounding coarse.
+
+    Returns
+    -------
+    rate_hz : float or None
+        None where the times are too few or too coarse to tell it.
+    uncertainty : float
 
     Raises
     ------
@@ -73,7 +79,7 @@ def rate_from_times(times: NDArray[np.float64]) -> float | None:
         Where time does not rise, jumps (lost samples) or stands (repeated ones).
     """
     if times.size < 3:
-        return None
+        return None, 0.0
     if not np.all(np.isfinite(times)):
         raise EmaError(f"time is not a number at sample {int(np.argmin(np.isfinite(times)))}; export again")
     steps = np.diff(times)
@@ -85,17 +91,18 @@ def rate_from_times(times: NDArray[np.float64]) -> float | None:
         )
     if mean <= 0 or np.any(steps < 0):
         raise EmaError(f"time runs backwards at sample {int(np.argmax(steps <= 0)) + 1}; export again")
-    if np.any(steps == 0):
-        return _rate_of_equal_times(times)
     step = float(np.median(steps))
     worst = int(np.argmax(np.abs(steps - step)))
+    uncertainty = float(abs(steps[worst] - step) / span)
+    if np.any(steps == 0):
+        return _rate_of_equal_times(times, uncertainty), uncertainty
     if abs(steps[worst] - step) > 0.5 * step:
         raise _gap(float(steps[worst]), worst + 1, step)
-    return whole_rate(mean, max(1e-9, time_rounding(times)))
+    return whole_rate(mean, max(1e-9, uncertainty)), uncertainty
 
 
-def _rate_of_equal_times(times: NDArray[np.float64]) -> float | None:
-    """The same where several samples have one time: it was rounded, or rows were written twice.
+def _rate_of_equal_times(times: NDArray[np.float64], uncertainty: float) -> float | None:
+    """The rate where several samples have one time: it was rounded, or rows were written twice.
 
     Rounding to significant digits is coarser later in the record, so that each stamp is held against those beside it:
     it stands for as many samples as fill the step to the next one, or one more.
@@ -128,7 +135,7 @@ def _rate_of_equal_times(times: NDArray[np.float64]) -> float | None:
             f"time {times[first[at]]:.6g} s has {rows[at]} samples where {widest[at] / step:.0f} are usual: samples "
             "are missing; export the record again without gaps"
         )
-    return whole_rate(step, time_rounding(times))
+    return whole_rate(step, uncertainty)
 
 
 def _is_power_of_ten(values: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -140,18 +147,6 @@ def _gap(jump: float, sample: int, step: float) -> EmaError:
         f"time jumps by {jump:.6g} s at sample {sample} where {step:.6g} s is the step: "
         "samples are missing; export the record again without gaps"
     )
-
-
-def time_rounding(times: NDArray[np.float64]) -> float:
-    """Relative uncertainty of the rate of a time axis (n,) whose values were rounded when written.
-
-    Rounding scatters each step; over the whole span it all but vanishes, unless the record is short or the rounding
-    coarse.
-    """
-    if times.size < 3 or times[-1] <= times[0]:
-        return 0.0
-    steps = np.diff(times)
-    return float(np.max(np.abs(steps - np.median(steps))) / (times[-1] - times[0]))
 
 
 def whole_rate(step: float, relative_rounding: float) -> float:

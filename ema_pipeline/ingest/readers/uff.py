@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ema_pipeline.errors import EmaError
 from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.readers.raw import RawChannel, RawRecord, clean_unit
-from ema_pipeline.ingest.readers.timebase import rate_from_times, time_rounding, whole_rate
+from ema_pipeline.ingest.readers.timebase import rate_from_times, whole_rate
 
 NAME = "UFF58"
 
@@ -76,7 +76,8 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
         samples, times = _body(data, block, header, name, extract, notes)
         step = float(header["abscissa_inc"])
         if times is not None:
-            rate, rounding = rate_from_times(times), max(rounding, time_rounding(times))
+            rate, uncertainty = rate_from_times(times)
+            rounding = max(rounding, uncertainty)
         else:
             rate = whole_rate(step, _ABSCISSA_ROUNDING) if step > 0 else None
         if rate is not None:
