@@ -2,8 +2,7 @@
 
 The linear part, tangents of the nonlinear elements included, is advanced exactly in its own complex modes, where
 every state is a number of its own; the nonlinear elements only need their stretches. A compiled loop takes all
-pairs of assembly and blow through time: this is what a fit needs, which asks for the same blows at a dozen
-neighbouring sets of parameters. Elements with a memory take the slower way of
+pairs of assembly and blow through time. Elements with a memory take the slower way of
 `mechanics.marching.marched_response`.
 """
 
@@ -79,10 +78,10 @@ def batch_response(assemblies: Sequence[Assembly], blows: Blows, substeps: int) 
         For structural damping, and where the motion grows without bound.
     """
     if any(e.law is None for a in assemblies for e in a.nonlinear):
-        return one_by_one(assemblies, blows, substeps)
+        return _one_by_one(assemblies, blows, substeps)
     force, straight = fine_force(blows.force, substeps)
     orders = np.array([ORDERS[q] for q in blows.quantities])
-    batch = prepared(assemblies, blows.out_rows, orders, blows.in_rows)
+    batch = _prepared(assemblies, blows.out_rows, orders, blows.in_rows)
     step = 1 / (blows.sample_rate_hz * substeps)
     found = _moved(batch, straight, step, substeps, trace=True)
     result = found.motion.swapaxes(2, 3)
@@ -94,7 +93,7 @@ def batch_response(assemblies: Sequence[Assembly], blows: Blows, substeps: int) 
 
 
 def _driven(
-    batch: Batch, a: int, forces: NDArray[np.float64], step: float, substeps: int
+    batch: _Batch, a: int, forces: NDArray[np.float64], step: float, substeps: int
 ) -> NDArray[np.float64]:
     """Motion (n_blows, n_outputs, n_samples) of one assembly's linear part under the elements' forces given."""
     hits, m, steps = forces.shape
@@ -111,7 +110,7 @@ def _driven(
         direct=batch.direct[a : a + 1, :, at],
     )
     flat = forces.reshape(-1, steps)
-    found = marched(linear, linear.outputs, flat, step, substeps).motion[0].swapaxes(1, 2)
+    found = _marched(linear, flat, step, substeps).motion[0].swapaxes(1, 2)
     found += linear.direct[0].T[..., None] * flat[:, None, ::substeps]
     return np.asarray(found.reshape(hits, m, *found.shape[1:]).sum(axis=1))
 
@@ -152,7 +151,7 @@ def compiled_response(
     EmaError
         For structural damping, and where the motion grows without bound.
     """
-    batch = prepared(assemblies, out_rows, orders, in_rows)
+    batch = _prepared(assemblies, out_rows, orders, in_rows)
     step = 1 / (sample_rate_hz * substeps)
     found = _moved(batch, force, step, substeps)
     return found.motion.swapaxes(2, 3), batch.direct[:, :, : len(force)].swapaxes(1, 2)
@@ -177,7 +176,7 @@ def response_from_rest(
 
 
 @dataclass(frozen=True)
-class Batch:
+class _Batch:
     """Modes of many assemblies, filled up with nothing to one size.
 
     Attributes
@@ -202,12 +201,12 @@ class Batch:
     direct: NDArray[np.float64]
 
 
-def prepared(
+def _prepared(
     assemblies: Sequence[Assembly],
     out_rows: NDArray[np.float64],
     orders: NDArray[np.int64],
     in_rows: NDArray[np.float64],
-) -> Batch:
+) -> _Batch:
     """Modes of assemblies with the same coordinates, and what blows and elements do to them."""
     elements = {e.name: e for a in assemblies for e in a.nonlinear}
     for assembly in assemblies:
@@ -235,31 +234,35 @@ def prepared(
         own = {e.name: e.law for e in assembly.nonlinear}
         for j, name in enumerate(elements):
             laws[i, j] = own.get(name) or _NO_FORCE
-    return Batch(tuple(elements), laws, poles, inputs, stretch, outputs, direct)
+    return _Batch(tuple(elements), laws, poles, inputs, stretch, outputs, direct)
 
 
-def marched(
-    batch: Batch,
-    outputs: NDArray[np.complex128],
-    force: NDArray[np.float64],
-    step: float,
-    substeps: int,
-    trace: bool = False,
+def _marched(
+    batch: _Batch, force: NDArray[np.float64], step: float, substeps: int, trace: bool = False
 ) -> Marched:
     """`mechanics.kernel.march` of a batch."""
     from ema_pipeline.mechanics.kernel import march  # compiles at its first use
 
-    direct = batch.direct[:, : outputs.shape[1], len(force) :]
+    direct = batch.direct[:, :, len(force) :]
     return march(
-        batch.laws, batch.poles, batch.inputs, batch.stretch, outputs, direct, force, step, substeps, trace
+        batch.laws,
+        batch.poles,
+        batch.inputs,
+        batch.stretch,
+        batch.outputs,
+        direct,
+        force,
+        step,
+        substeps,
+        trace,
     )
 
 
 def _moved(
-    batch: Batch, force: NDArray[np.float64], step: float, substeps: int, trace: bool = False
+    batch: _Batch, force: NDArray[np.float64], step: float, substeps: int, trace: bool = False
 ) -> Marched:
-    """`marched` at all outputs; EmaError where the motion of an assembly has no solution."""
-    found = marched(batch, batch.outputs, force, step, substeps, trace)
+    """The same; EmaError where the motion of an assembly has no solution."""
+    found = _marched(batch, force, step, substeps, trace)
     if found.failed.any():
         raise EmaError(
             f"no solution with {', '.join(batch.names)}: the motion grows without bound, or the step of {step:.3g} s "
@@ -268,7 +271,7 @@ def _moved(
     return found
 
 
-def one_by_one(assemblies: Sequence[Assembly], blows: Blows, substeps: int) -> NDArray[np.float64]:
+def _one_by_one(assemblies: Sequence[Assembly], blows: Blows, substeps: int) -> NDArray[np.float64]:
     """The same for elements with a memory or a law of their own."""
     order = [ORDERS[q] for q in blows.quantities]
     result = []

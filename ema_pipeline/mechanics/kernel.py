@@ -32,19 +32,12 @@ class Marched(NamedTuple):
     motion : ndarray, (A, n_blows, n_kept, n_outputs)
     forces : ndarray, (A, n_blows, m, n_steps)
         Of the elements; without steps where they were not asked for.
-    last : ndarray, (A, n_blows, 2P)
-        Real and imaginary parts of y = z - Γ₁f at the last step.
-    begun, ended : complex ndarray, (A, n_blows + m, P)
-        Γ₀ + EΓ₁ and Γ₁: what a force at the start of a step and one at its end add to y and to z.
     failed : ndarray of bool, (A,)
         True where no solution was found at some step: what is given of that assembly is nothing then.
     """
 
     motion: NDArray[np.float64]
     forces: NDArray[np.float64]
-    last: NDArray[np.float64]
-    begun: NDArray[np.complex128]
-    ended: NDArray[np.complex128]
     failed: NDArray[np.bool_]
 
 
@@ -106,15 +99,14 @@ def march(
     kept = (steps - 1) // keep_every + 1
     result = np.zeros((len(poles), hits, kept, outputs.shape[1]))
     forces = np.zeros((len(poles), hits, laws.shape[1], steps if trace else 0))
-    last = np.zeros((len(poles), hits, 2 * poles.shape[1]))
     # one memory layout, so that one compiled loop serves all
     numbers = (
         laws, decay, begun, ended, _halves(stretch), _halves(outputs), reach, seen, force,
     )  # fmt: skip
     same = [np.ascontiguousarray(a) for a in numbers]
     failed = np.zeros(len(poles), dtype=np.bool_)
-    _march(*same, step, keep_every, result, forces, last, failed)  # type: ignore[call-arg]
-    return Marched(result, forces, last, begun, ended, failed)
+    _march(*same, step, keep_every, result, forces, failed)  # type: ignore[call-arg]
+    return Marched(result, forces, failed)
 
 
 def _halves(rows: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -160,7 +152,6 @@ def _march(  # type: ignore[no-untyped-def]
     keep_every,
     result,
     forces,
-    last,
     failed,
 ):
     count, size = decay.shape
@@ -258,55 +249,3 @@ def _march(  # type: ignore[no-untyped-def]
                         for p in range(2 * size):
                             s += outputs[a, c, p] * y[p]
                         result[a, h, at, c] = s
-            for p in range(2 * size):  # `last[a, h] = y` takes the compiler seconds more
-                last[a, h, p] = y[p]
-
-
-@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
-def _add_product(re, im, a_re, a_im, b_re, b_im):  # type: ignore[no-untyped-def]
-    """Add the products of two arrays of complex numbers."""
-    for n in range(re.size):
-        re[n] += a_re[n] * b_re[n] - a_im[n] * b_im[n]
-        im[n] += a_re[n] * b_im[n] + a_im[n] * b_re[n]
-
-
-@numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
-def drive(free, transfer, of_blows, of_elements, point, direct, at_once, result):  # type: ignore[no-untyped-def]
-    """Lines at the outputs: what is free, and transfer functions times the lines of the forces.
-
-    Parameters
-    ----------
-    free : complex ndarray, (n_outputs, n_blows, n_lines)
-    transfer : complex ndarray, (n_outputs, n_phases, n_points + m, n_lines)
-        From a force at each phase of a sample, first of the blows' points, then of the elements.
-    of_blows : complex ndarray, (n_phases, n_blows, n_lines)
-    of_elements : complex ndarray, (n_phases, n_blows, m, n_lines)
-    point : ndarray of int, (n_blows,)
-    direct : ndarray, (n_outputs, n_blows)
-    at_once : complex ndarray, (n_blows, n_lines)
-        Lines of the blows, to be multiplied with `direct`.
-    result : complex ndarray, (n_blows, n_outputs, n_lines)
-        Overwritten.
-    """
-    hits, channels, count = result.shape
-    phases, m = of_elements.shape[0], of_elements.shape[2]
-    points = transfer.shape[2] - m
-    re, im = np.empty(count), np.empty(count)
-    # halves of their own are what a processor's vectors take
-    by_re, by_im = transfer.real.copy(), transfer.imag.copy()
-    blow_re, blow_im = of_blows.real.copy(), of_blows.imag.copy()
-    own_re, own_im = of_elements.real.copy(), of_elements.imag.copy()
-    for h in range(hits):
-        for o in range(channels):
-            for n in range(count):
-                re[n] = free[o, h, n].real + direct[o, h] * at_once[h, n].real
-                im[n] = free[o, h, n].imag + direct[o, h] * at_once[h, n].imag
-            for j in range(phases):
-                _add_product(
-                    re, im, by_re[o, j, point[h]], by_im[o, j, point[h]], blow_re[j, h], blow_im[j, h]
-                )
-                for i in range(m):
-                    k = points + i
-                    _add_product(re, im, by_re[o, j, k], by_im[o, j, k], own_re[j, h, i], own_im[j, h, i])
-            for n in range(count):
-                result[h, o, n] = complex(re[n], im[n])
