@@ -78,10 +78,6 @@ class DrivenSystem:
         """The arrays that parameters change."""
         return self.stiffness, self.damping, self.inputs, self.push, self.numbers
 
-    def scaled_inputs(self, factor: NDArray[np.float64]) -> DrivenSystem:
-        """With every force times a factor, (n_inputs,)."""
-        return replace(self, inputs=self.inputs * factor)
-
 
 def driven_system(
     assembly: Assembly, in_rows: NDArray[np.float64], linear: LinearSystem | None = None
