@@ -490,6 +490,7 @@ def test_a_round_judges_the_finalists_best_first(monkeypatch: pytest.MonkeyPatch
     ranked = [SimpleNamespace(gain=g, final=g < 5.0) for g in (1.0, 9.0, 4.0, 2.0)]
     told = {NOTHING: 0.1}
     monkeypatch.setattr(rounds, "_with_relief", lambda o, ranking, settings: ranking)
+    monkeypatch.setattr(rounds, "_at_usual_scatters", lambda o, ranking, settings: ranking)
     monkeypatch.setattr(
         rounds,
         "probabilities",
@@ -569,6 +570,7 @@ def judged_round(
     asked: list[Any] = [SimpleNamespace(label=n, generic=False) for n, _, _ in found]
     told = [Ranked(h, fit, gain, True) for h, (_, gain, _) in zip(asked, found, strict=True)]
     monkeypatch.setattr(rounds, "_with_relief", lambda o, ranking, settings: ranking)
+    monkeypatch.setattr(rounds, "_at_usual_scatters", lambda o, ranking, settings: ranking)
     monkeypatch.setattr(probability, "named", lambda hypothesis, fit: names[hypothesis.label])
     monkeypatch.setattr(
         rounds,
