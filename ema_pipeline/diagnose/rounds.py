@@ -109,10 +109,9 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
     that stands out changes is helped to the difference, if it explains the data with none that does; and so is every
     other one that explains them so and gains no less.
     """
-    p = ranking.base.posterior
-    bounded = within_scatter(observations, ranking.base).posterior
-    relief = p.evidence_at_scatters - bounded.evidence_at_scatters
-    if bounded is p or not (bounded.fails(settings.error_limit) or relief > MOST_GAINED):
+    p, bounded = ranking.base.posterior, within_scatter(observations, ranking.base)
+    relief = _lost(ranking.base, bounded)
+    if bounded is ranking.base or not (bounded.posterior.fails(settings.error_limit) or relief > MOST_GAINED):
         return ranking
     parts = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, part_reach(observations, p)))]
 
@@ -142,9 +141,11 @@ def _at_usual_scatters(observations: Observations, ranking: Ranking, settings: D
     lost_by_base = _lost(ranking.base, with_usual_scatters(observations, ranking.base))
 
     def relieved(one: Ranked) -> Ranked:
-        held = with_usual_scatters(observations, one.fit) if one.final else one.fit
+        if not one.final:
+            return one
+        held = with_usual_scatters(observations, one.fit)
         fails = within_scatter(observations, held).posterior.fails(settings.error_limit)
-        if not one.final or fails or outlying_damping(observations, held) is not None:
+        if fails or outlying_damping(observations, held) is not None:
             return one
         return replace(one, gain=one.gain + max(lost_by_base - _lost(one.fit, held), 0.0))
 

@@ -10,11 +10,10 @@ from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import UNKNOWN, Diagnosis, Rung
 from ema_pipeline.number_text import plain
 from ema_pipeline.report import diagnosis
-from ema_pipeline.report.cautions import suspicions
-from ema_pipeline.report.commands import command
 from ema_pipeline.report.effect_places import EffectPlaces, effect_places
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.shapes import drawing_for
+from ema_pipeline.report.summary import commands_left
 
 _WORTH_A_WORD = 0.01
 """Probability of an effect that is not in the library from which it is told."""
@@ -67,7 +66,9 @@ def page_top(results: RunResults) -> PageTop:
     found = results.diagnosis
     if found is None:
         return PageTop(_heading_without_diagnosis(results), "", _tiles(results))
-    known = PageTop("", "", _tiles(results), commands=_commands(results, found), drawing=_drawing(results))
+    known = PageTop(
+        "", "", _tiles(results), commands=commands_left(results, results.folder), drawing=_drawing(results)
+    )
     if results.diagnosis_is_old:
         told = "The diagnosis below is older than this change; repeat it to see what is still missing."
         return replace(known, heading=_changed(results), summary=told)
@@ -79,17 +80,6 @@ def page_top(results: RunResults) -> PageTop:
         against=_against(found),
         next=found.next_measurement,
     )
-
-
-def _commands(results: RunResults, found: Diagnosis) -> tuple[str, ...]:
-    """What to type next: what the diagnosis proposes, or after a change the diagnosis again, or the change back."""
-    if suspicions(results):
-        return ()  # the test first
-    folder, files = results.folder, results.effect_files
-    if not results.diagnosis_is_old:
-        return diagnosis.next_commands(found, folder, results.added, files)
-    back = [command("remove", folder, results.added[-1], effect_files=files)] if results.added else []
-    return (command("diagnose", folder, effect_files=files), *back)
 
 
 def _changed(results: RunResults) -> str:

@@ -20,11 +20,11 @@ from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.number_text import below, format_percent, format_value, plain, signed
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import Weight, cautions, left_out, suspicions
-from ema_pipeline.report.commands import command, naming, typed
+from ema_pipeline.report.commands import naming, typed
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.simulation import error_lines
-from ema_pipeline.report.summary import changed_words
+from ema_pipeline.report.summary import changed_words, commands_left
 from ema_pipeline.report.tables import Row, Table
 from ema_pipeline.report.terminal import Clean, build_table, console_text
 from ema_pipeline.report.thresholds import LOW_MAC
@@ -225,13 +225,7 @@ def next_lines(results: RunResults, out: str, program: str) -> tuple[str, ...]:
         named = shlex.join(["--out", out, *naming(results.effect_files)])
         again = f"run {shlex.quote(raw)}{model} {named}"
         return (f"correct test.toml, then {shlex.quote(program)} {again}",)
-    if results.diagnosis is None:
-        return ()
-    files = results.effect_files
-    commands = diagnosis.next_commands(results.diagnosis, out, results.added, files)
-    if results.diagnosis_is_old:
-        commands = (command("diagnose", out, effect_files=files),)
-    return tuple(typed(c, program) for c in commands[:1])
+    return tuple(typed(c, program) for c in commands_left(results, out)[:1])
 
 
 def modes_table(results: RunResults) -> Table:

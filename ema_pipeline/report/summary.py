@@ -10,6 +10,7 @@ from ema_pipeline.inference import ERROR_LIMIT
 from ema_pipeline.number_text import format_value, plain
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import cautions, fails, identified_words, suspicions
+from ema_pipeline.report.commands import command
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.name_text import words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
@@ -84,6 +85,20 @@ def changed_words(results: RunResults) -> str:
     before = " and ".join(diagnosis.label_words(x) for x in results.diagnosed_on)
     of = f"the model with {before}" if before else "the base model"
     return f"{now}; the diagnosis is of {of}: 'ema diagnose' repeats it."
+
+
+def commands_left(results: RunResults, out: str) -> tuple[str, ...]:
+    """What to type next: what the diagnosis proposes, or after a change the diagnosis again, or the change back.
+
+    None without a diagnosis, and where a sensor is suspected: the test comes first.
+    """
+    if results.diagnosis is None or suspicions(results):
+        return ()
+    files = results.effect_files
+    if not results.diagnosis_is_old:
+        return diagnosis.next_commands(results.diagnosis, out, results.added, files)
+    back = [command("remove", out, results.added[-1], effect_files=files)] if results.added else []
+    return (command("diagnose", out, effect_files=files), *back)
 
 
 def _other_error(results: RunResults, fit: FitResult) -> list[str]:

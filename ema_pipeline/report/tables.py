@@ -202,13 +202,12 @@ def alone_table(compared: Comparison) -> Table:
     """Measured modes that the fitted model does not have, with the model's mode of the same shape."""
     rows = []
     for m in compared.alone:
-        known = math.isfinite(m.model_frequency_hz)
         cells = (
             m.configuration,
             str(m.measured + 1),
             plain(m.measured_frequency_hz, 5),
             plain(m.model_frequency_hz, 5),
-            signed(percent_off(m.measured_frequency_hz, m.model_frequency_hz) if known else math.nan, 1),
+            signed(percent_off(m.measured_frequency_hz, m.model_frequency_hz)),
             f"{m.mac:.2f}" if math.isfinite(m.mac) else "–",
         )
         rows.append(Row(cells, True))

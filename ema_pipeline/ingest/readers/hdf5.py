@@ -63,11 +63,12 @@ def read(path: Path, limits: ReadLimits) -> RawRecord:
                 if found is not None:
                     arrays.append(found)
     holders = {a.path[:depth] for a in arrays for depth in range(1, len(a.path)) if np.size(a.values) > 1}
-    for at in [
-        at for at in groups if at not in holders
-    ]:  # what stands apart from the samples may speak of the whole file
-        attributes = {**groups[at], **attributes}
-    stated = {f"group '{'/'.join(at)}'": groups[at] for at in groups if at in holders}
+    stated: dict[str, Mapping[str, Any]] = {}
+    for at, own in groups.items():
+        if at in holders:
+            stated[f"group '{'/'.join(at)}'"] = own
+        else:  # what stands apart from the samples may speak of the whole file
+            attributes = {**own, **attributes}
     return assemble(arrays, {"file attributes": attributes, **stated}, limits)
 
 
