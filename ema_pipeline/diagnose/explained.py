@@ -149,8 +149,8 @@ def with_usual_scatters(observations: Observations, fit: Fit) -> Fit:
     return at_usual_scatters(observations, fit, (*_OF_TESTS, DAMPING_SCATTER))
 
 
-def explains_by_scatter(observations: Observations, fit: Fit, settings: DiagnoseSettings) -> bool:
-    """True where frequencies, shapes or damping ratios scatter more than usual, and the data are not explained else."""
+def fails_at_usual_scatters(observations: Observations, fit: Fit, settings: DiagnoseSettings) -> bool:
+    """True where frequencies, shapes or damping ratios scatter more than usual, and the fit fails if they must not."""
     usual = at_usual_scatters(observations, fit)
     fails = usual is not fit and within_scatter(observations, usual).posterior.fails(settings.error_limit)
     return fails or outlying_damping(observations, fit) is not None

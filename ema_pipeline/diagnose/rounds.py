@@ -18,7 +18,7 @@ from ema_pipeline.diagnose.claims import (
 )
 from ema_pipeline.diagnose.explained import (
     MOST_GAINED,
-    explains_by_scatter,
+    fails_at_usual_scatters,
     outlying_damping,
     with_usual_scatters,
 )
@@ -130,13 +130,13 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
 
 
 def _at_usual_scatters(observations: Observations, ranking: Ranking, settings: DiagnoseSettings) -> Ranking:
-    """The ranking at usual scatters of frequencies, shapes and damping ratios where larger ones alone let the base
-    model explain the data.
+    """The ranking at usual scatters of frequencies, shapes and damping ratios where those of the base model are larger,
+    and it fails with the usual ones.
 
     Left alone, they grow until they hold what is missing about as well as it can be held. What explains the data with
     the usual ones is helped to the difference.
     """
-    if not explains_by_scatter(observations, ranking.base, settings):
+    if not fails_at_usual_scatters(observations, ranking.base, settings):
         return ranking
     lost_by_base = _lost(ranking.base, with_usual_scatters(observations, ranking.base))
 

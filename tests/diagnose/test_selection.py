@@ -420,7 +420,7 @@ def test_a_base_model_that_fails_once_no_part_stands_out_counts_with_that_fit(
     assert found.base is base
 
 
-def test_where_larger_scatters_alone_explain_the_data_effects_are_compared_at_the_usual_ones(
+def test_where_the_base_model_fails_at_usual_scatters_effects_are_compared_at_these(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Those that need no more than these are helped to what the base model loses there, less what they lose."""
@@ -436,7 +436,9 @@ def test_where_larger_scatters_alone_explain_the_data_effects_are_compared_at_th
         return Ranked(SimpleNamespace(label=label), of, gain, final)  # type: ignore[arg-type]
 
     base, needs_more = fit(60.0, 54.0), True
-    monkeypatch.setattr(rounds, "explains_by_scatter", lambda o, one, settings: needs_more and one is base)
+    monkeypatch.setattr(
+        rounds, "fails_at_usual_scatters", lambda o, one, settings: needs_more and one is base
+    )
     monkeypatch.setattr(rounds, "with_usual_scatters", lambda o, one: one.usual)
     monkeypatch.setattr(rounds, "outlying_damping", lambda o, one: one if one.damped else None)
     monkeypatch.setattr(rounds, "within_scatter", lambda o, one: one)
