@@ -41,8 +41,6 @@ _BETTER = 0.05
 """Log evidence by which a start must lead a fit to be followed."""
 _ALIKE = 0.05
 """Difference of the logarithms of two learned scatters that says nothing."""
-
-
 _WORTH = 2
 """Fits with scatters to be learned, which take longest, from which processes are worth it."""
 

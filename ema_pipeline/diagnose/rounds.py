@@ -97,7 +97,19 @@ def round_of(
     judged: list[Judged] = []
     for one in sorted((r for r in ranking.ranked if r.final), key=lambda r: -r.gain):
         judged.append(judge(observations, ranking, one, settings, nothing, judged))
-    return weighed(ranking, sorted(judged, key=lambda j: -j.gain), hypotheses, settings, found)
+    judged.sort(key=lambda j: -j.gain)
+    best = next((j for j in judged if j.claimed), None)
+    if best is not None:
+        judged = [replace(j, gain=best.gain) if _as_good(j, best) else j for j in judged]
+    return weighed(ranking, judged, hypotheses, settings, found)
+
+
+def _as_good(one: Judged, best: Judged) -> bool:
+    """True where one predicts held-out data better than the best, whose lead in evidence may be no more than what
+    equivalent linearisation leaves out of both.
+    """
+    near = one.claimed and best.gain - one.gain < min(one.linearisation, best.linearisation)
+    return near and one.held_after.log_density > best.held_after.log_density
 
 
 def _with_relief(observations: Observations, ranking: Ranking, settings: DiagnoseSettings) -> Ranking:

@@ -462,6 +462,40 @@ def test_where_the_base_model_fails_at_usual_scatters_effects_are_compared_at_th
     assert rounds._at_usual_scatters(data, given, SETTINGS) is given
 
 
+@pytest.mark.parametrize(
+    ("linearisation", "behind", "predicts", "level"),
+    [
+        (17.0, 12.0, -9.0, True),
+        (17.0, 12.0, -11.0, False),
+        (17.0, 18.0, -9.0, False),
+        (0.0, 1.0, -9.0, False),
+    ],
+)
+def test_a_rival_that_predicts_better_is_level_where_linearisation_may_account_for_the_lead(
+    monkeypatch: pytest.MonkeyPatch, linearisation: float, behind: float, predicts: float, level: bool
+) -> None:
+    """Teeth that part at the ring were 11.7 behind those at the sun, which held-out hits spoke against by 14."""
+
+    def rival(label: str, gain: float, density: float) -> Any:
+        one = judged(label, gain, linear=False)
+        one.held_after, one.linearisation = SimpleNamespace(log_density=density), linearisation
+        return one
+
+    sun, ring = rival("backlash@sun", 150.0, -10.0), rival("backlash@ring", 150.0 - behind, predicts)
+    known = {"sun": sun, "ring": ring}
+    ranked = tuple(SimpleNamespace(final=True, gain=j.gain, name=name) for name, j in known.items())
+    given: Any = SimpleNamespace(ranked=ranked)
+    for name in ("_with_relief", "_at_usual_scatters"):
+        monkeypatch.setattr(rounds, name, lambda o, ranking, settings: ranking)
+    monkeypatch.setattr(rounds, "probabilities", lambda *asked: {NOTHING: 0.0})
+    monkeypatch.setattr(rounds, "judge", lambda o, ranking, one, *rest: known[one.name])
+    monkeypatch.setattr(rounds, "replace", replaced)
+    monkeypatch.setattr(rounds, "weighed", lambda ranking, found, *rest: found)
+    data: Any = None
+    told: Any = rounds.round_of(data, given, [], SETTINGS, 0)
+    assert [j.gain for j in told] == [150.0, 150.0 if level else 150.0 - behind]
+
+
 def replaced(one: Any, **changes: Any) -> Any:
     """`replace` for what stands for a dataclass, too."""
     if isinstance(one, SimpleNamespace):
