@@ -21,7 +21,13 @@ def _flat(row: Any) -> Any:
         return row
     flat: dict[str, Any] = {}
     for key, value in row.items():
-        inner = {f"{key}.{k}": v for k, v in value.items()} if isinstance(value, dict) else {key: value}
+        # An empty table stays what it is, so that it is refused as a coefficient and not left out.
+        inner = (
+            {f"{key}.{k}": v for k, v in value.items()} if value and isinstance(value, dict) else {key: value}
+        )
+        for dof in inner:
+            if dof in flat:
+                raise ValueError(f"'{dof}' has two coefficients; give it one")
         flat |= inner
     return flat
 

@@ -190,6 +190,10 @@ def _check_element(
         raise Mistake(
             (*location, "value"), f"value = {value:g} N: friction cannot be negative; give 0 or more"
         )
+    if isinstance(entry, NonlinearEntry) and entry.law == "relaxation" and value < 0:
+        # Its damper, stiffness times time, would be negative and feed energy in.
+        said = f"value = {value:g} N/m: a relaxation cannot be negative; give 0 or more"
+        raise Mistake((*location, "value"), said)
     if (loss := values.get("loss_factor", 0.0)) < 0:
         said = f"loss_factor = {loss:g}: a loss factor cannot be negative; give 0 or more"
         raise Mistake((*location, "loss_factor"), said)
