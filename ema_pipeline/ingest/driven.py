@@ -43,6 +43,10 @@ that was computed may reach its amplitude exactly many times, and nearly so a hu
 CLIPPED_SHARE = 0.85
 """Share of samples near the top that lie at the very top: 0.5 for smooth peaks, 1 for clipped ones."""
 
+SPIKE = 10.0
+"""Size of one sample over the largest other one from which it is no motion: a filtered signal does not rise and fall so
+far within two samples, and what moves steadily does not do so once."""
+
 
 @dataclass(frozen=True)
 class ForceChannel:
@@ -255,6 +259,20 @@ def _check_channel(
         raise EmaError(
             f"{where}: is clipped at {top:.4g}: its tops are flat; record again with a larger range"
         )
+    at, times = _largest_sample(samples)
+    if times >= SPIKE and channel.quantity != "force":
+        raise EmaError(
+            f"{where}: sample {at} is {samples[at]:.4g}, {times:.3g} times the largest other one: a spike, no motion; "
+            "record again, or cut it off with first_sample and last_sample"
+        )
+
+
+def _largest_sample(samples: NDArray[np.float64]) -> tuple[int, float]:
+    """Where a record is furthest from its median, and how many times as far as everywhere else."""
+    size = np.abs(samples - np.median(samples))
+    at = int(np.argmax(size))
+    others = float(np.max(np.delete(size, at)))
+    return at, float(size[at]) / others if others > 0 else float("inf")
 
 
 def _at_limits(samples: NDArray[np.float64]) -> int:

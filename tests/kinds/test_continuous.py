@@ -171,6 +171,15 @@ def test_noise_that_piles_up_at_a_limit_is_clipped(
     _one_line(capsys, folder, "channel 'f': is clipped at 2.5", "with a larger range")
 
 
+def test_a_spike_in_a_response_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One lone sample would raise the whole spectrum."""
+    folder = _folder(tmp_path, DESCRIPTION, samples=8192)
+    with h5py.File(tmp_path / "r.h5", "r+") as file:
+        largest = np.max(np.abs(file["x"][:]))
+        file["x"][900] = 20 * largest
+    _one_line(capsys, folder, "channel 'x': sample 900 is", "a spike, no motion; record again")
+
+
 @pytest.mark.parametrize("steps", [12, 200])
 def test_signals_in_steps_of_a_converter_are_not_clipped(steps: int) -> None:
     sine = np.round(steps * np.sin(2 * np.pi * 0.4123 * np.arange(20_000)))
