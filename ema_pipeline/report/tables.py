@@ -10,7 +10,7 @@ from ema_pipeline.check_result import CheckResult
 from ema_pipeline.correlate.types import Comparison, Pairing, percent_off
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
-from ema_pipeline.modal.circle.compare import average
+from ema_pipeline.modal.circle.compare import average, telling
 from ema_pipeline.modal.types import ModalModel, Mode
 from ema_pipeline.number_text import below, format_percent, format_value, plain, prefixed, signed
 from ema_pipeline.report.cautions import fails
@@ -392,7 +392,8 @@ def _verdict_cell(verdicts: Sequence[CheckResult]) -> str:
 
 
 def _mode_row(index: int, mode: Mode) -> Row:
-    circle = average(mode.circles) if mode.circles else None  # what the remark about circles compares with
+    circles = telling(mode.circles)
+    circle = average(circles) if circles else None  # what the remark about circles compares with
     cells = (
         str(index + 1),
         _bare(mode.frequency_hz, mode.frequency_std_hz),

@@ -22,6 +22,7 @@ from ema_pipeline.modal.circle import (
     identify_by_circle,
     on_circle,
 )
+from ema_pipeline.modal.circle.compare import disagreement, telling
 from ema_pipeline.modal.circle.geometry import algebraic_circle, geometric_circle
 from ema_pipeline.modal.circle.identify import rank_one
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
@@ -247,6 +248,18 @@ def test_a_frequency_lies_where_the_frf_has_it_however_coarse_the_lines(
     for at in 40.0 * (1 + 0.01 * np.array([-1.0, 0.0, 1.0])):
         expected = accelerance(np.array([at]), seen, np.ones((1, 1)), 1)[0, 0, 0] / (2j * np.pi * at)
         assert abs(on_circle(circles[0], at) - expected) < 0.02 * circles[0].radius
+
+
+def test_a_circle_without_width_does_not_widen_the_interval_of_its_mode() -> None:
+    """Such a fit ends at a damping ratio of zero, beside the frequency, and its own σ is many times as large."""
+    frfs = three_mode_frfs(0.01)
+    model = modal_model(frfs, THREE_POLES, THREE_SHAPES)
+    (good, *_), *_ = circle_fits(frfs, model)
+    lost = replace(good, damping_ratio=1e-6, damping_std=2e-4, natural_frequency_hz=48.0)
+    assert telling([lost, good]) == [good]
+    mode = replace(model.modes[0], circles=(lost, lost, good))
+    assert disagreement(mode, CircleSettings()) == ""
+    assert disagreement(replace(mode, circles=(lost, lost)), CircleSettings()) == ""
 
 
 def test_taking_neighbours_off_is_more_truthful() -> None:

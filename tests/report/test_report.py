@@ -9,6 +9,8 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.number_text import format_percent, format_value, signed
 from ema_pipeline.report import plots as report_plots
 from ema_pipeline.report import style, summary, summary_files, tables, terminal
+from ema_pipeline.report.cautions import _of_fit
 from ema_pipeline.report.html import bokeh_script, report_html, write_report
 from ema_pipeline.report.name_text import words
 from ema_pipeline.report.plots import figure_specs, write_plots
@@ -425,6 +428,34 @@ def test_misfit_is_the_first_caution_even_where_values_are_identified(run: RunRe
     assert "does not explain" not in " ".join(summary.cautions(run))
     poor = replace(run, fit=replace(run.fit, error=55.6))
     assert summary.cautions(poor)[0].startswith("The model does not explain the data (error 55.6)")
+
+
+def test_a_model_that_the_diagnosis_finds_adequate_is_not_said_to_fail(run: RunResults) -> None:
+    """Beside hundreds of data of single hits the modes alone may lie further off."""
+    assert run.fit is not None
+    poor = replace(run.fit, error=55.6)
+
+    def told(verdict: str) -> str:
+        found: Any = SimpleNamespace(verdict=verdict, error=1.71)
+        return " ".join(text for _, text in _of_fit(poor, found))
+
+    assert "does not explain" not in told("adequate")
+    assert "does not explain the data (error 1.71)" in told("unknown_effect")
+
+
+@pytest.mark.parametrize(("left", "ringing", "told"), [(0.07, 3, True), (0.07, 2, False), (0.02, 4, False)])
+def test_hits_that_still_ring_at_the_end_of_their_records_are_told(
+    run: RunResults, left: float, ringing: int, told: bool
+) -> None:
+    """What is cut off biases modes by more than their uncertainty."""
+    c = run.configurations[0]
+    verdicts = [
+        judged("response decay", left if k < ringing else 0.0, 0.01, False, "", "warn", "ch4 still at 7 %")
+        for k in range(4)
+    ]
+    hits = tuple(replace(c.hits[0], verdicts=(v,)) for v in verdicts)
+    cautions = summary.cautions(replace(run, configurations=(replace(c, hits=hits),)))
+    assert any(f"{ringing} of 4 hits still ring" in text for text in cautions) is told
 
 
 def test_hits_of_opposite_sign_which_make_modes_vanish_are_the_first_caution(run: RunResults) -> None:

@@ -19,6 +19,9 @@ FEW_LINES = 2.0
 """Half-power bandwidth times record length. The response left at the end of a record is exp(-π) = 4 % of its
 start for one line in the half-power band, 0.2 % for two."""
 
+_VAGUE = 1.0
+"""1 σ of a circle's damping ratio, over that, from which it says nothing: the fit has ended at a width of zero."""
+
 _DISTORTED = 0.015  # systematic misfit over the radius
 _SYSTEMATIC = 0.3  # correlation of the misfit from line to line; white noise gives slightly less than 0
 _STRONGLY_DISTORTED = 0.05  # flagged even where frequency and damping agree
@@ -49,6 +52,11 @@ def average(circles: Sequence[CircleFit]) -> CircleAverage:
     )
     damping, damping_std = _median([c.damping_ratio for c in circles], [c.damping_std for c in circles])
     return CircleAverage(frequency, frequency_std, damping, damping_std)
+
+
+def telling(circles: Sequence[CircleFit]) -> list[CircleFit]:
+    """Circles whose damping ratio is not as well zero."""
+    return [c for c in circles if c.damping_std < _VAGUE * c.damping_ratio]
 
 
 def attach_circles(frfs: FrfSet, modal: ModalModel, settings: CircleSettings | None = None) -> ModalModel:
@@ -82,9 +90,10 @@ def attach_circles(frfs: FrfSet, modal: ModalModel, settings: CircleSettings | N
 
 def disagreement(mode: Mode, settings: CircleSettings) -> str:
     """How a mode differs from its own circles, e.g. ``"damping 1.2 % against 1 %"``; empty if it does not."""
-    if not mode.circles:
+    circles = telling(mode.circles)
+    if not circles:
         return ""
-    circle = average(mode.circles)
+    circle = average(circles)
     half_width = abs(mode.damping_ratio) * mode.frequency_hz
     words = []
     allowed = settings.flag_sigma * _combined(circle.frequency_std_hz, mode.frequency_std_hz)
