@@ -1,7 +1,7 @@
 """Modes of the model that coincide with a paired one and have no measured partner: the measured shape holds of both.
 
-Of two modes within the half-power bandwidth a test with one reference often shows one, whose shape is any mix of the
-two. So is the shape of a repeated mode. What the second one can explain is projected out of the differences.
+Of two modes closer than a half-width a test with one reference shows one, whose shape is any mix of the two. So is the
+shape of a repeated mode. What the second one can explain is projected out of the differences.
 
 References
 ----------
@@ -23,8 +23,6 @@ Real = NDArray[np.float64]
 
 _FEWEST_SENSORS = 4
 """Sensors without which two shapes explain nearly any third one."""
-_REACH = 2.0
-"""Half-widths: two modes 1.5 apart were found as one, whose shape bent the parts of the model."""
 _SEEN = 0.1
 """Share of the paired mode's squares from which the sensors see another one: in what was measured as one mode the two
 have shares as their residues, and one that hardly moves a sensor explains no wrong shape."""
@@ -35,7 +33,7 @@ _ALONG = 1e-6
 def hidden_partners(
     solution: EigenSolution, to: NDArray[np.int64], sensors: NDArray[np.int64], read: Real
 ) -> NDArray[np.int64]:
-    """Nearest mode without a partner that sensors see within the bandwidth of each paired one, -1 for none, (k,).
+    """Nearest mode without a partner that sensors see within a half-width of each paired one, -1 for none, (k,).
 
     Parameters
     ----------
@@ -47,10 +45,10 @@ def hidden_partners(
     read : ndarray, (s, n)
         What the sensors read of all modes, in their modal scale.
     """
-    reach = _REACH * np.nan_to_num(solution.damping_ratio * solution.frequency_hz)
+    width = np.nan_to_num(solution.damping_ratio * solution.frequency_hz)
     strength = np.sum(np.abs(read) ** 2, axis=0)
     return np.asarray(
-        nearest_seen(solution.frequency_hz, reach, to, sensors >= _FEWEST_SENSORS, strength, _SEEN), np.int64
+        nearest_seen(solution.frequency_hz, width, to, sensors >= _FEWEST_SENSORS, strength, _SEEN), np.int64
     )
 
 

@@ -192,13 +192,13 @@ def turn_slopes(read, slopes, result):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def nearest_seen(frequency_hz, reach, to, asked, strength, least):  # type: ignore[no-untyped-def]
-    """Nearest mode within reach of each of some that is none of them, and that is seen at all; -1 for none.
+def nearest_seen(frequency_hz, width, to, asked, strength, least):  # type: ignore[no-untyped-def]
+    """Nearest mode within a half-width of each of some that is none of them, and that is seen at all; -1 for none.
 
     Parameters
     ----------
-    frequency_hz, reach, strength : ndarray, (n,)
-        Of all modes; reach in Hz, and sums of squares of what sensors read.
+    frequency_hz, width, strength : ndarray, (n,)
+        Of all modes; half-widths in Hz, and sums of squares of what sensors read.
     to : ndarray of int, (k,)
     asked : ndarray of bool, (k,)
         False where the answer is none.
@@ -211,7 +211,7 @@ def nearest_seen(frequency_hz, reach, to, asked, strength, least):  # type: igno
     for k in range(len(to)):
         if not asked[k]:
             continue
-        own, nearest = to[k], reach[to[k]]
+        own, nearest = to[k], width[to[k]]
         for i in range(len(frequency_hz)):
             distance = abs(frequency_hz[i] - frequency_hz[own])
             if distance < nearest and not paired[i] and strength[i] >= least * strength[own]:

@@ -28,15 +28,15 @@ def solution(hz: list[float], ratio: float = 0.01) -> Any:
 @pytest.mark.parametrize(
     ("hz", "to", "sensors", "found"),
     [
-        ([100.0, 101.9, 150.0], [0, 2], [6, 6], [1, -1]),  # within the bandwidth of 2 Hz
-        ([100.0, 102.1, 150.0], [0, 2], [6, 6], [-1, -1]),
+        ([100.0, 100.9, 150.0], [0, 2], [6, 6], [1, -1]),  # within a half-width of 1 Hz
+        ([100.0, 101.1, 150.0], [0, 2], [6, 6], [-1, -1]),
         ([100.0, 100.9, 150.0], [0, 1, 2], [6, 6, 6], [-1, -1, -1]),  # it has a partner of its own
         ([100.0, 100.9, 99.5], [0], [6], [2]),  # the nearest
         ([100.0, 100.9, 150.0], [0], [3], [-1]),  # two shapes explain any third one at three sensors
         ([100.0], [], [], []),
     ],
 )
-def test_a_hidden_partner_lies_within_the_bandwidth_and_has_no_measured_mode(
+def test_a_hidden_partner_lies_within_a_half_width_and_has_no_measured_mode(
     hz: list[float], to: list[int], sensors: list[int], found: list[int]
 ) -> None:
     got = hidden_partners(solution(hz), np.array(to, int), np.array(sensors, int), np.ones((6, len(hz))))
