@@ -1,4 +1,4 @@
-"""The compiled loop of `mechanics.batch`: modal states through time, nonlinear elements solved at every step."""
+"""The compiled loop of `mechanics.modal_response`: modal states through time, with the nonlinear elements solved."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.mechanics.laws import LAWS
+from ema_pipeline.mechanics.laws import FRICTION, LAWS, POLYNOMIAL
 
 _polynomial, _, _parting = (numba.njit(law, inline="always") for law in LAWS)
 
@@ -29,16 +29,16 @@ class Marched(NamedTuple):
 
     Attributes
     ----------
-    motion : ndarray, (A, n_blows, n_kept, n_outputs)
-    forces : ndarray, (A, n_blows, m, n_steps)
+    motion : ndarray, (n_blows, n_kept, n_outputs)
+    forces : ndarray, (n_blows, m, n_steps)
         Of the elements; without steps where they were not asked for.
-    failed : ndarray of bool, (A,)
-        True where no solution was found at some step: what is given of that assembly is nothing then.
+    failed : bool
+        True where no solution was found at some step: motion and forces say nothing then.
     """
 
     motion: NDArray[np.float64]
     forces: NDArray[np.float64]
-    failed: NDArray[np.bool_]
+    failed: bool
 
 
 def march(
@@ -57,15 +57,15 @@ def march(
 
     Parameters
     ----------
-    laws : ndarray, (A, m, 4)
+    laws : ndarray, (m, 4)
         Law and numbers of each element, see `Nonlinear.law`.
-    poles : complex ndarray, (A, P)
-    inputs : complex ndarray, (A, n_blows + m, P)
+    poles : complex ndarray, (P,)
+    inputs : complex ndarray, (n_blows + m, P)
         What a force adds to the rate of the states: of each blow, of each element.
-    stretch : complex ndarray, (A, 2m, P)
+    stretch : complex ndarray, (2m, P)
         Stretches and rates of the elements are the real parts of `stretch` times the states.
-    outputs : complex ndarray, (A, n_outputs, P)
-    direct : ndarray, (A, n_outputs, m)
+    outputs : complex ndarray, (n_outputs, P)
+    direct : ndarray, (n_outputs, m)
         What the elements' forces add to the outputs at once.
     force : ndarray, (n_blows, n_steps)
         At every step; straight in between.
@@ -90,28 +90,27 @@ def march(
     whole = np.where(small, 1 + x / 2, (decay - 1) / safe) * step
     late = np.where(small, 0.5 + x / 6, (decay - 1 - x) / safe**2) * step
     early = whole - late + decay * late
-    begun, ended = inputs * early[:, None], inputs * late[:, None]
+    begun, ended = inputs * early, inputs * late
     # what a force at the end of a step adds to stretches and outputs
-    reach = np.einsum("asp,acp->asc", stretch, ended).real
-    seen = np.einsum("aop,acp->aoc", outputs, ended).real
-    seen[:, :, hits:] += direct
+    reach = np.einsum("sp,cp->sc", stretch, ended).real
+    seen = np.einsum("op,cp->oc", outputs, ended).real
+    seen[:, hits:] += direct
     steps = force.shape[1]
     kept = (steps - 1) // keep_every + 1
-    result = np.zeros((len(poles), hits, kept, outputs.shape[1]))
-    forces = np.zeros((len(poles), hits, laws.shape[1], steps if trace else 0))
+    result = np.zeros((hits, kept, len(outputs)))
+    forces = np.zeros((hits, len(laws), steps if trace else 0))
     # one memory layout, so that one compiled loop serves all
     numbers = (
         laws, decay, begun, ended, _halves(stretch), _halves(outputs), reach, seen, force,
     )  # fmt: skip
     same = [np.ascontiguousarray(a) for a in numbers]
-    failed = np.zeros(len(poles), dtype=np.bool_)
-    _march(*same, step, keep_every, result, forces, failed)  # type: ignore[call-arg]
-    return Marched(result, forces, failed)
+    solved = _march(*same, step, keep_every, result, forces)  # type: ignore[call-arg]
+    return Marched(result, forces, not solved)
 
 
 def _halves(rows: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """(A, n, 2P): rows that give Re(row·z) from real and imaginary parts of z."""
-    return np.concatenate([rows.real, -rows.imag], axis=2)
+    """(n, 2P): rows that give Re(row·z) from real and imaginary parts of z."""
+    return np.concatenate([rows.real, -rows.imag], axis=1)
 
 
 @numba.njit(inline="always")
@@ -152,100 +151,97 @@ def _march(  # type: ignore[no-untyped-def]
     keep_every,
     result,
     forces,
-    failed,
 ):
-    count, size = decay.shape
+    """Fill in `result` and `forces`; False where there is no solution at some step."""
+    size = len(decay)
     hits, steps = force.shape
-    m = laws.shape[1]
-    channels = outputs.shape[1]
-    trace = forces.shape[3] > 0
+    m = len(laws)
+    channels = len(outputs)
+    trace = forces.shape[2] > 0
     y = np.zeros(2 * size)
     g, d, v, solved = np.zeros(m), np.zeros(m), np.zeros(m), np.zeros(m)
     # of friction: its velocity, and the rate that it takes over that
     resolved, stop = np.ones(m), np.zeros(m)
-    for a in range(count):
-        turn, fade = decay[a].imag.copy(), decay[a].real.copy()
-        push_re, push_im = begun[a, hits:].real.copy(), begun[a, hits:].imag.copy()
-        for j in range(m):
-            if laws[a, j, 0] == 1.0:
-                taken = -reach[a, m + j, hits + j] * laws[a, j, 1]
-                resolved[j] = max(laws[a, j, 2], taken / _RINGING)
-                stop[j] = taken / resolved[j]
-        for h in range(hits):
-            if failed[a]:
-                break
-            g[:] = 0.0
-            for p in range(size):  # z = 0
-                y[p] = -ended[a, h, p].real * force[h, 0]
-                y[size + p] = -ended[a, h, p].imag * force[h, 0]
-            scale = 1e-9
-            b_re, b_im = begun[a, h].real.copy(), begun[a, h].imag.copy()
-            for k in range(1, steps):
-                f = force[h, k - 1]
-                for p in range(size):
-                    re, im = y[p], y[size + p]
-                    y[p] = fade[p] * re - turn[p] * im + b_re[p] * f
-                    y[size + p] = turn[p] * re + fade[p] * im + b_im[p] * f
-                for j in range(m):
-                    if g[j] != 0.0:
-                        for p in range(size):
-                            y[p] += push_re[j, p] * g[j]
-                            y[size + p] += push_im[j, p] * g[j]
-                f = force[h, k]
-                for j in range(m):
-                    dj, vj = reach[a, j, h] * f, reach[a, m + j, h] * f
-                    if laws[a, j, 0] == 1.0:  # the only law that asks for the rate, and not for the stretch
-                        for p in range(2 * size):
-                            vj += stretch[a, m + j, p] * y[p]
-                    else:
-                        for p in range(2 * size):
-                            dj += stretch[a, j, p] * y[p]
-                    d[j], v[j] = dj, vj
+    turn, fade = decay.imag.copy(), decay.real.copy()
+    push_re, push_im = begun[hits:].real.copy(), begun[hits:].imag.copy()
+    for j in range(m):
+        if laws[j, 0] == FRICTION:
+            taken = -reach[m + j, hits + j] * laws[j, 1]
+            resolved[j] = max(laws[j, 2], taken / _RINGING)
+            stop[j] = taken / resolved[j]
+    for h in range(hits):
+        g[:] = 0.0
+        for p in range(size):  # z = 0
+            y[p] = -ended[h, p].real * force[h, 0]
+            y[size + p] = -ended[h, p].imag * force[h, 0]
+        scale = 1e-9
+        b_re, b_im = begun[h].real.copy(), begun[h].imag.copy()
+        for k in range(1, steps):
+            f = force[h, k - 1]
+            for p in range(size):
+                re, im = y[p], y[size + p]
+                y[p] = fade[p] * re - turn[p] * im + b_re[p] * f
+                y[size + p] = turn[p] * re + fade[p] * im + b_im[p] * f
+            for j in range(m):
+                if g[j] != 0.0:
+                    for p in range(size):
+                        y[p] += push_re[j, p] * g[j]
+                        y[size + p] += push_im[j, p] * g[j]
+            f = force[h, k]
+            for j in range(m):
+                dj, vj = reach[j, h] * f, reach[m + j, h] * f
+                if laws[j, 0] == FRICTION:  # the only law that asks for the rate, and not for the stretch
+                    for p in range(2 * size):
+                        vj += stretch[m + j, p] * y[p]
+                else:
+                    for p in range(2 * size):
+                        dj += stretch[j, p] * y[p]
+                d[j], v[j] = dj, vj
+            worst = 0.0
+            solved[:] = np.inf
+            for _ in range(_NEWTON):
                 worst = 0.0
-                solved[:] = np.inf
-                for _ in range(_NEWTON):
-                    worst = 0.0
-                    for j in range(m):
-                        kind = laws[a, j, 0]
-                        n1, n2, n3 = laws[a, j, 1], laws[a, j, 2], laws[a, j, 3]
-                        if kind == 1.0:
-                            free = v[j]
-                            for i in range(m):
-                                if i != j:
-                                    free += reach[a, m + j, hits + i] * g[i]
-                            found, error = g[j], 0.0
-                            if n1 != 0.0 and not abs(free - solved[j]) <= _SAME * abs(free):
-                                found = n1 * _gripped(free / resolved[j], stop[j], g[j] / n1)
-                                error = found - g[j]
-                                solved[j], g[j] = free, found
-                        else:
-                            dj, vj = d[j], v[j]
-                            for i in range(m):
-                                dj += reach[a, j, hits + i] * g[i]
-                                vj += reach[a, m + j, hits + i] * g[i]
-                            if kind == 0.0:
-                                found, by_d, by_v = _polynomial(dj, vj, n1, n2, n3)
-                            else:
-                                found, by_d, by_v = _parting(dj, vj, n1, n2, n3)
+                for j in range(m):
+                    kind = laws[j, 0]
+                    n1, n2, n3 = laws[j, 1], laws[j, 2], laws[j, 3]
+                    if kind == FRICTION:
+                        free = v[j]
+                        for i in range(m):
+                            if i != j:
+                                free += reach[m + j, hits + i] * g[i]
+                        found, error = g[j], 0.0
+                        if n1 != 0.0 and not abs(free - solved[j]) <= _SAME * abs(free):
+                            found = n1 * _gripped(free / resolved[j], stop[j], g[j] / n1)
                             error = found - g[j]
-                            slope = by_d * reach[a, j, hits + j] + by_v * reach[a, m + j, hits + j]
-                            g[j] += error / max(1.0 - slope, 0.1)
-                        scale = max(scale, abs(found))
-                        worst = max(worst, abs(error))
-                    if not worst > _TOLERANCE * scale:
-                        break
-                if not (worst <= 1e-4 * scale and scale < _WILD):
-                    failed[a] = True
+                            solved[j], g[j] = free, found
+                    else:
+                        dj, vj = d[j], v[j]
+                        for i in range(m):
+                            dj += reach[j, hits + i] * g[i]
+                            vj += reach[m + j, hits + i] * g[i]
+                        if kind == POLYNOMIAL:
+                            found, by_d, by_v = _polynomial(dj, vj, n1, n2, n3)
+                        else:
+                            found, by_d, by_v = _parting(dj, vj, n1, n2, n3)
+                        error = found - g[j]
+                        slope = by_d * reach[j, hits + j] + by_v * reach[m + j, hits + j]
+                        g[j] += error / max(1.0 - slope, 0.1)
+                    scale = max(scale, abs(found))
+                    worst = max(worst, abs(error))
+                if not worst > _TOLERANCE * scale:
                     break
-                if trace:
+            if not (worst <= 1e-4 * scale and scale < _WILD):
+                return False
+            if trace:
+                for j in range(m):
+                    forces[h, j, k] = g[j]
+            if channels and k % keep_every == 0:
+                at = k // keep_every
+                for c in range(channels):
+                    s = seen[c, h] * f
                     for j in range(m):
-                        forces[a, h, j, k] = g[j]
-                if channels and k % keep_every == 0:
-                    at = k // keep_every
-                    for c in range(channels):
-                        s = seen[a, c, h] * f
-                        for j in range(m):
-                            s += seen[a, c, hits + j] * g[j]
-                        for p in range(2 * size):
-                            s += outputs[a, c, p] * y[p]
-                        result[a, h, at, c] = s
+                        s += seen[c, hits + j] * g[j]
+                    for p in range(2 * size):
+                        s += outputs[c, p] * y[p]
+                    result[h, at, c] = s
+    return True

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Spring
-from ema_pipeline.mechanics.batch import response_from_rest
 from ema_pipeline.mechanics.laws import Nonlinear
 from ema_pipeline.mechanics.marching import marched_response
+from ema_pipeline.mechanics.modal_response import response_from_rest
 from ema_pipeline.mechanics.time_response import TimeResponse
 
 

@@ -1,13 +1,10 @@
-"""What an analyser's anti-alias filter leaves of a signal."""
+"""The analyser's anti-alias filter, and forces at the steps between samples."""
 
 from __future__ import annotations
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-
-_EDGE = 32
-"""Samples over which a record is mirrored beyond its end, so that the filter meets no step."""
 
 
 def anti_alias(frequency_hz: NDArray[np.float64], sample_rate_hz: float) -> NDArray[np.float64]:
@@ -17,19 +14,25 @@ def anti_alias(frequency_hz: NDArray[np.float64], sample_rate_hz: float) -> NDAr
     return np.asarray(np.cos(0.5 * np.pi * flank) ** 2)
 
 
-def band_limited(fine: NDArray[np.float64], substeps: int) -> NDArray[np.float64]:
-    """Signals (..., n_steps) at `substeps` steps per sample, without what an analyser's filter takes off.
+def straightened(force: NDArray[np.float64], substeps: int) -> NDArray[np.float64]:
+    """Band-limited forces at steps, whose straight connections act on slow motions as the forces do.
 
-    A blow between teeth is shorter than a sample: what is sampled without a filter has the area of the spike wrong,
-    and with it the motion at low frequencies.
+    Parameters
+    ----------
+    force : ndarray, (n_forces, n_samples)
+        N.
+    substeps : int
+        Steps per sample.
+
+    Returns
+    -------
+    ndarray, (n_forces, substeps·(n_samples - 1) + 1)
+        Straight lines between steps weaken what happens at frequency f by sinc²(f·step), which is taken back here.
     """
-    if substeps == 1 or not fine.size:
-        return fine
-    n, edge = fine.shape[-1], min(_EDGE * substeps, fine.shape[-1] - 1)
-    length = scipy.fft.next_fast_len(n + 2 * edge, real=True)
-    longer = np.zeros((*fine.shape[:-1], length))
-    longer[..., :n] = fine
-    taper = np.cos(0.5 * np.pi * np.arange(1, edge + 1) / edge) ** 2
-    longer[..., n : n + edge] = fine[..., -2 : -edge - 2 : -1] * taper
-    gain = anti_alias(scipy.fft.rfftfreq(length, 1 / substeps), 1.0)
-    return np.asarray(scipy.fft.irfft(scipy.fft.rfft(longer) * gain, length)[..., :n])
+    n = force.shape[1]
+    length = scipy.fft.next_fast_len(n + 64, real=True)
+    padded = np.pad(force, ((0, 0), (0, length - n)))
+    spectrum = scipy.fft.rfft(padded, axis=1)
+    ramp = np.sinc(np.arange(spectrum.shape[1]) / (length * substeps)) ** 2
+    fine = scipy.fft.irfft(spectrum / ramp * substeps, length * substeps, axis=1)
+    return np.asarray(fine[:, : (n - 1) * substeps + 1])

@@ -20,7 +20,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.levels.scatter import Scatter
 from ema_pipeline.levels.sizes import means_of_sheets
 from ema_pipeline.levels.types import HitModes, Pulses
-from ema_pipeline.mechanics.batch import fine_force
+from ema_pipeline.mechanics.sampling import straightened
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.observations.mode_data import ModeData, prepare
 from ema_pipeline.observations.ringing import Ringing
@@ -353,7 +353,7 @@ class HitData:
         if substeps not in self._blows:
             assert self.pulses is not None
             after = int(_QUIET_S * self.pulses.sample_rate_hz)
-            self._blows[substeps] = fine_force(np.pad(self.pulses.force_n, ((0, 0), (0, after))), substeps)[1]
+            self._blows[substeps] = straightened(np.pad(self.pulses.force_n, ((0, 0), (0, after))), substeps)
         return self._blows[substeps]
 
     @cached_property

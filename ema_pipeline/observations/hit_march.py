@@ -161,9 +161,9 @@ def _forces(data: HitData, elements: Sequence[Nonlinear], driven: Driven) -> tup
     substeps = max(1, int(np.ceil(driven.omega.max() / rate / _PHASE)))
     poles = np.asarray(1j * driven.omega - driven.decay, np.complex128)
     moved = driven.stretch / (1j * driven.omega)
-    rows = np.concatenate([moved, moved * poles])[None]
-    laws = np.array([[e.law for e in elements]], dtype=float)
-    nothing = np.zeros((1, 0, len(poles)), complex), np.zeros((1, 0, len(elements)))
+    rows = np.concatenate([moved, moved * poles])
+    laws = np.array([e.law for e in elements], dtype=float)
+    nothing = np.zeros((0, len(poles)), complex), np.zeros((0, len(elements)))
     blows, hits, whole = data.blows(substeps), len(pulses.force_n), int(rate / data.line_hz)
     found: Real = np.zeros((hits, len(elements), 0))
     faded = _FADED if any(map(rubs, elements)) else 0.0
@@ -173,10 +173,10 @@ def _forces(data: HitData, elements: Sequence[Nonlinear], driven: Driven) -> tup
         force = np.zeros((len(left), (count - 1) * substeps + 1))
         cut = min(force.shape[1], blows.shape[1])
         force[:, :cut] = driven.scale * blows[left, :cut]
-        inputs = np.concatenate([driven.struck[left], -driven.stretch])[None].astype(complex)
+        inputs = np.concatenate([driven.struck[left], -driven.stretch]).astype(complex)
         marched = march(
             laws,
-            poles[None],
+            poles,
             inputs,
             rows,
             *nothing,
@@ -185,9 +185,9 @@ def _forces(data: HitData, elements: Sequence[Nonlinear], driven: Driven) -> tup
             substeps,
             trace=True,
         )
-        if marched.failed.any():
+        if marched.failed:
             return None, 0.0
-        forces = marched.forces[0]
+        forces = marched.forces
         found = _lengthened(found, forces.shape[2])
         found[left] = forces
         late = _largest(forces[:, :, forces.shape[2] * 2 // 3 :]) > faded * _largest(forces)

@@ -1,16 +1,14 @@
-"""Compiled responses of nonlinear assemblies to hammer blows."""
+"""Compiled responses of nonlinear assemblies to a hammer blow."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.signal import firwin, resample
 
 from ema_pipeline.effects.library import get_effect
 from ema_pipeline.errors import EmaError
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
-from ema_pipeline.mechanics.batch import Blows, batch_response
-from ema_pipeline.mechanics.laws import BoucWen, DryFriction, Nonlinear, PartingSpring, PolynomialSpring
+from ema_pipeline.mechanics.laws import DryFriction, Nonlinear, PartingSpring, PolynomialSpring
 from ema_pipeline.mechanics.nonlinear import nonlinear_response
 from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.types import Parameter
@@ -81,63 +79,10 @@ def test_the_compiled_loop_agrees_with_the_general_integrator(element: Nonlinear
     assert np.std(compiled.acceleration - expected) < 1e-6 * np.std(expected)
 
 
-def test_many_models_and_blows_at_once_are_each_as_alone() -> None:
-    models = [
-        RIG.assembly("test", TRUE).add(PolynomialSpring("cubic", {"hub.x": 1.0}, cubic=k))
-        for k in (-1e9, 2e11, 6e11)
-    ]
-    models.append(RIG.assembly("test", TRUE))
-    force = np.stack([pulse(400, p) for p in (30.0, 200.0)])
-    rows = np.eye(4)
-    blows = Blows(
-        RATE, force, rows[[0, 2]], rows, ("acceleration", "velocity", "displacement", "acceleration")
-    )
-    together = batch_response(models, blows, 3)
-    for i, model in enumerate(models):
-        for j in range(2):
-            one = Blows(RATE, force[j : j + 1], rows[[0, 2]][j : j + 1], rows, blows.quantities)
-            np.testing.assert_allclose(
-                together[i, j], batch_response([model], one, 3)[0, 0], rtol=1e-9, atol=1e-12
-            )
-
-
-def test_strikes_shorter_than_a_sample_are_read_as_an_analyser_reads_them() -> None:
-    """Against the general integrator at 16 times the rate behind another filter, a plain FIR low-pass."""
-    model = RIG.assembly("test", TRUE).add(
-        PartingSpring("contact", {"hub.x": 1.0, "rim.x": -1.0}, 2e7, preload=2e-7, gap=1e-3)
-    )
-    force = pulse(600, 100.0)
-    rows = np.eye(4)[[0, 2]]
-    fine = resample(force, 600 * 16)
-    exact = nonlinear_response(model, 16 * RATE, fine[None], rows, rows[:1]).acceleration
-    taps = firwin(1601, 0.44 * RATE, fs=16 * RATE)
-    read = np.stack([np.convolve(channel, taps, "same") for channel in exact])[:, ::16]
-    blows = Blows(RATE, force[None], rows[:1], rows, ("acceleration", "acceleration"))
-    simulated = batch_response([model], blows, 16)[0, 0]
-    f, fade = np.fft.rfftfreq(600, 1 / RATE), np.exp(-np.arange(600) / 200)
-    inside = (f > 20) & (f < 0.36 * RATE)
-
-    def apart(signals: np.ndarray) -> float:
-        a, b = (np.fft.rfft(x * fade)[:, inside] for x in (signals, read))
-        return float(np.linalg.norm(a - b) / np.linalg.norm(b))
-
-    assert apart(exact[:, ::16]) > 0.3  # the case is one in which it matters
-    assert apart(simulated) < 0.01
-
-
-def test_elements_with_a_memory_go_through_the_general_integrator() -> None:
-    model = RIG.assembly("test", TRUE).add(BoucWen("loop", {"hub.x": 1.0}, 3.0, 5e4, 0.6))
-    force = pulse(300, 60.0)
-    blows = Blows(RATE, force[None], np.eye(4)[:1], np.eye(4), ("acceleration",) * 4)
-    expected = plain(model, force, np.eye(4)[0], np.eye(4), 2)
-    np.testing.assert_allclose(batch_response([model], blows, 2)[0, 0], expected, rtol=1e-8, atol=1e-9)
-
-
 def test_motion_without_bound_is_an_error_of_one_line() -> None:
     model = RIG.assembly("test", TRUE).add(PolynomialSpring("soft", {"hub.x": 1.0}, cubic=-1e16))
-    blows = Blows(RATE, pulse(400, 300.0)[None], np.eye(4)[:1], np.eye(4), ("acceleration",) * 4)
     with pytest.raises(EmaError, match="soft") as raised:
-        batch_response([model], blows, 1)
+        nonlinear_response(model, RATE, pulse(400, 300.0)[None], np.eye(4), np.eye(4)[:1])
     assert "\n" not in str(raised.value)
 
 
