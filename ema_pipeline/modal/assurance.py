@@ -1,4 +1,4 @@
-"""How alike shapes are, and how real: MAC, CoMAC, subspaces, MPC, MPD, optimal phase.
+"""How alike shapes are, and how real: MAC, also with a subspace, MPC, optimal phase.
 
 Shapes are rows. An entry that is NaN was not measured; it is left out of every comparison that it would
 take part in. What is left undefined by that (no common DOF, or a shape that is zero at all of them) is NaN.
@@ -6,13 +6,8 @@ take part in. What is left undefined by that (no common DOF, or a shape that is 
 References
 ----------
 Allemang, R. J. & Brown, D. L., "A correlation coefficient for modal vector analysis", IMAC 1982.
-Lieven, N. A. J. & Ewins, D. J., "Spatial correlation of mode shapes, the coordinate modal assurance
-criterion (COMAC)", IMAC 1988.
 Pappa, R. S., Elliott, K. B. & Schenk, A., "Consistent-mode indicator for the eigensystem realization
 algorithm", J. Guidance, Control, and Dynamics 16(5), 1993.
-Heylen, W., Lammens, S. & Sas, P., "Modal Analysis Theory and Testing", KU Leuven, 1997.
-Björck, Å. & Golub, G. H., "Numerical methods for computing angles between linear subspaces",
-Math. Comp. 27, 1973.
 """
 
 from __future__ import annotations
@@ -49,30 +44,6 @@ def auto_mac(shapes: ArrayLike) -> NDArray[np.float64]:
     return mac(shapes, shapes)
 
 
-def comac(shapes_a: ArrayLike, shapes_b: ArrayLike) -> NDArray[np.float64]:
-    """Coordinate MAC: how well each DOF agrees over a list of paired shapes.
-
-    Parameters
-    ----------
-    shapes_a, shapes_b : array_like, (n_pairs, n_dofs)
-        Row i of one is paired with row i of the other.
-
-    Returns
-    -------
-    ndarray, (n_dofs,)
-        (Σ|a b*|)² / (Σ|a|² Σ|b|²), 0…1. Each pair is first scaled to equal norm over its common DOFs, so
-        that unscaled shapes can be compared with scaled ones.
-    """
-    a, has_a = _rows(shapes_a)
-    b, has_b = _rows(shapes_b)
-    both = has_a * has_b
-    a, b = a * both, b * both
-    a = a * _ratio(1.0, np.sqrt(_power(a).sum(axis=1, keepdims=True)), undefined=0.0)
-    b = b * _ratio(1.0, np.sqrt(_power(b).sum(axis=1, keepdims=True)), undefined=0.0)
-    cross = np.abs(a * b.conj()).sum(axis=0) ** 2
-    return np.minimum(_ratio(cross, _power(a).sum(axis=0) * _power(b).sum(axis=0)), 1.0)
-
-
 def mpc(shape: ArrayLike) -> float:
     """Modal phase collinearity |φᵀφ|² / (φᴴφ)²: 1 for a real shape at any phase, 0 for a travelling wave.
 
@@ -87,25 +58,6 @@ def mpc(shape: ArrayLike) -> float:
     """
     phi = _finite(shape)
     return float(np.minimum(_ratio(np.abs(np.sum(phi * phi)) ** 2, np.sum(_power(phi)) ** 2), 1.0))
-
-
-def mpd(shape: ArrayLike) -> float:
-    """Mean phase deviation, rad: mean angle between the entries and the line closest to them.
-
-    Parameters
-    ----------
-    shape : array_like, (n_dofs,)
-
-    Returns
-    -------
-    float
-        0 for a real shape at any phase, up to π/4; weighted by the entries' moduli.
-    """
-    phi = _finite(shape)
-    turned = phi * np.exp(-1j * _optimal_phase(phi))
-    weight = np.abs(turned)
-    angle = np.arctan2(np.abs(turned.imag), np.abs(turned.real))
-    return float(_ratio(np.sum(weight * angle), np.sum(weight)))
 
 
 def real_shape(shape: ArrayLike) -> tuple[NDArray[np.complex128], float]:
@@ -153,29 +105,6 @@ def subspace_mac(shape: ArrayLike, basis: ArrayLike) -> float:
     return float(np.minimum(_ratio(np.sum(_power(inside)), np.sum(_power(phi[common]))), 1.0))
 
 
-def subspace_similarity(basis_a: ArrayLike, basis_b: ArrayLike) -> NDArray[np.float64]:
-    """Cosines of the principal angles between two spans, largest first.
-
-    Parameters
-    ----------
-    basis_a : array_like, (k_a, n_dofs)
-    basis_b : array_like, (k_b, n_dofs)
-
-    Returns
-    -------
-    ndarray, (min(rank a, rank b),)
-        All 1 where one span contains the other, all 0 where they are orthogonal; the square of the smallest
-        is the MAC of the worst-matching direction. Empty where no DOF is common.
-    """
-    a = np.atleast_2d(np.asarray(basis_a, dtype=np.complex128))
-    b = np.atleast_2d(np.asarray(basis_b, dtype=np.complex128))
-    common = np.all(np.isfinite(a), axis=0) & np.all(np.isfinite(b), axis=0)
-    q_a, q_b = _orthonormal(a[:, common]), _orthonormal(b[:, common])
-    if 0 in q_a.shape or 0 in q_b.shape:
-        return np.empty(0)
-    return np.minimum(np.linalg.svd(q_a.conj().T @ q_b, compute_uv=False), 1.0)
-
-
 def _rows(shapes: ArrayLike) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
     """Shapes scaled to a largest entry of 1 (against under- and overflow) with zeros for NaN; the mask."""
     rows = np.atleast_2d(np.asarray(shapes, dtype=np.complex128))
@@ -211,6 +140,6 @@ def _power(x: NDArray[np.complex128]) -> NDArray[np.float64]:
     return np.asarray(x.real**2 + x.imag**2)
 
 
-def _ratio(top: ArrayLike, bottom: ArrayLike, undefined: float = np.nan) -> NDArray[np.float64]:
+def _ratio(top: ArrayLike, bottom: ArrayLike) -> NDArray[np.float64]:
     top, bottom = np.broadcast_arrays(np.asarray(top, dtype=float), np.asarray(bottom, dtype=float))
-    return np.divide(top, bottom, out=np.full(top.shape, undefined), where=bottom > 0)
+    return np.divide(top, bottom, out=np.full(top.shape, np.nan), where=bottom > 0)

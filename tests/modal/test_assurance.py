@@ -7,13 +7,10 @@ import pytest
 
 from ema_pipeline.modal.assurance import (
     auto_mac,
-    comac,
     mac,
     mpc,
-    mpd,
     real_shape,
     subspace_mac,
-    subspace_similarity,
 )
 
 NAN = complex(np.nan, np.nan)
@@ -62,40 +59,21 @@ def test_auto_mac_has_a_unit_diagonal_and_is_symmetric() -> None:
     assert found == pytest.approx(found.T)
 
 
-def test_comac_names_the_dof_that_disagrees() -> None:
-    rng = np.random.default_rng(3)
-    a = rng.standard_normal((5, 20))
-    b = a * rng.uniform(-2, 2, (5, 1))
-    assert comac(a, b) == pytest.approx(1.0)
-    b = b.copy()
-    b[:, 2] = rng.standard_normal(5)
-    assert np.argmin(comac(a, b)) == 2
-
-
-def test_comac_of_one_pair_is_one_and_unmeasured_dofs_are_nan() -> None:
-    found = comac([[1.0, 2.0, NAN]], [[3.0, 1.0, 1.0]])
-    assert found[:2] == pytest.approx(1.0)
-    assert np.isnan(found[2])
-
-
 @pytest.mark.parametrize("phase", [0.0, 0.3, 1.2, -2.5])
-def test_mpc_is_one_and_mpd_zero_for_a_real_shape_at_any_phase(phase: float) -> None:
+def test_mpc_is_one_for_a_real_shape_at_any_phase(phase: float) -> None:
     shape = np.append(np.array([1.0, -2.0, 0.5]) * np.exp(1j * phase), NAN)
     assert mpc(shape) == pytest.approx(1.0, abs=1e-12)
-    assert mpd(shape) == pytest.approx(0.0, abs=1e-7)
 
 
-def test_mpc_is_zero_and_mpd_is_45_degrees_for_a_travelling_wave() -> None:
+def test_mpc_is_zero_for_a_travelling_wave() -> None:
     wave = np.exp(2j * np.pi * np.arange(8) / 8)
     assert mpc(wave) == pytest.approx(0.0, abs=1e-15)
     assert mpc([1, 1j]) == pytest.approx(0.0, abs=1e-15)
-    assert mpd([1, 1j]) == pytest.approx(np.pi / 4)
 
 
 def test_mpc_of_a_hand_computed_shape() -> None:
-    # φ = [1, j/2]: S_xx = 1, S_yy = 1/4, S_xy = 0: (3/4)²/(5/4)² = 9/25; angle 90° with weight 1/2 of 3/2
+    # φ = [1, j/2]: S_xx = 1, S_yy = 1/4, S_xy = 0: (3/4)²/(5/4)² = 9/25
     assert mpc([1, 0.5j]) == pytest.approx(9 / 25)
-    assert mpd([1, 0.5j]) == pytest.approx(np.pi / 6)
 
 
 def test_mpc_agrees_with_the_eigenvalues_of_the_scatter_matrix() -> None:
@@ -144,12 +122,3 @@ def test_subspace_mac_of_a_shape_half_inside() -> None:
     assert subspace_mac([1, 0, 1], [[1, 0, 0], [0, 1, 0]]) == pytest.approx(0.5)
     assert subspace_mac([1, NAN, 1], [[1, 0, 0], [0, 1, 0]]) == pytest.approx(0.5)
     assert subspace_mac([0, 0, 1], [[1, 0, 0], [0, 1, 0]]) == pytest.approx(0.0)
-
-
-def test_subspace_similarity_gives_cosines_of_principal_angles() -> None:
-    angle = 0.4
-    a = [[1, 0, 0], [0, 1, 0]]
-    b = [[1, 0, 0], [0, 5 * np.cos(angle), 5 * np.sin(angle)]]
-    assert subspace_similarity(a, b) == pytest.approx([1.0, np.cos(angle)])
-    assert subspace_similarity(a, [[0, 0, 1]]) == pytest.approx([0.0])
-    assert subspace_similarity([[1, NAN]], [[NAN, 1]]).size == 0
