@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.errors import EmaError
 from ema_pipeline.modal.assurance import mpc
 from ema_pipeline.modal.types import NO_SYNTHESIS, ModalModel, Mode, StabilisationChart
 
@@ -122,30 +120,3 @@ def from_modal_model(model: ModalModel, configuration: str) -> MeasuredModes:
         if n_dofs and all(len(m.shape_own_std) for m in modes)
         else None,
     )
-
-
-def from_frequencies(
-    configuration: str,
-    frequency_hz: Sequence[float] | NDArray[np.float64],
-    frequency_std_hz: Sequence[float] | NDArray[np.float64] | None = None,
-) -> MeasuredModes:
-    """Measured modes from a plain table of frequencies, as a paper prints them.
-
-    Raises
-    ------
-    EmaError
-        If a frequency is not positive, or the two columns differ in length.
-    """
-    frequency = np.asarray(frequency_hz, dtype=float)
-    std = (
-        np.full(frequency.shape, np.nan) if frequency_std_hz is None else np.asarray(frequency_std_hz, float)
-    )
-    if frequency.ndim != 1 or std.shape != frequency.shape:
-        raise EmaError(f"{configuration}: {std.size} standard deviations for {frequency.size} frequencies")
-    if not np.all(np.isfinite(frequency) & (frequency > 0)):
-        raise EmaError(
-            f"{configuration}: measured frequencies must be positive numbers in Hz; got {frequency}"
-        )
-    order = np.argsort(frequency, kind="stable")
-    unknown = np.full(frequency.shape, np.nan)
-    return MeasuredModes(configuration, frequency[order], std[order], unknown, unknown.copy())

@@ -21,17 +21,6 @@ RIGID_HZ = 1e-3
 _FORBIDDEN = 1e6
 
 
-def pair_rig(
-    rig: Rig,
-    configuration: str,
-    values: Mapping[str, float] | None,
-    measured: MeasuredModes,
-    settings: PairingSettings,
-) -> Pairing:
-    """Pair measured modes with the rig's modes at parameter `values`; see `pair`."""
-    return pair_system(rig, rig.system(configuration, values), measured, settings)
-
-
 def pair_system(
     rig: Rig, system: LinearSystem, measured: MeasuredModes, settings: PairingSettings
 ) -> Pairing:

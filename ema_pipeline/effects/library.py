@@ -91,11 +91,6 @@ def effect_library(files: Iterable[str | Path] = (), rig: Rig | None = None) -> 
     return library
 
 
-def effect_ids(library: Library | None = None) -> tuple[str, ...]:
-    """Ids of all effects, sorted."""
-    return tuple(sorted(shipped_effects() if library is None else library))
-
-
 def get_effect(effect_id: str, library: Library | None = None) -> Effect:
     """The effect of that id; EmaError with a hint for unknown ones."""
     known = shipped_effects() if library is None else library

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from frequencies import from_frequencies
 from numpy.typing import NDArray
 
-from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
-from ema_pipeline.correlate.pairing import assign, close_groups, pair, pair_rig, shape_agreement
+from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.correlate.pairing import assign, close_groups, pair, pair_system, shape_agreement
 from ema_pipeline.correlate.settings import CompareSettings, PairingSettings
+from ema_pipeline.correlate.types import Pairing
 from ema_pipeline.dof import Dof
-from ema_pipeline.errors import EmaError
 from ema_pipeline.fit.comparison import band_differences, compare
 from ema_pipeline.fit.parameters import FittedModes
 from ema_pipeline.frf.types import FrfSet
@@ -25,13 +26,24 @@ from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.mode_rows import FREQUENCY_NOISE, SHAPE_NOISE
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.rigs import load_rig
-from ema_pipeline.rigs.types import ModelMode
+from ema_pipeline.rigs.types import ModelMode, Rig
 
 SENSORS = (
     "carrier.x", "carrier.y", "sun.x", "sun.y", "planet1.x", "planet1.y", "planet2.x", "planet2.y",
     "carrier.u", "sun.u", "planet1.u", "planet2.u",
 )  # fmt: skip
 TRUTH = {"sun_planet_mesh_stiffness": 2e7, "sun_bearing_stiffness": 1.1e6, "modal_damping_ratio": 0.012}
+
+
+def pair_with(
+    rig: Rig,
+    configuration: str,
+    values: dict[str, float] | None,
+    measured: MeasuredModes,
+    settings: PairingSettings,
+) -> Pairing:
+    """Measured modes paired with the rig's at parameter values."""
+    return pair_system(rig, rig.system(configuration, values), measured, settings)
 
 
 def simulated(
@@ -62,7 +74,7 @@ def simulated(
 
 def test_every_mode_pairs_with_itself_when_the_model_is_the_truth() -> None:
     measured = simulated()
-    pairing = pair_rig(load_rig("planetary"), "no_ring", TRUTH, measured, PairingSettings())
+    pairing = pair_with(load_rig("planetary"), "no_ring", TRUTH, measured, PairingSettings())
     f, _ = normal_modes(load_rig("planetary").system("no_ring", TRUTH))
     assert len(pairing.pairs) == len(measured)
     for p in pairing.pairs:
@@ -74,7 +86,7 @@ def test_every_mode_pairs_with_itself_when_the_model_is_the_truth() -> None:
 def test_shapes_keep_the_pairs_right_when_the_nominal_model_is_off_by_a_fifth() -> None:
     # nearest frequencies would pair the 106 Hz mode with a neighbour here
     measured = simulated(values={"sun_bearing_stiffness": 0.7e6, "sun_planet_mesh_stiffness": 1e7})
-    pairing = pair_rig(load_rig("planetary"), "no_ring", None, measured, PairingSettings())
+    pairing = pair_with(load_rig("planetary"), "no_ring", None, measured, PairingSettings())
     nominal = load_rig("planetary").system("no_ring")
     _, phi = normal_modes(nominal)
     rows = sensor_rows(nominal, measured.dofs)
@@ -158,7 +170,7 @@ def test_a_shape_unlike_any_is_refused_with_the_best_mac() -> None:
     assert measured.shapes is not None
     shapes = measured.shapes.copy()
     shapes[3] = np.eye(12)[8] - np.eye(12)[2] + 0.5 * np.eye(12)[5]
-    pairing = pair_rig(
+    pairing = pair_with(
         load_rig("planetary"), "no_ring", TRUTH, replace(measured, shapes=shapes), PairingSettings()
     )
     refused = [u for u in pairing.unpaired_measured if u.index == 3]
@@ -170,7 +182,7 @@ def test_a_frequency_far_from_any_is_refused_and_one_above_all_is_beyond_reach()
     measured = from_frequencies("no_ring", [51.0, 480.0, 5000.0])
     reasons = [
         u.reason
-        for u in pair_rig(
+        for u in pair_with(
             load_rig("planetary"), "no_ring", None, measured, PairingSettings()
         ).unpaired_measured
     ]
@@ -192,14 +204,14 @@ def test_a_mode_of_bodies_without_sensors_is_said_to_be_not_measured() -> None:
         shapes=measured.shapes[rotational],  # type: ignore[index]
         shape_std=measured.shape_std[rotational],  # type: ignore[index]
     )
-    pairing = pair_rig(load_rig("planetary"), "no_ring", TRUTH, kept, PairingSettings())
+    pairing = pair_with(load_rig("planetary"), "no_ring", TRUTH, kept, PairingSettings())
     in_band = [u for u in pairing.unpaired_model if 20 < u.frequency_hz < 2500]
     assert in_band
     assert all(u.reason.startswith("not measured: it moves ") for u in in_band)
 
 
 def test_modes_above_the_band_are_said_to_be_above_the_band() -> None:
-    pairing = pair_rig(
+    pairing = pair_with(
         load_rig("planetary"), "no_ring", TRUTH, simulated(band=(20.0, 500.0)), PairingSettings()
     )
     assert [u.reason for u in pairing.unpaired_model if u.frequency_hz > 500] == ["above band", "above band"]
@@ -216,13 +228,6 @@ def test_unless_set_otherwise_modes_within_two_per_cent_form_a_group() -> None:
     for second, alike in ((101.9, True), (102.1, False)):
         groups = close_groups(np.array([100.0, second]), width)
         assert (groups[0] == groups[1]) == alike
-
-
-def test_a_table_of_frequencies_is_sorted_and_none_may_be_zero() -> None:
-    table = from_frequencies("no_ring", [100.0, 50.0])
-    assert table.frequency_hz.tolist() == [50.0, 100.0]
-    with pytest.raises(EmaError, match="must be positive"):
-        from_frequencies("no_ring", [0.0, 10.0])
 
 
 def as_drawn(measured: MeasuredModes, scatter: float) -> FittedModes:
@@ -251,7 +256,7 @@ def test_differences_are_one_when_every_datum_is_off_by_one_standard_deviation()
         shape_std=None,
         dofs=(),
     )
-    pairing = pair_rig(rig, "no_ring", TRUTH, shifted, PairingSettings())
+    pairing = pair_with(rig, "no_ring", TRUTH, shifted, PairingSettings())
     result = compare(as_drawn(shifted, 1e-9), {"no_ring": shifted}, None, {"no_ring": pairing})
     assert [m.frequency_z for m in result.modes] == pytest.approx([1.0] * len(measured), abs=1e-6)
     assert [m.damping_z for m in result.modes] == pytest.approx([-1.0] * len(measured), abs=1e-6)
@@ -260,7 +265,7 @@ def test_differences_are_one_when_every_datum_is_off_by_one_standard_deviation()
 
 def test_the_error_is_that_of_the_fit() -> None:
     measured = simulated()
-    pairing = pair_rig(load_rig("planetary"), "no_ring", TRUTH, measured, PairingSettings())
+    pairing = pair_with(load_rig("planetary"), "no_ring", TRUTH, measured, PairingSettings())
     fitted = as_drawn(measured, 1.0)
     result = compare(fitted, {"no_ring": measured}, None, {"no_ring": pairing})
     assert result.error == fitted.posterior.error
@@ -273,7 +278,7 @@ def test_a_sensor_that_reads_ten_percent_too_much_stands_out_among_the_dofs() ->
     shapes = measured.shapes.copy()
     shapes[:, 3] *= 1.1
     wrong = replace(measured, shapes=shapes)
-    pairing = pair_rig(load_rig("planetary"), "no_ring", TRUTH, wrong, PairingSettings())
+    pairing = pair_with(load_rig("planetary"), "no_ring", TRUTH, wrong, PairingSettings())
     result = compare(as_drawn(wrong, 1.0), {"no_ring": wrong}, None, {"no_ring": pairing})
     assert max(result.dofs, key=lambda d: d.z).dof == "sun.y"
 
@@ -347,11 +352,11 @@ def test_why_a_mode_stays_unpaired_is_said_with_its_numbers() -> None:
     model_hz, _ = normal_modes(rig.system("default"))
     settings = PairingSettings(frequency_tolerance=0.1)
     table = from_frequencies("default", [0.8 * model_hz[0], model_hz[1]])
-    pairing = pair_rig(rig, "default", {}, table, settings)
+    pairing = pair_with(rig, "default", {}, table, settings)
     assert [(p.measured, p.model) for p in pairing.pairs] == [(1, 1)]
     assert [u.reason for u in pairing.unpaired_measured] == ["no model mode within 10 %"]
     # Without a stated band modes are looked for from 0.7 times the lowest to 1.3 times the highest measured one.
     assert [u.reason for u in pairing.unpaired_model] == ["no measured mode within 10 %", "above band"]
     narrow = from_frequencies("default", [1.2 * model_hz[1], 1.01 * model_hz[2]])
-    pairing = pair_rig(rig, "default", {}, narrow, PairingSettings())
+    pairing = pair_with(rig, "default", {}, narrow, PairingSettings())
     assert [u.reason for u in pairing.unpaired_model] == ["below band"]

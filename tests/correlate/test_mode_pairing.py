@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from frequencies import from_frequencies
 
-from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
+from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.observations.mode_data import ModeData, prepare
 from ema_pipeline.observations.mode_pairing import OwnDamping, paired, turned

@@ -13,10 +13,11 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from frequencies import from_frequencies
 from imperfect_modes import GOOD, NORMAL, Hidden, Lab, chain, chain_modes, planetary_modes
 
 from ema_pipeline import codec
-from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
+from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.claims import judge, left_of_close_modes
 from ema_pipeline.diagnose.diagnosis import diagnose
 from ema_pipeline.diagnose.explained import at_usual_scatters, explanation, outlying_damping

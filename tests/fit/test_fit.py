@@ -8,8 +8,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from frequencies import from_frequencies
 
-from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
+from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import effect_library, parse_effect
 from ema_pipeline.effects.rig import rig_with_effects

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.linalg
+from frequencies import from_frequencies
 from imperfect_modes import EXACT, GOOD, Hidden, chain, chain_modes, planetary_modes
 
-from ema_pipeline.correlate.measured import MeasuredModes, from_frequencies
+from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.diagnose.hypotheses import list_hypotheses
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.library import effect_library, parse_effect
