@@ -20,8 +20,9 @@ from pathlib import Path
 import numpy as np
 
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
+from ema_pipeline.mechanics.driven_system import CodedElements
 from ema_pipeline.mechanics.laws import PolynomialSpring
-from ema_pipeline.mechanics.simulation import between_samples, driven_system, march
+from ema_pipeline.mechanics.simulation import between_samples, march
 
 RIG = """masses = [{ at = "mass.x", value = 1.0 }]
 springs = [{ at = "mass.x", value = 1.0 }]
@@ -80,7 +81,8 @@ def speed(samples: int = 100_000, substeps: int = 4) -> None:
             Spring(f"k{k}", {dofs[k]: 1.0, **({dofs[k - 1]: -1.0} if k else {})}, 1e5) for k in range(n)
         ]
         cubic = PolynomialSpring("cubic", {dofs[0]: 1.0}, 0.0, 1e9)
-        system = driven_system(Assembly(dofs, (*elements, *springs, cubic)), np.eye(n)[:1])
+        assembly = Assembly(dofs, (*elements, *springs, cubic))
+        system = CodedElements.of(assembly).driven(assembly.system(), np.eye(n)[:1])
         march(system, 1024.0, substeps, fine, np.zeros(system.size))
         times = []
         for _ in range(5):

@@ -27,7 +27,8 @@ from ema_pipeline.diagnose.types import NOTHING, Candidate, Diagnosis, Ladder, R
 from ema_pipeline.effects.base import Effect, PlacedEffect
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.errors import EmaError
-from ema_pipeline.mechanics.simulation import COARSE, coded_law
+from ema_pipeline.mechanics.driven_system import coded_law
+from ema_pipeline.mechanics.simulation import COARSE
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.fitting import Fit, Model, learned, refined

@@ -9,11 +9,14 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-POLYNOMIAL, FRICTION, SQUARE_DAMPER, BOUC_WEN, PARTING, MAXWELL = range(6)
-"""Laws of the elements; what their four numbers are is said in `_law`."""
-
-NUMBERS = 4
-"""Numbers of a law."""
+from ema_pipeline.mechanics.driven_system import (
+    BOUC_WEN,
+    FRICTION,
+    MAXWELL,
+    PARTING,
+    POLYNOMIAL,
+    SQUARE_DAMPER,
+)
 
 COLUMNS = 8
 """Derivatives that the loops take at once; a rest takes as long as all of them."""
@@ -48,12 +51,12 @@ def _law(kind, d, v, z, a, b, c, e):  # type: ignore[no-untyped-def]
     """
     g = gd = gv = gz = ga = gb = 0.0
     r = rd = rv = rz = ra = rb = rc = re = 0.0
-    if kind == 0:
+    if kind == POLYNOMIAL:
         g = (a + b * d) * d * d
         gd = (2.0 * a + 3.0 * b * d) * d
         ga = d * d
         gb = ga * d
-    elif kind == 1:
+    elif kind == FRICTION:
         fast = abs(v * (1.0 / b))
         gap = np.exp(-2.0 * fast) if fast < _SATURATED else 0.0  # np.tanh takes three times as long
         t = (1.0 - gap) / (1.0 + gap)
@@ -61,9 +64,9 @@ def _law(kind, d, v, z, a, b, c, e):  # type: ignore[no-untyped-def]
             t = -t
         s = 1.0 - t * t
         g, gv, ga, gb = a * t, a * s / b, t, -a * s * v / (b * b)
-    elif kind == 2:
+    elif kind == SQUARE_DAMPER:
         g, gv, ga = a * abs(v) * v, 2.0 * a * abs(v), abs(v) * v
-    elif kind == 3:
+    elif kind == BOUC_WEN:
         g, gz = z, 1.0
         u = z * (1.0 / b)  # the quotient is ready before z is, and the loop waits for z
         size = abs(u)
@@ -77,7 +80,7 @@ def _law(kind, d, v, z, a, b, c, e):  # type: ignore[no-untyped-def]
         rc = -a * v * low * size
         if size > 1e-12:
             re = -a * np.log(size) * low * drag * u
-    elif kind == 4:
+    elif kind == PARTING:
         over = d + b
         if over > 0.0:
             g, gd, ga, gb = a * over, a, over, a

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.mechanics.driven_system import DrivenSystem
 from ema_pipeline.mechanics.modes import eigen_solution
-from ema_pipeline.mechanics.simulation import DrivenSystem
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.mechanics.terms import DAMPING_MATRIX, MASS, STIFFNESS, Matrices
 

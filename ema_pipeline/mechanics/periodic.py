@@ -14,7 +14,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.mechanics.simulation import WITH_MEMORY, DrivenSystem, Slopes, march
+from ema_pipeline.mechanics.driven_system import WITH_MEMORY, DrivenSystem, Slopes
+from ema_pipeline.mechanics.simulation import march
 
 _ROUNDS = 12
 """Periods or Newton steps after which the response is left to settle by itself."""

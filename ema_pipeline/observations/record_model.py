@@ -21,14 +21,14 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Damper
 from ema_pipeline.mechanics.driven_slopes import ModalDamping, driven_derivatives, matrix_derivatives
-from ema_pipeline.mechanics.modes import modal_damping
-from ema_pipeline.mechanics.simulation import (
+from ema_pipeline.mechanics.driven_system import (
     WITH_MEMORY,
     CodedElements,
     DrivenSystem,
     Slopes,
     coded_law,
 )
+from ema_pipeline.mechanics.modes import modal_damping
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.mechanics.terms import Matrices
 from ema_pipeline.observations.parts import (

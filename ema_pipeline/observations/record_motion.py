@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.mechanics.driven_system import DrivenSystem, Slopes, resolved
 from ema_pipeline.mechanics.periodic import steady_response
-from ema_pipeline.mechanics.simulation import DrivenSystem, Sensors, Slopes, march_windows, resolved
+from ema_pipeline.mechanics.simulation import Sensors, march_windows
 from ema_pipeline.observations.record_data import RecordData
 
 DIED_OUT = 10.0

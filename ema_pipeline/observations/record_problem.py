@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.inference import Residuals, Unknowns, joined
-from ema_pipeline.mechanics.simulation import HYSTERESIS, DrivenSystem, Slopes
+from ema_pipeline.mechanics.driven_system import BOUC_WEN, DrivenSystem, Slopes
 from ema_pipeline.observations.base import EffectProblem
 from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, SHARE, RecordData
 from ema_pipeline.observations.record_model import RecordModel
@@ -187,7 +187,7 @@ class RecordProblem(EffectProblem):
         if slopes is not None:
             change[:, np.arange(moving), marched + np.arange(moving)] = o.begin_scale
         for k, (_, j) in enumerate(self.model.memories, start=moving):
-            force = system.kinds[j] == HYSTERESIS  # what it remembers; others remember a stretch
+            force = system.kinds[j] == BOUC_WEN  # what it remembers; others remember a stretch
             size = system.numbers[j, 1] if force else np.abs(system.rows[j]) @ o.begin_scale[: moving // 2]
             begin[:, moving + j] = _MEMORY * size * unknown[:, k]
             if slopes is not None:

@@ -22,7 +22,8 @@ from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.inference import Posterior, Residuals, Scatter
 from ema_pipeline.ingest.driven import DrivenRecord
-from ema_pipeline.mechanics.simulation import FINE, DrivenSystem, Sensors, Slopes, substeps_for
+from ema_pipeline.mechanics.driven_system import DrivenSystem, Slopes
+from ema_pipeline.mechanics.simulation import FINE, Sensors, substeps_for
 from ema_pipeline.observations.linear_start import linear_start
 from ema_pipeline.observations.parts import DAMPING
 from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, SHARE, RecordData

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from driven import driven_system
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
@@ -13,7 +14,7 @@ from ema_pipeline.ingest.driven import DrivenRecord, ForceChannel
 from ema_pipeline.ingest.records import ResponseChannel
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
 from ema_pipeline.mechanics.frf import receptance
-from ema_pipeline.mechanics.simulation import between_samples, driven_system, march
+from ema_pipeline.mechanics.simulation import between_samples, march
 from ema_pipeline.report.interactive.packing import LEVELS, packed_frfs
 
 RATE = 512.0

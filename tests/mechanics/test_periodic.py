@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from driven import driven_system, set_difference
 
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
 from ema_pipeline.mechanics.dissipation import HystereticSpring
+from ema_pipeline.mechanics.driven_system import DrivenSystem, Slopes
 from ema_pipeline.mechanics.laws import Nonlinear, PolynomialSpring
 from ema_pipeline.mechanics.periodic import steady_response
-from ema_pipeline.mechanics.simulation import DrivenSystem, Slopes, between_samples, driven_system, march
+from ema_pipeline.mechanics.simulation import between_samples, march
 
 RATE, PERIOD, FINE = 256.0, 256, 4
 ROWS = ({"a.x": 1.0}, {"a.x": 1.0, "b.x": -1.0})
@@ -58,7 +60,7 @@ def test_its_derivatives_are_those_of_the_settled_motion(law: Nonlinear) -> None
     step, force = 1.0, _force()
     low, here, high = (_system(law, 4e3 + d) for d in (-step, 0.0, step))
     slopes = Slopes.none(here, 1)
-    slopes.set_difference(0, low, high, 2 * step)
+    set_difference(slopes, 0, low, high, 2 * step)
     found = steady_response(here, RATE, FINE, force, slopes)
     ends = [steady_response(s, RATE, FINE, force) for s in (low, high)]
     assert found is not None

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from driven import driven_system, set_difference
 from scipy.integrate import solve_ivp
 
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
 from ema_pipeline.mechanics.dissipation import HystereticSpring, SquareDamper
+from ema_pipeline.mechanics.driven_system import Slopes, resolved
 from ema_pipeline.mechanics.laws import BoucWen, DryFriction, Maxwell, PartingSpring, PolynomialSpring
 from ema_pipeline.mechanics.nonlinear import nonlinear_response
 from ema_pipeline.mechanics.simulation import (
     Sensors,
-    Slopes,
     between_samples,
-    driven_system,
     march,
-    resolved,
 )
 
 RATE, SUBSTEPS = 500.0, 8
@@ -150,7 +149,7 @@ def test_derivatives_are_those_of_the_motion() -> None:
         low[k] -= step
         high[k] += step
         ends = [driven_system(assembly(p), rows) for p in (low, high)]
-        slopes.set_difference(k, *ends, 2 * step)
+        set_difference(slopes, k, *ends, 2 * step)
     _, change = read(point, slopes)
     for k in range(len(point)):
         low, high = point.copy(), point.copy()
