@@ -23,7 +23,7 @@ from ema_pipeline.mechanics.modes import total_damping
 from ema_pipeline.mechanics.system import LinearSystem
 
 POLYNOMIAL, FRICTION, SQUARE_DAMPER, BOUC_WEN, PARTING, MAXWELL = range(6)
-"""Kinds of elements; `mechanics.driven` has their laws, and what their four numbers are."""
+"""Kinds of elements; `mechanics.simulation_kernel` has their laws, and what their four numbers are."""
 WITH_MEMORY = (BOUC_WEN, MAXWELL)
 """Kinds that have a memory."""
 _NO_LOSS = 1e-6
@@ -127,7 +127,7 @@ class CodedElements:
 
 
 def coded_law(element: Nonlinear) -> tuple[int, tuple[float, float, float, float]]:
-    """Law and numbers of an element as `mechanics.driven` has them; EmaError for one that it does not know."""
+    """Kind and numbers of an element, see `mechanics.simulation_kernel`; EmaError for one that it does not know."""
     if isinstance(element, PolynomialSpring):
         return POLYNOMIAL, (element.quadratic, element.cubic, 0.0, 0.0)
     if isinstance(element, DryFriction):

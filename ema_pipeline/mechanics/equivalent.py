@@ -64,9 +64,9 @@ class Motions:
             return np.asarray(quadratic * (offset**2 + square) + cubic * offset * (offset**2 + 3 * square))
         if kind == FRICTION:  # odd in the rate
             return np.zeros(len(offset))
-        from ema_pipeline.mechanics import averages  # compiled on first use
+        from ema_pipeline.mechanics import equivalent_kernel as kernel  # compiled on first use
 
-        found = averages.mean_force(*element.law[1:], self.amplitude, _phases(len(self.omega)), offset)
+        found = kernel.mean_force(*element.law[1:], self.amplitude, _phases(len(self.omega)), offset)
         return np.asarray(found)
 
     def stiffness(self, element: Nonlinear, offset: Real) -> Complex:
@@ -84,16 +84,16 @@ class Motions:
             others = 0.5 * np.sum(each, axis=1, keepdims=True) - 0.5 * each
             about = offset[:, None]
             return (2 * quadratic * about + cubic * (3 * (about**2 + others) + 0.75 * each)).astype(complex)
-        from ema_pipeline.mechanics import averages  # compiled on first use
+        from ema_pipeline.mechanics import equivalent_kernel as kernel  # compiled on first use
 
         phases = _phases(len(self.omega))
         if kind == FRICTION:
             limit, velocity = law[1:3]
-            return np.asarray(1j * limit * averages.friction(velocity, self.amplitude, self.omega, phases))
+            return np.asarray(1j * limit * kernel.friction(velocity, self.amplitude, self.omega, phases))
         k, preload, gap = law[1:]
         if preload == np.inf:
             return np.zeros(self.amplitude.shape, complex)
-        return np.asarray(k * averages.parting(preload, gap, self.amplitude, phases, offset), complex)
+        return np.asarray(k * kernel.parting(preload, gap, self.amplitude, phases, offset), complex)
 
 
 def settled_offsets(elements: Sequence[Nonlinear], motions: Sequence[Motions], flexibility: Real) -> Real:

@@ -122,7 +122,7 @@ def parting(stretch: float, rate: float, k: float, preload: float, gap: float) -
 
 
 LAWS = (polynomial, friction, parting)
-"""Laws without memory, which `mechanics.kernel` and `mechanics.averages` compile."""
+"""Laws without memory, which `mechanics.modal_response_kernel` and `mechanics.equivalent_kernel` compile."""
 POLYNOMIAL, FRICTION, PARTING = range(len(LAWS))
 AT_LARGER_MOTION = ((1, 2, 0), (-1, -1, 0), (0, -1, -1))
 """Of each law, powers of a factor by which its three numbers change where it does the same, over the motion, as with

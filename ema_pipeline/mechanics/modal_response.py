@@ -50,7 +50,7 @@ def response_from_rest(
     EmaError
         For structural damping, and where the motion grows without bound.
     """
-    from ema_pipeline.mechanics.kernel import march  # compiles at its first use
+    from ema_pipeline.mechanics.modal_response_kernel import march  # compiles at its first use
 
     elements = assembly.nonlinear
     for element in elements:

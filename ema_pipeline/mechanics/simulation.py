@@ -130,7 +130,7 @@ def march_windows(
     derivatives : ndarray, (n_windows, n_samples, 2n + m, p)
         None where the motion grows without bound in one of them.
     """
-    from ema_pipeline.mechanics import driven  # compiled on first use
+    from ema_pipeline.mechanics import simulation_kernel as kernel  # compiled on first use
 
     step = 1 / (sample_rate_hz * substeps)
     shape = (len(force), (force.shape[1] - 1) // (2 * substeps) + 1, system.size)
@@ -140,15 +140,15 @@ def march_windows(
         system.numbers, force, begin, step, substeps,
     )  # fmt: skip
     if slopes is None:
-        if not driven.march_windows(*fixed, states):
+        if not kernel.march_windows(*fixed, states):
             return None
         return states, np.empty((*shape, 0))
     count = slopes.begin.shape[-1]
-    width = -(-count // driven.COLUMNS) * driven.COLUMNS
-    known = driven.FEW if width == driven.COLUMNS else ()
+    width = -(-count // kernel.COLUMNS) * kernel.COLUMNS
+    known = kernel.FEW if width == kernel.COLUMNS else ()
     derivatives = np.empty((*shape, width))
     arrays = (*fixed, *(_filled_up(a, width) for a in slopes.arrays), known, states, derivatives)
-    if not driven.march_windows_with_slopes(*arrays):
+    if not kernel.march_windows_with_slopes(*arrays):
         return None
     return states, derivatives[..., :count]
 
@@ -218,12 +218,12 @@ def accelerations(
     slopes: Slopes | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Accelerations (n_samples, n) at marched states, and their derivatives (n_samples, n, p)."""
-    from ema_pipeline.mechanics import driven
+    from ema_pipeline.mechanics import simulation_kernel as kernel
 
     p = 0 if derivatives is None else derivatives.shape[2]
     tangent = np.empty((len(states), system.size, 0)) if derivatives is None else derivatives
     given = slopes or Slopes.none(system, p)
-    found: tuple[NDArray[np.float64], NDArray[np.float64]] = driven.accelerations(
+    found: tuple[NDArray[np.float64], NDArray[np.float64]] = kernel.accelerations(
         system.stiffness, system.damping, system.inputs, system.push, system.rows, system.kinds, system.numbers,
         np.ascontiguousarray(force), states, tangent,
         given.stiffness, given.damping, given.inputs, given.push, given.numbers,

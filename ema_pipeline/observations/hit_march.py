@@ -153,7 +153,7 @@ def marched_modes(
 
 def _forces(data: HitData, elements: Sequence[Nonlinear], driven: Driven) -> tuple[Real | None, float]:
     """Forces of the elements beside their tangents', (h, n_elements, n_steps), until there are none; step, s."""
-    from ema_pipeline.mechanics.kernel import march  # compiles at its first use
+    from ema_pipeline.mechanics.modal_response_kernel import march  # compiles at its first use
 
     pulses = data.pulses
     assert pulses is not None

@@ -253,7 +253,7 @@ def test_hits_aimed_to_both_sides_differ_in_phase_and_not_in_quadrature() -> Non
 
 @pytest.mark.parametrize("stop", [0.0, 0.01, 1.0, 3.0])
 def test_friction_at_the_end_of_a_step_solves_its_equation(stop: float) -> None:
-    from ema_pipeline.mechanics.kernel import _gripped
+    from ema_pipeline.mechanics.modal_response_kernel import _gripped
 
     def rate(u: float) -> float:
         return u + stop * np.tanh(u) - abs(free)
