@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ema_pipeline.effects.base import PlacedEffect, effect_of
 from ema_pipeline.inference import Apart, Posterior, Residuals, Unknowns, joined
 from ema_pipeline.observations.amplitude_starts import begun, sized_anew
-from ema_pipeline.observations.base import EffectProblem
+from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.hit_data import HitData, comparable
 from ema_pipeline.observations.hit_lattice import LEAST, MarchedHits, on_lattice
 from ema_pipeline.observations.hit_march import rubs, steps_to_end
@@ -59,7 +59,7 @@ _BEYOND = 3.0
 """Growth of what linearisation leaves out per decay rate by which a pole moves: it is of first order in that."""
 
 
-class AmplitudeObservations:
+class AmplitudeObservations(Observations):
     """Modes of a rig, and of single hits at several force levels.
 
     Parameters
@@ -102,10 +102,6 @@ class AmplitudeObservations:
         """What is compared of the hits of every configuration."""
         defaults = {name: s.default for name, s in self.scatters.items()}
         return tuple(HitRows(h, defaults, self.cut_off) for h in self.hits)
-
-    def suited(self, effects: Sequence[PlacedEffect]) -> AmplitudeObservations:
-        """See `Observations`."""
-        return self
 
     def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> AmplitudeObservations:
         """See `Observations`: hits are marched about the structure of this fit."""

@@ -74,22 +74,21 @@ class EffectProblem(Problem, Protocol):
 
 
 class Observations(Protocol):
-    """Measured data of one kind, compared with any model."""
+    """Measured data of one kind, compared with any model: a class with `scatters`, `problem` and `folds`.
 
-    @property
-    def scatters(self) -> Mapping[str, Scatter]:
-        """The hyper-parameters that these data depend on."""
-        ...
+    Attributes
+    ----------
+    scatters : mapping of str to Scatter
+        The hyper-parameters that these data depend on.
+    linearised : bool
+        True where effects that depend on the amplitude are known to first order, whose rest looks like another.
+    level_dependent : bool
+        True where modes are seen to move with the force of the hits, which no linear model does.
+    """
 
-    @property
-    def linearised(self) -> bool:
-        """True where effects that depend on the amplitude are known to first order, whose rest looks like another."""
-        ...
-
-    @property
-    def level_dependent(self) -> bool:
-        """True where modes are seen to move with the force of the hits, which no linear model does."""
-        ...
+    scatters: Mapping[str, Scatter]
+    linearised: bool = False
+    level_dependent: bool = False
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> EffectProblem:
         """The problem of fitting the rig with `effects`, whose sizes have these prior 1 σ, to the data."""
@@ -97,11 +96,11 @@ class Observations(Protocol):
 
     def suited(self, effects: Sequence[PlacedEffect]) -> Observations:
         """The same data for models with these effects: with unknowns that only they need. Often the same object."""
-        ...
+        return self
 
     def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> Observations:
         """The same data, with what takes long found about a fit with these effects. Often the same object."""
-        ...
+        return self
 
     def in_full(
         self, effects: Sequence[PlacedEffect], found: Posterior
@@ -109,7 +108,7 @@ class Observations(Protocol):
         """The data with what these effects do calculated in full about a fit with them, and as well as these are known
         then with what they do to first order; None where nothing is known to first order only.
         """
-        ...
+        return None
 
     def folds(self) -> Sequence[tuple[Observations, Observations]]:
         """Pairs of what is fitted and what is held out: a configuration, a hit point, a level, a share of modes."""
@@ -119,4 +118,4 @@ class Observations(Protocol):
         """The same data, of which folds hold out nothing that has no partner in `found`: no fit to the rest could tell
         of a mode that an effect adds. Often the same object.
         """
-        ...
+        return self

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.errors import EmaError
-from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns, descend, joined
+from ema_pipeline.inference import Residuals, Scatter, Unknowns, descend, joined
 from ema_pipeline.ingest.defaults import CALIBRATION_STD
 from ema_pipeline.loops.types import Loop
 from ema_pipeline.mechanics.assembly import Spring
 from ema_pipeline.mechanics.cycles import Cycles
-from ema_pipeline.observations.base import EffectProblem
+from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.loop_data import LoopData, left_out, typical_of
 from ema_pipeline.observations.loop_forces import ForceAtPoint, Isolator, IsolatorForce
 from ema_pipeline.observations.parts import Dependence, dependence, part_key
@@ -61,7 +61,7 @@ class Spread:
     relative: NDArray[np.float64]
 
 
-class LoopObservations:
+class LoopObservations(Observations):
     """Measured loops of a rig's isolator.
 
     Parameters
@@ -83,9 +83,6 @@ class LoopObservations:
         Without loops, and for a rig that has no isolator.
     """
 
-    linearised = False
-    level_dependent = False
-
     def __init__(
         self,
         rig: Rig,
@@ -106,15 +103,11 @@ class LoopObservations:
         self.typical: Typical = whole.typical if whole else typical_of(self.data)
         self.shared: Dependence = whole.shared if whole else self._dependence()
         self.starts: dict[tuple[str, ...], NDArray[np.float64]] = whole.starts if whole else {}
-
-    @property
-    def scatters(self) -> Mapping[str, Scatter]:
-        """See `Observations`."""
-        known = (
+        scatters = (
             Scatter(FORCE_SCATTER, "force that no model explains", DISCREPANCY, 1.5, most=MOST),
             Scatter(NOISE_SCATTER, "noise that the cycles do not show", UNSEEN_NOISE, 1.5, most=MOST),
         )
-        return {s.name: s for s in known}
+        self.scatters = {s.name: s for s in scatters}
 
     @cached_property
     def measured(self) -> NDArray[np.float64]:
@@ -165,17 +158,6 @@ class LoopObservations:
         """The effect with the starts and prior scales of its sizes as these loops' force and motion suggest."""
         return self.typical.scaled(effect)
 
-    def suited(self, effects: Sequence[PlacedEffect]) -> LoopObservations:
-        """See `Observations`."""
-        return self
-
-    def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> LoopObservations:
-        """See `Observations`."""
-        return self
-
-    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> None:
-        """See `Observations`."""
-
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> LoopProblem:
         """See `Observations`."""
         mine = [self.scaled(e) for e in effects]
@@ -202,10 +184,6 @@ class LoopObservations:
             calibration=self.calibration,
             whole=self,
         )
-
-    def holding_out_explained(self, found: Residuals) -> LoopObservations:
-        """See `Observations`."""
-        return self
 
     def folds(self) -> list[tuple[LoopObservations, LoopObservations]]:
         """Each amplitude held out in turn, each frequency, and each setting where there are several."""

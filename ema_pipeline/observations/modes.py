@@ -10,8 +10,9 @@ import numpy as np
 from ema_pipeline.dof import Dof
 from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.frf.channels import ChannelQuality
-from ema_pipeline.inference import Posterior, Residuals, Scatter
+from ema_pipeline.inference import Residuals, Scatter
 from ema_pipeline.ingest.defaults import CALIBRATION_STD
+from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_pairing import OwnDamping
 from ema_pipeline.observations.mode_problem import CALIBRATION, MIXING, ModeProblem
@@ -49,7 +50,7 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
     return {s.name: s for s in known}
 
 
-class ModeObservations:
+class ModeObservations(Observations):
     """Measured modes of a rig's configurations.
 
     Parameters
@@ -74,9 +75,6 @@ class ModeObservations:
         What the sensors of a configuration read, by it and the id of its data, the positions of unknowns counted from
         the first one that is not the model's: the same for all models, so cached here by their problems.
     """
-
-    linearised = False
-    level_dependent = False
 
     def __init__(
         self,
@@ -107,13 +105,6 @@ class ModeObservations:
         if key not in self._has:
             self._has[key] = self.rig.knows(configuration, dof)
         return self._has[key]
-
-    def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> ModeObservations:
-        """See `Observations`."""
-        return self
-
-    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> None:
-        """See `Observations`."""
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> ModeProblem:
         """See `Observations`."""

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from ema_pipeline.effects.base import PlacedEffect
-from ema_pipeline.inference import Posterior, Residuals, Scatter, Unknowns
-from ema_pipeline.observations.base import EffectProblem
+from ema_pipeline.inference import Residuals, Scatter, Unknowns
+from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_problem import ModeProblem
 from ema_pipeline.observations.mode_rows import FREQUENCY, SHAPE, Compared, Rows, stacked
@@ -68,7 +68,7 @@ Pairs = Mapping[str, NDArray[np.int64]]
 """Mode of B for every mode of A, -1 for none, by configuration."""
 
 
-class PairObservations:
+class PairObservations(Observations):
     """Measured modes of two tests of one rig.
 
     Parameters
@@ -81,9 +81,6 @@ class PairObservations:
         Labels of effects that the rig had in both tests.
     repeat : RepeatSettings, optional
     """
-
-    linearised = False
-    level_dependent = False
 
     def __init__(
         self,
@@ -99,17 +96,6 @@ class PairObservations:
         self.b = b.with_data([self._commensurate(d) for d in b.data])
         self.scatters = {**a.scatters, **{s.name: s for s in self.repeat.values()}}
 
-    def suited(self, effects: Sequence[PlacedEffect]) -> PairObservations:
-        """See `Observations`."""
-        return self
-
-    def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> PairObservations:
-        """See `Observations`."""
-        return self
-
-    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> None:
-        """See `Observations`."""
-
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> PairProblem:
         """See `Observations`."""
         known = [e for e in effects if e.label in self.common]
@@ -118,10 +104,6 @@ class PairObservations:
             ModeProblem(self.a, RigModel(self.a.rig, known, scales, self.a.shared)),
             ModeProblem(self.b, RigModel(self.a.rig, effects, scales, self.a.shared)),
         )
-
-    def holding_out_explained(self, found: Residuals) -> PairObservations:
-        """See `Observations`."""
-        return self
 
     def folds(self, count: int = 4) -> list[tuple[PairObservations, PairObservations]]:
         """Every `count`-th mode of both tests held out in turn, over all configurations; pairs stay together."""

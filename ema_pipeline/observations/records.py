@@ -20,10 +20,11 @@ from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.effects.generic import is_place, place_rows
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.inference import Posterior, Residuals, Scatter
+from ema_pipeline.inference import Scatter
 from ema_pipeline.ingest.driven import DrivenRecord
 from ema_pipeline.mechanics.driven_system import DrivenSystem, Slopes
 from ema_pipeline.mechanics.simulation import FINE, Sensors, substeps_for
+from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.linear_start import linear_start
 from ema_pipeline.observations.parts import DAMPING
 from ema_pipeline.observations.record_data import BANDS, DISCREPANCY, SHARE, RecordData
@@ -57,7 +58,7 @@ _HEADROOM = 1.3
 """Factor by which effects may raise the highest natural frequency before steps become coarser than meant."""
 
 
-class RecordObservations:
+class RecordObservations(Observations):
     """Records of one configuration of a rig.
 
     Parameters
@@ -86,9 +87,6 @@ class RecordObservations:
         Without records to fit, and for a rig that lacks a measured DOF.
     """
 
-    linearised = False
-    level_dependent = False
-
     def __init__(
         self,
         rig: Rig,
@@ -108,6 +106,7 @@ class RecordObservations:
         self.held_out = tuple(held_out)
         self.basis = basis or _basis(rig, configuration, [d.record for d in self.data], frfs)
         self.like, self.modal, self.phase = like, modal, phase
+        self.scatters = self._scatters()
         self.finds_states = (
             False  # True where states at the start are found from the first samples, not fitted
         )
@@ -127,9 +126,8 @@ class RecordObservations:
             return self.like.rms
         return np.asarray(np.sqrt(np.mean([d.rms**2 for d in self.data], axis=0)))
 
-    @cached_property
-    def scatters(self) -> Mapping[str, Scatter]:
-        """See `Observations`: the noise of every response in every band, in units of the discrepancy."""
+    def _scatters(self) -> dict[str, Scatter]:
+        """The noise of every response in every band, in units of the discrepancy."""
         width = self.sample_rate_hz / 2 / BANDS
         found = {}
         for o, dof in enumerate(self.basis.outputs):
@@ -277,17 +275,6 @@ class RecordObservations:
         """What a system does in one record; None where its motion grows without bound."""
         return simulated(data, self.substeps, self.slowest_rad_s, self.sensors, system, begin, slopes)
 
-    def suited(self, effects: Sequence[PlacedEffect]) -> RecordObservations:
-        """See `Observations`."""
-        return self
-
-    def about(self, effects: Sequence[PlacedEffect], found: Posterior) -> RecordObservations:
-        """See `Observations`."""
-        return self
-
-    def in_full(self, effects: Sequence[PlacedEffect], found: Posterior) -> None:
-        """See `Observations`."""
-
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> RecordProblem:
         """See `Observations`."""
         return RecordProblem(self, RecordModel(self.basis, [self.scaled(e) for e in effects], scales))
@@ -305,10 +292,6 @@ class RecordObservations:
             self.rig, self.configuration, records, held_out, None, used, self.like or self, self.modal,
             phase or self.phase,
         )  # fmt: skip
-
-    def holding_out_explained(self, found: Residuals) -> RecordObservations:
-        """See `Observations`."""
-        return self
 
     def folds(self) -> Sequence[tuple[RecordObservations, RecordObservations]]:
         """The records that the test holds out; none where it holds out none."""
