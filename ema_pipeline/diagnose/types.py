@@ -6,10 +6,6 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
-from ema_pipeline.dof import Dof
 from ema_pipeline.inference import ERROR_LIMIT
 
 VerdictWord = Literal["adequate", "effect", "ambiguous", "unknown_effect", "not_enough_data"]
@@ -121,9 +117,6 @@ class Rung:
         Against the base model.
     unexplained : int
         Measured modes that the model does not explain.
-    misfit, heldout_misfit : tuple of float
-        Normalised time-domain misfit at each force level of the ladder, of hits that were fitted and of a level left
-        out of the fit; empty where hits at one level only were compared.
     unknowns : dict of str to float
         Everything uncertain as this model was fitted, by name: where a later fit of it begins.
     """
@@ -136,39 +129,7 @@ class Rung:
     parameters: dict[str, EffectSize]
     log_evidence: float
     unexplained: int
-    misfit: tuple[float, ...] = ()
-    heldout_misfit: tuple[float, ...] = ()
     unknowns: dict[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class TimeTrace:
-    """One signal after a hit, measured and simulated with the measured force, within the band of the modes.
-
-    Attributes
-    ----------
-    configuration, hit : str
-        The hit as ``file#number``.
-    force_n : float
-        Force level.
-    impact, sensor : Dof
-    quantity : str
-        What the sensor measures.
-    sample_rate_hz : float
-    measured, before, after : ndarray, (n_samples,)
-        SI; simulated by the base model and by the last rung.
-    """
-
-    configuration: str
-    hit: str
-    force_n: float
-    impact: Dof
-    sensor: Dof
-    quantity: str
-    sample_rate_hz: float
-    measured: NDArray[np.float64]
-    before: NDArray[np.float64]
-    after: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -202,17 +163,6 @@ class Ladder:
         entry).
     note : str
         Why no further effect was added.
-    force_n : tuple of float
-        Force levels at which hits were simulated; empty where modes were compared.
-    hit_noise : float
-        Share of the measured amplitude that the simulation of a hit may miss; NaN where modes were compared.
-    traces : tuple of TimeTrace
-        Measured and simulated signals of the base model and of the last rung.
-    compared_s : float
-        Length of what was compared of each hit, where that is only the first part of its window; else NaN.
-    left_out : tuple of str
-        Hits, as ``file#number``, that were not compared because their motion is too sensitive to the
-        measured force.
     scatters : tuple of LearnedScatter
         What σ includes in addition to the test's own scatter.
     """
@@ -222,11 +172,6 @@ class Ladder:
     damping_noise: float
     shape_noise: float
     note: str
-    force_n: tuple[float, ...] = ()
-    hit_noise: float = float("nan")
-    traces: tuple[TimeTrace, ...] = ()
-    compared_s: float = float("nan")
-    left_out: tuple[str, ...] = ()
     scatters: tuple[LearnedScatter, ...] = ()
 
 

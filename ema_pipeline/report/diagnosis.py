@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 from ema_pipeline.diagnose.sentences import label_text, probability_text, value_text
@@ -198,14 +197,6 @@ def of_modes(ladder: Ladder) -> bool:
 
 def noise_words(ladder: Ladder) -> str:
     """What σ includes in addition to the test's own scatter."""
-    if ladder.force_n:
-        of_sigma = (
-            "Error: simulated against measured hits, in standard uncertainties: the sensors' noise, "
-            f"{plain(100 * ladder.hit_noise, 2)} % of the signal around each frequency, and an error of the linear "
-            "model that is the same at every force level. A linear model can therefore have an error of about 1 and "
-            "still miss much of the hard hits: look at the shares that are missed."
-        )
-        return " ".join(filter(None, (hits_words(ladder), of_sigma)))
     if not of_modes(ladder):
         return "σ: the scatter of the measured signals."
     return (
@@ -222,24 +213,6 @@ def sigma_words(found: Diagnosis) -> str:
     return (
         "σ includes the scatter of parts and sensors that is learned with each effect, and differs from row to row: "
         "compare rows by their probability, not by their error."
-    )
-
-
-def hits_words(ladder: Ladder) -> str:
-    """How the last rung's simulated hits fare against the base model's, in a sentence; empty without any."""
-    if not ladder.force_n or len(ladder.rungs) < 2:
-        return ""
-    first, last = ladder.rungs[0].heldout_misfit, ladder.rungs[-1].heldout_misfit
-    told = [
-        f"{plain(100 * b, 2)} → {plain(100 * a, 2)} % at {f:.3g} N"
-        for f, b, a in zip(ladder.force_n, first, last, strict=True)
-        if math.isfinite(a) and math.isfinite(b)
-    ]
-    if not told:
-        return ""
-    return (
-        "Each hit was simulated with its measured force. Share of the measured signals that is missed, each level "
-        f"being predicted by a fit to the others: {', '.join(told)}."
     )
 
 

@@ -138,7 +138,6 @@ def page_context(
         "levels": any(
             c.levels and has_to_say(c.levels) and len(c.levels.levels) > 1 for c in results.configurations
         ),
-        "traces": bool(results.shown_ladder and results.shown_ladder.traces),
         "sweeps": bool(fit and fit.sweeps),
         "loops": bool(results.loops and results.loops.models),
         "loss": bool(results.loops and any(one.loss for one in results.loops.isolators.values())),

@@ -10,7 +10,6 @@ from typing import Literal
 
 from matplotlib.figure import Figure
 
-from ema_pipeline.diagnose.types import Ladder
 from ema_pipeline.files import replace_file
 from ema_pipeline.frf.overview import representative_frfs
 from ema_pipeline.modal.types import ModalModel
@@ -25,7 +24,6 @@ from ema_pipeline.report.figures import (
     modes,
     nyquist,
     shapes,
-    traces,
 )
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.name_text import slug
@@ -174,28 +172,6 @@ def _diagnosed(results: RunResults) -> Iterator[FigureSpec]:
             "",
             "Error of the models rung by rung, on the data fitted and on data held out",
             partial(diagnosis.ladder_errors, ladder),
-        )
-        yield from _simulated_hits(ladder)
-
-
-def _simulated_hits(ladder: Ladder) -> Iterator[FigureSpec]:
-    """Where hits at several force levels were simulated: what was missed, and signals."""
-    if not ladder.force_n:
-        return
-    yield FigureSpec(
-        "diagnosis_misfit",
-        "hits",
-        "",
-        "Share of the measured signals that simulated hits miss, by force level",
-        partial(traces.level_misfits, ladder),
-    )
-    for group in traces.trace_groups(ladder.traces):
-        yield FigureSpec(
-            f"diagnosis_hits_{slug(group[0].configuration)}",
-            "hits",
-            "",
-            traces.traces_caption(group),
-            partial(traces.hit_traces, group, ladder.rungs[-1].effects),
         )
 
 

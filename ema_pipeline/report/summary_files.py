@@ -11,7 +11,7 @@ from typing import Any
 
 from ema_pipeline.choices import Choices
 from ema_pipeline.correlate.types import Comparison, percent_off
-from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder, Rung
+from ema_pipeline.diagnose.types import Candidate, Diagnosis, EffectSize, Ladder
 from ema_pipeline.exchange.tables import csv_text, modes_table
 from ema_pipeline.files import replace_file
 from ema_pipeline.fit.types import FitResult
@@ -60,10 +60,6 @@ def summary(results: RunResults) -> dict[str, Any]:
     if results.shown_ladder is not None:
         content["ladder"] = _ladder(results.shown_ladder)
         content["ladder_note"] = results.shown_ladder.note
-        if math.isfinite(results.shown_ladder.compared_s):
-            content["ladder_compared_s"] = results.shown_ladder.compared_s
-        if results.shown_ladder.left_out:
-            content["ladder_left_out"] = list(results.shown_ladder.left_out)
     if results.simulation:
         content["simulation"] = _simulation(results)
     content["warnings"] = list(cautions(results))
@@ -201,7 +197,6 @@ def _ladder(ladder: Ladder) -> list[dict[str, Any]]:
             "unexplained_modes": r.unexplained,
             "parameters": _sizes(r.parameters),
         }
-        | _misfits(ladder, r)
         for r in ladder.rungs
     ]
 
@@ -232,17 +227,6 @@ def _simulation(results: RunResults) -> dict[str, Any]:
         for loop in results.hysteresis
     ]
     return {"records": records} | ({"hysteresis": loops} if loops else {})
-
-
-def _misfits(ladder: Ladder, rung: Rung) -> dict[str, Any]:
-    """Normalised time-domain misfit by force level, where hits were simulated."""
-    if not ladder.force_n:
-        return {}
-    return {
-        "force_n": list(ladder.force_n),
-        "misfit": list(rung.misfit),
-        "heldout_misfit": list(rung.heldout_misfit),
-    }
 
 
 def _sizes(sizes: Mapping[str, EffectSize]) -> dict[str, Any]:

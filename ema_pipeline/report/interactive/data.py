@@ -66,7 +66,6 @@ def model_data(results: RunResults) -> dict[str, Any]:
         "mac": {c.name: _pairing_mac(c) for c in results.configurations if c.pairing and c.pairing.mac.size},
         "ladder": ladder_data(results.shown_ladder),
         "sweeps": _sweeps(results),
-        "traces": _traces(results),
         "loops": loops_data(results.loops),
         "loss": loss_data(results.loops),
     }
@@ -359,23 +358,6 @@ def _sweeps(results: RunResults) -> list[dict[str, Any]]:
             "y": _rounded(s.error, 5),
         }
         for s in results.fit.sweeps
-    ]
-
-
-def _traces(results: RunResults) -> list[dict[str, Any]]:
-    ladder = results.shown_ladder
-    if ladder is None:
-        return []
-    return [
-        {
-            "name": f"{t.configuration}: {t.sensor.point} after a blow of {t.force_n:.3g} N on {t.impact.point}",
-            "quantity": t.quantity,
-            "step": 1e3 / t.sample_rate_hz,
-            "signals": [
-                _rounded(s[: max(t.measured.size // 2, 2)], 4) for s in (t.measured, t.before, t.after)
-            ],
-        }
-        for t in ladder.traces
     ]
 
 

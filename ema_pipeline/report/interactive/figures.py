@@ -325,28 +325,6 @@ def levels() -> Any:
     return made
 
 
-def traces() -> Any:
-    """Signals after one hit: measured, and simulated by the base model and by the last one."""
-    made = new_figure("time, ms", "signal", 300, name="traces.figure")
-    data = source("traces.signals", "t", "measured", "before", "after")
-    made.line("t", "measured", source=data, color=INK, line_width=1.5, legend_label="measured").glyph.tags = [
-        INK_TAG
-    ]
-    made.line(
-        "t",
-        "before",
-        source=data,
-        color=BEFORE,
-        line_dash="dashed",
-        line_width=1.4,
-        legend_label="base model",
-    )
-    made.line("t", "after", source=data, color=AFTER, line_width=1.4, legend_label="with effects")
-    made.yaxis.name = "traces.axis"
-    place_legend(made)
-    return made
-
-
 def sweeps() -> Any:
     """The error function over one stiffness, per configuration and number of modes."""
     made = new_figure("stiffness, N/m", "error function ε", 300, x_axis_type="log", y_axis_type="log")
@@ -364,7 +342,6 @@ _FIGURES: dict[str, Callable[[], Any]] = {
     "mac": mac,
     "shape": shape,
     "levels": levels,
-    "traces": traces,
     "sweeps": sweeps,
     "loops": loops_figure,
     "loss": loss_figure,

@@ -156,12 +156,6 @@ function EmaFigures(page) {
       });
       columns("levels", "levels.lines", lines); columns("levels", "levels.points", dots);
     },
-    traces: function () {
-      var t = page.model().traces[Number((byId("traces-pick") || { value: 0 }).value)];
-      if (!t) { return; }
-      columns("traces", "traces.signals", { t: t.signals[0].map(function (_, k) { return k * t.step; }), measured: t.signals[0], before: t.signals[1], after: t.signals[2] });
-      set("traces", "traces.axis", { axis_label: t.quantity + ", " + ({ acceleration: "m/s²", velocity: "m/s", displacement: "m" }[t.quantity] || "") });
-    },
     loops: function () {
       var pick = (byId("loops-pick") || { value: "0" }).value, some = page.model().loops.filter(function (_, k) { return pick === "0" || Number(pick) === k + 1; });
       var curves = empty(["x", "measured", "before", "after"]), left = empty(["share", "before", "after"]);

@@ -273,7 +273,6 @@ var EmaPage = (function () {
     on("errors-quantity", "change", function () { refill(["errors"]); });
     on("mac-pick", "change", function () { refill(["mac"]); });
     on("loops-pick", "change", function () { refill(["loops"]); });
-    on("traces-pick", "change", function () { refill(["traces"]); });
     on("nyquist-pick", "change", function (e) { chosen.circle = Number(e.target.value); circleText(); refill(["nyquist"]); });
     document.addEventListener("click", function (e) {
       var pick = e.target.closest("button.pick"), copy = e.target.closest("button.copy");
@@ -287,7 +286,6 @@ var EmaPage = (function () {
     chooseFrf();
     options(byId("mac-pick"), matrices().map(function (m) { return m.name; }), 0);
     options(byId("loops-pick"), ["all"].concat(data.model.loops.map(function (l) { return l.name; })), 0);
-    options(byId("traces-pick"), data.model.traces.map(function (t) { return t.name; }), 0);
     var first = document.querySelector("button.pick");
     if (first) { chooseMode(first.dataset.configuration, Number(first.dataset.mode)); }
     play(false);
