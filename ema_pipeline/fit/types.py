@@ -64,17 +64,6 @@ class StepwiseEstimate:
 
 
 @dataclass(frozen=True)
-class Profile:
-    """Profile likelihood of one parameter: the best objective with the parameter held at `values`.
-
-    `objective` is -2 log posterior minus its minimum, so 1 marks one standard deviation.
-    """
-
-    values: NDArray[np.float64]
-    objective: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
 class ParameterEstimate:
     """A fitted parameter.
 
@@ -83,8 +72,8 @@ class ParameterEstimate:
     value, std : float
         Estimate and its standard deviation (1 σ) from the posterior covariance.
     low, high : float
-        68 % interval from the profile likelihood (equal to value ∓ std where no profile was made);
-        an open end is at the parameter's bound.
+        68 % interval within the bounds, of a rig's parameter by a factor; the bounds where nothing measured depends
+        on a free one.
     unit : str
     free : bool
         True for parameters without a prior.
@@ -96,7 +85,6 @@ class ParameterEstimate:
         (value - nominal)/prior_std; NaN without prior.
     note : str
         Why not identified, at a bound, out of tolerance; empty otherwise.
-    profile : Profile or None
     """
 
     name: str
@@ -111,7 +99,6 @@ class ParameterEstimate:
     identified: bool
     shift_z: float
     note: str
-    profile: Profile | None = None
 
 
 @dataclass(frozen=True)

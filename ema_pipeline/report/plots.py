@@ -315,15 +315,6 @@ def _fitted(results: RunResults) -> Iterator[FigureSpec]:
             "Fitted parameters against their nominal values and tolerances",
             partial(fit.parameter_forest, found),
         )
-        profiled = [p for p in found.parameters.values() if p.profile is not None]
-        for n, chunk in enumerate(_chunks(len(profiled), fit.PROFILES_PER_SHEET), start=1):
-            yield FigureSpec(
-                f"fit_profiles_{n}",
-                "fit",
-                "",
-                "Profile likelihood of fitted parameters",
-                partial(fit.profiles, [profiled[k] for k in chunk]),
-            )
         if len(found.names) > 1:
             yield FigureSpec(
                 "fit_correlation",

@@ -19,7 +19,7 @@ from ema_pipeline.correlate.types import (
     Unpaired,
 )
 from ema_pipeline.dof import Dof
-from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate, Profile, StepwiseEstimate
+from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate, StepwiseEstimate
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.mechanics.system import LinearSystem
@@ -373,11 +373,6 @@ def fit_result() -> FitResult:
     ]
     parameters = {}
     for name, value, std, unit, free, nominal, prior, identified, remark in table:
-        grid = np.linspace(max(value - 3 * std, 0.05 * value), value + 3 * std, 25)
-        bend = ((grid - value) / std) ** 2 * (1 + 0.1 * (grid - value) / std)
-        if not identified and free:
-            bend = np.minimum(bend, 0.6)
-        profile = Profile(grid, bend) if free or "sun" in name else None
         parameters[name] = ParameterEstimate(
             name,
             value,
@@ -391,7 +386,6 @@ def fit_result() -> FitResult:
             identified,
             (value - nominal) / prior,
             remark,
-            profile,
         )
     a = rng.normal(size=(len(table), len(table))) + 2 * np.eye(len(table))
     cov = a @ a.T

@@ -1,20 +1,17 @@
-"""The error function over a stiffness, the fitted parameters, their profiles and correlation."""
+"""The error function over a stiffness, the fitted parameters and their correlation."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
+from ema_pipeline.fit.types import ErrorSweep, FitResult
 from ema_pipeline.number_text import format_value, plain, prefixed
 from ema_pipeline.report.name_text import words
 from ema_pipeline.report.style import (
     BLACK,
-    GREY,
     LINES,
     MARKERS,
     MEASURED,
@@ -27,7 +24,6 @@ from ema_pipeline.report.style import (
     styled,
 )
 
-PROFILES_PER_SHEET = 6
 _NUMBERS_UP_TO = 14
 
 
@@ -144,53 +140,6 @@ def parameter_forest(fit: FitResult) -> Figure:
             fontweight="bold" if p.identified else "normal",
         )
     return figure
-
-
-@styled
-def profiles(parameters: Sequence[ParameterEstimate]) -> Figure:
-    """Profile likelihoods: 1 marks one standard deviation, 4 two; dashed the parabola of value ± σ."""
-    rows = -(-len(parameters) // 3)
-    figure = new_figure(2.15 * rows + 0.35)
-    grid = figure.add_gridspec(rows, 3, hspace=0.75, wspace=0.3, **margins(figure, top=0.35, bottom=0.75))
-    for k, p in enumerate(parameters):
-        ax = figure.add_subplot(grid[k // 3, k % 3])
-        _profile(ax, p, first=k % 3 == 0)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=4, frameon=False)
-    return figure
-
-
-def _profile(ax: Axes, p: ParameterEstimate, first: bool) -> None:
-    assert p.profile is not None
-    scale, unit = prefixed(max(abs(p.value), p.std if np.isfinite(p.std) else 0), p.unit)
-    x, y = p.profile.values * scale, p.profile.objective
-    ax.axhline(1, color=GREY, lw=0.6, ls=":")
-    ax.axhline(4, color=GREY, lw=0.6, ls=":")
-    low, high = (np.clip(v * scale, x.min(), x.max()) for v in (p.low, p.high))
-    ax.axvspan(low, high, color="#dfe9f2", lw=0, label="68 % interval")
-    if np.isfinite(p.std) and p.std > 0:
-        fine = np.linspace(x.min(), x.max(), 2000)
-        ax.plot(
-            fine,
-            ((fine / scale - p.value) / p.std) ** 2,
-            "--",
-            color=VERMILLION,
-            lw=0.9,
-            label="normal with this σ",
-        )
-    ax.plot(x, y, "o-", color=MEASURED, ms=2.4, label="profile")
-    ax.axvline(p.value * scale, color=BLACK, lw=0.8, label="estimate")
-    if x.min() > 0 and x.max() > 20 * x.min():
-        # profiles that reach out to a bound
-        ax.set_xscale("log")
-        ax.xaxis.set_major_locator(LogLocator(base=10, subs=(1.0,), numticks=5))
-        ax.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-        ax.xaxis.set_minor_formatter(NullFormatter())
-    ax.set_ylim(0, max(5.0, min(9.0, 1.1 * float(np.nanmax(y)))))
-    ax.set_title(words(p.name) + ("" if p.identified else "\nnot identified"), fontsize=7, pad=4)
-    ax.set_xlabel(f"value, {unit or 1}")
-    if first:
-        ax.set_ylabel("−2 Δ log posterior, 1")
 
 
 @styled
