@@ -69,13 +69,12 @@ class Body:
             return self.x + 0.71 * self.radius, self.y + 0.71 * self.radius
         return self.x, self.y + (self.radius + 0.18 if self.form == "ring" else 0.0)
 
-    def displaced(self, motion: Motion, scale: float, phase: float = 0.0) -> tuple[float, float, float]:
-        """Centre and rotation (rad) at a phase of the cycle."""
-        turn = np.exp(1j * phase)
+    def displaced(self, motion: Motion, scale: float) -> tuple[float, float, float]:
+        """Centre and rotation (rad) at phase 0 of the cycle."""
         return (
-            self.x + scale * float((motion.x * turn).real),
-            self.y + scale * float((motion.y * turn).real),
-            scale * float((motion.u * turn).real) / self.radius,
+            self.x + scale * float(motion.x.real),
+            self.y + scale * float(motion.y.real),
+            scale * float(motion.u.real) / self.radius,
         )
 
     def outline(self, samples: int = 6) -> NDArray[np.float64]:

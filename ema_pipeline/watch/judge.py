@@ -15,7 +15,6 @@ from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.description import RecordDescription, TestDescription
 from ema_pipeline.ingest.hit_checks import hits_of_test
-from ema_pipeline.ingest.hit_settings import HitSettings
 from ema_pipeline.ingest.load import load_record
 from ema_pipeline.ingest.records import Hit, HitSamples, Record, cut_hit
 
@@ -57,7 +56,6 @@ def judge_record(
     test: TestDescription,
     entry: RecordDescription,
     before: Sequence[HitSamples],
-    settings: HitSettings | None = None,
 ) -> tuple[JudgedRecord, list[HitSamples]]:
     """Judge one record.
 
@@ -67,7 +65,6 @@ def judge_record(
     entry : RecordDescription
     before : sequence of HitSamples
         Good hits of other records on the same point.
-    settings : HitSettings, optional
 
     Returns
     -------
@@ -81,7 +78,7 @@ def judge_record(
         If the record cannot be read, or contradicts the description.
     """
     record = load_record(test, entry)
-    hits = hits_of_test([record], settings)
+    hits = hits_of_test([record])
     good = [_in_memory(record, h) for h in hits if h.accepted]
     faults = [
         v.message for h in hits for v in h.verdicts if not v.passes and v.consequence != "warn" and v.message

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.simulate_amplitude import COORDINATES, observed, simulated_hits, true_assembly
+from simulate_amplitude import COORDINATES, observed, simulated_hits, true_assembly
 
 from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.observations.hit_aim import as_aimed

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from support.simulate_amplitude import COORDINATES, RIG, observed, simulated_hits, true_assembly
+from simulate_amplitude import COORDINATES, RIG, observed, simulated_hits, true_assembly
 
 from ema_pipeline.effects.library import parse_effect
 from ema_pipeline.levels.differences import smooth_terms
