@@ -72,6 +72,9 @@ def march(
     step : float
         s.
     keep_every : int
+        Steps per sample of the motion.
+    trace : bool
+        True where the forces of the elements are wanted at every step, too.
 
     Returns
     -------

@@ -89,6 +89,7 @@ class Polished:
 
 
 def polished(few: FitData, fit: SegmentFit) -> Polished:
+    """What is kept of a fit to the few rows of a sub-band, with the covariance of its poles where it can be had."""
     covariance = None if few.transposed else _covariance(few, fit)
     return Polished(fit.estimate, fit.held, fit.away, newton_step(fit.estimate, fit.solution), covariance)
 

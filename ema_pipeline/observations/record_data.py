@@ -19,8 +19,6 @@ DISCREPANCY = 1e-2
 """Standard uncertainty of a response as a share of its root mean square: sensors, and a force known at samples only."""
 SHARE = "share of the response"
 """Name of the scatter in proportion to the response itself."""
-_LEAST_NOISE = 1e-5
-"""Noise, in units of the discrepancy, below which records are not told apart from exact ones."""
 _RESTLESS = 1.5
 """A first period that differs from the mean by this many times what others do holds a transient."""
 _AROUND = 5

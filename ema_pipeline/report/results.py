@@ -129,7 +129,7 @@ class RunResults:
     loops : LoopResults or None
         Of a test of force-displacement loops.
     sensitivities : tuple of CheckResult
-        Channels whose scale or sign the model contradicts, see `fit.sensitivities`.
+        Channels whose scale or sign the model contradicts, see `fit.channel_faults`.
     effect_files : tuple of str
         Files with the user's own effects that were named in this call, as a user would type them. No command that is
         shown names another one, since results may come from a stranger.

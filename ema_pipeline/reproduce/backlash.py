@@ -114,6 +114,7 @@ def described_resonance(rig: Rig, mode: int, level: Level) -> float:
 
 
 def backlash_table(rig: Rig, swept: list[list[Level]]) -> Table:
+    """Resonances of the swept levels beside those that a describing function gives, and the stiffness of the teeth."""
     entries = []
     for sweep, levels in zip(SWEEPS, swept, strict=True):
         for level in levels:
