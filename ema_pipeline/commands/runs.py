@@ -153,7 +153,7 @@ def fit(
         return
     results = load_results(run)
     if results.fit is not None:
-        show(terminal.fit_table(results.fit))
+        show(terminal.fit_table(results.fit, results.provisional))
     elif results.current_rung is not None:
         stated = {} if run.model is None else run.model.parameters
         units = {name: p.unit for name, p in stated.items()}

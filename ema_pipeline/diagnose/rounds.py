@@ -97,11 +97,10 @@ def round_of(
     judged: list[Judged] = []
     for one in sorted((r for r in ranking.ranked if r.final), key=lambda r: -r.gain):
         judged.append(judge(observations, ranking, one, settings, nothing, judged))
-    judged.sort(key=lambda j: -j.gain)
-    best = next((j for j in judged if j.claimed), None)
+    best = max((j for j in judged if j.claimed), key=lambda j: j.gain, default=None)
     if best is not None:
         judged = [replace(j, gain=best.gain) if _as_good(j, best) else j for j in judged]
-    return weighed(ranking, judged, hypotheses, settings, found)
+    return weighed(ranking, sorted(judged, key=lambda j: -j.gain), hypotheses, settings, found)
 
 
 def _as_good(one: Judged, best: Judged) -> bool:

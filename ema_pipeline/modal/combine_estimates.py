@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ema_pipeline.modal.circle.compare import CLOSE_BANDWIDTHS, FEW_LINES, average, telling
+from ema_pipeline.modal.circle.compare import CLOSE_BANDWIDTHS, FEW_LINES, average_told
 from ema_pipeline.modal.drift.align import Alignment, PeakMovement
 from ema_pipeline.modal.hit_to_hit import peak_of
 from ema_pipeline.modal.identify import ANCHORED
@@ -80,9 +80,8 @@ def _weighed(mode: Mode, peak: PeakMovement | None, record_s: float, decay_rad_s
     frequencies = [NamedEstimate("all FRFs", mode.frequency_hz, mode.frequency_std_hz)]
     dampings = [NamedEstimate("all FRFs", mode.damping_ratio, mode.damping_std)]
     seen = mode.damping_ratio * mode.frequency_hz + decay_rad_s / (2 * np.pi)
-    circles = telling(mode.circles)
-    if circles and 2 * seen * record_s >= FEW_LINES:
-        circle = average(circles)
+    circle = average_told(mode.circles)
+    if circle is not None and 2 * seen * record_s >= FEW_LINES:
         frequencies.append(NamedEstimate("circles", circle.frequency_hz, circle.frequency_std_hz))
         dampings.append(NamedEstimate("circles", circle.damping_ratio, circle.damping_std))
     if peak is not None and ANCHORED not in mode.flags:

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from enum import IntEnum
 
 from ema_pipeline.check_result import CheckResult
-from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
 from ema_pipeline.frf.channel_faults import SENSITIVITY
 from ema_pipeline.frf.signs import SIGN
@@ -71,20 +70,15 @@ def suspicions(results: RunResults) -> tuple[str, ...]:
     return tuple(_sentence(text) for text in found)
 
 
-def identified_words(p: ParameterEstimate, fit: FitResult) -> str:
-    """``"identified by the data"`` or why not."""
-    if p.identified and fails(fit):
+def identified_words(p: ParameterEstimate, provisional: bool) -> str:
+    """``"identified by the data"`` or why not, see `RunResults.provisional`."""
+    if p.identified and provisional:
         return "provisional: the model does not explain the data"
     if p.identified:
         return "identified by the data"
     if p.free:
         return "not identified by the data" + (f": {p.note}" if p.note else "")
     return "not narrowed by the data: its tolerance determines it"
-
-
-def fails(fit: FitResult) -> bool:
-    """True where the model does not fit, so that its values hold only for a model that lacks nothing."""
-    return fit.error > fit.error_limit
 
 
 def _where(results: RunResults, c: ConfigurationResults) -> str:
@@ -103,17 +97,17 @@ def _all(results: RunResults) -> Iterator[tuple[Weight, str]]:
     if results.not_diagnosed:
         yield Weight.MISFIT, f"Nothing was diagnosed: {results.not_diagnosed}"
     if results.fit is not None:
-        yield from _of_fit(results.fit, None if results.diagnosis_is_old else results.diagnosis)
+        found = None if results.diagnosis_is_old else results.diagnosis
+        error = results.fit.error if found is None else found.error
+        yield from _of_fit(results.fit, error, results.provisional)
     for c in results.configurations:
         for weight, text in _of_configuration(c):
             yield weight, _where(results, c) + text
 
 
-def _of_fit(fit: FitResult, found: Diagnosis | None) -> Iterator[tuple[Weight, str]]:
-    """Of the fitted values, in accord with a diagnosis of the same model: it judges by single hits, too."""
-    provisional = fails(fit) and (found is None or found.verdict != "adequate")
+def _of_fit(fit: FitResult, error: float, provisional: bool) -> Iterator[tuple[Weight, str]]:
+    """Of the fitted values; `error` is that of the model as the verdict states it."""
     if provisional:
-        error = fit.error if found is None else found.error
         yield (
             Weight.MISFIT,
             f"The model does not explain the data (error {plain(error, 3)}): "
@@ -122,7 +116,7 @@ def _of_fit(fit: FitResult, found: Diagnosis | None) -> Iterator[tuple[Weight, s
     for p in fit.parameters.values():
         value = format_value(p.value, p.std, p.unit)
         if p.free and not p.identified:
-            told = f"{words(p.name)} ({value}) is {identified_words(p, fit)}. Do not quote it as a result."
+            told = f"{words(p.name)} ({value}) is {identified_words(p, provisional)}. Do not quote it as a result."
             yield Weight.VALUE, told
         elif not provisional and math.isfinite(p.shift_z) and abs(p.shift_z) > FAR_SIGMA:
             yield (

@@ -158,15 +158,15 @@ def page_context(
             {
                 "name": words(p.name),
                 "value": format_value(p.value, p.std, p.unit),
-                "words": summary.identified_words(p, fit),
-                "identified": p.identified and not summary.fails(fit),
+                "words": summary.identified_words(p, results.provisional),
+                "identified": p.identified and not results.provisional,
             }
             for p in summary.stiffnesses(fit)
         ]
         if fit
         else [],
         "configurations": configurations,
-        "parameters": tables.parameters_table(fit) if fit else None,
+        "parameters": tables.parameters_table(fit, results.provisional) if fit else None,
         "sweeps": tables.sweeps_table(fit) if fit and fit.sweeps else None,
         "stepwise": _stepwise(results),
         "differences": tables.differences_table(compared) if compared else None,

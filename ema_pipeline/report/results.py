@@ -166,6 +166,16 @@ class RunResults:
         return self.diagnosis is not None and now != then
 
     @property
+    def provisional(self) -> bool:
+        """True where the model in use does not fit, so that its values hold only for a model that lacks nothing.
+
+        A diagnosis of this model that finds it adequate decides: it judges by single hits, too.
+        """
+        adequate = self.diagnosis is not None and self.diagnosis.verdict == "adequate"
+        fails = self.fit is not None and self.fit.error > self.fit.error_limit
+        return fails and (self.diagnosis_is_old or not adequate)
+
+    @property
     def current_rung(self) -> Rung | None:
         """The model in use as a ladder has it; None where no ladder holds just its effects."""
         rungs = () if self.shown_ladder is None else self.shown_ladder.rungs

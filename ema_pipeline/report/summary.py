@@ -9,7 +9,7 @@ from ema_pipeline.fit.types import FitResult, ParameterEstimate
 from ema_pipeline.inference import ERROR_LIMIT
 from ema_pipeline.number_text import format_value, plain
 from ema_pipeline.report import diagnosis
-from ema_pipeline.report.cautions import cautions, fails, identified_words, suspicions
+from ema_pipeline.report.cautions import cautions, identified_words, suspicions
 from ema_pipeline.report.commands import command
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.name_text import words
@@ -17,7 +17,7 @@ from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.simulation import error_lines, loop_words
 from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC
 
-__all__ = ["cautions", "fails", "findings", "identified_words", "stiffnesses"]
+__all__ = ["cautions", "findings", "identified_words", "stiffnesses"]
 
 TOLD = 6
 """Narrowed parameters that are named."""

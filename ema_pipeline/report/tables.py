@@ -10,10 +10,9 @@ from ema_pipeline.check_result import CheckResult
 from ema_pipeline.correlate.types import Comparison, Pairing, percent_off
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.ingest.records import Hit
-from ema_pipeline.modal.circle.compare import average, telling
+from ema_pipeline.modal.circle.compare import average_told
 from ema_pipeline.modal.types import ModalModel, Mode
 from ema_pipeline.number_text import below, format_percent, format_value, plain, prefixed, signed
-from ema_pipeline.report.cautions import fails
 from ema_pipeline.report.diagnosis import parameter_words
 from ema_pipeline.report.name_text import words
 from ema_pipeline.report.thresholds import FAR_SIGMA, LOW_MAC
@@ -100,15 +99,18 @@ def unpaired_table(pairing: Pairing) -> Table:
     return Table(("side", "mode", "frequency, Hz", "reason"), rows, frozenset({1, 2}))
 
 
-def parameters_table(fit: FitResult) -> Table:
-    """One row per parameter: estimate, 68 % interval, nominal value, shift, and what the data say of it."""
+def parameters_table(fit: FitResult, provisional: bool) -> Table:
+    """One row per parameter: estimate, 68 % interval, nominal value, shift, and what the data say of it.
+
+    See `RunResults.provisional`.
+    """
     rows = []
     for p in fit.parameters.values():
         scale, unit = prefixed(max(abs(p.value), p.std if math.isfinite(p.std) else 0.0), p.unit)
         low, high = (plain(v * scale, 4) if math.isfinite(v) else "open" for v in (p.low, p.high))
         tail = f" {unit}" if unit not in ("", "1") else ""
         far = math.isfinite(p.shift_z) and abs(p.shift_z) > FAR_SIGMA
-        held = "provisional" if fails(fit) else "identified"
+        held = "provisional" if provisional else "identified"
         status = held if p.identified else ("NOT identified" if p.free else "not narrowed")
         rows.append(
             Row(
@@ -392,8 +394,7 @@ def _verdict_cell(verdicts: Sequence[CheckResult]) -> str:
 
 
 def _mode_row(index: int, mode: Mode) -> Row:
-    circles = telling(mode.circles)
-    circle = average(circles) if circles else None  # what the remark about circles compares with
+    circle = average_told(mode.circles)  # what the remark about circles compares with
     cells = (
         str(index + 1),
         _bare(mode.frequency_hz, mode.frequency_std_hz),

@@ -186,9 +186,12 @@ def _alone(compared: Comparison) -> list[str]:
     return found
 
 
-def fit_table(fit: FitResult) -> RenderableType:
-    """Fitted parameters with their uncertainty, nominal values, and what the data say of each."""
-    source = tables.parameters_table(fit).picked((0, 1, 3, 4, 5))
+def fit_table(fit: FitResult, provisional: bool) -> RenderableType:
+    """Fitted parameters with their uncertainty, nominal values, and what the data say of each.
+
+    See `RunResults.provisional`.
+    """
+    source = tables.parameters_table(fit, provisional).picked((0, 1, 3, 4, 5))
     source = _renamed(source, ("parameter", "fitted (±1σ)", "nominal (±1σ)", "shift", "data say"))
     return Group(
         text_table(source, "Parameters; shift: in tolerances"),

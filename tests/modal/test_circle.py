@@ -22,7 +22,7 @@ from ema_pipeline.modal.circle import (
     identify_by_circle,
     on_circle,
 )
-from ema_pipeline.modal.circle.compare import disagreement, telling
+from ema_pipeline.modal.circle.compare import average_told, disagreement
 from ema_pipeline.modal.circle.geometry import algebraic_circle, geometric_circle
 from ema_pipeline.modal.circle.identify import rank_one
 from ema_pipeline.modal.types import ModalModel, Mode, StabilisationChart
@@ -256,7 +256,7 @@ def test_a_circle_without_width_does_not_widen_the_interval_of_its_mode() -> Non
     model = modal_model(frfs, THREE_POLES, THREE_SHAPES)
     (good, *_), *_ = circle_fits(frfs, model)
     lost = replace(good, damping_ratio=1e-6, damping_std=2e-4, natural_frequency_hz=48.0)
-    assert telling([lost, good]) == [good]
+    assert average_told([lost, good]) == average([good])
     mode = replace(model.modes[0], circles=(lost, lost, good))
     assert disagreement(mode, CircleSettings()) == ""
     assert disagreement(replace(mode, circles=(lost, lost)), CircleSettings()) == ""

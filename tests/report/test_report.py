@@ -26,7 +26,6 @@ from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.number_text import format_percent, format_value, signed
 from ema_pipeline.report import plots as report_plots
 from ema_pipeline.report import style, summary, summary_files, tables, terminal
-from ema_pipeline.report.cautions import _of_fit
 from ema_pipeline.report.html import bokeh_script, report_html, write_report
 from ema_pipeline.report.name_text import words
 from ema_pipeline.report.plots import figure_specs, write_plots
@@ -433,11 +432,11 @@ def test_misfit_is_the_first_caution_even_where_values_are_identified(run: RunRe
 def test_a_model_that_the_diagnosis_finds_adequate_is_not_said_to_fail(run: RunResults) -> None:
     """Beside hundreds of data of single hits the modes alone may lie further off."""
     assert run.fit is not None
-    poor = replace(run.fit, error=55.6)
+    poor = replace(run, fit=replace(run.fit, error=55.6))
 
     def told(verdict: str) -> str:
         found: Any = SimpleNamespace(verdict=verdict, error=1.71)
-        return " ".join(text for _, text in _of_fit(poor, found))
+        return " ".join(summary.cautions(replace(poor, diagnosis=found)))
 
     assert "does not explain" not in told("adequate")
     assert "does not explain the data (error 1.71)" in told("unknown_effect")
@@ -523,7 +522,7 @@ def test_comparison_names_modes_that_the_model_does_not_have(run: RunResults) ->
 def test_fit_and_comparison_say_what_epsilon_is(run: RunResults) -> None:
     assert run.fit is not None
     assert run.comparison is not None
-    for table in (terminal.fit_table(run.fit), terminal.comparison_tables(run.comparison)):
+    for table in (terminal.fit_table(run.fit, run.provisional), terminal.comparison_tables(run.comparison)):
         told = " ".join(_printed(table, 80).split())
         assert told.count("ε: the error function of the source papers, the sum over the paired modes") == 1
 
@@ -543,7 +542,7 @@ def _tables(run: RunResults) -> list[object]:
     assert run.fit is not None
     return [
         RunScreen(run, "out"),
-        terminal.fit_table(run.fit),
+        terminal.fit_table(run.fit, run.provisional),
         terminal.modes_table(c.modal),
         terminal.hits_table(c.hits),
         terminal.verdict_table(c.hits),
@@ -588,7 +587,7 @@ def test_names_of_fitted_parameters_are_broken_between_words_only(run: RunResult
     effect = replace(first, name="mesh_stiffness_loss@sun-planet1.fraction")
     fit = replace(run.fit, parameters={**run.fit.parameters, effect.name: effect})
     for width in (80, 70):
-        words = _printed(terminal.fit_table(fit), width).split()
+        words = _printed(terminal.fit_table(fit, run.provisional), width).split()
         assert {"stiffness", "loss", "sun-planet1,", "fraction"} <= set(words)
 
 

@@ -19,7 +19,7 @@ FEW_LINES = 2.0
 """Half-power bandwidth times record length. The response left at the end of a record is exp(-π) = 4 % of its
 start for one line in the half-power band, 0.2 % for two."""
 
-_VAGUE = 1.0
+_WIDTHLESS = 1.0
 """1 σ of a circle's damping ratio, over that, from which it says nothing: the fit has ended at a width of zero."""
 
 _DISTORTED = 0.015  # systematic misfit over the radius
@@ -54,9 +54,10 @@ def average(circles: Sequence[CircleFit]) -> CircleAverage:
     return CircleAverage(frequency, frequency_std, damping, damping_std)
 
 
-def telling(circles: Sequence[CircleFit]) -> list[CircleFit]:
-    """Circles whose damping ratio is not as well zero."""
-    return [c for c in circles if c.damping_std < _VAGUE * c.damping_ratio]
+def average_told(circles: Sequence[CircleFit]) -> CircleAverage | None:
+    """The same of those whose damping ratio is not as well zero; None where there are none."""
+    telling = [c for c in circles if c.damping_std < _WIDTHLESS * c.damping_ratio]
+    return average(telling) if telling else None
 
 
 def attach_circles(frfs: FrfSet, modal: ModalModel, settings: CircleSettings | None = None) -> ModalModel:
@@ -90,10 +91,9 @@ def attach_circles(frfs: FrfSet, modal: ModalModel, settings: CircleSettings | N
 
 def disagreement(mode: Mode, settings: CircleSettings) -> str:
     """How a mode differs from its own circles, e.g. ``"damping 1.2 % against 1 %"``; empty if it does not."""
-    circles = telling(mode.circles)
-    if not circles:
+    circle = average_told(mode.circles)
+    if circle is None:
         return ""
-    circle = average(circles)
     half_width = abs(mode.damping_ratio) * mode.frequency_hz
     words = []
     allowed = settings.flag_sigma * _combined(circle.frequency_std_hz, mode.frequency_std_hz)
