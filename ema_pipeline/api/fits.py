@@ -110,7 +110,7 @@ class Fit(Report):
         ax.plot([], [], "o", color="C0", mfc="white", label="fitted, not identified")
         ax.set_yticks(range(len(shown)), [p.name.replace("_", " ") for p in shown])
         ax.set_xlabel("value over nominal value")
-        ax.legend()
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, fontsize="small", frameon=False)
         return ax
 
     def add(self, *effects: str) -> Fit:
