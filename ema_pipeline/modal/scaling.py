@@ -16,6 +16,10 @@ from ema_pipeline.dof import Dof
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
 
+_ACROSS = 0.03
+"""Share of a mode's largest motion that sensors across it and hits off their direction show at a driving point: between
+those of good and of normal laboratories. Near a node it is more than what moves along the hit."""
+
 
 @dataclass(frozen=True)
 class ScaledShapes:
@@ -26,7 +30,8 @@ class ScaledShapes:
     dofs : tuple of Dof
     shapes : complex ndarray, (n_modes, n_dofs)
     stds, own_stds : ndarray, (n_modes, n_dofs)
-        The latter without what all entries of a mode have in common.
+        The latter without what all entries of a mode have in common. The scale multiplies what was measured, and
+        divides what was only hit.
     scale_std : ndarray, (n_modes,)
         Relative standard deviation of the scale; NaN where unscaled.
     """
@@ -89,9 +94,10 @@ def scale_shapes(
                 std[o] = (
                     0.5 * np.hypot(shape_stds[r, o] * abs(kappa), ref_std[k]) if len(shared) == 1 else std[o]
                 )
-            own = np.concatenate([np.minimum(own, std), ref_std[extra]])
+            off = np.abs(ref[extra]) * relative
+            own = np.concatenate([np.minimum(own, std), np.hypot(ref_std[extra], 2 * off)])
             phi = np.concatenate([phi, ref[extra]])
-            std = np.concatenate([std, np.hypot(ref_std[extra], np.abs(ref[extra]) * relative)])
+            std = np.concatenate([std, np.hypot(ref_std[extra], off)])
         both = _normalised(phi, np.stack([std, own]), keep_scale=bool(shared) and calibrated)
         out[r], (stds[r], own_stds[r]) = both
     if not calibrated:
@@ -105,8 +111,8 @@ def _row_scale(
     """κ with κ²·shape = participation at the shared DOFs, and its relative standard deviation."""
     a = np.array([shape[o] for o, _ in shared])
     b = np.array([part[k] for _, k in shared])
-    sa = np.array([shape_std[o] for o, _ in shared])
-    sb = np.array([part_std[k] for _, k in shared])
+    sa = np.array([np.hypot(shape_std[o], _ACROSS * np.nanmax(np.abs(shape))) for o, _ in shared])
+    sb = np.array([np.hypot(part_std[k], _ACROSS * np.nanmax(np.abs(part))) for _, k in shared])
     ok = np.isfinite(a)
     a, b, sa, sb = a[ok], b[ok], sa[ok], sb[ok]
     power = np.sqrt(np.sum(np.abs(b) ** 2) / max(np.sum(np.abs(a) ** 2), 1e-300))

@@ -54,9 +54,29 @@ def test_what_is_in_common_is_no_part_of_what_entries_have_of_their_own(calibrat
         calibrated=calibrated,
     )  # fmt: skip
     assert found.own_stds.shape == found.stds.shape == (1, 4)
-    assert np.all(found.own_stds <= found.stds)
+    assert np.all(found.own_stds[:, :3] <= found.stds[:, :3])
     size = np.abs(found.shapes[0, 1] / shapes[0, 1])
     np.testing.assert_allclose(found.own_stds[0, 1:3], 0.1 * size * np.array([0.5, 1.0]))
+
+
+def test_a_point_that_was_only_hit_is_as_uncertain_as_the_scale() -> None:
+    """The driving point lies near a node: what it shows may be motion across the hit."""
+    rows = (Dof("a", "x"), Dof("b", "x"))
+    stds, share = np.full((1, 2), 1e-4), np.ones((1, 2))
+
+    def relative(at_driving_point: float) -> tuple[float, float]:
+        shapes = np.array([[at_driving_point, 1.0]], complex)
+        part = np.array([[at_driving_point, 1.0]], complex)
+        found = scale_shapes(
+            rows, (rows[0], Dof("c", "x")), POLES[:1], shapes, stds, share, part, np.full((1, 2), 1e-4),
+            calibrated=True,
+        )  # fmt: skip
+        return float(found.own_stds[0, 2] / abs(found.shapes[0, 2])), float(found.scale_std[0])
+
+    near, scale = relative(0.01)
+    assert near > 1.0
+    assert near == pytest.approx(2 * scale, rel=1e-2)
+    assert relative(1.0)[0] < 0.1
 
 
 def test_shapes_are_compared_by_what_is_their_own_where_that_is_known() -> None:
