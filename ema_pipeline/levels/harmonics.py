@@ -22,6 +22,10 @@ REACH = 1.5
 """Distance from the exact multiple or sum in half-power half-widths of what is made there: the frequencies move
 while they decay."""
 
+SLOWEST = 0.33
+"""Share of the decay rate of the product of the motions that make it, below which a pole is none: a product decays no
+slower than what makes it."""
+
 GROWTH = 1.5
 """Power of the force, above which a response grows like no mode: 1 for a mode, 2 and 3 for what it makes."""
 
@@ -46,7 +50,7 @@ def product_of(mode: Mode, parents: Sequence[Mode]) -> str:
         hz = a * first.frequency_hz + b * second.frequency_hz
         half = abs(a) * _half_width(first) + abs(b) * _half_width(second)
         distance = abs(mode.frequency_hz - hz) / half
-        if hz > 0 and distance < best:
+        if hz > 0 and distance < best and _half_width(mode) > SLOWEST * half:
             best, words = distance, _text(a, first) + (_text(b, second, sign=True) if b else "") + " Hz"
     return words
 

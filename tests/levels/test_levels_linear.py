@@ -158,6 +158,8 @@ def test_products_of_two_modes_are_told_by_their_frequencies(
     assert product_of(at(200.3, a), [a, b]) == "2 × 100 Hz"
     assert product_of(at(270.2, a), [a, b]) == "100 + 170 Hz"
     assert product_of(at(270.2, a), [a]) == ""
+    slow = replace(at(270.2, a), pole=complex(0.2 * a.pole.real, a.pole.imag))
+    assert product_of(slow, [a, b]) == ""  # it outlives what would make it
     made, apart = at(510.3, a), at(800.0, a)
     assert list(may_be_products([a, b, made, apart])) == [False, False, True, False]
 
