@@ -24,6 +24,7 @@ from ema_pipeline.inference import Posterior, Residuals, lower_factor, same_matc
 from ema_pipeline.observations.base import EffectProblem, Observations
 from ema_pipeline.observations.fitting import Fit, Model, transferred
 from ema_pipeline.observations.size_map import LOG_STD, SizeMap
+from ema_pipeline.observations.without_partner import UNEXPLAINED
 from ema_pipeline.processes import spread
 
 _NINE_OF_TEN = 1.2816
@@ -262,6 +263,9 @@ class _Shown:
             return float(np.log(max(gained, 1e-9) / self._wanted(gain, sigmas, known)))
 
         first, begin, change = self._moved(unknown)
+        added = self.problem.modes_added(self.null, begin) if self.linear else 0
+        if added:  # without the effect these would find no partner
+            return float(np.log(UNEXPLAINED * added / self._wanted(gain, sigmas, 1 / self.std))), True
         whole = first if change is None else self.gains.change(change)
         if change is None or not self.linear:
             return over(whole), change is not None

@@ -235,6 +235,11 @@ class AmplitudeProblem(EffectProblem):
         """See `EffectProblem`."""
         return self.modes.tuned(x[: len(self.modes.unknowns)], name)
 
+    def modes_added(self, x: NDArray[np.float64], further: NDArray[np.float64]) -> int:
+        """See `EffectProblem`."""
+        count = len(self.modes.unknowns)
+        return self.modes.modes_added(x[:count], further[:count])
+
     @property
     def sole_parts(self) -> Mapping[str, tuple[str, float]]:
         """See `EffectProblem`."""

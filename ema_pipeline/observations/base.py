@@ -59,6 +59,12 @@ class EffectProblem(Problem, Protocol):
         """Unknowns of the size `name` at which a mode comes to where one was measured that has no partner at `x`."""
         return []
 
+    def modes_added(self, x: NDArray[np.float64], further: NDArray[np.float64]) -> int:
+        """Number of modes that would have been measured at `further` while there is nothing near the band at `x`, where
+        none of them would find a partner.
+        """
+        return 0
+
     def first_order(
         self, found: Posterior, added: Sequence[EffectProblem]
     ) -> list[NDArray[np.float64] | None]:

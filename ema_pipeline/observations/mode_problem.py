@@ -48,6 +48,13 @@ _WRONG = 4.0
 """σ from which a shape is another one."""
 _MOST_TUNED = 2
 """Sizes of an effect that are tried for one measured mode without a partner, best first by the shape."""
+_FOUND = 0.5, 0.95
+"""Shares of the lowest frequency of a measured mode and of the end of the band between which a mode would have been
+measured. The force has energy far below, where no record is long enough."""
+_NEAR_BAND = 0.25, 1.2
+"""The same between which it may have been."""
+_READ = 0.1
+"""Share of its largest motion that some sensor reads of a mode that would be measured."""
 _TWIN = 0.8
 """Modal assurance criterion of two measured modes from which one may be the other's twin."""
 
@@ -293,6 +300,24 @@ class ModeProblem(EffectProblem):
                 like = mac(data.shapes[r], (along @ shapes[: along.shape[1]]).T)[0]
                 found += [float(sizes[k]) for k in np.argsort(-like)[:_MOST_TUNED]]
         return found
+
+    def modes_added(self, x: NDArray[np.float64], further: NDArray[np.float64]) -> int:
+        """See `EffectProblem`: those that sensors read."""
+        count = 0
+        for data in self.observations.data:
+            before, after = (self._modes(data.configuration, at) for at in (x, further))
+            if before is None or after is None or not data.complete or not len(data):
+                continue
+            low, high = float(np.exp(np.min(data.log_frequency))), data.band_hz[1]
+            along = self.sensing(data).along
+            read = np.max(np.abs(along @ after.shapes[: along.shape[1]]), axis=0, initial=0.0)
+            seen = read > _READ * np.max(np.abs(after.shapes), axis=0)
+            begin, end = _FOUND[0] * low, _FOUND[1] * high
+            inside = (after.frequency_hz > begin) & (after.frequency_hz < end) & seen
+            begin, end = _NEAR_BAND[0] * low, _NEAR_BAND[1] * high
+            near = (before.frequency_hz > begin) & (before.frequency_hz < end)
+            count += max(int(np.sum(inside)) - int(np.sum(near)), 0)
+        return count
 
     def first_order(
         self, found: Posterior, added: Sequence[EffectProblem]

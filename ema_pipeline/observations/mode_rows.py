@@ -116,6 +116,8 @@ class Rows:
     blur : ndarray, (k,), optional
         1 σ of what the measurement holds beside what it is compared with. It makes a difference count less, and what is
         left costs what it would on average: it is no evidence for a model or against it.
+    wider : float
+        Price of what is in `own` for the model's sake, at the default scatter.
     """
 
     difference: NDArray[np.float64]
@@ -130,6 +132,7 @@ class Rows:
     model: NDArray[np.float64] | None = None
     noise: str = ""
     blur: NDArray[np.float64] | None = None
+    wider: float = 0.0
 
     def __len__(self) -> int:
         return len(self.difference)
@@ -188,6 +191,7 @@ def whitened(
         at = here.stop
         mode[here] = r.mode + first
         blur = _NONE
+        log_scale += r.wider
         if r.blur is not None:
             blurred[here], blur = r.blur > 0, r.blur
             log_scale += _usual_of_blurred(r, c.heated)

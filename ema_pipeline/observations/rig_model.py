@@ -19,7 +19,14 @@ from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Assembly, Row
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, solved
 from ema_pipeline.mechanics.system import LinearSystem
-from ema_pipeline.mechanics.terms import DAMPING_MATRIX, STRUCTURAL, Matrices, Terms, assemble_terms
+from ema_pipeline.mechanics.terms import (
+    DAMPING_MATRIX,
+    STIFFNESS,
+    STRUCTURAL,
+    Matrices,
+    Terms,
+    assemble_terms,
+)
 from ema_pipeline.observations.effect_terms import AddedTerms, EffectTerms, differences
 from ema_pipeline.observations.mode_pairing import OwnDamping
 from ema_pipeline.observations.parts import DAMPING, DAMPING_SCATTER, Dependence, dependence, part_key
@@ -271,6 +278,25 @@ class RigModel:
             }
             self._nominal[key] = self.rig.assembly(configuration, values)
         return self._nominal[key]
+
+    def strain_in_effects(
+        self, configuration: str, x: NDArray[np.float64], solution: EigenSolution
+    ) -> NDArray[np.float64]:
+        """Share of the strain energy of every undamped mode in springs that the effects add, (n,).
+
+        0 where they add none, and where they add coordinates.
+        """
+        shares = np.zeros(len(solution.eigenvalues))
+        if not self.effects:
+            return shares
+        nothing = np.zeros(len(self.unknowns) - self.shape_start)
+        nothing[: len(self.dependence.geometric)] = x[self.shape_start :][: len(self.dependence.geometric)]
+        rig = self._assembled(configuration, nothing, frozenset(range(len(self.effects))))
+        if len(rig.dofs) == len(shares):
+            stiffness = rig.dense(rig.scaled(x[: self._logs]))[STIFFNESS]
+            own = np.einsum("ir,ir->r", solution.shapes, stiffness @ solution.shapes)
+            shares = np.clip(1 - own / solution.eigenvalues, 0.0, 1.0)
+        return shares
 
     def couples(self, configuration: str) -> bool:
         """True where dampers, losses or gyroscopic effects couple the modes, with the effects at their start values."""

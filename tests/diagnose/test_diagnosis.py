@@ -350,6 +350,27 @@ def test_what_is_known_already_is_not_looked_for_again() -> None:
 # --- verdicts, groups and held-out data ----------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_spring_to_ground_of_a_free_rig_is_named_though_the_mode_that_it_holds_has_little_damping(
+    seed: int,
+) -> None:
+    """What lifts a mode from 0 Hz may lose nothing; and where it is, that mode is in the band."""
+    (modes,) = chain_modes(seed, hidden=added(Spring, 8e4, {"m1.z": 1.0}), held=False).values()
+    assert modes.frequency_hz[0] < 16 < 30 < modes.frequency_hz[1]
+    damping = modes.damping_ratio.copy()
+    damping[0] *= 0.06
+    modes = replace(modes, damping_ratio=damping, damping_std=0.02 * damping)
+    rig = chain(held=False)
+    found = diagnose(observed(rig, {"all": modes}), rig, GENERIC, None, SETTINGS)
+    assert found.verdict == "effect"
+    assert found.ladder.rungs[-1].error < 1.3
+    (first,) = (c for c in found.candidates if c.claimed)
+    assert "spring@m1" in (first.label, *first.equivalents)
+    assert abs(first.parameters["stiffness"].value - 8e4) < 3 * first.parameters["stiffness"].std
+    (limit,) = (one.size for one in found.detection_limits if one.label == "spring@m1")
+    assert limit < 8e4
+
+
 def test_effects_that_explain_the_data_alike_are_a_group_with_a_measurement_that_parts_them() -> None:
     # no shapes: a symmetric chain tells nothing of left or right
     measured = chain_modes(8, GOOD, added(Spring, 4e5, {"m2.z": 1.0}))["all"]

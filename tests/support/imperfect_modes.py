@@ -136,8 +136,8 @@ def _across(assembly: Assembly, name: str) -> Array:
 # --- a rig of the user's own -------------------------------------------------------------------------------------
 
 
-def chain(masses: int = 5, tolerance: float = 0.03, free: bool = False) -> ParametricRig:
-    """Equal masses between equal springs, both ends held; one parameter for all masses and one for all springs."""
+def chain(masses: int = 5, tolerance: float = 0.03, free: bool = False, held: bool = True) -> ParametricRig:
+    """Equal masses between equal springs, both ends held or none; one parameter for all masses, one for all springs."""
     parameters = {
         p.name: p
         for p in (
@@ -146,25 +146,25 @@ def chain(masses: int = 5, tolerance: float = 0.03, free: bool = False) -> Param
             Parameter("modal_damping_ratio", 0.01, "1", 0.3, 0.0, 0.5),
         )
     }
-    return ParametricRig("chain", ("all",), parameters, partial(_chain, masses))
+    return ParametricRig("chain", ("all",), parameters, partial(_chain, masses, held))
 
 
-def _chain(masses: int, configuration: str, values: Mapping[str, float]) -> Assembly:
+def _chain(masses: int, held: bool, configuration: str, values: Mapping[str, float]) -> Assembly:
     dofs = [f"m{i + 1}.z" for i in range(masses)]
     elements: list[Element] = [Mass(f"mass {i + 1}", {d: 1.0}, values["mass"]) for i, d in enumerate(dofs)]
-    rows = [{dofs[0]: 1.0}]
-    rows += [difference({a: 1.0}, {b: 1.0}) for a, b in zip(dofs[1:], dofs[:-1], strict=True)]
-    rows.append({dofs[-1]: 1.0})
+    rows = [difference({a: 1.0}, {b: 1.0}) for a, b in zip(dofs[1:], dofs[:-1], strict=True)]
+    if held:
+        rows = [{dofs[0]: 1.0}, *rows, {dofs[-1]: 1.0}]
     elements += [Spring(f"spring {i}", row, values["stiffness"]) for i, row in enumerate(rows)]
     return Assembly(tuple(dofs), tuple(elements), {}, values["modal_damping_ratio"])
 
 
 def chain_modes(
-    seed: int, lab: Lab = NORMAL, hidden: Hidden | None = None, masses: int = 5
+    seed: int, lab: Lab = NORMAL, hidden: Hidden | None = None, masses: int = 5, held: bool = True
 ) -> dict[str, MeasuredModes]:
     """Modes of the chain, every mass with a sensor."""
     names = [f"m{i + 1}.z" for i in range(masses)]
-    return measure(chain(masses), {"all": names}, (10.0, 500.0), seed, lab, hidden)
+    return measure(chain(masses, held=held), {"all": names}, (10.0, 500.0), seed, lab, hidden)
 
 
 PLANETARY_BODIES = {
