@@ -9,8 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
+from itertools import pairwise
 
 import numpy as np
+import scipy.linalg
 from numpy.typing import NDArray
 
 from ema_pipeline.effects.base import PlacedEffect
@@ -95,6 +97,19 @@ class LinearTerms:
                 return None
         return linear
 
+    @classmethod
+    def joined(cls, parts: Sequence[LinearTerms]) -> LinearTerms:
+        """The terms of several parts with the same coordinates, none of which depends on another's sizes."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(
+            tuple(s for p in parts for s in p.sizes),
+            Terms.joined([p.start for p in parts]),
+            np.concatenate([p.begin for p in parts]),
+            scipy.linalg.block_diag(*(p.slopes for p in parts)),
+            np.concatenate([p.skew_slopes for p in parts]),
+        )
+
     def at(self, unknowns: Real) -> Terms:
         """Terms at the sizes' unknowns, (k,)."""
         return self._at(np.array([s.coordinate(float(x)) for s, x in zip(self.sizes, unknowns, strict=True)]))
@@ -162,11 +177,20 @@ class AddedTerms:
         added = Assembly(dofs or edited.dofs, edited.elements[before:])
         return assemble_terms(added, self.dependent, part_key)
 
-    @property
-    def anew(self) -> bool:
-        """True where the effect adds elements whose terms are not linear in its sizes, and does no more than that."""
-        adds = self.at(_unknowns(self.sizes, _begin(self.sizes))) is not None
-        return adds and LinearTerms.found(self.sizes, self.at) is None
+    @cached_property
+    def adds(self) -> bool:
+        """True where the effect adds elements, and does no more than that."""
+        return self.at(_unknowns(self.sizes, _begin(self.sizes))) is not None
+
+    @cached_property
+    def _linear(self) -> LinearTerms | None:
+        return LinearTerms.found(self.sizes, self.at)
+
+    def linear(self, dofs: tuple[str, ...]) -> LinearTerms | None:
+        """Its terms with these coordinates where they are linear in its sizes."""
+        if dofs == self.host.dofs:
+            return self._linear
+        return LinearTerms.found(self.sizes, partial(self.at, dofs=dofs))
 
 
 @dataclass(frozen=True)
@@ -202,26 +226,45 @@ class EffectTerms:
             Terms of the rig at all sizes' unknowns, (k,), without the effects of these numbers.
         """
         sizes = [s for one in each for s in one.sizes]
+        found = cls._of_each(each, sizes, assembled)
+        if found is not None:
+            return found
         linear = LinearTerms.found(sizes, lambda x: assembled(x, frozenset()))
-        if linear is not None:
-            return cls(linear, np.arange(len(sizes)))
+        return None if linear is None else cls(linear, np.arange(len(sizes)))
+
+    @classmethod
+    def _of_each(
+        cls,
+        each: Sequence[AddedTerms],
+        sizes: Sequence[SizeMap],
+        assembled: Callable[[Real, frozenset[int]], Terms],
+    ) -> EffectTerms | None:
+        """With what effects add each on its own, beside the rig with all others; None where they depend on these."""
         ends = np.cumsum([0, *(len(one.sizes) for one in each)])
-        anew = frozenset(i for i, one in enumerate(each) if one.anew)
-        at = [k for i in range(len(each)) if i not in anew for k in range(ends[i], ends[i + 1])]
-        begin = _begin(sizes)
+        own = [np.arange(a, b) for a, b in pairwise(ends)]
+        adding = [i for i, one in enumerate(each) if one.adds]
+        rest = np.array([k for i in range(len(each)) if i not in adding for k in own[i]], np.int64)
+        begin = _unknowns(sizes, _begin(sizes))
 
         def without(unknowns: Real) -> Terms:
-            x = _unknowns(sizes, begin)
-            x[at] = unknowns
-            return assembled(x, anew)
+            x = begin.copy()
+            x[rest] = unknowns
+            return assembled(x, frozenset(adding))
 
-        linear = LinearTerms.found([sizes[k] for k in at], without) if anew else None
-        if linear is None:
+        others = LinearTerms.found([sizes[k] for k in rest], without)
+        if others is None:
             return None
-        added = tuple((each[i], slice(int(ends[i]), int(ends[i + 1]))) for i in sorted(anew))
-        terms = cls(linear, np.array(at, np.int64), added)
-        tried = [_unknowns(sizes, share * begin) for share in _TRIED]
-        return terms if all(terms._is(assembled(x, frozenset()), x) for x in tried) else None
+        parts, places, added = [others], [rest], []
+        for i in adding:
+            linear = each[i].linear(others.start.dofs)
+            if linear is None:
+                added.append((each[i], slice(int(ends[i]), int(ends[i + 1]))))
+            else:
+                parts.append(linear)
+                places.append(own[i])
+        terms = cls(LinearTerms.joined(parts), np.concatenate(places), tuple(added))
+        tried = _unknowns(sizes, _TRIED[0] * _begin(sizes))
+        return terms if terms._is(assembled(tried, frozenset()), tried) else None
 
     def at(self, unknowns: Real) -> Terms | None:
         """Terms at all sizes' unknowns, (k,); None where an effect does more than add elements there."""
@@ -236,8 +279,6 @@ class EffectTerms:
     def slopes_at(self, unknowns: Real, logs: Real) -> Slopes | None:
         """Derivatives at all sizes' unknowns, (k,), and the rig's unknown logarithms; None as in `at`."""
         own = self.linear.slopes_at(unknowns[self.places], logs)
-        if not self.added:
-            return own
         dense, skew = (np.zeros((len(unknowns), *a.shape[1:])) for a in own)
         dense[self.places], skew[self.places] = own
         for one, place in self.added:

@@ -6,9 +6,10 @@ is one product. Only what an effect edits is differentiated by small differences
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +34,10 @@ from ema_pipeline.observations.parts import DAMPING, DAMPING_SCATTER, Dependence
 from ema_pipeline.observations.size_map import LOG_STD, SizeMap
 from ema_pipeline.rigs.types import Rig
 
-_MOST_KNOWN = 1000
-"""Models of one rig of which the terms of their effects are kept: those of some rankings."""
+T = TypeVar("T")
+
+_MOST_KNOWN = 2000
+"""Effects of one rig, and models with them, of which terms are kept: those of some rankings."""
 
 
 class RigModel:
@@ -232,12 +235,8 @@ class RigModel:
     def _effect_terms(self, configuration: str) -> EffectTerms | None:
         """How the terms depend on the effects' sizes; None where that is not known."""
         if configuration not in self._of_effects:
-            known, key = self.dependence.known, (configuration, self.effects, tuple(self.sizes.values()))
-            if key not in known:
-                if len(known) >= _MOST_KNOWN:
-                    known.clear()
-                known[key] = self._found_effect_terms(configuration)
-            self._of_effects[configuration] = known[key]
+            key = (configuration, self.effects, tuple(self.sizes.values()))
+            self._of_effects[configuration] = self._kept(key, lambda: self._found_effect_terms(configuration))
         return self._of_effects[configuration]
 
     def _found_effect_terms(self, configuration: str) -> EffectTerms | None:
@@ -247,8 +246,18 @@ class RigModel:
         each = []
         for one in self.effects:
             sizes = tuple(self.sizes[one.parameter_name(p.name)] for p in one.effect.parameters)
-            each.append(AddedTerms(host, elements, one, sizes))
+            added = partial(AddedTerms, host, elements, one, sizes)
+            each.append(self._kept((configuration, one, sizes), added))
         return EffectTerms.found(each, partial(self._assembled, configuration))
+
+    def _kept(self, key: tuple[object, ...], make: Callable[[], T]) -> T:
+        """What `make` makes, kept for all models of the rig."""
+        known = self.dependence.known
+        if key not in known:
+            if len(known) >= _MOST_KNOWN:
+                known.clear()
+            known[key] = make()
+        return cast(T, known[key])
 
     def assembly(
         self, configuration: str, shape: NDArray[np.float64], without: frozenset[int] = frozenset()
