@@ -314,12 +314,19 @@ def _scalar(raw: Any, annotation: Any) -> Any:
     if isinstance(raw, bytes):
         raw = raw.decode("utf-8", errors="surrogateescape")
     if annotation is Dof:
-        return Dof.parse(str(raw))
+        return _dof(str(raw))
     if annotation is Path:
         return Path(str(raw))
     if annotation in _SCALARS:
         return annotation(raw)
     return raw.item() if isinstance(raw, np.generic) else raw
+
+
+def _dof(text: str) -> Dof:
+    try:
+        return Dof.parse(text)
+    except EmaError as error:
+        raise DamagedError(str(error)) from None
 
 
 def _strip_optional(annotation: Any) -> tuple[Any, bool]:

@@ -299,7 +299,7 @@ class Store:
             links = [
                 group.get(name, getlink=True)
                 for stage in (() if stages is None else stages)
-                for group in [codec.member(stages, stage)]
+                for group in [_find(stages, stage) or {}]
                 for name in group
             ]
             return [self._part_of(link) for link in links if isinstance(link, h5py.ExternalLink)]
@@ -357,7 +357,8 @@ class Store:
                 result: T = codec.read(group, name, cls, left_out)
             except codec.MissingError:
                 raise EmaError(
-                    f"{self.path}: stage '{stage}' was written by another version of ema; run it again"
+                    f"{self.path}: stage '{stage}' was written by another version of ema; "
+                    f"bring everything up to date with 'ema run RAW --out {self.folder}'"
                 ) from None
             return result
 
@@ -368,7 +369,7 @@ class Store:
             places = [
                 (stage, name)
                 for stage in (() if stages is None else stages)
-                for name in codec.member(stages, stage)
+                for name in _find(stages, stage) or ()
             ]
         found = {}
         for stage, configuration in places:
@@ -391,14 +392,22 @@ def _provenance(group: h5py.Group) -> Provenance:
     return found
 
 
-def _find(file: h5py.File, path: str) -> h5py.Group | None:
-    """The group at `path`, None where there is none."""
+def _find(file: h5py.Group, path: str) -> h5py.Group | None:
+    """The group at `path`, None where there is none.
+
+    Raises
+    ------
+    DamagedError
+        If an array is in its place.
+    """
     group = file
     for step in path.split("/"):
         try:
             group = codec.member(group, step)
         except codec.MissingError:
             return None
+        if not isinstance(group, h5py.Group):
+            raise codec.DamagedError(f"{group.name} is an array where results are kept")
     return group
 
 

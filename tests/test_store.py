@@ -621,3 +621,26 @@ def test_a_stage_whose_origin_lacks_something_is_damaged(tmp_path: Path) -> None
     for read in (store.provenance, lambda: store.key("frf")):
         with pytest.raises(EmaError, match=r"ema\.h5: is damaged \(.*settings is missing\); delete it"):
             read()
+
+
+@pytest.mark.parametrize("place", ["stages", "stages/frf", "stages/frf/all"])
+def test_an_array_in_the_place_of_results_is_damage(tmp_path: Path, place: str) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key", "{}", 0.1, result=np.zeros(3))
+    with h5py.File(store.path, "r+") as file:
+        del file[place]
+        file[place] = np.zeros(3)
+    for read in (store.provenance, store.parts, lambda: store.find("frf", ALL, "result", np.ndarray)):
+        with contextlib.suppress(EmaError):  # another error is a fault of the program
+            read()
+    with pytest.raises(EmaError, match=r"ema\.h5: is damaged \(/stages.* is an array where results are kept\)"):
+        store.key("frf")
+
+
+def test_a_damaged_dof_is_said_with_the_file(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.save("frf", ALL, "key", "{}", 0.1, dofs=(Dof.parse("sun.x"),), dof=Dof.parse("sun.x"))
+    with h5py.File(store.path, "r+") as file:
+        file["stages/frf/all"].attrs["dof"] = b"nowhere"
+    with pytest.raises(EmaError, match=r"ema\.h5: is damaged \(.*dof 'nowhere' is not of the form"):
+        store.find("frf", ALL, "dof", Dof)
