@@ -80,8 +80,10 @@ def replacing(path: Path) -> Iterator[Path]:
     Raises
     ------
     EmaError
-        If the disk is full or the folder cannot be written; what stood at `path` is left as it was.
+        If the disk is full, the folder cannot be written or `path` is a folder; what stood at `path` is left as it was.
     """
+    if path.is_dir():
+        raise EmaError(f"{path}: is a folder; name a file in it")
     scratch = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         yield scratch

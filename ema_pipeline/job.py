@@ -17,7 +17,7 @@ from ema_pipeline.run.opening import existing_run, load_info, new_run, stored_se
 from ema_pipeline.run.rollback import everything_taken_back, settings_taken_back
 from ema_pipeline.run.settings import override
 from ema_pipeline.run.types import Run, RunInfo
-from ema_pipeline.store import ALL, Store
+from ema_pipeline.store import ALL, RESULTS_FILE, Store, check_answer_folder
 
 DescribeSource = Callable[[Path, str | None, str | None, Iterable[str]], RunInfo]
 """Checks what a run starts from; takes source, rig, pipeline and overrides."""
@@ -66,6 +66,7 @@ def run_raw(
     EmaError
         Whatever is wrong with data or settings, in one line.
     """
+    check_answer_folder(out, RESULTS_FILE)
     info = (describe_source or describe)(raw, rig, pipeline, overrides)
     store, effect_files = Store(out), tuple(effect_files)
     info = with_effect_files(store, info, effect_files)

@@ -34,8 +34,15 @@ ALL = "all"
 """Name that stands for all configurations together."""
 
 LOCK_FILE = ".lock"
-RESULTS_FILE = "ema.h5"
+RESULTS_FILE, SERIES_FILE, CHANGES_FILE = "ema.h5", "series.db", "changes.json"
 PARTS_FOLDER = "stages"
+
+ANSWERS = {
+    RESULTS_FILE: "the results of a test",
+    SERIES_FILE: "a series of tests",
+    CHANGES_FILE: "a comparison of two tests",
+}
+"""Files by whose names a folder is known to hold an answer, and of what."""
 
 LARGE_BYTES = 1_000_000
 """Size from which a result gets a file of its own: below, copying ``ema.h5`` costs less than the files' clutter."""
@@ -377,6 +384,27 @@ class Store:
                 if group is not None:
                     found[stage, configuration] = _provenance(group)
         return found
+
+
+def check_answer_folder(folder: Path, own: str) -> None:
+    """Refuse a folder that holds an answer of another kind, whose report and tables would be replaced.
+
+    Parameters
+    ----------
+    folder : Path
+    own : str
+        The file of `ANSWERS` that an earlier answer of the same kind may have left there.
+
+    Raises
+    ------
+    EmaError
+        Also where the folder is a file.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise EmaError(f"{folder}: is no folder; name another with --out")
+    for name, words in ANSWERS.items():
+        if name != own and (folder / name).is_file():
+            raise EmaError(f"{folder}: holds {words}, whose report would be lost; name another with --out")
 
 
 def _group(stage: str, configuration: str) -> str:

@@ -71,3 +71,14 @@ def test_a_scratch_file_keeps_its_failure_until_it_is_asked(tmp_path: Path) -> N
 def test_a_folder_that_cannot_be_copied_says_why_of_its_first_file() -> None:
     text = "[Errno 28] No space left on device"
     assert reason(shutil.Error([("a/b", "c/b", text), ("a/d", "c/d", text)])) == text
+
+
+@pytest.mark.parametrize("name", ["", "folder"])
+def test_a_folder_is_not_replaced_by_a_file(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "folder").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(EmaError, match="is a folder; name a file in it"):
+        replace_file(Path(name), "one")
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]

@@ -22,7 +22,7 @@ from ema_pipeline.report.summary_files import finite
 from ema_pipeline.run.measured import measured_modes
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.run.types import Run
-from ema_pipeline.store import RESULTS_FILE
+from ema_pipeline.store import CHANGES_FILE, RESULTS_FILE
 
 MEASURING = 'stages=["ingest", "hits", "frf", "modal", "levels"]'
 """Stages that are run where a test is given as a raw folder: its modes, and no diagnosis of its own."""
@@ -57,21 +57,6 @@ class Changes:
         ):
             return "changed" if self.modes.changed else "same"
         return "changed" if self.physics.claimed else "same"
-
-
-def check_answer_folder(folder: Path) -> None:
-    """Refuse a folder whose own report the answer would take the place of, and what is no folder.
-
-    Raises
-    ------
-    EmaError
-    """
-    if folder.exists() and not folder.is_dir():
-        raise EmaError(f"{folder}: is no folder; name another with --out")
-    if (folder / RESULTS_FILE).is_file():
-        raise EmaError(
-            f"{folder}: holds the results of a test, whose report would be lost; name another with --out"
-        )
 
 
 def open_test(
@@ -190,6 +175,6 @@ def _lone(mode: tuple[str, int, float]) -> dict[str, Any]:
 
 def write_changes(found: Changes, out: Path) -> Path:
     """Write ``changes.json`` into a folder."""
-    path = out / "changes.json"
+    path = out / CHANGES_FILE
     replace_file(path, json.dumps(changes_content(found), indent=2, ensure_ascii=False) + "\n")
     return path

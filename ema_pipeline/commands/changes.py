@@ -55,19 +55,14 @@ def changes(
     """
     from ema_pipeline.changes.page import write_page
     from ema_pipeline.changes.tables import limits_text, notes, short_modes_table, verdict_text
-    from ema_pipeline.changes.two_tests import (
-        changes_content,
-        check_answer_folder,
-        compare_runs,
-        open_test,
-        write_changes,
-    )
+    from ema_pipeline.changes.two_tests import changes_content, compare_runs, open_test, write_changes
     from ema_pipeline.report.terminal import text_table
+    from ema_pipeline.store import CHANGES_FILE, check_answer_folder
 
     repeats, by_rig = _repeats(repeat or []), rig != NO_RIG
     rig = rig if by_rig else None
     folder = out or Path("results") / f"changes_{a.resolve().name}_{b.resolve().name}"
-    check_answer_folder(folder)
+    check_answer_folder(folder, CHANGES_FILE)
     with progress(quiet) as show_stage:
         run_a = open_test(a, rig, folder / "A", show_stage, effect_file or [])
         run_b = open_test(b, rig, folder / "B", show_stage, effect_file or [])

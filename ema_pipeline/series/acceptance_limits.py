@@ -254,7 +254,14 @@ def _shape(modes: MeasuredModes, k: int) -> Shape | None:
 
 
 def write_limits(limits: Limits, path: Path, notes: Iterable[str] = ()) -> None:
-    """Write ``limits.toml``."""
+    """Write ``limits.toml``; limits that were learned before are replaced, nothing else is.
+
+    Raises
+    ------
+    EmaError
+        If something else is there, or the file cannot be written.
+    """
+    _check_replaceable(path)
     document = tomlkit.document()
     document.add(tomlkit.comment("Limits of 'ema series judge'. Remove what is not to be judged."))
     for text in notes:
@@ -262,6 +269,19 @@ def write_limits(limits: Limits, path: Path, notes: Iterable[str] = ()) -> None:
     for key, value in limits.model_dump(mode="json", by_alias=True, exclude_none=True).items():
         document.add(key, tomlkit.item(value))
     replace_file(path, tomlkit.dumps(document))
+
+
+def _check_replaceable(path: Path) -> None:
+    if not path.exists() or path.is_dir():  # a folder is refused where files are written
+        return
+    try:
+        learned = parse(Limits, read_toml(path), path).learnt_from != ""
+    except EmaError:
+        learned = False
+    if not learned:
+        raise EmaError(
+            f"{path}: holds something else than learned limits and is kept; name another with --to"
+        )
 
 
 def good_lot(tests: pd.DataFrame, wanted: Iterable[str] = ()) -> list[str]:

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.series.rows import COLUMNS, Row, TestRow
+from ema_pipeline.store import SERIES_FILE
 
 if TYPE_CHECKING:
     import pandas as pd
 
-DATABASE = "series.db"
 SCHEMA = 1
 
 _TEXT = frozenset(
@@ -59,7 +59,7 @@ class SeriesDatabase:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.path = folder, folder / DATABASE
+        self.folder, self.path = folder, folder / SERIES_FILE
         with _told(self.path):
             self._connection = sqlite3.connect(self.path)
             # SQLite's journal undoes a half-written test; write-ahead logs do not work on network shares.
@@ -75,11 +75,17 @@ class SeriesDatabase:
         EmaError
             If the folder holds none.
         """
-        if not (folder / DATABASE).is_file():
+        if not (folder / SERIES_FILE).is_file():
             raise EmaError(
-                f"{folder}: holds no {DATABASE}; make one with 'ema series run TREE --out {folder}'"
+                f"{folder}: holds no {SERIES_FILE}; make one with 'ema series run TREE --out {folder}'"
             )
-        return cls(folder)
+        found = cls(folder)
+        if not found.about("tree") and not found.keys():
+            found.close()
+            raise EmaError(
+                f"{found.path}: is of a series that was not run; repeat 'ema series run TREE --out {folder}'"
+            )
+        return found
 
     def _prepare(self) -> None:
         version = int(self._connection.execute("PRAGMA user_version").fetchone()[0])
@@ -87,6 +93,9 @@ class SeriesDatabase:
             raise EmaError(
                 f"{self.path}: has layout {version}, this version of ema knows {SCHEMA}; delete it"
             )
+        self._check_tables(complete=version == SCHEMA)
+        if version == SCHEMA:  # reading leaves the file as it is
+            return
         with self._connection:
             self._connection.execute("CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT)")
             for table, columns in COLUMNS.items():
@@ -95,6 +104,20 @@ class SeriesDatabase:
                 self._connection.execute(f'CREATE TABLE IF NOT EXISTS "{table}" ({own}{unique})')
                 self._connection.execute(f'CREATE INDEX IF NOT EXISTS "{table}_test" ON "{table}" (test)')
             self._connection.execute(f"PRAGMA user_version = {SCHEMA}")
+
+    def _check_tables(self, complete: bool) -> None:
+        """Make sure that the tables are those of a series; one that is being made may lack some."""
+        ours = {"about": {"name", "value"}} | {table: set(columns) for table, columns in COLUMNS.items()}
+        named = self._connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+        columns = "SELECT name FROM pragma_table_info(?)"
+        there = {t: {c for (c,) in self._connection.execute(columns, (t,))} for (t,) in named}
+        wanted = ours if complete else there
+        for table in sorted({*wanted, *there}):
+            if there.get(table) != ours.get(table):
+                raise EmaError(
+                    f"{self.path}: table '{table}' is not that of a series, or of another version of ema; name "
+                    "another folder with --out, or delete the file and run the series again"
+                )
 
     def close(self) -> None:
         """Close the file."""
@@ -151,12 +174,32 @@ class SeriesDatabase:
         return {str(name): (key or "", state) for name, key, state in found}
 
     def table(self, name: str) -> pd.DataFrame:
-        """A whole table, by test, configuration and mode where it has these."""
+        """A whole table, by test, configuration and mode where it has these.
+
+        Raises
+        ------
+        EmaError
+            If it cannot be read, or holds text where a number belongs.
+        """
         import pandas as pd
 
         order = [c for c in ("test", "configuration", "mode", "name") if c in COLUMNS[name]]
         by = ", ".join(order)
-        return pd.read_sql_query(f'SELECT * FROM "{name}" ORDER BY {by}, rowid', self._connection)
+        with _told(self.path):
+            self._check_numbers(name)
+            return pd.read_sql_query(f'SELECT * FROM "{name}" ORDER BY {by}, rowid', self._connection)
+
+    def _check_numbers(self, table: str) -> None:
+        """Make sure that columns of numbers hold nothing else: SQLite would take anything."""
+        for column in COLUMNS[table]:
+            text = (
+                f'SELECT "{column}" FROM "{table}" WHERE typeof("{column}") IN (\'text\', \'blob\') LIMIT 1'
+            )
+            if _type(column) != "TEXT" and (found := self._connection.execute(text).fetchone()):
+                raise EmaError(
+                    f"{self.path}: table '{table}' holds {found[0]!r} in the column '{column}' of numbers; delete the "
+                    "file and run the series again"
+                )
 
 
 def rows_of(table: pd.DataFrame) -> Iterable[Any]:

@@ -41,10 +41,22 @@ class Features:
 
 
 def modes_of_tests(database: SeriesDatabase) -> dict[str, TestModes]:
-    """Measured modes of all tests that have some, by test and configuration."""
+    """Measured modes of all tests that have some, by test and configuration.
+
+    Raises
+    ------
+    EmaError
+        If the table of modes is damaged.
+    """
     found: dict[str, TestModes] = {}
     for (test, configuration), rows in database.table("modes").groupby(["test", "configuration"], sort=True):
-        found.setdefault(str(test), {})[str(configuration)] = _measured(str(configuration), rows)
+        try:
+            modes = _measured(str(configuration), rows)
+        except (ValueError, TypeError, KeyError, IndexError, EmaError):
+            raise EmaError(
+                f"{database.path}: the modes of test '{test}' are damaged; delete the file and run the series again"
+            ) from None
+        found.setdefault(str(test), {})[str(configuration)] = modes
     return found
 
 

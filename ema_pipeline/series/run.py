@@ -13,6 +13,7 @@ from ema_pipeline.describe import DEFAULT_PIPELINE, checked_rig, rig_text
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import file_hash
+from ema_pipeline.ingest.description import DESCRIPTION_FILE
 from ema_pipeline.keys import code_fingerprint
 from ema_pipeline.processes import peak_memory_mb
 from ema_pipeline.run.settings import load_pipeline
@@ -21,7 +22,7 @@ from ema_pipeline.series.engine import Work, in_processes, on_cluster
 from ema_pipeline.series.find import FoundTest, find_tests, raw_fingerprint
 from ema_pipeline.series.one_test import Task, run_task
 from ema_pipeline.series.rows import TestRow
-from ema_pipeline.store import RESULTS_FILE, Store
+from ema_pipeline.store import RESULTS_FILE, SERIES_FILE, Store, check_answer_folder
 
 TESTS_FOLDER = "tests"
 """Folder of a series that holds the results folders."""
@@ -106,6 +107,7 @@ def run_series(
         single test is in its row.
     """
     start = time.perf_counter()
+    _check_folder(out)
     made_of = _made_of(rig, pipeline, overrides, effect_files)
     tests = find_tests(tree, out)
     with Store(out).lock():
@@ -155,6 +157,13 @@ def _absolute(name_or_path: str | None) -> str | None:
     if name_or_path is None or not Path(name_or_path).is_file():
         return name_or_path
     return str(Path(name_or_path).resolve())
+
+
+def _check_folder(out: Path) -> None:
+    """A series neither takes the place of another answer nor lies in the raw folder of a test, which it would hide."""
+    check_answer_folder(out, SERIES_FILE)
+    if (out / DESCRIPTION_FILE).exists():
+        raise EmaError(f"{out}: holds the raw data of a test; name another folder with --out")
 
 
 def _check_tree(database: SeriesDatabase, tree: Path) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.stats
-from bench import ema
+from bench import ema, write_bench
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.series.acceptance_limits import Range, learn_limits, read_limits
@@ -271,3 +272,78 @@ def test_page_of_a_series_without_results(tmp_path: Path, capsys: pytest.Capture
     code, _, err = ema(capsys, "series", "compare", tmp_path / "S")
     assert code == 1
     assert "no test has modes" in err
+
+
+def test_learned_limits_take_the_place_of_nothing_else(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The database, a note and limits by hand are kept."""
+    folder = tmp_path / "S"
+    _series(folder).close()
+    assert ema(capsys, "series", "limits", folder)[0] == 0
+    assert ema(capsys, "series", "limits", folder)[0] == 0
+    (tmp_path / "note.txt").write_text("mine", encoding="utf-8")
+    (tmp_path / "own.toml").write_text("[[modes]]\nfrequency_hz = 30\n", encoding="utf-8")
+    for kept in (folder / "series.db", tmp_path / "note.txt", tmp_path / "own.toml"):
+        before = kept.read_bytes()
+        code, _, err = ema(capsys, "series", "limits", folder, "--to", kept)
+        assert code == 1
+        assert f"{kept}: holds something else than learned limits and is kept" in err
+        assert kept.read_bytes() == before
+    assert "is a folder" in ema(capsys, "series", "limits", folder, "--to", tmp_path)[2]
+
+
+FOREIGN = {
+    "empty": ((), "was not run"),
+    "another_program": (("CREATE TABLE customers (name TEXT)",), "table 'customers' is not that of a series"),
+    "other_columns": (("ALTER TABLE tests DROP COLUMN reason",), "table 'tests' is not that of a series"),
+    "text_for_a_number": (
+        ("UPDATE modes SET frequency_hz = 'abc'",),
+        "holds 'abc' in the column 'frequency_hz'",
+    ),
+    "no_shape": (("UPDATE modes SET shape = '{'",), "the modes of test 'unit1' are damaged"),
+}
+
+
+@pytest.mark.parametrize("case", FOREIGN)
+def test_a_database_that_is_none_of_a_series_is_said_in_one_line(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes, said = FOREIGN[case]
+    folder = tmp_path / "S"
+    if case in ("empty", "another_program"):
+        folder.mkdir()
+        (folder / "series.db").touch()
+    else:
+        _series(folder, 2).close()
+    connection = sqlite3.connect(folder / "series.db")
+    with connection:
+        for text in changes:
+            connection.execute(text)
+    connection.close()
+    for verb in ("compare", "trend", "report"):
+        code, _, err = ema(capsys, "series", verb, folder)
+        assert code == 1
+        assert said in err
+        assert len(err.splitlines()) == 1
+
+
+def test_a_series_takes_the_place_of_no_other_answer(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raw = write_bench(tmp_path / "tree")
+    for name, said in (
+        ("ema.h5", "results of a test"),
+        ("changes.json", "comparison"),
+        ("test.toml", "raw data"),
+    ):
+        out = tmp_path / name.partition(".")[0]
+        out.mkdir()
+        (out / name).touch()
+        code, _, err = ema(capsys, "series", "run", tmp_path / "tree", "--out", out)
+        assert code == 1
+        assert said in err
+        assert [path.name for path in out.iterdir()] == [name]
+    (tmp_path / "S").mkdir()
+    (tmp_path / "S" / "series.db").touch()
+    assert "holds a series of tests" in ema(capsys, "run", raw, "--out", tmp_path / "S")[2]
