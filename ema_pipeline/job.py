@@ -196,7 +196,7 @@ def adding(labels: Iterable[str]) -> Callable[[tuple[str, ...]], tuple[str, ...]
     """The change that adds effects on top."""
 
     def change(effects: tuple[str, ...]) -> tuple[str, ...]:
-        for label in labels:
+        for label in map(_plain_label, labels):
             if label in effects:
                 raise EmaError(f"effect '{label}' is in the model already")
             effects = (*effects, label)
@@ -207,13 +207,20 @@ def adding(labels: Iterable[str]) -> Callable[[tuple[str, ...]], tuple[str, ...]
 
 def removing(label: str) -> Callable[[tuple[str, ...]], tuple[str, ...]]:
     """The change that takes one effect away."""
+    label = _plain_label(label)
 
     def change(effects: tuple[str, ...]) -> tuple[str, ...]:
         if label not in effects:
-            raise EmaError(f"effect '{label}' is not in the model{did_you_mean(label, effects)}")
+            hint = did_you_mean(label, effects) if effects else ", which has no added effects"
+            raise EmaError(f"effect '{label}' is not in the model{hint}")
         return tuple(x for x in effects if x != label)
 
     return change
+
+
+def _plain_label(label: str) -> str:
+    """An effect's label without blanks, so that it is found again however it was typed."""
+    return "@".join(part.strip() for part in label.split("@"))
 
 
 def _with_decisions_of(store: Store, info: RunInfo) -> RunInfo:

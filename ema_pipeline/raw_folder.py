@@ -15,6 +15,7 @@ from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import Hit
 from ema_pipeline.number_text import format_value
 from ema_pipeline.run.settings import PipelineSettings, load_pipeline, toml_value
+from ema_pipeline.settings import parse
 
 if TYPE_CHECKING:
     from ema_pipeline.ingest.description import TestDescription
@@ -90,7 +91,10 @@ def simulate_raw(
     """Simulate a campaign; values and settings are given as ``"name=value"``."""
     from ema_pipeline.effects.library import effect_library
     from ema_pipeline.simulate.campaign import simulate_campaign
+    from ema_pipeline.simulate.settings import SimulationSettings
 
+    named = _named_values(settings, "--set")
+    parse(SimulationSettings, named, "simulate")  # else --set sensors=… would stand for the option --sensor
     return simulate_campaign(
         out,
         rig,
@@ -100,7 +104,7 @@ def simulate_raw(
         sensors=sensors,
         impacts=impacts,
         library=effect_library(effect_files, checked_rig(rig)),
-        **_named_values(settings, "--set"),
+        **named,
     )
 
 

@@ -306,7 +306,8 @@ class Store:
             links = [
                 group.get(name, getlink=True)
                 for stage in (() if stages is None else stages)
-                for group in [_find(stages, stage) or {}]
+                for group in [_find(stages, stage)]
+                if group is not None
                 for name in group
             ]
             return [self._part_of(link) for link in links if isinstance(link, h5py.ExternalLink)]

@@ -74,13 +74,17 @@ def simulate(
             help="Setting of the test, e.g. sample_rate_hz=25600; all: ema settings simulate.",
         ),
     ] = None,
-    format_: Annotated[str, typer.Option("--format", help="uff, csv, hdf5, mat, wav or tdms.")] = "uff",
-    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 0,
+    format_: Annotated[
+        str | None, typer.Option("--format", help="uff, csv, hdf5, mat, wav or tdms; uff if left out.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of all random numbers; 0 if left out.")] = None,
     quiet: Quiet = False,
 ) -> None:
     """Simulate a hammer test of a rig and write it as a raw folder."""
     from ema_pipeline.raw_folder import simulate_raw
 
+    options = {"format": format_, "seed": seed}
+    own = [f"{name}={value}" for name, value in options.items() if value is not None]
     made = simulate_raw(
         out,
         rig,
@@ -90,7 +94,7 @@ def simulate(
         values=value or [],
         sensors=sensor or [],
         impacts=impact or [],
-        settings=[*(set_ or []), f"format={format_}", f"seed={seed}"],
+        settings=[*(set_ or []), *own],
     )
     if not quiet:
         where = ", ".join(made.configurations)

@@ -115,6 +115,8 @@ def parse_sized(text: str) -> tuple[str, dict[str, float]]:
     values: dict[str, float] = {}
     for part in filter(None, (p.strip() for p in sizes.split(","))):
         name, equals, number = part.partition("=")
+        if name.strip() in values:
+            raise EmaError(f"'{text}': '{name.strip()}' is given twice; give it once")
         try:
             values[name.strip()] = float(number)
         except ValueError:

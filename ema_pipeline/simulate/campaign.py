@@ -19,7 +19,7 @@ from ema_pipeline.rigs import load_rig, model_modes, rig_names
 from ema_pipeline.rigs.entries import LARGEST
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.settings import parse
-from ema_pipeline.simulate.folder import BAD_HIT, TestFolder
+from ema_pipeline.simulate.folder import BAD_HIT, BLOW_WITHIN_S, LONGEST_CONTACT, TestFolder
 from ema_pipeline.simulate.hits import HitSeries
 from ema_pipeline.simulate.imperfections import generator
 from ema_pipeline.simulate.response import Respond, response, response_by_poles
@@ -103,12 +103,7 @@ def simulate_campaign(
     """
     out = Path(out)
     options = parse(SimulationSettings, settings, "simulate")
-    samples = options.sample_rate_hz * options.duration_s
-    if samples > MOST_SAMPLES:
-        raise EmaError(
-            f"simulate: sample_rate_hz = {options.sample_rate_hz:g} and duration_s = {options.duration_s:g} make "
-            f"{samples:.3g} samples per hit, {MOST_SAMPLES:g} at most; lower one of them"
-        )
+    _check_times(options)
     if any(out.glob("test.toml")) or any(out.glob("*/test.toml")):
         raise EmaError(f"{out}: holds a test already; name another folder or delete it")
     base = rig if not isinstance(rig, str | Path) else load_rig(rig)
@@ -119,13 +114,13 @@ def simulate_campaign(
     true = true_values(made.rig, values or {}, options.scatter, of_values)
     _check_bad_hits(options, chosen)
 
-    out.mkdir(parents=True, exist_ok=True)
-    rig_name = base.name
-    if isinstance(rig, str | Path) and str(rig) not in rig_names():
-        shutil.copyfile(rig, out / "rig.toml")
-        rig_name = ""
-    _check_dofs(base, chosen, (*sensors, *impacts))
+    _check_dofs(base, chosen, sensors, impacts)
+    own_rig = isinstance(rig, str | Path) and str(rig) not in rig_names()
+    rig_name = "" if own_rig else base.name
     tests = _tests(out, base, rig_name, chosen, sensors, impacts, options)
+    out.mkdir(parents=True, exist_ok=True)
+    if own_rig:
+        shutil.copyfile(str(rig), out / "rig.toml")
     with single_blas_thread():
         written = _write(tests, made, true, options, respond, random)
     truth: dict[str, Any] = {
@@ -260,7 +255,14 @@ def _known(names: Sequence[str], known: Sequence[str], what: str) -> list[str]:
     for name in names:
         if name not in known:
             raise EmaError(f"no {what} '{name}'{did_you_mean(name, known)}")
+    _check_once(names, what)
     return list(names)
+
+
+def _check_once(names: Sequence[str], what: str) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise EmaError(f"{what} '{name}' is named twice; name it once")
 
 
 def _places(texts: Sequence[str], assembly: Assembly) -> tuple[Dof, ...]:
@@ -268,10 +270,36 @@ def _places(texts: Sequence[str], assembly: Assembly) -> tuple[Dof, ...]:
     return tuple(d for d in map(Dof.parse, texts) if assembly.has_dof(d.point))
 
 
-def _check_dofs(rig: Rig, configurations: Sequence[str], texts: Sequence[str]) -> None:
-    for dof in map(Dof.parse, texts):
+def _check_dofs(
+    rig: Rig, configurations: Sequence[str], sensors: Sequence[str], impacts: Sequence[str]
+) -> None:
+    for dof in map(Dof.parse, (*sensors, *impacts)):
         if not any(rig.knows(c, dof) for c in configurations):
             rig.assembly(configurations[0]).row(dof.point)  # raises with a hint
+    _check_once([Dof.parse(text).point for text in sensors], "sensor")  # its channel is named by the point
+    _check_once(impacts, "impact")
+
+
+def _check_times(options: SimulationSettings) -> None:
+    """EmaError for records that are too long, or that do not hold the blow."""
+    rate, duration, contact = options.sample_rate_hz, options.duration_s, options.contact_s
+    samples = rate * duration
+    if samples > MOST_SAMPLES:
+        raise EmaError(
+            f"simulate: sample_rate_hz = {rate:g} and duration_s = {duration:g} make {samples:.3g} samples per hit, "
+            f"{MOST_SAMPLES:g} at most; lower one of them"
+        )
+    if rate * contact < 1:
+        raise EmaError(
+            f"simulate: contact_s = {contact:g} is shorter than a sample at sample_rate_hz = {rate:g}, so that the "
+            "force would not be seen; raise one of them"
+        )
+    latest = options.pretrigger_s + BLOW_WITHIN_S + LONGEST_CONTACT * contact
+    if duration <= latest:
+        raise EmaError(
+            f"simulate: duration_s = {duration:g} ends before the blow does, {latest:.3g} s after the start; raise it, "
+            "or lower pretrigger_s or contact_s"
+        )
 
 
 def _check_bad_hits(options: SimulationSettings, configurations: Sequence[str]) -> None:

@@ -23,6 +23,12 @@ from ema_pipeline.simulate.settings import SimulationSettings
 from ema_pipeline.simulate.writers import SUFFIX, WRITERS
 
 BAD_HIT = re.compile(r"^(?:(?P<configuration>[^:#]+):)?(?P<dof>[^:#]+)#(?P<number>\d+)$")
+BLOW_WITHIN_S = 0.01
+"""Latest start of a blow after the pre-trigger."""
+
+LONGEST_CONTACT = 1.05
+"""Longest contact of a hit over the stated one; the shortest is as much shorter."""
+
 _BOUNCE_DELAY_S = (0.006, 0.012)
 _BOUNCE_SIZE = (0.25, 0.5)
 
@@ -145,9 +151,9 @@ class TestFolder:
         o = self.options
         blows = []
         for i, number in enumerate(range(first, min(first + o.hits_per_record, o.hits + 1))):
-            time = i * o.duration_s + o.pretrigger_s + random.uniform(0, 0.01)
+            time = i * o.duration_s + o.pretrigger_s + random.uniform(0, BLOW_WITHIN_S)
             peak = level * max(0.2, 1 + o.force_spread * random.standard_normal())
-            pulses = [Pulse(time, peak, o.contact_s * random.uniform(0.95, 1.05))]
+            pulses = [Pulse(time, peak, o.contact_s * random.uniform(2 - LONGEST_CONTACT, LONGEST_CONTACT))]
             if self._is_bad(o.double_hits, impact, number):
                 pulses.append(
                     Pulse(

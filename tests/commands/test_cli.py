@@ -593,6 +593,35 @@ def test_bad_settings_are_one_clear_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_settings_of_a_simulated_test_are_those_that_were_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Format and seed have options of their own, which take no effect where they are left out."""
+    short = ("--rig", "frame", "--set", "hits=1", "--set", "duration_s=0.2")
+    given = ("--set", "seed=3", "--set", "format=csv")
+    assert ema(capsys, "simulate", tmp_path / "a", *short, *given)[0] == 0
+    assert ema(capsys, "simulate", tmp_path / "b", *short, "--seed", "3", "--format", "csv")[0] == 0
+    a, b = (sorted((tmp_path / name).glob("*.csv")) for name in "ab")
+    assert len(a) == 3
+    assert [path.read_bytes() for path in a] == [path.read_bytes() for path in b]
+    code, _, err = ema(capsys, "simulate", tmp_path / "c", *short, "--set", "sensors=x")
+    assert code == 1
+    assert "unknown key 'sensors'" in err
+
+
+def test_an_effect_is_found_again_however_it_was_typed(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(results, out)
+    assert "which has no added effects" in ema(capsys, "remove", out, "sensor_mass@all")[2]
+    assert ema(capsys, "add", out, " sensor_mass @ all")[0] == 0
+    code, _, err = ema(capsys, "add", out, "sensor_mass@all")
+    assert code == 1
+    assert "is in the model already" in err
+    assert ema(capsys, "remove", out, "sensor_mass@all")[0] == 0
+
+
 def test_every_setting_is_listed_with_its_default_its_values_and_why(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -239,7 +239,7 @@ def test_every_format_holds_the_same_volts(tmp_path: Path) -> None:
 
     stem = "storey2_x_150N_1"
     for name in ("hdf5", "csv", "mat", "wav", "tdms", "uff"):
-        simulate_campaign(tmp_path / name, "frame", format=name, duration_s=0.1, hits=1, seed=5)
+        simulate_campaign(tmp_path / name, "frame", format=name, duration_s=0.2, hits=1, seed=5)
     truth = read_h5(tmp_path / "hdf5" / f"{stem}.h5")
     table = pd.read_csv(tmp_path / "csv" / f"{stem}.csv")
     mat = scipy.io.loadmat(tmp_path / "mat" / f"{stem}.mat")
@@ -268,7 +268,7 @@ def test_rig_file_travels_with_the_data(tmp_path: Path) -> None:
     file = tmp_path / "my.toml"
     file.write_text('base = "planetary"\n[geometry]\nplanets = 3\n', encoding="utf-8")
     simulate_campaign(
-        tmp_path / "raw", file, configurations=["no_ring"], duration_s=0.1, hits=1, format="hdf5"
+        tmp_path / "raw", file, configurations=["no_ring"], duration_s=0.2, hits=1, format="hdf5"
     )
     assert (tmp_path / "raw" / "rig.toml").read_text(encoding="utf-8") == file.read_text(encoding="utf-8")
     test = tomllib.loads((tmp_path / "raw" / "test.toml").read_text(encoding="utf-8"))
@@ -298,19 +298,33 @@ def test_rig_file_travels_with_the_data(tmp_path: Path) -> None:
             {"sample_rate_hz": 1e12},
             "sample_rate_hz = 1e\\+12 and duration_s = 2 make 2e\\+12 samples per hit",
         ),
+        (
+            {"sample_rate_hz": 1e-300},
+            "contact_s = 0.0006 is shorter than a sample at sample_rate_hz = 1e-300",
+        ),
+        ({"contact_s": 1e-300}, "contact_s = 1e-300 is shorter than a sample"),
+        (
+            {"duration_s": 0.1},
+            "duration_s = 0.1 ends before the blow does, 0.111 s after the start; raise it",
+        ),
+        ({"contact_s": 1e30}, "duration_s = 2 ends before the blow does"),
+        ({"configurations": ["no_ring", "no_ring"]}, "configuration 'no_ring' is named twice"),
+        ({"sensors": ["sun.x", "-sun.x"]}, "sensor 'sun.x' is named twice"),
+        ({"impacts": ["sun.x", "sun.x"]}, "impact 'sun.x' is named twice"),
+        ({"effects": ["sensor_mass@all:mass=1,mass=2"]}, "'mass' is given twice"),
         ({"duration_s": 1e9}, "make 5.12e\\+12 samples per hit, 1e\\+07 at most; lower one of them"),
     ],
 )
 def test_mistakes_are_named_before_anything_is_written(tmp_path: Path, arguments: dict, message: str) -> None:
     with pytest.raises(EmaError, match=message):
         simulate_campaign(tmp_path / "raw", "planetary", **arguments)
-    assert not list(tmp_path.glob("raw/*/*.toml"))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_that_holds_a_test_is_not_written_over(tmp_path: Path) -> None:
-    simulate_campaign(tmp_path / "raw", "frame", duration_s=0.1, hits=1)
+    simulate_campaign(tmp_path / "raw", "frame", duration_s=0.2, hits=1)
     with pytest.raises(EmaError, match="holds a test already"):
-        simulate_campaign(tmp_path / "raw", "frame", duration_s=0.1, hits=1)
+        simulate_campaign(tmp_path / "raw", "frame", duration_s=0.2, hits=1)
 
 
 SAMPLES = Path(__file__).parents[2] / "sample_data"

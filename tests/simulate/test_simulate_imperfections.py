@@ -222,7 +222,7 @@ def test_a_hit_that_is_off_pushes_both_ways() -> None:
 
 
 def test_hits_scatter_in_direction_and_each_is_written_down(tmp_path: Path) -> None:
-    simulate_campaign(tmp_path, RIG, aim_deg=8.0, hits=12, duration_s=0.05, configurations=["no_ring"])
+    simulate_campaign(tmp_path, RIG, aim_deg=8.0, hits=12, duration_s=0.15, configurations=["no_ring"])
     truth = json.loads((tmp_path / "truth.json").read_text(encoding="utf-8"))
     aims = [a for r in truth["configurations"]["no_ring"]["records"] for a in r["aim_deg"]]
     assert len(aims) == 48
@@ -378,7 +378,7 @@ def test_every_rig_can_be_imperfect(tmp_path: Path, rig: str | int, effect: str 
 
 
 def test_each_imperfection_leaves_the_others_and_the_noise_as_they_are(tmp_path: Path) -> None:
-    common: dict[str, Any] = {"imperfection": "normal", "duration_s": 0.05, "hits": 1, "format": "hdf5"}
+    common: dict[str, Any] = {"imperfection": "normal", "duration_s": 0.15, "hits": 1, "format": "hdf5"}
     _, full = simulated(tmp_path / "full", "frame", **common)
     _, less = simulated(tmp_path / "less", "frame", aim_deg=0.0, part_scatter=0.0, **common)
     assert less["imperfections"]["channels"] == full["imperfections"]["channels"]
