@@ -33,6 +33,9 @@ TRUTH_FILE = "truth.json"
 MOST_SAMPLES = 1e7
 """Per hit; a hundred times what hammer tests take."""
 
+LEAST_CONTACT = 0.1
+"""Samples; the recorder's filter spreads a shorter contact over samples with less than a tenth of its force."""
+
 
 @dataclass(frozen=True)
 class SimulatedCampaign:
@@ -289,10 +292,10 @@ def _check_times(options: SimulationSettings) -> None:
             f"simulate: sample_rate_hz = {rate:g} and duration_s = {duration:g} make {samples:.3g} samples per hit, "
             f"{MOST_SAMPLES:g} at most; lower one of them"
         )
-    if rate * contact < 1:
+    if rate * contact < LEAST_CONTACT:
         raise EmaError(
-            f"simulate: contact_s = {contact:g} is shorter than a sample at sample_rate_hz = {rate:g}, so that the "
-            "force would not be seen; raise one of them"
+            f"simulate: contact_s = {contact:g} is too short for sample_rate_hz = {rate:g}: hardly any of the force "
+            "would be recorded; raise one of them"
         )
     latest = options.pretrigger_s + BLOW_WITHIN_S + LONGEST_CONTACT * contact
     if duration <= latest:

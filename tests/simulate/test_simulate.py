@@ -300,9 +300,9 @@ def test_rig_file_travels_with_the_data(tmp_path: Path) -> None:
         ),
         (
             {"sample_rate_hz": 1e-300},
-            "contact_s = 0.0006 is shorter than a sample at sample_rate_hz = 1e-300",
+            "contact_s = 0.0006 is too short for sample_rate_hz = 1e-300",
         ),
-        ({"contact_s": 1e-300}, "contact_s = 1e-300 is shorter than a sample"),
+        ({"contact_s": 1e-300}, "contact_s = 1e-300 is too short"),
         (
             {"duration_s": 0.1},
             "duration_s = 0.1 ends before the blow does, 0.111 s after the start; raise it",
