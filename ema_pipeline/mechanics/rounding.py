@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import scipy.linalg
 
-from ema_pipeline.mechanics.assembly import Assembly, Mass, Nonlinear, Row, Spring, row_matrix
+from ema_pipeline.mechanics.assembly import Assembly, Gyroscopic, Mass, Nonlinear, Row, Spring, row_matrix
 from ema_pipeline.mechanics.modes import eigen_solution
 from ema_pipeline.mechanics.system import LinearSystem
 
@@ -21,8 +21,8 @@ LOWEST_HZ = 0.01
 Weighted = tuple[str, Row, float]
 
 
-def lost_to_rounding(assembly: Assembly) -> Mass | Spring | Nonlinear | None:
-    """The spring or mass beside which a mode that is no rigid-body mode is too low to be computed; None where all are.
+def lost_to_rounding(assembly: Assembly) -> Mass | Spring | Nonlinear | Gyroscopic | None:
+    """The element beside which a mode that is no rigid-body mode is too low to be computed; None where all are.
 
     Raises
     ------
@@ -30,6 +30,8 @@ def lost_to_rounding(assembly: Assembly) -> Mass | Spring | Nonlinear | None:
         As `eigen_solution`.
     """
     system = assembly.system()
+    if (coupling := _too_strong(assembly, system)) is not None:
+        return coupling
     if _all_far_from_zero(system):
         return None
     values, shapes = eigen_solution(system)
@@ -54,6 +56,24 @@ def lost_to_rounding(assembly: Assembly) -> Mass | Spring | Nonlinear | None:
     return found
 
 
+def _too_strong(assembly: Assembly, system: LinearSystem) -> Gyroscopic | None:
+    """The gyroscopic coupling, of either sign, whose own frequency squared is further above all others than `SPAN`.
+
+    A coupling splits two modes at ω into one near its own frequency ω_g and one near ω²/ω_g.
+    """
+    couplings = [e for e in assembly.elements if isinstance(e, Gyroscopic)]
+    if not couplings:
+        return None
+    index = {d: i for i, d in enumerate(assembly.dofs)}
+    highest = float(eigen_solution(system)[0][-1])
+    for e in couplings:
+        a, b = row_matrix([e.a, e.b], index)
+        inertias = [float(v @ np.linalg.solve(system.mass, v)) for v in (a, b)]
+        if highest > 0 and e.coefficient**2 * inertias[0] * inertias[1] > SPAN * highest:
+            return e
+    return None
+
+
 def _all_far_from_zero(system: LinearSystem) -> bool:
     """True where the eigenvalues alone, a third of the work of a solution with shapes, show that nothing is wrong."""
     try:
@@ -63,10 +83,13 @@ def _all_far_from_zero(system: LinearSystem) -> bool:
     return bool(values[0] > values[-1] / SPAN)
 
 
-def said_of_lost(element: Mass | Spring | Nonlinear) -> str:
+def said_of_lost(element: Mass | Spring | Nonlinear | Gyroscopic) -> str:
     """What is wrong with the element that `lost_to_rounding` found, and what to do."""
     if isinstance(element, Mass):
         what, remedy = f"{element.value:g} is so small", "give a larger mass, or leave the coordinate out"
+    elif isinstance(element, Gyroscopic):
+        what = f"{element.coefficient:g} is so large"
+        remedy = "give a coupling nearer to 0"
     else:
         what = f"{_stiffness(element):g} is so large"
         remedy = "give a smaller stiffness, or make one body of the two"

@@ -31,7 +31,7 @@ from ema_pipeline.mechanics.laws import (
 from ema_pipeline.mechanics.rounding import lost_to_rounding, said_of_lost
 from ema_pipeline.rigs.base import ParametricRig
 from ema_pipeline.rigs.element_entries import ElementEntry, ElementRigFile, NonlinearEntry
-from ema_pipeline.rigs.entries import Mistake, merged
+from ema_pipeline.rigs.entries import LARGEST_LOSS_FACTOR, Mistake, check_damper, merged
 from ema_pipeline.rigs.types import Parameter, Rig
 from ema_pipeline.rigs.units import UNITS_OF, factor_to
 from ema_pipeline.toml_lines import Location
@@ -186,6 +186,8 @@ def _check_element(
         raise Mistake((*location, "value"), f"value = {value:g} kg: give a mass above 0")
     if location[0] == "dampers" and value < 0:
         raise Mistake((*location, "value"), f"value = {value:g} N·s/m: a damper cannot be negative")
+    if location[0] == "dampers" and isinstance(entry.value, str):
+        check_damper(parameters[entry.value])
     if isinstance(entry, NonlinearEntry) and entry.law == "friction" and value < 0:
         raise Mistake(
             (*location, "value"), f"value = {value:g} N: friction cannot be negative; give 0 or more"
@@ -196,6 +198,9 @@ def _check_element(
         raise Mistake((*location, "value"), said)
     if (loss := values.get("loss_factor", 0.0)) < 0:
         said = f"loss_factor = {loss:g}: a loss factor cannot be negative; give 0 or more"
+        raise Mistake((*location, "loss_factor"), said)
+    if loss > LARGEST_LOSS_FACTOR:
+        said = f"loss_factor = {loss:g}: no material has one above {LARGEST_LOSS_FACTOR:g}; 15 % is 0.15"
         raise Mistake((*location, "loss_factor"), said)
     for name in entry.configurations:
         if name not in file.configurations:

@@ -15,6 +15,15 @@ from ema_pipeline.toml_lines import Location
 M = TypeVar("M", bound=BaseModel)
 LARGEST_TOLERANCE = 3.0
 
+MODAL_DAMPING_RATIO = "modal_damping_ratio"
+"""Parameter of every rig: the damping ratio of all modes."""
+
+DAMPER_UNIT = "N·s/m"
+"""Unit by which parameters of shipped rigs are known to be those of dampers."""
+
+LARGEST_LOSS_FACTOR = 10.0
+"""Rubber and viscoelastic layers reach about 2; a larger number is a percentage or a slip of the pen."""
+
 SMALLEST, LARGEST = 1e-30, 1e30
 """SI units, of whatever is not 0; products of numbers beyond these leave the range of double precision."""
 
@@ -141,4 +150,25 @@ def merged(default: Parameter, given: ParameterEntry) -> Parameter:
         )
     if default.unit == "kg" and result.value <= 0:
         raise Mistake((*here, "value"), f"parameter '{name}' = {result.value:g}{unit}: give a mass above 0")
+    if name == MODAL_DAMPING_RATIO and not (0 <= minimum and result.value < 1):
+        raise Mistake(
+            (*here, "min" if minimum < 0 else "value"),
+            f"parameter '{name}' = {result.value:g}, from {minimum:g} on: a damping ratio lies from 0 to below 1",
+        )
     return result
+
+
+def check_damper(parameter: Parameter) -> None:
+    """Make sure that a parameter of dampers takes no energy below 0; that of a gyroscopic coupling has either sign.
+
+    Raises
+    ------
+    Mistake
+        Names its lower bound, which holds for its value too.
+    """
+    if parameter.minimum < 0:
+        raise Mistake(
+            ("parameters", parameter.name, "min"),
+            f"parameter '{parameter.name}' has min {parameter.minimum:g} {parameter.unit}: a damper cannot be negative; "
+            "give min = 0 or more",
+        )

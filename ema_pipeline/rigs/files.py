@@ -17,7 +17,7 @@ from ema_pipeline.mechanics.rounding import lost_to_rounding, said_of_lost
 from ema_pipeline.rigs.base import RigKind
 from ema_pipeline.rigs.element_entries import ElementRigFile
 from ema_pipeline.rigs.elements import rig_from_elements
-from ema_pipeline.rigs.entries import Mistake, ParameterOrNumber, merged, parsed
+from ema_pipeline.rigs.entries import DAMPER_UNIT, Mistake, ParameterOrNumber, check_damper, merged, parsed
 from ema_pipeline.rigs.types import Parameter, Rig
 from ema_pipeline.settings import Settings
 from ema_pipeline.toml_lines import key_lines, line_of
@@ -120,6 +120,8 @@ def _derived(file: DerivedRigFile, kinds: Mapping[str, RigKind]) -> Rig:
             hint = did_you_mean(name, defaults)
             raise Mistake(("parameters", name), f"unknown key 'parameters.{name}'{hint}")
         changed[name] = merged(default, entry)
+        if default.unit == DAMPER_UNIT:
+            check_damper(changed[name])
     rig = kind.make(geometry, changed)
     _check_rounding(rig, changed, defaults)
     stated: dict[str, Any] = {"name": file.name, "modal_damping_scatter": file.modal_damping_scatter}

@@ -303,6 +303,13 @@ def test_rig_from_scratch_may_hold_every_law_of_the_mechanics(tmp_path: Path) ->
         ("value = 3e4", "value = -3e4", 49, "value = -30000 N/m: a relaxation cannot be negative"),
         ("time = 0.01", "time = 0", 46, "a relaxation needs a time above 0 s"),
         ('between = ["rotor.x", "rotor.y"]', 'at = "rotor.x"', 18, "key 'between' is missing"),
+        (
+            "value = 30.0",
+            "value = -1e30",
+            20,
+            "'gyroscopic 1' = -1e+30 is so large that the model's lowest modes",
+        ),
+        ("loss_factor = 0.04", "loss_factor = 15", 14, "no material has one above 10; 15 % is 0.15"),
         ("min = -1e12, ", "", 4, "'hardening' = -1e+10 N/m³ lies outside its bounds 0 … inf"),
     ],
 )
@@ -352,6 +359,14 @@ MISTAKES = [
         "'sun mass y' = 1e-20 is so small that the model's lowest modes",
     ),
     ("sun_mass = 2.2", "modal_damping_ratio = 1.5", 9, "'modal_damping_ratio' = 1.5 lies outside"),
+    ("sun_mass = 2.2", "modal_damping_ratio = { value = 1.5, max = 2 }", 9, "from 0 to below 1"),
+    ("sun_mass = 2.2", "modal_damping_ratio = { min = -1e30 }", 9, "a damping ratio lies from 0 to below 1"),
+    (
+        "sun_mass = 2.2",
+        "sun_bearing_damping = { value = -1e30, min = -1e30 }",
+        9,
+        "has min -1e+30 N·s/m: a damper cannot be negative; give min = 0 or more",
+    ),
 ]
 
 
@@ -568,6 +583,34 @@ def test_a_unit_of_another_dimension_is_an_error(
     assert code == 1
     assert f"line {line}: " in err
     assert words in err
+
+
+def test_a_gyroscopic_coupling_may_have_either_sign_and_be_strong(tmp_path: Path) -> None:
+    for value in ("-30.0", "-1e6", "1e6"):
+        text = ROTOR.replace("value = 30.0", f"value = {value}")
+        found = load_rig(write(tmp_path, text)).assembly("default").named("gyroscopic 1")
+        assert isinstance(found, Gyroscopic)
+        assert found.coefficient == float(value)
+
+
+def test_the_bound_of_a_dampers_parameter_is_not_negative(tmp_path: Path) -> None:
+    text = """
+[parameters]
+loss = { value = 1.0, min = -1e30, unit = "N*s/m" }
+[[masses]]
+at = "m.x"
+value = 1.0
+[[springs]]
+at = "m.x"
+value = 1e4
+[[dampers]]
+at = "m.x"
+value = "loss"
+"""
+    with pytest.raises(
+        EmaError, match=r"line 3: parameter 'loss' has min -1e\+30 .*a damper cannot be negative"
+    ):
+        load_rig(write(tmp_path, text))
 
 
 def test_a_model_without_a_mode_that_vibrates_says_what_to_correct(tmp_path: Path) -> None:
