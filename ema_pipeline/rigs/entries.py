@@ -150,7 +150,7 @@ def merged(default: Parameter, given: ParameterEntry) -> Parameter:
         )
     if default.unit == "kg" and result.value <= 0:
         raise Mistake((*here, "value"), f"parameter '{name}' = {result.value:g}{unit}: give a mass above 0")
-    if name == MODAL_DAMPING_RATIO and not (0 <= minimum and result.value < 1):
+    if name == MODAL_DAMPING_RATIO and not (minimum >= 0 and result.value < 1):
         raise Mistake(
             (*here, "min" if minimum < 0 else "value"),
             f"parameter '{name}' = {result.value:g}, from {minimum:g} on: a damping ratio lies from 0 to below 1",
@@ -169,6 +169,6 @@ def check_damper(parameter: Parameter) -> None:
     if parameter.minimum < 0:
         raise Mistake(
             ("parameters", parameter.name, "min"),
-            f"parameter '{parameter.name}' has min {parameter.minimum:g} {parameter.unit}: a damper cannot be negative; "
-            "give min = 0 or more",
+            f"parameter '{parameter.name}' has min {parameter.minimum:g} {parameter.unit}: a damper cannot be "
+            "negative; give min = 0 or more",
         )
