@@ -15,7 +15,8 @@ from ema_pipeline.ingest.description import ChannelDescription, RecordDescriptio
 from ema_pipeline.ingest.driven_entries import record_name
 from ema_pipeline.ingest.file_size_limits import ReadLimits
 from ema_pipeline.ingest.load import RATE_TOLERANCE, ScaledChannels, load_channels
-from ema_pipeline.ingest.pulse import noise_of
+from ema_pipeline.ingest.lost_samples import frozen_stretch
+from ema_pipeline.ingest.pulse import noise_of, step_of
 from ema_pipeline.ingest.records import ResponseChannel
 
 FIT, HELD_OUT = "fit", "held_out"
@@ -167,6 +168,7 @@ def _record(test: TestDescription, entry: RecordDescription, data: ScaledChannel
     period = 0 if frame else entry.period_samples or 0
     for channel, samples in zip((*test.forces, *test.responses), (*force, *responses), strict=True):
         _check_channel(channel, samples, data.full_scale[channel.name], where)
+        _check_frozen(channel, samples, bool(frame), f"{where}, channel '{channel.name}'")
     _check_length(entry, force.shape[1], where)
     if period or frame:
         _check_whole(force, period or frame, where)
@@ -264,6 +266,19 @@ def _check_channel(
         raise EmaError(
             f"{where}: sample {at} is {samples[at]:.4g}, {times:.3g} times the largest other one: a spike, no motion; "
             "record again, or cut it off with first_sample and last_sample"
+        )
+
+
+def _check_frozen(
+    channel: ChannelDescription, samples: NDArray[np.float64], bursts: bool, where: str
+) -> None:
+    """Stretches at one value; a force at 0, or between bursts, rests because nothing drives."""
+    start, stop = frozen_stretch(samples, step_of(samples))
+    rests = channel.quantity == "force" and (bursts or samples[start] == 0.0)
+    if stop > start and not rests:
+        raise EmaError(
+            f"{where}: stands at {samples[start]:.4g} from sample {start} to {stop - 1}, amid a signal: samples were "
+            "lost; export or record again, or cut them off with first_sample and last_sample"
         )
 
 

@@ -15,6 +15,8 @@ from typer.testing import CliRunner
 import ema_pipeline as ema
 from ema_pipeline.cli import app
 from ema_pipeline.ingest.driven import AT_LIMIT, _at_limits, _piled_up
+from ema_pipeline.ingest.lost_samples import frozen_stretch
+from ema_pipeline.ingest.pulse import step_of
 
 RUNNER = CliRunner()
 
@@ -178,6 +180,34 @@ def test_a_spike_in_a_response_is_refused(tmp_path: Path, capsys: pytest.Capture
         largest = np.max(np.abs(file["x"][:]))
         file["x"][900] = 20 * largest
     _one_line(capsys, folder, "channel 'x': sample 900 is", "a spike, no motion; record again")
+
+
+@pytest.mark.parametrize("channel", ["f", "x"])
+@pytest.mark.parametrize(("start", "stop"), [(3000, 3100), (7000, 8192), (0, 300)])
+def test_a_channel_that_stood_still_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], channel: str, start: int, stop: int
+) -> None:
+    """The recorder went on with the last value: force and response no longer belong together."""
+    folder = _folder(tmp_path, DESCRIPTION.replace("period_samples = 512", ""), samples=8192)
+    with h5py.File(tmp_path / "r.h5", "r+") as file:
+        held = np.median(file[channel][:]) + 0.5 * np.std(file[channel][:])
+        file[channel][start:stop] = held
+    said = f"channel '{channel}': stands at {held:.4g} from sample {start} to {stop - 1}"
+    _one_line(capsys, folder, said, "samples were lost", "first_sample and last_sample")
+
+
+def test_what_rests_on_purpose_has_lost_nothing() -> None:
+    """Bursts with nothing between them, holds of a random staircase, and the calm before and after."""
+    random = np.random.default_rng(6)
+    noise = random.standard_normal(4096)
+    staircase = np.repeat(random.standard_normal(64), 64)
+    calm = np.concatenate([np.zeros(500), noise, np.zeros(500)])
+    quiet = np.round(3 * np.sin(2 * np.pi * 1e-4 * np.arange(40_000)))  # slower than the converter's steps
+    for samples in (noise, staircase, calm, quiet):
+        assert frozen_stretch(samples, step_of(samples)) == (0, 0)
+    bursts = np.where(np.arange(4096) % 1024 < 700, noise, 0.0)
+    start, stop = frozen_stretch(bursts, step_of(bursts))
+    assert (stop - start, bursts[start]) == (324, 0.0)  # a force may rest at 0, a response may not
 
 
 @pytest.mark.parametrize("steps", [12, 200])
