@@ -48,12 +48,12 @@ def change_choices(
         For hits and modes that do not exist, and where too little is left to analyse; nothing is changed then.
     """
     effect_files = tuple(effect_files)
-    run = existing_run(folder, effect_files)
-    kind = kind_of(run.info)
-    if "modal" not in kind.measures:
-        raise EmaError(f"{folder}: a test of {kind.words} has no hits and no modes to choose")
-    store = Store(folder)
+    store = Store.existing(folder)
     with store.lock():
+        run = existing_run(folder, effect_files)
+        kind = kind_of(run.info)
+        if "modal" not in kind.measures:
+            raise EmaError(f"{folder}: a test of {kind.words} has no hits and no modes to choose")
         info = dataclasses.replace(run.info, choices=change(run))
         run = new_run(store, info, effect_files)
         run.check_effect_files()

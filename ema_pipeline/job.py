@@ -94,14 +94,15 @@ def run_on(
         Whatever is wrong with the folder or the settings, in one line.
     """
     effect_files = tuple(effect_files)
-    info = existing_run(folder, effect_files).info
-    store = Store(folder)
-    settings = override(stored_settings(store, info), overrides, folder)
-    info = dataclasses.replace(info, pipeline=settings.model_dump_json())
-    run = new_run(store, info, effect_files)
-    run.check_effect_files()
-    with store.lock(), settings_taken_back(store, info):
-        return run, run_stages(run, stages, show)
+    store = Store.existing(folder)
+    with store.lock():
+        info = existing_run(folder, effect_files).info
+        settings = override(stored_settings(store, info), overrides, folder)
+        info = dataclasses.replace(info, pipeline=settings.model_dump_json())
+        run = new_run(store, info, effect_files)
+        run.check_effect_files()
+        with settings_taken_back(store, info):
+            return run, run_stages(run, stages, show)
 
 
 AFTER_EFFECTS = ("fit", "correlate", "report")
@@ -153,11 +154,11 @@ def changed_effects(
     and can be finished. Parameters and errors are those of `change_effects`.
     """
     effect_files = tuple(effect_files)
-    run = existing_run(folder, effect_files)
-    require_judge(run, "add").check_model(run)
-    store = Store(folder)
-    settings = override(stored_settings(store, run.info), overrides, folder)
+    store = Store.existing(folder)
     with store.lock():
+        run = existing_run(folder, effect_files)
+        require_judge(run, "add").check_model(run)
+        settings = override(stored_settings(store, run.info), overrides, folder)
         info = dataclasses.replace(
             run.info, effects=change(run.info.effects), pipeline=settings.model_dump_json()
         )

@@ -44,6 +44,12 @@ ANSWERS = {
 }
 """Files by whose names a folder is known to hold an answer, and of what."""
 
+FILES = (RESULTS_FILE, "summary.json", "modes.csv", "report.html")
+"""Files of a results folder that go back together; large results beside them are never changed."""
+
+BEFORE = ".before."
+"""Begins the name of a folder with these files as they were before a change that is under way."""
+
 LARGE_BYTES = 1_000_000
 """Size from which a result gets a file of its own: below, copying ``ema.h5`` costs less than the files' clutter."""
 
@@ -313,7 +319,11 @@ class Store:
             return [self._part_of(link) for link in links if isinstance(link, h5py.ExternalLink)]
 
     def _tidy(self) -> None:
-        """Remove what killed processes left behind, and the files of results that were replaced."""
+        """Take back and remove what killed processes left behind, and remove the files of results that were replaced."""
+        for before in self.folder.glob(f"{BEFORE}[0-9]*.tmp"):
+            if before.is_dir() and not before.is_symlink() and (before / RESULTS_FILE).is_file():
+                bring_back_files(self.folder, before)
+                os.rename(before, before.with_name(f".done{before.suffixes[0]}.tmp"))
         for left_over in self.folder.glob(".*.[0-9]*.tmp"):
             if left_over.is_dir() and not left_over.is_symlink():
                 shutil.rmtree(left_over, ignore_errors=True)
@@ -385,6 +395,27 @@ class Store:
                 if group is not None:
                     found[stage, configuration] = _provenance(group)
         return found
+
+
+def keep_files(folder: Path, place: Path) -> None:
+    """Keep the files of a results folder as they are, in an empty folder of the same file system."""
+    for name in FILES:
+        if (folder / name).is_file():
+            link_or_copy(folder / name, place / name)
+
+
+def bring_back_files(folder: Path, place: Path) -> None:
+    """Replace the files of a results folder by those that were kept in `place`; new ones go.
+
+    `place` stays whole, so that this can be repeated if it is interrupted.
+    """
+    for name in reversed(FILES):  # the store last: until then the folder is in its later state
+        if (place / name).is_file():
+            with replacing(folder / name) as scratch:
+                scratch.unlink(missing_ok=True)  # what a killed process of the same number left there
+                link_or_copy(place / name, scratch)
+        else:
+            (folder / name).unlink(missing_ok=True)
 
 
 def check_answer_folder(folder: Path, own: str) -> None:

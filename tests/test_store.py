@@ -393,8 +393,8 @@ def test_files_of_replaced_and_of_never_linked_results_are_removed(tmp_path: Pat
 
 def test_what_killed_processes_left_behind_is_removed(tmp_path: Path) -> None:
     (tmp_path / ".report.html.123.tmp").touch()
-    (tmp_path / ".before.123.tmp").mkdir()
-    (tmp_path / ".before.123.tmp" / "ema.h5").touch()
+    (tmp_path / ".keeping.123.tmp").mkdir()
+    (tmp_path / ".keeping.123.tmp" / "ema.h5").touch()
     with Store(tmp_path).lock():
         assert [path.name for path in tmp_path.iterdir()] == [LOCK_FILE]
 
@@ -633,7 +633,9 @@ def test_an_array_in_the_place_of_results_is_damage(tmp_path: Path, place: str) 
     for read in (store.provenance, store.parts, lambda: store.find("frf", ALL, "result", np.ndarray)):
         with contextlib.suppress(EmaError):  # another error is a fault of the program
             read()
-    with pytest.raises(EmaError, match=r"ema\.h5: is damaged \(/stages.* is an array where results are kept\)"):
+    with pytest.raises(
+        EmaError, match=r"ema\.h5: is damaged \(/stages.* is an array where results are kept\)"
+    ):
         store.key("frf")
 
 

@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from ema_pipeline.api.arguments import expect
 from ema_pipeline.plain_text import printable
 
 if TYPE_CHECKING:
@@ -59,8 +60,17 @@ class Report(ABC):
 
 
 def axes_or_new(ax: Axes | None, height_in: float = 3.2) -> Axes:
-    """The axes given, or those of a new pyplot figure."""
+    """The axes given, or those of a new pyplot figure.
+
+    Raises
+    ------
+    EmaError
+        If what is given is no axes.
+    """
     if ax is not None:
+        from matplotlib.axes import Axes
+
+        expect("ax", ax, Axes, "axes of Matplotlib, e.g. those of plt.subplots()")
         return ax
     from matplotlib import pyplot
 

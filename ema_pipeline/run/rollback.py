@@ -14,13 +14,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.files import cannot_write, link_or_copy
+from ema_pipeline.files import cannot_write
 from ema_pipeline.run.opening import load_info, save_info
 from ema_pipeline.run.types import RunInfo
-from ema_pipeline.store import RESULTS_FILE, Store
-
-FILES = (RESULTS_FILE, "summary.json", "modes.csv", "report.html")
-"""Files of a results folder that go back together; large results beside them are never changed."""
+from ema_pipeline.store import BEFORE, Store, bring_back_files, keep_files
 
 
 @dataclasses.dataclass
@@ -59,20 +56,25 @@ def settings_taken_back(store: Store, info: RunInfo) -> Iterator[Change]:
 def everything_taken_back(store: Store, info: RunInfo) -> Iterator[Change]:
     """Describe the run anew; if what follows fails or is interrupted, description, results and report go back.
 
-    The lock of the store must be held from before to after: large results that were replaced are kept until then.
+    So they do if the process is killed: then by whoever locks the store next. The lock of the store must be held from
+    before to after: large results that were replaced are kept until then.
     """
-    place = store.folder / f".before.{os.getpid()}.tmp"
+    making = store.folder / f".keeping.{os.getpid()}.tmp"
+    place = store.folder / f"{BEFORE}{os.getpid()}.tmp"
     try:
         try:
-            place.mkdir()
-            keep_files(store.folder, place)
+            making.mkdir()
+            keep_files(store.folder, making)
+            os.rename(making, place)  # complete from its first moment on
         except OSError as error:
             raise cannot_write(store.path, error) from None
         with _taken_back(Change(), lambda: bring_back_files(store.folder, place)) as change:
             save_info(store, info)
             yield change
     finally:
-        shutil.rmtree(place, ignore_errors=True)
+        with contextlib.suppress(OSError):  # in one step it no longer counts; then it may go bit by bit
+            os.rename(place, making)
+        shutil.rmtree(making, ignore_errors=True)
 
 
 @contextlib.contextmanager
@@ -84,19 +86,3 @@ def _taken_back(change: Change, take_back: Callable[[], None]) -> Iterator[Chang
             with contextlib.suppress(EmaError, OSError):  # it is the error of the change that is told
                 take_back()
         raise
-
-
-def keep_files(folder: Path, place: Path) -> None:
-    """Keep the files of a results folder as they are, in an empty folder of the same file system."""
-    for name in FILES:
-        if (folder / name).is_file():
-            link_or_copy(folder / name, place / name)
-
-
-def bring_back_files(folder: Path, place: Path) -> None:
-    """Replace the files of a results folder by those that were kept in `place`; new ones go."""
-    for name in reversed(FILES):  # the store last: until then the folder is in its later state
-        if (place / name).is_file():
-            os.replace(place / name, folder / name)
-        else:
-            (folder / name).unlink(missing_ok=True)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
+import os
 import shutil
+import signal
 from pathlib import Path
 
 import pytest
@@ -252,3 +255,42 @@ def test_settings_of_a_run_that_fails_are_taken_back(
             describe_source=describe_modes,
         )
     assert load_info(Store(out)) == before
+
+
+def test_a_change_whose_process_was_killed_is_taken_back_by_the_next_one(
+    results: Path, tmp_path: Path
+) -> None:
+    """Description, results and report belong together again, and the change can be repeated."""
+    out = tmp_path / "copy"
+    shutil.copytree(results, out)
+    before = contents(out)
+    child = os.fork()
+    if child == 0:
+        with changed_effects(
+            out, adding(["sensor_mass@all"])
+        ):  # description and ladder are those of the change
+            (out / "report.html").write_text("new", encoding="utf-8")
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(child, 0)
+    assert contents(out) != before
+    with Store(out).lock():
+        assert contents(out) == before
+    assert change_effects(out, adding(["sensor_mass@all"])).info.effects == ("sensor_mass@all",)
+
+
+def test_a_change_builds_on_what_another_process_has_changed(results: Path, tmp_path: Path) -> None:
+    """What is changed is read once the folder is locked: nothing of another change is lost."""
+    out = tmp_path / "copy"
+    shutil.copytree(results, out)
+    lock = Store.lock
+
+    def late(store: Store) -> contextlib.AbstractContextManager[None]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Store, "lock", lock)
+            change_effects(out, adding(["sensor_mass@all"]))
+        return lock(store)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Store, "lock", late)
+        run = change_effects(out, adding(["shaft_torsion@sun"]))
+    assert run.info.effects == ("sensor_mass@all", "shaft_torsion@sun")
