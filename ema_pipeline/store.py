@@ -319,7 +319,7 @@ class Store:
             return [self._part_of(link) for link in links if isinstance(link, h5py.ExternalLink)]
 
     def _tidy(self) -> None:
-        """Take back and remove what killed processes left behind, and remove the files of results that were replaced."""
+        """Take back what killed processes have half changed; remove what they left and results that were replaced."""
         for before in self.folder.glob(f"{BEFORE}[0-9]*.tmp"):
             if before.is_dir() and not before.is_symlink() and (before / RESULTS_FILE).is_file():
                 bring_back_files(self.folder, before)

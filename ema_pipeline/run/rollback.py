@@ -11,7 +11,6 @@ import dataclasses
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 from ema_pipeline.errors import EmaError
 from ema_pipeline.files import cannot_write
