@@ -19,6 +19,7 @@ from ema_pipeline.api.modes import Modes, modes_of
 from ema_pipeline.api.work import Settings, Work, overrides
 from ema_pipeline.choosing import change_choices, excluding, including
 from ema_pipeline.errors import EmaError
+from ema_pipeline.files import reason
 from ema_pipeline.job import adding, change_effects, removing, run_raw
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.run.opening import existing_run
@@ -60,9 +61,15 @@ class Results(Report):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The content of ``summary.json``."""
-        with builtins.open(self.folder / "summary.json", encoding="utf-8") as file:
-            content: dict[str, Any] = json.load(file)
+        """The content of ``summary.json``; EmaError where it cannot be read."""
+        path = self.folder / "summary.json"
+        try:
+            with builtins.open(path, encoding="utf-8") as file:
+                content: dict[str, Any] = json.load(file)
+        except (OSError, ValueError) as error:
+            raise EmaError(
+                f"{path}: cannot be read ({reason(error)}); write it again with 'ema report {self.folder}'"
+            ) from None
         return content
 
     @property

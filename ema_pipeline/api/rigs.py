@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ema_pipeline.api.arguments import plain
+from ema_pipeline.api.arguments import expect, plain, texts
 from ema_pipeline.api.display import Report
 from ema_pipeline.describe import checked_rig
 from ema_pipeline.errors import EmaError
 from ema_pipeline.rigs.base import ParametricRig, model_modes
+from ema_pipeline.rigs.entries import MODAL_DAMPING_RATIO
 from ema_pipeline.rigs.types import Parameter
 
 if TYPE_CHECKING:
@@ -41,6 +44,32 @@ class Rig(Report, ParametricRig):
     modal_damping_scatter : float
         Standard deviation (1 σ) of ln ζ from mode to mode.
     """
+
+    def __post_init__(self) -> None:
+        expect("name", self.name, str, "a text")
+        names = texts("configurations", self.configurations, "a list of names such as ('free', 'clamped')")
+        if not names:
+            raise EmaError(f"rig '{self.name}': has no configuration; give at least one name")
+        expect(
+            "parameters",
+            self.parameters,
+            Mapping,
+            "ema.Parameter by name, e.g. {'k': ema.Parameter('k', 1e4, 'N/m')}",
+        )
+        for name, parameter in self.parameters.items():
+            expect(f"parameter '{name}'", parameter, Parameter, f"ema.Parameter('{name}', value, unit)")
+        for key in ("build", "uses", "classifier"):
+            expect(key, getattr(self, key), Callable, "a function")  # type: ignore[arg-type]
+        scatter = self.modal_damping_scatter
+        if not isinstance(scatter, Real) or not 0 <= scatter < math.inf:
+            raise EmaError(
+                f"rig '{self.name}': modal_damping_scatter = {scatter!r}: give 0 or more, 1 sigma of ln ζ"
+            )
+        damping = self.parameters.get(MODAL_DAMPING_RATIO)
+        if damping is not None and not 0 <= damping.value < 1:
+            raise EmaError(
+                f"rig '{self.name}': {MODAL_DAMPING_RATIO} = {damping.value:g}: a damping ratio lies from 0 to below 1"
+            )
 
     @classmethod
     def of_elements(cls, name: str, **keys: Any) -> Rig:

@@ -80,7 +80,7 @@ class ParametricRig:
         Raises
         ------
         EmaError
-            For an unknown configuration or an unknown parameter.
+            For an unknown configuration or an unknown parameter, or where `build` gives no assembly.
         """
         self._check(configuration)
         complete = {name: p.value for name, p in self.parameters.items()}
@@ -88,7 +88,13 @@ class ParametricRig:
             if name not in complete:
                 raise EmaError(f"rig '{self.name}' has no parameter '{name}'{did_you_mean(name, complete)}")
             complete[name] = float(value)
-        return self.build(configuration, complete)
+        found = self.build(configuration, complete)
+        if not isinstance(found, Assembly):
+            kind = type(found).__name__
+            raise EmaError(
+                f"rig '{self.name}': build gives {kind} for '{configuration}'; let it return an Assembly"
+            )
+        return found
 
     def system(self, configuration: str, values: Mapping[str, float] | None = None) -> LinearSystem:
         """Matrices at `values` (nominal values where left out)."""

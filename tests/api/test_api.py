@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import doctest
 import importlib
+import shutil
 import subprocess
 import sys
 from dataclasses import FrozenInstanceError
@@ -296,3 +298,43 @@ def test_a_table_of_modes_is_fitted_like_identified_ones(tmp_path: Path) -> None
     assert modes.frequency_hz.tolist() == [14.2, 39.5, 57.0]
     ax = Figure().subplots()
     assert modes.plot(ax) is ax
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"name": None}, "name: give a text, not None"),
+        ({"configurations": "default"}, "configurations: give a list of names"),
+        ({"configurations": ()}, "has no configuration; give at least one name"),
+        ({"parameters": None}, "parameters: give ema.Parameter by name"),
+        ({"parameters": {"k": 1e4}}, r"parameter 'k': give ema.Parameter\('k', value, unit\), not 10000.0"),
+        ({"build": None}, "build: give a function, not None"),
+        ({"modal_damping_scatter": float("nan")}, "modal_damping_scatter = nan: give 0 or more"),
+        (
+            {"parameters": {"modal_damping_ratio": ema.Parameter("modal_damping_ratio", -1.0, "1")}},
+            "modal_damping_ratio = -1: a damping ratio lies from 0 to below 1",
+        ),
+    ],
+)
+def test_a_rig_built_in_python_is_checked(changes: dict, message: str) -> None:
+    with pytest.raises(ema.EmaError, match=message):
+        dataclasses.replace(ema.load_rig("frame"), **changes)
+
+
+def test_a_rig_whose_function_gives_no_assembly_says_so() -> None:
+    rig = dataclasses.replace(ema.load_rig("frame"), build=lambda configuration, values: None)
+    with pytest.raises(ema.EmaError, match="build gives NoneType for 'default'; let it return an Assembly"):
+        rig.table()
+
+
+def test_axes_that_are_none_and_a_summary_that_is_gone_are_said(
+    lines: SimpleNamespace, results: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ema.EmaError, match=r"ax: give axes of Matplotlib, .* not 3"):
+        lines.fit.plot(3)
+    shutil.copytree(results, tmp_path / "copy")
+    (tmp_path / "copy" / "summary.json").unlink(missing_ok=True)
+    with pytest.raises(
+        ema.EmaError, match=r"summary\.json: cannot be read .*; write it again with 'ema report"
+    ):
+        _ = ema.open(tmp_path / "copy").summary
