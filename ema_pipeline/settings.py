@@ -35,6 +35,8 @@ def _no_boolean(given: object) -> object:
 FirstLayout = Annotated[Literal[1], BeforeValidator(_no_boolean)]
 """``schema = 1`` of a file."""
 
+_ALTERNATIVE = re.compile(r"(constrained-)?(float|int|str)|\w+\[.*\]")
+
 M = TypeVar("M", bound=BaseModel)
 
 
@@ -59,7 +61,7 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
         return model.model_validate(data)
     except ValidationError as error:
         first = error.errors()[0]
-        path = ".".join(str(p) for p in first["loc"])
+        path = _path(first["loc"])
         if first["type"] == "extra_forbidden":
             known = _fields_at(model, first["loc"][:-1])
             raise EmaError(
@@ -67,11 +69,18 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
             ) from None
         if first["type"] == "missing":
             raise EmaError(f"{where}: key '{path}' is missing; add it") from None
-        message = first["msg"].removeprefix("Value error, ")
+        alternatives = [e["msg"] for e in error.errors() if _path(e["loc"]) == path]
+        message = " or ".join(dict.fromkeys(alternatives)).removeprefix("Value error, ")
         message = message.replace("valid tuple", "list in [ ]").replace("Tuple", "List")
         message = re.sub(r"a valid dictionary( or instance of \w+)?", "a table of keys and values", message)
         shown = _shown(first.get("input"))
         raise EmaError(f"{where}: {path or 'file'} = {shown}: {message}") from None
+
+
+def _path(loc: tuple[int | str, ...]) -> str:
+    """The key; of alternatives, e.g. a word or a number, pydantic adds which of them it tried."""
+    tried = bool(loc) and _ALTERNATIVE.fullmatch(str(loc[-1]))
+    return ".".join(str(step) for step in (loc[:-1] if tried else loc))
 
 
 def _shown(value: Any) -> str:

@@ -22,6 +22,9 @@ def check(raw: Raw, set_: Overrides = None, json: Json = False) -> None:
     from ema_pipeline.report import summary_files, terminal
 
     records = check_records(raw, set_ or [])
+    if records is not None and json:
+        show_json({"records": records})
+        return
     if records is not None:
         for line in records:
             show(line)

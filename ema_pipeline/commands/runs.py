@@ -108,7 +108,10 @@ def stage_command(name: str) -> Callable[..., None]:
         json: Json = False,
     ) -> None:
         from ema_pipeline.job import run_on
+        from ema_pipeline.kinds import require_stage
+        from ema_pipeline.run.opening import existing_run
 
+        require_stage(existing_run(out, effect_file or []), name)
         with progress(quiet) as show_stage:
             run, computed = run_on(out, [name], set_ or [], show_stage, effect_file or [])
         if json:
@@ -196,9 +199,12 @@ def report(
 def levels(out: Out, effect_file: EffectFiles = None, set_: Overrides = None, json: Json = False) -> None:
     """Show what moves with the force of the hits: frequency and damping of every mode by force level."""
     from ema_pipeline.job import run_on
+    from ema_pipeline.kinds import require_stage
     from ema_pipeline.report import terminal
+    from ema_pipeline.run.opening import existing_run
     from ema_pipeline.stages.results import load_results
 
+    require_stage(existing_run(out, effect_file or []), "levels")
     with progress(False) as show_stage:
         run, _ = run_on(out, ["levels", "report"], set_ or [], show_stage, effect_file or [])
     if json:

@@ -21,6 +21,7 @@ from ema_pipeline.ingest.readers import read_raw, reader_of
 from ema_pipeline.ingest.readers.raw import FULL_SCALE, RawChannel, RawRecord
 from ema_pipeline.ingest.swap import is_pulse
 from ema_pipeline.plain_text import printable
+from ema_pipeline.store import RESULTS_FILE
 from ema_pipeline.units import SI_SYMBOL, Unit, find_unit
 
 _HAMMER_NAME = re.compile(r"hammer|hmr|impact|impuls|force|kraft|(^|[^a-z])ham([^a-z]|$)", re.IGNORECASE)
@@ -143,7 +144,9 @@ def _candidates(folder: Path) -> list[Path]:
     return [
         p
         for p in files
-        if p.name not in (DESCRIPTION_FILE, RIG_FILE) and p.stat().st_size > 0 and reader_of(p) is not None
+        if p.name not in (DESCRIPTION_FILE, RIG_FILE, RESULTS_FILE)
+        and p.stat().st_size > 0
+        and reader_of(p) is not None
     ]
 
 

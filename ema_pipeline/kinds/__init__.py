@@ -7,7 +7,7 @@ from ema_pipeline.kinds import continuous, hammer, loops, mode_table
 from ema_pipeline.kinds.base import Judge, Kind
 from ema_pipeline.run.types import Run, RunInfo
 
-__all__ = ["KINDS", "Judge", "Kind", "kind_of", "require_judge", "stages_of"]
+__all__ = ["KINDS", "Judge", "Kind", "kind_of", "require_judge", "require_stage", "stages_of"]
 
 KINDS = {kind.name: kind for kind in (hammer.KIND, mode_table.KIND, loops.KIND, continuous.KIND)}
 """Every kind of test by its name."""
@@ -31,6 +31,24 @@ def stages_of(run: Run) -> frozenset[str]:
     kind = kind_of(run.info)
     judge = kind.judge(run)
     return frozenset((*kind.measures, "report")) | (judge.stages if judge is not None else frozenset())
+
+
+def require_stage(run: Run, stage: str) -> None:
+    """Make sure that a stage works on what a run holds.
+
+    Raises
+    ------
+    EmaError
+        Without a model where the stage needs one, and for a stage of tests of another kind.
+    """
+    there, kind = stages_of(run), kind_of(run.info)
+    if stage in there:
+        return
+    if kind.judge(run) is None and not any(stage in k.measures for k in KINDS.values()):
+        raise run.without_model(stage)
+    raise EmaError(
+        f"{run.store.folder}: {kind.words} have no stage '{stage}'; theirs are {', '.join(sorted(there))}"
+    )
 
 
 def require_judge(run: Run, command: str) -> Judge:

@@ -766,3 +766,44 @@ def test_ctrl_c_ends_within_a_second_with_one_line_that_says_how_to_go_on(
     assert told.startswith("ema: interrupted; finished stages are kept, go on with: ema run")
     done = subprocess.run([*command, "--verbose"], capture_output=True, text=True, check=True)
     assert stage not in done.stdout.partition("Computed: ")[2].split(", ")[0]
+
+
+def test_a_stage_of_another_kind_of_test_is_refused(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing computed and nothing printed would look like an answer."""
+    table, out = results / "modes.csv", tmp_path / "out"
+    options = ("--rig", "planetary", "--set", 'stages=["modal"]', "--quiet")
+    assert ema(capsys, "run", "--modes", table, "--out", out, *options)[0] == 0
+    for verb in ("hits", "levels"):
+        code, text, err = ema(capsys, verb, out)
+        assert (code, text) == (1, "")
+        assert f"tables of modes have no stage '{verb}'; theirs are correlate" in err
+
+
+def test_a_setting_with_alternatives_says_all_of_them(
+    results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, err = ema(capsys, "frf", results, "--set", "frf.exponential_window=x")
+    assert code == 1
+    assert (
+        "frf.exponential_window = 'x': Input should be 'none' or 'auto' or Input should be a valid number"
+        in err
+    )
+
+
+def test_what_loops_hold_is_printed_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_sine_tests(tmp_path, PRINTED, frequencies_hz=(10.0,), amplitudes_m=(1e-3,))
+    code, out, _ = ema(capsys, "check", tmp_path, "--json")
+    assert code == 0
+    assert json.loads(out)["records"][0].startswith("10Hz_1mm.csv: ")
+
+
+def test_results_are_no_records_to_describe(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out").mkdir()
+    shutil.copy(results / "ema.h5", tmp_path / "out")
+    code, _, err = ema(capsys, "init", tmp_path / "out")
+    assert code == 1
+    assert "no record files here" in err
