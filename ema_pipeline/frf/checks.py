@@ -45,6 +45,9 @@ well differ by a factor or in sign with the direction."""
 WEAK_LEVEL, OBVIOUS_FACTOR = 0.15, 7.0
 """From this share on such a test makes factors of up to five by itself: only larger ones speak of a sensitivity."""
 
+_DERIVATIVES = {"acceleration": 0, "velocity": 1, "displacement": 2}
+"""From a quantity to acceleration."""
+
 NOISE_MARGIN = 2.0
 """Reciprocal FRFs may differ by their noise: this many times its power is taken off their difference."""
 
@@ -168,13 +171,17 @@ def _floor(variance: NDArray[np.float64], lines: NDArray[np.intp]) -> NDArray[np
 
 
 def _driving_points(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[CheckResult]:
-    """Sign of driving points: a passive structure takes power in, so that Im(accelerance) ≥ 0."""
+    """Sign of driving points: a passive structure takes power in, so that Im(accelerance) ≥ 0.
+
+    Lines count in the quantity measured: as acceleration, what a velocity sensor reads beside resonances (its noise,
+    a slow mode cut off at the end of the record) would grow with the frequency until it outweighed them.
+    """
     verdicts = []
     driver = "force" if frfs.excitation else "hammer"
     for o, output in enumerate(frfs.outputs):
         if output not in frfs.inputs or frfs.hits[o, frfs.inputs.index(output)] == 0:
             continue
-        loss = _accelerance(frfs, o, frfs.inputs.index(output), inside).imag
+        loss = (frfs.frf[o, frfs.inputs.index(output), inside] * 1j ** _DERIVATIVES[frfs.quantities[o]]).imag
         # Squares: resonances decide, not the noise between them.
         total = float(np.sum(loss**2))
         wrong = float(np.sum(loss[loss < 0] ** 2)) / total if total > 0 else 0.0
@@ -263,5 +270,4 @@ def _noise(frfs: FrfSet, output: int, source: int, inside: slice) -> NDArray[np.
 
 
 def _to_acceleration(frfs: FrfSet, output: int, inside: slice) -> NDArray[np.complex128]:
-    power = {"acceleration": 0, "velocity": 1, "displacement": 2}[frfs.quantities[output]]
-    return np.asarray((2j * np.pi * frfs.frequency_hz[inside]) ** power)
+    return np.asarray((2j * np.pi * frfs.frequency_hz[inside]) ** _DERIVATIVES[frfs.quantities[output]])

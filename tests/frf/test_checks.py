@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -125,6 +127,21 @@ def test_driving_points_count_by_the_squares_of_their_loss_from_the_first_to_the
     mixed = only(made(1j * loss[None, None], band_hz=(10.0, 21.0)), "driving point")
     assert mixed.value == pytest.approx(50.0 / 114.0)
     assert "not at one point" in mixed.message
+
+
+@pytest.mark.parametrize("power", [0, 1, 2], ids=["acceleration", "velocity", "displacement"])
+def test_noise_of_a_sensor_turns_no_driving_point(power: int) -> None:
+    rng = np.random.default_rng(1)
+    frequency = np.arange(1.0, LINES)
+    turn = 1j**power  # the accelerance of a resonance is positive imaginary
+    resonance = 1j / turn / (1 + 1j * (frequency - 15.0))
+    noise = 0.05 * (rng.standard_normal(LINES - 1) + 1j * rng.standard_normal(LINES - 1))
+    frf = np.concatenate([[0.0], resonance + noise])[None, None]
+    quantity = ("acceleration", "velocity", "displacement")[power]
+    set_of = {sign: replace(made(sign * frf), quantities=(quantity,)) for sign in (1.0, -1.0)}
+    found = only(set_of[1.0], "driving point")
+    assert found.passes and found.value < 0.08
+    assert "reversed" in only(set_of[-1.0], "driving point").message
 
 
 def test_line_0_holds_the_offset_and_counts_in_no_check() -> None:
