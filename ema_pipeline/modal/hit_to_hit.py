@@ -108,7 +108,7 @@ def identify_hits(
     release_memory()
     asked = wanted(included, frfs.response_decay_rad_s)
     modal = identify(frfs, settings, progress, alignment.known_peaks(), asked)
-    modal = without_growing(without_hum(modal, frfs, asked), frfs)
+    modal = without_growing(without_hum(modal, hits, frfs, asked), frfs)
     decay = frfs.response_decay_rad_s
     if alignment.n_hits == 1:
         modal = within_decay(of_one_hit(modal, settings.repeatability), alignment, decay)

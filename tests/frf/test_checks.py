@@ -140,7 +140,8 @@ def test_noise_of_a_sensor_turns_no_driving_point(power: int) -> None:
     quantity = ("acceleration", "velocity", "displacement")[power]
     set_of = {sign: replace(made(sign * frf), quantities=(quantity,)) for sign in (1.0, -1.0)}
     found = only(set_of[1.0], "driving point")
-    assert found.passes and found.value < 0.08
+    assert found.passes
+    assert found.value < 0.08
     assert "reversed" in only(set_of[-1.0], "driving point").message
 
 
