@@ -231,9 +231,12 @@ def _moving(mode: Mode, alignment: Alignment, decay_rad_s: float) -> Mode:
     peak = peak_of(mode, alignment, decay_rad_s)
     n = alignment.n_hits
     own = peak.own_spread if peak is not None and peak.single else 0.0
-    # drift was taken off each hit, so that all count alike; its own movement a mode shows in strong hits above all
+    # drift was taken off each hit, as well as it is known; its own movement a mode shows in strong hits above all
     of_own = _mean_std(own, peak.hits, peak.shift - peak.common) if peak is not None else 0.0
-    mean_std = float(np.hypot(alignment.common_std, of_own * _of_few(n)))
+    common = alignment.common_std
+    if peak is not None:
+        common = float(np.hypot(peak.common_std, 0.0 if alignment.aligned else peak.drift))
+    mean_std = float(np.hypot(common, of_own * _of_few(n)))
     trend = _with_force(peak) if peak is not None and own > 0 else 0.0
     if trend:
         # a mode that moves with the force has no one frequency: the interval holds what it moves by

@@ -112,6 +112,52 @@ def test_drift_from_point_to_point_is_known_from_as_many_values_as_points() -> N
     assert stds[0] > drift.std(ddof=1) / np.sqrt(8)
 
 
+def test_a_trend_over_the_hits_is_known_far_better_than_its_size() -> None:
+    rng = np.random.default_rng(4)
+    trend, noise = 2e-3 * np.linspace(-0.5, 0.5, 8), np.full((8, 5), 1e-5)
+    shift = trend[:, None] + noise * rng.standard_normal((8, 5))
+    found = movement(shift, noise, np.ones((8, 5)), np.repeat([0, 1], 4))
+    assert found.common == pytest.approx(trend, abs=2e-5)
+    assert found.spread == pytest.approx(trend.std(), rel=0.1)
+    assert found.mean_std < 0.03 * found.spread
+
+
+def test_peaks_that_different_points_show_are_brought_together_by_the_trend() -> None:
+    """Each peak shows on one point only: nothing but the trend tells how far the rig drifted from point to point."""
+    rng = np.random.default_rng(6)
+    point = np.repeat([0, 1], 5)
+    trend, side = 1e-3 * np.linspace(-0.5, 0.5, 10), np.array([0, 0, 1, 1])
+    shown = side == point[:, None]
+    noise = np.where(shown, 5e-6, 5e-4)
+    shift = trend[:, None] + noise * rng.standard_normal((10, 4))
+    found = movement(shift, noise, np.where(shown, 1.0, 0.01), point)
+    for c in range(4):
+        share = shown[:, c] / 5.0
+        error = float(share @ (found.common - trend))
+        assert abs(error) < 1e-4  # as measured the hits on either point are off by 2.8e-4
+        assert abs(error) < 1.645 * found.error.mean_std(share)
+        assert found.error.mean_std(share) > found.mean_std
+
+
+@pytest.mark.parametrize("trend", [1.0, 0.0], ids=["trend", "hits"])
+@pytest.mark.parametrize("n_points", [1, 3])
+def test_nine_of_ten_intervals_hold_whatever_the_drift(trend: float, n_points: int) -> None:
+    rng = np.random.default_rng(12)
+    inside, widths = [], []
+    for _ in range(120):
+        n = 4 * n_points
+        drift = 1e-3 * (trend * np.linspace(-0.5, 0.5, n) + (1 - trend) * rng.standard_normal(n) / 3)
+        noise = np.full((n, 3), 1e-5)
+        shift = drift[:, None] + noise * rng.standard_normal((n, 3))
+        found = movement(shift, noise, np.ones((n, 3)), np.repeat(np.arange(n_points), 4))
+        mean = shift.mean(axis=0) - found.common.mean()
+        std = np.hypot(found.mean_std, 1e-5 / np.sqrt(n))
+        inside.append(abs(mean[0]) < 1.645 * std)
+        widths.append(std)
+    assert 0.84 < np.mean(inside) < 0.99
+    assert np.median(widths) < (1e-4 if trend else 4e-4)
+
+
 def test_drift_of_all_frequencies_makes_no_twins_and_is_in_the_intervals() -> None:
     found = identified(SYSTEM, 2, [0, 3, 5], drift=1.5e-3)
     modes = found.modal.modes

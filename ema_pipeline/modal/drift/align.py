@@ -24,6 +24,13 @@ NOTICED = 0.03
 """Movement in half-power half-widths from which hits are aligned: a smaller one widens a peak by less than a
 thousandth."""
 
+CLEAR = 3.0
+"""Common movement over how well it is known in a hit, from which hits are aligned even where it widens no peak: a fit
+that weighs hits by their noise finds each mode where it was when those hits struck that show it best."""
+
+LEAST = 3e-4
+"""Movement in half-power half-widths that is left in any case."""
+
 MOVES = 0.05
 """Movement of one peak beyond that of all, in half-power half-widths, from which a fit makes twins of it."""
 
@@ -68,6 +75,10 @@ class PeakMovement:
         Size of the force peak.
     own_spread : float
         Standard deviation of the movement beyond the common one.
+    drift : float
+        Common movement of the hits that show the peak best, which the FRFs as measured have in them.
+    common_std : float
+        How well it is known against rest, widened so that normal intervals of few hits and points hold.
     """
 
     frequency_hz: float
@@ -82,6 +93,8 @@ class PeakMovement:
     shift_std: Real
     force: Real
     own_spread: float
+    drift: float
+    common_std: float
 
 
 @dataclass(frozen=True)
@@ -202,6 +215,8 @@ def _movements(peaks: list[PeakPoles], keys: tuple[HitKey, ...]) -> tuple[Moveme
             shift_std=std[:, c],
             force=force,
             own_spread=float(moved.own_spread[c]),
+            drift=float(drift[c]),
+            common_std=moved.error.mean_std(share[:, c]),
         )
         for c, p in enumerate(peaks)
     )
@@ -236,7 +251,9 @@ def _warps(
 ) -> dict[int, Real]:
     """Shift of every line of every hit; empty where nothing moves enough to be noticed."""
     damping = np.array([p.damping_ratio for p in looked_at])
-    common = moved.common if moved.spread > NOTICED * float(damping.min()) else np.zeros(len(moved.common))
+    clear = moved.spread > CLEAR * float(np.median(moved.common_std))
+    least = (LEAST if clear else NOTICED) * float(damping.min())
+    common = moved.common if moved.spread > least else np.zeros(len(moved.common))
     alone = np.array(
         [p.single and p.own_spread > NOTICED * p.damping_ratio for p in looked_at], dtype=np.bool_
     )

@@ -2,10 +2,11 @@
 
 The frequency of peak c in hit h on point p, relative to its own mean, is taken as
 
-    e_hc = m_c + g_p + d_h + k_pc + x_hc + noise ,
+    e_hc = m_c + b t_h + g_p + d_h + k_pc + x_hc + noise ,
 
-g_p + d_h what all peaks have in common, g_p alike in all hits of a point, for a rig drifts while the hammer moves from
-point to point; k_pc what the peak shows alike in all hits of a point, x_hc its own movement.
+b t_h + g_p + d_h what all peaks have in common: a trend over the order t_h of the hits, as where a rig warms up; g_p
+alike in all hits of a point, for a rig drifts while the hammer moves from point to point; d_h of the hit alone. k_pc is
+what the peak shows alike in all hits of a point, x_hc its own movement.
 k_pc is mostly no movement but a second mode under the peak, or the flank of a stronger one, which another point
 excites in another ratio: it grows as the peak itself gets weaker, and so may x_hc. The variances of g, d, k and x
 are estimated with them (expectation-maximisation).
@@ -13,6 +14,7 @@ are estimated with them (expectation-maximisation).
 References
 ----------
 Laird, N. M. & Ware, J. H., "Random-effects models for longitudinal data", Biometrics 38, 1982.
+Satterthwaite, F. E., "An approximate distribution of estimates of variance components", Biometrics Bulletin 2, 1946.
 """
 
 from __future__ import annotations
@@ -35,8 +37,57 @@ COVERED = 0.95
 TAIL = 4.0
 """Degrees of freedom of the t distribution that stands for errors: single hits may be far off."""
 
+FEWEST_FOR_TREND = 3
+"""Hits without which no trend is told from scatter."""
+
+STEP = 0.1
+"""Relative change of a variance by which is seen what depends on it."""
+
 FLOOR = 1e-12
 """Least variance of a relative frequency."""
+
+
+@dataclass(frozen=True)
+class CommonError:
+    """How well the common movement is known.
+
+    Attributes
+    ----------
+    covariance : ndarray, (n_hits, n_hits)
+        Of the common movement in the hits, given the variances: its mean over hits, which frequencies at rest are
+        told from, included.
+    slopes : tuple of ndarray, (n_hits, n_hits)
+        How the covariance grows with the variances of single hits and of points, relative to them.
+    degrees : tuple of float
+        Degrees of freedom from which these two are known.
+    widening : tuple of float
+        How much these two widen: hits and points that follow one another may have moved alike.
+    """
+
+    covariance: Real
+    slopes: tuple[Real, Real]
+    degrees: tuple[float, float]
+    widening: tuple[float, float]
+
+    def mean_std(self, share: Real) -> float:
+        """Standard deviation that the common movement leaves in a weighted mean over hits.
+
+        It is widened so that normal intervals hold though its variances are known from few hits and points.
+
+        Parameters
+        ----------
+        share : ndarray, (n_hits,)
+            Weights, sum 1: where few hits or points show a mode, it is their movement that counts.
+        """
+        parts = [float(share @ slope @ share) for slope in self.slopes]
+        variance = float(share @ self.covariance @ share)
+        variance += sum(part * (wide**2 - 1) for part, wide in zip(parts, self.widening, strict=True))
+        if not variance > 0:
+            return 0.0
+        parts = [part * wide**2 for part, wide in zip(parts, self.widening, strict=True)]
+        uncertainty = sum(part**2 / free for part, free in zip(parts, self.degrees, strict=True))
+        free = variance**2 / max(uncertainty, 1e-9 * variance**2)
+        return float(np.sqrt(variance) * wider(max(free, 1.0)))
 
 
 @dataclass(frozen=True)
@@ -46,12 +97,11 @@ class Movement:
     Attributes
     ----------
     common, common_std : ndarray, (n_hits,)
-        Factor g + d of every hit, shrunk towards 0 by its own variance.
+        Factor b t + g + d of every hit, g and d shrunk towards 0 by their own variances.
     spread : float
-        Standard deviation of g + d.
-    mean_std : float
-        Standard deviation of the mean of g + d over hits, widened so that normal intervals of a mean of few hits and
-        points hold.
+        Standard deviation of b t + g + d.
+    error : CommonError
+        How well it is known.
     own : ndarray, (n_hits, n_peaks)
         Movement x of single peaks beyond it, shrunk; 0 where a hit does not show the peak.
     own_spread : ndarray, (n_peaks,)
@@ -63,18 +113,27 @@ class Movement:
     common: Real
     common_std: Real
     spread: float
-    mean_std: float
+    error: CommonError
     own: Real
     own_spread: Real
     point_spread: Real
+
+    @property
+    def mean_std(self) -> float:
+        """Standard deviation that it leaves in a mean over all hits."""
+        return self.error.mean_std(np.full(len(self.common), 1 / len(self.common)))
 
 
 @dataclass(frozen=True)
 class _Posterior:
     mean: Real
-    variance: Real
+    covariance: Real
     fitted: Real
     fitted_variance: Real
+
+    @property
+    def variance(self) -> Real:
+        return np.diag(self.covariance)
 
 
 def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -> Movement:
@@ -84,6 +143,7 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     ----------
     shift, std : ndarray, (n_hits, n_peaks)
         Relative frequency of every peak in every hit; std ``inf`` where a hit does not show the peak.
+        Hits in the order in which they came.
     strength : ndarray, (n_hits, n_peaks)
         Size of the peak in the hit over its median.
     point : ndarray of int, (n_hits,)
@@ -91,8 +151,8 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     n_hits, n_peaks = shift.shape
     known = np.isfinite(std)
     repeated = np.bincount(point, minlength=int(point.max()) + 1)[point] > 1
-    design, groups, of_point = _design(known, point, repeated)
-    n_points = of_point.shape[1]
+    design, groups, shared = _design(known, point, repeated)
+    n_trend, n_points = shared.trend.shape[1], shared.of_point.shape[1]
     hit, peak = np.nonzero(known)
     value = shift[hit, peak]
     noise = std[hit, peak] ** 2
@@ -102,14 +162,18 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     moving = common
     own, per_point = 0.5 * start + FLOOR, 0.5 * start + FLOOR
     tail = np.ones(len(value))
-    hits = slice(n_peaks, n_peaks + n_hits)
+    slope = slice(n_peaks, n_peaks + n_trend)
+    hits = slice(slope.stop, slope.stop + n_hits)
     points = slice(hits.stop, hits.stop + n_points)
+
+    def solved(common: float, moving: float) -> _Posterior:
+        of_common = (np.full(n_hits, common), np.full(n_points, moving))
+        prior = np.concatenate([np.full(n_peaks + n_trend, np.inf), *of_common, per_point[groups]])
+        return _posterior(design, value, error, prior)
+
     for _ in range(ITERATIONS):
         error = (noise + own[peak] * weak) / tail
-        prior = np.concatenate(
-            [np.full(n_peaks, np.inf), np.full(n_hits, common), np.full(n_points, moving), per_point[groups]]
-        )
-        found = _posterior(design, value, error, prior)
+        found = solved(common, moving)
         left = value - found.fitted
         square = left**2 + found.fitted_variance
         tail = (TAIL + 1) / (TAIL + square / (error * tail))
@@ -127,24 +191,51 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     # What a weak peak seems to move beyond what a strong one does is the flank of another: no movement to undo.
     spread = own[peak] * np.minimum(weak, 1.0)
     single[hit, peak] = (value - found.fitted) * spread / (own[peak] * weak + noise)
+    read = np.hstack([shared.trend, np.eye(n_hits), shared.of_point])
+    both = slice(n_peaks, points.stop)
+
+    def covariance(found: _Posterior) -> Real:
+        return np.asarray(read @ found.covariance[both, both] @ read.T)
+
+    found = solved(common, moving)
+    factor, known_to = read @ found.mean[both], covariance(found)
+    slopes = [
+        (covariance(solved(*more)) - known_to) / STEP
+        for more in ((common * (1 + STEP), moving), (common, moving * (1 + STEP)))
+    ]
+    trend = shared.trend @ found.mean[slope]
+    at_points = shared.of_point.T @ trend / np.maximum(shared.of_point.sum(axis=0), 1.0)
+    between = max(n_points - 1, 1)
+    # k takes its share of what few points show of g
+    few = np.sqrt((between + 1) / between)
+    alike = (
+        widening(trend + found.mean[hits]),
+        few * widening(at_points + found.mean[points]) if n_points else 1.0,
+    )
+    degrees = (max(n_hits - 1 - n_trend - (between if n_points else 0), 1), between)
     return Movement(
-        common=found.mean[hits] + of_point @ found.mean[points],
-        common_std=np.sqrt(found.variance[hits] + of_point @ found.variance[points]),
-        spread=float(np.sqrt(common + (moving if n_points else 0.0))),
-        mean_std=_mean_std(
-            (np.sqrt(common), found.mean[hits], np.full(n_hits, 1 / n_hits)),
-            (np.sqrt(moving), found.mean[points], of_point.sum(axis=0) / n_hits),
-        ),
+        common=factor,
+        common_std=np.sqrt(np.diag(known_to)),
+        spread=float(np.sqrt(common + (moving if n_points else 0.0) + np.sum(found.mean[slope] ** 2))),
+        error=CommonError(known_to, (slopes[0], slopes[1]), degrees, alike),
         own=single,
         own_spread=np.sqrt(own),
         point_spread=np.sqrt(np.where(np.isin(np.arange(n_peaks), groups), per_point, 0.0)),
     )
 
 
+@dataclass(frozen=True)
+class _Shared:
+    """Of all peaks: the trend over hits, (n_hits, 0 or 1), and which hits share each g, (n_hits, n_g)."""
+
+    trend: Real
+    of_point: Real
+
+
 def _design(
     known: NDArray[np.bool_], point: NDArray[np.int64], repeated: NDArray[np.bool_]
-) -> tuple[Real, NDArray[np.int64], Real]:
-    """Columns of m, d, g and k for every value, the peak of each k, and which hits share each g, (n_hits, n_g)."""
+) -> tuple[Real, NDArray[np.int64], _Shared]:
+    """Columns of m, b, d, g and k for every value, the peak of each k, and what b and g multiply."""
     n_hits, n_peaks = known.shape
     hit, peak = np.nonzero(known)
     # At one point g would be the mean of all peaks.
@@ -152,16 +243,22 @@ def _design(
     of_point = (point[:, None] == moved).astype(float)
     pairs = sorted({(int(point[h]), int(c)) for h, c in zip(hit, peak, strict=True) if repeated[h]})
     place = {pair: k for k, pair in enumerate(pairs)}
-    before = n_peaks + n_hits
+    order = np.arange(n_hits) - 0.5 * (n_hits - 1)
+    trend = (order / max(float(np.std(order)), 1.0))[:, None]
+    if n_hits < FEWEST_FOR_TREND:
+        trend = trend[:, :0]
+    first = n_peaks + trend.shape[1]
+    before = first + n_hits
     design = np.zeros((len(hit), before + len(moved) + len(pairs)))
     row = np.arange(len(hit))
     design[row, peak] = 1.0
-    design[row, n_peaks + hit] = 1.0
+    design[:, n_peaks:first] = trend[hit]
+    design[row, first + hit] = 1.0
     design[:, before : before + len(moved)] = of_point[hit]
     for k, (h, c) in enumerate(zip(hit, peak, strict=True)):
         if repeated[h]:
             design[k, before + len(moved) + place[int(point[h]), int(c)]] = 1.0
-    return design, np.array([c for _, c in pairs], dtype=np.int64), of_point
+    return design, np.array([c for _, c in pairs], dtype=np.int64), _Shared(trend, of_point)
 
 
 def _variance(found: _Posterior, of: slice) -> float:
@@ -176,9 +273,7 @@ def _posterior(design: Real, value: Real, error: Real, prior: Real) -> _Posterio
     scale = 1.0 / np.sqrt(np.diag(precision))
     covariance = np.linalg.inv(precision * scale[:, None] * scale) * scale[:, None] * scale
     mean = covariance @ (scaled.T @ value)
-    return _Posterior(
-        mean, np.diag(covariance), design @ mean, np.einsum("ka,ab,kb->k", design, covariance, design)
-    )
+    return _Posterior(mean, covariance, design @ mean, np.einsum("ka,ab,kb->k", design, covariance, design))
 
 
 def _own_variance(old: float, square: Real, noise: Real, weak: Real, tail: Real) -> float:
@@ -188,23 +283,6 @@ def _own_variance(old: float, square: Real, noise: Real, weak: Real, tail: Real)
     total = noise / weak + old
     ratio = float(np.mean(tail * square / weak / total**2) / np.mean(1.0 / total))
     return max(old * np.sqrt(ratio), FLOOR)
-
-
-def _mean_std(*parts: tuple[float, Real, Real]) -> float:
-    """Standard deviation of a mean of parts, each with its spread, its values in order and their weights in the mean.
-
-    Where hits of few points share most of the movement, there are as many independent values as points.
-    """
-    variance, uncertainty = 0.0, 0.0
-    for spread, values, weights in parts:
-        if len(values):
-            free = max(len(values) - 1, 1)
-            # the spread is one of maximum likelihood, which leaves out that the mean was estimated too
-            part = spread**2 * float(np.sum(weights**2)) * widening(values) ** 2 * len(values) / free
-            variance, uncertainty = variance + part, uncertainty + part**2 / free
-    if not variance > 0:
-        return 0.0
-    return float(np.sqrt(variance) * wider(variance**2 / uncertainty))
 
 
 def wider(degrees: float) -> float:
