@@ -206,13 +206,13 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     trend = shared.trend @ found.mean[slope]
     at_points = shared.of_point.T @ trend / np.maximum(shared.of_point.sum(axis=0), 1.0)
     between = max(n_points - 1, 1)
-    # k takes its share of what few points show of g
-    few = np.sqrt((between + 1) / between)
-    alike = (
-        widening(trend + found.mean[hits]),
-        few * widening(at_points + found.mean[points]) if n_points else 1.0,
-    )
     degrees = (max(n_hits - 1 - n_trend - (between if n_points else 0), 1), between)
+    # what peaks move by themselves, x and k, takes its share of what few hits and points show of d and g
+    few = [np.sqrt((free + 1) / free) for free in degrees]
+    alike = (
+        few[0] * widening(trend + found.mean[hits]),
+        few[1] * widening(at_points + found.mean[points]) if n_points else 1.0,
+    )
     return Movement(
         common=factor,
         common_std=np.sqrt(np.diag(known_to)),
