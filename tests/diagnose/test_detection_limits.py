@@ -80,6 +80,10 @@ class Bent:
     def uninterpolated(x: np.ndarray) -> np.ndarray:
         return x
 
+    @staticmethod
+    def modes_added(x: np.ndarray, further: np.ndarray) -> int:
+        return 0
+
     def residuals(
         self, x: Any, scatters: Any, *, derivatives: bool = True, matching: Any = None
     ) -> Residuals:

@@ -335,3 +335,20 @@ def test_a_second_mode_under_a_peak_is_no_change_of_its_frequency() -> None:
     assert abs(found.change) > 3 * found.std
     assert not found.single
     assert found.width == pytest.approx(-2 * peak.poles[0].real)
+
+
+def test_two_points_do_not_widen_the_interval_of_drift_that_scatters_from_hit_to_hit() -> None:
+    """Beside a trend nothing tells what two points differ by: told apart, their intervals were six times too wide."""
+    rng, scatter, point = np.random.default_rng(5), 1e-3, np.repeat([0, 1], 5)
+    widths, errors = [], []
+    for _ in range(40):
+        shift = scatter * rng.standard_normal((10, 1)) + 1e-5 * rng.standard_normal((10, 4))
+        found = movement(shift - shift.mean(axis=0), np.full((10, 4), 1e-5), np.ones((10, 4)), point)
+        widths.append(found.mean_std)
+        errors.append(abs(shift.mean()))
+    held = np.mean(np.array(errors) < 1.645 * np.array(widths))
+    assert held >= 0.85
+    assert np.quantile(widths, 0.9) < scatter
+    jump = np.where(point == 0, -1.0, 1.0)[:, None] * scatter + 0.03 * scatter * rng.standard_normal((10, 1))
+    found = movement(jump + np.zeros((10, 4)), np.full((10, 4), 1e-5), np.ones((10, 4)), point)
+    assert found.mean_std > scatter  # of two points hardly anything is known

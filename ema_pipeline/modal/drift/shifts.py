@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri, stdtrit
+from scipy.special import fdtrc, ndtri, stdtrit
 
 from ema_pipeline.modal.serial import widening
 
@@ -39,6 +39,12 @@ TAIL = 4.0
 
 FEWEST_FOR_TREND = 3
 """Hits without which no trend is told from scatter."""
+
+JUMP_P = 0.1
+"""p value above which two points differ by no more than a line explains."""
+
+SHOWN = 0.05
+"""Least ratio of the information that two points give of a peak that both of them show."""
 
 STEP = 0.1
 """Relative change of a variance by which is seen what depends on it."""
@@ -151,7 +157,11 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     n_hits, n_peaks = shift.shape
     known = np.isfinite(std)
     repeated = np.bincount(point, minlength=int(point.max()) + 1)[point] > 1
-    design, groups, shared = _design(known, point, repeated)
+    of_points = np.unique(point[repeated])
+    # At one point g would be the mean of all peaks; two differ by what a line explains, too.
+    if len(np.unique(point)) < 2 or (len(of_points) == 2 and _explained_by_a_line(shift, std, point)):
+        of_points = of_points[:0]
+    design, groups, shared = _design(known, point, repeated, of_points)
     n_trend, n_points = shared.trend.shape[1], shared.of_point.shape[1]
     hit, peak = np.nonzero(known)
     value = shift[hit, peak]
@@ -233,13 +243,14 @@ class _Shared:
 
 
 def _design(
-    known: NDArray[np.bool_], point: NDArray[np.int64], repeated: NDArray[np.bool_]
+    known: NDArray[np.bool_],
+    point: NDArray[np.int64],
+    repeated: NDArray[np.bool_],
+    moved: NDArray[np.int64],
 ) -> tuple[Real, NDArray[np.int64], _Shared]:
     """Columns of m, b, d, g and k for every value, the peak of each k, and what b and g multiply."""
     n_hits, n_peaks = known.shape
     hit, peak = np.nonzero(known)
-    # At one point g would be the mean of all peaks.
-    moved = np.unique(point[repeated]) if len(np.unique(point)) > 1 else np.zeros(0, int)
     of_point = (point[:, None] == moved).astype(float)
     pairs = sorted({(int(point[h]), int(c)) for h, c in zip(hit, peak, strict=True) if repeated[h]})
     place = {pair: k for k, pair in enumerate(pairs)}
@@ -259,6 +270,30 @@ def _design(
         if repeated[h]:
             design[k, before + len(moved) + place[int(point[h]), int(c)]] = 1.0
     return design, np.array([c for _, c in pairs], dtype=np.int64), _Shared(trend, of_point)
+
+
+def _explained_by_a_line(shift: Real, std: Real, point: NDArray[np.int64]) -> bool:
+    """True where a line over the hits leaves two points with no difference that an F test would see.
+
+    Line and difference are nearly the same there: beside each other, neither variance is known. False where no peak
+    shows on both points.
+    """
+    first = point == point[0]
+    weight = 1 / std**2
+    here, there = weight[first].mean(axis=0), weight[~first].mean(axis=0)
+    weight = weight * (np.minimum(here, there) > SHOWN * np.maximum(here, there))
+    seen = weight.sum(axis=1) > 0
+    free = int(np.sum(seen)) - 3
+    if len(np.unique(point)) != 2 or free < 1 or not (np.any(seen & first) and np.any(seen & ~first)):
+        return False
+    common = (np.sum(weight * shift, axis=1) / np.maximum(weight.sum(axis=1), 1e-300))[seen]
+    order = np.flatnonzero(seen).astype(float)
+    columns = np.stack([np.ones(len(order)), order - order.mean(), first[seen]], axis=1)
+    left = [
+        np.sum((common - c @ np.linalg.lstsq(c, common, rcond=None)[0]) ** 2)
+        for c in (columns[:, :2], columns)
+    ]
+    return bool(fdtrc(1, free, (left[0] - left[1]) / max(left[1] / free, 1e-300)) > JUMP_P)
 
 
 def _variance(found: _Posterior, of: slice) -> float:
