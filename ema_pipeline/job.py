@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+from ema_pipeline.answers import check_answer_folder
 from ema_pipeline.describe import describe
 from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.errors import EmaError, did_you_mean
@@ -17,7 +18,7 @@ from ema_pipeline.run.opening import existing_run, load_info, new_run, stored_se
 from ema_pipeline.run.rollback import everything_taken_back, settings_taken_back
 from ema_pipeline.run.settings import override
 from ema_pipeline.run.types import Run, RunInfo
-from ema_pipeline.store import ALL, RESULTS_FILE, Store, check_answer_folder
+from ema_pipeline.store import ALL, RESULTS_FILE, Store
 
 DescribeSource = Callable[[Path, str | None, str | None, Iterable[str]], RunInfo]
 """Checks what a run starts from; takes source, rig, pipeline and overrides."""

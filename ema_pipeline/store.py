@@ -34,15 +34,8 @@ ALL = "all"
 """Name that stands for all configurations together."""
 
 LOCK_FILE = ".lock"
-RESULTS_FILE, SERIES_FILE, CHANGES_FILE = "ema.h5", "series.db", "changes.json"
+RESULTS_FILE = "ema.h5"
 PARTS_FOLDER = "stages"
-
-ANSWERS = {
-    RESULTS_FILE: "the results of a test",
-    SERIES_FILE: "a series of tests",
-    CHANGES_FILE: "a comparison of two tests",
-}
-"""Files by whose names a folder is known to hold an answer, and of what."""
 
 FILES = (RESULTS_FILE, "summary.json", "modes.csv", "report.html")
 """Files of a results folder that go back together; large results beside them are never changed."""
@@ -416,27 +409,6 @@ def bring_back_files(folder: Path, place: Path) -> None:
                 link_or_copy(place / name, scratch)
         else:
             (folder / name).unlink(missing_ok=True)
-
-
-def check_answer_folder(folder: Path, own: str) -> None:
-    """Refuse a folder that holds an answer of another kind, whose report and tables would be replaced.
-
-    Parameters
-    ----------
-    folder : Path
-    own : str
-        The file of `ANSWERS` that an earlier answer of the same kind may have left there.
-
-    Raises
-    ------
-    EmaError
-        Also where the folder is a file.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise EmaError(f"{folder}: is no folder; name another with --out")
-    for name, words in ANSWERS.items():
-        if name != own and (folder / name).is_file():
-            raise EmaError(f"{folder}: holds {words}, whose report would be lost; name another with --out")
 
 
 def _group(stage: str, configuration: str) -> str:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from ema_pipeline.answers import CHANGES_FILE
 from ema_pipeline.changes.modes import ModeChanges, mode_changes
 from ema_pipeline.changes.physics import PhysicalChange, Progress, physical_change
 from ema_pipeline.describe import checked_rig
@@ -22,7 +23,7 @@ from ema_pipeline.report.summary_files import finite
 from ema_pipeline.run.measured import measured_modes
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.run.types import Run
-from ema_pipeline.store import CHANGES_FILE, RESULTS_FILE
+from ema_pipeline.store import RESULTS_FILE
 
 MEASURING = 'stages=["ingest", "hits", "frf", "modal", "levels"]'
 """Stages that are run where a test is given as a raw folder: its modes, and no diagnosis of its own."""

@@ -53,11 +53,11 @@ def changes(
     With a rig, by --rig or of the tests themselves, both are fitted as one problem, in which parts, sensors and
     calibration are the same. Without one modes are matched and compared one by one.
     """
+    from ema_pipeline.answers import CHANGES_FILE, check_answer_folder
     from ema_pipeline.changes.page import write_page
     from ema_pipeline.changes.tables import limits_text, notes, short_modes_table, verdict_text
     from ema_pipeline.changes.two_tests import changes_content, compare_runs, open_test, write_changes
     from ema_pipeline.report.terminal import text_table
-    from ema_pipeline.store import CHANGES_FILE, check_answer_folder
 
     repeats, by_rig = _repeats(repeat or []), rig != NO_RIG
     rig = rig if by_rig else None

@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ema_pipeline.answers import SERIES_FILE
 from ema_pipeline.errors import EmaError
 from ema_pipeline.series.rows import COLUMNS, Row, TestRow
-from ema_pipeline.store import SERIES_FILE
 
 if TYPE_CHECKING:
     import pandas as pd

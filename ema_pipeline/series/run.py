@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from ema_pipeline.answers import SERIES_FILE, check_answer_folder
 from ema_pipeline.describe import DEFAULT_PIPELINE, checked_rig, rig_text
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.errors import EmaError
@@ -22,7 +23,7 @@ from ema_pipeline.series.engine import Work, in_processes, on_cluster
 from ema_pipeline.series.find import FoundTest, find_tests, raw_fingerprint
 from ema_pipeline.series.one_test import Task, run_task
 from ema_pipeline.series.rows import TestRow
-from ema_pipeline.store import RESULTS_FILE, SERIES_FILE, Store, check_answer_folder
+from ema_pipeline.store import RESULTS_FILE, Store
 
 TESTS_FOLDER = "tests"
 """Folder of a series that holds the results folders."""
