@@ -111,8 +111,8 @@ def _row_scale(
     """κ with κ²·shape = participation at the shared DOFs, and its relative standard deviation."""
     a = np.array([shape[o] for o, _ in shared])
     b = np.array([part[k] for _, k in shared])
-    sa = np.array([np.hypot(shape_std[o], _ACROSS * np.nanmax(np.abs(shape))) for o, _ in shared])
-    sb = np.array([np.hypot(part_std[k], _ACROSS * np.nanmax(np.abs(part))) for _, k in shared])
+    sa = np.hypot([shape_std[o] for o, _ in shared], _ACROSS * np.nanmax(np.abs(shape)))
+    sb = np.hypot([part_std[k] for _, k in shared], _ACROSS * np.nanmax(np.abs(part)))
     ok = np.isfinite(a)
     a, b, sa, sb = a[ok], b[ok], sa[ok], sb[ok]
     power = np.sqrt(np.sum(np.abs(b) ** 2) / max(np.sum(np.abs(a) ** 2), 1e-300))

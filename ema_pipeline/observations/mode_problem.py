@@ -305,7 +305,8 @@ class ModeProblem(EffectProblem):
         """See `EffectProblem`: those that sensors read."""
         count = 0
         for data in self.observations.data:
-            before, after = (self._modes(data.configuration, at) for at in (x, further))
+            # the modes at `further` are mostly the last ones, which are kept
+            after, before = (self._modes(data.configuration, at) for at in (further, x))
             if before is None or after is None or not data.complete or not len(data):
                 continue
             low, high = float(np.exp(np.min(data.log_frequency))), data.band_hz[1]

@@ -298,12 +298,12 @@ class RigModel:
         shares = np.zeros(len(solution.eigenvalues))
         if not self.effects:
             return shares
-        nothing = np.zeros(len(self.unknowns) - self.shape_start)
-        nothing[: len(self.dependence.geometric)] = x[self.shape_start :][: len(self.dependence.geometric)]
-        rig = self._assembled(configuration, nothing, frozenset(range(len(self.effects))))
+        shape = x[self.shape_start :].copy()
+        shape[len(self.dependence.geometric) :] = 0.0  # of no effect: the same terms at all sizes
+        rig = self._assembled(configuration, shape, frozenset(range(len(self.effects))))
         if len(rig.dofs) == len(shares):
-            stiffness = rig.dense(rig.scaled(x[: self._logs]))[STIFFNESS]
-            own = np.einsum("ir,ir->r", solution.shapes, stiffness @ solution.shapes)
+            springs = rig.matrix == STIFFNESS
+            own = rig.scaled(x[: self._logs])[springs] @ (rig.rows[springs] @ solution.shapes) ** 2
             shares = np.clip(1 - own / solution.eigenvalues, 0.0, 1.0)
         return shares
 

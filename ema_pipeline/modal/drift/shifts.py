@@ -157,9 +157,10 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     n_hits, n_peaks = shift.shape
     known = np.isfinite(std)
     repeated = np.bincount(point, minlength=int(point.max()) + 1)[point] > 1
-    of_points = np.unique(point[repeated])
+    struck, of_points = np.unique(point), np.unique(point[repeated])
     # At one point g would be the mean of all peaks; two differ by what a line explains, too.
-    if len(np.unique(point)) < 2 or (len(of_points) == 2 and _explained_by_a_line(shift, std, point)):
+    two = len(struck) == len(of_points) == 2
+    if len(struck) < 2 or (two and _explained_by_a_line(shift, std, point)):
         of_points = of_points[:0]
     design, groups, shared = _design(known, point, repeated, of_points)
     n_trend, n_points = shared.trend.shape[1], shared.of_point.shape[1]
@@ -284,7 +285,7 @@ def _explained_by_a_line(shift: Real, std: Real, point: NDArray[np.int64]) -> bo
     weight = weight * (np.minimum(here, there) > SHOWN * np.maximum(here, there))
     seen = weight.sum(axis=1) > 0
     free = int(np.sum(seen)) - 3
-    if len(np.unique(point)) != 2 or free < 1 or not (np.any(seen & first) and np.any(seen & ~first)):
+    if free < 1 or not (np.any(seen & first) and np.any(seen & ~first)):
         return False
     common = (np.sum(weight * shift, axis=1) / np.maximum(weight.sum(axis=1), 1e-300))[seen]
     order = np.flatnonzero(seen).astype(float)
