@@ -5,6 +5,7 @@
     python benchmarks/identification_study.py coverage --cases 500
     python benchmarks/identification_study.py noise --cases 30
     python benchmarks/identification_study.py window --cases 60
+    python benchmarks/identification_study.py ringing --cases 60
     python benchmarks/identification_study.py moving --cases 20
     python benchmarks/identification_study.py roving --cases 24
 
@@ -289,23 +290,58 @@ def noise_study(cases: int, first: int, settings: ModalSettings) -> None:
     print(f"{invented} modes invented in {cases} sets of pure noise")
 
 
-def coverage_study(cases: int, first: int, settings: ModalSettings) -> None:
+def coverage_case(seed: int) -> tuple[TrueSystem, list[Record]]:
+    """A system with well separated modes, in records in which all of them decay."""
+    rng = np.random.default_rng(50_000 + seed)
+    n_out, n_ref = int(rng.integers(2, 13)), int(rng.integers(1, 3))
+    system = random_system(
+        rng, n_modes=int(rng.integers(2, 6)), n_dofs=n_out, low_hz=60, high_hz=360, min_spacing=0.05,
+        damping=(0.003, 0.02),
+    )  # fmt: skip
+    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
+    dofs_out, dofs_in = list(range(n_out)), list(range(n_ref))
+    hits = simulate_hits(
+        system, dofs_out, dofs_in, f_max=400.0, record_s=max(6.0 / slowest, 1.28),
+        n_hits=int(rng.integers(1, 6)),
+        force_noise=rng.uniform(0.002, 0.05), response_noise=rng.uniform(0.002, 0.05), rng=rng,
+    )  # fmt: skip
+    return system, records_of(hits, dofs_out, dofs_in)
+
+
+def ringing_case(seed: int) -> tuple[TrueSystem, list[Record]]:
+    """A freely suspended system in records at whose end the slowest mode has kept 10 to 60 % of its motion.
+
+    Sensors measure acceleration, velocity or displacement; the suspension moves at 1 to 3 Hz.
+    """
+    rng = np.random.default_rng(130_000 + seed)
+    n_out, n_ref, quantity = int(rng.integers(3, 9)), int(rng.integers(1, 3)), seed % 3
+    system = random_system(
+        rng, n_modes=int(rng.integers(2, 6)), n_dofs=n_out, low_hz=60, high_hz=360, min_spacing=0.05,
+        damping=(0.0005, 0.01),
+    )  # fmt: skip
+    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
+    system = TrueSystem(
+        np.concatenate([[rng.uniform(1.0, 3.0)], system.frequency_hz]),
+        np.concatenate([[0.03], system.damping_ratio]),
+        np.concatenate([rng.standard_normal((1, n_out)), system.shapes]),
+    )
+    dofs_out, dofs_in = list(range(n_out)), list(range(n_ref))
+    hits = simulate_hits(
+        system, dofs_out, dofs_in, f_max=400.0, record_s=max(-np.log(rng.uniform(0.1, 0.6)) / slowest, 0.5),
+        n_hits=int(rng.integers(2, 6)), force_noise=rng.uniform(1e-4, 0.01),
+        response_noise=rng.uniform(1e-4, 0.01), rng=rng, integrations=quantity,
+    )  # fmt: skip
+    records = records_of(hits, dofs_out, dofs_in, ("acceleration", "velocity", "displacement")[quantity])
+    return system, records
+
+
+def coverage_study(
+    case: Callable[[int], tuple[TrueSystem, list[Record]]], seeds: Iterable[int], settings: ModalSettings
+) -> None:
     inside = {"frequency": [], "damping": [], "shape": []}
-    for seed in range(first, first + cases):
-        rng = np.random.default_rng(50_000 + seed)
-        n_out, n_ref = int(rng.integers(2, 13)), int(rng.integers(1, 3))
-        system = random_system(
-            rng, n_modes=int(rng.integers(2, 6)), n_dofs=n_out, low_hz=60, high_hz=360, min_spacing=0.05,
-            damping=(0.003, 0.02),
-        )  # fmt: skip
-        slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
-        dofs_out, dofs_in = list(range(n_out)), list(range(n_ref))
-        hits = simulate_hits(
-            system, dofs_out, dofs_in, f_max=400.0, record_s=max(6.0 / slowest, 1.28),
-            n_hits=int(rng.integers(1, 6)),
-            force_noise=rng.uniform(0.002, 0.05), response_noise=rng.uniform(0.002, 0.05), rng=rng,
-        )  # fmt: skip
-        model = identify(measured(records_of(hits, dofs_out, dofs_in)), settings)
+    for seed in seeds:
+        system, records = case(seed)
+        model = identify(measured(records), settings)
         pairs, _ = match(system, model)
         for t, j in pairs.items():
             mode = model.modes[j]
@@ -500,7 +536,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "study", choices=["random", "pairs", "noise", "coverage", "window", "moving", "roving"]
+        "study", choices=["random", "pairs", "noise", "coverage", "window", "ringing", "moving", "roving"]
     )
     parser.add_argument("--cases", type=int, default=50)
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
@@ -529,7 +565,8 @@ def main() -> None:
             seeds = range(args.first + start, args.first + args.cases, 2)
             hits_study(roving_case, seeds, settings, args.verbose)
     else:
-        coverage_study(args.cases, args.first, settings)
+        case = ringing_case if args.study == "ringing" else coverage_case
+        coverage_study(case, range(args.first, args.first + args.cases), settings)
 
 
 if __name__ == "__main__":

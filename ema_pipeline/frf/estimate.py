@@ -153,6 +153,7 @@ class _Total:
     hammer: ChannelQuality | None = None
     pairs: dict[tuple[str, str], HitLines] = field(default_factory=dict)
     first: HitSamples | None = None
+    rings_on: bool = False
 
     def sheet_of(self, hit: HitSamples) -> _Sheet:
         """The sheet that a hit goes to, new where needed."""
@@ -185,6 +186,7 @@ class _Total:
         self.hammer = merged(
             self.hammer, ChannelQuality(hit.force_name, hit.force_calibration_std, hit.force_transverse)
         )
+        self.rings_on |= hit.hit.rings_on
         impact = hit.hit.impact
         self.inputs.setdefault(impact.point, replace(impact, sign=1))
         self.delays.setdefault(impact.point, []).append((hit.hit.peak - hit.hit.start) / hit.sample_rate_hz)
@@ -345,6 +347,7 @@ def _finish(
             [[_lines_of_variance(int(n), settings, frequency.size) for n in row] for row in hits],
             dtype=np.int64,
         ).reshape(hits.shape),
+        rings_on=total.rings_on,
     )
 
 

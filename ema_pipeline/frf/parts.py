@@ -111,6 +111,7 @@ def joined(parts: Mapping[str, FrfSet]) -> FrfSet:
         channels=tuple(known) if len(known) == len(channels) else (),
         hammer=_hammer(sets.values()),
         variance_lines=lines,
+        rings_on=any(s.rings_on for s in sets.values()),
     )
 
 

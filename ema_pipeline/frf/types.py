@@ -74,10 +74,12 @@ class FrfSet:
     detected_distortion : ndarray, (n_outputs, 2, n_lines), or None
         Response at lines that carry no force, over the typical force of a line that does, SI: distortion of odd and
         of even order; NaN elsewhere.
-        variance_lines : ndarray of int, (n_outputs, n_inputs), or None
+    variance_lines : ndarray of int, (n_outputs, n_inputs), or None
         Neighbouring lines over which the noise power of `variance` was averaged; None where each stands for itself.
+    rings_on : bool
+        True where responses have not decayed at the end of the records.
     verdicts : tuple of CheckResult
-            Checks that need several hits or several points: signs of hits, coherence, driving point, reciprocity.
+        Checks that need several hits or several points: signs of hits, coherence, driving point, reciprocity.
     """
 
     frequency_hz: NDArray[np.float64]
@@ -105,6 +107,7 @@ class FrfSet:
     distortion_variance: NDArray[np.float64] | None = None
     detected_distortion: NDArray[np.float64] | None = None
     variance_lines: NDArray[np.int64] | None = None
+    rings_on: bool = False
 
     def accelerance(self, lines: slice = ALL_LINES) -> NDArray[np.complex128]:
         """All FRFs as acceleration over force, (m/s²)/N, shape (n_outputs, n_inputs, n_lines)."""

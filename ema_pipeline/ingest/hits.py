@@ -167,10 +167,7 @@ def trim_hits(
         Unchanged where `trim` is "none" or where all responses have decayed.
     """
     settings = settings or HitSettings()
-    undecayed = any(
-        v.check == "response decay" and not v.passes for h in hits if h.accepted for v in h.verdicts
-    )
-    if settings.trim == "none" or not undecayed:
+    if settings.trim == "none" or not any(h.rings_on for h in hits if h.accepted):
         return tuple(hits)
     lead = max(
         hit.peak - hit.start - _onset(record.force[hit.start : hit.stop], hit.peak - hit.start)

@@ -164,6 +164,11 @@ class Hit:
         return not any(v.consequence == "reject_hit" and not v.passes for v in self.verdicts)
 
     @property
+    def rings_on(self) -> bool:
+        """True where a response has not decayed at the end of the record."""
+        return any(v.check == "response decay" and not v.passes for v in self.verdicts)
+
+    @property
     def rejected_channels(self) -> frozenset[str]:
         """Names of channels that must not be used in this hit."""
         return frozenset(

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from ema_pipeline.modal.compress import Window
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, Step, best_shapes, newton_step, solve_linear
+from ema_pipeline.modal.heavily_damped import has_peak
+from ema_pipeline.modal.mode_acceptance import PLAIN_DAMPING
 from ema_pipeline.modal.polish import descend
 from ema_pipeline.modal.segment import SegmentFit, impossible, measured_noise, put_back
 from ema_pipeline.threads import in_order
@@ -84,6 +86,15 @@ def placed(
         if not lost.any():
             return estimate, held
         start, held = put_back(estimate, start, lost), held | lost
+
+
+def backgrounds(data: FitData, estimate: Estimate) -> NDArray[np.bool_]:
+    """Poles with much damping and no peak in the response of all rows, (n_modes,)."""
+    out = -estimate.poles.real > PLAIN_DAMPING * np.abs(estimate.poles)
+    if out.any():
+        power = np.sum(np.abs(data.frf) ** 2, axis=(0, 1))
+        out[out] = [not has_peak(data.omega, power, pole) for pole in estimate.poles[out]]
+    return out
 
 
 def _added(parts: list[_Sums]) -> _Sums:

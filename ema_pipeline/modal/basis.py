@@ -100,15 +100,26 @@ EDGE_DECAY = 0.06
 """Their decay, as a share of the width of the band."""
 
 
-def residual_columns(omega: Real) -> Complex:
+def residual_columns(omega: Real, cut_s: float | None = None) -> Complex:
     """Terms of modes outside the band, each with a complex coefficient per FRF.
 
     A mass line (constant) and a stiffness line (ω²) stand for what is far away; one pole beyond either edge
     for modes that lie close to the band, whose tails no polynomial of low order follows.
 
+    Where responses are cut off while they ring, all that still moves stops at once. What that adds beside the modes'
+    own functions (the width of the pulse and its time between samples, modes outside the band, derivatives of
+    velocities and displacements) is a straight line over frequency, turned by the time of the end, which at FFT
+    lines is that of the hit.
+
+    Parameters
+    ----------
+    omega : ndarray, (n_lines,)
+    cut_s : float, optional
+        Time before the hit in records that end while the responses ring; None where they have decayed.
+
     Returns
     -------
-    ndarray, (8, n_lines)
+    ndarray, (8 or 12, n_lines)
         Each term times 1 and j, scaled to order 1 in the band.
     """
     width = omega[-1] - omega[0]
@@ -117,4 +128,6 @@ def residual_columns(omega: Real) -> Complex:
     below = 1.0 / (1j * (omega - omega[0] + EDGE * width) / width + EDGE_DECAY)
     above = 1.0 / (1j * (omega - omega[-1] - EDGE * width) / width + EDGE_DECAY)
     terms = np.stack([one, square - square.mean(), below, above])
+    if cut_s is not None:
+        terms = np.concatenate([terms, np.exp(1j * omega * cut_s) * np.stack([one, omega / omega[-1]])])
     return np.concatenate([terms, 1j * terms])

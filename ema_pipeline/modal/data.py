@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.channels import moved_sensors
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.modal.basis import residual_columns
 from ema_pipeline.modal.settings import ModalSettings
 
 PERIODS_AT_LOW_END = 3
@@ -46,6 +47,8 @@ class FitData:
         Decay rate of the exponential window under which all was measured, noise too; 0 for none.
     in_turn : bool
         True where a sensor was moved from DOF to DOF, and several points were struck each time.
+    cut_s : float, optional
+        Mean time before the hit in records that end while the responses ring; None where they have decayed.
     """
 
     omega: NDArray[np.float64]
@@ -56,6 +59,7 @@ class FitData:
     transposed: bool
     window_rad_s: float = 0.0
     in_turn: bool = False
+    cut_s: float | None = None
 
     def lines(self, first: int, stop: int) -> FitData:
         """The same FRFs on lines ``first:stop``."""
@@ -65,6 +69,17 @@ class FitData:
     def rows(self, rows: slice) -> FitData:
         """Some rows on the same lines."""
         return replace(self, frf=self.frf[rows], variance=self.variance[rows], measured=self.measured[rows])
+
+    def reference(self, number: int) -> FitData:
+        """One column of FRFs on the same lines."""
+        one = [number]
+        return replace(
+            self, frf=self.frf[:, one], variance=self.variance[:, one], measured=self.measured[:, one]
+        )
+
+    def residual_columns(self) -> NDArray[np.complex128]:
+        """See `basis.residual_columns`."""
+        return residual_columns(self.omega, self.cut_s)
 
     def row_blocks(self, numbers: int = AT_ONCE) -> list[slice]:
         """Rows in blocks that are small beside the whole, for what can be done row by row."""
@@ -133,9 +148,13 @@ def arrange(frfs: FrfSet, band_hz: tuple[float, float]) -> FitData:
         )
     if not measured.all():
         acc = np.where(measured[..., None], acc, 0.0)
-    rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
+    delay_s = float(np.nanmean(frfs.delay_s))
+    rest_s = max(frfs.record_s - delay_s, 0.5 * frfs.record_s)
     transposed = acc.shape[0] < acc.shape[1]
     if transposed:
         acc, variance, measured = acc.swapaxes(0, 1), variance.swapaxes(0, 1), measured.T
     in_turn = len(frfs.inputs) > 1 and bool(moved_sensors(frfs))
-    return FitData(omega, acc, variance, measured, rest_s, transposed, frfs.response_decay_rad_s, in_turn)
+    return FitData(
+        omega, acc, variance, measured, rest_s, transposed, frfs.response_decay_rad_s, in_turn,
+        delay_s if frfs.rings_on else None,
+    )  # fmt: skip

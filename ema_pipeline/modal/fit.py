@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.basis import mode_columns, real_columns, residual_columns
+from ema_pipeline.modal.basis import mode_columns, real_columns
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.gram_kernel import products
 from ema_pipeline.threads import in_order
@@ -209,7 +209,7 @@ def best_shapes(data: FitData, weight: Real, estimate: Estimate) -> BestShapes:
 def with_slopes(data: FitData, weight: Real, estimate: Estimate, best: BestShapes) -> LinearSolution:
     """All of `solve_linear` from the best shapes of the same data; a step that is not taken needs these alone."""
     m, each = len(estimate.poles), data.frf.shape[:2]
-    residual, known = residual_columns(data.omega), _known(data, weight)
+    residual, known = data.residual_columns(), _known(data, weight)
     first = len(residual) + 2 * m
 
     def columns(lines: slice) -> Complex:
@@ -237,7 +237,7 @@ def shapes_by_lines(data: FitData, known: Known, blocks: list[slice], estimate: 
     estimate : Estimate
     """
     m, each = len(estimate.poles), data.frf.shape[:2]
-    residual = residual_columns(data.omega)
+    residual = data.residual_columns()
 
     def columns(lines: slice) -> Complex:
         return np.concatenate(
@@ -402,7 +402,7 @@ def _blocks(n_lines: int) -> list[slice]:
 
 def residual_fit(data: FitData, weight: Real, modes: Complex) -> Complex:
     """Best residual terms for what the modes leave over, (n_rows, n_references, n_lines)."""
-    columns = residual_columns(data.omega)
+    columns = data.residual_columns()
     n_lines = data.frf.shape[-1]
     sums = weighted_grams(columns, weight.reshape(-1, n_lines), (data.frf - modes).reshape(-1, n_lines))
     coefficients = solve_scaled(sums.gram, sums.moment[..., None])[..., 0]

@@ -20,7 +20,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.basis import mode_columns, real_columns, residual_columns
+from ema_pipeline.modal.basis import mode_columns, real_columns
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import (
     Estimate,
@@ -85,7 +85,7 @@ def scatter_of_scores(
     z = parameter_columns(estimate, solution.shapes)
     eliminated = _eliminated(estimate, solution)
     columns = np.concatenate(
-        [*real_columns(data.omega, estimate.poles, data.rest_s), residual_columns(data.omega)]
+        [*real_columns(data.omega, estimate.poles, data.rest_s), data.residual_columns()]
     )
     n_rows, n_ref, _ = data.frf.shape
     # what all outputs share adds up over the outputs of one input before it is squared
@@ -293,7 +293,7 @@ def _meat_of_shapes(data: FitData, estimate: Estimate, noise: Noise) -> Real:
     """Covariance of the right-hand sides that give the shapes of each row, (n_rows, 2M, 2M)."""
     mix = mixing(estimate.participation)
     columns = mode_columns(data.omega, estimate.poles, data.rest_s)
-    residual = residual_columns(data.omega)
+    residual = data.residual_columns()
     variance, weight = noise.variance, noise.weight(data.measured)
     out = np.zeros((len(data.frf), len(columns), len(columns)))
     for o, i in np.ndindex(*data.measured.shape):

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.all_rows import linear_fit, placed
+from ema_pipeline.modal.all_rows import backgrounds, linear_fit, placed
 from ema_pipeline.modal.bands import SubBand, between
 from ema_pipeline.modal.compress import Window
 from ema_pipeline.modal.data import FitData
@@ -64,6 +64,10 @@ class FittedModes:
     held: NDArray[np.bool_]
     away: Complex
     restless: NDArray[np.bool_]
+
+    def take(self, keep: NDArray[np.bool_]) -> FittedModes:
+        """The modes that `keep` picks."""
+        return FittedModes(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
 @dataclass(frozen=True)
@@ -135,7 +139,10 @@ def of_all_rows(window: Window, fit: Polished, part: SubBand, iterations: int) -
         points = of_all_blocks([told for _, told in each], transposed)
         parameters = _widened(first, scatter_over_points(points))
     shapes, stds, own = (np.concatenate(x) for x in zip(*some, strict=True))
-    return _core(part, estimate, (held, fit.away), (fit.step, step), parameters, (shapes, stds, own))
+    found = _core(part, estimate, (held, fit.away), (fit.step, step), parameters, (shapes, stds, own))
+    # where all rows find no place for a pole, it is a mode only if it has a peak
+    driven = (held & ~fit.held)[between(estimate.poles, part.low, part.high)]
+    return found.take(~(driven & backgrounds(window.data, Estimate(found.poles, found.participation))))
 
 
 def _core(

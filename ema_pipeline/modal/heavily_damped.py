@@ -146,15 +146,7 @@ def one_shape(data: FitData, weight: Real, estimate: Estimate) -> Real:
     free = Estimate(estimate.poles, np.ones((n_modes, 1), dtype=np.complex128))
     residues = np.empty((n_modes, len(data.measured), n_ref), dtype=np.complex128)
     for i in range(n_ref):
-        column = FitData(
-            data.omega,
-            data.frf[:, [i]],
-            data.variance[:, [i]],
-            data.measured[:, [i]],
-            data.rest_s,
-            data.transposed,
-            data.window_rad_s,
-        )
+        column = data.reference(i)
         residues[:, :, i] = solve_linear(column, weight[:, [i]], free).shapes.T
     scale = np.sqrt(np.mean(weight, axis=-1))
     values = np.linalg.svd(residues * scale, compute_uv=False) ** 2

@@ -140,15 +140,7 @@ def at_peak(data: FitData, pole: complex) -> Estimate:
     poles = np.array([pole])
     residues = np.empty(data.measured.shape, dtype=np.complex128)
     for i in range(data.measured.shape[1]):
-        column = FitData(
-            near.omega,
-            near.frf[:, [i]],
-            near.variance[:, [i]],
-            near.measured[:, [i]],
-            near.rest_s,
-            near.transposed,
-            near.window_rad_s,
-        )
+        column = near.reference(i)
         weight = np.where(column.measured[..., None], np.ones(column.frf.shape), 0.0)
         residues[:, i] = solve_linear(column, weight, Estimate(poles, np.ones((1, 1), complex))).shapes[:, 0]
     # rows of strong hits must not outweigh all others: each counts by its own size

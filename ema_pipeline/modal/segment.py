@@ -166,7 +166,7 @@ def measured_noise(
     n_lines = len(data.omega)
     n_ref = data.measured.shape[1]
     # the fit follows the noise a little: one shape entry per row and mode, and the residual terms
-    linear = 2.0 * len(estimate.poles) / max(n_ref, 1) + 8.0
+    linear = 2.0 * len(estimate.poles) / max(n_ref, 1) + len(data.residual_columns())
     share = max(1.0 - linear / (2.0 * n_lines), 0.3)
     left /= share
     found = fit_law_of_squares(left, square, data.measured, inputs_are_rows=data.transposed).at_squares(

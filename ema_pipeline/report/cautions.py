@@ -202,8 +202,8 @@ def _undecayed(c: ConfigurationResults) -> str:
         return ""
     worst = max(ringing, key=lambda v: v.value)
     return (
-        f"{len(ringing)} of {len(used)} hits still ring at the end of their records ({worst.message}): frequencies "
-        "and damping of such modes may be off by more than their uncertainty"
+        f"{len(ringing)} of {len(used)} hits still ring at the end of their records ({worst.message}): the fit of "
+        "modes takes that into account, but their damping is known less well"
     )
 
 

@@ -29,6 +29,7 @@ from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import cut_hit
 from ema_pipeline.modal import segment, sub_bands
+from ema_pipeline.modal.all_rows import backgrounds
 from ema_pipeline.modal.data import FitData, arrange
 from ema_pipeline.modal.fit import Estimate
 from ema_pipeline.modal.identify import identify
@@ -284,6 +285,40 @@ def test_a_truncated_record_is_flagged_at_its_hits_and_at_the_modes_that_ring_on
     assert flags[4.0] == [True, False]
     assert passes[12.0] == {True}
     assert flags[12.0] == [False, False]
+
+
+def test_poles_with_much_damping_are_backgrounds_unless_they_make_a_peak() -> None:
+    peak, far_down = (
+        2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2)) for f, zeta in ((100.0, 0.06), (200.0, 0.06))
+    )
+    light = 2 * np.pi * 200.0 * (-0.01 + 1j)
+    omega = 2 * np.pi * np.arange(40.0, 300.0, 0.5)
+    frf = (1 / (1j * omega - peak) + 1e-3)[None, None]
+    data = FitData(omega, frf, np.ones(frf.shape), np.ones((1, 1), dtype=bool), 3.0, False)
+    poles = np.array([peak, light, far_down])
+    assert backgrounds(data, Estimate(poles, np.ones((3, 1)))).tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("quantity", ["acceleration", "velocity", "displacement"])
+def test_modes_that_ring_on_are_right_whatever_the_sensors_measure(quantity: str) -> None:
+    """Hardly any noise; a third of the first mode and of one below the band is left at the end of the record."""
+    frequency, record_s, outputs = np.array([1.5, 61.0, 150.0]), 2.0, [0, 1, 2, 3]
+    rest = np.array([0.4, 0.33, 1e-3])
+    system = TrueSystem(
+        frequency,
+        -np.log(rest) / (2 * np.pi * frequency * record_s),
+        np.random.default_rng(2).standard_normal((3, 4)),
+    )
+    hits = simulate_hits(
+        system, outputs, [0, 1], f_max=200.0, record_s=record_s, n_hits=2, force_noise=1e-6, response_noise=1e-6,
+        rng=np.random.default_rng(5), integrations=["acceleration", "velocity", "displacement"].index(quantity),
+    )  # fmt: skip
+    records = records_of(hits, outputs, [0, 1], quantity)
+    frfs = estimate_frfs(cut_hit(r, h) for r, h in zip(records, hits_of_test(records), strict=True))
+    model = identify(frfs, ModalSettings(low_hz=20.0))
+    assert frfs.rings_on
+    assert frequencies(model) == pytest.approx(frequency[1:], rel=3e-6)
+    assert dampings(model) == pytest.approx(system.damping_ratio[1:], rel=3e-3)
 
 
 def test_a_mode_that_the_polish_drives_away_is_kept_as_it_was_with_a_flag_and_a_wider_uncertainty(

@@ -446,7 +446,7 @@ def test_a_model_that_the_diagnosis_finds_adequate_is_not_said_to_fail(run: RunR
 def test_hits_that_still_ring_at_the_end_of_their_records_are_told(
     run: RunResults, left: float, ringing: int, told: bool
 ) -> None:
-    """What is cut off biases modes by more than their uncertainty."""
+    """Damping of what is cut off is known less well."""
     c = run.configurations[0]
     verdicts = [
         judged("response decay", left if k < ringing else 0.0, 0.01, False, "", "warn", "ch4 still at 7 %")

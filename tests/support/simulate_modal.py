@@ -69,13 +69,14 @@ def simulate_hits(
     alike: float = 0.0,
     softening: float = 0.0,
     calibration: float = 0.0,
+    integrations: int = 0,
 ) -> Hits:
     """Simulate hits; noise levels are rms of the noise over rms of the channel's signal in the record.
 
     `drift` is the standard deviation of a factor on all frequencies of a hit, `wander` that of a factor on each,
     `alike` the correlation of both from one hit to the next; `softening` the relative drop of the first half of the
     modes from the softest hit (80 N) to the hardest (160 N), zero in their middle; `calibration` the standard
-    deviation of a constant factor on each channel.
+    deviation of a constant factor on each channel; `integrations` is 1 for velocities, 2 for displacements.
 
     Response noise is set per channel from its signal averaged over inputs, as a sensor's noise floor is.
     """
@@ -88,6 +89,7 @@ def simulate_hits(
     f = np.fft.rfftfreq(n_long, 1 / rate)
     taper = np.clip((0.5 * rate - f) / (0.5 * rate - 1.05 * f_max), 0, 1)
     taper = 0.5 - 0.5 * np.cos(np.pi * taper)
+    integrated = (2j * np.pi * np.maximum(f, f[1])) ** -integrations * ((f > 0) | (not integrations))
     still = system.accelerance(f, dofs_out, dofs_in) if not (drift or wander or softening) else None
     soft = np.arange(len(system.frequency_hz)) < len(system.frequency_hz) // 2
     width = 0.9 / f_max  # half-sine: first zero of the spectrum at 1.67 f_max
@@ -116,7 +118,7 @@ def simulate_hits(
             start = (pretrigger + rng.uniform(-0.5, 0.5)) / rate - tau / 2
             spectrum = spectrum * np.exp(-1j * (a + 2 * np.pi * f * start)) * taper
             force[i, h] = np.fft.irfft(spectrum, n_long)[:n] * rate
-            resp[i, h] = np.fft.irfft(column * spectrum, n_long)[:, :n] * rate
+            resp[i, h] = np.fft.irfft(column * integrated * spectrum, n_long)[:, :n] * rate
     if calibration:
         resp = resp * (1 + calibration * rng.standard_normal(len(dofs_out)))[:, None]
     sigma_f = force_noise * np.sqrt(np.mean(force**2))
@@ -129,9 +131,11 @@ def simulate_hits(
     return Hits(force, resp, rate, pretrigger, float(sigma_f), sigma_y)
 
 
-def records_of(hits: Hits, dofs_out: list[int], dofs_in: list[int]) -> list[Record]:
+def records_of(
+    hits: Hits, dofs_out: list[int], dofs_in: list[int], quantity: str = "acceleration"
+) -> list[Record]:
     """The hits as records of one hit each, as ingest hands them on; DOF k is called ``pk.z``."""
-    channels = tuple(ResponseChannel(f"a{k}", Dof(f"p{k}", "z"), "acceleration") for k in dofs_out)
+    channels = tuple(ResponseChannel(f"a{k}", Dof(f"p{k}", "z"), quantity) for k in dofs_out)
     return [
         Record(
             f"p{k}_{h}.h5",
