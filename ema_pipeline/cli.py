@@ -61,6 +61,7 @@ def main() -> None:
             stream.reconfigure(errors="backslashreplace")
     try:
         answer_ctrl_c(program())
+        _refuse_empty(sys.argv[1:])
         app()
     except EmaError as error:
         _stop(f"ema: {error}", 1)
@@ -80,6 +81,16 @@ def main() -> None:
             _stop_for_crash(error)
         where = f"{refused.filename}: " if refused.filename else ""
         _stop(f"ema: {where}{reason(refused)}; check the disk's free space and the folder's rights", 1)
+
+
+def _refuse_empty(arguments: list[str]) -> None:
+    """An empty path would stand for the current folder, which would be read or written to."""
+    if "" in arguments:
+        before = arguments[: arguments.index("")]
+        where = f" after {before[-1]}" if before else ""
+        raise EmaError(
+            f"the argument{where} is empty, perhaps a variable without a value: state it, or leave it out"
+        )
 
 
 def _refused_by_system(error: Exception) -> OSError | None:

@@ -80,7 +80,8 @@ class ParametricRig:
         Raises
         ------
         EmaError
-            For an unknown configuration or an unknown parameter, or where `build` gives no assembly.
+            For an unknown configuration or an unknown parameter, or where `build` asks for another one or gives no
+            assembly.
         """
         self._check(configuration)
         complete = {name: p.value for name, p in self.parameters.items()}
@@ -88,7 +89,13 @@ class ParametricRig:
             if name not in complete:
                 raise EmaError(f"rig '{self.name}' has no parameter '{name}'{did_you_mean(name, complete)}")
             complete[name] = float(value)
-        found = self.build(configuration, complete)
+        try:
+            found = self.build(configuration, complete)
+        except KeyError as error:
+            known = ", ".join(f"'{n}'" for n in complete) or "none"
+            raise EmaError(
+                f"rig '{self.name}': build asks for {error}, the parameters are {known}; name them alike"
+            ) from error
         if not isinstance(found, Assembly):
             kind = type(found).__name__
             raise EmaError(

@@ -327,6 +327,14 @@ def test_a_rig_whose_function_gives_no_assembly_says_so() -> None:
         rig.table()
 
 
+def test_a_rig_whose_function_asks_for_a_parameter_that_it_lacks_says_so() -> None:
+    rig = dataclasses.replace(ema.load_rig("frame"), build=lambda configuration, values: values["k9"])
+    with pytest.raises(
+        ema.EmaError, match=r"rig 'frame': build asks for 'k9', the parameters are '.*name them alike"
+    ):
+        rig.table()
+
+
 def test_axes_that_are_none_and_a_summary_that_is_gone_are_said(
     lines: SimpleNamespace, results: Path, tmp_path: Path
 ) -> None:

@@ -328,6 +328,16 @@ def test_the_version_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     assert out.startswith("ema 0.")
 
 
+def test_an_empty_path_is_refused_and_nothing_is_written_to_the_current_folder(
+    small_raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, _, err = ema(capsys, "run", small_raw, "--out", "")
+    assert code == 1
+    assert "the argument after --out is empty" in err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_wrong_option_is_a_usage_error_with_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
     assert ema(capsys, "run")[0] == 2
     assert ema(capsys, "run", "x", "--no-such-option")[0] == 2
