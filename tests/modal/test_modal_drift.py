@@ -15,7 +15,7 @@ from ema_pipeline.frf.warp import WarpedTransform
 from ema_pipeline.ingest.hit_checks import hits_of_test
 from ema_pipeline.ingest.records import HitSamples, cut_hit
 from ema_pipeline.modal.combine_estimates import NamedEstimate, pool
-from ema_pipeline.modal.drift.align import _movements
+from ema_pipeline.modal.drift.align import _movements, _warps
 from ema_pipeline.modal.drift.local import PeakPoles, change_in_decay, peak_poles
 from ema_pipeline.modal.drift.shifts import movement
 from ema_pipeline.modal.drift.windows import HitKey, PeakWindow
@@ -221,6 +221,31 @@ def test_a_peak_that_hits_on_one_point_hardly_show_stays_at_its_pole() -> None:
     moved, found = _movements(peaks, keys)
     assert found[2].frequency_hz == pytest.approx(120.0, rel=2e-4)
     assert np.abs(moved.own[:3, 2]).max() < 2e-4
+
+
+def test_a_peak_that_moves_takes_its_flanks_along_and_nothing_that_lies_farther_off() -> None:
+    poles = 2 * np.pi * np.array([complex(-0.3, 50.0), complex(-0.3, 51.5), complex(-0.5, 120.0)])
+    own = np.outer([5e-4, -4e-4, 2e-4, -3e-4, 1e-4, -1e-4], [0.0, 1.0, 1.0])
+    peaks = [
+        PeakPoles(p, p * (1 + own[:, c]), np.full(6, 1e-6 * p.imag), np.ones((6, 3)))
+        for c, p in enumerate(poles)
+    ]
+    keys = tuple(HitKey(f"{k}.h5", 0, "p0.z", 100.0) for k in range(6))
+    moved, looked_at = _movements(peaks, keys)
+    frequency = np.arange(0.0, 200.0, 0.25)
+    warps = _warps(peaks, looked_at, moved, frequency)
+    for h in range(6):
+        at_50, flank, at_51, between, flank_of_120, at_120 = np.interp(
+            [50.0, 50.75, 51.5, 90.0, 119.75, 120.0], frequency, warps[h] - moved.common[h]
+        )
+        assert [at_50, at_51, at_120] == pytest.approx(
+            own[h] - own[:, 1].mean() * np.array([0, 1, 1]), abs=5e-5
+        )
+        assert flank == pytest.approx(
+            0.5 * (at_50 + at_51), rel=0.02
+        )  # straight from one plateau to the next
+        assert flank_of_120 == at_120
+        assert between == pytest.approx(0.0, abs=1e-7)
 
 
 def test_hits_that_do_not_move_are_left_as_they_are() -> None:

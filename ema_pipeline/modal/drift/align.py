@@ -44,6 +44,9 @@ REACH = 2.0
 PLATEAU = 0.4
 """Share of the way to the next peak that moves with a peak: its flanks too must stay where it is."""
 
+FLANKS = 5.0
+"""Half-power half-widths of a peak that move with it at most: what lies between distant peaks may be another mode."""
+
 
 @dataclass(frozen=True)
 class PeakMovement:
@@ -263,9 +266,14 @@ def _warps(
     order = np.argsort([p.frequency_hz for p in looked_at])
     centre = np.array([looked_at[c].frequency_hz for c in order])
     gap = np.diff(centre, prepend=0.0, append=float(frequency_hz[-1]))
-    nodes = np.stack([centre - PLATEAU * gap[:-1], centre + PLATEAU * gap[1:]], axis=1)
+    flank = FLANKS * damping[order] * centre
+    below, above = np.minimum(PLATEAU * gap[:-1], flank), np.minimum(PLATEAU * gap[1:], flank)
+    # between distant peaks lines stay where they are, between near ones they go from one plateau to the next
+    rest = np.concatenate([[True], 2 * (above[:-1] + below[1:]) < gap[1:-1], [True]])
+    nodes = np.stack([centre - 2 * below, centre - below, centre + above, centre + 2 * above], axis=1)
+    used = np.stack([rest[:-1], np.full(len(centre), True), np.full(len(centre), True), rest[1:]], axis=1)
     out = {}
     for h in range(len(common)):
-        values = np.repeat(own[h, order], 2)
-        out[h] = common[h] + np.interp(frequency_hz, nodes.ravel(), values, left=0.0, right=0.0)
+        values = own[h, order][:, None] * [0.0, 1.0, 1.0, 0.0]
+        out[h] = common[h] + np.interp(frequency_hz, nodes[used], values[used])
     return out
