@@ -30,8 +30,11 @@ HARMONICS = 13
 MAINS_DRIFT = 1e-3
 """Relative: ±0.05 Hz, within which grids are held."""
 
-TONES = 9
+FEWEST_TONES, MOST_TONES = 9, 129
 """Frequencies of the mains tried in every hit."""
+
+TONE_STEP = 0.025
+"""Periods over the record by which these differ: a tone that is not quite met leaves what looks like a mode."""
 
 TRACE = 1e-6
 """Share by which tones decay over the record."""
@@ -250,7 +253,8 @@ def _columns(
     slow = blow[:, None] * x[:, None] ** np.arange(3)
     poles = np.array([*candidate.neighbours, mode.pole], dtype=np.complex128) - hit.window_rad_s
     decays = blow * pole_values(omega, poles, rest_s)
-    drift = MAINS_DRIFT * np.linspace(-1, 1, TONES)
+    wanted = np.ceil(2 * MAINS_DRIFT * candidate.tone_hz * record_s / TONE_STEP)
+    drift = MAINS_DRIFT * np.linspace(-1, 1, int(np.clip(wanted, FEWEST_TONES, MOST_TONES)))
     # a trace of decay, since the transform of a tone right on a line is a limit
     decay = hit.window_rad_s + TRACE / record_s
     tones = np.asarray(2j * np.pi * candidate.tone_hz * (1 + drift) - decay, dtype=np.complex128)

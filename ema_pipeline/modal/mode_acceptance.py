@@ -35,6 +35,9 @@ FALSE_ALARM = 1e-6
 MAX_DAMPING_STD = 0.35
 """A pole whose damping is not known to this share is not told from noise."""
 
+MAX_PLAIN_DAMPING_STD = 0.5
+"""The same of a plain mode, which noise has not made: its decay lies two standard deviations from that of a tone."""
+
 MIN_VOTES = 0.3
 """Share of model orders that must show a mode, unless the FRFs show it plainly or the noise is known."""
 
@@ -195,8 +198,10 @@ def _strength_over_noise(data: FitData, fit: SegmentFit) -> Real:
     The damping of a mode that the polish could not place is not known, and said to be so.
     """
     gain, threshold = significance(data, fit.noise, fit.estimate, fit.solution)
-    std = decay_std(data, fit.estimate, fit.solution) * np.sqrt(likeness(-fit.estimate.poles.real, data))
-    known = np.where(fit.held, np.inf, MAX_DAMPING_STD / np.maximum(std, 1e-9))
+    std = decay_std(fit.estimate, fit.solution) * np.sqrt(likeness(-fit.estimate.poles.real, data))
+    plain = visibility(data, fit.estimate, fit.solution) >= PLAIN
+    most = np.where(plain, MAX_PLAIN_DAMPING_STD, MAX_DAMPING_STD)
+    known = np.where(fit.held, np.inf, most / np.maximum(std, 1e-9))
     return np.asarray(np.minimum(gain / threshold, known))
 
 
@@ -206,18 +211,13 @@ def _size(estimate: Estimate, solution: LinearSolution) -> Real:
     )
 
 
-def decay_std(data: FitData, estimate: Estimate, solution: LinearSolution) -> Real:
-    """Standard deviation of each pole's decay rate by the fit alone, relative to it or to one over the record's length.
-
-    Of a mode that decays more slowly than that, a record shows how much is left at its end, and no more.
-    """
+def decay_std(estimate: Estimate, solution: LinearSolution) -> Real:
+    """Relative standard deviation of each pole's decay rate, from the fit alone."""
     information = newton_step(estimate, solution).information
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information * scale[:, None] * scale[None], rcond=1e-12)
     std = np.sqrt(0.5 * np.maximum(np.diag(inverse), 0)) * scale
-    return np.asarray(
-        std[0 : 2 * len(estimate.poles) : 2] / np.maximum(np.abs(estimate.poles.real), 1 / data.rest_s)
-    )
+    return np.asarray(std[0 : 2 * len(estimate.poles) : 2] / np.abs(estimate.poles.real))
 
 
 def visibility(data: FitData, estimate: Estimate, solution: LinearSolution) -> Real:

@@ -88,6 +88,12 @@ def test_a_pole_that_follows_mains_hum_is_named_and_no_mode(decay: float) -> Non
     assert any("hum" in note and "150.01 Hz" in note for note in fewer.notes)
 
 
+@pytest.mark.parametrize("mains_hz", [49.9938, 50.0062, 50.0188])
+def test_strong_hum_between_two_round_frequencies_is_no_mode(mains_hz: float) -> None:
+    modal, fewer = judged(with_hum(mains_hz, 1.0), 3 * mains_hz, 0.1)
+    assert fewer.modes == (modal.modes[0], *modal.modes[2:])
+
+
 def test_hum_of_single_hits_that_start_at_the_blow_hardly_decays() -> None:
     records = [
         replace(r, force=r.force[18:], responses=np.asarray(r.responses)[:, 18:])
