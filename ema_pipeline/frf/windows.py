@@ -91,6 +91,10 @@ class Windows:
     Offsets, which a window would smear over the lowest lines, are taken off first: the mean before the pulse
     where at least eight samples lie there, otherwise the median of the record.
 
+    Responses that still ring from the hit before, earlier in the recording, are held at their mean until the blow. What
+    rings then starts with the blow, as the response to it does, and changes residues alone: from before the
+    blow on it would turn against them over frequency, and poles would be off.
+
     Parameters
     ----------
     hit : HitSamples
@@ -107,7 +111,10 @@ class Windows:
         self._shape = force_window(hit.force, peak) if settings.force_window == "auto" else None
         self.active = self._decay is not None or self._shape is not None or offsets
         self._offsets = offsets
-        self._rest = find_pulse(hit.force, peak).start if self.active else 0
+        struck_ringing = hit.hit.number > 0 and hit.hit.rings_on
+        before = find_pulse(hit.force, peak).start if self.active or struck_ringing else 0
+        self._rest = before if self.active else 0
+        self._held = before if struck_ringing else 0
 
     def force(self, samples: NDArray[np.float64]) -> NDArray[np.float64]:
         """The windowed force; the samples themselves without windows."""
@@ -119,7 +126,10 @@ class Windows:
         return windowed if self._decay is None else windowed * self._decay
 
     def responses(self, block: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The windowed responses (n_channels, n_samples); the block itself without an exponential window."""
+        """The windowed responses (n_channels, n_samples); the block itself where nothing has to be done."""
+        if self._held:
+            block = block.copy()
+            block[:, : self._held] = block[:, : self._held].mean(axis=1, keepdims=True)
         if self._decay is None:
             return block - _offset(block, self._rest) if self._offsets else block
         return np.asarray((block - _offset(block, self._rest)) * self._decay)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import signal
 from simulate_hits import modal_response, record_of
 
+from ema_pipeline.check_result import judged
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf import FrfSet, FrfSettings, estimate_frfs
 from ema_pipeline.frf.windows import force_window
@@ -228,6 +229,34 @@ def test_record_cut_at_the_blow_keeps_rational_frfs_although_it_has_not_decayed(
         for s, a in ((pole, residue), (pole.conjugate(), residue.conjugate())):
             expected += a / RATE * (1 - np.exp(s * n / RATE)) / (1 - np.exp(s / RATE) / z)
     assert np.allclose(frfs.frf[0, 0], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("number", "still_ringing", "alike"), [(1, True, True), (1, False, False), (0, True, False)]
+)
+def test_what_still_rings_when_a_later_hit_strikes_changes_residues_alone(
+    number: int, still_ringing: bool, alike: bool
+) -> None:
+    """Around a mode the FRF stays a multiple of that of a structure that was struck at rest."""
+    n, blow = 1024, 64
+    force = np.zeros(n)
+    force[blow] = 50.0
+    time = np.arange(n) / RATE
+    pole = complex(-1.0, 2 * np.pi * 80.0)  # 2.5 periods before the blow, 61 % left at the end
+    answer = modal_response(force, RATE, np.array([pole]), np.array([80j]))
+    left = 0.2 * np.ptp(answer) * np.real(np.exp(pole * time + 1j))
+    frf = []
+    for samples in (answer, answer + left):
+        h = hit_of(force, samples[None, :])
+        decay = judged(
+            "response decay", 0.6, 0.01, not still_ringing, "", "warn", "still rings", channel="a0"
+        )
+        found = estimate_frfs([replace(h, hit=replace(h.hit, number=number, verdicts=(decay,)))])
+        frf.append(found.frf[0, 0, 20:61])  # 20 Hz on either side of the mode
+    # a constant stands for what is far away, the static part of what is cut off
+    columns = np.stack([frf[0], np.ones(41)], axis=1)
+    rest = frf[1] - columns @ np.linalg.lstsq(columns, frf[1], rcond=None)[0]
+    assert bool(np.linalg.norm(rest) < 0.03 * np.linalg.norm(frf[1] - frf[0])) is alike
 
 
 def test_force_window_keeps_the_pulse_whole() -> None:
