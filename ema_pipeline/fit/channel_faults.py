@@ -38,6 +38,10 @@ AGREEMENT = 0.5
 """Mean cosine of the phase between measured and modelled FRF from which on the model describes the FRF at all: below,
 the FRF is ruled by what the model leaves out (transverse sensitivity, oblique blows) or its modes lie elsewhere."""
 
+ONE_SIZE = 3.0
+"""An FRF that differs from its channel's others by a larger factor is ruled by what the model leaves out: oblique blows
+where the model answers blows along one direction hardly at all."""
+
 CLEAR = 0.7
 """At least one FRF of a channel must agree as well as this before the channel is called reversed."""
 
@@ -81,7 +85,8 @@ def suspected_sensitivities(
     found: dict[tuple[str, float], list[tuple[str, _Suspicion]]] = {}
     for configuration, measured in frfs.items():
         log_ratio, cosine = _against_model(measured, systems[configuration])
-        for s in (*_factors(measured, log_ratio, cosine), *_reversed(measured, cosine)):
+        faults = *_factors(measured, log_ratio, cosine), *_reversed(measured, _of_one_size(log_ratio, cosine))
+        for s in faults:
             found.setdefault(
                 (s.what, round(4 * math.log(s.factor)) if s.factor > 0 else s.factor), []
             ).append((configuration, s))
@@ -191,10 +196,34 @@ def _factors(frfs: FrfSet, log_ratio: Real, cosine: Real) -> list[_Suspicion]:
     elif frfs.force_calibrated:
         common = 0.0
     for o, log in zip(known, logs - common, strict=True):
-        if abs(log) > math.log(SUSPECT_FACTOR):
+        if abs(log) > math.log(SUSPECT_FACTOR) and not _right_where_struck(
+            frfs, int(o), log_ratio - common, cosine
+        ):
             cause = likely_cause(math.exp(log), frfs.quantities[o])
             found.append(_Suspicion(_channel_words(frfs, int(o)), math.exp(log), cause))
     return found
+
+
+def _right_where_struck(frfs: FrfSet, output: int, log_ratio: Real, cosine: Real) -> bool:
+    """True where the channel's driving point has the right size: a gain is one for all FRFs of a channel."""
+    struck = [i for i, d in enumerate(frfs.inputs) if d.point == frfs.outputs[output].point]
+    return any(
+        abs(log_ratio[output, i]) <= math.log(SUSPECT_FACTOR) and cosine[output, i] >= CLEAR for i in struck
+    )
+
+
+def _of_one_size(log_ratio: Real, cosine: Real) -> Real:
+    """Cosines of FRFs of the right size, or of their channel's where none is right; NaN elsewhere.
+
+    A sign turns no size.
+    """
+    kept = cosine.copy()
+    for logs, own in zip(log_ratio, kept, strict=True):
+        weight = np.nan_to_num(own**2)
+        if np.any(weight) and not np.any(np.abs(logs) < math.log(ONE_SIZE)):
+            logs = logs - _weighted_median(logs, weight)
+        own[np.abs(logs) >= math.log(ONE_SIZE)] = np.nan
+    return kept
 
 
 def _common(logs: Real) -> float:

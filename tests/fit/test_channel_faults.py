@@ -162,6 +162,30 @@ def test_a_sensor_that_hardly_moves_its_own_way_may_read_another_one() -> None:
     assert suspected(2, 5.0 * exact[2]) == ["m2.x 5.0"]  # no other sensor at this body
 
 
+def test_what_oblique_blows_make_where_the_model_hardly_answers_turns_no_channel() -> None:
+    """Far smaller than the channel's other FRFs are against the model, and of the other sign; a turned channel is."""
+    stiffness = np.array([[3e5, -2e5, 0.0], [-2e5, 3e5, -1e5], [0.0, -1e5, 2e5]])
+    system = LinearSystem(
+        dofs=("m1.x", "m2.x", "m3.x"), mass=np.eye(3), stiffness=stiffness, damping=2e-5 * stiffness,
+        structural=np.zeros((3, 3)), modal_damping_ratio=0.0, sensors={},
+    )  # fmt: skip
+    lines = np.arange(1.0, 200.0, 0.25)
+    blank = frf_set(lines, np.zeros((3, 3, len(lines)), complex), range(3), range(3))
+    points = tuple(map(Dof.parse, system.dofs))
+    blank = replace(blank, outputs=points, inputs=points, band_hz=(2.0, 190.0))
+    exact = windowed_accelerance(system, blank)
+
+    def suspected(factors: list[float]) -> list[str]:
+        read = exact.copy()
+        read[2] *= np.array(factors)[:, None]
+        told = suspected_sensitivities({"all": replace(blank, frf=read)}, {"all": [system]})
+        return [f"{c.channel} {c.value:.1f}" for c in told]
+
+    assert suspected([-0.03, -0.03, 1.0]) == []
+    assert suspected([-1.0, -1.0, -1.0]) == ["m3.x -1.0"]
+    assert suspected([-5.0, -5.0, -5.0]) == ["m3.x 5.0", "m3.x -1.0"]
+
+
 def hits_in(raw: Path) -> list[HitSamples]:
     """The hits of a test, cut from their records."""
     records = [r for test in read_campaign(raw).tests for r in load_records(test)]
