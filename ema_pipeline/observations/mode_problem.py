@@ -72,13 +72,14 @@ def _drift(configuration: str, test: str) -> str:
     return f"drift of {configuration}{' in ' + test if test else ''}"
 
 
-def _transverse(sensor: str, direction: str) -> str:
-    return f"transverse sensitivity at {sensor} along {direction}"
+def _transverse(sensor: str, direction: str, where: str) -> str:
+    """Name of the unknown: a sensor that is mounted anew reads across its axis in another direction."""
+    return f"transverse sensitivity at {sensor} along {direction}{where}"
 
 
-def _aim(sensor: str) -> str:
+def _aim(sensor: str, where: str) -> str:
     """Name of the unknown: blows off their direction excite less, all modes alike."""
-    return f"aim at {sensor}"
+    return f"aim at {sensor}{where}"
 
 
 @dataclass(frozen=True)
@@ -162,13 +163,15 @@ class ModeProblem(EffectProblem):
         gains = {_calibration(s, c): c.calibration_std / CALIBRATION_STD for s, c in sensors.items()}
         gains = {name: std for name, std in gains.items() if std > 0}
         across: dict[str, float] = {}
-        for s, c in sensors.items():
-            others, off = self.directions_across(s), c.off_direction
-            if c.transverse > 0 or off:
-                std = float(np.hypot(c.transverse / np.sqrt(max(len(others), 1)), off))
-                across |= {_transverse(s, d): std for d in others}
+        for where, s in dict.fromkeys(
+            (self._where(d), o.point) for d in self.observations.data for o in d.dofs
+        ):
+            c, others = sensors[s], self.directions_across(s)
+            if c.transverse > 0 or c.off_direction:
+                std = float(np.hypot(c.transverse / np.sqrt(max(len(others), 1)), c.off_direction))
+                across |= {_transverse(s, d, where): std for d in others}
             if c.aim:
-                across[_aim(s)] = c.aim
+                across[_aim(s, where)] = c.aim
         drifts = [_drift(d.configuration, self.observations.test) for d in self.observations.data]
         return joined(
             self.model.unknowns,
@@ -180,6 +183,11 @@ class ModeProblem(EffectProblem):
                 for d in self.observations.data
             ),
         )
+
+    def _where(self, d: ModeData) -> str:
+        """What tells the mountings and blows of one configuration from those of the others."""
+        several = len({of.configuration for of in self.observations.data}) > 1
+        return f", {d.configuration}" if several else ""
 
     def directions_across(self, sensor: str) -> tuple[str, ...]:
         """Directions whose motion a sensor also reads; for one on the rim the radius, wherever it is."""
@@ -216,17 +224,17 @@ class ModeProblem(EffectProblem):
         most = max(map(len, _FRAMES)) + 1
         across = np.zeros((most, *along.shape))
         gain = np.full(len(d.dofs), -1)
-        transverse = np.full((most, len(d.dofs)), -1)
+        transverse, where = np.full((most, len(d.dofs)), -1), self._where(d)
         for i, dof in enumerate(d.dofs):
             gain[i] = self.unknowns.index.get(
                 _calibration(dof.point, self.observations.channel(dof.point)), -1
             )
             for k, direction in enumerate(self.directions_across(dof.point)):
                 other = Dof(dof.body, direction)
-                transverse[k, i] = self.unknowns.index.get(_transverse(dof.point, direction), -1)
+                transverse[k, i] = self.unknowns.index.get(_transverse(dof.point, direction, where), -1)
                 if transverse[k, i] >= 0 and self.observations.has(d.configuration, other):
                     across[k, i] = self.model.sensor_rows(d.configuration, (other,))[0]
-            transverse[-1, i] = self.unknowns.index.get(_aim(dof.point), -1)
+            transverse[-1, i] = self.unknowns.index.get(_aim(dof.point, where), -1)
             across[-1, i] = along[i]
         drift = self.unknowns.index.get(_drift(d.configuration, self.observations.test), -1)
         mixing = np.array([self.unknowns.index.get(n, -1) for n in self._mixing(d)], np.int64)
