@@ -18,7 +18,7 @@ from ema_pipeline.modal.assurance import mac, mpc
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, LinearSolution, newton_step, synthesis
 from ema_pipeline.modal.fit_covariance import evidence
-from ema_pipeline.modal.heavily_damped import has_peak, unearned
+from ema_pipeline.modal.heavily_damped import UNSEEN, has_peak, unearned
 from ema_pipeline.modal.missed import left_over
 from ema_pipeline.modal.noise import Noise
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
@@ -37,6 +37,9 @@ MAX_DAMPING_STD = 0.35
 
 MAX_PLAIN_DAMPING_STD = 0.5
 """The same of a plain mode, which noise has not made: its decay lies two standard deviations from that of a tone."""
+
+MAX_UNSEEN_DAMPING_STD = 0.15
+"""The same of a pole that no model order shows, which else mends what a fit leaves over beside another mode."""
 
 MIN_VOTES = 0.3
 """Share of model orders that must show a mode, unless the FRFs show it plainly or the noise is known."""
@@ -153,7 +156,8 @@ def credible(
     support = np.maximum(share / needed, np.where(twin, 0.0, plain))
     # any mix of two modes at one pole is a shape of that pole, complex ones too
     support = np.where(_incoherent(solution) & ~twin, 0.0, support)
-    support = np.where(explained, np.maximum(support, 1.0), support)
+    told = (share > UNSEEN) | (decay_std(estimate, solution) < MAX_UNSEEN_DAMPING_STD)
+    support = np.where(explained & told, np.maximum(support, 1.0), support)
     # where the polish finds no place for a mode, it is one only if most orders and the FRFs show it plainly
     support = np.where(fit.held, np.minimum(plain, share / SURE_VOTES), support)
     weight = fit.noise.weight(data.measured)
