@@ -31,6 +31,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 
 from simulate_modal import (
+    QUANTITIES,
     FrfSet,
     Hits,
     TrueSystem,
@@ -116,8 +117,7 @@ def random_case(seed: int) -> tuple[TrueSystem, Hits, FrfSet, list[int], list[in
     f_max = float(rng.choice([400.0, 800.0, 1600.0, 3200.0]))
     low = f_max * rng.uniform(0.02, 0.15)
     system = random_system(rng, n_modes=n_modes, n_dofs=n_out, low_hz=low, high_hz=0.95 * f_max)
-    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
-    record = float(np.clip(4.5 / slowest, 1024 / f_max, 16384 / f_max))
+    record = float(np.clip(4.5 / system.slowest_decay, 1024 / f_max, 16384 / f_max))
     dofs_out, dofs_in = list(range(n_out)), sorted(rng.choice(n_out, n_ref, replace=False).tolist())
     hits = simulate_hits(
         system,
@@ -228,8 +228,7 @@ def pair_case(seed: int) -> tuple[TrueSystem, Hits, FrfSet, list[int], list[int]
         np.insert(base.damping_ratio, k + 1, zeta),
         np.insert(base.shapes, k + 1, rng.standard_normal(n_out), axis=0),
     )
-    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
-    record = float(np.clip(4.5 / slowest, 1.28, 20.0))
+    record = float(np.clip(4.5 / system.slowest_decay, 1.28, 20.0))
     dofs_out, dofs_in = list(range(n_out)), sorted(rng.choice(n_out, n_ref, replace=False).tolist())
     hits = simulate_hits(
         system, dofs_out, dofs_in, f_max=f_max, record_s=record, n_hits=int(rng.integers(2, 6)),
@@ -298,10 +297,9 @@ def coverage_case(seed: int) -> tuple[TrueSystem, list[Record]]:
         rng, n_modes=int(rng.integers(2, 6)), n_dofs=n_out, low_hz=60, high_hz=360, min_spacing=0.05,
         damping=(0.003, 0.02),
     )  # fmt: skip
-    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
     dofs_out, dofs_in = list(range(n_out)), list(range(n_ref))
     hits = simulate_hits(
-        system, dofs_out, dofs_in, f_max=400.0, record_s=max(6.0 / slowest, 1.28),
+        system, dofs_out, dofs_in, f_max=400.0, record_s=max(6.0 / system.slowest_decay, 1.28),
         n_hits=int(rng.integers(1, 6)),
         force_noise=rng.uniform(0.002, 0.05), response_noise=rng.uniform(0.002, 0.05), rng=rng,
     )  # fmt: skip
@@ -314,12 +312,12 @@ def ringing_case(seed: int) -> tuple[TrueSystem, list[Record]]:
     Sensors measure acceleration, velocity or displacement; the suspension moves at 1 to 3 Hz.
     """
     rng = np.random.default_rng(130_000 + seed)
-    n_out, n_ref, quantity = int(rng.integers(3, 9)), int(rng.integers(1, 3)), seed % 3
+    n_out, n_ref, quantity = int(rng.integers(3, 9)), int(rng.integers(1, 3)), QUANTITIES[seed % 3]
     system = random_system(
         rng, n_modes=int(rng.integers(2, 6)), n_dofs=n_out, low_hz=60, high_hz=360, min_spacing=0.05,
         damping=(0.0005, 0.01),
     )  # fmt: skip
-    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
+    slowest = system.slowest_decay
     system = TrueSystem(
         np.concatenate([[rng.uniform(1.0, 3.0)], system.frequency_hz]),
         np.concatenate([[0.03], system.damping_ratio]),
@@ -329,10 +327,9 @@ def ringing_case(seed: int) -> tuple[TrueSystem, list[Record]]:
     hits = simulate_hits(
         system, dofs_out, dofs_in, f_max=400.0, record_s=max(-np.log(rng.uniform(0.1, 0.6)) / slowest, 0.5),
         n_hits=int(rng.integers(2, 6)), force_noise=rng.uniform(1e-4, 0.01),
-        response_noise=rng.uniform(1e-4, 0.01), rng=rng, integrations=quantity,
+        response_noise=rng.uniform(1e-4, 0.01), rng=rng, quantity=quantity,
     )  # fmt: skip
-    records = records_of(hits, dofs_out, dofs_in, ("acceleration", "velocity", "displacement")[quantity])
-    return system, records
+    return system, records_of(hits, dofs_out, dofs_in)
 
 
 def coverage_study(
@@ -366,10 +363,9 @@ def moving_case(seed: int) -> tuple[TrueSystem, Hits, list[int], list[int]]:
         rng, n_modes=int(rng.integers(4, 11)), n_dofs=n_out, low_hz=50, high_hz=760, min_spacing=0.03,
         damping=(0.002, 0.02),
     )  # fmt: skip
-    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
     dofs_out, dofs_in = list(range(n_out)), list(range(n_ref))
     hits = simulate_hits(
-        system, dofs_out, dofs_in, f_max=800.0, record_s=float(np.clip(6.0 / slowest, 1.28, 10.0)),
+        system, dofs_out, dofs_in, f_max=800.0, record_s=float(np.clip(6.0 / system.slowest_decay, 1.28, 10.0)),
         n_hits=int(rng.integers(1, 6)),
         force_noise=rng.uniform(0.01, 0.05), response_noise=rng.uniform(0.01, 0.05), rng=rng,
         drift=1e-3, softening=1e-3, calibration=0.04,
@@ -388,11 +384,11 @@ def roving_case(seed: int) -> tuple[TrueSystem, Hits, list[int], list[int]]:
         rng, n_modes=int(rng.integers(4, 9)), n_dofs=n_in, low_hz=40, high_hz=360, min_spacing=0.03,
         damping=(0.002, 0.01),
     )  # fmt: skip
-    slowest = float(np.min(system.damping_ratio * system.frequency_hz * 2 * np.pi))
     dofs_in = list(range(n_in))
     dofs_out = sorted(rng.choice(n_in, n_out, replace=False).tolist())
+    record_s = float(np.clip(6.0 / system.slowest_decay, 2.56, 10.0))
     hits = simulate_hits(
-        system, dofs_out, dofs_in, f_max=400.0, record_s=float(np.clip(6.0 / slowest, 2.56, 10.0)), n_hits=1,
+        system, dofs_out, dofs_in, f_max=400.0, record_s=record_s, n_hits=1,
         force_noise=rng.uniform(0.002, 0.02), response_noise=rng.uniform(0.002, 0.02), rng=rng,
         drift=1e-4, wander=2e-4, alike=0.7 * (seed % 2), softening=2e-4, calibration=0.04,
     )  # fmt: skip

@@ -39,8 +39,8 @@ AGREEMENT = 0.5
 the FRF is ruled by what the model leaves out (transverse sensitivity, oblique blows) or its modes lie elsewhere."""
 
 ONE_SIZE = 3.0
-"""An FRF that differs from its channel's others by a larger factor is ruled by what the model leaves out: oblique blows
-where the model answers blows along one direction hardly at all."""
+"""An FRF that differs from the model's, or where none is right from its channel's others, by a larger factor is ruled
+by what the model leaves out: oblique blows where it answers blows along one direction hardly at all."""
 
 CLEAR = 0.7
 """At least one FRF of a channel must agree as well as this before the channel is called reversed."""

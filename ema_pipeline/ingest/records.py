@@ -164,9 +164,14 @@ class Hit:
         return not any(v.consequence == "reject_hit" and not v.passes for v in self.verdicts)
 
     @property
+    def undecayed(self) -> tuple[CheckResult, ...]:
+        """Verdicts on responses that have not decayed at the end of the record."""
+        return tuple(v for v in self.verdicts if v.check == "response decay" and not v.passes)
+
+    @property
     def rings_on(self) -> bool:
         """True where a response has not decayed at the end of the record."""
-        return any(v.check == "response decay" and not v.passes for v in self.verdicts)
+        return bool(self.undecayed)
 
     @property
     def rejected_channels(self) -> frozenset[str]:

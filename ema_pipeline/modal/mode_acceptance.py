@@ -119,7 +119,9 @@ ECHO_MAC = 0.6
 def significant(data: FitData, fit: SegmentFit) -> NDArray[np.bool_]:
     """Candidates to drop from a first guess: impossible ones, else those that noise alone could make."""
     out = impossible(data, fit.estimate)
-    return out if out.any() else _next(_strength_over_noise(data, fit))
+    if out.any():
+        return out
+    return _next(_strength_over_noise(data, fit, decay_std(fit.estimate, fit.solution)))
 
 
 def credible(
@@ -156,14 +158,15 @@ def credible(
     support = np.maximum(share / needed, np.where(twin, 0.0, plain))
     # any mix of two modes at one pole is a shape of that pole, complex ones too
     support = np.where(_incoherent(solution) & ~twin, 0.0, support)
-    told = (share > UNSEEN) | (decay_std(estimate, solution) < MAX_UNSEEN_DAMPING_STD)
+    std = decay_std(estimate, solution)
+    told = (share > UNSEEN) | (std < MAX_UNSEEN_DAMPING_STD)
     support = np.where(explained & told, np.maximum(support, 1.0), support)
     # where the polish finds no place for a mode, it is one only if most orders and the FRFs show it plainly
     support = np.where(fit.held, np.minimum(plain, share / SURE_VOTES), support)
     weight = fit.noise.weight(data.measured)
     support = np.where(unearned(data, weight, estimate, solution, share, explained), 0.0, support)
     support = np.where(peaks.owners(estimate), np.maximum(support, 1.0), support)
-    out = _next(np.minimum(_strength_over_noise(data, fit), support))
+    out = _next(np.minimum(_strength_over_noise(data, fit, std), support))
     # one or two sensors tell little: they are asked last, of modes that all else speaks for
     return out if out.any() else _smaller_of_pairs(estimate, solution, _followers(data, estimate, solution))
 
@@ -196,13 +199,13 @@ def _next(score: Real) -> NDArray[np.bool_]:
     return np.asarray((score < 1) & (score <= max(HOPELESS, float(score.min()))))
 
 
-def _strength_over_noise(data: FitData, fit: SegmentFit) -> Real:
-    """Above 1 where noise cannot have made the candidate, and its damping is known well enough.
+def _strength_over_noise(data: FitData, fit: SegmentFit, std: Real) -> Real:
+    """Above 1 where noise cannot have made the candidate, and its damping is known well enough, by its `decay_std`.
 
     The damping of a mode that the polish could not place is not known, and said to be so.
     """
     gain, threshold = significance(data, fit.noise, fit.estimate, fit.solution)
-    std = decay_std(fit.estimate, fit.solution) * np.sqrt(likeness(-fit.estimate.poles.real, data))
+    std = std * np.sqrt(likeness(-fit.estimate.poles.real, data))
     plain = visibility(data, fit.estimate, fit.solution) >= PLAIN
     most = np.where(plain, MAX_PLAIN_DAMPING_STD, MAX_DAMPING_STD)
     known = np.where(fit.held, np.inf, most / np.maximum(std, 1e-9))

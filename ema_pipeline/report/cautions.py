@@ -196,8 +196,8 @@ def left_out(c: ConfigurationResults) -> list[str]:
 def _undecayed(c: ConfigurationResults) -> str:
     """That most hits were still ringing at the end of their records; empty where they were not, or a window was."""
     used = [h for h in c.hits if h.accepted]
-    left = [[v for v in h.verdicts if v.check == "response decay" and not v.passes] for h in used]
-    ringing = [v for v in (max(of, key=lambda v: v.value) for of in left if of) if v.value > _RINGING]
+    worst_of_hits = (max(h.undecayed, key=lambda v: v.value) for h in used if h.rings_on)
+    ringing = [v for v in worst_of_hits if v.value > _RINGING]
     if 2 * len(ringing) <= len(used) or (c.frfs is not None and c.frfs.response_decay_rad_s):
         return ""
     worst = max(ringing, key=lambda v: v.value)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter1d
 from simulate_modal import (
+    QUANTITIES,
     TrueSystem,
     frf_set,
     h1,
@@ -299,7 +300,7 @@ def test_poles_with_much_damping_are_backgrounds_unless_they_make_a_peak() -> No
     assert backgrounds(data, Estimate(poles, np.ones((3, 1)))).tolist() == [False, False, True]
 
 
-@pytest.mark.parametrize("quantity", ["acceleration", "velocity", "displacement"])
+@pytest.mark.parametrize("quantity", QUANTITIES)
 def test_modes_that_ring_on_are_right_whatever_the_sensors_measure(quantity: str) -> None:
     """Hardly any noise; a third of the first mode and of one below the band is left at the end of the record."""
     frequency, record_s, outputs = np.array([1.5, 61.0, 150.0]), 2.0, [0, 1, 2, 3]
@@ -311,9 +312,9 @@ def test_modes_that_ring_on_are_right_whatever_the_sensors_measure(quantity: str
     )
     hits = simulate_hits(
         system, outputs, [0, 1], f_max=200.0, record_s=record_s, n_hits=2, force_noise=1e-6, response_noise=1e-6,
-        rng=np.random.default_rng(5), integrations=["acceleration", "velocity", "displacement"].index(quantity),
+        rng=np.random.default_rng(5), quantity=quantity,
     )  # fmt: skip
-    records = records_of(hits, outputs, [0, 1], quantity)
+    records = records_of(hits, outputs, [0, 1])
     frfs = estimate_frfs(cut_hit(r, h) for r, h in zip(records, hits_of_test(records), strict=True))
     model = identify(frfs, ModalSettings(low_hz=20.0))
     assert frfs.rings_on
@@ -493,10 +494,8 @@ def test_a_band_without_lines_is_refused_with_a_remedy() -> None:
 def test_random_systems_lose_and_gain_no_modes(seed: int) -> None:
     rng = np.random.default_rng(700 + seed)
     system = random_system(rng, n_modes=8, n_dofs=10, low_hz=30, high_hz=380, min_spacing=0.02)
-    slowest = np.min(system.damping_ratio * system.frequency_hz) * 2 * np.pi
-    frfs = hammer_test(
-        system, list(range(10)), [0, 1, 2], record_s=float(np.clip(5 / slowest, 3, 12)), noise=0.02, seed=seed
-    )
+    record_s = float(np.clip(5 / system.slowest_decay, 3, 12))
+    frfs = hammer_test(system, list(range(10)), [0, 1, 2], record_s=record_s, noise=0.02, seed=seed)
     model = identify(frfs, ModalSettings())
     assert len(model.modes) == 8
     assert frequencies(model) == pytest.approx(system.frequency_hz, rel=1e-3)

@@ -16,6 +16,9 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import Record, ResponseChannel
 
+QUANTITIES = "acceleration", "velocity", "displacement"
+"""What sensors may measure: each is the one before it integrated."""
+
 
 @dataclass(frozen=True)
 class TrueSystem:
@@ -30,6 +33,11 @@ class TrueSystem:
         w = 2 * np.pi * self.frequency_hz
         z = self.damping_ratio
         return np.asarray(w * (-z + 1j * np.sqrt(1 - z**2)))
+
+    @property
+    def slowest_decay(self) -> float:
+        """Least decay rate of a mode, rad/s."""
+        return float(np.min(self.damping_ratio * self.frequency_hz * 2 * np.pi))
 
     def accelerance(self, frequency_hz: NDArray[np.float64], dofs_out: list[int], dofs_in: list[int]):
         """(n_out, n_in, n_lines), as a sum over modes of −ω² φφᵀ/(ω_r² − ω² + 2jζω_rω)."""
@@ -49,6 +57,7 @@ class Hits:
     pretrigger: int
     force_noise: float
     response_noise: NDArray[np.float64]
+    quantity: str = "acceleration"
 
 
 def simulate_hits(
@@ -69,27 +78,27 @@ def simulate_hits(
     alike: float = 0.0,
     softening: float = 0.0,
     calibration: float = 0.0,
-    integrations: int = 0,
+    quantity: str = "acceleration",
 ) -> Hits:
     """Simulate hits; noise levels are rms of the noise over rms of the channel's signal in the record.
 
     `drift` is the standard deviation of a factor on all frequencies of a hit, `wander` that of a factor on each,
     `alike` the correlation of both from one hit to the next; `softening` the relative drop of the first half of the
     modes from the softest hit (80 N) to the hardest (160 N), zero in their middle; `calibration` the standard
-    deviation of a constant factor on each channel; `integrations` is 1 for velocities, 2 for displacements.
+    deviation of a constant factor on each channel; `quantity` what the sensors measure, one of `QUANTITIES`.
 
     Response noise is set per channel from its signal averaged over inputs, as a sensor's noise floor is.
     """
     rate = 2.56 * f_max
     n = round(record_s * rate)
     rate = n / record_s
-    slowest = float(np.min(system.damping_ratio * 2 * np.pi * system.frequency_hz))
-    periods = int(np.ceil(max(2.0, 12.0 / (slowest * record_s))))
+    periods = int(np.ceil(max(2.0, 12.0 / (system.slowest_decay * record_s))))
     n_long = n * periods
     f = np.fft.rfftfreq(n_long, 1 / rate)
     taper = np.clip((0.5 * rate - f) / (0.5 * rate - 1.05 * f_max), 0, 1)
     taper = 0.5 - 0.5 * np.cos(np.pi * taper)
-    integrated = (2j * np.pi * np.maximum(f, f[1])) ** -integrations * ((f > 0) | (not integrations))
+    integrated = (2j * np.pi * np.maximum(f, f[1])) ** -QUANTITIES.index(quantity)
+    integrated[0] *= quantity == QUANTITIES[0]  # no static part of what is integrated
     still = system.accelerance(f, dofs_out, dofs_in) if not (drift or wander or softening) else None
     soft = np.arange(len(system.frequency_hz)) < len(system.frequency_hz) // 2
     width = 0.9 / f_max  # half-sine: first zero of the spectrum at 1.67 f_max
@@ -128,14 +137,12 @@ def simulate_hits(
     if decay_rad_s:
         window = np.exp(-decay_rad_s * np.arange(n) / rate)
         force, resp = force * window, resp * window
-    return Hits(force, resp, rate, pretrigger, float(sigma_f), sigma_y)
+    return Hits(force, resp, rate, pretrigger, float(sigma_f), sigma_y, quantity)
 
 
-def records_of(
-    hits: Hits, dofs_out: list[int], dofs_in: list[int], quantity: str = "acceleration"
-) -> list[Record]:
+def records_of(hits: Hits, dofs_out: list[int], dofs_in: list[int]) -> list[Record]:
     """The hits as records of one hit each, as ingest hands them on; DOF k is called ``pk.z``."""
-    channels = tuple(ResponseChannel(f"a{k}", Dof(f"p{k}", "z"), quantity) for k in dofs_out)
+    channels = tuple(ResponseChannel(f"a{k}", Dof(f"p{k}", "z"), hits.quantity) for k in dofs_out)
     return [
         Record(
             f"p{k}_{h}.h5",

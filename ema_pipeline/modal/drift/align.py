@@ -271,7 +271,8 @@ def _warps(
     # between distant peaks lines stay where they are, between near ones they go from one plateau to the next
     rest = np.concatenate([[True], 2 * (above[:-1] + below[1:]) < gap[1:-1], [True]])
     nodes = np.stack([centre - 2 * below, centre - below, centre + above, centre + 2 * above], axis=1)
-    used = np.stack([rest[:-1], np.full(len(centre), True), np.full(len(centre), True), rest[1:]], axis=1)
+    used = np.ones(nodes.shape, dtype=np.bool_)
+    used[:, 0], used[:, 3] = rest[:-1], rest[1:]
     out = {}
     for h in range(len(common)):
         values = own[h, order][:, None] * [0.0, 1.0, 1.0, 0.0]
