@@ -288,6 +288,16 @@ def test_estimates_that_disagree_widen_the_interval_and_two_of_them_move_the_val
     assert all(abs(w.value - value) < 2 * std for w in (pole, circle, hit))
 
 
+def test_what_is_always_allowed_does_not_add_up_with_the_standard_deviations() -> None:
+    pole, hits = NamedEstimate("all FRFs", 0.134, 0.006), NamedEstimate("single hits", 0.099, 0.0055)
+    value, std, said = pool([pole, hits], 0.0134, "%", 1.0)  # 0.035 apart: each alone allows less
+    assert value == pole.value
+    assert std == pytest.approx(np.hypot(0.006, 0.0175))
+    assert said
+    nearer = NamedEstimate("single hits", 0.108, 0.0055)
+    assert pool([pole, nearer], 0.0134, "%", 1.0) == (pole.value, pole.std, "")
+
+
 def test_a_heavy_pole_without_a_peak_is_told_from_one_that_makes_a_peak() -> None:
     omega = 2 * np.pi * np.linspace(10, 100, 600)
     pole = complex(-0.04, 1.0) * 2 * np.pi * 50
