@@ -186,11 +186,11 @@ def drops_to(left: float) -> str:
 
 
 def doubt_of_nothing(nothing: float, settings: DiagnoseSettings) -> str:
-    """Why nothing is claimed at a probability that nothing is missing; empty where something may be."""
+    """Why nothing is claimed at a probability that nothing of the library is missing; empty where something may be."""
     if nothing <= settings.doubt:
         return ""
     told, most = (probability_text(p) for p in (nothing, settings.doubt))
-    return f"the probability that nothing is missing, {told}, is above {most}"
+    return f"the probability that no effect of the library is missing, {told}, is above {most}"
 
 
 def sigmas_asked(observations: Observations, hypothesis: Hypothesis, settings: DiagnoseSettings) -> float:

@@ -118,7 +118,9 @@ def pool(found: list[NamedEstimate], tolerance: float, unit: str, scale: float) 
     """
     first, others = found[0], found[1:]
     against = [
-        w for w in others if abs(w.value - first.value) > np.hypot(tolerance, SIGMA * np.hypot(w.std, first.std))
+        w
+        for w in others
+        if abs(w.value - first.value) > np.hypot(tolerance, SIGMA * np.hypot(w.std, first.std))
     ]
     if not against:
         return first.value, first.std, ""

@@ -98,7 +98,8 @@ def _all(results: RunResults) -> Iterator[tuple[Weight, str]]:
         yield Weight.MISFIT, f"Nothing was diagnosed: {results.not_diagnosed}"
     if results.fit is not None:
         found = None if results.diagnosis_is_old else results.diagnosis
-        error = results.fit.error if found is None else found.error
+        # as the verdict states it, unless it is the fit alone that fails
+        error = results.fit.error if found is None or found.error <= found.error_limit else found.error
         yield from _of_fit(results.fit, error, results.provisional)
     for c in results.configurations:
         for weight, text in _of_configuration(c):
@@ -106,7 +107,7 @@ def _all(results: RunResults) -> Iterator[tuple[Weight, str]]:
 
 
 def _of_fit(fit: FitResult, error: float, provisional: bool) -> Iterator[tuple[Weight, str]]:
-    """Of the fitted values; `error` is that of the model as the verdict states it."""
+    """Of the fitted values; `error` is that of the model."""
     if provisional:
         yield (
             Weight.MISFIT,

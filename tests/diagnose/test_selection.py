@@ -585,9 +585,7 @@ def test_nothing_is_claimed_where_its_probability_without_doubtful_evidence_is_t
     nothing = 0.9 / (0.9 + 0.1 * np.exp(left))
     assert one.probabilities[NOTHING] == pytest.approx(nothing)
     assert one.judged[0].claimed is claimed is bool(nothing <= SETTINGS.doubt)
-    told = (
-        "the probability that nothing is missing, 21 %, is above 20 %, and without what tests often make of"
-    )
+    told = "the probability that no effect of the library is missing, 21 %, is above 20 %, and without what "
     assert one.judged[0].doubt.startswith(told) is not claimed
     assert one.judged[0].doubt.endswith("drops to 3.5") is not claimed
 

@@ -434,12 +434,13 @@ def test_a_model_that_the_diagnosis_finds_adequate_is_not_said_to_fail(run: RunR
     assert run.fit is not None
     poor = replace(run, fit=replace(run.fit, error=55.6))
 
-    def told(verdict: str) -> str:
-        found: Any = SimpleNamespace(verdict=verdict, error=1.71)
+    def told(verdict: str, error: float = 1.71) -> str:
+        found: Any = SimpleNamespace(verdict=verdict, error=error, error_limit=1.3)
         return " ".join(summary.cautions(replace(poor, diagnosis=found)))
 
     assert "does not explain" not in told("adequate")
     assert "does not explain the data (error 1.71)" in told("unknown_effect")
+    assert "does not explain the data (error 55.6)" in told("effect", 0.95)  # no error that explains them
 
 
 @pytest.mark.parametrize(("left", "ringing", "told"), [(0.07, 3, True), (0.07, 2, False), (0.02, 4, False)])
