@@ -19,6 +19,7 @@ from ema_pipeline.modal.drift.align import NOTICED, Alignment, PeakMovement, ali
 from ema_pipeline.modal.drift.local import DecayChange
 from ema_pipeline.modal.drift.shifts import wider
 from ema_pipeline.modal.drift.windows import Hits
+from ema_pipeline.modal.hum_removal import hum_of
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.mains_hum import without_hum
 from ema_pipeline.modal.serial import widening
@@ -99,6 +100,30 @@ def identify_hits(
     HitModes
         The intervals of frequencies hold their scatter over hits.
     """
+    found = _identified(hits, measured, frf_settings, settings, progress, included)
+    with single_blas_thread():
+        hum = hum_of(found.modal, hits, found.frfs)
+    if hum is None:
+        return found
+    del found
+    cleaned = hum.taken_off(hits)
+
+    def without_tones() -> FrfSet:
+        return estimate_frfs(cleaned(), frf_settings, coherence=False)
+
+    again = _identified(cleaned, without_tones, frf_settings, settings, progress, included)
+    return replace(again, modal=replace(again.modal, notes=(*again.modal.notes, hum.note)))
+
+
+def _identified(
+    hits: Hits,
+    measured: Callable[[], FrfSet],
+    frf_settings: FrfSettings,
+    settings: ModalSettings,
+    progress: Progress | None,
+    included: Sequence[ModeChoice],
+) -> HitModes:
+    """The same of hits as they are."""
     frfs = measured()
     with single_blas_thread():
         alignment = align(hits, frfs, frf_settings, analysis_band(frfs, settings))

@@ -247,19 +247,29 @@ def _columns(
     mode: Mode, candidate: _Candidate, hit: _HitLines, omega: Real, record_s: float
 ) -> tuple[Complex, Complex, list[Complex]]:
     """Background (n_lines, n_columns), a decay from the blow on, and tones that last for the whole record."""
-    rest_s = record_s - hit.delay_s
-    blow = np.exp(-1j * omega * hit.delay_s)
-    x = (omega - omega.mean()) / (omega[-1] - omega[0])
-    slow = blow[:, None] * x[:, None] ** np.arange(3)
     poles = np.array([*candidate.neighbours, mode.pole], dtype=np.complex128) - hit.window_rad_s
-    decays = blow * pole_values(omega, poles, rest_s)
-    wanted = np.ceil(2 * MAINS_DRIFT * candidate.tone_hz * record_s / TONE_STEP)
-    drift = MAINS_DRIFT * np.linspace(-1, 1, int(np.clip(wanted, FEWEST_TONES, MOST_TONES)))
-    # a trace of decay, since the transform of a tone right on a line is a limit
-    decay = hit.window_rad_s + TRACE / record_s
-    tones = np.asarray(2j * np.pi * candidate.tone_hz * (1 + drift) - decay, dtype=np.complex128)
-    background = np.column_stack([slow, *decays[:-1]])
+    blow = np.exp(-1j * omega * hit.delay_s)
+    decays = blow * pole_values(omega, poles, record_s - hit.delay_s)
+    tones = tone_poles(candidate.tone_hz, drifts(candidate.tone_hz, record_s), record_s, hit.window_rad_s)
+    background = np.column_stack([slow(omega, hit.delay_s), *decays[:-1]])
     return background, decays[-1], list(pole_values(omega, tones, record_s))
+
+
+def slow(omega: Real, delay_s: float) -> Complex:
+    """What all that lies far away adds to a few lines, from the blow on, (n_lines, 3)."""
+    x = (omega - omega.mean()) / (omega[-1] - omega[0])
+    return np.asarray(np.exp(-1j * omega * delay_s)[:, None] * x[:, None] ** np.arange(3))
+
+
+def drifts(tone_hz: float, record_s: float) -> Real:
+    """Relative differences of the mains' frequency from its nominal one that are tried."""
+    wanted = np.ceil(2 * MAINS_DRIFT * tone_hz * record_s / TONE_STEP)
+    return MAINS_DRIFT * np.linspace(-1, 1, int(np.clip(wanted, FEWEST_TONES, MOST_TONES)))
+
+
+def tone_poles(tone_hz: float, drift: Real, record_s: float, window_rad_s: float) -> Complex:
+    """Poles of tones, rad/s, with a trace of decay, since the transform of a tone right on a line is a limit."""
+    return np.asarray(2j * np.pi * tone_hz * (1 + drift) - window_rad_s - TRACE / record_s)
 
 
 def _left(columns: Complex, values: Complex) -> Real:

@@ -1,0 +1,252 @@
+"""Mains hum taken off the hits in which it stands out, so that modes are identified without it.
+
+Hum leaks into all lines around it, and a fit that has to leave it over knows the modes nearby far less well than the
+hits tell of them. It is there before the blow, does not decay, and has another phase against every blow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import rfft
+
+from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.ingest.hit_checks import HUM_HZ
+from ema_pipeline.ingest.records import HitSamples
+from ema_pipeline.lazy_samples import LazySamples
+from ema_pipeline.modal.basis import pole_functions, pole_values
+from ema_pipeline.modal.drift.windows import Hits
+from ema_pipeline.modal.mains_hum import HARMONICS, MAINS_DRIFT, drifts, slow, tone_poles
+from ema_pipeline.modal.types import ModalModel
+
+Complex = NDArray[np.complex128]
+Real = NDArray[np.float64]
+
+HALF_WIDTH = 12
+"""Lines looked at on either side of a tone, wherever the mains drifts to."""
+
+REACH = 30
+"""Lines beyond these within which a mode reaches into them."""
+
+PLAIN = 20.0
+"""Power of a tone over that of noise, mean of all hits, from which it is taken off: without hum it is 1 to 5."""
+
+COHERENT = 0.7
+"""Share of the squared tones that all hits and channels have in common, their phases counted from the blow: about 1 of
+what is left of a mode, whose shape is nearly real, and of hum one over the root of the number of hits."""
+
+FEWEST_HITS = 4
+"""Hits without which their phases tell nothing."""
+
+BLOCK = 32
+"""Channels transformed at once."""
+
+_REFINED = np.linspace(-1, 1, 9)
+
+
+@dataclass(frozen=True)
+class _Tone:
+    """A multiple of the mains' frequency, the lines around it, and the poles of modes that reach into them."""
+
+    hz: float
+    lines: slice
+    poles: Complex
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Tones of one hit: `gain` is their power over that of noise, `squares` are those of their sizes at the blow, over
+    the squared force, (n_tones, n_channels).
+    """
+
+    poles: Complex
+    sizes: Complex
+    gain: Real
+    squares: Complex
+    points: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Hum:
+    """Tones that stand out of the hits.
+
+    Attributes
+    ----------
+    hz : tuple of float
+        Multiples of the mains' frequency.
+    sizes : dict of (str, int) to complex ndarray, (n_channels, n_tones)
+        Of every hit by its file and number: of the transform of exp(st), so that the tone is 2 Re(size·exp(st)) times
+        the time between samples.
+    poles : dict of (str, int) to complex ndarray, (n_tones,)
+        s, rad/s.
+    """
+
+    hz: tuple[float, ...]
+    sizes: dict[tuple[str, int], Complex]
+    poles: dict[tuple[str, int], Complex]
+
+    def taken_off(self, hits: Hits) -> Hits:
+        """The hits without these tones."""
+
+        def cleaned() -> Iterator[HitSamples]:
+            for hit in hits():
+                key = hit.hit.file, hit.hit.number
+                less = _WithoutTones(hit, self.sizes[key], self.poles[key])
+                yield replace(hit, responses=less)
+
+        return cleaned
+
+    @property
+    def note(self) -> str:
+        """What was done."""
+        named = ", ".join(f"{hz:g}" for hz in self.hz)
+        return f"mains hum at {named} Hz was taken off every hit before modes were identified"
+
+
+class _WithoutTones(LazySamples):
+    """Responses of a hit less tones that last for the whole record."""
+
+    def __init__(self, hit: HitSamples, sizes: Complex, poles: Complex) -> None:
+        self._whole, self._sizes, self._poles = hit.responses, sizes, poles
+        self._step_s = 1 / hit.sample_rate_hz
+        self.shape = hit.responses.shape[0], hit.responses.shape[1]
+
+    def read(self, row: int, start: int, stop: int) -> Real:
+        """Samples ``start:stop`` of one channel."""
+        time = self._step_s * np.arange(start, stop)
+        tones = sum(
+            size * np.exp(pole * time) for size, pole in zip(self._sizes[row], self._poles, strict=True)
+        )
+        return np.asarray(self._whole[row, start:stop] - 2 * self._step_s * np.real(tones))
+
+
+def hum_of(modal: ModalModel, hits: Hits, frfs: FrfSet) -> Hum | None:
+    """Tones at multiples of the mains' frequency that stand out of the hits beside the modes; None without any.
+
+    Parameters
+    ----------
+    modal : ModalModel
+        Without modes that are hum.
+    hits : callable
+        Gives the accepted hits, as they were recorded.
+    frfs : FrfSet
+        Of these hits.
+    """
+    tones = _tones(modal, frfs)
+    if not tones:
+        return None
+    keys, found = [], []
+    for hit in hits():
+        keys.append((hit.hit.file, hit.hit.number))
+        found.append(_read(hit, tones))
+    plain = _plain(found)
+    if plain is None or not plain.any():
+        return None
+    place = {point: k for k, point in enumerate(_points(found))}
+    taken = np.flatnonzero(plain.any(axis=1))
+    rows = [[place[p] for p in one.points] for one in found]
+    sizes = [np.where(plain[:, r], one.sizes, 0)[taken].T for one, r in zip(found, rows, strict=True)]
+    return Hum(
+        tuple(tones[k].hz for k in taken),
+        dict(zip(keys, sizes, strict=True)),
+        {key: one.poles[taken] for key, one in zip(keys, found, strict=True)},
+    )
+
+
+def _tones(modal: ModalModel, frfs: FrfSet) -> list[_Tone]:
+    """Multiples of 50 and 60 Hz within the band."""
+    step = float(frfs.frequency_hz[1])
+    poles = np.array([m.pole for m in modal.modes], dtype=np.complex128)
+    low, high = modal.band_hz
+    tones = []
+    for hz in sorted({mains * k for mains in HUM_HZ for k in range(1, HARMONICS + 1)}):
+        half = HALF_WIDTH + int(np.ceil(MAINS_DRIFT * hz / step))
+        if low + half * step < hz < high - half * step:
+            centre = round(hz / step)
+            near = np.abs(poles.imag / (2 * np.pi) - hz) < (half + REACH) * step
+            tones.append(_Tone(hz, slice(max(1, centre - half), centre + half + 1), poles[near]))
+    return tones
+
+
+def _read(hit: HitSamples, tones: Sequence[_Tone]) -> _Found:
+    """Tones of one hit: those of one drift of the mains that stands out most of all channels."""
+    record_s, count = hit.force.size / hit.sample_rate_hz, len(hit.channels)
+    delay_s = (hit.hit.peak - hit.hit.start) / hit.sample_rate_hz
+    lines = [np.empty((t.lines.stop - t.lines.start, count), dtype=np.complex128) for t in tones]
+    for start in range(0, count, BLOCK):
+        rows = slice(start, min(start + BLOCK, count))
+        spectra = np.asarray(rfft(np.asarray(hit.responses[rows])))
+        for tone, values in zip(tones, lines, strict=True):
+            values[:, rows] = spectra[:, tone.lines].T
+    beside = [_Beside(t, v, hit, record_s, delay_s) for t, v in zip(tones, lines, strict=True)]
+
+    def gain(drift: Real) -> Real:
+        return np.sum([one.at(drift)[1].sum(axis=1) for one in beside], axis=0)
+
+    tried = drifts(tones[-1].hz, record_s)
+    step = tried[1] - tried[0]
+    drift = tried[np.argmax(gain(tried))]
+    for _ in range(2):  # to a sixteenth of the first step
+        nearer = drift + step * _REFINED
+        drift, step = nearer[np.argmax(gain(nearer))], step * (_REFINED[1] - _REFINED[0])
+    best = [one.at(np.array([drift])) for one in beside]
+    sizes, gains = (np.array([b[k][0] for b in best]) for k in (0, 1))
+    poles = np.array([one.poles(np.array([drift]))[0] for one in beside])
+    force = np.asarray(rfft(hit.force))
+    blow = np.exp(poles * delay_s) / np.array([force[(t.lines.start + t.lines.stop) // 2] for t in tones])
+    return _Found(poles, sizes, gains, (sizes * blow[:, None]) ** 2, tuple(c.dof.point for c in hit.channels))
+
+
+class _Beside:
+    """Lines of a hit about one tone, beside all that begins with the blow: modes, also those that moved a little."""
+
+    def __init__(
+        self, tone: _Tone, values: Complex, hit: HitSamples, record_s: float, delay_s: float
+    ) -> None:
+        self._hz, self._record_s, self._window = tone.hz, record_s, hit.window_decay_rad_s
+        self._omega = 2 * np.pi * np.arange(tone.lines.start, tone.lines.stop) / record_s
+        functions = pole_functions(self._omega, tone.poles - self._window, record_s - delay_s)
+        decays = np.exp(-1j * self._omega * delay_s) * np.concatenate(functions)
+        background = np.column_stack([slow(self._omega, delay_s), *decays])
+        self._basis = np.linalg.qr(background / np.linalg.norm(background, axis=0))[0]
+        self._left = self._beside(values)
+        self._free = max(len(self._omega) - background.shape[1] - 1, 1)
+
+    def poles(self, drift: Real) -> Complex:
+        """Of the tone at drifts of the mains."""
+        return tone_poles(self._hz, drift, self._record_s, self._window)
+
+    def at(self, drift: Real) -> tuple[Complex, Real]:
+        """Sizes of the tone, and its power over that of what is left beside it, (n_drifts, n_channels)."""
+        tones = self._beside(pole_values(self._omega, self.poles(drift), self._record_s).T)
+        power = np.sum(np.abs(tones) ** 2, axis=0)[:, None]
+        sizes = (tones.conj().T @ self._left) / power
+        explained = np.abs(sizes) ** 2 * power
+        noise = (np.sum(np.abs(self._left) ** 2, axis=0) - explained) / self._free
+        return sizes, explained / np.maximum(noise, 1e-12 * explained + 1e-300)
+
+    def _beside(self, values: Complex) -> Complex:
+        return np.asarray(values - self._basis @ (self._basis.conj().T @ values))
+
+
+def _points(found: Sequence[_Found]) -> list[str]:
+    return list(dict.fromkeys(p for one in found for p in one.points))
+
+
+def _plain(found: Sequence[_Found]) -> NDArray[np.bool_] | None:
+    """Tones that stand out and are no part of modes, (n_tones, n_points); None of too few hits."""
+    points = _points(found)
+    gain = np.full((len(found), len(found[0].poles), len(points)), np.nan)
+    squares = np.full(gain.shape, np.nan, dtype=np.complex128)
+    for k, one in enumerate(found):
+        rows = [points.index(p) for p in one.points]
+        gain[k][:, rows], squares[k][:, rows] = one.gain, one.squares
+    if len(found) < FEWEST_HITS:
+        return None
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.nanmean(gain, axis=0)
+        common = np.abs(np.nansum(squares, axis=(0, 2))) / np.nansum(np.abs(squares), axis=(0, 2))
+    return np.asarray((np.nan_to_num(mean) >= PLAIN) & (common < COHERENT)[:, None])
