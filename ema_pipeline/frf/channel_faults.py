@@ -9,7 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 SENSITIVITY = "sensitivity"
-"""Name of the check."""
+EXCHANGED = "exchanged channels"
+"""Names of the checks."""
+
+REVERSED = 0.9
+"""Share of a driving point's resonances that point the wrong way, above which all do: of two modes one may."""
 
 SUSPECT_FACTOR = 3.0
 """Factor against a model from which on a sensitivity is suspected. Rigs whose parts, channels and blows are off as in a

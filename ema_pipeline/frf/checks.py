@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.check_result import CheckResult, judged
 from ema_pipeline.frf.channel_faults import (
+    EXCHANGED,
     RECIPROCAL_FACTOR,
+    REVERSED,
     SENSITIVITY,
     channels_words,
     factor_words,
@@ -176,25 +179,49 @@ def _driving_points(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[
     Lines count in the quantity measured: as acceleration, what a velocity sensor reads beside resonances (its noise,
     a slow mode cut off at the end of the record) would grow with the frequency until it outweighed them.
     """
-    verdicts = []
+    limit = settings.negative_driving_point
+    place = {d: o for o, d in enumerate(frfs.outputs)}
+    own = {place[d]: i for i, d in enumerate(frfs.inputs) if d in place and frfs.hits[place[d], i] > 0}
+    wrong = {o: _taken_out(frfs, o, own[o], inside) for o in sorted(own)}
+    verdicts, told = [], set[int]()
+    for one, other in combinations([o for o, share in wrong.items() if share > limit], 2):
+        # each reads the driving point of the other: of reversed ones neither does
+        crossed = max(_taken_out(frfs, other, own[one], inside), _taken_out(frfs, one, own[other], inside))
+        if crossed <= limit and not told & {one, other}:
+            told |= {one, other}
+            verdicts.append(_exchanged(frfs, one, other, max(wrong[one], wrong[other]), limit))
     driver = "force" if frfs.excitation else "hammer"
-    for o, output in enumerate(frfs.outputs):
-        if output not in frfs.inputs or frfs.hits[o, frfs.inputs.index(output)] == 0:
-            continue
-        loss = (frfs.frf[o, frfs.inputs.index(output), inside] * 1j ** _DERIVATIVES[frfs.quantities[o]]).imag
-        # Squares: resonances decide, not the noise between them.
-        total = float(np.sum(loss**2))
-        wrong = float(np.sum(loss[loss < 0] ** 2)) / total if total > 0 else 0.0
-        if wrong > 0.5:
+    for o in sorted(set(own) - told):
+        output = frfs.outputs[o]
+        if wrong[o] > REVERSED:
             what = f"point the wrong way; sensor or {driver} is reversed, put '-' before its dof"
         else:
             what = f"differ in sign; {driver} and sensor are not at one point"
-        fault, limit = f"driving point {output}: resonances {what}", settings.negative_driving_point
-        name, passes = f"{output} over {output}", wrong <= limit
+        fault, name = f"driving point {output}: resonances {what}", f"{output} over {output}"
+        passes = wrong[o] <= limit
         verdicts.append(
-            judged("driving point", wrong, limit, passes, DRIVING_POINT, "warn", fault, channel=name)
+            judged("driving point", wrong[o], limit, passes, DRIVING_POINT, "warn", fault, channel=name)
         )
     return verdicts
+
+
+def _taken_out(frfs: FrfSet, output: int, source: int, inside: slice) -> float:
+    """Share of an FRF's lines, by their squares, that no driving point has: power is given back. 1 if not measured."""
+    if frfs.hits[output, source] == 0:
+        return 1.0
+    loss = (frfs.frf[output, source, inside] * 1j ** _DERIVATIVES[frfs.quantities[output]]).imag
+    # Squares: resonances decide, not the noise between them.
+    total = float(np.sum(loss**2))
+    return float(np.sum(loss[loss < 0] ** 2)) / total if total > 0 else 0.0
+
+
+def _exchanged(frfs: FrfSet, one: int, other: int, wrong: float, limit: float) -> CheckResult:
+    points = f"{frfs.outputs[one]} and {frfs.outputs[other]}"
+    sensors = channels_words([_sensor(frfs, one), _sensor(frfs, other)])
+    fault = (
+        f"{sensors} are exchanged: each shows the driving point of the other ({points}); exchange their dof"
+    )
+    return judged(EXCHANGED, wrong, limit, False, DRIVING_POINT, "warn", fault, channel=points)
 
 
 def _reciprocity(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[CheckResult]:

@@ -9,7 +9,7 @@ from enum import IntEnum
 
 from ema_pipeline.check_result import CheckResult
 from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
-from ema_pipeline.frf.channel_faults import SENSITIVITY
+from ema_pipeline.frf.channel_faults import EXCHANGED, REVERSED, SENSITIVITY
 from ema_pipeline.frf.signs import SIGN
 from ema_pipeline.modal.types import GROWS
 from ema_pipeline.number_text import below, format_value, plain
@@ -87,8 +87,8 @@ def _where(results: RunResults, c: ConfigurationResults) -> str:
 
 
 def _of_sensor(v: CheckResult) -> bool:
-    """True for a check that a wrong sign or sensitivity fails."""
-    return v.check == SENSITIVITY or (v.check == "driving point" and v.value > 0.5)
+    """True for a check that a wrong sign, sensitivity or DOF fails."""
+    return v.check in (SENSITIVITY, EXCHANGED) or (v.check == "driving point" and v.value > REVERSED)
 
 
 def _all(results: RunResults) -> Iterator[tuple[Weight, str]]:

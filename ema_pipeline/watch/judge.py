@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
+from ema_pipeline.frf.channel_faults import EXCHANGED
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
@@ -156,7 +157,6 @@ def _correlation(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> float:
 
 
 def _driving_point(hits: Sequence[HitSamples]) -> list[str]:
-    """What the check of the driving point's sign says."""
-    return [
-        v.message for v in _frfs(hits).verdicts if v.check == "driving point" and not v.passes and v.message
-    ]
+    """What the checks of the driving points' signs say."""
+    of_signs = ("driving point", EXCHANGED)
+    return [v.message for v in _frfs(hits).verdicts if v.check in of_signs and not v.passes and v.message]

@@ -17,6 +17,7 @@ from simulate_hits import modal_response, record_of
 from ema_pipeline.check_result import judged
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf import FrfSet, FrfSettings, estimate_frfs
+from ema_pipeline.frf.channel_faults import EXCHANGED
 from ema_pipeline.frf.windows import force_window
 from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.ingest.hit_checks import hits_of_test
@@ -514,6 +515,19 @@ def test_a_sensor_beside_the_point_that_is_struck_is_not_called_reversed() -> No
     assert found.limit < found.value < 0.5
     assert "hammer and sensor are not at one point" in found.message
     assert "reversed" not in found.message
+
+
+def test_exchanged_sensors_are_named_once_and_neither_is_called_reversed() -> None:
+    rows = two_way_hits(1.0, 1.0)
+    swapped = [replace(h, responses=np.asarray(h.responses)[::-1]) for h in rows]
+    found = estimate_frfs(swapped).verdicts
+    assert not [v for v in found if v.check == "driving point"]
+    (told,) = (v for v in found if v.check == EXCHANGED)
+    assert not told.passes
+    assert "exchange their dof" in told.message
+    assert "reversed" not in " ".join(v.message for v in found)
+    for right in (rows, two_way_hits(1.0, -1.0)):
+        assert EXCHANGED not in {v.check for v in estimate_frfs(right).verdicts}
 
 
 def test_one_hit_each_way_is_enough_for_reciprocity() -> None:

@@ -55,7 +55,9 @@ function EmaFigures(page) {
       function factor(m) { return m[0] ? [m[0], m[1]] : m[1]; }
       var several = e.modes.concat(page.model().lone).some(function (m) { return m[0]; });
       var lone = page.model().lone, every = e.modes.map(function (m) { return m.slice(0, 2); });
-      lone.forEach(function (m) { every.push(m.slice(0, 2)); });
+      lone.forEach(function (m) {  // one without a partner in this model may have one in another
+        if (!every.some(function (o) { return o[0] === m[0] && o[1] === m[1]; })) { every.push(m.slice(0, 2)); }
+      });
       if (several) { var order = []; every.forEach(function (m) { if (order.indexOf(m[0]) < 0) { order.push(m[0]); } }); every.sort(function (a, b) { return order.indexOf(a[0]) - order.indexOf(b[0]) || parseInt(a[1], 10) - parseInt(b[1], 10); }); }
       else { every.sort(function (a, b) { return parseInt(a[1], 10) - parseInt(b[1], 10); }); }
       var before = e.modes.map(function (_, i) { return size(chosen.before, i); }), after = e.modes.map(function (_, i) { return chosen.after === chosen.before ? null : size(chosen.after, i); });
