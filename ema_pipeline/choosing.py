@@ -165,7 +165,8 @@ def _hit(run: Run, text: str) -> HitChoice:
         )
     wanted = 1 if number is None else number
     if wanted not in {h.number + 1 for h in mine}:
-        raise EmaError(f"{configuration}/{file}: holds {len(mine)} hits, none is number {wanted}")
+        count = "1 hit" if len(mine) == 1 else f"{len(mine)} hits"
+        raise EmaError(f"{configuration}/{file}: holds {count}, counted from 1; none is number {wanted}")
     return HitChoice(configuration, file, wanted)
 
 

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from ema_pipeline.series.rows import TestRow
     from ema_pipeline.series.run import SeriesRun, Watch
 
-series = typer.Typer(help="Many tests: run, limits, judge, compare, trend, report.", no_args_is_help=True)
+series = typer.Typer(
+    help="Many tests: run, limits, judge, compare, trend, report, export.", no_args_is_help=True
+)
 
 Series = Annotated[Path, typer.Argument(metavar="S", help="Folder of a series, from 'ema series run'.")]
 _EVERY_S = 10.0

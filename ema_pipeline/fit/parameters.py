@@ -227,9 +227,11 @@ def _not_measured(p: Parameter, value: float, prior: float) -> ParameterEstimate
     """A parameter that nothing measured depends on: its prior, or where it is free, nothing but its bounds."""
     std, shift = (float("nan"), float("nan")) if p.free else (abs(p.tolerance * p.value), 0.0)
     low, high = (p.minimum, p.maximum) if p.free else (value - std, value + std)
+    why = "not measured: nothing that was measured depends on it"
+    if not p.free and p.value == 0:
+        why = "stated to be 0: a tolerance is a share of that"
     return ParameterEstimate(
-        p.name, value, std, low, high, p.unit, p.free, p.value, prior, False, shift,
-        "not measured: nothing that was measured depends on it",
+        p.name, value, std, low, high, p.unit, p.free, p.value, prior, False, shift, why
     )  # fmt: skip
 
 

@@ -172,7 +172,8 @@ def left_out(c: ConfigurationResults) -> list[str]:
     lines = []
     if rejected:
         lines.append(
-            f"{len(rejected)} of {len(c.hits)} hits were left out, first {rejected[0].file}: {rejected[0].reason}"
+            f"{len(rejected)} of {len(c.hits)} hits {'was' if len(rejected) == 1 else 'were'} left out, "
+            f"{'' if len(rejected) == 1 else 'first '}{rejected[0].file}: {rejected[0].reason}"
         )
     copies = [v for h in c.hits for v in h.verdicts if v.check == "copy" and not v.passes]
     lines += list(dict.fromkeys(v.message for v in copies))

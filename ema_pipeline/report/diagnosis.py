@@ -36,8 +36,9 @@ def heading(found: Diagnosis) -> str:
     near = any(c.would_explain(found.error_limit) for c in found.candidates[:1])
     if found.verdict == "unknown_effect" and near:
         return "Something is missing, and no effect is supported enough to be named"
+    known = " and ".join(map(label_words, found.ladder.rungs[0].effects)) if found.ladder.rungs else ""
     return {
-        "adequate": "Nothing is missing as far as these data can tell",
+        "adequate": f"{f'With {known} nothing' if known else 'Nothing'} is missing as far as these data can tell",
         "unknown_effect": "Something is missing that is not in the library",
         "not_enough_data": "Not enough data to show what is missing",
     }[found.verdict]

@@ -132,7 +132,7 @@ def _tiles(results: RunResults) -> tuple[Tile, ...]:
             Tile(
                 "modes explained", f"{total - first.unexplained} of {total}",
                 f"{total - last.unexplained} of {total}" if more else "",
-                "measured modes with a counterpart in the model, including duplicates",
+                "measured modes that the diagnosis assigns to one of the model, however unlike; duplicates count",
             )
         )  # fmt: skip
     return tuple(tiles)

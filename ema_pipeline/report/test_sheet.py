@@ -35,7 +35,7 @@ def set_up_table(results: RunResults, c: ConfigurationResults) -> Table:
             ("record", f"{plain(f.record_s, 4)} s, lines every {plain(step, 3)} Hz"),
             (
                 "estimator",
-                f"{f.estimator}, {counts.min()} to {counts.max()} {'averages' if f.excitation else 'hits'} per FRF"
+                f"{f.estimator}, {_from_to(counts.min(), counts.max(), 'average' if f.excitation else 'hit')} per FRF"
                 if counts.size
                 else f.estimator,
             ),
@@ -51,6 +51,11 @@ def set_up_table(results: RunResults, c: ConfigurationResults) -> Table:
         if listed:
             rows.append((f"{words(what)} by hand", ", ".join(map(str, listed))))
     return Table(("item", c.name), tuple(Row(r) for r in rows))
+
+
+def _from_to(low: int, high: int, what: str) -> str:
+    """``"3 to 5 hits"``, ``"3 hits"`` or ``"1 hit"``."""
+    return f"{low} {what}{'' if low == 1 else 's'}" if low == high else f"{low} to {high} {what}s"
 
 
 def _windows(settings: Mapping[str, str], decay_rad_s: float) -> list[tuple[str, str]]:
