@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import datetime as dt
 import re
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, field_validator
+from pydantic_core import ErrorDetails
 
 from ema_pipeline.errors import EmaError, did_you_mean
 
@@ -60,21 +62,44 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        first = error.errors()[0]
-        path = _path(first["loc"])
+        first = _first(error)
+        path, of = _path(first["loc"]), _of_table(first["loc"], data)
         if first["type"] == "extra_forbidden":
             known = _fields_at(model, first["loc"][:-1])
             raise EmaError(
-                f"{where}: unknown key '{path}'{did_you_mean(str(first['loc'][-1]), known)}"
+                f"{where}: unknown key '{path}'{of}{did_you_mean(str(first['loc'][-1]), known)}"
             ) from None
         if first["type"] == "missing":
-            raise EmaError(f"{where}: key '{path}' is missing; add it") from None
+            raise EmaError(f"{where}: key '{path}'{of} is missing; add it") from None
         alternatives = [e["msg"] for e in error.errors() if _path(e["loc"]) == path]
         message = " or ".join(dict.fromkeys(alternatives)).removeprefix("Value error, ")
         message = message.replace("valid tuple", "list in [ ]").replace("Tuple", "List")
         message = re.sub(r"a valid dictionary( or instance of \w+)?", "a table of keys and values", message)
         shown = _shown(first.get("input"))
         raise EmaError(f"{where}: {path or 'file'} = {shown}: {message}") from None
+
+
+def _first(error: ValidationError) -> ErrorDetails:
+    """What is said of several errors: of a key that is missing where another one has its name misspelt, that one."""
+    found = error.errors()
+    if found[0]["type"] == "missing":
+        *table, key = found[0]["loc"]
+        unknown = [e for e in found if e["type"] == "extra_forbidden" and list(e["loc"][:-1]) == table]
+        return next((e for e in unknown if get_close_matches(str(e["loc"][-1]), [str(key)])), found[0])
+    return found[0]
+
+
+def _of_table(loc: tuple[int | str, ...], data: Any) -> str:
+    """Of tables in a list, which are counted from 0, the one in which the key is by its name; empty without."""
+    for step in loc[:-1]:
+        try:
+            data = data[step]
+        except (KeyError, IndexError, TypeError):
+            return ""
+        if isinstance(step, int) and isinstance(data, dict):
+            name = next((data[key] for key in ("name", "file", "at") if isinstance(data.get(key), str)), None)
+            return f" of '{name}'" if name else ""
+    return ""
 
 
 def _path(loc: tuple[int | str, ...]) -> str:

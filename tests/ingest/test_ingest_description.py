@@ -61,6 +61,10 @@ WRONG = {
         DESCRIPTION.replace('dof = "tip.z"', 'dof = "tip.z"\nsensitivity = 10'),
         "did you mean 'sensitivity_mv'?",
     ),
+    "misspelt key that must be there": (
+        DESCRIPTION.replace("quantity =", "quanity =", 1),
+        "unknown key 'channels.0.quanity' of 'hammer' (did you mean 'quantity'?)",
+    ),
     "unknown quantity": (DESCRIPTION.replace('"acceleration"', '"accel"'), "quantity"),
     "newer schema": (DESCRIPTION.replace("schema = 1", "schema = 2"), "schema"),
     "unit of another quantity": (

@@ -162,6 +162,13 @@ def test_every_verdict_has_its_plain_heading(verdict: VerdictWord, expected: str
     assert diagnosis.heading(found(verdict)) == expected
 
 
+def test_the_heading_of_an_adequate_model_names_the_effects_that_it_has() -> None:
+    told = found("adequate")
+    with_crack = replace(told, ladder=replace(told.ladder, rungs=(rung((CRACK,), 0.9, 0.9, 0),)))
+    expected = "With mesh stiffness loss at sun-planet1 nothing is missing as far as these data can tell"
+    assert diagnosis.heading(with_crack) == expected
+
+
 def test_what_is_missing_may_be_in_the_library_where_the_best_candidate_would_explain_the_data() -> None:
     told = found("unknown_effect")
     near = replace(told, candidates=(replace(told.candidates[0], claimed=False, error_after=1.1),))

@@ -327,10 +327,15 @@ def levels() -> Any:
 
 def sweeps() -> Any:
     """The error function over one stiffness, per configuration and number of modes."""
-    made = new_figure("stiffness, N/m", "error function ε", 300, x_axis_type="log", y_axis_type="log")
-    lines = source("sweeps.lines", "xs", "ys", "text", "color")
-    curves = made.multi_line("xs", "ys", source=lines, line_color="color", line_width=2)
+    made = new_figure("stiffness, N/m", "error function ε", 360, x_axis_type="log", y_axis_type="log")
+    lines = source("sweeps.lines", "xs", "ys", "text", "color", "dash")
+    curves = made.multi_line(
+        "xs", "ys", source=lines, line_color="color", line_dash="dash", line_width=2, legend_field="text"
+    )
     hover(made, [curves], ("", "@text"))
+    place_legend(made)
+    made.legend.ncols = 2
+    made.legend.click_policy = "none"  # one renderer draws all curves
     return made
 
 

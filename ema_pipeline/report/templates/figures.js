@@ -186,8 +186,8 @@ function EmaFigures(page) {
       columns("loss", "loss.lines", lines); columns("loss", "loss.points", dots);
     },
     sweeps: function () {
-      var colors = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"], s = page.model().sweeps;
-      columns("sweeps", "sweeps.lines", { xs: s.map(function (x) { return x.x; }), ys: s.map(function (x) { return x.y.map(function (v) { return v === null ? NaN : v; }); }), text: s.map(function (x) { return x.text; }), color: s.map(function (_, k) { return colors[k % colors.length]; }) });
+      var colors = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"], dashes = ["solid", "dashed", "dotted", "dotdash", "dashdot", "dashed"], s = page.model().sweeps;
+      columns("sweeps", "sweeps.lines", { xs: s.map(function (x) { return x.x; }), ys: s.map(function (x) { return x.y.map(function (v) { return v === null ? NaN : v; }); }), text: s.map(function (x) { return x.text; }), color: s.map(function (_, k) { return colors[k % colors.length]; }), dash: s.map(function (_, k) { return dashes[k % dashes.length]; }) });
     }
   };
 }

@@ -34,7 +34,7 @@ var EmaPage = (function () {
         if (m.type !== "ColorBar") { m.setv({ axis_label_text_color: ink, axis_line_color: ink, major_tick_line_color: ink, minor_tick_line_color: null }); }
         else { m.setv({ background_fill_color: null }); }
       } else if (m.type === "Grid") { m.setv({ grid_line_color: line }); }
-      else if (m.type === "Legend") { m.setv({ label_text_color: ink, background_fill_color: paper, orientation: narrow ? "vertical" : "horizontal", spacing: narrow ? -4 : 14 }); }
+      else if (m.type === "Legend") { m.setv({ label_text_color: ink, background_fill_color: paper, orientation: narrow ? "vertical" : "horizontal", spacing: narrow ? -4 : 14 }); if (m.ncols !== "auto") { m.setv({ ncols: narrow ? 1 : 2 }); } }
       else if (m.tags && m.tags.indexOf("ink") >= 0) { m.setv({ line_color: ink }); }
     });
   }
