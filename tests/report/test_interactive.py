@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import report_example as example
 
+from ema_pipeline.correlate.types import Unpaired
 from ema_pipeline.dof import Dof
 from ema_pipeline.mechanics.frf import receptance
 from ema_pipeline.mechanics.partial_fractions import partial_fractions
@@ -188,6 +189,38 @@ def test_axis_begins_with_the_modes_and_the_legend_has_what_the_chart_has(
     )
     assert set(tab.evaluate(entries)) == {"mode indicator (log)", "stands for a mode"}
     tab.close()
+
+
+def test_a_mode_without_a_partner_in_one_model_of_two_stands_once_in_the_figure_of_errors(
+    browser, run: RunResults, tmp_path: Path
+) -> None:
+    c = run.configurations[0]
+    assert c.pairing is not None
+    assert c.modal is not None
+    compared = {m.measured for m in run.comparison.modes if m.configuration == c.name}  # type: ignore[union-attr]
+    index = min(compared)
+    lone = (
+        *c.pairing.unpaired_measured,
+        Unpaired(index, c.modal.modes[index].frequency_hz, "shape unlike any"),
+    )
+    one = replace(c, pairing=replace(c.pairing, unpaired_measured=lone))
+    page = tmp_path / "report.html"
+    page.write_text(
+        report_html(replace(run, configurations=(one, *run.configurations[1:]))), encoding="utf-8"
+    )
+    tab = browser.new_page()
+    errors: list[str] = []
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.on("console", lambda told: errors.append(told.text) if told.type == "error" else None)
+    tab.goto(page.as_uri())
+    tab.locator(".bk[data-figure=errors]").scroll_into_view_if_needed()
+    tab.wait_for_selector("[data-figure=errors][data-state=shown]", timeout=30_000)
+    shown = "Bokeh.documents.find(d => d.get_model_by_name('errors.x')).get_model_by_name('errors.x').factors"
+    factors = [tuple(f) for f in tab.evaluate(shown)]
+    tab.close()
+    assert not errors
+    assert len(factors) == len(set(factors))
+    assert (c.name, f"{index + 1}: {c.modal.modes[index].frequency_hz:.5g} Hz") in factors
 
 
 def test_names_from_files_are_text_in_page_and_data(run: RunResults) -> None:
