@@ -19,6 +19,7 @@ from ema_pipeline.modal.drift.align import NOTICED, Alignment, PeakMovement, ali
 from ema_pipeline.modal.drift.local import DecayChange
 from ema_pipeline.modal.drift.shifts import wider
 from ema_pipeline.modal.drift.windows import Hits
+from ema_pipeline.modal.force_zeros import without_zeros
 from ema_pipeline.modal.hum_removal import hum_of
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.mains_hum import without_hum
@@ -134,6 +135,7 @@ def _identified(
     asked = wanted(included, frfs.response_decay_rad_s)
     modal = identify(frfs, settings, progress, alignment.known_peaks(), asked)
     modal = without_growing(without_hum(modal, hits, frfs, asked), frfs)
+    modal = without_zeros(modal, hits, frfs, asked)
     decay = frfs.response_decay_rad_s
     if alignment.n_hits == 1:
         modal = within_decay(of_one_hit(modal, settings.repeatability), alignment, decay)

@@ -16,6 +16,7 @@ from ema_pipeline.modal.drift.shifts import Movement, movement
 from ema_pipeline.modal.drift.windows import HitKey, Hits, peak_windows, spectra_of_hits
 from ema_pipeline.modal.peaks import KnownPeaks
 
+Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
 
 FEWEST_HITS = 2
@@ -46,6 +47,10 @@ PLATEAU = 0.4
 
 FLANKS = 5.0
 """Half-power half-widths of a peak that move with it at most: what lies between distant peaks may be another mode."""
+
+
+MOST_HITS = 0.6
+"""Share of the hits in which a sensor measured that was not moved; a channel may have been rejected in some."""
 
 
 @dataclass(frozen=True)
@@ -161,6 +166,7 @@ def align(hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float,
     if not windows:
         return nothing
     keys, spectra = spectra_of_hits(hits, frfs, settings, windows)
+    spectra = [_of_fixed_sensors(frf) for frf in spectra]
     rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
     omega = 2 * np.pi * frfs.frequency_hz
     found = [peak_poles(w, frf, omega[w.lines], rest_s) for w, frf in zip(windows, spectra, strict=True)]
@@ -184,6 +190,20 @@ def align(hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float,
         return by_hit[hit.hit.file, hit.hit.number]
 
     return Alignment(moved.spread, moved.mean_std, len(keys), looked_at, shift_of)
+
+
+def _of_fixed_sensors(frf: Complex) -> Complex:
+    """What sensors show that measured in most hits, where others were moved between them: all of it without any.
+
+    A sensor that was moved shows more or less of the flanks of other modes at each place, which would seem to move the
+    peak.
+
+    Parameters
+    ----------
+    frf : complex ndarray, (n_hits, n_outputs, n_lines)
+    """
+    fixed = np.isfinite(frf).all(axis=-1).mean(axis=0) >= MOST_HITS
+    return frf[:, fixed] if fixed.any() else frf
 
 
 def _movements(peaks: list[PeakPoles], keys: tuple[HitKey, ...]) -> tuple[Movement, tuple[PeakMovement, ...]]:
@@ -242,7 +262,7 @@ def _is_single(peak: PeakPoles, *, one_point: bool) -> bool:
     if one_point:
         return True
     shown = np.isfinite(peak.std)
-    if peak.residues.shape[1] < 2:
+    if peak.residues.shape[1] < 2 or np.count_nonzero(shown) < 2:
         return False
     scaled = peak.residues[shown] / peak.std[shown, None]
     values = np.linalg.svd(scaled, compute_uv=False)
