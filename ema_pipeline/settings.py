@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import datetime as dt
 import re
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, field_validator
-from pydantic_core import ErrorDetails
 
 from ema_pipeline.errors import EmaError, did_you_mean
 
@@ -62,10 +62,10 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        first = _first(error)
+        first, meant = _first(error.errors())
         path, of = _path(first["loc"]), _of_table(first["loc"], data)
         if first["type"] == "extra_forbidden":
-            known = _fields_at(model, first["loc"][:-1])
+            known = [meant] if meant else _fields_at(model, first["loc"][:-1])
             raise EmaError(
                 f"{where}: unknown key '{path}'{of}{did_you_mean(str(first['loc'][-1]), known)}"
             ) from None
@@ -79,14 +79,16 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
         raise EmaError(f"{where}: {path or 'file'} = {shown}: {message}") from None
 
 
-def _first(error: ValidationError) -> ErrorDetails:
-    """What is said of several errors: of a key that is missing where another one has its name misspelt, that one."""
-    found = error.errors()
-    if found[0]["type"] == "missing":
-        *table, key = found[0]["loc"]
+def _first(found: Sequence[Mapping[str, Any]]) -> tuple[Mapping[str, Any], str]:
+    """The error that is told, and the key that was meant where its name is misspelt: a key that is missing goes first."""
+    first = found[0]
+    if first["type"] == "missing":
+        *table, key = first["loc"]
         unknown = [e for e in found if e["type"] == "extra_forbidden" and list(e["loc"][:-1]) == table]
-        return next((e for e in unknown if get_close_matches(str(e["loc"][-1]), [str(key)])), found[0])
-    return found[0]
+        for other in unknown:
+            if get_close_matches(str(other["loc"][-1]), [str(key)]):
+                return other, str(key)
+    return first, ""
 
 
 def _of_table(loc: tuple[int | str, ...], data: Any) -> str:

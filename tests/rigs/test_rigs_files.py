@@ -290,7 +290,12 @@ def test_rig_from_scratch_may_hold_every_law_of_the_mechanics(tmp_path: Path) ->
     ("old", "new", "line", "words"),
     [
         ('law = "cubic"', 'law = "qubic"', 22, "nonlinear.0.law = 'qubic'"),
-        ('law = "cubic"', 'low = "cubic"', 21, "'nonlinear.0.law' is missing"),
+        (
+            'law = "cubic"',
+            'low = "cubic"',
+            21,
+            "unknown key 'nonlinear.0.low' of 'rotor.x' (did you mean 'law'?)",
+        ),
         ("preload = 1e-5\n", "", 33, "key 'preload' is missing"),
         ("sigma = 0.5", 'sigma = "sigma"', 45, "sigma 'sigma' is no parameter"),
         ("rho = 600.0", "rho = -600.0", 39, "'mesh pad': a Bouc-Wen element needs rho > 0"),
@@ -383,7 +388,7 @@ ELEMENT_MISTAKES = [
     ("[[masses]]", "[[mases]]", 5, "'mases' (did you mean 'masses'?)"),
     ('at = "base.x"\nvalue = 3', 'att = "base.x"\nvalue = 3', 9, "did you mean 'at'?"),
     ('at = "base.x"\nvalue = 3', 'at = "base"\nvalue = 3', 9, "dof 'base' is not of the form"),
-    ("value = 3.0", "", 8, "key 'masses.1.value' is missing"),
+    ("value = 3.0", "", 8, "key 'masses.1.value' of 'base.x' is missing"),
     ("value = 3.0", "value = 0", 10, "value = 0 kg: give a mass above 0"),
     (
         'name = "link"\n',
