@@ -80,7 +80,7 @@ def parse(model: type[M], data: Any, where: str | Path) -> M:
 
 
 def _first(found: Sequence[Mapping[str, Any]]) -> tuple[Mapping[str, Any], str]:
-    """The error that is told, and the key that was meant where its name is misspelt: a key that is missing goes first."""
+    """The error that is told, and the key that was meant where that is a misspelt one that must be there."""
     first = found[0]
     if first["type"] == "missing":
         *table, key = first["loc"]
