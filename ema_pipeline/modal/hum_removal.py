@@ -31,6 +31,9 @@ HALF_WIDTH = 12
 REACH = 30
 """Lines beyond these within which a mode reaches into them."""
 
+MOST_NEAR = 6
+"""Modes that reach into the lines of a tone, above which too few lines are left to tell it from them."""
+
 PLAIN = 20.0
 """Power of a tone over that of noise, mean of all hits, from which it is taken off: without hum it is 1 to 5."""
 
@@ -167,7 +170,8 @@ def _tones(modal: ModalModel, frfs: FrfSet) -> list[_Tone]:
         if low + half * step < hz < high - half * step:
             centre = round(hz / step)
             near = np.abs(poles.imag / (2 * np.pi) - hz) < (half + REACH) * step
-            tones.append(_Tone(hz, slice(max(1, centre - half), centre + half + 1), poles[near]))
+            if np.count_nonzero(near) <= MOST_NEAR:
+                tones.append(_Tone(hz, slice(max(1, centre - half), centre + half + 1), poles[near]))
     return tones
 
 
@@ -195,8 +199,10 @@ def _read(hit: HitSamples, tones: Sequence[_Tone]) -> _Found:
     best = [one.at(np.array([drift])) for one in beside]
     sizes, gains = (np.array([b[k][0] for b in best]) for k in (0, 1))
     poles = np.array([one.poles(np.array([drift]))[0] for one in beside])
-    force = np.asarray(rfft(hit.force))
-    blow = np.exp(poles * delay_s) / np.array([force[(t.lines.start + t.lines.stop) // 2] for t in tones])
+    spectrum = np.asarray(rfft(hit.force))
+    force = np.array([spectrum[(t.lines.start + t.lines.stop) // 2] for t in tones])
+    force[force == 0] = 1.0
+    blow = np.exp(poles * delay_s) / force
     return _Found(poles, sizes, gains, (sizes * blow[:, None]) ** 2, tuple(c.dof.point for c in hit.channels))
 
 

@@ -122,3 +122,11 @@ def test_hits_that_share_no_channel_show_hum_together() -> None:
 
 def test_few_hits_do_not_tell_hum_from_what_is_left_of_modes() -> None:
     assert hum_in(hits_of(0.01, n_hits=3))[0] is None
+
+
+def test_hum_among_many_modes_is_left_where_it_is() -> None:
+    """They leave too few lines to tell a tone from them."""
+    hz = 50 + 0.7 * np.arange(-4.0, 5.0)
+    system = TrueSystem(hz, np.full(9, 0.003), np.random.default_rng(1).normal(size=(9, 2)))
+    hum, _ = hum_in(hits_of(0.01, system))
+    assert hum is None or 50.0 not in hum.hz
