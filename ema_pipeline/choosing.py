@@ -13,6 +13,7 @@ from ema_pipeline.ingest.records import Hit
 from ema_pipeline.kinds import kind_of, stages_of
 from ema_pipeline.modal.chosen import REACH, nearest_mode, pole_of_chart
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.number_text import counted
 from ema_pipeline.pipeline import ShowStage, run_stages
 from ema_pipeline.run.measured import modes_of_structure
 from ema_pipeline.run.opening import existing_run, new_run
@@ -165,8 +166,9 @@ def _hit(run: Run, text: str) -> HitChoice:
         )
     wanted = 1 if number is None else number
     if wanted not in {h.number + 1 for h in mine}:
-        count = "1 hit" if len(mine) == 1 else f"{len(mine)} hits"
-        raise EmaError(f"{configuration}/{file}: holds {count}, counted from 1; none is number {wanted}")
+        raise EmaError(
+            f"{configuration}/{file}: holds {counted(len(mine), 'hit')}, counted from 1; none is number {wanted}"
+        )
     return HitChoice(configuration, file, wanted)
 
 

@@ -11,6 +11,11 @@ _GRAMS_BELOW_KG = 0.1
 """Masses of bodies are given in kg, those of sensors and of added masses in g."""
 
 
+def counted(n: int, noun: str) -> str:
+    """``"1 hit"`` or ``"3 hits"``."""
+    return f"{n} {noun}{'' if n == 1 else 's'}"
+
+
 def prefixed(magnitude: float, unit: str) -> tuple[float, str]:
     """Factor and unit that bring `magnitude` between 1 and 1000, e.g. ``(1e-6, "MN/m")`` for 1e7 N/m.
 

@@ -6,8 +6,6 @@ noise are smooth over frequency; divided by the force they look like a heavily d
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
@@ -15,7 +13,7 @@ from scipy.fft import rfft
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.drift.windows import Hits
 from ema_pipeline.modal.identify import ANCHORED, AT_PEAK
-from ema_pipeline.modal.left_out import sentences, taken_out
+from ema_pipeline.modal.left_out import taken_out_and_named
 from ema_pipeline.modal.peaks import KnownPeaks
 from ema_pipeline.modal.types import ModalModel, Mode
 
@@ -26,7 +24,7 @@ WEAK = 0.01
 
 DIPS = 0.4
 """Power of the force at a mode, over that two to four half-power half-widths on either side, below which it has a zero
-there. Modes of simulated tests at zeros had up to 0.4, those that zeros made 0.02 to 0.38."""
+there: 0.02 to 0.38 where zeros made a pole. Modes lie at zeros, too."""
 
 UNKNOWN = 0.04
 """Relative standard deviation of the damping above which such a mode is doubted: real ones had up to 0.01, those that
@@ -60,15 +58,13 @@ def without_zeros(modal: ModalModel, hits: Hits, frfs: FrfSet, wanted: KnownPeak
     gone = [k for k in doubtful if _at_zero(modal.modes[k], list(power.values()), step)]
     if not gone:
         return modal
-    fewer = taken_out(modal, gone, "a pole", REASON)
-    named = tuple(entry for entry in fewer.left_out if entry.reason == REASON)
-    return replace(fewer, notes=(*fewer.notes, *sentences(named)))
+    return taken_out_and_named(modal, gone, "a pole", REASON)
 
 
 def _doubtful(mode: Mode, wanted: KnownPeaks) -> bool:
-    asked = np.any(np.abs(wanted.poles.imag - mode.pole.imag) < wanted.reach)
     held = ANCHORED in mode.flags or AT_PEAK in mode.flags
-    return not asked and not held and mode.damping_std > UNKNOWN * abs(mode.damping_ratio)
+    poorly_known = mode.damping_std > UNKNOWN * abs(mode.damping_ratio)
+    return poorly_known and not held and not wanted.hold(mode.pole)
 
 
 def _at_zero(mode: Mode, power: list[Real], step_hz: float) -> bool:
@@ -76,13 +72,10 @@ def _at_zero(mode: Mode, power: list[Real], step_hz: float) -> bool:
     line = round(mode.frequency_hz / step_hz)
     width = max(mode.frequency_hz * mode.damping_ratio / step_hz, 1.0)
     near, far = max(int(2 * width), 3), max(int(4 * width), 5)
+    if not near < line < len(power[0]) - far:
+        return False
     here = np.array([p[max(line - 1, 1) : line + 2].mean() for p in power])
     most = np.array([p[1:].max() for p in power])
-    beside = [
-        max(np.median(p[max(line - far, 1) : line - near + 1]), np.median(p[line + near : line + far + 1]))
-        for p in power
-        if near < line < len(p) - far
-    ]
-    if len(beside) < len(power) or not np.all(here < WEAK * most):
-        return False
-    return bool(np.any(here < DIPS * np.array(beside)))
+    sides = slice(max(line - far, 1), line - near + 1), slice(line + near, line + far + 1)
+    beside = np.array([max(np.median(p[side]) for side in sides) for p in power])
+    return bool(np.all(here < WEAK * most) and np.any(here < DIPS * beside))

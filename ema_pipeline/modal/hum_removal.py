@@ -145,12 +145,15 @@ def hum_of(modal: ModalModel, hits: Hits, frfs: FrfSet) -> Hum | None:
     for hit in hits():
         keys.append((hit.hit.file, hit.hit.number))
         found.append(_read(hit, tones))
-    plain = _plain(found)
-    if plain is None or not plain.any():
+    if len(found) < FEWEST_HITS:
         return None
-    place = {point: k for k, point in enumerate(_points(found))}
-    taken = np.flatnonzero(plain.any(axis=1))
+    points = dict.fromkeys(p for one in found for p in one.points)
+    place = {point: k for k, point in enumerate(points)}
     rows = [[place[p] for p in one.points] for one in found]
+    plain = _plain(found, rows, len(place))
+    if not plain.any():
+        return None
+    taken = np.flatnonzero(plain.any(axis=1))
     sizes = [np.where(plain[:, r], one.sizes, 0)[taken].T for one, r in zip(found, rows, strict=True)]
     return Hum(
         tuple(tones[k].hz for k in taken),
@@ -238,20 +241,20 @@ class _Beside:
         return np.asarray(values - self._basis @ (self._basis.conj().T @ values))
 
 
-def _points(found: Sequence[_Found]) -> list[str]:
-    return list(dict.fromkeys(p for one in found for p in one.points))
+def _plain(found: Sequence[_Found], rows: Sequence[list[int]], count: int) -> NDArray[np.bool_]:
+    """Tones that stand out and are no part of modes, (n_tones, n_points).
 
-
-def _plain(found: Sequence[_Found]) -> NDArray[np.bool_] | None:
-    """Tones that stand out and are no part of modes, (n_tones, n_points); None of too few hits."""
-    points = _points(found)
-    gain = np.full((len(found), len(found[0].poles), len(points)), np.nan)
+    Parameters
+    ----------
+    found : sequence of _Found
+    rows : sequence of list of int
+        Of every hit: which of the `count` points its channels are at.
+    count : int
+    """
+    gain = np.full((len(found), len(found[0].poles), count), np.nan)
     squares = np.full(gain.shape, np.nan, dtype=np.complex128)
-    for k, one in enumerate(found):
-        rows = [points.index(p) for p in one.points]
-        gain[k][:, rows], squares[k][:, rows] = one.gain, one.squares
-    if len(found) < FEWEST_HITS:
-        return None
+    for k, (one, here) in enumerate(zip(found, rows, strict=True)):
+        gain[k][:, here], squares[k][:, here] = one.gain, one.squares
     with np.errstate(invalid="ignore", divide="ignore"):
         mean = np.nanmean(gain, axis=0)
         common = np.abs(np.nansum(squares, axis=(0, 2))) / np.nansum(np.abs(squares), axis=(0, 2))

@@ -135,17 +135,23 @@ def _averaged_lines(frfs: FrfSet, transposed: bool) -> NDArray[np.int64]:
 def _first_noise(data: FitData, averaged: NDArray[np.int64]) -> tuple[Window, Real]:
     """Data with noise from hits or a first guess of it, and noise level of every FRF."""
     known = np.array([np.any(row > 0, axis=-1) for row in data.variance]) & data.measured
-    floor = np.array([np.mean(np.abs(row) ** 2, axis=-1) for row in data.frf])
-    second = np.array([second_difference_power(row) for row in data.frf])
-    level = np.where(data.measured, np.maximum(second, np.maximum(1e-12 * floor, 1e-300)), 1.0)
     if not known.any():
+        level = _white_level(data)
         return whole(data, flat_law(level, len(data.omega)), from_hits=False), level
     hits = fit_law(data.variance, data.frf, data.measured, inputs_are_rows=data.transposed, averaged=averaged)
     shape = np.median(hits.shape @ hits.hats, axis=-1)
-    # a point that was hit once has no scatter
-    hits = replace(hits, level=np.where(known | ~data.measured, hits.level, level / shape))
+    once = data.measured & ~known
+    if once.any():  # points that were hit once have no scatter
+        hits = replace(hits, level=np.where(once, _white_level(data) / shape, hits.level))
     typical = hits.level * shape + hits.floor
     return whole(data, hits, from_hits=True), np.where(data.measured, typical, 1.0)
+
+
+def _white_level(data: FitData) -> Real:
+    """A first guess of the noise of every FRF, from its second differences over lines; 1 where not measured."""
+    floor = np.array([np.mean(np.abs(row) ** 2, axis=-1) for row in data.frf])
+    second = np.array([second_difference_power(row) for row in data.frf])
+    return np.where(data.measured, np.maximum(second, np.maximum(1e-12 * floor, 1e-300)), 1.0)
 
 
 def _model(

@@ -87,6 +87,13 @@ def taken_out(modal: ModalModel, gone: Collection[int], evidence: str, reason: s
     )
 
 
+def taken_out_and_named(modal: ModalModel, gone: Collection[int], evidence: str, reason: str) -> ModalModel:
+    """`taken_out`, with a sentence on each of them among the notes."""
+    fewer = taken_out(modal, gone, evidence, reason)
+    named = tuple(entry for entry in fewer.left_out if entry.reason == reason)
+    return replace(fewer, notes=(*fewer.notes, *sentences(named)))
+
+
 def sentences(entries: tuple[LeftOut, ...]) -> list[str]:
     """One sentence on each of the first few, and one on the others."""
     told = [f"{e.frequency_hz:.5g} Hz ({e.evidence}) has no mode: {e.reason}" for e in entries[:MOST]]

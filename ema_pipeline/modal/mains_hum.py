@@ -7,7 +7,7 @@ to decay within the record.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.hit_checks import HUM_HZ
 from ema_pipeline.modal.basis import pole_values
 from ema_pipeline.modal.drift.windows import Hits
-from ema_pipeline.modal.left_out import sentences, taken_out
+from ema_pipeline.modal.left_out import taken_out_and_named
 from ema_pipeline.modal.peaks import KnownPeaks
 from ema_pipeline.modal.types import ModalModel, Mode
 
@@ -121,8 +121,7 @@ def without_hum(modal: ModalModel, hits: Hits, frfs: FrfSet, wanted: KnownPeaks)
     looked_at = [
         candidate
         for k, mode in enumerate(modal.modes)
-        if not np.any(np.abs(wanted.poles.imag - mode.pole.imag) < wanted.reach)
-        and (candidate := _candidate(modal, k, frfs, rest_s)) is not None
+        if not wanted.hold(mode.pole) and (candidate := _candidate(modal, k, frfs, rest_s)) is not None
     ]
     if not looked_at:
         return modal
@@ -134,9 +133,7 @@ def without_hum(modal: ModalModel, hits: Hits, frfs: FrfSet, wanted: KnownPeaks)
     ]
     if not gone:
         return modal
-    fewer = taken_out(modal, gone, "a tone", REASON)
-    named = tuple(entry for entry in fewer.left_out if entry.reason == REASON)
-    return replace(fewer, notes=(*fewer.notes, *sentences(named)))
+    return taken_out_and_named(modal, gone, "a tone", REASON)
 
 
 def _tone(frequency_hz: float, reach_hz: float) -> float:

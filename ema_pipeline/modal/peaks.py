@@ -81,6 +81,10 @@ class KnownPeaks:
                 out[r], poles[r] = lost, pole if lost else poles[r]
         return out, poles
 
+    def hold(self, pole: complex) -> bool:
+        """True where a pole belongs to one of the peaks by its frequency."""
+        return bool(np.any(np.abs(self.poles.imag - pole.imag) < self.reach))
+
     def absent(self, estimate: Estimate) -> KnownPeaks:
         """Peaks near which no mode lies."""
         distance = np.abs(self.poles[:, None] - estimate.poles[None])

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.modal.left_out import sentences, taken_out
+from ema_pipeline.modal.left_out import taken_out_and_named
 from ema_pipeline.modal.types import GROWS, ModalModel, Mode
 
 CLEARLY = 3.0
@@ -38,9 +36,7 @@ def without_growing(modal: ModalModel, frfs: FrfSet) -> ModalModel:
             f"{first.frequency_hz:.5g} Hz) once the exponential window of {frfs.response_decay_rad_s:.3g} rad/s is "
             f"taken off, which decays faster than the responses: {REMEDY}"
         )
-    fewer = taken_out(modal, gone, "mode", GROWS)
-    named = tuple(entry for entry in fewer.left_out if entry.reason == GROWS)
-    return replace(fewer, notes=(*fewer.notes, *sentences(named)))
+    return taken_out_and_named(modal, gone, "mode", GROWS)
 
 
 def _grows(mode: Mode) -> bool:

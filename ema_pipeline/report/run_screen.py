@@ -17,7 +17,7 @@ from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import Candidate, Diagnosis
 from ema_pipeline.modal.chosen import EXCLUDED
 from ema_pipeline.modal.types import ModalModel
-from ema_pipeline.number_text import below, format_percent, format_value, plain, signed
+from ema_pipeline.number_text import below, counted, format_percent, format_value, plain, signed
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import Weight, cautions, left_out, suspicions
 from ema_pipeline.report.commands import naming, typed
@@ -131,7 +131,7 @@ def _verdict(results: RunResults) -> str:
     if not modes:
         return "No modes were found." if results.configurations else "Nothing has been analysed yet."
     low, high = min(m.frequency_hz for m in modes), max(m.frequency_hz for m in modes)
-    return f"{_count(len(modes), 'mode')} from {plain(low)} to {plain(high)} Hz; no model was named (--rig)."
+    return f"{counted(len(modes), 'mode')} from {plain(low)} to {plain(high)} Hz; no model was named (--rig)."
 
 
 def _diagnosed(found: Diagnosis) -> str:
@@ -186,7 +186,7 @@ def _data_words(c: ConfigurationResults, several: bool, choices: Choices) -> str
         yours = f" ({len(choices.excluded_hits)} excluded by you)" if choices.excluded_hits else ""
         parts.append(f"{sum(h.accepted for h in c.hits)} of {len(c.hits)} hits used{yours}{dropped}")
     if c.modal is not None:
-        parts.append(_count(len(c.modal.modes), "mode") + _chosen_words(choices))
+        parts.append(counted(len(c.modal.modes), "mode") + _chosen_words(choices))
         parts += _candidates_left_out(c.modal)
     if c.pairing is not None:
         weak = sum(p.mac < LOW_MAC for p in c.pairing.pairs)
@@ -204,7 +204,7 @@ def _candidates_left_out(modal: ModalModel) -> list[str]:
     named = ", ".join(plain(f) for f in found[:_MOST_NAMED])
     more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
     reasons = "reason" if len(found) == 1 else "reasons"
-    return [f"{_count(len(found), 'candidate')} left out: {named} Hz{more} ({reasons} in the report)"]
+    return [f"{counted(len(found), 'candidate')} left out: {named} Hz{more} ({reasons} in the report)"]
 
 
 def _chosen_words(choices: Choices) -> str:
@@ -262,7 +262,3 @@ def _mode_rows(c: ConfigurationResults, paired: bool) -> Iterator[tuple[tuple[st
         mac = "–" if math.isnan(pair.mac) else below(pair.mac, LOW_MAC) if weak else f"{pair.mac:.2f}"
         off = percent_off(mode.frequency_hz, pair.model_frequency_hz)
         yield (*cells, plain(pair.model_frequency_hz, 5), signed(off, 2), mac), weak
-
-
-def _count(n: int, noun: str) -> str:
-    return f"{n} {noun}{'' if n == 1 else 's'}"

@@ -7,7 +7,7 @@ import math
 from ema_pipeline.correlate.types import Pairing
 from ema_pipeline.fit.types import FitResult, ParameterEstimate
 from ema_pipeline.inference import ERROR_LIMIT
-from ema_pipeline.number_text import format_value, plain
+from ema_pipeline.number_text import counted, format_value, plain
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.cautions import cautions, identified_words, suspicions
 from ema_pipeline.report.commands import command
@@ -147,14 +147,14 @@ def _measured(c: ConfigurationResults) -> str:
     text = f"{c.name}: {used} of {len(c.hits)} hits used" if c.hits else f"{c.name}:"
     if c.frfs is not None:
         text += (
-            f"{',' if c.hits else ''} {_count(len(c.frfs.outputs), 'response')} × "
-            f"{_count(len(c.frfs.inputs), 'force' if c.frfs.excitation else 'impact point')}"
+            f"{',' if c.hits else ''} {counted(len(c.frfs.outputs), 'response')} × "
+            f"{counted(len(c.frfs.inputs), 'force' if c.frfs.excitation else 'impact point')}"
         )
     if c.modal is None:
         return text + "; no modes identified yet."
     low, high = c.modal.band_hz
     text += "; " if c.hits or c.frfs is not None else " "
-    text += _count(len(c.modal.modes), "mode")
+    text += counted(len(c.modal.modes), "mode")
     text += f" between {low:.4g} and {high:.5g} Hz" if math.isfinite(high) else " from a table"
     if c.pairing is not None:
         text += f", {paired_words(c.pairing)}"
@@ -189,7 +189,3 @@ def _worst(results: RunResults) -> list[str]:
         d = max(dofs, key=lambda d: d.z)
         lines.append(f"Largest difference in shape: at {d.dof}, {d.configuration}, {plain(d.z, 2)}σ.")
     return lines
-
-
-def _count(n: int, noun: str) -> str:
-    return f"{n} {noun}{'' if n == 1 else 's'}"

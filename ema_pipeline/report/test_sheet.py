@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from ema_pipeline.number_text import plain
+from ema_pipeline.number_text import counted, plain
 from ema_pipeline.report.name_text import words
 from ema_pipeline.report.results import ConfigurationResults, RunResults
 from ema_pipeline.report.tables import Row, Table
@@ -55,7 +55,7 @@ def set_up_table(results: RunResults, c: ConfigurationResults) -> Table:
 
 def _from_to(low: int, high: int, what: str) -> str:
     """``"3 to 5 hits"``, ``"3 hits"`` or ``"1 hit"``."""
-    return f"{low} {what}{'' if low == 1 else 's'}" if low == high else f"{low} to {high} {what}s"
+    return counted(low, what) if low == high else f"{low} to {counted(high, what)}"
 
 
 def _windows(settings: Mapping[str, str], decay_rad_s: float) -> list[tuple[str, str]]:

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from accepted_hits import accepted
 from simulate_modal import TrueSystem, records_of, simulate_hits
 
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
-from ema_pipeline.ingest.hit_checks import hits_of_test
-from ema_pipeline.ingest.records import HitSamples, cut_hit
+from ema_pipeline.ingest.records import HitSamples
 from ema_pipeline.modal.data import analysis_band
 from ema_pipeline.modal.drift.align import Alignment, align
 from ema_pipeline.modal.force_zeros import REASON, without_zeros
@@ -45,9 +45,7 @@ def hits_of(
         response_noise=noise,
         rng=np.random.default_rng(3),
     )
-    records = records_of(made, outputs, points)
-    by_file = {r.file: r for r in records}
-    return [cut_hit(by_file[h.file], h) for h in hits_of_test(records) if h.accepted]
+    return accepted(records_of(made, outputs, points))
 
 
 def modes_of(hits: Sequence[HitSamples]) -> ModalModel:
@@ -99,18 +97,17 @@ def test_sensors_that_are_moved_make_no_peak_seem_to_move() -> None:
 
 
 @pytest.fixture(scope="module")
-def at_zero() -> tuple[list[HitSamples], float]:
-    """Hits whose force has a zero at 300 Hz, and that frequency."""
-    zero = 300.0
+def at_zero() -> list[HitSamples]:
+    """Hits whose force has a zero at 300 Hz."""
     hits = []
     for hit in hits_of(SYSTEM, [0], 3):
         rate = hit.sample_rate_hz
         spectrum = np.fft.rfft(hit.force)
         f = np.fft.rfftfreq(hit.force.size, 1 / rate)
         low = 0.05 / (1 + (f / 150.0) ** 4)  # a soft tip
-        dip = np.minimum(1.0, 0.02 + np.abs(f - zero) / 8.0)
+        dip = np.minimum(1.0, 0.02 + np.abs(f - 300.0) / 8.0)
         hits.append(replace(hit, force=np.fft.irfft(spectrum * low * dip, hit.force.size)))
-    return hits, zero
+    return hits
 
 
 @pytest.mark.parametrize(
@@ -123,13 +120,12 @@ def at_zero() -> tuple[list[HitSamples], float]:
     ],
 )
 def test_a_pole_at_a_zero_of_the_force_is_no_mode_unless_it_is_known_well(
-    at_zero: tuple[list[HitSamples], float],
+    at_zero: list[HitSamples],
     frequency_hz: float,
     relative_std: float,
     flags: tuple[str, ...],
     stays: bool,
 ) -> None:
-    hits, _ = at_zero
     frfs = estimate_frfs(hits_of(SYSTEM, [0], 3))
     modal = identify(frfs, ModalSettings())
     zeta = 0.01
@@ -143,8 +139,8 @@ def test_a_pole_at_a_zero_of_the_force_is_no_mode_unless_it_is_known_well(
         flags=flags,
     )
     made = replace(modal, modes=(*modal.modes, added))
-    left = without_zeros(made, lambda: hits, frfs, NO_PEAKS)
+    left = without_zeros(made, lambda: at_zero, frfs, NO_PEAKS)
     assert (left.modes == made.modes) is stays
     assert [e.reason for e in left.left_out if e.frequency_hz == frequency_hz] == ([] if stays else [REASON])
     asked = KnownPeaks(np.array([pole]), np.array([5.0]), np.ones((1, 2)))
-    assert without_zeros(made, lambda: hits, frfs, asked) is made
+    assert without_zeros(made, lambda: at_zero, frfs, asked) is made

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from accepted_hits import accepted
 from simulate_modal import Hits, TrueSystem, records_of, simulate_hits
 
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.ingest.hit_checks import hits_of_test
-from ema_pipeline.ingest.records import HitSamples, cut_hit
+from ema_pipeline.ingest.records import HitSamples
 from ema_pipeline.modal.hit_to_hit import identify_hits
 from ema_pipeline.modal.hum_removal import Hum, hum_of
 from ema_pipeline.modal.identify import identify
@@ -42,9 +42,7 @@ def hits_of(
         for output, size in ((0, 1.0), (1, -0.6)):
             responses[0, hit, output] += share * np.max(np.abs(made.responses)) * size * hum
     rest = made.sample_rate_hz, made.pretrigger, made.force_noise, made.response_noise
-    records = records_of(Hits(made.force, responses, *rest), [0, 1], [0])
-    by_file = {r.file: r for r in records}
-    return [cut_hit(by_file[h.file], h) for h in hits_of_test(records) if h.accepted]
+    return accepted(records_of(Hits(made.force, responses, *rest), [0, 1], [0]))
 
 
 def modes_of(hits: Sequence[HitSamples]) -> ModalModel:

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from accepted_hits import accepted
 from simulate_modal import TrueSystem, frf_set, random_system, records_of, simulate_hits
 
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.warp import WarpedTransform
-from ema_pipeline.ingest.hit_checks import hits_of_test
-from ema_pipeline.ingest.records import HitSamples, cut_hit
+from ema_pipeline.ingest.records import HitSamples
 from ema_pipeline.modal.combine_estimates import NamedEstimate, pool
 from ema_pipeline.modal.drift.align import _movements, _warps
 from ema_pipeline.modal.drift.local import PeakPoles, change_in_decay, peak_poles
@@ -58,9 +58,8 @@ def identified(system: TrueSystem, n_hits: int, references: list[int], **moves: 
 
 
 def source(records: list) -> Callable[[], Iterator[HitSamples]]:
-    by_file = {r.file: r for r in records}
-    found = [h for h in hits_of_test(records) if h.accepted]
-    return lambda: (cut_hit(by_file[h.file], h) for h in found)
+    hits = accepted(records)
+    return lambda: iter(hits)
 
 
 @pytest.mark.parametrize("n", [200, 201])

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from accepted_hits import accepted
 from click.testing import Result
 from simulate_modal import Hits, TrueSystem, records_of, simulate_hits, write_raw_folder
 from typer.testing import CliRunner
@@ -16,8 +17,7 @@ from ema_pipeline import cli
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.ingest.hit_checks import hits_of_test
-from ema_pipeline.ingest.records import HitSamples, Record, cut_hit
+from ema_pipeline.ingest.records import Record
 from ema_pipeline.modal.drift.plain import plain_peaks
 from ema_pipeline.modal.drift.windows import MAX_PEAKS
 from ema_pipeline.modal.identify import identify
@@ -56,11 +56,6 @@ def with_hum(
 
 def _rest(made: Hits) -> tuple[float, int, float, np.ndarray]:
     return made.sample_rate_hz, made.pretrigger, made.force_noise, made.response_noise
-
-
-def accepted(records: list[Record]) -> list[HitSamples]:
-    by_file, found = {r.file: r for r in records}, [h for h in hits_of_test(records) if h.accepted]
-    return [cut_hit(by_file[h.file], h) for h in found]
 
 
 def measured(records: list[Record]) -> FrfSet:

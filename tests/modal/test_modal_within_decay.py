@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from accepted_hits import accepted
 from scipy.signal import fftconvolve
 from simulate_modal import Hits, TrueSystem, records_of, simulate_hits
 
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
-from ema_pipeline.ingest.hit_checks import hits_of_test
-from ema_pipeline.ingest.records import HitSamples, Record, cut_hit
+from ema_pipeline.ingest.records import Record
 from ema_pipeline.modal.drift.align import Alignment
 from ema_pipeline.modal.drift.local import DecayChange
 from ema_pipeline.modal.hit_to_hit import identify_hits, within_decay
@@ -59,14 +58,9 @@ def moving_records(sensors: list[int], n_hits: int, rise: float, noise: float = 
 
 
 def identified(records: list[Record]) -> ModalModel:
-    by_file, found = {r.file: r for r in records}, [h for h in hits_of_test(records) if h.accepted]
-
-    def hits() -> Iterator[HitSamples]:
-        return (cut_hit(by_file[h.file], h) for h in found)
-
-    source: Callable[[], Iterator[HitSamples]] = hits
-    frfs = estimate_frfs(source(), FrfSettings())
-    return identify_hits(source, lambda: frfs, FrfSettings(), ModalSettings()).modal
+    hits = accepted(records)
+    frfs = estimate_frfs(hits, FrfSettings())
+    return identify_hits(lambda: hits, lambda: frfs, FrfSettings(), ModalSettings()).modal
 
 
 @pytest.mark.parametrize("rise", [0.001, 0.004])

@@ -48,7 +48,6 @@ PLATEAU = 0.4
 FLANKS = 5.0
 """Half-power half-widths of a peak that move with it at most: what lies between distant peaks may be another mode."""
 
-
 MOST_HITS = 0.6
 """Share of the hits in which a sensor measured that was not moved; a channel may have been rejected in some."""
 
