@@ -30,7 +30,7 @@ from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.diagnose.types import NOTHING
 from ema_pipeline.inference import beyond
 from ema_pipeline.observations.base import Observations
-from ema_pipeline.observations.fitting import Fit, part_reach, within_scatter
+from ema_pipeline.observations.fitting import Fit, learned, part_reach, within_scatter
 
 _PARALLEL = 0.95
 """Cosine of what an effect and what a part change from which they are the same place."""
@@ -116,9 +116,9 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
     evidence of that fit.
 
     Left alone, the scatter of a few parts grows until none stands out, and the evidence of a base model that bends
-    one part is hardly behind that of the model with what is missing there. An effect that changes just what a part
-    that stands out changes is helped to the difference, if it explains the data with none that does; and so is every
-    other one that explains them so and gains no less.
+    one part is hardly behind that of the model with what is missing there. Where an effect that changes just what a
+    part that stands out changes explains the data with none that does, everything that explains them so is helped to
+    the difference.
     """
     p, bounded = ranking.base.posterior, within_scatter(observations, ranking.base)
     relief = _lost(ranking.base, bounded)
@@ -126,17 +126,24 @@ def _with_relief(observations: Observations, ranking: Ranking, settings: Diagnos
         return ranking
     parts = [p.unknowns.names[i] for i in np.flatnonzero(beyond(p, part_reach(observations, p)))]
 
-    def explains(one: Ranked) -> bool:
-        found = within_scatter(observations, one.fit)
-        return found is one.fit and not found.posterior.fails(settings.error_limit)
+    def helped(one: Ranked) -> Ranked | None:
+        """With none that stands out, if it explains the data so; None where it does not."""
+        if not one.final:
+            return None
+        fit = within_scatter(observations, one.fit)
+        if fit is not one.fit:  # its own scatters were learned with that part
+            fit = learned(observations, fit, past_barriers=False)
+            if within_scatter(observations, fit) is not fit:
+                return None
+        if fit.posterior.fails(settings.error_limit):
+            return None
+        gain = one.gain + fit.log_evidence - one.fit.log_evidence
+        return replace(one, fit=fit, gain=gain + max(relief, 0.0))
 
-    able = [r for r in ranking.ranked if r.final and explains(r)]
-    least = min((r.gain for r in able if _changes(r, parts)), default=np.inf)
-    helped = [r.hypothesis.label for r in able if r.gain >= least]
-    ranked = [
-        replace(r, gain=r.gain + max(relief, 0.0)) if r.hypothesis.label in helped else r
-        for r in ranking.ranked
-    ]
+    better = {r.hypothesis.label: able for r in ranking.ranked if (able := helped(r))}
+    if not any(_changes(able, parts) for able in better.values()):
+        return ranking
+    ranked = [better.get(r.hypothesis.label, r) for r in ranking.ranked]
     return replace(ranking, ranked=tuple(sorted(ranked, key=lambda r: -r.gain)))
 
 
