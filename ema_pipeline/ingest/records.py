@@ -210,6 +210,8 @@ class HitSamples:
         As in `Record`.
     band_hz : tuple of float
         As in `Record`.
+    before : LazySamples, (n_channels, n_before), optional
+        What the record holds of the responses before it was cut; None where that is not known.
     """
 
     hit: Hit
@@ -223,6 +225,7 @@ class HitSamples:
     force_calibration_std: float = CALIBRATION_STD
     force_transverse: float = TRANSVERSE
     band_hz: tuple[float, float] = ANY_BAND_HZ
+    before: LazySamples | None = None
 
 
 def cut_hit(record: Record, hit: Hit) -> HitSamples:
@@ -234,6 +237,7 @@ def cut_hit(record: Record, hit: Hit) -> HitSamples:
         sample_rate_hz=record.sample_rate_hz,
         force=record.force[hit.start : hit.stop],
         responses=CutSamples(record.responses, keep, hit.start, hit.stop),
+        before=CutSamples(record.responses, keep, 0, hit.start),
         channels=tuple(record.channels[i] for i in keep),
         force_calibrated=record.force_calibrated,
         window_decay_rad_s=record.window_decay_rad_s,

@@ -1,7 +1,8 @@
 """Mains hum taken off the hits in which it stands out, so that modes are identified without it.
 
 Hum leaks into all lines around it, and a fit that has to leave it over knows the modes nearby far less well than the
-hits tell of them. It is there before the blow, does not decay, and has another phase against every blow.
+hits tell of them. It does not decay, and is there before the blow: what is left of close modes beside a fit that is not
+perfect may seem to last, but begins with the blow.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from scipy.fft import rfft
 
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.hit_checks import HUM_HZ
+from ema_pipeline.ingest.pulse import find_pulse
 from ema_pipeline.ingest.records import HitSamples
 from ema_pipeline.lazy_samples import LazySamples
 from ema_pipeline.modal.basis import pole_functions, pole_values
@@ -37,12 +39,20 @@ MOST_NEAR = 6
 PLAIN = 20.0
 """Power of a tone over that of noise, mean of all hits, from which it is taken off: without hum it is 1 to 5."""
 
-COHERENT = 0.7
-"""Share of the squared tones that all hits and channels have in common, their phases counted from the blow: about 1 of
-what is left of a mode, whose shape is nearly real, and of hum one over the root of the number of hits."""
+THERE_BEFORE = 0.5
+"""Share of a tone that has to be there before the blow: 1 of hum, 0 of what begins with it."""
+
+CERTAIN = 3.0
+"""Standard deviations by which that has to be more than nothing."""
+
+REST = 0.25
+"""Share of the record before which no sample is looked at: the mains drifts."""
 
 FEWEST_HITS = 4
-"""Hits without which their phases tell nothing."""
+"""Hits without which it is not known how these scatter."""
+
+FEWEST_SAMPLES = 16
+"""Before the blow; fewer tell nothing."""
 
 BLOCK = 32
 """Channels transformed at once."""
@@ -61,14 +71,17 @@ class _Tone:
 
 @dataclass(frozen=True)
 class _Found:
-    """Tones of one hit: `gain` is their power over that of noise, `squares` are those of their sizes at the blow, over
-    the squared force, (n_tones, n_channels).
+    """Tones of one hit, (n_tones, n_channels).
+
+    `gain` is their power over that of noise. `before` are their products with each other before the blow, (n_tones,
+    n_tones, n_channels), and `shown` those with the samples there, both over the power of these.
     """
 
     poles: Complex
     sizes: Complex
     gain: Real
-    squares: Complex
+    before: Real
+    shown: Real
     points: tuple[str, ...]
 
 
@@ -202,11 +215,31 @@ def _read(hit: HitSamples, tones: Sequence[_Tone]) -> _Found:
     best = [one.at(np.array([drift])) for one in beside]
     sizes, gains = (np.array([b[k][0] for b in best]) for k in (0, 1))
     poles = np.array([one.poles(np.array([drift]))[0] for one in beside])
-    spectrum = np.asarray(rfft(hit.force))
-    force = np.array([spectrum[(t.lines.start + t.lines.stop) // 2] for t in tones])
-    force[force == 0] = 1.0
-    blow = np.exp(poles * delay_s) / force
-    return _Found(poles, sizes, gains, (sizes * blow[:, None]) ** 2, tuple(c.dof.point for c in hit.channels))
+    return _Found(poles, sizes, gains, *_before(hit, sizes, poles), tuple(c.dof.point for c in hit.channels))
+
+
+def _before(hit: HitSamples, sizes: Complex, poles: Complex) -> tuple[Real, Real]:
+    """Products of tones before the blow with each other and with the samples there, over the power of these."""
+    blow = find_pulse(hit.force, hit.hit.peak - hit.hit.start).start
+    count = 0 if hit.before is None else hit.before.shape[1]
+    first = max(count - int(REST * hit.force.size), 0)
+    samples = np.asarray(hit.responses[:, :blow])
+    if hit.before is not None:
+        samples = np.concatenate([hit.before[:, first:], samples], axis=1)
+    if samples.shape[1] < FEWEST_SAMPLES:
+        return np.zeros((len(sizes), *sizes.shape)), np.zeros(sizes.shape)
+    step_s = 1 / hit.sample_rate_hz
+    time = step_s * (np.arange(samples.shape[1]) - (count - first))
+    functions = np.exp(poles[:, None] * time)
+    waves = np.concatenate([functions.real, -functions.imag])
+    waves -= waves.mean(axis=1, keepdims=True)
+    samples = samples - samples.mean(axis=1, keepdims=True)
+    power = np.maximum(np.mean(samples**2, axis=1), 1e-300)
+    parts = 2 * step_s * np.array([sizes.real, sizes.imag])
+    among = (waves @ waves.T).reshape(2, len(poles), 2, len(poles))
+    products = np.einsum("akc,akbj,bjc->kjc", parts, among, parts, optimize=True)
+    shown = np.sum(parts * (waves @ samples.T).reshape(parts.shape), axis=0)
+    return products / power, shown / power
 
 
 class _Beside:
@@ -242,7 +275,7 @@ class _Beside:
 
 
 def _plain(found: Sequence[_Found], rows: Sequence[list[int]], count: int) -> NDArray[np.bool_]:
-    """Tones that stand out and are no part of modes, (n_tones, n_points).
+    """Tones that stand out and are there before the blow, (n_tones, n_points).
 
     Parameters
     ----------
@@ -252,10 +285,29 @@ def _plain(found: Sequence[_Found], rows: Sequence[list[int]], count: int) -> ND
     count : int
     """
     gain = np.full((len(found), len(found[0].poles), count), np.nan)
-    squares = np.full(gain.shape, np.nan, dtype=np.complex128)
-    for k, (one, here) in enumerate(zip(found, rows, strict=True)):
-        gain[k][:, here], squares[k][:, here] = one.gain, one.squares
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.nanmean(gain, axis=0)
-        common = np.abs(np.nansum(squares, axis=(0, 2))) / np.nansum(np.abs(squares), axis=(0, 2))
-    return np.asarray((np.nan_to_num(mean) >= PLAIN) & (common < COHERENT)[:, None])
+    for of_hit, one, here in zip(gain, found, rows, strict=True):
+        of_hit[:, here] = one.gain
+    plain = np.nan_to_num(np.nanmean(gain, axis=0)) >= PLAIN
+    at = np.flatnonzero(plain.any(axis=1))
+    plain[at] &= _there_before(found, rows, plain, at)[:, None]
+    return np.asarray(plain)
+
+
+def _there_before(
+    found: Sequence[_Found], rows: Sequence[list[int]], plain: NDArray[np.bool_], at: NDArray[np.intp]
+) -> NDArray[np.bool_]:
+    """Which tones of those `at` are in the samples before the blow as well, by the channels where they are plain."""
+    n, seen = len(at), [plain[at][:, r] for r in rows]
+    products = np.array(
+        [
+            np.sum(one.before[np.ix_(at, at)] * s[:, None] * s, axis=2)
+            for one, s in zip(found, seen, strict=True)
+        ]
+    ).reshape(len(found), n, n)
+    shown = np.array([np.sum(one.shown[at] * s, axis=1) for one, s in zip(found, seen, strict=True)])
+    inverse = np.linalg.pinv(products.sum(axis=0), hermitian=True)
+    share = inverse @ shown.sum(axis=0)
+    # as hits scatter: what rings on from an earlier blow is no white noise
+    left = (shown - products @ share) @ inverse
+    std = np.sqrt(np.sum(left**2, axis=0) * len(found) / (len(found) - 1))
+    return np.asarray((share > THERE_BEFORE) & (share > CERTAIN * std))

@@ -14,6 +14,7 @@ from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import HitSamples
+from ema_pipeline.lazy_samples import CutSamples
 from ema_pipeline.modal.hit_to_hit import identify_hits
 from ema_pipeline.modal.hum_removal import Hum, hum_of
 from ema_pipeline.modal.identify import identify
@@ -24,15 +25,17 @@ SYSTEM = TrueSystem(np.array([51.1, 82.0, 171.0]), np.array([0.01, 0.006, 0.005]
 
 
 def hits_of(
-    share: float, system: TrueSystem = SYSTEM, record_s: float = 4.0, n_hits: int = 6
+    share: float, system: TrueSystem = SYSTEM, record_s: float = 4.0, n_hits: int = 6, pretrigger: int = 20
 ) -> list[HitSamples]:
     """Hits on one point with hum and two of its harmonics, `share` of the largest response, in both responses.
 
     The mains' frequency differs from hit to hit and wanders within each, and the harmonics' phases with it.
     """
     rng = np.random.default_rng(7)
-    noise = {"force_noise": 1e-4, "response_noise": 1e-4}
-    made = simulate_hits(system, [0, 1], [0], f_max=400, record_s=record_s, n_hits=n_hits, rng=rng, **noise)
+    made = simulate_hits(
+        system, [0, 1], [0], f_max=400, record_s=record_s, n_hits=n_hits, rng=rng,
+        force_noise=1e-4, response_noise=1e-4, pretrigger=pretrigger,
+    )  # fmt: skip
     time = np.arange(made.force.shape[-1]) / made.sample_rate_hz
     responses = made.responses.copy()
     for hit in range(n_hits):
@@ -108,7 +111,7 @@ def test_a_mode_on_the_hum_stays_what_it_is() -> None:
 def test_hits_that_share_no_channel_show_hum_together() -> None:
     """A roving sensor: every hit shows one channel."""
     roved = [
-        replace(h, responses=np.asarray(h.responses)[[k % 2]], channels=(h.channels[k % 2],))
+        replace(h, responses=np.asarray(h.responses)[[k % 2]], channels=(h.channels[k % 2],), before=None)
         for k, h in enumerate(hits_of(0.01))
     ]
     hum, frfs = hum_in(roved)
@@ -116,6 +119,29 @@ def test_hits_that_share_no_channel_show_hum_together() -> None:
     assert hum.hz == (50.0, 100.0, 150.0)
     assert len(frfs.outputs) == 2
     assert all(np.asarray(h.responses).shape[0] == 1 for h in hum.taken_off(lambda: roved)())
+
+
+def test_what_begins_with_the_blow_is_no_hum() -> None:
+    """Whatever its phase, as what is left of close modes that the fit does not quite meet."""
+    begun = []
+    for h, clean in zip(hits_of(0.01, pretrigger=200), hits_of(0.0, pretrigger=200), strict=True):
+        responses, start = np.array(h.responses), h.hit.peak - h.hit.start - 10
+        responses[:, :start] = np.asarray(clean.responses)[:, :start]
+        begun.append(replace(h, responses=responses))
+    assert hum_in(begun)[0] is None
+
+
+def test_hum_is_told_by_what_the_record_holds_before_hits_that_are_cut_at_the_blow() -> None:
+    cut = []
+    for h in hits_of(0.01, pretrigger=200):
+        start = h.hit.peak - h.hit.start - 10
+        before = CutSamples(np.asarray(h.responses), [0, 1], 0, start)
+        less = replace(h, force=h.force[start:], responses=np.asarray(h.responses)[:, start:])
+        cut.append(replace(less, hit=replace(h.hit, start=h.hit.start + start), before=before))
+    hum, _ = hum_in(cut)
+    assert hum is not None
+    assert hum.hz == (50.0, 100.0, 150.0)
+    assert hum_in([replace(h, before=None) for h in cut])[0] is None
 
 
 def test_few_hits_do_not_tell_hum_from_what_is_left_of_modes() -> None:
