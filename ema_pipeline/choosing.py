@@ -165,7 +165,7 @@ def _hit(run: Run, text: str) -> HitChoice:
             f"{configuration}/{file}: holds {len(mine)} hits; name one, e.g. '{configuration}/{file}#1'"
         )
     wanted = 1 if number is None else number
-    if wanted not in {h.number + 1 for h in mine}:
+    if wanted not in {h.number for h in mine}:
         raise EmaError(
             f"{configuration}/{file}: holds {counted(len(mine), 'hit')}, counted from 1; none is number {wanted}"
         )
@@ -174,7 +174,7 @@ def _hit(run: Run, text: str) -> HitChoice:
 
 def _found_hit(run: Run, choice: HitChoice) -> Hit:
     return next(
-        h for h in _hits(run, choice.configuration) if (h.file, h.number + 1) == (choice.file, choice.number)
+        h for h in _hits(run, choice.configuration) if (h.file, h.number) == (choice.file, choice.number)
     )
 
 
@@ -187,7 +187,7 @@ def _require_others(run: Run, choices: Choices, choice: HitChoice) -> None:
         for h in _hits(run, choice.configuration)
         if h.impact.point == point
         and (h.accepted or rejected_by_choice(h))
-        and (h.file, h.number + 1) not in gone
+        and (h.file, h.number) not in gone
     ]
     if not left:
         raise EmaError(f"hit '{choice}' is the last good one on {point}; a point needs one")

@@ -264,7 +264,7 @@ def _accumulate(
                 key = (point, sheet.impact)
                 if key not in pairs:
                     pairs[key] = HitLines(strongest_lines(cross))
-                pairs[key].add(f"{hit.hit.file}#{hit.hit.number}", cross, power)
+                pairs[key].add(hit.hit.label, cross, power)
         parts = response.view(np.float64)
         np.multiply(parts, parts, out=parts)
         sheet.auto[rows] += parts[:, 0::2]

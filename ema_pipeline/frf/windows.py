@@ -111,7 +111,7 @@ class Windows:
         self._shape = force_window(hit.force, peak) if settings.force_window == "auto" else None
         self.active = self._decay is not None or self._shape is not None or offsets
         self._offsets = offsets
-        struck_ringing = hit.hit.number > 0 and hit.hit.rings_on
+        struck_ringing = hit.hit.number > 1 and hit.hit.rings_on
         before = find_pulse(hit.force, peak).start if self.active or struck_ringing else 0
         self._rest = before if self.active else 0
         self._held = before if struck_ringing else 0

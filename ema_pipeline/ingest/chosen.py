@@ -19,7 +19,7 @@ def without_excluded(hits: tuple[Hit, ...], excluded: Collection[HitChoice]) -> 
     named = {(x.file, x.number) for x in excluded}
     verdict = CheckResult(CHOICE, 1.0, 0.0, "1", False, "", "reject_hit", message="excluded by the user")
     return tuple(
-        replace(h, verdicts=(*h.verdicts, verdict)) if (h.file, h.number + 1) in named else h for h in hits
+        replace(h, verdicts=(*h.verdicts, verdict)) if (h.file, h.number) in named else h for h in hits
     )
 
 

@@ -152,7 +152,7 @@ def _silent_hit(record: Record, reason: str, settings: HitSettings) -> Hit:
     fault, name = reason.removeprefix(f"{record.file}: "), record.force_name
     limit = settings.trigger_noise
     verdict = judged("force level", 0.0, limit, False, "", "reject_hit", fault, channel=name, unit="×")
-    return Hit(record.file, 0, record.impact, 0, record.force.size, 0, 0.0, (verdict,), part=record.part)
+    return Hit(record.file, 1, record.impact, 0, record.force.size, 0, 0.0, (verdict,), part=record.part)
 
 
 def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> Hit:
@@ -186,7 +186,7 @@ def check_hit(record: Record, hit: Hit, settings: HitSettings | None = None) -> 
         verdicts.append(_force_peak(hit.peak_force, name))
     verdicts += _lost(force, step_of(force), name, "reject_hit", pulse.peak, rate)
     # Before the first hit of a record the structure is at rest: what is there is noise and hum.
-    rest = pulse.start if hit.start == 0 and hit.number == 0 else 0
+    rest = pulse.start if hit.start == 0 and hit.number == 1 else 0
 
     def check(row: int) -> tuple[list[CheckResult], bytes]:
         samples = record.responses[row, hit.start : hit.stop]

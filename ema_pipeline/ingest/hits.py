@@ -94,7 +94,7 @@ def find_hits(record: Record, settings: HitSettings | None = None) -> tuple[Hit,
             force_unit="N" if record.force_calibrated else "V",
             part=record.part,
         )
-        for number, (peak, (start, stop)) in enumerate(zip(peaks, bounds, strict=True))
+        for number, (peak, (start, stop)) in enumerate(zip(peaks, bounds, strict=True), start=1)
     )
 
 

@@ -130,7 +130,7 @@ class Hit:
     file : str
         Record file.
     number : int
-        Number of the hit within its record, from 0.
+        Number of the hit within its record, counted from 1.
     impact : Dof
         Where the hammer strikes.
     start, stop : int
@@ -157,6 +157,11 @@ class Hit:
     verdicts: tuple[CheckResult, ...] = ()
     force_unit: str = "N"
     part: str = ""
+
+    @property
+    def label(self) -> str:
+        """As a hit is named where it is left out."""
+        return f"{self.file}#{self.number}"
 
     @property
     def accepted(self) -> bool:

@@ -193,7 +193,7 @@ def _of_hit(
         if table is not None:
             best = float(np.abs(residues[task.mode, task.sensor, i]))
             amplitude = table[0] * 2 * best / abs(pole) ** 2
-            name = f"{hit.hit.file}#{hit.hit.number}"
+            name = hit.hit.label
             curves.append(DecayCurve(task.mode, name, frfs.outputs[task.sensor], amplitude, *table[1:]))
     return curves
 

@@ -266,7 +266,7 @@ def _spectra(
     peak = hit.hit.peak - hit.hit.start
     first, pulse = pulse_alone(hit.force, peak)
     return _Hit(
-        f"{hit.hit.file}#{hit.hit.number}",
+        hit.hit.label,
         abs(hit.hit.peak_force),
         max(one.record_s - float(one.delay_s[0]), 0.5 * one.record_s),
         tuple(acc[:, w.lines].copy() for w in windows),

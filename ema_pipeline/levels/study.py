@@ -103,7 +103,7 @@ def study_levels(
     kept = [h.hit for h in hits()]
     unit = kept[0].force_unit
     force = np.array([abs(h.peak_force) for h in kept])
-    names = tuple(f"{h.file}#{h.number}" for h in kept)
+    names = tuple(h.label for h in kept)
     place = levels_of(kept, settings)
     n_levels = int(place.max()) + 1
     if n_levels == 1:
@@ -191,7 +191,7 @@ def _level(
     from ema_pipeline.modal.chosen import chosen, wanted
     from ema_pipeline.modal.identify import identify
 
-    some = (h for h in hits() if f"{h.hit.file}#{h.hit.number}" in names)
+    some = (h for h in hits() if h.hit.label in names)
     frfs = estimate_frfs(some, frf_settings)
     asked = wanted(choices.included_modes, frfs.response_decay_rad_s)
     modal = chosen(identify(frfs, modal_settings, wanted=asked), choices)

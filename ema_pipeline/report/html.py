@@ -329,7 +329,7 @@ def _hit_rows(results: RunResults, c: ConfigurationResults) -> list[dict[str, An
     table, excluded = tables.hits_table(c.hits), results.choices.of(c.name).excluded_hits
     rows = []
     for hit, row in zip(c.hits[:HITS_LISTED], table.rows, strict=False):
-        choice = HitChoice(c.name, hit.file, hit.number + 1)
+        choice = HitChoice(c.name, hit.file, hit.number)
         rows.append(
             {
                 "cells": row.cells,

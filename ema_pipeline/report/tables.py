@@ -247,7 +247,7 @@ def rejected_hits_table(hits: Sequence[Hit]) -> Table:
     rows = []
     for h in hits:
         if not h.accepted:
-            rows.append(Row((h.file, str(h.number + 1), str(h.impact), "hit rejected", h.reason), True))
+            rows.append(Row((h.file, str(h.number), str(h.impact), "hit rejected", h.reason), True))
         elif h.rejected_channels:
             why = "; ".join(
                 v.message or f"{v.channel}: {v.check}"
@@ -258,7 +258,7 @@ def rejected_hits_table(hits: Sequence[Hit]) -> Table:
                 Row(
                     (
                         h.file,
-                        str(h.number + 1),
+                        str(h.number),
                         str(h.impact),
                         f"left out: {', '.join(sorted(h.rejected_channels))}",
                         why,
@@ -279,7 +279,7 @@ def verdicts_table(hits: Sequence[Hit]) -> Table:
         head.append(f"{words(v.check)} (limit {with_unit(v.limit, v.unit)})")
     rows = []
     for h in hits:
-        cells = [h.file, str(h.number + 1), str(h.impact), with_unit(h.peak_force, h.force_unit)]
+        cells = [h.file, str(h.number), str(h.impact), with_unit(h.peak_force, h.force_unit)]
         for check in checks:
             mine = [v for v in h.verdicts if v.check == check]
             cells.append(_verdict_cell(mine))
@@ -303,7 +303,7 @@ def hits_table(hits: Sequence[Hit]) -> Table:
         warned = any(not v.passes for v in h.verdicts)
         result = "FAIL" if not h.accepted else "PASS" if not warned else "warn"
         peak = with_unit(h.peak_force, h.force_unit)
-        name = h.file + (f" ({h.number + 1})" if h.number else "")
+        name = h.file + (f" ({h.number})" if h.number > 1 else "")
         rows.append(Row((name, str(h.impact), peak, *values, result), not h.accepted))
     head = ("file", "impact", "peak", *SHOWN_CHECKS.values(), "result")
     return Table(head, tuple(rows), frozenset({2, 3, 4, 5}))

@@ -41,14 +41,14 @@ def test_a_response_reversed_in_one_of_two_hits_is_told_although_the_average_van
     assert not found["p0.z over p0.z"].passes
     assert found["p1.z over p0.z"].passes
     assert found["p0.z over p0.z"].message.startswith(
-        "hits of p0.z over p0.z have opposite signs (hit2.csv#0 and hit1.csv#0): look up direction and cable"
+        "hits of p0.z over p0.z have opposite signs (hit2.csv#1 and hit1.csv#1): look up direction and cable"
     )
 
 
 @pytest.mark.parametrize("odd", [1, 2, 3, 4])
 def test_the_hit_that_differs_from_most_is_named_first(odd: int) -> None:
     hits = [hit(k, (-1.0, 1.0) if k == odd else (1.0, 1.0)) for k in (1, 2, 3, 4)]
-    assert f"(hit{odd}.csv#0 and " in signs(hits)["p0.z over p0.z"].message
+    assert f"(hit{odd}.csv#1 and " in signs(hits)["p0.z over p0.z"].message
 
 
 def test_a_hammer_reversed_in_one_hit_reverses_all_channels() -> None:

@@ -54,7 +54,7 @@ def test_every_hit_of_a_continuous_recording_is_found_whatever_its_size() -> Non
     record = recording(times, heights, 8.0)
     hits = find_hits(record)
     assert [round(h.peak / RATE, 1) for h in hits] == times
-    assert [h.number for h in hits] == [0, 1, 2, 3, 4]
+    assert [h.number for h in hits] == [1, 2, 3, 4, 5]
     assert all(a.stop <= b.start for a, b in pairwise(hits))
     aligned = align_hits(hits, RATE)
     lengths = {h.stop - h.start for h in aligned}

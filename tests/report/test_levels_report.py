@@ -35,7 +35,7 @@ def level(force_n: float, frequency_hz: float) -> ForceLevel:
         AXIS, frf_of(frequency_hz), 0.999 * ones, 1e-4 * ones, (POINT,), (POINT,), ("acceleration",), np.array([[2]]),
         "H1", 2.0, 0.0, np.array([0.05]), (1.0, 180.0), True, np.zeros(1),
     )  # fmt: skip
-    return ForceLevel(force_n, (f"{force_n:g}.csv#0",), frfs)
+    return ForceLevel(force_n, (f"{force_n:g}.csv#1",), frfs)
 
 
 def mode_at(frequency_hz: float) -> Mode:
@@ -66,7 +66,7 @@ def results() -> RunResults:
         np.ones((2, 1)), float("nan"), float("nan"), False, "", np.array([-1, 1]),
     )  # fmt: skip
     curve = DecayCurve(
-        0, "300.csv#0", POINT, np.array([1e-4, 1e-5]), np.array([104.0, 101.5]), np.array([0.1, 0.1]),
+        0, "300.csv#1", POINT, np.array([1e-4, 1e-5]), np.array([104.0, 101.5]), np.array([0.1, 0.1]),
         np.array([0.01, 0.01]), np.array([1e-4, 1e-4]),
     )  # fmt: skip
     study = LevelStudy(

@@ -461,7 +461,7 @@ def test_hits_that_still_ring_at_the_end_of_their_records_are_told(
 def test_hits_of_opposite_sign_which_make_modes_vanish_are_the_first_caution(run: RunResults) -> None:
     c = run.configurations[0]
     assert c.frfs is not None
-    told = "hits of a.x over b.x have opposite signs (2.csv#0 and 1.csv#0)"
+    told = "hits of a.x over b.x have opposite signs (2.csv#1 and 1.csv#1)"
     found = judged(SIGN, -1.0, -0.7, False, "", "warn", told, channel="a.x over b.x")
     odd = replace(c, frfs=replace(c.frfs, verdicts=(*c.frfs.verdicts, found)))
     assert summary.cautions(replace(run, configurations=(odd, *run.configurations[1:])))[0].endswith(

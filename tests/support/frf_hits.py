@@ -33,7 +33,7 @@ def hit_of(
     channels = tuple(
         ResponseChannel(f"a{i}", Dof.parse(d), "acceleration", 0.01 * i) for i, d in enumerate(outputs)
     )
-    hit = Hit(file, 0, Dof.parse(impact), 0, force.size, int(np.argmax(np.abs(force))), float(force.max()))
+    hit = Hit(file, 1, Dof.parse(impact), 0, force.size, int(np.argmax(np.abs(force))), float(force.max()))
     return HitSamples(hit, RATE, force, responses, channels)
 
 

@@ -320,7 +320,7 @@ def hits(rng: np.random.Generator) -> tuple[Hit, ...]:
             out.append(
                 Hit(
                     f"{dof.strip('-')}_1.uff",
-                    n,
+                    n + 1,
                     Dof.parse(dof),
                     0,
                     1000,

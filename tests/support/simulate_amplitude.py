@@ -114,7 +114,7 @@ def simulated_hits(
                 response = clean + noise * random.standard_normal(clean.shape)
                 file = f"{struck}_{level:g}_{k}.csv"
                 peak = int(np.argmax(force))
-                hit = Hit(file, 0, Dof.parse(struck), 0, SAMPLES, peak, float(force[peak]))
+                hit = Hit(file, 1, Dof.parse(struck), 0, SAMPLES, peak, float(force[peak]))
                 found.append(HitSamples(hit, RATE, force, response, channels))
     return found
 

@@ -111,7 +111,7 @@ def hits_of(case: Case, rng: np.random.Generator) -> list[HitSamples]:
             ResponseChannel(f"a{i}", Dof(f"p{i}", "z"), "acceleration") for i in range(len(soft))
         )
         peak = int(np.argmax(noisy))
-        hit = Hit(f"h{number}.csv", 0, Dof(f"p{point}", "z"), 0, SAMPLES, peak, float(noisy[peak]))
+        hit = Hit(f"h{number}.csv", 1, Dof(f"p{point}", "z"), 0, SAMPLES, peak, float(noisy[peak]))
         out.append(HitSamples(hit, RATE_HZ, noisy, records, channels))
     return out
 
@@ -122,5 +122,5 @@ def sampled_hit(name: str, force: Real, responses: Real, rate_hz: float) -> HitS
         ResponseChannel(f"a{i}", Dof(f"p{i}", "z"), "acceleration") for i in range(len(responses))
     )
     peak = int(np.argmax(force))
-    hit = Hit(name, 0, Dof("p0", "z"), 0, force.size, peak, float(force[peak]))
+    hit = Hit(name, 1, Dof("p0", "z"), 0, force.size, peak, float(force[peak]))
     return HitSamples(hit, rate_hz, force, responses, channels)
