@@ -31,7 +31,6 @@ from ema_pipeline.diagnose.first_fits import (
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.ranked import BEATEN, Ranking, unbeaten
 from ema_pipeline.diagnose.score import UNSEEN, Score, scores
-from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.fitting import Fit, freed, learned, met, refined, unbent, within_scatter
@@ -89,8 +88,8 @@ def rank(
     further : int
         Finalists that promise most beside learned scatters, which may be far narrower than those begun with.
     unpaired : float
-        What modes without a partner cost whatever was added in an earlier ranking: no reason to search further, unless
-        they are so many that the model does not explain the data.
+        What modes without a partner cost whatever was added in an earlier ranking: no reason to search further where
+        all of them are doubtful.
     before : dict of str to Posterior, optional
         Fits of hypotheses to the same data with fewer unknowns, from which theirs are begun.
     """
@@ -98,9 +97,8 @@ def rank(
     residuals, fails = base.posterior.residuals, base.posterior.error > _EXPLAINED
     # a model that explains all that was surely measured needs no search for the sake of other modes
     explains = not fails and not residuals.unexplained
-    alone = not explains and residuals.penalty > (
-        unpaired if residuals.unexplained <= MOST_UNEXPLAINED else 0.0
-    )
+    # what no effect alone gave a partner another may give one beside it
+    alone = not explains and residuals.penalty > (0.0 if residuals.unexplained else unpaired)
     tried = tried_sizes(observations, base, models, hypotheses, processes) if alone else {}
     lost = bool(tried) or (alone and residuals.unexplained > 0)
     stuck = lost or fails

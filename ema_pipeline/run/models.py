@@ -14,6 +14,7 @@ from ema_pipeline.frf.channels import uncertainty_of_dofs
 from ema_pipeline.observations.fitting import Model, model_with
 from ema_pipeline.observations.mode_data import prepare
 from ema_pipeline.observations.modes import ModeObservations
+from ema_pipeline.observations.reach import within_reach
 from ema_pipeline.rigs.types import Rig
 from ema_pipeline.run.measured import (
     level_studies,
@@ -50,7 +51,8 @@ def mode_observations(run: Run) -> ModeObservations:
 def _mode_observations(run: Run, rig: Rig) -> ModeObservations:
     measured, frfs = measured_modes(run), measured_frfs(run)
     channels = uncertainty_of_dofs((frfs.get(name), modes.dofs) for name, modes in measured.items())
-    return ModeObservations(rig, [prepare(m, run.settings.fit) for m in measured.values()], channels)
+    data = [within_reach(prepare(m, run.settings.fit), rig) for m in measured.values()]
+    return ModeObservations(rig, data, channels)
 
 
 def amplitude_observations(run: Run) -> AmplitudeObservations | None:
@@ -74,7 +76,10 @@ def amplitude_observations(run: Run) -> AmplitudeObservations | None:
     if not hits:
         return None
     modes = mode_observations(run)
-    marked = [replace(d, product=products.get(d.configuration)) for d in modes.data]
+    marked = [
+        replace(d, product=products[d.configuration][: len(d)] if d.configuration in products else None)
+        for d in modes.data
+    ]
     return AmplitudeObservations(modes.with_data(marked), hits)
 
 

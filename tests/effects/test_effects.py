@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +140,49 @@ def test_shaft_torsion_lifts_the_rigid_body_mode_of_the_free_carrier() -> None:
     rig = rig_with_effects(RIG, [("shaft_torsion@carrier", {"stiffness": 4e5})])
     after = [m.frequency_hz for m in model_modes(rig, "no_ring")]
     assert before.count(0.0) - after.count(0.0) == 1
+
+
+def chain_of(*stiffness: float) -> Assembly:
+    """Masses of 1, 2, … kg along x, in a row between springs, of which those of 0 N/m are left out."""
+    count = len(stiffness) - 1
+    dofs = [f"m{i + 1}.x" for i in range(count)]
+    rows: list[dict[str, float]] = [
+        {dofs[0]: 1.0},
+        *({a: -1.0, b: 1.0} for a, b in pairwise(dofs)),
+        {dofs[-1]: 1.0},
+    ]
+    springs = [Spring(f"k{i}", row, k) for i, (row, k) in enumerate(zip(rows, stiffness, strict=True)) if k]
+    masses = [Mass(f"m{i + 1}", {d: 1.0}, i + 1.0) for i, d in enumerate(dofs)]
+    return Assembly(tuple(dofs), (*masses, *springs))
+
+
+def test_a_suspension_adds_as_much_to_the_square_of_every_frequency() -> None:
+    """It is shared by the bodies as their masses are, so that no shape changes."""
+    free, effect = chain_of(0.0, 2e5, 3e5, 0.0), get_effect("suspension")
+    assert effect.find_places(free) == ("all",)
+    before, after = (
+        normal_modes(a.system())[0] for a in (free, effect.apply(free, "all", {"stiffness": 6e3}))
+    )
+    assert after[0] == pytest.approx(np.sqrt(6e3 / 6.0) / (2 * np.pi))
+    assert np.diff([before**2, after**2], axis=0)[0] == pytest.approx(6e3 / 6.0 / (2 * np.pi) ** 2)
+    assert effect.scales(free, "all")["stiffness"] == pytest.approx(6.0 * (2 * np.pi * 8.0) ** 2)
+
+
+@pytest.mark.parametrize("springs", [(1e3, 2e5, 0.0), (1e-3, 2e5, 0.0), (0.0, 2e5, 3e5)])
+def test_what_is_held_has_no_suspension_to_be_found(springs: tuple[float, ...]) -> None:
+    held, effect = chain_of(*springs), get_effect("suspension")
+    assert effect.find_places(held) == ()
+    assert effect.fits(held, "all")  # a spring to ground that was found first does not take it away
+    assert not get_effect("suspension").places(RIG, "no_ring")
+
+
+def test_a_suspension_holds_every_direction_of_a_body_and_not_its_rotation() -> None:
+    rig = frame(1)
+    dofs = ("a.x", "a.y", "a.u")
+    masses = [Mass(d, {d: 1.0}, m) for d, m in zip(dofs, (4.0, 4.0, 1.0), strict=True)]
+    lone = get_effect("suspension").apply(Assembly(dofs, tuple(masses)), "all", {"stiffness": 100.0})
+    assert np.diag(lone.system().stiffness).tolist() == [100.0, 100.0, 0.0]
+    assert not get_effect("suspension").places(rig, "default")
 
 
 def test_sensor_mass_lowers_every_elastic_frequency_as_one_over_the_root_of_mass() -> None:

@@ -1,0 +1,84 @@
+"""Foam, cords or rubber that carry the whole structure, where the model hangs free."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ema_pipeline.effects.base import Effect, EffectParameter
+from ema_pipeline.mechanics.assembly import Assembly, Mass, Spring
+
+ALL = "all"
+
+USUAL_HZ = 8.0
+"""Natural frequency on a usual suspension, by which its stiffness is known beforehand (1 σ about none)."""
+
+_HELD = 1e-9
+"""Stiffness against a common translation, over that of all springs, from which something holds the structure."""
+
+
+def _shares(assembly: Assembly) -> dict[str, float]:
+    """Mass along every translation, kg, by DOF."""
+    masses = dict.fromkeys((d for d in assembly.dofs if not d.endswith(".u")), 0.0)
+    for element in assembly.elements:
+        if isinstance(element, Mass):
+            for dof, factor in element.row.items():
+                if dof in masses:
+                    masses[dof] += element.value * factor**2
+    return masses
+
+
+def _places(assembly: Assembly) -> tuple[str, ...]:
+    """All of a structure that moves freely along one direction."""
+    directions = {d.rpartition(".")[2] for d in assembly.dofs} & {"x", "y", "z"}
+    total = sum(abs(s.stiffness) for s in assembly.springs())
+    for direction in directions:
+        held = sum(
+            abs(s.stiffness) * sum(v for d, v in s.row.items() if d.endswith(f".{direction}")) ** 2
+            for s in assembly.springs()
+        )
+        if held <= _HELD * total:
+            return (ALL,)
+    return ()
+
+
+def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
+    masses = _shares(assembly)
+    whole = _moved(masses)
+    return assembly.add(
+        *(
+            Spring(f"suspension at {dof}", {dof: 1.0}, values["stiffness"] * mass / whole)
+            for dof, mass in masses.items()
+            if mass > 0
+        )
+    )
+
+
+def _moved(masses: Mapping[str, float]) -> float:
+    """Largest mass that moves along one direction, kg."""
+    directions = {d.rpartition(".")[2] for d in masses}
+    return max(sum(m for d, m in masses.items() if d.endswith(f".{one}")) for one in directions)
+
+
+def _scale(assembly: Assembly, place: str) -> Mapping[str, float]:
+    return {"stiffness": (2 * np.pi * USUAL_HZ) ** 2 * _moved(_shares(assembly))}
+
+
+EFFECT = Effect(
+    id="suspension",
+    title="soft suspension of the whole structure (foam, cords), which the model leaves out",
+    parameters=(
+        EffectParameter(
+            "stiffness", "N/m", 0.0, 1e4, 1e4, 0.0, 1e9,
+            "of the whole suspension along one direction, shared by the bodies as their masses are",
+        ),
+    ),
+    find_places=_places,
+    edit=_edit,
+    signs="rigid-body modes are not at 0 Hz, and the lowest others a little high",
+    reference="D. J. Ewins, Modal Testing, 2nd ed. (2000), section 3.3.2",
+    other_places=lambda assembly, place: place == ALL,
+    generic=True,
+    scales=_scale,
+)  # fmt: skip
