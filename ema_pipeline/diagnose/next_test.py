@@ -45,7 +45,7 @@ def next_measurement(
     if verdict == "unknown_effect":
         return (
             "Hit at three force levels: if a natural frequency moves, the missing effect depends on amplitude; "
-            "if not, put further sensors around the place named."
+            "if not, put further sensors where measurement and model differ most."
         )
     if verdict == "ambiguous" and len(group) > 1:
         first, second = group[0].ranked.fit, group[1].ranked.fit

@@ -25,7 +25,7 @@ KIND = Kind(
     judge=by_modes.judge,
     modes=_modes,
     next_measurement=(  # nobody can strike a table
-        "Add shapes at further points near the place named, and the standard deviations of the numbers; "
-        "only hits at several force levels can show whether the missing effect depends on amplitude."
+        "Add shapes at further points where measurement and model differ most, and the standard deviations of the "
+        "numbers; only hits at several force levels can show whether the missing effect depends on amplitude."
     ),
 )
