@@ -103,7 +103,9 @@ def judge_record(
 def _in_memory(record: Record, hit: Hit) -> HitSamples:
     """The samples of a hit, which may stay longer than its file."""
     cut = cut_hit(record, hit)
-    return dataclasses.replace(cut, force=np.array(cut.force), responses=np.asarray(cut.responses[:]))
+    return dataclasses.replace(
+        cut, force=np.array(cut.force), responses=np.asarray(cut.responses[:]), before=None
+    )
 
 
 def _frfs(hits: Sequence[HitSamples]) -> FrfSet:

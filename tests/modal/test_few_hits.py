@@ -86,7 +86,10 @@ def test_sensors_that_are_moved_make_no_peak_seem_to_move() -> None:
         rows = [0, 1 + k % 4]  # the first sensor stays at the point that is struck
         roved.append(
             replace(
-                hit, responses=np.asarray(hit.responses)[rows], channels=tuple(hit.channels[r] for r in rows)
+                hit,
+                responses=np.asarray(hit.responses)[rows],
+                channels=tuple(hit.channels[r] for r in rows),
+                before=None,
             )
         )
     alignment = alignment_of(roved)
