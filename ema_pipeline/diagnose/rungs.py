@@ -34,11 +34,15 @@ which is friction. In a study ten others lay within 1.64 σ so, and friction was
 
 
 def rungs_of(observations: Observations, fits: Sequence[Fit], processes: int | None = 1) -> tuple[Rung, ...]:
-    """Every fit as a rung, at the scatters of the last one; `processes` share them, None for one per processor."""
+    """Every fit as a rung, at the scatters of the last one; `processes` share them, None for one per processor.
+
+    Nothing is held out that has no partner without the effects, as in the diagnosis.
+    """
     scatters = fits[-1].posterior.scatters
+    explained = observations.holding_out_explained(fits[0].posterior.residuals)
 
     def at(fit: Fit) -> Rung:
-        return rung_at(observations, fit, scatters)
+        return rung_at(explained, fit, scatters)
 
     return with_gains(list(spread(at, fits, processes, least=2)))
 

@@ -128,6 +128,24 @@ def test_a_rung_of_the_true_model_has_its_fits_numbers(monkeypatch: pytest.Monke
     )
 
 
+def test_a_ladder_holds_nothing_out_that_has_no_partner_without_its_effects(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As in the diagnosis: no fit to the rest could tell of a mode that an effect adds."""
+
+    def fit(residuals: str) -> Any:
+        return SimpleNamespace(posterior=SimpleNamespace(residuals=residuals, scatters={"of": residuals}))
+
+    data: Any = SimpleNamespace(holding_out_explained=lambda found: f"without what is alone in {found}")
+    monkeypatch.setattr(
+        rungs, "rung_at", lambda data, fit, scatters: (data, fit.posterior.residuals, scatters)
+    )
+    monkeypatch.setattr(rungs, "with_gains", tuple)
+    asked, scatters = "without what is alone in base", {"of": "last"}
+    told: Any = rungs.rungs_of(data, [fit("base"), fit("last")])
+    assert told == ((asked, "base", scatters), (asked, "last", scatters))
+
+
 def test_a_ladder_is_measured_at_given_scatters_as_far_as_they_are_known(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
