@@ -229,6 +229,7 @@ def _faint(
     That is stated with other sizes as usual: friction shows half the force at half the rate as well.
     """
     judged = [j for j in judged if j.hypothesis.placed.effect.linear or len(j.named.sizes) == 1]
+    judged = [j for j in judged if not _gives_partners(j)]
     asked = [j.hypothesis for j in judged]
     already = len(found.claimed)
     limits = detection_limits(found.observations, found.final, hypotheses, settings, asked, already)
@@ -241,6 +242,12 @@ def _faint(
             for name, size in j.named.sizes.items()
         )
     ]
+
+
+def _gives_partners(one: Judged) -> bool:
+    """True where measured modes have no partner without it: that shows it, whatever else its size changes."""
+    without, beside = (fit.posterior.residuals.unexplained for fit in (one.base, one.after))
+    return without > beside
 
 
 def _candidates(

@@ -517,11 +517,12 @@ def test_no_modes_at_all_are_refused_or_called_too_few() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "limit", "largest", "linear", "two_sizes", "dropped"),
-    [(0.9, 3.0, False, True, False, True), (-0.9, 3.0, False, True, False, True),
-     (1.1, 3.0, False, True, False, False), (0.9, 3.0, True, True, False, False),
-     (0.9, np.inf, False, True, False, False), (0.9, 3.0, False, True, True, True),
-     (0.9, 3.0, False, False, False, True), (0.9, 3.0, False, False, True, False)],
+    ("size", "limit", "largest", "linear", "two_sizes", "alone", "dropped"),
+    [(0.9, 3.0, False, True, False, 0, True), (-0.9, 3.0, False, True, False, 0, True),
+     (1.1, 3.0, False, True, False, 0, False), (0.9, 3.0, True, True, False, 0, False),
+     (0.9, np.inf, False, True, False, 0, False), (0.9, 3.0, False, True, True, 0, True),
+     (0.9, 3.0, False, False, False, 0, True), (0.9, 3.0, False, False, True, 0, False),
+     (0.9, 3.0, False, True, False, 1, False)],
 )  # fmt: skip
 def test_what_is_far_too_small_to_be_seen_is_not_claimed(
     monkeypatch: pytest.MonkeyPatch,
@@ -530,12 +531,13 @@ def test_what_is_far_too_small_to_be_seen_is_not_claimed(
     largest: bool,
     linear: bool,
     two_sizes: bool,
+    alone: int,
     dropped: bool,
 ) -> None:
     """The selection is made once more without it, and the reader is told.
 
     Of two sizes of an effect that depends on the amplitude, the limit of one says nothing at another value of the
-    other.
+    other. What gives a measured mode its partner shows by that.
     """
     placed = SimpleNamespace(effect=SimpleNamespace(linear=linear))
     one, other = (SimpleNamespace(label=f"spring@{place}", placed=placed) for place in ("m1", "m2"))
@@ -544,9 +546,13 @@ def test_what_is_far_too_small_to_be_seen_is_not_claimed(
     named = SimpleNamespace(label=one.label, sizes=sizes)
     asked: list[list[str]] = []
 
+    def leaving(unexplained: int) -> Any:
+        return SimpleNamespace(posterior=SimpleNamespace(residuals=SimpleNamespace(unexplained=unexplained)))
+
     def select(observations: Any, known: Any, hypotheses: Any, settings: Any, progress: Any) -> Any:
         asked.append([h.label for h in hypotheses])
-        claimed = [SimpleNamespace(hypothesis=one, named=named)] if one in hypotheses else []
+        claim = SimpleNamespace(hypothesis=one, named=named, base=leaving(alone), after=leaving(0))
+        claimed = [claim] if one in hypotheses else []
         return SimpleNamespace(claimed=claimed, rounds=[], observations=observations, final=None)
 
     limits = [DetectionLimit(one.label, "stiffness", limit, "N/m", largest=largest)]
