@@ -16,24 +16,24 @@ USUAL_HZ = 8.0
 
 _HELD = 1e-9
 """Stiffness against a common translation, over that of all springs, from which something holds the structure."""
+_DIRECTIONS = ("x", "y", "z")
 
 
-def _shares(assembly: Assembly) -> dict[str, float]:
-    """Mass along every translation, kg, by DOF."""
-    masses = dict.fromkeys((d for d in assembly.dofs if not d.endswith(".u")), 0.0)
+def _carried(assembly: Assembly) -> dict[str, float]:
+    """Mass that moves along every translation in the fixed frame, kg, by DOF."""
+    masses = dict.fromkeys((d for d in assembly.dofs if d.rpartition(".")[2] in _DIRECTIONS), 0.0)
     for element in assembly.elements:
         if isinstance(element, Mass):
             for dof, factor in element.row.items():
                 if dof in masses:
                     masses[dof] += element.value * factor**2
-    return masses
+    return {dof: mass for dof, mass in masses.items() if mass > 0}
 
 
 def _places(assembly: Assembly) -> tuple[str, ...]:
     """All of a structure that moves freely along one direction."""
-    directions = {d.rpartition(".")[2] for d in assembly.dofs} & {"x", "y", "z"}
     total = sum(abs(s.stiffness) for s in assembly.springs())
-    for direction in directions:
+    for direction in {d.rpartition(".")[2] for d in _carried(assembly)}:
         held = sum(
             abs(s.stiffness) * sum(v for d, v in s.row.items() if d.endswith(f".{direction}")) ** 2
             for s in assembly.springs()
@@ -44,25 +44,22 @@ def _places(assembly: Assembly) -> tuple[str, ...]:
 
 
 def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assembly:
-    masses = _shares(assembly)
+    masses = _carried(assembly)
     whole = _moved(masses)
-    return assembly.add(
-        *(
-            Spring(f"suspension at {dof}", {dof: 1.0}, values["stiffness"] * mass / whole)
-            for dof, mass in masses.items()
-            if mass > 0
-        )
+    springs = (
+        Spring(f"suspension at {dof}", {dof: 1.0}, values["stiffness"] * mass / whole)
+        for dof, mass in masses.items()
     )
+    return assembly.add(*springs)
 
 
 def _moved(masses: Mapping[str, float]) -> float:
     """Largest mass that moves along one direction, kg."""
-    directions = {d.rpartition(".")[2] for d in masses}
-    return max(sum(m for d, m in masses.items() if d.endswith(f".{one}")) for one in directions)
+    return max(sum(m for d, m in masses.items() if d.endswith(f".{one}")) for one in _DIRECTIONS)
 
 
 def _scale(assembly: Assembly, place: str) -> Mapping[str, float]:
-    return {"stiffness": (2 * np.pi * USUAL_HZ) ** 2 * _moved(_shares(assembly))}
+    return {"stiffness": (2 * np.pi * USUAL_HZ) ** 2 * _moved(_carried(assembly))}
 
 
 EFFECT = Effect(
@@ -78,7 +75,7 @@ EFFECT = Effect(
     edit=_edit,
     signs="rigid-body modes are not at 0 Hz, and the lowest others a little high",
     reference="D. J. Ewins, Modal Testing, 2nd ed. (2000), section 3.3.2",
-    other_places=lambda assembly, place: place == ALL,
+    other_places=lambda assembly, place: place == ALL and bool(_carried(assembly)),
     generic=True,
     scales=_scale,
 )  # fmt: skip

@@ -177,12 +177,14 @@ def test_what_is_held_has_no_suspension_to_be_found(springs: tuple[float, ...]) 
 
 
 def test_a_suspension_holds_every_direction_of_a_body_and_not_its_rotation() -> None:
-    rig = frame(1)
     dofs = ("a.x", "a.y", "a.u")
     masses = [Mass(d, {d: 1.0}, m) for d, m in zip(dofs, (4.0, 4.0, 1.0), strict=True)]
     lone = get_effect("suspension").apply(Assembly(dofs, tuple(masses)), "all", {"stiffness": 100.0})
     assert np.diag(lone.system().stiffness).tolist() == [100.0, 100.0, 0.0]
-    assert not get_effect("suspension").places(rig, "default")
+    turning = Assembly(dofs[2:], tuple(masses[2:]))
+    assert not get_effect("suspension").find_places(turning)
+    with pytest.raises(EmaError, match="cannot sit at 'all'"):
+        get_effect("suspension").apply(turning, "all", {"stiffness": 100.0})
 
 
 def test_sensor_mass_lowers_every_elastic_frequency_as_one_over_the_root_of_mass() -> None:
