@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.dof import Dof
+from ema_pipeline.levels.types import ModeLevels
 from ema_pipeline.modal.assurance import mac
 from ema_pipeline.modal.mode_acceptance import ECHO_MAC, ECHO_REACH, SAME_RESPONSE
 from ema_pipeline.modal.types import ModalModel, Mode
@@ -28,6 +30,9 @@ APART = 20.0
 
 FARTHEST = 1.0
 """Distance beyond which two modes are not the same."""
+
+TRUSTED_VOTES = 0.3
+"""Share of model orders that must show a mode which the softest hits do not show."""
 
 
 def distances(a: ModalModel, b: ModalModel) -> Real:
@@ -153,3 +158,17 @@ def echoes(modal: ModalModel, sure: NDArray[np.bool_], least_mac: float = ECHO_M
     alike = np.nan_to_num(mac(shapes, shapes)) > least_mac
     near = np.abs(poles[:, None] - poles[None]) < ECHO_REACH * np.abs(poles.real)[None]
     return np.asarray(~sure & (alike & near & sure[None]).any(axis=1))
+
+
+def trusted(modal: ModalModel, modes: Sequence[ModeLevels]) -> Integers:
+    """Modes that the softest hits show, and others that are plain and no echo of these."""
+    votes = np.array([m.stability for m in modal.modes])
+    soft = np.array([m.level_modes is not None and m.level_modes[0] >= 0 for m in modes], dtype=bool)
+    if not len(votes):
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(soft | ((votes >= TRUSTED_VOTES) & ~echoes(modal, soft)))
+
+
+def only(modal: ModalModel, chosen: Integers) -> ModalModel:
+    """The model with the chosen modes alone."""
+    return replace(modal, modes=tuple(modal.modes[k] for k in chosen))
