@@ -16,8 +16,6 @@ from ema_pipeline.modal.assurance import mac, subspace_mac
 from ema_pipeline.rigs.base import modes_of
 from ema_pipeline.rigs.types import ModelMode, Rig
 
-BEYOND = "beyond the model's reach: above its highest mode"
-"""Why a measured mode has no partner where the model ends below it."""
 # Modes below this are rigid-body modes to any hammer test.
 RIGID_HZ = 1e-3
 _FORBIDDEN = 1e6
@@ -206,7 +204,7 @@ def _why_measured(
     f = measured.frequency_hz[r]
     elastic = model_f[model_f > RIGID_HZ]
     if elastic.size == 0 or f > elastic.max() * np.exp(tolerance):
-        return BEYOND
+        return "beyond the model's reach: above its highest mode"
     near = np.flatnonzero(distance[r] <= tolerance)
     if near.size == 0:
         return f"no model mode within {100 * tolerance:.0f} %"

@@ -105,12 +105,14 @@ def _along(row: Row, elements: Sequence[tuple[Row, float]]) -> float:
 
 def usual_mass(assembly: Assembly, place: str) -> float:
     """Three tenths of the mass that moves at a place, kg."""
-    rows = place_rows(assembly, place)
-    masses = [e for e in assembly.elements if isinstance(e, Mass)]
-    moved = [
-        sum(m.value * (m.row.get(d, 0.0) * v) ** 2 for m in masses for d, v in row.items()) for row in rows
-    ]
+    moved = [moved_mass(assembly, row) for row in place_rows(assembly, place)]
     return 0.3 * max(float(np.mean(moved)), 1e-6)
+
+
+def moved_mass(assembly: Assembly, row: Row) -> float:
+    """Mass that moves along a row, kg."""
+    masses = [e for e in assembly.elements if isinstance(e, Mass)]
+    return sum(m.value * (m.row.get(d, 0.0) * v) ** 2 for m in masses for d, v in row.items())
 
 
 def usual_damping(assembly: Assembly, place: str) -> float:

@@ -6,6 +6,9 @@ import re
 
 from ema_pipeline.mechanics.assembly import Assembly, Row
 
+ALL = "all"
+"""Place of an effect that sits on all bodies at once."""
+
 
 def is_planet(body: str) -> bool:
     """True for ``planet1``, ``planet2`` …"""

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from ema_pipeline.effects.base import Effect, EffectParameter
+from ema_pipeline.effects.places import ALL
 from ema_pipeline.mechanics.assembly import Assembly, Mass
-
-ALL = "all"
 
 
 def _places(assembly: Assembly) -> tuple[str, ...]:

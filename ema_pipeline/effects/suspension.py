@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from ema_pipeline.effects.base import Effect, EffectParameter
-from ema_pipeline.mechanics.assembly import Assembly, Mass, Spring
-
-ALL = "all"
+from ema_pipeline.effects.generic import moved_mass
+from ema_pipeline.effects.places import ALL
+from ema_pipeline.mechanics.assembly import Assembly, Spring
 
 USUAL_HZ = 8.0
 """Natural frequency on a usual suspension, by which its stiffness is known beforehand (1 σ about none)."""
@@ -21,12 +21,8 @@ _DIRECTIONS = ("x", "y", "z")
 
 def _carried(assembly: Assembly) -> dict[str, float]:
     """Mass that moves along every translation in the fixed frame, kg, by DOF."""
-    masses = dict.fromkeys((d for d in assembly.dofs if d.rpartition(".")[2] in _DIRECTIONS), 0.0)
-    for element in assembly.elements:
-        if isinstance(element, Mass):
-            for dof, factor in element.row.items():
-                if dof in masses:
-                    masses[dof] += element.value * factor**2
+    dofs = [d for d in assembly.dofs if d.rpartition(".")[2] in _DIRECTIONS]
+    masses = {d: moved_mass(assembly, {d: 1.0}) for d in dofs}
     return {dof: mass for dof, mass in masses.items() if mass > 0}
 
 

@@ -15,7 +15,7 @@ from ema_pipeline.rigs.base import model_modes
 from ema_pipeline.rigs.types import Rig
 
 REACH = 1.3
-"""Factor within which a natural frequency of the model and the measured one lie, as in the pairing."""
+"""Factor within which a natural frequency of the model and the measured one lie: about that of the pairing."""
 
 
 def within_reach(data: ModeData, rig: Rig) -> ModeData:

@@ -6,13 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from ema_pipeline.correlate.pairing import BEYOND
 from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import UNKNOWN, Diagnosis, Rung
 from ema_pipeline.number_text import plain
 from ema_pipeline.report import diagnosis
 from ema_pipeline.report.effect_places import EffectPlaces, effect_places
-from ema_pipeline.report.results import ConfigurationResults, RunResults
+from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.shapes import drawing_for
 from ema_pipeline.report.summary import commands_left
 
@@ -125,8 +124,8 @@ def _tiles(results: RunResults) -> tuple[Tile, ...]:
             "the same on data that the fit has not seen",
         ),
     ]  # fmt: skip
-    total = sum(len(c.modal.modes) - _beyond(c) for c in results.configurations if c.modal)
-    ladder = results.shown_ladder
+    compared, ladder = results.comparison, results.shown_ladder
+    total = 0 if compared is None else len(compared.modes) + len(compared.alone)
     if total and ladder is not None and diagnosis.of_modes(ladder):
         more = last.unexplained != first.unexplained
         tiles.append(
@@ -138,11 +137,6 @@ def _tiles(results: RunResults) -> tuple[Tile, ...]:
             )
         )  # fmt: skip
     return tuple(tiles)
-
-
-def _beyond(c: ConfigurationResults) -> int:
-    """Measured modes that are not compared: the model ends below them."""
-    return sum(u.reason == BEYOND for u in c.pairing.unpaired_measured) if c.pairing else 0
 
 
 def _against(found: Diagnosis) -> tuple[str, ...]:

@@ -76,7 +76,7 @@ def amplitude_observations(run: Run) -> AmplitudeObservations | None:
     if not hits:
         return None
     modes = mode_observations(run)
-    marked = [
+    marked = [  # modes that are not compared are the last ones
         replace(d, product=products[d.configuration][: len(d)] if d.configuration in products else None)
         for d in modes.data
     ]
