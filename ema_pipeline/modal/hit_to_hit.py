@@ -20,6 +20,7 @@ from ema_pipeline.modal.drift.local import DecayChange
 from ema_pipeline.modal.drift.shifts import wider
 from ema_pipeline.modal.drift.windows import Hits
 from ema_pipeline.modal.force_zeros import without_zeros
+from ema_pipeline.modal.gain_changes import gain_changes
 from ema_pipeline.modal.hum_removal import hum_of
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.mains_hum import without_hum
@@ -64,7 +65,7 @@ class HitModes:
     ----------
     modal : ModalModel
     frfs : FrfSet
-        From which they were identified: aligned, where hits differ in frequency.
+        From which they were identified: aligned where hits differ in frequency, with one gain of each sensor.
     alignment : Alignment
     """
 
@@ -131,6 +132,9 @@ def _identified(
         if alignment.shifts is not None:
             del frfs
             frfs = estimate_frfs(hits(), frf_settings, alignment.shifts, coherence=False)
+        gains = gain_changes(frfs, analysis_band(frfs, settings))
+        if gains is not None:
+            frfs = gains.taken_out(frfs)
     release_memory()
     asked = wanted(included, frfs.response_decay_rad_s)
     modal = identify(frfs, settings, progress, alignment.known_peaks(), asked)
@@ -139,6 +143,8 @@ def _identified(
     decay = frfs.response_decay_rad_s
     if alignment.n_hits == 1:
         modal = within_decay(of_one_hit(modal, settings.repeatability), alignment, decay)
+    if gains is not None:
+        modal = replace(modal, sensor_notes=(gains.note,))
     return HitModes(with_movement(modal, alignment, decay), frfs, alignment)
 
 

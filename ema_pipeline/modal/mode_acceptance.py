@@ -157,9 +157,10 @@ def credible(
     share = votes(estimate)
     support = np.maximum(share / needed, np.where(twin, 0.0, plain))
     # any mix of two modes at one pole is a shape of that pole, complex ones too
-    support = np.where(_incoherent(solution) & ~twin, 0.0, support)
+    random = _incoherent(solution) & ~twin
+    support = np.where(random, 0.0, support)
     std = decay_std(estimate, solution)
-    told = (share > UNSEEN) | (std < MAX_UNSEEN_DAMPING_STD)
+    told = (share > UNSEEN) | ((std < MAX_UNSEEN_DAMPING_STD) & ~random)
     support = np.where(explained & told, np.maximum(support, 1.0), support)
     # where the polish finds no place for a mode, it is one only if most orders and the FRFs show it plainly
     support = np.where(fit.held, np.minimum(plain, share / SURE_VOTES), support)

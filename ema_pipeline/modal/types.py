@@ -181,6 +181,8 @@ class ModalModel:
     chart : StabilisationChart
     notes : tuple of str
         Plain sentences, e.g. that a single reference cannot show a multiplicity.
+    sensor_notes : tuple of str
+        The same on sensors that the modes show to be at fault.
     left_out : tuple of LeftOut
         Peaks and columns of stable poles without a mode.
     """
@@ -197,4 +199,5 @@ class ModalModel:
     inputs: tuple[Dof, ...]
     chart: StabilisationChart
     notes: tuple[str, ...] = ()
+    sensor_notes: tuple[str, ...] = ()
     left_out: tuple[LeftOut, ...] = ()

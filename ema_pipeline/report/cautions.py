@@ -154,6 +154,7 @@ def _of_configuration(c: ConfigurationResults) -> Iterator[tuple[Weight, str]]:
             yield Weight.LEFT_OUT, told
         if not c.modal.scaled and c.modal.dofs:
             yield Weight.SCALE, c.modal.scaling_note or "shapes are unscaled: no driving point"
+        yield from ((Weight.SENSOR, note) for note in c.modal.sensor_notes)
         yield from ((Weight.MODE, note) for note in c.modal.notes if note != c.modal.scaling_note)
     if c.pairing is not None:
         for u in c.pairing.unpaired_measured:

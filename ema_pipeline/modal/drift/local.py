@@ -41,6 +41,9 @@ FOLLOWED = 0.7
 FEWEST_LEFT = 6
 """Lines beyond the unknowns without which nothing is said of what a peak does within a decay."""
 
+MOST_ALIKE = 0.95
+"""Largest correlation of neighbouring lines that is reckoned with: it is known from few lines."""
+
 MAX_DAMPING = 0.2
 """A pole with more is no peak."""
 
@@ -97,13 +100,32 @@ class DecayChange:
 
 
 @dataclass(frozen=True)
+class PeakResidues:
+    """Residues of a peak at one pole for all FRFs.
+
+    Attributes
+    ----------
+    residues : complex ndarray, (n_inputs, n_outputs)
+    variance : ndarray, (n_inputs, n_outputs)
+        E|r - E r|² of each, from what the fit leaves of its FRF; infinite where not measured.
+    """
+
+    residues: Complex
+    variance: Real
+
+
+@dataclass(frozen=True)
 class _Fit:
-    """Linear fit of some FRFs: residues (n_frfs,), what is left (n_frfs, n_lines), and the derivative."""
+    """Linear fit of some FRFs: residues (n_frfs,), what is left (n_frfs, n_lines), and the derivative.
+
+    `gain` is the variance of a residue over that of a line.
+    """
 
     residues: Complex
     left: Complex
     derivative: Complex
     free: int
+    gain: float
 
 
 def peak_poles(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> PeakPoles | None:
@@ -194,6 +216,46 @@ def plain_pole(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> 
     return shared[0] if explained > EXPLAINED else None
 
 
+def peak_residues(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> PeakResidues | None:
+    """Residues of a peak in all FRFs; None where no pole is found at the peak.
+
+    Parameters
+    ----------
+    window : PeakWindow
+    frf : complex ndarray, (n_inputs, n_outputs, n_lines)
+        Accelerance on the lines of the window; NaN where not measured.
+    omega : ndarray, (n_lines,)
+    rest_s : float
+        Time from hit to end of the record.
+    """
+    known = np.asarray(np.isfinite(frf).all(axis=-1))
+    data = np.where(known[..., None], frf, 0.0)
+    shared = _shared_pole(window, data, known, omega, rest_s)
+    if shared is None or _explained(shared[0], window, data, omega, rest_s) < FOLLOWED:
+        return None
+    fit = _linear_fit(shared[0], window.neighbours, data.reshape(-1, len(omega)), omega, rest_s)
+    if fit is None or len(omega) <= fit.free:
+        return None
+    power = np.sum(np.abs(fit.left) ** 2, axis=-1) / (len(omega) - fit.free) * _serial(fit.left)
+    variance = np.where(known, fit.gain * power.reshape(known.shape), np.inf)
+    return PeakResidues(fit.residues.reshape(known.shape), variance)
+
+
+def _serial(left: Complex) -> Real:
+    """How much more the variance of a coefficient is than if what is left on neighbouring lines were independent.
+
+    What bends under a peak is no noise, and moves the residue by more than noise of that size.
+
+    Parameters
+    ----------
+    left : complex ndarray, (n_frfs, n_lines)
+    """
+    power = np.maximum(np.sum(np.abs(left) ** 2, axis=-1), 1e-300)
+    alike = np.sum((left[:, 1:] * left[:, :-1].conj()).real, axis=-1) / power
+    alike = np.clip(alike, 0.0, MOST_ALIKE)
+    return np.asarray((1 + alike) / (1 - alike))
+
+
 def _explained(pole: complex, window: PeakWindow, data: Complex, omega: Real, rest_s: float) -> float:
     """Share of what a straight background leaves of the FRFs that a pole explains."""
     flat = data.reshape(-1, len(omega))
@@ -258,7 +320,8 @@ def _linear_fit(pole: complex, others: Complex, data: Complex, omega: Real, rest
     solved = np.linalg.lstsq(triangle, inside.T, rcond=1e-10)[0]
     left = data - inside @ basis.T
     across = derivative[0] - basis @ (basis.conj().T @ derivative[0])
-    return _Fit(solved[0] / size, left, across, len(columns))
+    gain = float(np.sum(np.abs(np.linalg.pinv(triangle, rcond=1e-10)[0]) ** 2)) / size**2
+    return _Fit(solved[0] / size, left, across, len(columns), gain)
 
 
 def _columns(u: Complex) -> Complex:
