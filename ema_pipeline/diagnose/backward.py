@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from ema_pipeline.diagnose.claims import Judged, judge
 from ema_pipeline.diagnose.hypotheses import Hypothesis
 from ema_pipeline.diagnose.ranked import Ranked, Ranking
+from ema_pipeline.diagnose.rounds import Round
 from ema_pipeline.diagnose.settings import DiagnoseSettings
 from ema_pipeline.inference import Posterior
 from ema_pipeline.observations.base import Observations
@@ -22,7 +23,7 @@ def reconsidered(
     observations: Observations,
     start: Fit,
     claimed: Sequence[Judged],
-    rivals: dict[str, tuple[Judged, ...]],
+    rounds: dict[str, Round],
     settings: DiagnoseSettings,
 ) -> list[Judged]:
     """Claims without those that are needless by now or cannot be told from a later one, and with those replaced that a
@@ -35,8 +36,8 @@ def reconsidered(
         The model before any claim.
     claimed : sequence of Judged
         In the order in which they were added.
-    rivals : dict of str to tuple of Judged
-        By the label of a claim: the finalists of its round. A replacement inherits them.
+    rounds : dict of str to Round
+        By the label of a claim, with its rivals. A replacement inherits them.
     settings : DiagnoseSettings
 
     Returns
@@ -49,11 +50,46 @@ def reconsidered(
     last = claimed[-1].ranked.fit
     fit = _fitted(observations, start.model, now, last) if changed else learned(observations, last)
     while len(now) > 1:
-        better = _best_change(observations, start.model, now, fit, rivals, settings)
+        better = _best_change(observations, start.model, now, fit, rounds, settings)
         if better is None:
             break
         now, fit, changed = *better, True
     return _judged_anew(observations, start, now, fit, settings) if changed else list(claimed)
+
+
+def alike_beside(
+    observations: Observations,
+    known: Model,
+    claimed: Sequence[Judged],
+    rounds: dict[str, Round],
+    final: Fit,
+    settings: DiagnoseSettings,
+) -> tuple[tuple[Judged, ...], ...]:
+    """Each claim and what explains the data as well in its place, all other claims known; the rig's own effects first.
+
+    What came near an early claim may be far behind once the later ones are known, or be one of them.
+    """
+    effects = [j.hypothesis for j in claimed]
+    labels = [h.label for h in effects]
+    told = []
+    for i, one in enumerate(claimed):
+        near = rounds[labels[i]].alike(settings)
+        rivals = [j for j in near if j.hypothesis.label not in labels]
+        if rivals and (one is not claimed[-1] or not any(one is j for j in near)):
+
+            def evidence(rival: Judged, i: int = i) -> float:
+                instead = [*effects[:i], rival.hypothesis, *effects[i + 1 :]]
+                return _fitted(observations, known, instead, final, rival).log_evidence
+
+            reached = spread(evidence, rivals, settings.processes, _WORTH)
+            near_final = (final.log_evidence - e < settings.alike for e in reached)
+            rivals = [j for j, stays in zip(rivals, near_final, strict=True) if stays]
+        first = next((k for k, j in enumerate(near) if j.hypothesis.label == labels[i]), 0)
+        before = {id(j) for j in near[:first]}
+        told.append(
+            (*(j for j in rivals if id(j) in before), one, *(j for j in rivals if id(j) not in before))
+        )
+    return tuple(told)
 
 
 def cannot_be_told(observations: Observations, linear: Hypothesis, other: Hypothesis) -> bool:
@@ -93,7 +129,7 @@ def _best_change(
     known: Model,
     now: Sequence[Hypothesis],
     fit: Fit,
-    rivals: dict[str, tuple[Judged, ...]],
+    rounds: dict[str, Round],
     settings: DiagnoseSettings,
 ) -> tuple[list[Hypothesis], Fit] | None:
     """The change that raises the evidence most, a needless effect counting as much as a claim needs."""
@@ -101,7 +137,7 @@ def _best_change(
     plans: list[_Plan] = []
     for i, one in enumerate(now[:-1]):  # the last was judged with all others known
         plans.append(_Plan([h for h in now if h is not one], one))
-        for rival in rivals.get(one.label, ()):
+        for rival in rounds[one.label].judged:
             if rival.hypothesis.label not in labels:
                 plans.append(_Plan([*now[:i], rival.hypothesis, *now[i + 1 :]], one, rival))
 
@@ -118,7 +154,7 @@ def _best_change(
         return None
     plan = plans[best]
     after = plan.before if plan.rival is None else plan.rival.hypothesis
-    rivals.setdefault(after.label, rivals.get(plan.before.label, ()))
+    rounds.setdefault(after.label, rounds[plan.before.label])
     return list(plan.effects), Fit(_with(known, plan.effects), found[best])
 
 

@@ -107,7 +107,7 @@ def diagnose(
             limits = detection_limits(first.observations, first.final, hypotheses, settings, found=already)
         ladder = ladder_aside()
     errors = (ladder.rungs[0].error, ladder.rungs[-1].error)
-    group = alike(found, settings)
+    group = alike(found)
     share = complete(*reached.telling) if explained else CLOSEST
     candidates = tuple(
         replace(c, probability=share * c.probability)
@@ -115,7 +115,7 @@ def diagnose(
     )
     start = found.rounds[0].ranking.base
     begun = reached if start is found.final else explanation(first.observations, start, settings)
-    probabilities = shared(found.rounds[0].probabilities, share, share if begun.explained else 0.0)
+    probabilities = shared(_first_probabilities(found), share, share if begun.explained else 0.0)
     nothing, limit = probabilities[NOTHING], found.final.posterior.error_limit(settings.error_limit)
     visible = math.nan
     if verdict == "adequate":
@@ -132,7 +132,7 @@ def diagnose(
         ),
         null_probability=nothing,
         candidates=candidates,
-        indistinguishable=_groups(found, group, settings),
+        indistinguishable=_groups(found, group),
         next_measurement=next_measurement(first.observations, first, group, verdict),
         localisation=()
         if explained
@@ -146,6 +146,16 @@ def diagnose(
         nothing_visible=visible,
         error_limit=limit,
     )
+
+
+def _first_probabilities(found: Selection) -> dict[str, float]:
+    """Of the first round; what was dropped once more was known leaves its share to the first claim."""
+    told = dict(found.rounds[0].probabilities)
+    best = found.rounds[0].best
+    if best is not None and found.claimed and best.named.label not in {j.named.label for j in found.claimed}:
+        first = found.claimed[0].named.label
+        told[first] = told.get(first, 0.0) + told.pop(best.named.label, 0.0)
+    return told
 
 
 def _ladder(found: Selection, settings: DiagnoseSettings) -> Ladder:
@@ -301,13 +311,11 @@ def _candidate(j: Judged, probability: float, claimed: bool) -> Candidate:
     )
 
 
-def _groups(
-    found: Selection, group: Sequence[Judged], settings: DiagnoseSettings
-) -> tuple[tuple[str, ...], ...]:
+def _groups(found: Selection, group: Sequence[Judged]) -> tuple[tuple[str, ...], ...]:
     """What cannot be told apart: several effects, several names of one, and generic ones beside the rig's own."""
     groups = [tuple(j.named.label for j in group)] if len(group) > 1 else []
-    for j, of in zip(found.claimed, found.rounds, strict=False):
-        near = [n.named.label for n in of.alike(settings) if n.hypothesis.label != j.hypothesis.label]
+    for j, alike_it in zip(found.claimed, found.alike, strict=True):
+        near = [n.named.label for n in alike_it if n is not j]
         names = (j.named.label, *j.named.equivalents, *(n for n in near if not any(n in g for g in groups)))
         if len(names) > 1:
             groups.append(names)

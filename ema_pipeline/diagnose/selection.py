@@ -9,7 +9,7 @@ from operator import is_
 
 import numpy as np
 
-from ema_pipeline.diagnose.backward import cannot_be_told, reconsidered
+from ema_pipeline.diagnose.backward import alike_beside, cannot_be_told, reconsidered
 from ema_pipeline.diagnose.claims import BY_OTHERS, Judged, judge
 from ema_pipeline.diagnose.first_fits import CONTINUED
 from ema_pipeline.diagnose.hypotheses import Hypothesis
@@ -38,12 +38,15 @@ class Selection:
         The model with all that is claimed.
     observations : Observations
         With the unknowns that this model calls for.
+    alike : tuple of tuple of Judged
+        Per claim: it, and what explains the data as well in its place.
     """
 
     rounds: tuple[Round, ...]
     claimed: tuple[Judged, ...]
     final: Fit
     observations: Observations
+    alike: tuple[tuple[Judged, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,7 @@ def select(
     observations = observations.about(known.effects, base.posterior)
     rounds: list[Round] = []
     claimed: list[Judged] = []
-    rivals: dict[str, tuple[Judged, ...]] = {}
+    of_claims: dict[str, Round] = {}
     fitted: dict[str, Posterior] = {}
 
     def ask(
@@ -131,7 +134,9 @@ def select(
         rounds.append(found)
         near = found.alike(settings)
         if not near or len(claimed) == settings.most_effects:
-            return Selection(tuple(rounds), tuple(claimed), found.ranking.base, observations)
+            final = found.ranking.base
+            groups = alike_beside(observations, known, claimed, of_claims, final, settings)
+            return Selection(tuple(rounds), tuple(claimed), final, observations, groups)
         added = next(j for j in near if j.claimed)  # a rival alone does not pass the conditions of a claim
         suited = observations.suited(added.ranked.fit.model.effects)
         if suited is not observations:
@@ -140,9 +145,9 @@ def select(
             known_so_far = Earlier(tuple(led), len(claimed) + 1, fitted)
             return select(suited, known, hypotheses, settings, progress, known_so_far)
         claimed.append(added)
-        rivals[added.hypothesis.label] = found.judged
+        of_claims[added.hypothesis.label] = found
         if len(claimed) > 1:
-            now = reconsidered(observations, start, claimed, rivals, settings)
+            now = reconsidered(observations, start, claimed, of_claims, settings)
             ahead = ahead if len(now) == len(claimed) and all(map(is_, now, claimed)) else None
             claimed = now
         if ahead is None:

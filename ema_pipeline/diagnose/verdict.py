@@ -29,17 +29,16 @@ def verdict_of(found: Selection, settings: DiagnoseSettings, explained: bool) ->
         return "unknown_effect"
     if not found.claimed:
         return "adequate"
-    return "ambiguous" if len(alike(found, settings)) > 1 else "effect"
+    return "ambiguous" if len(alike(found)) > 1 else "effect"
 
 
-def alike(found: Selection, settings: DiagnoseSettings) -> tuple[Judged, ...]:
-    """Hypotheses of the round that claimed the last effect which explain the data as well.
+def alike(found: Selection) -> tuple[Judged, ...]:
+    """The last claim in whose place others explain the data as well, and these.
 
     Where one of the rig's own effects is among them, it is named, and generic ones stand beside it as equivalents; not
     so where it is but a part out of tolerance.
     """
-    for k in reversed(range(len(found.claimed))):
-        near = found.rounds[k].alike(settings)
+    for near in reversed(found.alike):
         own = tuple(j for j in near if not j.hypothesis.generic)
         contenders = own if any(j.specific for j in own) else near
         if len(contenders) > 1:

@@ -9,7 +9,7 @@ import pytest
 from written_fits import fit, hypothesis, law
 
 from ema_pipeline.diagnose import backward
-from ema_pipeline.diagnose.backward import cannot_be_told, reconsidered
+from ema_pipeline.diagnose.backward import alike_beside, cannot_be_told, reconsidered
 
 
 def at(one: Any, place: str, unit: str = "1") -> Any:
@@ -69,3 +69,39 @@ def test_a_linear_claim_goes_once_a_law_at_its_place_is_claimed(
     else:
         assert fitted == []
         assert found == claimed
+
+
+def test_rivals_of_an_early_claim_are_held_against_it_with_the_later_ones_known(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of one claim nothing is fitted again; what is claimed itself is no rival."""
+    mass, spring, other, far = (
+        SimpleNamespace(hypothesis=hypothesis(name))
+        for name in ("mass@q3", "spring@q1", "mass@q3.x", "mass@all")
+    )
+    near = {"mass@q3": (mass, other, far, spring), "spring@q1": (spring, mass)}
+    rounds: Any = {name: SimpleNamespace(alike=lambda s, name=name: near[name]) for name in near}
+    evidence = {"mass@q3.x": 99.0, "mass@all": 40.0}
+    asked: list[list[str]] = []
+
+    def fitted(observations: object, known: object, effects: Any, final: object, rival: Any) -> Any:
+        asked.append([h.label for h in effects])
+        return SimpleNamespace(log_evidence=evidence[rival.hypothesis.label])
+
+    monkeypatch.setattr(backward, "_fitted", fitted)
+    settings: Any = SimpleNamespace(processes=1, alike=3.0)
+    nothing: Any = None
+    final: Any = SimpleNamespace(log_evidence=100.0)
+
+    def told(*claimed: Any) -> list[list[str]]:
+        found = alike_beside(nothing, nothing, claimed, rounds, final, settings)
+        return [[j.hypothesis.label for j in group] for group in found]
+
+    assert told(mass, spring) == [["mass@q3", "mass@q3.x"], ["spring@q1"]]
+    assert asked == [["mass@q3.x", "spring@q1"], ["mass@all", "spring@q1"]]
+    asked.clear()
+    assert told(mass) == [["mass@q3", "mass@q3.x", "mass@all", "spring@q1"]]
+    assert not asked
+    again: Any = SimpleNamespace(hypothesis=mass.hypothesis)  # judged anew, after the spring
+    assert told(spring, again) == [["spring@q1"], ["mass@q3", "mass@q3.x"]]
+    assert asked == [["spring@q1", "mass@q3.x"], ["spring@q1", "mass@all"]]

@@ -19,7 +19,7 @@ from ema_pipeline.diagnose.claims import (
     PREDICTED_WORSE,
     Judged,
 )
-from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _groups
+from ema_pipeline.diagnose.diagnosis import _candidates, _ended, _first_probabilities, _groups
 from ema_pipeline.diagnose.ranked import Ranked, Ranking
 from ema_pipeline.diagnose.rounds import Round
 from ema_pipeline.diagnose.selection import Selection, _beside, select
@@ -709,7 +709,8 @@ def test_no_more_effects_are_added_than_may_be(monkeypatch: pytest.MonkeyPatch) 
 
 def selected(claimed: list[Any], *rounds: Round) -> Selection:
     nothing: Any = None
-    return Selection(tuple(rounds), tuple(claimed), nothing, nothing)
+    alike_claims = tuple(of.alike(SETTINGS) for _, of in zip(claimed, rounds, strict=False))
+    return Selection(tuple(rounds), tuple(claimed), nothing, nothing, alike_claims)
 
 
 def test_how_the_search_ended() -> None:
@@ -750,6 +751,14 @@ def test_candidates_are_the_claimed_ones_with_final_sizes_then_the_group_then_th
     assert len(_candidates(selected([a, b], first, second, third), few, (), hypotheses, final)) == 2
 
 
+def test_what_took_the_place_of_the_first_leader_has_its_probability() -> None:
+    leader, spring = judged("mass@all", 20.0), judged("spring@q3", 9.0)
+    first = a_round(leader, spring, told={"mass@all": 0.9, "spring@q3": 0.05})
+    assert _first_probabilities(selected([spring], first)) == {"spring@q3": pytest.approx(0.95)}
+    assert _first_probabilities(selected([leader], first)) == {"mass@all": 0.9, "spring@q3": 0.05}
+    assert _first_probabilities(selected([], first)) == {"mass@all": 0.9, "spring@q3": 0.05}
+
+
 def test_without_a_claim_the_candidates_are_those_of_the_first_round() -> None:
     one = a_round(judged("a@x", 2.0, "weak"), judged("b@x", 1.0, "weak"), told={"a@x": 0.2})
     found = _candidates(selected([], one), SETTINGS, (), [], {})
@@ -781,8 +790,8 @@ def test_a_part_out_of_tolerance_stands_beside_a_generic_effect_as_likely() -> N
     generic, part = judged("damper@m1", 8.0, generic=True), judged("out_of_tolerance@k1", 7.0, specific=False)
     own = judged("sensor_mass@m1", 6.0)
     alone, beside = a_round(generic, part), a_round(generic, part, own)
-    assert labels(alike(selected([generic], alone), SETTINGS)) == ["damper@m1", "out_of_tolerance@k1"]
-    assert labels(alike(selected([generic], beside), SETTINGS)) == ["sensor_mass@m1", "out_of_tolerance@k1"]
+    assert labels(alike(selected([generic], alone))) == ["damper@m1", "out_of_tolerance@k1"]
+    assert labels(alike(selected([generic], beside))) == ["sensor_mass@m1", "out_of_tolerance@k1"]
 
 
 def test_groups_are_rivals_and_names_of_one_each_told_once() -> None:
@@ -790,7 +799,7 @@ def test_groups_are_rivals_and_names_of_one_each_told_once() -> None:
     rival, generic = judged("c@x", 8.0), judged("s@x", 19.0, generic=True)
     rounds = a_round(a, generic), a_round(b, rival), a_round()
     found = selected([a, b], *rounds)
-    assert _groups(found, (b, rival), SETTINGS) == (("b@x", "c@x"), ("a@x", "a@z", "s@x"))
-    assert _groups(found, (), SETTINGS) == (("a@x", "a@z", "s@x"), ("b@x", "c@x"))
-    assert _groups(selected([b], a_round(b)), (), SETTINGS) == ()
-    assert _groups(selected([b], a_round(b)), (b,), SETTINGS) == ()
+    assert _groups(found, (b, rival)) == (("b@x", "c@x"), ("a@x", "a@z", "s@x"))
+    assert _groups(found, ()) == (("a@x", "a@z", "s@x"), ("b@x", "c@x"))
+    assert _groups(selected([b], a_round(b)), ()) == ()
+    assert _groups(selected([b], a_round(b)), (b,)) == ()
