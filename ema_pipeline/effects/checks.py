@@ -99,6 +99,12 @@ def _check_at(effect: Effect, assembly: Assembly, place: str, path: Path) -> Non
                 f"{where} makes the {name} {largest:.3g} at its start values; keep it below {LARGEST:g}: correct "
                 "edit or start"
             )
+    first = effect.parameters[0]
+    if started.mass.shape != base.mass.shape and first.minimum <= first.null < math.inf:
+        raise EmaError(
+            f"{where} adds coordinates, which cannot be where '{first.name}' is {first.null:g}; set its minimum above "
+            f"that, to {first.null + first.scale / 1000:g} for instance"
+        )
     try:
         eigen_solution(started)
     except EmaError as error:

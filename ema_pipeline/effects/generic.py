@@ -16,6 +16,9 @@ def bodies_and_dofs(assembly: Assembly) -> tuple[str, ...]:
     return (*assembly.bodies, *assembly.dofs)
 
 
+SUSPENDING = 0.05
+"""Stiffness of a spring to ground over the median of those between bodies below which it only carries the structure."""
+
 _PARALLEL = 1 - 1e-6
 """Squared cosine of two rows that are one and the same motion."""
 _PLANE = ({"x", "y"}, {"zeta", "eta"})
@@ -71,9 +74,16 @@ def with_polynomial_springs(assembly: Assembly, place: str, title: str, **term: 
 
 
 def usual_stiffness(assembly: Assembly) -> float:
-    """Half of the median stiffness of the model's springs, N/m."""
-    known = [s.stiffness for s in assembly.springs() if s.stiffness > 0]
+    """Half of the median stiffness of the model's springs, N/m; foam or cords that carry it do not count."""
+    springs = [s for s in assembly.springs() if s.stiffness > 0]
+    inner = [s.stiffness for s in springs if not _to_ground(s.row)]
+    least = SUSPENDING * float(np.median(inner)) if inner else 0.0
+    known = [s.stiffness for s in springs if not _to_ground(s.row) or s.stiffness > least]
     return 0.5 * float(np.median(known)) if known else 1e5
+
+
+def _to_ground(row: Row) -> bool:
+    return len({dof.rpartition(".")[0] for dof in row}) == 1
 
 
 def least_stiffness(assembly: Assembly, place: str) -> Mapping[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from ema_pipeline.effects.base import Effect, effect_of
+from ema_pipeline.effects.generic import usual_stiffness
 from ema_pipeline.effects.library import (
     effect_library,
     get_effect,
@@ -387,3 +389,16 @@ def test_no_more_can_be_lost_than_stands_at_a_place() -> None:
     assert least(mass, "a.x-b.x") == 0.0
     damper = shipped_effects()["damper"]
     assert damper.possible(assembly, "a.x") is damper
+
+
+def test_foam_that_carries_a_structure_does_not_make_small_springs_usual() -> None:
+    """Four springs of 800 kN/m and five of 300 N/m to ground: the median of all would be the foam's."""
+    bodies = [f"m{k}" for k in range(1, 6)]
+    inner = [Spring(f"{a}{b}", {f"{a}.z": 1.0, f"{b}.z": -1.0}, 8e5) for a, b in pairwise(bodies)]
+    foam = [Spring(f"foam {b}", {f"{b}.z": 1.0}, 300.0) for b in bodies]
+    masses = [Mass(b, {f"{b}.z": 1.0}, 1.0) for b in bodies]
+    dofs = tuple(f"{b}.z" for b in bodies)
+    assert usual_stiffness(Assembly(dofs, (*masses, *inner, *foam))) == 4e5
+    seats = [replace(f, stiffness=2e5) for f in foam]
+    assert usual_stiffness(Assembly(dofs, (*masses, *inner, *seats))) == 1e5
+    assert usual_stiffness(Assembly(dofs, (*masses, *foam))) == 150.0

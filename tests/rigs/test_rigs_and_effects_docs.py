@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from ema_pipeline import cli
+from ema_pipeline.effects.checks import check_on_rig
 from ema_pipeline.effects.library import effect_library
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.errors import EmaError
@@ -178,6 +179,46 @@ def test_mistakes_in_an_effect_file_are_told_with_line_and_remedy_before_anythin
         assert f"oil_film.py, line {line}: " in str(done.exception).replace(str(tmp_path) + "/", "")
         assert words in str(done.exception)
     assert not Path("out").exists()
+
+
+def test_an_effect_that_adds_coordinates_cannot_be_null_within_its_range(tmp_path: Path) -> None:
+    """A tuned absorber: without its mass there is one mode less, and nothing that is compared stays the same."""
+    file = tmp_path / "absorber.py"
+    text = """
+from ema_pipeline.effects.base import Effect, EffectParameter
+from ema_pipeline.mechanics.assembly import Mass, Spring
+
+
+def places(assembly):
+    return assembly.bodies
+
+
+def edit(assembly, place, values):
+    if values["mass"] == 0.0:
+        return assembly
+    dof = f"{place}_absorber.x"
+    spring = Spring(f"{place} absorber spring", {**assembly.row(f"{place}.x"), dof: -1.0}, 5e5 * values["mass"])
+    return assembly.add(Mass(f"{place} absorber", {dof: 1.0}, values["mass"]), spring, dofs=(dof,))
+
+
+EFFECT = Effect(
+    id="absorber",
+    title="a tuned absorber",
+    parameters=(EffectParameter("mass", "kg", 0.0, 0.03, 0.05, MINIMUM, 10.0, "its mass"),),
+    find_places=places,
+    edit=edit,
+    signs="a mode splits in two",
+    reference="Den Hartog",
+)
+"""
+    rig = load_rig("frame")
+    file.write_text(text.replace("MINIMUM", "0.0"), encoding="utf-8")
+    with pytest.raises(
+        EmaError, match=r"adds coordinates, which cannot be where 'mass' is 0; .* to 5e-05 for"
+    ):
+        check_on_rig(effect_library([str(file)])["absorber"], rig, file)
+    file.write_text(text.replace("MINIMUM", "5e-5"), encoding="utf-8")
+    check_on_rig(effect_library([str(file)])["absorber"], rig, file)
 
 
 def test_effects_of_a_file_are_listed_with_the_others(
