@@ -65,7 +65,7 @@ def alike_beside(
     final: Fit,
     settings: DiagnoseSettings,
 ) -> tuple[tuple[Judged, ...], ...]:
-    """Each claim and what explains the data as well in its place, all other claims known; the rig's own effects first.
+    """Each claim and what explains the data as well in its place, all other claims known.
 
     What came near an early claim may be far behind once the later ones are known, or be one of them.
     """
@@ -84,11 +84,7 @@ def alike_beside(
             reached = spread(evidence, rivals, settings.processes, _WORTH)
             near_final = (final.log_evidence - e < settings.alike for e in reached)
             rivals = [j for j, stays in zip(rivals, near_final, strict=True) if stays]
-        first = next((k for k, j in enumerate(near) if j.hypothesis.label == labels[i]), 0)
-        before = {id(j) for j in near[:first]}
-        told.append(
-            (*(j for j in rivals if id(j) in before), one, *(j for j in rivals if id(j) not in before))
-        )
+        told.append((one, *rivals))
     return tuple(told)
 
 

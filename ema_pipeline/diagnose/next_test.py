@@ -43,10 +43,7 @@ def next_measurement(
 ) -> str:
     """The measurement that would help most, in a sentence; empty where nothing is needed."""
     if verdict == "unknown_effect":
-        return (
-            "Hit at three force levels: if a natural frequency moves, the missing effect depends on amplitude; "
-            "if not, put further sensors where measurement and model differ most."
-        )
+        return _beyond_the_library(observations)
     if verdict == "ambiguous" and len(group) > 1:
         first, second = group[0].ranked.fit, group[1].ranked.fit
         names = (label_text(group[0].named.label), label_text(group[1].named.label))
@@ -70,6 +67,19 @@ def next_measurement(
         f"{best_option.text} would distinguish {names[0]} from {names[1]}: a difference of "
         f"{best_option.separation:.1f} standard deviations is expected."
     )
+
+
+def _beyond_the_library(observations: Observations) -> str:
+    """What helps where nothing explains the data; a value of the rig file that is wrong looks like that too."""
+    further = sensors = "put further sensors where measurement and model differ most"
+    if not observations.linearised:
+        moves = "if a natural frequency moves, the missing effect depends on amplitude"
+        further = f"hit at three force levels: {moves}; if not, {sensors}"
+    elif observations.level_dependent:
+        further = (
+            "hit more softly, until no mode moves with the force: what is missing beside that shows there"
+        )
+    return f"Check values and units in the rig file; if they are right, {further}."
 
 
 def _options(observations: ModeObservations, first: Fit, second: Fit) -> list[Option]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ema_pipeline.diagnose.claims import Judged
 from ema_pipeline.diagnose.selection import Selection
-from ema_pipeline.diagnose.settings import DiagnoseSettings
+from ema_pipeline.diagnose.settings import MOST_UNEXPLAINED, DiagnoseSettings
 from ema_pipeline.diagnose.types import VerdictWord
 from ema_pipeline.observations.fitting import Fit
 from ema_pipeline.observations.parts import FREE_STD
@@ -23,7 +23,8 @@ def too_few(fit: Fit) -> bool:
 
 def verdict_of(found: Selection, settings: DiagnoseSettings, explained: bool) -> VerdictWord:
     """What the data support; `explained` where the final model explains them, see `Explanation.explained`."""
-    if not found.claimed and too_few(found.final):
+    unpaired = found.final.posterior.residuals.unexplained > MOST_UNEXPLAINED
+    if not found.claimed and too_few(found.final) and not unpaired:
         return "not_enough_data"
     if not explained:
         return "unknown_effect"

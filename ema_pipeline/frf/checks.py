@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from ema_pipeline.check_result import CheckResult, judged
 from ema_pipeline.frf.channel_faults import (
@@ -47,6 +48,10 @@ well differ by a factor or in sign with the direction."""
 
 WEAK_LEVEL, OBVIOUS_FACTOR = 0.15, 7.0
 """From this share on such a test makes factors of up to five by itself: only larger ones speak of a sensitivity."""
+
+LINES_OF_ONE_HIT = 5
+"""Lines averaged before the sign of a driving point is judged from one hit: where a soft tip has little force, noise is
+as large as a resonance, and no second hit shows that it is noise."""
 
 _DERIVATIVES = {"acceleration": 0, "velocity": 1, "displacement": 2}
 """From a quantity to acceleration."""
@@ -210,6 +215,8 @@ def _taken_out(frfs: FrfSet, output: int, source: int, inside: slice) -> float:
     if frfs.hits[output, source] == 0:
         return 1.0
     loss = (frfs.frf[output, source, inside] * 1j ** _DERIVATIVES[frfs.quantities[output]]).imag
+    if frfs.hits[output, source] == 1:
+        loss = uniform_filter1d(loss, LINES_OF_ONE_HIT, mode="constant")
     # Squares: resonances decide, not the noise between them.
     total = float(np.sum(loss**2))
     return float(np.sum(loss[loss < 0] ** 2)) / total if total > 0 else 0.0

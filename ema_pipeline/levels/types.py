@@ -12,6 +12,10 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.types import ModalModel
 
+_FAR, _FAR_IN_WIDTHS, _FAR_IN_STDS = 0.01, 1.0, 5.0
+"""Change of a frequency from the softest to the hardest level, relative, in the peak's width at half its power and in
+standard deviations, that is no drift. So far a frequency also moves within each decay, and single hits scatter."""
+
 _NO_DOUBT = 1e-5
 """Of ten simulated linear structures with oblique hits and drift the least p value is 0.005; parting teeth and sticking
 friction have 1e-9 and less."""
@@ -113,6 +117,20 @@ class ModeLevels:
         """The softest and the hardest level whose hits tell the size; None where fewer than two do."""
         known = [] if self.size is None else np.flatnonzero(np.isfinite(self.size)).tolist()
         return (known[0], known[-1]) if len(known) > 1 else None
+
+    @property
+    def moved_far(self) -> bool:
+        """True where the frequency rises or falls from level to level by more than any drift."""
+        known = np.isfinite(self.frequency_hz)
+        if np.count_nonzero(known) < 2:
+            return False
+        frequency, std = self.frequency_hz[known], self.frequency_std_hz[known]
+        steps = np.diff(frequency)
+        width = 2 * float(np.mean(self.damping_ratio[known])) * frequency[0]
+        spread = _FAR_IN_STDS * float(np.hypot(std[0], std[-1]))
+        least = max(_FAR * frequency[0], _FAR_IN_WIDTHS * width, spread)
+        one_way = np.all(steps > 0) or np.all(steps < 0)
+        return bool(one_way and abs(frequency[-1] - frequency[0]) > least)
 
 
 @dataclass(frozen=True)
@@ -262,4 +280,4 @@ class LevelStudy:
     @property
     def clearly_level_dependent(self) -> bool:
         """True where there is no doubt of it: scatter that differs from level to level passes the other tests."""
-        return self.level_dependent and self.p_value < _NO_DOUBT
+        return self.level_dependent and (self.p_value < _NO_DOUBT or any(m.moved_far for m in self.modes))

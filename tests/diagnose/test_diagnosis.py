@@ -393,6 +393,19 @@ def test_three_frequencies_do_not_name_an_effect() -> None:
     assert not names_of(found)
 
 
+def test_modes_far_from_a_rig_with_values_in_a_wrong_unit_are_not_too_few() -> None:
+    """Masses in grams: no measured mode has a partner, so that nothing is compared."""
+    right = chain(3)
+    rig = replace(
+        right, build=lambda name, values: right.assembly(name, {**values, "mass": 1000 * values["mass"]})
+    )
+    found = diagnose(
+        observed(rig, chain_modes(3, GOOD, masses=3)), rig, {"mass": GENERIC["mass"]}, None, SETTINGS
+    )
+    assert found.verdict == "unknown_effect"
+    assert found.next_measurement.startswith("Check values and units in the rig file")
+
+
 def test_the_right_effect_predicts_what_was_held_out_and_a_wrong_one_does_not() -> None:
     rig = chain()
     observations = observed(rig, chain_modes(9, GOOD, added(Mass, 1.0, {"m4.z": 1.0})))

@@ -200,4 +200,22 @@ def test_other_verdicts_and_other_data_propose_no_measurement_of_modes(
 ) -> None:
     assert asked(monkeypatch, "effect") == ""
     assert asked(monkeypatch, "ambiguous", observations=object()) == ""
-    assert asked(monkeypatch, "unknown_effect").startswith("Hit at three force levels")
+
+
+def test_beyond_the_library_the_rig_file_is_checked_first_and_no_test_is_proposed_that_was_made(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plain = asked(monkeypatch, "unknown_effect")
+    assert plain.startswith(
+        "Check values and units in the rig file; if they are right, hit at three force levels"
+    )
+    still, moving = (
+        asked(
+            monkeypatch,
+            "unknown_effect",
+            observations=SimpleNamespace(linearised=True, level_dependent=moves),
+        )
+        for moves in (False, True)
+    )
+    assert still.endswith("if they are right, put further sensors where measurement and model differ most.")
+    assert "hit more softly, until no mode moves" in moving
