@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from ema_pipeline.errors import EmaError
 
-_PATTERN = re.compile(r"^\s*([+-]?)\s*([A-Za-z_][\w-]*|\d[\w-]*)\.([A-Za-z_]\w*)\s*$")
+_PATTERN = re.compile(r"^\s*([+-]?)\s*(\w[\w-]*)\.([^\W\d]\w*)\s*$")
 
 
 @dataclass(frozen=True, order=True)
@@ -39,7 +39,10 @@ class Dof:
         """
         match = _PATTERN.match(text)
         if match is None:
-            raise EmaError(f"dof '{text}' is not of the form body.direction, e.g. 'sun.x' or '-sun.x'")
+            raise EmaError(
+                f"dof '{text}' is not of the form body.direction, e.g. 'sun.x' or '-sun.x'; the name of a body has "
+                "letters, digits, '_' and '-', but no spaces"
+            )
         return cls(match[2], match[3], -1 if match[1] == "-" else 1)
 
     @property

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ema_pipeline.api.arguments import expect, path
 from ema_pipeline.api.display import Report, axes_or_new
 from ema_pipeline.api.frfs import Frfs
-from ema_pipeline.api.work import Settings, Work, overrides
+from ema_pipeline.api.work import MADE_FRFS, Settings, Work, overrides
 from ema_pipeline.describe import describe_modes
 from ema_pipeline.errors import EmaError
 from ema_pipeline.frf.types import FrfSet
@@ -197,7 +197,7 @@ def identify(frfs: Frfs, *, settings: Settings | None = None) -> Modes:
     (3, 3)
     """
     expect("frfs", frfs, Frfs, "FRFs, as test.frfs() gives them")
-    work = frfs._work.with_settings(settings)
+    work = frfs._work.with_settings(settings, MADE_FRFS)
     work.run("modal", "levels")
     return modes_of(work)
 

@@ -109,11 +109,11 @@ class Rig(Report, ParametricRig):
             raise EmaError(f"rig '{name}'{f', {where}' if where else ''}: {mistake}") from None
 
     def table(self) -> pd.DataFrame:
-        """The model's own modes at nominal values: frequency, damping ratio, family."""
+        """The model's own modes at nominal values, counted from 1: frequency, damping ratio, family."""
         import pandas as pd
 
         rows = [
-            (c, m.index, m.frequency_hz, m.damping_ratio, m.family)
+            (c, m.index + 1, m.frequency_hz, m.damping_ratio, m.family)
             for c in self.configurations
             for m in model_modes(self, c)
         ]

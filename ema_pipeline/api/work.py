@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from ema_pipeline.api import arguments
@@ -46,6 +47,13 @@ def overrides(settings: Settings | None) -> list[str]:
         return [f"{name}={json.dumps(plain(value))}" for name, value in settings.items()]
     except TypeError as error:
         raise EmaError(f"settings: a value is no number, text or list of these ({error})") from None
+
+
+MADE_FRFS = dict.fromkeys(("hits", "frf"), "Test.frfs(settings=…)")
+"""Sections that FRFs have been made with, and the call that takes their settings."""
+
+MADE_MODES = dict.fromkeys(("modal", "levels"), "ema.identify(…, settings=…)")
+"""The same of modes."""
 
 
 @dataclass(frozen=True)
@@ -100,12 +108,31 @@ class Work:
         """The run as it stands."""
         return new_run(self.store, self.info, self.effect_files, self.rig)
 
-    def with_settings(self, settings: Settings | None) -> Work:
-        """The same results with other settings for what is computed from here on."""
+    def with_settings(
+        self, settings: Settings | None, made: Mapping[str, str] = MappingProxyType({})
+    ) -> Work:
+        """The same results with other settings for what is computed from here on.
+
+        Parameters
+        ----------
+        settings : mapping, optional
+        made : mapping of str to str, optional
+            Sections of what is there already, and the call that takes their settings.
+
+        Raises
+        ------
+        EmaError
+            Where a setting is of what is there already: it would change nothing.
+        """
         changes = overrides(settings)
         if not changes:
             return self
-        changed = override(stored_settings(self.store, self.info), changes, "settings")
+        stored = stored_settings(self.store, self.info)
+        changed = override(stored, changes, "settings")
+        for section, call in made.items():
+            if getattr(changed, section) != getattr(stored, section):
+                name = next(n for n in settings or () if n.partition(".")[0] == section)
+                raise EmaError(f"settings: '{name}' cannot change what is there already; give it to {call}")
         info = dataclasses.replace(self.info, pipeline=changed.model_dump_json())
         return dataclasses.replace(Work.copy_of(self.store, info, self.effect_files), rig=self.rig)
 
@@ -164,7 +191,7 @@ class Work:
         made.store.copy_from(self.store, measures, dict(zip(self.info.configurations, names, strict=True)))
         made = dataclasses.replace(made, rig=None if named else model, effect_files=files)
         info = with_effect_files(made.store, made.info, files)
-        return dataclasses.replace(made, info=info).with_settings(settings)
+        return dataclasses.replace(made, info=info).with_settings(settings, {**MADE_FRFS, **MADE_MODES})
 
     def with_effects(self, effects: Sequence[str]) -> Work:
         """The same results with other effects in the model from here on."""

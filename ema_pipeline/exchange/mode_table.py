@@ -164,7 +164,8 @@ def _table(
             try:
                 found.append(float(value) if value else np.nan)
             except ValueError:
-                raise EmaError(f"{path}: line {line}: {column} = '{value}' is no number") from None
+                remedy = "; write decimals with a point" if "," in value else ""
+                raise EmaError(f"{path}: line {line}: {column} = '{value}' is no number{remedy}") from None
         return found
 
     data: dict[str, Any] = {}

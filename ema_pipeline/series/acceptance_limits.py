@@ -99,8 +99,10 @@ def read_limits(path: Path) -> Limits:
     Raises
     ------
     EmaError
-        If it cannot be read, or something in it is wrong.
+        If there is none, it cannot be read, or something in it is wrong.
     """
+    if not path.exists():
+        raise EmaError(f"{path}: there are no limits yet; 'ema series limits' learns them from good tests")
     limits = parse(Limits, read_toml(path), path)
     if not limits.modes and not limits.parameters and limits.effects == "ignore":
         raise EmaError(f"{path}: holds no limit; add [[modes]] or [[parameters]]")

@@ -219,6 +219,14 @@ def test_a_rig_built_in_python_is_fitted_like_one_from_a_file(lines: SimpleNames
         (lambda x: x.frfs[0], "configuration: give the name of a configuration, e.g. 'default', not 0"),
         (lambda x: x.modes[0], "configuration: give the name"),
         (lambda x: x.test.frfs(settings="x"), "settings: give settings by their dotted name, .* not 'x'"),
+        (
+            lambda x: ema.identify(x.frfs, settings={"frf.estimator": "H2"}),
+            r"'frf.estimator' cannot change what is there already; give it to Test.frfs.settings=",
+        ),
+        (
+            lambda x: ema.diagnose(x.rig, x.modes, settings={"modal.identify.low_hz": 20}),
+            r"'modal.identify.low_hz' cannot change .* give it to ema.identify",
+        ),
         (lambda x: x.test.frfs({"frf.estimator": object()}), "settings: a value is no number, text or list"),
         (lambda _: ema.Parameter("k", float("nan"), "N/m"), "parameter 'k': value = nan: give a number"),
         (lambda _: ema.Parameter("k", "1", "N/m"), "parameter 'k': value = '1': give a number"),

@@ -167,6 +167,7 @@ def test_rows_without_a_configuration_are_of_the_rigs_only_one(tmp_path: Path) -
         ("frequency_hz,frequency_hz\n33,63\n", r"line 1: column 'frequency_hz' is there twice; keep one"),
         ("frequency_hz,sun.x,sun.x re\n33,1,2\n", r"line 1: column 'sun.x' is there twice; keep one"),
         ("frequency_hz,damping_ratio\n10,high\n", r"line 2: damping_ratio = 'high' is no number"),
+        ('frequency_hz,damping_ratio\n"39,33",0.01\n', r"'39,33' is no number; write decimals with a point"),
         ("frequency_hz,damping_ratio\n10,0.1\n11,\n", r"line 3: damping_ratio is missing"),
         ("frequency_hz\n", r"holds no modes"),
     ],

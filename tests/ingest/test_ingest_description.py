@@ -33,6 +33,13 @@ def test_a_roving_sensor_overrides_its_dof_for_one_record(tmp_path: Path) -> Non
     assert test.dof_of(test.responses[0], test.records[0]) == Dof("root", "y", -1)
 
 
+def test_names_of_bodies_have_letters_of_any_alphabet_and_no_spaces() -> None:
+    assert Dof.parse("-Öse.x") == Dof("Öse", "x", -1)
+    assert Dof.parse("2nd-stage.u") == Dof("2nd-stage", "u")
+    with pytest.raises(EmaError, match=r"'Träger vorn.x' is not of the form .* but no spaces"):
+        Dof.parse("Träger vorn.x")
+
+
 @pytest.mark.parametrize(("band", "right"), [((0.0, 0.5), True), ((-1.0, 5.0), False), ((5.0, 5.0), False)])
 def test_a_band_may_begin_at_0_and_has_its_lower_end_first(
     tmp_path: Path, band: tuple[float, float], right: bool

@@ -120,6 +120,8 @@ def test_judge_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     """Learnt limits, a reject with its effect, one without results, one on the line, one without a mode."""
     folder = tmp_path / "S"
     database = _series(folder)
+    with pytest.raises(EmaError, match=r"there are no limits yet; 'ema series limits' learns them"):
+        read_limits(folder / "limits.toml")
     assert ema(capsys, "series", "limits", folder)[0] == 0
     limits = read_limits(folder / "limits.toml")
     edge = limits.modes[0].frequency
