@@ -8,6 +8,7 @@ alone, are held against matrices of low rank, and factors that all peaks share a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,9 +17,8 @@ from scipy.stats import f as variance_ratio
 
 from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.modal.drift.local import peak_residues
-from ema_pipeline.modal.drift.windows import peak_windows
 from ema_pipeline.modal.low_rank import first_right, low_rank, tangent
+from ema_pipeline.modal.plain_residues import PlainResidues
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -150,7 +150,7 @@ class _PeakFit:
         return self.misfit / max(self.degrees, 1)
 
 
-def gain_changes(frfs: FrfSet, band_hz: tuple[float, float]) -> GainChanges | None:
+def gain_changes(frfs: FrfSet, found: Sequence[PlainResidues]) -> GainChanges | None:
     """Sensors whose gain differs between points of impact; None unless three peaks or more can show it, and do.
 
     Forward selection: a factor enters where an F-test on all peaks leaves less than `FALSE_ALARM` to chance, over all
@@ -161,13 +161,12 @@ def gain_changes(frfs: FrfSet, band_hz: tuple[float, float]) -> GainChanges | No
     ----------
     frfs : FrfSet
         With common poles: aligned where frequencies differ from hit to hit.
-    band_hz : tuple of float
+    found : sequence of PlainResidues
+        Of these FRFs.
     """
-    if min(frfs.hits.shape) < 2 or frfs.hits.size > MOST_CELLS:
+    if min(frfs.hits.shape) < 2 or frfs.hits.size > MOST_CELLS or len(found) < FEWEST_PEAKS:
         return None
-    peaks = _residues(frfs, band_hz)
-    if len(peaks) < FEWEST_PEAKS:
-        return None
+    peaks = [_Peak(p.residues, p.variance, first_right(p.residues, 1)) for p in found]
     cells, logarithms, covariance = _selected(*_weighed(peaks))
     if not cells:
         return None
@@ -180,25 +179,6 @@ def gain_changes(frfs: FrfSet, band_hz: tuple[float, float]) -> GainChanges | No
     std = np.sqrt(np.max(np.sum((full @ covariance) * full, axis=1)))
     factors = np.exp(full @ logarithms).reshape(n_inputs, n_outputs).T
     return GainChanges(frfs.outputs, frfs.inputs, factors, float(std))
-
-
-def _residues(frfs: FrfSet, band_hz: tuple[float, float]) -> list[_Peak]:
-    rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
-    n_outputs, n_inputs = frfs.hits.shape
-    found = []
-    for window in peak_windows(frfs, band_hz):
-        frf = frfs.accelerance(window.lines)[window.outputs].swapaxes(0, 1)
-        peak = peak_residues(window, frf, 2 * np.pi * frfs.frequency_hz[window.lines], rest_s)
-        if peak is None:
-            continue
-        residues = np.zeros((n_inputs, n_outputs), dtype=np.complex128)
-        variance = np.full((n_inputs, n_outputs), np.inf)
-        known = np.isfinite(peak.variance) & (peak.variance > 0)
-        residues[:, window.outputs] = np.where(known, peak.residues, 0.0)
-        variance[:, window.outputs] = np.where(known, peak.variance, np.inf)
-        if residues.any():
-            found.append(_Peak(residues, variance, first_right(residues, 1)))
-    return found
 
 
 def _weighed(peaks: list[_Peak]) -> tuple[list[_Peak], Real]:

@@ -13,6 +13,7 @@ from ema_pipeline.choices import ModeChoice
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
+from ema_pipeline.modal.channel_delays import channel_delays
 from ema_pipeline.modal.chosen import wanted
 from ema_pipeline.modal.data import analysis_band
 from ema_pipeline.modal.drift.align import NOTICED, Alignment, PeakMovement, align
@@ -24,6 +25,7 @@ from ema_pipeline.modal.gain_changes import gain_changes
 from ema_pipeline.modal.hum_removal import hum_of
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.mains_hum import without_hum
+from ema_pipeline.modal.plain_residues import plain_residues
 from ema_pipeline.modal.serial import widening
 from ema_pipeline.modal.settings import ModalSettings
 from ema_pipeline.modal.stated_window import without_growing
@@ -65,7 +67,7 @@ class HitModes:
     ----------
     modal : ModalModel
     frfs : FrfSet
-        From which they were identified: aligned where hits differ in frequency, with one gain of each sensor.
+        From which they were identified: aligned where hits differ in frequency, without faults of sensors.
     alignment : Alignment
     """
 
@@ -132,9 +134,12 @@ def _identified(
         if alignment.shifts is not None:
             del frfs
             frfs = estimate_frfs(hits(), frf_settings, alignment.shifts, coherence=False)
-        gains = gain_changes(frfs, analysis_band(frfs, settings))
-        if gains is not None:
-            frfs = gains.taken_out(frfs)
+        residues = plain_residues(frfs, analysis_band(frfs, settings))
+        faults = [
+            one for one in (gain_changes(frfs, residues), channel_delays(frfs, residues)) if one is not None
+        ]
+        for fault in faults:
+            frfs = fault.taken_out(frfs)
     release_memory()
     asked = wanted(included, frfs.response_decay_rad_s)
     modal = identify(frfs, settings, progress, alignment.known_peaks(), asked)
@@ -143,8 +148,7 @@ def _identified(
     decay = frfs.response_decay_rad_s
     if alignment.n_hits == 1:
         modal = within_decay(of_one_hit(modal, settings.repeatability), alignment, decay)
-    if gains is not None:
-        modal = replace(modal, sensor_notes=(gains.note,))
+    modal = replace(modal, sensor_notes=tuple(fault.note for fault in faults))
     return HitModes(with_movement(modal, alignment, decay), frfs, alignment)
 
 

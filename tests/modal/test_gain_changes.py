@@ -17,6 +17,7 @@ from ema_pipeline.modal.gain_changes import GainChanges, gain_changes
 from ema_pipeline.modal.hit_to_hit import HitModes, identify_hits
 from ema_pipeline.modal.identify import identify
 from ema_pipeline.modal.low_rank import low_rank, tangent
+from ema_pipeline.modal.plain_residues import plain_residues
 from ema_pipeline.modal.settings import ModalSettings
 
 OUTPUTS, INPUTS = [0, 1, 2, 3], [0, 2, 3]
@@ -46,7 +47,8 @@ def constant() -> NDArray[np.float64]:
 
 
 def found(hits: list[HitSamples]) -> GainChanges | None:
-    return gain_changes(estimate_frfs(hits), BAND)
+    frfs = estimate_frfs(hits)
+    return gain_changes(frfs, plain_residues(frfs, BAND))
 
 
 def identified(hits: list[HitSamples]) -> HitModes:

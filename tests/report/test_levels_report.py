@@ -89,7 +89,7 @@ def test_only_what_leaves_no_doubt_is_called_clear(results: RunResults) -> None:
     study = results.configurations[0].levels
     assert study is not None
     assert study.clearly_level_dependent
-    assert not replace(study, p_value=1e-3).clearly_level_dependent
+    assert not replace(study, p_value=1e-3, modes=()).clearly_level_dependent
     assert not replace(study, level_dependent=False).clearly_level_dependent
 
 
