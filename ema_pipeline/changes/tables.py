@@ -13,6 +13,9 @@ from ema_pipeline.number_text import format_percent, format_value, plain, signed
 from ema_pipeline.report.diagnosis_tables import detection_table
 from ema_pipeline.report.tables import Row, Table
 
+_LEAST_SHOWN = 0.005
+"""Change of a frequency in per cent that two decimals show."""
+
 _SHIFTED = 3.0
 """Standard deviations from which a shift of all frequencies is one."""
 
@@ -33,7 +36,10 @@ def verdict_text(found: Changes) -> str:
     if diagnosis.verdict == "not_enough_data":
         return f"The tests have too few modes in common to show a physical change. {_of_modes(found)}"
     odds = probability_text(diagnosis.null_probability)
-    return f"The same within what these tests can show (probability that nothing changed: {odds})."
+    same = f"The same within what these tests can show (probability that nothing changed: {odds})."
+    if any(m.changed for m in found.modes.modes):
+        return f"{same} {_of_modes(found)} Temperature, mounting or another scatter explains that; no effect does."
+    return same
 
 
 def _of_modes(found: Changes) -> str:
@@ -90,6 +96,8 @@ def _shift_text(found: ModeChanges, configuration: str) -> str:
     size = format_percent(shift.relative, shift.std)
     if not shift.alike:
         each = [100 * m.frequency_change[0] for m in found.modes if m.configuration == configuration]
+        if max(map(abs, each)) < _LEAST_SHOWN:
+            return f"frequencies changed by less than {_LEAST_SHOWN:g} %, not all by the same share"
         return f"frequencies changed by {signed(min(each), 2)} to {signed(max(each), 2)} %, not all by the same share"
     if abs(shift.relative) < _SHIFTED * shift.std:
         return f"no shift common to all frequencies ({size})"

@@ -118,8 +118,11 @@ class _Phases:
         """Delays of some sensors, each against all others in turn."""
         now = delay.copy()
         for _ in range(SWEEPS):
+            before = now.copy()
             for output in some:
                 now[output] = self.best(output, now)
+            if np.array_equal(before, now):
+                break
         return now
 
 

@@ -148,7 +148,8 @@ def perhaps_words(found: Diagnosis) -> str:
     c = found.suspected
     if c is None:
         return ""
-    return f"Perhaps {label_words(c.label)} ({probability_text(c.probability)}), not supported enough to be claimed."
+    probable = f"{probability_text(c.probability)}, sizes that would not show included"
+    return f"Perhaps {label_words(c.label)} ({probable}), not supported enough to be claimed."
 
 
 def or_words(c: Candidate) -> str:

@@ -15,7 +15,7 @@ from bench import ema, write_bench
 from ema_pipeline.changes.matrices import MacMatrix
 from ema_pipeline.changes.modes import mode_changes
 from ema_pipeline.changes.physics import pair_observations
-from ema_pipeline.changes.tables import mac_table, notes, short_modes_table
+from ema_pipeline.changes.tables import mac_table, notes, short_modes_table, verdict_text
 from ema_pipeline.changes.two_tests import Changes
 from ema_pipeline.commands.screen import show
 from ema_pipeline.correlate.matching import match_modes
@@ -214,6 +214,27 @@ def test_a_mode_of_one_test_alone_is_said() -> None:
     assert [m.mode_a for m in found.modes] == [1]
     assert found.only_a == (("default", 2, 20.0),)
     assert found.only_b == (("default", 2, 30.0),)
+
+
+def test_modes_that_changed_although_no_effect_explains_it_are_said_beside_the_answer() -> None:
+    before = {"default": _modes([10.0, 20.0], SHAPES[:2], std=1e-7)}
+    diagnosis = SimpleNamespace(
+        verdict="adequate", null_probability=0.99, ladder=SimpleNamespace(rungs=[SimpleNamespace(error=1.0)])
+    )
+    physics = SimpleNamespace(claimed=(), diagnosis=diagnosis)
+
+    def said(hz: list[float]) -> tuple[str, str]:
+        modes = mode_changes(before, {"default": _modes(hz, SHAPES[:2], std=1e-7)})
+        found = cast("Changes", SimpleNamespace(modes=modes, physics=physics))
+        return verdict_text(found), notes(found)[0]
+
+    changed, shift = said([10.0001, 19.9995])
+    assert changed.endswith(
+        "2 of 2 modes in common changed beyond their intervals (p < 0.01 over all that was compared). Temperature, "
+        "mounting or another scatter explains that; no effect does."
+    )
+    assert shift == "default: frequencies changed by less than 0.005 %, not all by the same share."
+    assert said([10.0, 20.0])[0].endswith("(probability that nothing changed: 99.0 %).")
 
 
 @pytest.mark.parametrize(

@@ -529,7 +529,8 @@ def test_an_adequate_verdict_has_the_probability_that_nothing_is_missing_that_wo
     )
     doubtful = replace(one, null_probability=0.3)
     assert run_screen._diagnosed(doubtful).endswith(
-        "Perhaps mesh stiffness loss at sun-planet1 (4.0 %), not supported enough to be claimed."
+        "Perhaps mesh stiffness loss at sun-planet1 (4.0 %, sizes that would not show included), not supported enough "
+        "to be claimed."
     )
     assert replace(one, nothing_visible=math.nan).adequate_probability == one.null_probability == 0.9
 
