@@ -22,10 +22,10 @@ _OF_TESTS = (FREQUENCY, FREQUENCY_NOISE, SHAPE)
 """Scatters of what tests and models have wrong, and no parts. In 118 simulated tests of rigs without fault none was
 more than a fifteenth above its default, which is what is usual; what was not in the library and was missed had brought
 them to twice their defaults. Those of parts differ from rig to rig: masses of a right model scattered by 4 %."""
-MOST_GAINED = 25.0
-"""Log evidence that larger ones may gain, a larger mixing of close shapes, and parts further out than parts scatter. Of
-rigs without fault one gained 20, by mixing, and no other more than 7; effects that the library lacked gained 40 to 150
-where the error without all that was 1.0 to 1.35, since a few frequencies hardly count among hundreds of entries."""
+MOST_GAINED, MOST_WITH_MIXING = 15.0, 25.0
+"""Log evidence that larger ones may gain, and parts further out than parts scatter; and that with a larger mixing of
+close shapes. Of rigs without fault one gained 20, by mixing, and no other more than 7; effects that the library lacked
+gained 40 to 150 where the error without all that was 1.0 to 1.35: frequencies hardly count among entries of shapes."""
 _USUAL_DAMPING_SCATTER = 0.5
 """1 σ of ln ζ from mode to mode in normal laboratories, where nothing but joints, cables and the suspension damps."""
 _BY_CHANCE = 0.005
@@ -116,8 +116,9 @@ def explanation(observations: Observations, fit: Fit, settings: DiagnoseSettings
     narrow = at_usual_scatters(observations, usual, (MIXING,))
     judged = within_scatter(observations, usual).posterior
     held = judged if narrow is usual else within_scatter(observations, narrow).posterior
-    wider = p.evidence_at_scatters - held.evidence_at_scatters > MOST_GAINED
-    fails = wider or judged.fails(limit)
+    gained = p.evidence_at_scatters - judged.evidence_at_scatters
+    with_mixing = p.evidence_at_scatters - held.evidence_at_scatters
+    fails = gained > MOST_GAINED or with_mixing > MOST_WITH_MIXING or judged.fails(limit)
     by_scatter = 0.0
     if fails and narrow is not fit and not within_scatter(observations, fit).posterior.fails(limit):
         by_scatter = held.error
