@@ -140,10 +140,9 @@ def peak_poles(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> 
     rest_s : float
         Time from hit to end of the record.
     """
-    known = np.asarray(np.isfinite(frf).all(axis=-1))
-    data = np.where(known[..., None], frf, 0.0)
-    shared = _shared_pole(window, data, known, omega, rest_s)
-    if shared is None or _explained(shared[0], window, data, omega, rest_s) < FOLLOWED:
+    known, data = _filled(frf)
+    shared = _shared_pole(window, data, known, omega, rest_s, FOLLOWED)
+    if shared is None:
         return None
     pole, noise = shared
     n_hits, n_outputs = known.shape
@@ -207,13 +206,9 @@ def plain_pole(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> 
     rest_s : float
         Time from hit to end of the record.
     """
-    known = np.asarray(np.isfinite(frf).all(axis=-1))
-    data = np.where(known[..., None], frf, 0.0)
-    shared = _shared_pole(window, data, known, omega, rest_s)
-    if shared is None:
-        return None
-    explained = _explained(shared[0], window, data, omega, rest_s)
-    return shared[0] if explained > EXPLAINED else None
+    known, data = _filled(frf)
+    shared = _shared_pole(window, data, known, omega, rest_s, EXPLAINED)
+    return None if shared is None else shared[0]
 
 
 def peak_residues(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> PeakResidues | None:
@@ -228,10 +223,9 @@ def peak_residues(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) 
     rest_s : float
         Time from hit to end of the record.
     """
-    known = np.asarray(np.isfinite(frf).all(axis=-1))
-    data = np.where(known[..., None], frf, 0.0)
-    shared = _shared_pole(window, data, known, omega, rest_s)
-    if shared is None or _explained(shared[0], window, data, omega, rest_s) < FOLLOWED:
+    known, data = _filled(frf)
+    shared = _shared_pole(window, data, known, omega, rest_s, FOLLOWED)
+    if shared is None:
         return None
     fit = _linear_fit(shared[0], window.neighbours, data.reshape(-1, len(omega)), omega, rest_s)
     if fit is None or len(omega) <= fit.free:
@@ -267,10 +261,16 @@ def _explained(pole: complex, window: PeakWindow, data: Complex, omega: Real, re
     return 1.0 - float(np.sum(np.abs(fit.left) ** 2)) / max(without, 1e-300)
 
 
+def _filled(frf: Complex) -> tuple[NDArray[np.bool_], Complex]:
+    """Which FRFs were measured, and all of them with 0 in place of the others."""
+    known = np.asarray(np.isfinite(frf).all(axis=-1))
+    return known, np.where(known[..., None], frf, 0.0)
+
+
 def _shared_pole(
-    window: PeakWindow, data: Complex, known: NDArray[np.bool_], omega: Real, rest_s: float
+    window: PeakWindow, data: Complex, known: NDArray[np.bool_], omega: Real, rest_s: float, least: float
 ) -> tuple[complex, Real] | None:
-    """Pole that fits all hits best, and the noise power of every output."""
+    """Pole that fits all hits best, and the noise power of every output; None where it explains less than `least`."""
     pole = window.pole
     flat = data.reshape(-1, len(omega))
     noise = np.ones(data.shape[1])
@@ -284,7 +284,9 @@ def _shared_pole(
         pole = _moved(pole, step)
         if not omega[0] < pole.imag < omega[-1] or not 0 < -pole.real < MAX_DAMPING * abs(pole):
             return None
-    return None if np.exp(pole.real * rest_s) > RINGS_ON else (pole, noise)
+    if np.exp(pole.real * rest_s) > RINGS_ON or _explained(pole, window, data, omega, rest_s) < least:
+        return None
+    return pole, noise
 
 
 def _own_pole(
