@@ -109,6 +109,11 @@ class FrfSet:
     variance_lines: NDArray[np.int64] | None = None
     rings_on: bool = False
 
+    @property
+    def rest_s(self) -> float:
+        """Time from the mean hit to the end of the record, s."""
+        return max(self.record_s - float(np.nanmean(self.delay_s)), 0.5 * self.record_s)
+
     def accelerance(self, lines: slice = ALL_LINES) -> NDArray[np.complex128]:
         """All FRFs as acceleration over force, (m/s²)/N, shape (n_outputs, n_inputs, n_lines)."""
         power = {"acceleration": 0, "velocity": 1, "displacement": 2}

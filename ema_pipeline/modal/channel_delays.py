@@ -17,15 +17,9 @@ from scipy.stats import f as variance_ratio
 from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.low_rank import first_right, low_rank
-from ema_pipeline.modal.plain_residues import PlainResidues
+from ema_pipeline.modal.plain_residues import FALSE_ALARM, FEWEST_PEAKS, PlainResidues
 
 Real = NDArray[np.float64]
-
-FEWEST_PEAKS = 3
-"""Peaks that must show one delay."""
-
-FALSE_ALARM = 1e-6
-"""Probability that the phases of shapes that are not quite real make a delay anywhere."""
 
 TRIALS = 20
 """Delays that are tried on each sensor count as so many independent ones."""

@@ -148,13 +148,11 @@ def arrange(frfs: FrfSet, band_hz: tuple[float, float]) -> FitData:
         )
     if not measured.all():
         acc = np.where(measured[..., None], acc, 0.0)
-    delay_s = float(np.nanmean(frfs.delay_s))
-    rest_s = max(frfs.record_s - delay_s, 0.5 * frfs.record_s)
     transposed = acc.shape[0] < acc.shape[1]
     if transposed:
         acc, variance, measured = acc.swapaxes(0, 1), variance.swapaxes(0, 1), measured.T
     in_turn = len(frfs.inputs) > 1 and bool(moved_sensors(frfs))
     return FitData(
-        omega, acc, variance, measured, rest_s, transposed, frfs.response_decay_rad_s, in_turn,
-        delay_s if frfs.rings_on else None,
+        omega, acc, variance, measured, frfs.rest_s, transposed, frfs.response_decay_rad_s, in_turn,
+        float(np.nanmean(frfs.delay_s)) if frfs.rings_on else None,
     )  # fmt: skip

@@ -18,16 +18,10 @@ from scipy.stats import f as variance_ratio
 from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.low_rank import first_right, low_rank, tangent
-from ema_pipeline.modal.plain_residues import PlainResidues
+from ema_pipeline.modal.plain_residues import FALSE_ALARM, FEWEST_PEAKS, PlainResidues
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
-
-FEWEST_PEAKS = 3
-"""Peaks that must share a factor: of each one it may be a second mode close by."""
-
-FALSE_ALARM = 1e-6
-"""Probability that noise makes a factor anywhere."""
 
 MOST_CELLS = 1000
 """FRFs above which nothing is looked for: the strongest sensors of so many would not stand for the rest."""

@@ -117,7 +117,7 @@ def without_hum(modal: ModalModel, hits: Hits, frfs: FrfSet, wanted: KnownPeaks)
     wanted : KnownPeaks
         Modes that the user asked for, which stay.
     """
-    rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
+    rest_s = frfs.rest_s
     looked_at = [
         candidate
         for k, mode in enumerate(modal.modes)

@@ -9,10 +9,16 @@ from numpy.typing import NDArray
 
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.drift.local import peak_residues
-from ema_pipeline.modal.drift.windows import peak_windows
+from ema_pipeline.modal.drift.windows import peak_frfs
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
+
+FEWEST_PEAKS = 3
+"""Peaks that must show a fault of a sensor alike: of each one it may be a second mode close by."""
+
+FALSE_ALARM = 1e-6
+"""Probability that chance makes a fault anywhere in a set of FRFs."""
 
 
 @dataclass(frozen=True)
@@ -36,19 +42,14 @@ class PlainResidues:
 
 def plain_residues(frfs: FrfSet, band_hz: tuple[float, float]) -> list[PlainResidues]:
     """Residues of every plain peak in a band, at the pole that all FRFs share."""
-    rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
     n_outputs, n_inputs = frfs.hits.shape
     found = []
-    for window in peak_windows(frfs, band_hz):
-        frf = frfs.accelerance(window.lines)[window.outputs].swapaxes(0, 1)
-        peak = peak_residues(window, frf, 2 * np.pi * frfs.frequency_hz[window.lines], rest_s)
-        if peak is None:
+    for window, frf, omega in peak_frfs(frfs, band_hz):
+        peak = peak_residues(window, frf, omega, frfs.rest_s)
+        if peak is None or not peak.residues.any():
             continue
         residues = np.zeros((n_inputs, n_outputs), dtype=np.complex128)
         variance = np.full((n_inputs, n_outputs), np.inf)
-        known = np.isfinite(peak.variance) & (peak.variance > 0)
-        residues[:, window.outputs] = np.where(known, peak.residues, 0.0)
-        variance[:, window.outputs] = np.where(known, peak.variance, np.inf)
-        if residues.any():
-            found.append(PlainResidues(window.pole.imag, residues, variance))
+        residues[:, window.outputs], variance[:, window.outputs] = peak.residues, peak.variance
+        found.append(PlainResidues(window.pole.imag, residues, variance))
     return found

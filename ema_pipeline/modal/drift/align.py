@@ -166,7 +166,7 @@ def align(hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float,
         return nothing
     keys, spectra = spectra_of_hits(hits, frfs, settings, windows)
     spectra = [_of_fixed_sensors(frf) for frf in spectra]
-    rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
+    rest_s = frfs.rest_s
     omega = 2 * np.pi * frfs.frequency_hz
     found = [peak_poles(w, frf, omega[w.lines], rest_s) for w, frf in zip(windows, spectra, strict=True)]
     if len(keys) == 1:

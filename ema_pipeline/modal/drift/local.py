@@ -106,8 +106,9 @@ class PeakResidues:
     Attributes
     ----------
     residues : complex ndarray, (n_inputs, n_outputs)
+        0 where not known.
     variance : ndarray, (n_inputs, n_outputs)
-        E|r - E r|² of each, from what the fit leaves of its FRF; infinite where not measured.
+        E|r - E r|² of each, from what the fit leaves of its FRF; infinite where not known.
     """
 
     residues: Complex
@@ -231,8 +232,10 @@ def peak_residues(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) 
     if fit is None or len(omega) <= fit.free:
         return None
     power = np.sum(np.abs(fit.left) ** 2, axis=-1) / (len(omega) - fit.free) * _serial(fit.left)
-    variance = np.where(known, fit.gain * power.reshape(known.shape), np.inf)
-    return PeakResidues(fit.residues.reshape(known.shape), variance)
+    variance = fit.gain * power.reshape(known.shape)
+    known &= variance > 0
+    residues = np.where(known, fit.residues.reshape(known.shape), 0.0)
+    return PeakResidues(residues, np.where(known, variance, np.inf))
 
 
 def _serial(left: Complex) -> Real:

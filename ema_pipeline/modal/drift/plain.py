@@ -6,7 +6,7 @@ import numpy as np
 
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.drift.local import plain_pole
-from ema_pipeline.modal.drift.windows import peak_windows
+from ema_pipeline.modal.drift.windows import peak_frfs
 from ema_pipeline.modal.peaks import KnownPeaks
 
 REACH = 2.0
@@ -25,11 +25,9 @@ def plain_peaks(frfs: FrfSet, band_hz: tuple[float, float]) -> KnownPeaks:
     frfs : FrfSet
     band_hz : tuple of float
     """
-    rest_s = max(frfs.record_s - float(np.nanmean(frfs.delay_s)), 0.5 * frfs.record_s)
     found = []
-    for window in peak_windows(frfs, band_hz, most=None):
-        frf = frfs.accelerance(window.lines)[window.outputs].swapaxes(0, 1)
-        pole = plain_pole(window, frf, 2 * np.pi * frfs.frequency_hz[window.lines], rest_s)
+    for window, frf, omega in peak_frfs(frfs, band_hz, most=None):
+        pole = plain_pole(window, frf, omega, frfs.rest_s)
         if pole is not None:
             found.append(pole)
     poles = np.array(found, dtype=np.complex128)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -111,6 +111,15 @@ def peak_windows(
     decay = np.array([max(_half_width(curve, k), 0.3) for k in kept]) * step
     poles = np.asarray(-decay + 1j * step * kept, dtype=np.complex128)
     return tuple(_window(frfs, level, poles, r, step) for r in range(len(poles)))
+
+
+def peak_frfs(
+    frfs: FrfSet, band_hz: tuple[float, float], most: int | None = MAX_PEAKS
+) -> Iterator[tuple[PeakWindow, Complex, Real]]:
+    """The same with the accelerances there, (n_inputs, n_outputs, n_lines), and the lines' frequencies, rad/s."""
+    for window in peak_windows(frfs, band_hz, most):
+        frf = frfs.accelerance(window.lines)[window.outputs].swapaxes(0, 1)
+        yield window, frf, 2 * np.pi * frfs.frequency_hz[window.lines]
 
 
 def _response_curve(frfs: FrfSet, level: Real) -> Real:
