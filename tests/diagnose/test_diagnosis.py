@@ -350,7 +350,7 @@ def test_what_is_known_already_is_not_looked_for_again() -> None:
 # --- verdicts, groups and held-out data ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [3, 5])
+@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.slow)])
 def test_a_spring_to_ground_of_a_free_rig_is_named_though_the_mode_that_it_holds_has_little_damping(
     seed: int,
 ) -> None:

@@ -189,7 +189,9 @@ def test_a_usual_laboratory_raises_no_suspicion(cautions: Told) -> None:
     assert not [c for c in cautions() if "sensitivity" in c or "opposite sign" in c]
 
 
-@pytest.mark.parametrize("folder", ["blind/p2", "imperfect/g1004", "imperfect/g1007"])
+@pytest.mark.parametrize(
+    "folder", [pytest.param("blind/p2", marks=pytest.mark.slow), "imperfect/g1004", "imperfect/g1007"]
+)
 def test_imperfect_rigs_raise_no_suspicion(
     test_data: Path, folder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -122,7 +122,7 @@ def test_three_modes_of_a_frame_and_no_others(test_data: Path, tmp_path: Path) -
     assert frequencies(model) == pytest.approx([2.17, 6.89, 13.263], rel=8e-3)
 
 
-@pytest.fixture(scope="module", params=["i2", "i3"])
+@pytest.fixture(scope="module", params=[pytest.param("i2", marks=pytest.mark.slow), "i3"])
 def imperfect(
     request: pytest.FixtureRequest, test_data: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Store, str]:
