@@ -11,7 +11,8 @@ from ema_pipeline.frf.estimate import Shifts
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.records import HitSamples
-from ema_pipeline.modal.drift.local import DecayChange, PeakPoles, change_in_decay, peak_poles
+from ema_pipeline.modal.drift.follow import FollowedPeak, follow_peak
+from ema_pipeline.modal.drift.local import DecayChange, change_in_decay
 from ema_pipeline.modal.drift.shifts import Movement, movement
 from ema_pipeline.modal.drift.windows import HitKey, Hits, peak_windows, spectra_of_hits
 from ema_pipeline.modal.peaks import KnownPeaks
@@ -35,10 +36,6 @@ LEAST = 3e-4
 MOVES = 0.05
 """Movement of one peak beyond that of all, in half-power half-widths, from which a fit makes twins of it."""
 
-ONE_MODE = 0.02
-"""Second over first singular value of the residues of a peak over hits, above which more than one mode shows in
-it: hits on other points then excite another mixture, which looks like movement."""
-
 REACH = 2.0
 """Decay rates within which no second mode is looked for at a peak that one mode makes."""
 
@@ -54,7 +51,7 @@ MOST_HITS = 0.6
 
 @dataclass(frozen=True)
 class PeakMovement:
-    """How the frequency and damping of one peak differ from hit to hit.
+    """How the frequency and damping of one mode that makes a peak, alone or with another, differ from hit to hit.
 
     Attributes
     ----------
@@ -168,19 +165,23 @@ def align(hits: Hits, frfs: FrfSet, settings: FrfSettings, band_hz: tuple[float,
     spectra = [_of_fixed_sensors(frf) for frf in spectra]
     rest_s = frfs.rest_s
     omega = 2 * np.pi * frfs.frequency_hz
-    found = [peak_poles(w, frf, omega[w.lines], rest_s) for w, frf in zip(windows, spectra, strict=True)]
+    one_point = len({k.point for k in keys}) == 1
+    found = [
+        follow_peak(w, frf, omega[w.lines], rest_s, one_point=one_point)
+        for w, frf in zip(windows, spectra, strict=True)
+    ]
     if len(keys) == 1:
         one = [
-            change_in_decay(w, frf[0], complex(p.poles[0]), omega[w.lines], rest_s)
+            change_in_decay(w, frf[0], complex(p.of_hits[0, 0]), omega[w.lines], rest_s)
             for w, frf, p in zip(windows, spectra, found, strict=True)
-            if p is not None and np.isfinite(p.std[0])
+            if p is not None and p.shown[0]
         ]
         return replace(nothing, changes=tuple(change for change in one if change is not None))
-    peaks = [p for p in found if p is not None and 2 * np.isfinite(p.std).sum() >= len(keys)]
+    peaks = [p for p in found if p is not None and 2 * p.shown.sum() >= len(keys)]
     if len(keys) < FEWEST_HITS or not peaks:
         return nothing
     moved, looked_at = _movements(peaks, keys)
-    warps = _warps(peaks, looked_at, moved, frfs.frequency_hz)
+    warps = _warps(looked_at, moved, frfs.frequency_hz)
     if not warps:
         return Alignment(moved.spread, moved.mean_std, len(keys), looked_at)
     by_hit = {key.name: warps[k] for k, key in enumerate(keys)}
@@ -205,72 +206,52 @@ def _of_fixed_sensors(frf: Complex) -> Complex:
     return frf[:, fixed] if fixed.any() else frf
 
 
-def _movements(peaks: list[PeakPoles], keys: tuple[HitKey, ...]) -> tuple[Movement, tuple[PeakMovement, ...]]:
-    """What all peaks have in common, and each peak by itself."""
-    size = np.array([np.linalg.norm(p.residues, axis=1) for p in peaks]).T
-    shift = np.array([p.poles.imag / p.pole.imag - 1 for p in peaks]).T
-    std = np.array([p.std / p.pole.imag for p in peaks]).T
+def _movements(
+    peaks: list[FollowedPeak], keys: tuple[HitKey, ...]
+) -> tuple[Movement, tuple[PeakMovement, ...]]:
+    """What all peaks have in common, and each mode that makes one by itself; `own` of the first is by mode."""
+    size = np.array([np.linalg.norm(p.residues, axis=(1, 2)) for p in peaks]).T
+    shift = np.array([p.moved.imag for p in peaks]).T
+    std = np.array([p.std for p in peaks]).T
     points = sorted({k.point for k in keys})
     place = np.array([points.index(k.point) for k in keys])
     typical = np.array([np.median(s[np.isfinite(e)]) for s, e in zip(size.T, std.T, strict=True)])
-    moved = movement(shift, std, size / np.maximum(typical, 1e-300), place)
-    # the hits that show a peak best have a drift of their own on average: poles are told at the mean drift of all hits
-    power = np.where(np.isfinite(std), size**2, 0.0)
-    share = power / np.maximum(power.sum(axis=0), 1e-300)
-    drift = share.T @ moved.common
-    peaks = [replace(p, pole=p.pole * (1 - d)) for p, d in zip(peaks, drift, strict=True)]
-    # own movement is told from the pole: the mean over hits is off where hits on some point show another mode's flank
-    moved = replace(moved, own=moved.own - np.sum(share * moved.own, axis=0))
-    hits = power.sum(axis=0) ** 2 / np.maximum((power**2).sum(axis=0), 1e-300)
+    moved = movement(shift, std, size / np.maximum(typical, 1e-300), place, [p.share for p in peaks])
     force = np.array([k.force for k in keys])
-    looked_at = tuple(
-        PeakMovement(
-            frequency_hz=abs(p.pole) / (2 * np.pi),
-            damping_ratio=-p.pole.real / abs(p.pole),
-            pole=p.pole,
-            hits=float(hits[c]),
-            spread=_spread(p, float(moved.own_spread[c])),
-            single=_is_single(p, one_point=len(points) == 1),
-            proven=len(points) > 1 and _is_single(p, one_point=False),
-            shift=np.where(np.isfinite(p.std), moved.common + moved.own[:, c], np.nan),
-            common=moved.common,
-            shift_std=std[:, c],
-            force=force,
-            own_spread=float(moved.own_spread[c]),
-            drift=float(drift[c]),
-            common_std=moved.error.mean_std(share[:, c]),
-        )
-        for c, p in enumerate(peaks)
-    )
-    return moved, looked_at
+    looked_at, own = [], []
+    for c, peak in enumerate(peaks):
+        for m, pole in enumerate(peak.poles):
+            # hits that show a mode best have a drift of their own on average: it is told at the mean drift of all hits
+            power = np.where(peak.shown, np.sum(np.abs(peak.residues[:, :, m]) ** 2, axis=1), 0.0)
+            share = power / max(float(power.sum()), 1e-300)
+            drift = float(share @ moved.common)
+            pole = complex(pole * (1 - drift))
+            # own movement is told from the pole: the mean over hits is off where some show another mode's flank
+            own.append(moved.own[:, c] - share @ moved.own[:, c])
+            own_spread = float(moved.own_spread[c])
+            decay = pole.imag * np.sqrt(float(share @ peak.moved.real**2))
+            looked_at.append(
+                PeakMovement(
+                    frequency_hz=abs(pole) / (2 * np.pi),
+                    damping_ratio=-pole.real / abs(pole),
+                    pole=pole,
+                    hits=float(power.sum() ** 2 / max(float(np.sum(power**2)), 1e-300)),
+                    spread=np.array([decay, own_spread * pole.imag]),
+                    single=len(peak.poles) == 1 if len(points) == 1 else peak.single,
+                    proven=len(points) > 1 and peak.single,
+                    shift=np.where(peak.shown, moved.common + own[-1], np.nan),
+                    common=moved.common,
+                    shift_std=std[:, c],
+                    force=force,
+                    own_spread=own_spread,
+                    drift=drift,
+                    common_std=moved.error.mean_std(share),
+                )
+            )
+    return replace(moved, own=np.array(own).T), tuple(looked_at)
 
 
-def _spread(peak: PeakPoles, own_spread: float) -> Real:
-    """Standard deviations of decay and frequency over hits, rad/s, (2,).
-
-    Decays are weighted as the shared pole weighs them, by the power with which a hit shows the peak.
-    """
-    power = np.where(np.isfinite(peak.std), np.sum(np.abs(peak.residues) ** 2, axis=1), 0.0)
-    off = peak.poles.real - peak.pole.real
-    decay = np.sqrt(np.sum(power * off**2) / max(float(power.sum()), 1e-300))
-    return np.array([float(decay), own_spread * peak.pole.imag])
-
-
-def _is_single(peak: PeakPoles, *, one_point: bool) -> bool:
-    """True where hits on different points show one and the same shape, or all hits struck one point."""
-    if one_point:
-        return True
-    shown = np.isfinite(peak.std)
-    if peak.residues.shape[1] < 2 or np.count_nonzero(shown) < 2:
-        return False
-    scaled = peak.residues[shown] / peak.std[shown, None]
-    values = np.linalg.svd(scaled, compute_uv=False)
-    return bool(values[1] < ONE_MODE * values[0])
-
-
-def _warps(
-    peaks: list[PeakPoles], looked_at: tuple[PeakMovement, ...], moved: Movement, frequency_hz: Real
-) -> dict[int, Real]:
+def _warps(looked_at: tuple[PeakMovement, ...], moved: Movement, frequency_hz: Real) -> dict[int, Real]:
     """Shift of every line of every hit; empty where nothing moves enough to be noticed."""
     damping = np.array([p.damping_ratio for p in looked_at])
     clear = moved.spread > CLEAR * float(np.median(moved.common_std))

@@ -1,7 +1,7 @@
-"""Pole of one peak in every single hit, from the lines around it, residues free in every FRF.
+"""Poles of one peak from the lines around it, residues free in every FRF.
 
-No mode shape is needed for it: a wrong one, as a fit of hits that do not belong together gives, would hide
-the movement that is looked for.
+No mode shape is needed for it: a wrong one, as a fit of hits that do not belong together gives, would hide what is
+looked for.
 """
 
 from __future__ import annotations
@@ -20,14 +20,8 @@ Real = NDArray[np.float64]
 SHARED_STEPS = 8
 """Steps of the pole that all hits share."""
 
-OWN_STEPS = 4
-"""Steps from there to the pole of each hit."""
-
 LARGEST_STEP = 0.5
 """Largest step of a pole, in its decay rate."""
-
-FARTHEST = 3.0
-"""A hit whose pole lies farther from that of all, in decay rates, does not show the mode."""
 
 RINGS_ON = 0.7
 """Share of a peak left at the end of the record above which it is a tone, not a decay."""
@@ -36,7 +30,7 @@ EXPLAINED = 0.9
 """Share of what a straight background leaves of the lines around a peak that one pole explains of a plain one."""
 
 FOLLOWED = 0.7
-"""The same for a peak that is followed from hit to hit: noise makes peaks that a pole explains worse."""
+"""The same for a peak that is followed from hit to hit: noise makes peaks that poles explain worse."""
 
 FEWEST_LEFT = 6
 """Lines beyond the unknowns without which nothing is said of what a peak does within a decay."""
@@ -46,28 +40,6 @@ MOST_ALIKE = 0.95
 
 MAX_DAMPING = 0.2
 """A pole with more is no peak."""
-
-
-@dataclass(frozen=True)
-class PeakPoles:
-    """Poles of one peak.
-
-    Attributes
-    ----------
-    pole : complex
-        That all hits share, rad/s.
-    poles : complex ndarray, (n_hits,)
-        Of every hit.
-    std : ndarray, (n_hits,)
-        Standard deviation of real and imaginary part, rad/s; ``inf`` where a hit does not show the peak.
-    residues : complex ndarray, (n_hits, n_outputs)
-        0 where a channel was left out.
-    """
-
-    pole: complex
-    poles: Complex
-    std: Real
-    residues: Complex
 
 
 @dataclass(frozen=True)
@@ -116,43 +88,26 @@ class PeakResidues:
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """Linear fit of some FRFs: residues (n_frfs,), what is left (n_frfs, n_lines), and the derivative.
+class LinearFit:
+    """Fit of some FRFs at given poles.
 
-    `gain` is the variance of a residue over that of a line.
+    Attributes
+    ----------
+    residues : complex ndarray, (n_frfs, n_modes)
+    left : complex ndarray, (n_frfs, n_lines)
+    derivatives : complex ndarray, (n_modes, n_lines)
+        By the poles, what residues and background cannot follow.
+    free : int
+        Number of coefficients of each FRF.
+    gain : float
+        Variance of a residue of the first mode over that of a line.
     """
 
     residues: Complex
     left: Complex
-    derivative: Complex
+    derivatives: Complex
     free: int
     gain: float
-
-
-def peak_poles(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> PeakPoles | None:
-    """Pole of a peak in every hit; None where no pole is found at the peak.
-
-    Parameters
-    ----------
-    window : PeakWindow
-    frf : complex ndarray, (n_hits, n_outputs, n_lines)
-        Accelerance of single hits on the lines of the window; NaN where not measured.
-    omega : ndarray, (n_lines,)
-    rest_s : float
-        Time from hit to end of the record.
-    """
-    known, data = _filled(frf)
-    shared = _shared_pole(window, data, known, omega, rest_s, FOLLOWED)
-    if shared is None:
-        return None
-    pole, noise = shared
-    n_hits, n_outputs = known.shape
-    poles, std = np.full(n_hits, pole), np.full(n_hits, np.inf)
-    residues = np.zeros((n_hits, n_outputs), dtype=np.complex128)
-    weight = np.where(known, 1.0 / noise, 0.0)
-    for h in range(n_hits):
-        poles[h], std[h], residues[h] = _own_pole(window, data[h], weight[h], pole, omega, rest_s)
-    return PeakPoles(pole, poles, std, residues)
 
 
 def change_in_decay(
@@ -176,15 +131,16 @@ def change_in_decay(
         Time from hit to end of the record.
     """
     data = frf[np.isfinite(frf).all(axis=-1)]
-    fit = _linear_fit(pole, window.neighbours, data, omega, rest_s)
+    fit = linear_fit(np.array([pole]), window.neighbours, data, omega, rest_s)
     if fit is None or len(omega) < fit.free + FEWEST_LEFT:
         return None
     noise = np.maximum(np.mean(np.abs(fit.left) ** 2, axis=1), 1e-300)
-    weight = fit.residues.conj() / noise
+    residues = fit.residues[:, 0]
     # all sensors share c, and the force's noise: they are one curve
-    curve = weight @ fit.left / float(np.sum(np.abs(fit.residues) ** 2 / noise))
+    curve = residues.conj() / noise @ fit.left / float(np.sum(np.abs(residues) ** 2 / noise))
     fast = pole_functions(omega, np.array([complex(3 * pole.real, pole.imag)]), rest_s)[0]
-    columns = np.stack([_across(fast, pole, window.neighbours, omega, rest_s)[0], fit.derivative], axis=1)
+    across = _across(fast, pole, window.neighbours, omega, rest_s)[0]
+    columns = np.stack([across, fit.derivatives[0]], axis=1)
     shares, _, rank, _ = np.linalg.lstsq(columns, curve, rcond=None)
     if rank < 2:
         return None
@@ -207,9 +163,9 @@ def plain_pole(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> 
     rest_s : float
         Time from hit to end of the record.
     """
-    known, data = _filled(frf)
-    shared = _shared_pole(window, data, known, omega, rest_s, EXPLAINED)
-    return None if shared is None else shared[0]
+    known, data = filled(frf)
+    shared = shared_poles(window, np.array([window.pole]), data, known, omega, rest_s, EXPLAINED)
+    return None if shared is None else complex(shared[0][0])
 
 
 def peak_residues(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> PeakResidues | None:
@@ -224,17 +180,17 @@ def peak_residues(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) 
     rest_s : float
         Time from hit to end of the record.
     """
-    known, data = _filled(frf)
-    shared = _shared_pole(window, data, known, omega, rest_s, FOLLOWED)
+    known, data = filled(frf)
+    shared = shared_poles(window, np.array([window.pole]), data, known, omega, rest_s, FOLLOWED)
     if shared is None:
         return None
-    fit = _linear_fit(shared[0], window.neighbours, data.reshape(-1, len(omega)), omega, rest_s)
+    fit = linear_fit(shared[0], window.neighbours, data.reshape(-1, len(omega)), omega, rest_s)
     if fit is None or len(omega) <= fit.free:
         return None
     power = np.sum(np.abs(fit.left) ** 2, axis=-1) / (len(omega) - fit.free) * _serial(fit.left)
     variance = fit.gain * power.reshape(known.shape)
     known &= variance > 0
-    residues = np.where(known, fit.residues.reshape(known.shape), 0.0)
+    residues = np.where(known, fit.residues[:, 0].reshape(known.shape), 0.0)
     return PeakResidues(residues, np.where(known, variance, np.inf))
 
 
@@ -253,10 +209,10 @@ def _serial(left: Complex) -> Real:
     return np.asarray((1 + alike) / (1 - alike))
 
 
-def _explained(pole: complex, window: PeakWindow, data: Complex, omega: Real, rest_s: float) -> float:
-    """Share of what a straight background leaves of the FRFs that a pole explains."""
+def _explained(poles: Complex, window: PeakWindow, data: Complex, omega: Real, rest_s: float) -> float:
+    """Share of what a straight background leaves of the FRFs that poles explain."""
     flat = data.reshape(-1, len(omega))
-    fit = _linear_fit(pole, window.neighbours, flat, omega, rest_s)
+    fit = linear_fit(poles, window.neighbours, flat, omega, rest_s)
     if fit is None:
         return 0.0
     basis = np.linalg.qr(np.stack([np.ones(len(omega)), np.linspace(-1, 1, len(omega))]).T)[0]
@@ -264,69 +220,84 @@ def _explained(pole: complex, window: PeakWindow, data: Complex, omega: Real, re
     return 1.0 - float(np.sum(np.abs(fit.left) ** 2)) / max(without, 1e-300)
 
 
-def _filled(frf: Complex) -> tuple[NDArray[np.bool_], Complex]:
+def filled(frf: Complex) -> tuple[NDArray[np.bool_], Complex]:
     """Which FRFs were measured, and all of them with 0 in place of the others."""
     known = np.asarray(np.isfinite(frf).all(axis=-1))
     return known, np.where(known[..., None], frf, 0.0)
 
 
-def _shared_pole(
-    window: PeakWindow, data: Complex, known: NDArray[np.bool_], omega: Real, rest_s: float, least: float
-) -> tuple[complex, Real] | None:
-    """Pole that fits all hits best, and the noise power of every output; None where it explains less than `least`."""
-    pole = window.pole
-    flat = data.reshape(-1, len(omega))
+def shared_poles(
+    window: PeakWindow,
+    start: Complex,
+    data: Complex,
+    known: NDArray[np.bool_],
+    omega: Real,
+    rest_s: float,
+    least: float,
+) -> tuple[Complex, Real] | None:
+    """Poles that fit all hits best, and the noise power of every output; None where they explain less than `least`.
+
+    Parameters
+    ----------
+    window : PeakWindow
+    start : complex ndarray, (n_modes,)
+        First guess, rad/s.
+    data : complex ndarray, (n_hits, n_outputs, n_lines)
+        Accelerance on the lines of the window; 0 where not measured.
+    known : ndarray of bool, (n_hits, n_outputs)
+    omega : ndarray, (n_lines,)
+    rest_s : float
+        Time from hit to end of the record.
+    least : float
+        Share of what a straight background leaves.
+    """
+    poles, flat = start, data.reshape(-1, len(omega))
     noise = np.ones(data.shape[1])
     for _ in range(SHARED_STEPS):
-        fit = _linear_fit(pole, window.neighbours, flat, omega, rest_s)
+        fit = linear_fit(poles, window.neighbours, flat, omega, rest_s)
         if fit is None:
             return None
         noise = _noise_of_outputs(fit, known)
-        weight = np.where(known, 1.0 / noise, 0.0).ravel()
-        step, _ = _step(fit, weight)
-        pole = _moved(pole, step)
-        if not omega[0] < pole.imag < omega[-1] or not 0 < -pole.real < MAX_DAMPING * abs(pole):
+        poles = _moved(poles, _steps(fit, np.where(known, 1.0 / noise, 0.0).ravel()))
+        inside = (omega[0] < poles.imag) & (poles.imag < omega[-1])
+        if not np.all(inside & (poles.real < 0) & (-poles.real < MAX_DAMPING * np.abs(poles))):
             return None
-    if np.exp(pole.real * rest_s) > RINGS_ON or _explained(pole, window, data, omega, rest_s) < least:
-        return None
-    return pole, noise
+    rings_on = np.exp(float(poles.real.max()) * rest_s) > RINGS_ON
+    return None if rings_on or _explained(poles, window, data, omega, rest_s) < least else (poles, noise)
 
 
-def _own_pole(
-    window: PeakWindow, data: Complex, weight: Real, start: complex, omega: Real, rest_s: float
-) -> tuple[complex, float, Complex]:
-    """Pole of one hit, its standard deviation, and its residues."""
-    lost = start, np.inf, np.zeros(len(data), dtype=np.complex128)
-    fit = _linear_fit(start, window.neighbours, data, omega, rest_s)
-    if fit is None:
-        return lost
-    pole, information = start, 0.0
-    for _ in range(OWN_STEPS):
-        step, information = _step(fit, weight)
-        pole = _moved(pole, step)
-        fit = _linear_fit(pole, window.neighbours * (pole.imag / start.imag), data, omega, rest_s)
-        if fit is None or abs(pole - start) > FARTHEST * -start.real or pole.real >= 0 or information <= 0:
-            return lost
-    outputs = max(int(np.count_nonzero(weight)), 1)
-    dof = max(outputs * (len(omega) - fit.free) - 1, 1)
-    spread = float(np.sum(weight[:, None] * np.abs(fit.left) ** 2)) / dof
-    return pole, float(np.sqrt(0.5 * spread / information)), np.where(weight > 0, fit.residues, 0.0)
+def linear_fit(
+    poles: Complex, others: Complex, data: Complex, omega: Real, rest_s: float
+) -> LinearFit | None:
+    """Residues of poles, of their neighbours, and a straight background that fit best, FRF by FRF.
 
+    Parameters
+    ----------
+    poles, others : complex ndarray
+        rad/s.
+    data : complex ndarray, (n_frfs, n_lines)
+    omega : ndarray, (n_lines,)
+    rest_s : float
+        Time from hit to end of the record.
 
-def _linear_fit(pole: complex, others: Complex, data: Complex, omega: Real, rest_s: float) -> _Fit | None:
-    """Residues of a pole, its neighbours, and a straight background that fit best, FRF by FRF."""
-    u, derivative = pole_functions(omega, np.concatenate([[pole], others]), rest_s)
+    Returns
+    -------
+    LinearFit or None
+        None where the lines are fewer than the coefficients.
+    """
+    n = len(poles)
+    u, derivative = pole_functions(omega, np.concatenate([poles, others]), rest_s)
     columns = _columns(u)
     if len(columns) + 2 > len(omega):
         return None
-    size = float(np.linalg.norm(u[0]))
+    size = np.linalg.norm(u[:n], axis=1)
     basis, triangle = np.linalg.qr(columns.T)
     inside = data @ basis.conj()
     solved = np.linalg.lstsq(triangle, inside.T, rcond=1e-10)[0]
     left = data - inside @ basis.T
-    across = derivative[0] - basis @ (basis.conj().T @ derivative[0])
-    gain = float(np.sum(np.abs(np.linalg.pinv(triangle, rcond=1e-10)[0]) ** 2)) / size**2
-    return _Fit(solved[0] / size, left, across, len(columns), gain)
+    across = derivative[:n] - (derivative[:n] @ basis.conj()) @ basis.T
+    gain = float(np.sum(np.abs(np.linalg.pinv(triangle, rcond=1e-10)[0]) ** 2) / size[0] ** 2)
+    return LinearFit(solved[:n].T / size, left, across, len(columns), gain)
 
 
 def _columns(u: Complex) -> Complex:
@@ -343,7 +314,7 @@ def _across(values: Complex, pole: complex, others: Complex, omega: Real, rest_s
     return np.asarray(values - (values @ basis.conj()) @ basis.T)
 
 
-def _noise_of_outputs(fit: _Fit, known: NDArray[np.bool_]) -> Real:
+def _noise_of_outputs(fit: LinearFit, known: NDArray[np.bool_]) -> Real:
     """Power that the fit leaves of every output, relative to the largest: only the ratios serve as weights."""
     power = np.sum(np.abs(fit.left) ** 2, axis=-1).reshape(known.shape)
     mean = np.where(known, power, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
@@ -351,16 +322,14 @@ def _noise_of_outputs(fit: _Fit, known: NDArray[np.bool_]) -> Real:
     return np.maximum(mean / top if top > 0 else np.ones(len(mean)), 1e-6)
 
 
-def _step(fit: _Fit, weight: Real) -> tuple[complex, float]:
-    """Gauss-Newton step of the pole, and the information it rests on."""
-    information = float(np.sum(weight * np.abs(fit.residues) ** 2)) * float(
-        np.sum(np.abs(fit.derivative) ** 2)
-    )
-    along = fit.left @ fit.derivative.conj()
-    slope = complex(np.sum(weight * fit.residues.conj() * along))
-    return (slope / information if information > 0 else 0j), information
+def _steps(fit: LinearFit, weight: Real) -> Complex:
+    """Gauss-Newton steps of the poles; `weight` by FRF."""
+    weighted = weight[:, None] * fit.residues.conj()
+    information = (weighted.T @ fit.residues) * (fit.derivatives.conj() @ fit.derivatives.T)
+    slope = np.sum(weighted * (fit.left @ fit.derivatives.conj().T), axis=0)
+    return np.asarray(np.linalg.lstsq(information, slope, rcond=1e-10)[0])
 
 
-def _moved(pole: complex, step: complex) -> complex:
-    limit = LARGEST_STEP * abs(pole.real)
-    return pole + step * min(1.0, limit / max(abs(step), 1e-300))
+def _moved(poles: Complex, steps: Complex) -> Complex:
+    limit = LARGEST_STEP * np.abs(poles.real)
+    return np.asarray(poles + steps * np.minimum(1.0, limit / np.maximum(np.abs(steps), 1e-300)))

@@ -2,8 +2,9 @@
 
 The frequency of peak c in hit h on point p, relative to its own mean, is taken as
 
-    e_hc = m_c + b t_h + g_p + d_h + k_pc + x_hc + noise ,
+    e_hc = Σ_i s_hci m_ci + b t_h + g_p + d_h + k_pc + x_hc + noise ,
 
+m_ci the mean of mode i of those that make the peak, s_hci the share with which the hit shows it, 1 where one makes it;
 b t_h + g_p + d_h what all peaks have in common: a trend over the order t_h of the hits, as where a rig warms up; g_p
 alike in all hits of a point, for a rig drifts while the hammer moves from point to point; d_h of the hit alone. k_pc is
 what the peak shows alike in all hits of a point, x_hc its own movement.
@@ -19,6 +20,7 @@ Satterthwaite, F. E., "An approximate distribution of estimates of variance comp
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -142,7 +144,9 @@ class _Posterior:
         return np.diag(self.covariance)
 
 
-def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -> Movement:
+def movement(
+    shift: Real, std: Real, strength: Real, point: NDArray[np.int64], shares: Sequence[Real] = ()
+) -> Movement:
     """Estimate what moves.
 
     Parameters
@@ -153,8 +157,12 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     strength : ndarray, (n_hits, n_peaks)
         Size of the peak in the hit over its median.
     point : ndarray of int, (n_hits,)
+    shares : sequence of ndarray, (n_hits, n_modes)
+        Of the modes that make each peak; one mode each where left out.
     """
     n_hits, n_peaks = shift.shape
+    shares = shares or [np.ones((n_hits, 1))] * n_peaks
+    n_means = sum(share.shape[1] for share in shares)
     known = np.isfinite(std)
     repeated = np.bincount(point, minlength=int(point.max()) + 1)[point] > 1
     struck, of_points = np.unique(point), np.unique(point[repeated])
@@ -162,7 +170,7 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     two = len(struck) == len(of_points) == 2
     if len(struck) < 2 or (two and _explained_by_a_line(shift, std, point)):
         of_points = of_points[:0]
-    design, groups, shared = _design(known, point, repeated, of_points)
+    design, groups, shared = _design(known, point, repeated, of_points, shares)
     n_trend, n_points = shared.trend.shape[1], shared.of_point.shape[1]
     hit, peak = np.nonzero(known)
     value = shift[hit, peak]
@@ -173,13 +181,13 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     moving = common
     own, per_point = 0.5 * start + FLOOR, 0.5 * start + FLOOR
     tail = np.ones(len(value))
-    slope = slice(n_peaks, n_peaks + n_trend)
+    slope = slice(n_means, n_means + n_trend)
     hits = slice(slope.stop, slope.stop + n_hits)
     points = slice(hits.stop, hits.stop + n_points)
 
     def solved(common: float, moving: float) -> _Posterior:
         of_common = (np.full(n_hits, common), np.full(n_points, moving))
-        prior = np.concatenate([np.full(n_peaks + n_trend, np.inf), *of_common, per_point[groups]])
+        prior = np.concatenate([np.full(n_means + n_trend, np.inf), *of_common, per_point[groups]])
         return _posterior(design, value, error, prior)
 
     for _ in range(ITERATIONS):
@@ -203,7 +211,7 @@ def movement(shift: Real, std: Real, strength: Real, point: NDArray[np.int64]) -
     spread = own[peak] * np.minimum(weak, 1.0)
     single[hit, peak] = (value - found.fitted) * spread / (own[peak] * weak + noise)
     read = np.hstack([shared.trend, np.eye(n_hits), shared.of_point])
-    both = slice(n_peaks, points.stop)
+    both = slice(n_means, points.stop)
 
     def covariance(found: _Posterior) -> Real:
         return np.asarray(read @ found.covariance[both, both] @ read.T)
@@ -248,24 +256,24 @@ def _design(
     point: NDArray[np.int64],
     repeated: NDArray[np.bool_],
     moved: NDArray[np.int64],
+    shares: Sequence[Real],
 ) -> tuple[Real, NDArray[np.int64], _Shared]:
     """Columns of m, b, d, g and k for every value, the peak of each k, and what b and g multiply."""
-    n_hits, n_peaks = known.shape
+    n_hits = len(known)
     hit, peak = np.nonzero(known)
     of_point = (point[:, None] == moved).astype(float)
     pairs = sorted({(int(point[h]), int(c)) for h, c in zip(hit, peak, strict=True) if repeated[h]})
     place = {pair: k for k, pair in enumerate(pairs)}
-    order = np.arange(n_hits) - 0.5 * (n_hits - 1)
+    order = np.arange(n_hits, dtype=np.float64) - 0.5 * (n_hits - 1)
     trend = (order / max(float(np.std(order)), 1.0))[:, None]
     if n_hits < FEWEST_FOR_TREND:
         trend = trend[:, :0]
-    first = n_peaks + trend.shape[1]
+    means = np.hstack([np.where((peak == c)[:, None], share[hit], 0.0) for c, share in enumerate(shares)])
+    first = means.shape[1] + trend.shape[1]
     before = first + n_hits
     design = np.zeros((len(hit), before + len(moved) + len(pairs)))
-    row = np.arange(len(hit))
-    design[row, peak] = 1.0
-    design[:, n_peaks:first] = trend[hit]
-    design[row, first + hit] = 1.0
+    design[:, :first] = np.hstack([means, trend[hit]])
+    design[np.arange(len(hit)), first + hit] = 1.0
     design[:, before : before + len(moved)] = of_point[hit]
     for k, (h, c) in enumerate(zip(hit, peak, strict=True)):
         if repeated[h]:

@@ -1,0 +1,190 @@
+"""One or two modes that make a peak, followed from hit to hit.
+
+Hits on other points excite two modes under one peak in another ratio. One pole then seems to move, and by more than
+drift moves it. Two poles whose frequencies move by one factor in each hit do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ema_pipeline.modal.drift.local import FOLLOWED, LARGEST_STEP, filled, linear_fit, shared_poles
+from ema_pipeline.modal.drift.windows import PeakWindow
+
+Complex = NDArray[np.complex128]
+Real = NDArray[np.float64]
+
+OWN_STEPS = 4
+"""Steps from the poles that all hits share to those of each hit."""
+
+FARTHEST = 3.0
+"""A hit whose poles lie farther from those of all, in decay rates, does not show the peak."""
+
+ONE_MODE = 0.02
+"""Second over first singular value of the residues of a peak over hits, above which more than one mode shows in
+it: hits on other points then excite another mixture, which looks like movement."""
+
+PURE = 0.005
+"""The same up to which no second mode is looked for."""
+
+APART = (-3.0, -1.5, -0.7, 0.7, 1.5, 3.0)
+"""Distances from the first, in half-power half-widths, at which a second mode is looked for."""
+
+PAIR = 0.25
+"""Share of what one mode leaves, with a frequency of its own in each hit, that two leave at most."""
+
+TWIN = 0.1
+"""Distance in decay rates below which two poles are one."""
+
+
+@dataclass(frozen=True)
+class FollowedPeak:
+    """A peak in all hits.
+
+    Attributes
+    ----------
+    poles : complex ndarray, (n_modes,)
+        That all hits share, rad/s: one or two.
+    moved : complex ndarray, (n_hits,)
+        What all of them move by in a hit, over their frequencies: the imaginary part is the frequency's.
+    std : ndarray, (n_hits,)
+        Standard deviation of its real and imaginary part; ``inf`` where a hit does not show the peak.
+    residues : complex ndarray, (n_hits, n_outputs, n_modes)
+        0 where a channel was left out.
+    share : ndarray, (n_hits, n_modes)
+        How much an error of the frequency of each mode counts in `moved`; sums to 1 over modes.
+    """
+
+    poles: Complex
+    moved: Complex
+    std: Real
+    residues: Complex
+    share: Real
+
+    @property
+    def shown(self) -> NDArray[np.bool_]:
+        """Hits that show the peak, (n_hits,)."""
+        return np.isfinite(self.std)
+
+    @property
+    def of_hits(self) -> Complex:
+        """Poles in every hit, rad/s, (n_hits, n_modes)."""
+        return np.asarray(self.poles + self.moved[:, None] * self.poles.imag)
+
+    @property
+    def single(self) -> bool:
+        """True where one mode makes the peak: hits on different points show one and the same shape."""
+        return len(self.poles) == 1 and self.second_shape < ONE_MODE
+
+    @property
+    def second_shape(self) -> float:
+        """Second over first singular value of the residues of the first over hits, each over its σ; 1 of but one."""
+        if self.residues.shape[1] < 2 or np.count_nonzero(self.shown) < 2:
+            return 1.0
+        scaled = self.residues[self.shown, :, 0] / self.std[self.shown, None]
+        values = np.linalg.svd(scaled, compute_uv=False)
+        return float(values[1] / values[0])
+
+
+def follow_peak(
+    window: PeakWindow, frf: Complex, omega: Real, rest_s: float, *, one_point: bool
+) -> FollowedPeak | None:
+    """Follow a peak from hit to hit; None where no pole is found there.
+
+    Parameters
+    ----------
+    window : PeakWindow
+    frf : complex ndarray, (n_hits, n_outputs, n_lines)
+        Accelerance of single hits on the lines of the window; NaN where not measured.
+    omega : ndarray, (n_lines,)
+    rest_s : float
+        Time from hit to end of the record.
+    one_point : bool
+        True where all hits struck one point: they excite two modes under a peak alike, as if they were one.
+    """
+    one = _followed(window, np.array([window.pole]), frf, omega, rest_s)
+    if one_point or (one is not None and one[0].second_shape <= PURE):
+        return None if one is None else one[0]
+    first = window.pole if one is None else complex(one[0].poles[0])
+    best, least = (None, np.inf) if one is None else (one[0], PAIR * one[1])
+    for apart in APART:
+        two = _followed(window, first + np.array([0.0, -1j * apart * first.real]), frf, omega, rest_s)
+        if two is not None and two[1] < least:
+            best, least = two
+    return best
+
+
+def _followed(
+    window: PeakWindow, start: Complex, frf: Complex, omega: Real, rest_s: float
+) -> tuple[FollowedPeak, float] | None:
+    """The peak if so many modes make it, and the power that they leave; None where they do not explain it."""
+    known, data = filled(frf)
+    shared = shared_poles(window, start, data, known, omega, rest_s, FOLLOWED)
+    if shared is None:
+        return None
+    poles, noise = shared
+    if len(poles) > 1 and abs(poles[1] - poles[0]) < TWIN * -float(poles.real.max()):
+        return None
+    weight = np.where(known, 1.0 / noise, 0.0)
+    hits = [_one_hit(window, poles, d, w, omega, rest_s) for d, w in zip(data, weight, strict=True)]
+    peak = FollowedPeak(
+        poles,
+        np.array([h.moved for h in hits]),
+        np.array([h.std for h in hits]),
+        np.array([h.residues for h in hits]),
+        np.array([h.share for h in hits]),
+    )
+    return peak, sum(h.left for h in hits)
+
+
+@dataclass(frozen=True)
+class _OneHit:
+    """A peak in one hit; see `FollowedPeak`. `left` is the power that the modes leave."""
+
+    moved: complex
+    std: float
+    residues: Complex
+    share: Real
+    left: float
+
+
+def _one_hit(
+    window: PeakWindow, poles: Complex, data: Complex, weight: Real, omega: Real, rest_s: float
+) -> _OneHit:
+    """The peak in one hit: all poles move by one factor."""
+    fit = linear_fit(poles, window.neighbours, data, omega, rest_s)
+    assert fit is not None  # the shared poles were fitted on as many lines
+    lost = _OneHit(
+        0j, np.inf, np.zeros_like(fit.residues), np.full(len(poles), 1 / len(poles)), _power(fit.left)
+    )
+    width = float(np.min(-poles.real / poles.imag))
+    moved = 0j
+    for _ in range(OWN_STEPS):
+        along = fit.residues * poles.imag
+        weighted = weight[:, None] * along.conj()
+        parts = np.sum((weighted.T @ along) * (fit.derivatives.conj() @ fit.derivatives.T), axis=0).real
+        information = float(parts.sum())
+        if not information > 0:
+            return lost
+        step = complex(np.sum(weighted * (fit.left @ fit.derivatives.conj().T))) / information
+        moved += step * min(1.0, LARGEST_STEP * width / max(abs(step), 1e-300))
+        own = poles + poles.imag * moved
+        if abs(moved) > FARTHEST * width or np.any(own.real >= 0):
+            return lost
+        again = linear_fit(own, window.neighbours * (1 + moved.imag), data, omega, rest_s)
+        assert again is not None
+        fit = again
+    outputs = max(int(np.count_nonzero(weight)), 1)
+    dof = max(outputs * (len(omega) - fit.free) - 1, 1)
+    spread = float(np.sum(weight[:, None] * np.abs(fit.left) ** 2)) / dof
+    residues = np.where(weight[:, None] > 0, fit.residues, 0.0)
+    return _OneHit(
+        moved, float(np.sqrt(0.5 * spread / information)), residues, parts / information, _power(fit.left)
+    )
+
+
+def _power(left: Complex) -> float:
+    return float(np.sum(np.abs(left) ** 2))
