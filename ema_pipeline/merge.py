@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -15,13 +15,15 @@ import tomlkit
 
 from ema_pipeline.correlate.matching import match_modes
 from ema_pipeline.correlate.measured import MeasuredModes
+from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
-from ema_pipeline.files import cannot_write
+from ema_pipeline.files import cannot_write, read_bounded
 from ema_pipeline.frf.estimate import estimate_frfs
-from ema_pipeline.frf.parts import gain_ratios
+from ema_pipeline.frf.parts import Recorded, check_recorded_alike, gain_ratios
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.campaign import read_campaign
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE, TestDescription
+from ema_pipeline.ingest.load import load_records
 from ema_pipeline.job import run_raw
 from ema_pipeline.names import check_name
 from ema_pipeline.number_text import format_percent
@@ -32,6 +34,7 @@ from ema_pipeline.run.records import accepted_hits
 from ema_pipeline.run.types import Run
 from ema_pipeline.significance import holm
 from ema_pipeline.store import RESULTS_FILE
+from ema_pipeline.toml_text import LARGEST_BYTES
 
 TOLERANCE = 1e-3
 """Relative 1 σ by which frequencies of one state differ between set-ups: temperature, and sensors that moved."""
@@ -41,6 +44,30 @@ LEVEL = 0.01
 
 _MEASURING = 'stages=["ingest", "hits", "frf", "modal"]'
 _JOINING = 'stages=["ingest", "hits", "frf"]'
+
+
+@dataclass(frozen=True)
+class _Described:
+    """One set-up as it is described, and its run where its results folder was given."""
+
+    name: str
+    raw: Path
+    test: TestDescription
+    run: Run | None
+
+    @property
+    def points(self) -> set[str]:
+        """What is struck and what is measured."""
+        pairs = [(r.impact, [self.test.dof_of(c, r) for c in self.test.responses]) for r in self.test.records]
+        return _points([d for d, _ in pairs if d], [d for _, dofs in pairs for d in dofs if d])
+
+    @property
+    def recorded(self) -> Recorded:
+        """What must be alike in all parts."""
+        test = self.test
+        dofs = [(test.dof_of(c, r), c.quantity) for r in test.records for c in test.responses]
+        quantities = {dof.point: quantity for dof, quantity in dofs if dof}
+        return Recorded(not test.force.uncalibrated, test.exponential_window_rad_s, quantities)
 
 
 @dataclass(frozen=True)
@@ -136,19 +163,22 @@ def merge(
     ------
     EmaError
         If the sources cannot be one test: other kinds, rigs, configurations, states, sample rates; no point in common;
-        hammers or sensors that contradict each other. Nothing is written then.
+        hammers or sensors that contradict each other. Nothing is written then. What the descriptions tell is checked
+        before modes are identified.
     """
     if out.exists():
         raise EmaError(f"{out}: exists already; choose a new folder with --out, or remove it")
+    described = _described(sources)
     with tempfile.TemporaryDirectory(prefix="ema-merge-") as scratch:
-        parts = _parts(sources, Path(scratch), show)
-        _check_connected(parts)
+        parts = [_identified(d, Path(scratch) / d.name, show) for d in described]
+        # hits that were left out may have been all on the point in common
+        _check_connected({p.raw: _points(p.frfs.inputs, p.frfs.outputs) for p in parts})
         modes = common_modes({p.name: p.modes for p in parts}, tolerance)
         _check_one_state(modes)
         folder = Path(scratch) / "merged"
         for part in parts:
             _copy(part, folder / part.name)
-        _check_one_rig(parts, folder)
+        _move_rig(parts, folder)
         run, _ = run_raw(folder, None, Path(scratch) / "results", None, [_JOINING], show)
         ((configuration, frfs),) = measured_frfs(run).items()
         gains = gain_ratios({p.name: _frfs_of(run, configuration, p.name) for p in parts})
@@ -161,30 +191,45 @@ def merge(
     return Merged(out, tuple(parts), frfs, modes, gains)
 
 
-def _parts(sources: Sequence[Path], scratch: Path, show: ShowStage | None) -> list[Part]:
+def _described(sources: Sequence[Path]) -> list[_Described]:
+    """The set-ups to merge, refused where their descriptions tell that they are not of one test."""
     if len(sources) < 2:
         raise EmaError("one test is nothing to merge; give two or more folders")
-    parts: list[Part] = []
+    found: list[_Described] = []
     for source in sources:
         run: Run | None = existing_run(source) if (source / RESULTS_FILE).is_file() else None
         raw = source if run is None else Path(run.info.raw)
-        test = _single_test(raw)
         name = check_name(raw.resolve().name, f"{raw}: name of the folder")
-        if any(p.name == name for p in parts):
+        found.append(_Described(name, raw, _single_test(raw), run))
+    first = found[0].test
+    for k, part in enumerate(found):
+        if any(other.name == part.name for other in found[:k]):
             raise EmaError(
-                f"{raw}: another of the folders is called '{name}', too; rename one, parts go by that name"
+                f"{part.raw}: another of the folders is called '{part.name}', too; rename one, parts go by that name"
             )
-        if parts and (test.configuration or "") != (parts[0].test.configuration or ""):
+        if (part.test.configuration or "") != (first.configuration or ""):
             raise EmaError(
-                f"{test.file}: is of configuration '{test.configuration or ''}', {parts[0].test.file} of "
-                f"'{parts[0].test.configuration or ''}'; only tests of one configuration can be merged"
+                f"{part.test.file}: is of configuration '{part.test.configuration or ''}', {first.file} of "
+                f"'{first.configuration or ''}'; only tests of one configuration can be merged"
             )
-        if run is None or not all(run.store.key("modal", c) for c in run.info.configurations):
-            run, _ = run_raw(raw, None, scratch / name, None, [_MEASURING], show)
-        ((_, frfs),) = measured_frfs(run).items()
-        ((_, modes),) = measured_modes(run).items()
-        parts.append(Part(name, raw, test, frfs, modes))
-    return parts
+    _check_one_rig([part.test for part in found])
+    _check_connected({part.raw: part.points for part in found})
+    check_recorded_alike({part.name: part.recorded for part in found})
+    # sample rates may stand in the record files only
+    for _ in load_records(
+        *(p.test.model_copy(update={"part": p.name, "records": p.test.records[:1]}) for p in found)
+    ):
+        pass
+    return found
+
+
+def _identified(part: _Described, out: Path, show: ShowStage | None) -> Part:
+    run = part.run
+    if run is None or not all(run.store.key("modal", c) for c in run.info.configurations):
+        run, _ = run_raw(part.raw, None, out, None, [_MEASURING], show)
+    ((_, frfs),) = measured_frfs(run).items()
+    ((_, modes),) = measured_modes(run).items()
+    return Part(part.name, part.raw, part.test, frfs, modes)
 
 
 def _single_test(raw: Path) -> TestDescription:
@@ -197,18 +242,20 @@ def _single_test(raw: Path) -> TestDescription:
     return tests[0]
 
 
-def _check_connected(parts: Sequence[Part]) -> None:
+def _points(struck: Iterable[Dof], measured: Iterable[Dof]) -> set[str]:
+    return {f"strike {d.point}" for d in struck} | {f"measure {d.point}" for d in measured}
+
+
+def _check_connected(points: Mapping[Path, set[str]]) -> None:
     """Every part must share a point that is struck, or a sensor, with those before: else no shape goes through all."""
     known: set[str] = set()
-    for k, part in enumerate(parts):
-        struck = {f"strike {d.point}" for d in part.frfs.inputs}
-        measured = {f"measure {d.point}" for d in part.frfs.outputs}
-        if k and not known & (struck | measured):
+    for raw, own in points.items():
+        if known and not known & own:
             raise EmaError(
-                f"{part.raw}: strikes no point and measures no direction that the other parts do; strike one of "
+                f"{raw}: strikes no point and measures no direction that the other parts do; strike one of "
                 "theirs, or leave one sensor where it was"
             )
-        known |= struck | measured
+        known |= own
 
 
 def common_modes(parts: Mapping[str, MeasuredModes], tolerance: float = TOLERANCE) -> tuple[CommonMode, ...]:
@@ -254,15 +301,27 @@ def _frfs_of(run: Run, configuration: str, part: str) -> FrfSet:
     return estimate_frfs(hits, run.settings.frf)
 
 
-def _check_one_rig(parts: Sequence[Part], folder: Path) -> None:
+def _check_one_rig(tests: Sequence[TestDescription]) -> None:
+    """One rig for all parts, by its name and by the rig file beside the description."""
+    named = [t for t in tests if t.rig is not None]
+    for test in named[1:]:
+        if test.rig != named[0].rig:
+            raise EmaError(
+                f"{test.file}: names rig '{test.rig}', {named[0].file} names '{named[0].rig}'; one test has one rig"
+            )
+    files = [t.folder / RIG_FILE for t in tests if (t.folder / RIG_FILE).is_file()]
+    for file in files[1:]:
+        if read_bounded(file, LARGEST_BYTES) != read_bounded(files[0], LARGEST_BYTES):
+            raise EmaError(
+                f"{files[0]} and {file} differ; one test has one rig, copy the right one over the other"
+            )
+
+
+def _move_rig(parts: Sequence[Part], folder: Path) -> None:
     """One rig file for all parts stands beside them."""
     files = [folder / p.name / RIG_FILE for p in parts if (folder / p.name / RIG_FILE).is_file()]
-    if not files:
-        return
-    read_campaign(folder)  # refuses rig files that differ
-    shutil.move(files[0], folder / RIG_FILE)
-    for file in files[1:]:
-        file.unlink()
+    for file in files:
+        file.replace(folder / RIG_FILE)
 
 
 def _copy(part: Part, folder: Path) -> None:

@@ -194,32 +194,65 @@ def test_tests_of_two_states_are_refused(
     assert (code, err) == (0, "")
 
 
-def test_what_cannot_be_one_test_is_refused(
-    tips: Path, run_of: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def _rewritten(raw: Path, folder: Path, *changes: tuple[str, str]) -> Path:
+    """A copy of a raw folder with these texts of its description replaced."""
+    shutil.copytree(raw, folder)
+    file = folder / "test.toml"
+    text = file.read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    file.write_text(text, encoding="utf-8")
+    return folder
+
+
+def test_what_descriptions_tell_is_refused_before_modes_are_identified(
+    tips: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, hard = tmp_path / "both", run_of["hard"]
-    _simulate(tmp_path / "slow", **SOFT | {"sample_rate_hz": 2560.0})
-    _refused(capsys, out, "sample rate", "record all parts at one rate", hard, tmp_path / "slow")
-    _simulate(tmp_path / "apart", **HARD | {"impacts": ["m2.x"], "sensors": ["m3.x"]})
-    _simulate(tmp_path / "alone", **HARD | {"impacts": ["m1.x"], "sensors": ["m1.x"]})
-    _refused(capsys, out, "strikes no point", "leave one sensor", tmp_path / "alone", tmp_path / "apart")
+    def run_raw(*_: object) -> None:
+        raise AssertionError("was run")
+
+    monkeypatch.setattr("ema_pipeline.merge.run_raw", run_raw)
+    out, hard = tmp_path / "both", tips / "hard"
+
+    def other(name: str, *changes: tuple[str, str]) -> Path:
+        return _rewritten(hard, tmp_path / name, *changes)
+
+    slow = _simulate(tmp_path / "slow", **SOFT | {"sample_rate_hz": 2560.0})
+    _refused(capsys, out, "sample rate", "record all parts at one rate", hard, slow)
+    apart = _simulate(tmp_path / "apart", **HARD | {"impacts": ["m2.x"], "sensors": ["m3.x"]})
+    alone = _simulate(tmp_path / "alone", **HARD | {"impacts": ["m1.x"], "sensors": ["m1.x"]})
+    _refused(capsys, out, "strikes no point", "leave one sensor", alone, apart)
     _refused(capsys, out, "nothing to merge", "two or more", hard)
-    _refused(capsys, out, "called 'hard', too", "rename one", hard, tips / "hard")
-    shutil.copytree(tips / "hard", tmp_path / "other")
-    description = tmp_path / "other" / "test.toml"
-    text = description.read_text(encoding="utf-8")
-    description.write_text(text.replace("sensitivity_mv = 2.3175", "sensitivity_mv = 22.5"), encoding="utf-8")
-    _refused(capsys, out, "differ by a factor of 9.7", "sensitivity_mv", hard, tmp_path / "other")
-    description.write_text(text.replace('impact = "m6.x"', 'impact = "-m6.x"'), encoding="utf-8")
-    _refused(capsys, out, "opposite signs", "reversed", hard, tmp_path / "other")
-    description.write_text(
-        'configuration = "else"\n' + text.replace("configuration =", "# "), encoding="utf-8"
-    )
-    _refused(capsys, out, "only tests of one configuration", "'else'", hard, tmp_path / "other")
+    _refused(capsys, out, "called 'hard', too", "rename one", hard, other("again/hard"))
+    renamed = other("else", ("configuration =", 'configuration = "else"  #'))
+    _refused(capsys, out, "only tests of one configuration", "'else'", hard, renamed)
+    window = other("window", ("sample_rate_hz =", "exponential_window_rad_s = 5.0\nsample_rate_hz ="))
+    _refused(capsys, out, "different exponential windows", "record them alike", hard, window)
+    volts = other("volts", ('unit = "N"\nsensitivity_mv = 2.3175', 'unit = "V"\nuncalibrated = true'))
+    _refused(capsys, out, "calibrated in only one", "state its sensitivity", hard, volts)
+    velocity = other("velocity", ('"acceleration"', '"velocity"'), ('"m/s^2"', '"m/s"'))
+    _refused(capsys, out, "is measured as acceleration in part 'hard'", "one kind", hard, velocity)
+    rig = other("rig")
+    rig.joinpath("rig.toml").write_text('name = "another"', encoding="utf-8")
+    _refused(capsys, out, "rig.toml differ", "copy the right one", hard, rig)
+    named = [
+        other(name, ("sample_rate_hz =", f'rig = "{name}"\nsample_rate_hz ='))
+        for name in ("gearbox", "isolator")
+    ]
+    _refused(capsys, out, "names rig 'isolator'", "one test has one rig", *named)
     out.mkdir()
-    code, _, err = ema(capsys, "merge", run_of["soft"], hard, "--out", out)
+    code, _, err = ema(capsys, "merge", hard, tips / "soft", "--out", out)
     assert code == 1
     assert "exists already" in err
+
+
+def test_hammers_that_contradict_each_other_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = _simulate(tmp_path / "one", **HARD | {"impacts": ["m1.x"], "sensors": ["m1.x"]})
+    other = _rewritten(one, tmp_path / "other", ("= 2.25", "= 22.5"))
+    _refused(capsys, tmp_path / "both", "differ by a factor of 10", "sensitivity_mv", one, other)
 
 
 def _refused(capsys: pytest.CaptureFixture[str], out: Path, what: str, remedy: str, *sources: Path) -> None:
@@ -316,6 +349,15 @@ def test_gains_of_two_hammers_meet_in_the_middle() -> None:
     exact = dataclasses.replace(soft, hammer=ChannelQuality("hammer", 0.0))
     level = np.abs(joined({"soft": exact, "hard": hard}).frf[0, 0]) / np.sqrt(2)
     assert np.mean(level[501:]) == pytest.approx(1.0, abs=3e-3)  # the one that is known better rules
+
+
+@pytest.mark.parametrize(
+    ("gain", "said"),
+    [(10.0, "differ by a factor of 10, .*sensitivity_mv"), (-1.0, "opposite signs: .*reversed")],
+)
+def test_gains_that_no_calibration_explains_are_refused(gain: float, said: str) -> None:
+    with pytest.raises(EmaError, match=said):
+        joined({"soft": _frfs(0.01, (1, 500), 1), "hard": _frfs(0.01, (200, 800), 2, gain=gain)})
 
 
 def test_a_gap_between_bands_is_refused() -> None:

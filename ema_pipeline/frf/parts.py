@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -31,6 +31,24 @@ PAIRS_SHARE = 0.1
 
 Gains = dict[tuple[str, str], tuple[float, float]]
 """ln of the gain of the first part over that of the second, and its standard uncertainty."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """How a part was recorded, as far as all parts must be recorded alike.
+
+    Attributes
+    ----------
+    force_calibrated : bool
+    decay_rad_s : float
+        Of the exponential window, rad/s.
+    quantities : mapping of str to str
+        What is measured at each point.
+    """
+
+    force_calibrated: bool
+    decay_rad_s: float
+    quantities: Mapping[str, str]
 
 
 def joined(parts: Mapping[str, FrfSet]) -> FrfSet:
@@ -63,11 +81,11 @@ def joined(parts: Mapping[str, FrfSet]) -> FrfSet:
     """
     if len(parts) == 1:
         return next(iter(parts.values()))
+    _check_alike(parts)
     sets = _with_one_gain(parts)
     first = next(iter(sets.values()))
     outputs = _points([d for s in sets.values() for d in s.outputs])
     inputs = _points([d for s in sets.values() for d in s.inputs])
-    _check_alike(sets)
     shape = (len(outputs), len(inputs), first.frequency_hz.size)
     frf = np.full(shape, complex(np.nan, np.nan))
     coherence, variance = np.full(shape, np.nan), np.full(shape, np.nan)
@@ -166,7 +184,6 @@ def _log_ratio(a: FrfSet, pair_a: tuple[int, int], b: FrfSet, pair_b: tuple[int,
 
 def _with_one_gain(parts: Mapping[str, FrfSet]) -> dict[str, FrfSet]:
     """The parts with the differences of their hammers' gains taken out."""
-    _check_axes(parts)
     names, ratios = list(parts), gain_ratios(parts)
     calibration = [_calibration(parts[name]) for name in names]
     rows = [np.eye(len(names))[k] / calibration[k] for k in range(len(names))]
@@ -241,36 +258,50 @@ def _covered(bands: Mapping[str, tuple[float, float]], frfs: FrfSet) -> tuple[fl
     return low, high
 
 
-def _check_axes(parts: Mapping[str, FrfSet]) -> None:
-    """Parts must share lines; everything else can only be compared then."""
+def check_recorded_alike(parts: Mapping[str, Recorded]) -> None:
+    """Refuse parts whose FRFs could not stand in one set.
+
+    Raises
+    ------
+    EmaError
+        If calibration or windows differ, or if a point is measured in two quantities.
+    """
+    (first, a), *rest = parts.items()
+    for name, b in rest:
+        if a.force_calibrated != b.force_calibrated:
+            raise EmaError(
+                f"the hammer is calibrated in only one of the parts '{first}' and '{name}'; state its sensitivity"
+            )
+        if a.decay_rad_s != b.decay_rad_s:
+            raise EmaError(
+                f"parts '{first}' and '{name}' were recorded with different exponential windows "
+                f"({a.decay_rad_s:g} and {b.decay_rad_s:g} rad/s); record them alike"
+            )
+    known: dict[str, tuple[str, str]] = {}
+    for name, part in parts.items():
+        for point, quantity in part.quantities.items():
+            other, before = known.setdefault(point, (name, quantity))
+            if before != quantity:
+                raise EmaError(
+                    f"{point} is measured as {before} in part '{other}', as {quantity} in part '{name}'; use one "
+                    "kind of sensor there"
+                )
+
+
+def _check_alike(parts: Mapping[str, FrfSet]) -> None:
+    """Parts must share lines and what `check_recorded_alike` asks for; everything else can only be compared then."""
     (first, a), *rest = parts.items()
     for name, b in rest:
         if a.frequency_hz.shape != b.frequency_hz.shape or not np.allclose(a.frequency_hz, b.frequency_hz):
             raise EmaError(
                 f"parts '{first}' and '{name}' differ in sample rate or length of their hits; record them alike"
             )
-        if a.force_calibrated != b.force_calibrated:
-            raise EmaError(
-                f"the hammer is calibrated in only one of the parts '{first}' and '{name}'; state its sensitivity"
-            )
-        if a.response_decay_rad_s != b.response_decay_rad_s:
-            raise EmaError(
-                f"parts '{first}' and '{name}' were recorded with different exponential windows "
-                f"({a.response_decay_rad_s:g} and {b.response_decay_rad_s:g} rad/s); record them alike"
-            )
+    check_recorded_alike({name: _recorded(s) for name, s in parts.items()})
 
 
-def _check_alike(parts: Mapping[str, FrfSet]) -> None:
-    """A point must be measured in one quantity."""
-    known: dict[str, tuple[str, str]] = {}
-    for name, s in parts.items():
-        for d, quantity in zip(s.outputs, s.quantities, strict=True):
-            other, before = known.setdefault(d.point, (name, quantity))
-            if before != quantity:
-                raise EmaError(
-                    f"{d.point} is measured as {before} in part '{other}', as {quantity} in part '{name}'; use one "
-                    "kind of sensor there"
-                )
+def _recorded(frfs: FrfSet) -> Recorded:
+    quantities = {d.point: quantity for d, quantity in zip(frfs.outputs, frfs.quantities, strict=True)}
+    return Recorded(frfs.force_calibrated, frfs.response_decay_rad_s, quantities)
 
 
 def _points(dofs: Sequence[Dof]) -> dict[str, Dof]:
