@@ -712,11 +712,16 @@ def test_the_reader_of_the_documentation_works_as_printed(
     exec(page.split("```python\n")[1].split("```")[0], module.__dict__)
     monkeypatch.setattr(readers, "READERS", (*READERS[:-1], module, READERS[-1]))
     path = tmp_path / "hit.dat"
-    head = b"NLOG" + struct.pack("<di", RATE, 2) + b"hammer".ljust(16, b"\0") + b"tip".ljust(16)
-    path.write_bytes(head + b"".join(x.astype("<f4").tobytes() for x in DATA.values()))
+    head = b"NLOG" + struct.pack("<dii", RATE, 2, SAMPLES) + b"hammer".ljust(16, b"\0") + b"tip".ljust(16)
+    whole = head + b"".join(x.astype("<f4").tobytes() for x in DATA.values())
+    path.write_bytes(whole)
     check(path, rtol=1e-5, format_name="NLOG")
-    path.write_bytes(path.read_bytes()[:-6])
-    with pytest.raises(EmaError, match=r"hit\.dat: is cut short"):
+    for cut in (6, 8, len(whole) - len(head), len(whole) - 30):  # 8: one sample of each channel
+        path.write_bytes(whole[:-cut])
+        with pytest.raises(EmaError, match=rf"hit\.dat: has {len(whole) - cut} bytes .*cut short"):
+            read_raw(path)
+    path.write_bytes(whole[:10])
+    with pytest.raises(EmaError, match=r"hit\.dat: cannot be read as NLOG; .*cut short"):
         read_raw(path)
 
 
