@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.files import replace_file
+from ema_pipeline.files import refuse_existing, replace_file
 from ema_pipeline.fit.types import FitResult
 from ema_pipeline.kinds import kind_of, stages_of
 from ema_pipeline.pipeline import ShowStage
@@ -87,13 +87,22 @@ def write_pages(run: Run, show: ShowStage | None = None) -> Path:
         return paper(run, progress)
 
 
-def export_results(out: Path, folder: Path, effect_files: Iterable[str] = ()) -> list[Path]:
+def export_results(out: Path, to: Path | None = None, effect_files: Iterable[str] = ()) -> list[Path]:
     """Write FRFs, modes and shapes of every configuration as universal file and as CSV.
+
+    Parameters
+    ----------
+    out : Path
+        Results folder.
+    to : Path, optional
+        Folder to write. Left out, it is ``out/export``, which belongs to the results: its files are replaced.
+    effect_files : iterable of str
+        Python files with the user's own effects.
 
     Raises
     ------
     EmaError
-        If nothing has been identified yet, or the folder cannot be written.
+        If nothing has been identified yet, a file exists already in `to`, or the folder cannot be written.
     """
     from ema_pipeline.exchange.tables import shapes_table, write_frf_csv, write_table
     from ema_pipeline.exchange.uff import write_uff
@@ -104,17 +113,19 @@ def export_results(out: Path, folder: Path, effect_files: Iterable[str] = ()) ->
     if "modal" not in kind.measures:
         raise EmaError(f"{out}: {kind.words} have neither FRFs nor modes to export; see summary.json")
     measured = measured_frfs(run)
-    written = []
+    folder, names = to or out / "export", run.info.configurations
+    ends = {name: (".uff", "_shapes.csv", "_frfs.csv")[: 3 if name in measured else 2] for name in names}
+    files = [folder / f"{name}{end}" for name in names for end in ends[name]]
+    if to is not None:
+        refuse_existing(files)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise EmaError(f"{folder}: cannot be written ({error.strerror}); name another folder") from None
-    for name in run.info.configurations:
-        modal, frfs = modes_of_structure(run, name), measured.get(name)
-        files = [folder / f"{name}.uff", folder / f"{name}_shapes.csv", folder / f"{name}_frfs.csv"]
-        write_uff(files[0], frfs, modal)
-        write_table(files[1], shapes_table(modal, name))
-        if frfs is not None:
-            write_frf_csv(files[2], frfs)
-        written += [f for f in files if f.exists()]
-    return written
+    for name in names:
+        modal = modes_of_structure(run, name)
+        write_uff(folder / f"{name}.uff", measured.get(name), modal)
+        write_table(folder / f"{name}_shapes.csv", shapes_table(modal, name))
+        if name in measured:
+            write_frf_csv(folder / f"{name}_frfs.csv", measured[name])
+    return files

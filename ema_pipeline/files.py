@@ -7,7 +7,7 @@ import io
 import os
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -71,6 +71,19 @@ def file_hash(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise EmaError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def refuse_existing(paths: Iterable[Path]) -> None:
+    """Refuse to write files into a folder of the user's where one is there already.
+
+    Raises
+    ------
+    EmaError
+        Names the first that is there.
+    """
+    found = next((path for path in paths if path.exists()), None)
+    if found is not None:
+        raise EmaError(f"{found}: exists already and is kept; name another folder with --to, or remove it")
 
 
 @contextmanager

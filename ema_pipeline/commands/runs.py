@@ -272,14 +272,19 @@ def _is_raw(folder: Path) -> bool:
 def export(
     out: Out,
     to: Annotated[
-        Path | None, typer.Option("--to", metavar="FOLDER", help="Folder to write; OUT/export if left out.")
+        Path | None,
+        typer.Option(
+            "--to",
+            metavar="FOLDER",
+            help="Folder to write, no file there is replaced; OUT/export if left out.",
+        ),
     ] = None,
     effect_file: EffectFiles = None,
 ) -> None:
     """Write FRFs, modes and shapes as universal file (58, 55) and CSV for other programs."""
     from ema_pipeline.export import export_results
 
-    for path in export_results(out, to or out / "export", effect_file or []):
+    for path in export_results(out, to, effect_file or []):
         show(str(path))
 
 

@@ -333,7 +333,10 @@ def report(
 def export(
     s: Series,
     to: Annotated[
-        Path | None, typer.Option("--to", metavar="FOLDER", help="Folder to write; S if left out.")
+        Path | None,
+        typer.Option(
+            "--to", metavar="FOLDER", help="Folder to write, no file there is replaced; S if left out."
+        ),
     ] = None,
     parquet: Annotated[bool, typer.Option("--parquet", help="Parquet in place of CSV.")] = False,
 ) -> None:
@@ -341,5 +344,5 @@ def export(
     from ema_pipeline.series.export import export_series
 
     with _opened(s) as database:
-        for path in export_series(database, to or s, parquet):
+        for path in export_series(database, to or s, parquet, keep=to is not None):
             show(str(path))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ema_pipeline.errors import EmaError
-from ema_pipeline.files import replacing
+from ema_pipeline.files import refuse_existing, replacing
 from ema_pipeline.series.database import SeriesDatabase, rows_of
 
 if TYPE_CHECKING:
@@ -39,25 +39,37 @@ def wide_table(database: SeriesDatabase) -> pd.DataFrame:
     return tests.merge(values, how="left", left_on="test", right_index=True)
 
 
-def export_series(database: SeriesDatabase, to: Path, parquet: bool = False) -> list[Path]:
+def export_series(
+    database: SeriesDatabase, to: Path, parquet: bool = False, *, keep: bool = False
+) -> list[Path]:
     """Write the wide table and the long ones into a folder; returns the files.
+
+    Parameters
+    ----------
+    database : SeriesDatabase
+    to : Path
+    parquet : bool
+        Parquet in place of CSV.
+    keep : bool
+        Refuse to replace files that exist already.
 
     Raises
     ------
     EmaError
-        If the folder cannot be written, or if what writes Parquet is not installed.
+        If the folder cannot be written, if a file exists already that is to be kept, or if what writes Parquet is not
+        installed.
     """
     if parquet and importlib.util.find_spec("pyarrow") is None:
         raise EmaError("--parquet needs pyarrow; install it with: pip install 'ema-pipeline[parquet]'")
+    paths = {name: to / f"{name}.{'parquet' if parquet else 'csv'}" for name in ("tests", *LONG_TABLES)}
+    if keep:
+        refuse_existing(paths.values())
     to.mkdir(parents=True, exist_ok=True)
-    tables = {"tests": wide_table(database)} | {name: database.table(name) for name in LONG_TABLES}
-    written = []
-    for name, table in tables.items():
-        path = to / f"{name}.{'parquet' if parquet else 'csv'}"
+    for name, path in paths.items():
+        table = wide_table(database) if name == "tests" else database.table(name)
         with replacing(path) as scratch:
             if parquet:
                 table.to_parquet(scratch, index=False)
             else:
                 table.to_csv(scratch, index=False)
-        written.append(path)
-    return written
+    return list(paths.values())

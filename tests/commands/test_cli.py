@@ -247,6 +247,23 @@ def test_exported_files_are_read_by_another_program(
     assert np.iscomplexobj(frf["data"])
 
 
+def test_export_replaces_files_in_the_results_folder_only(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mine = tmp_path / "no_ring_shapes.csv"
+    mine.write_text("mine", encoding="utf-8")
+    code, out, err = ema(capsys, "export", results, "--to", tmp_path)
+    assert_one_clear_line(code, out, err)
+    assert f"{mine}: exists already and is kept; name another folder with --to" in err
+    assert [p.name for p in tmp_path.iterdir()] == [mine.name]
+    assert mine.read_text(encoding="utf-8") == "mine"
+    own = results / "export" / mine.name
+    own.parent.mkdir(exist_ok=True)
+    own.write_text("of an earlier run", encoding="utf-8")
+    assert ema(capsys, "export", results)[0] == 0
+    assert own.read_text(encoding="utf-8").startswith("configuration,mode,")
+
+
 def test_a_table_of_modes_takes_the_place_of_raw_data(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

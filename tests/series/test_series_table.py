@@ -249,6 +249,21 @@ def test_false_alarms_of_trends_are_rare() -> None:
     assert scipy.stats.binomtest(alarms, 300, 0.02, alternative="greater").pvalue > 0.01, alarms
 
 
+def test_export_replaces_files_in_the_folder_of_the_series_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _series(tmp_path / "S", count=2)
+    mine = tmp_path / "modes.csv"
+    mine.write_text("mine", encoding="utf-8")
+    code, _, err = ema(capsys, "series", "export", tmp_path / "S", "--to", tmp_path)
+    assert (code, err.count("\n")) == (1, 1), err
+    assert f"{mine}: exists already and is kept; name another folder with --to" in err
+    assert mine.read_text(encoding="utf-8") == "mine"
+    assert not (tmp_path / "tests.csv").exists()
+    for _ in range(2):
+        assert ema(capsys, "series", "export", tmp_path / "S")[0] == 0
+
+
 def test_page_is_self_contained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every test is a row, the reject says why, names cannot become markup, nothing is loaded."""
     database = _series(tmp_path / "S")
