@@ -164,7 +164,7 @@ def estimate_driven_frfs(records: Sequence[DrivenRecord], settings: FrfSettings 
         channels=tuple(ChannelQuality(c.name, c.calibration_std, c.transverse) for c in first.channels),
         hammer=hammer,
         excitation=first.excitation or "continuous",
-        multiple_coherence=found.multiple if n_in > 1 else None,
+        multiple_coherence=_bridged(found.multiple[:, None], excited)[:, 0] if n_in > 1 else None,
         input_coherence=coherence if n_in > 1 else None,
         noise_variance=None if apart is None else apart.noise,
         distortion_variance=None if apart is None else apart.distortion,

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import zlib
+
 import numpy as np
 import pytest
 from driven import driven_system
@@ -15,6 +18,7 @@ from ema_pipeline.ingest.records import ResponseChannel
 from ema_pipeline.mechanics.assembly import Assembly, Damper, Mass, Spring
 from ema_pipeline.mechanics.frf import receptance
 from ema_pipeline.mechanics.simulation import between_samples, march
+from ema_pipeline.report.figures.frf import frf_sheet
 from ema_pipeline.report.interactive.packing import LEVELS, packed_frfs
 
 RATE = 512.0
@@ -74,6 +78,39 @@ def test_two_forces_at_once_give_the_matrix_and_a_variance_that_is_true(estimato
     assert np.median(frfs.multiple_coherence[:, on]) > 0.95
     assert frfs.input_coherence is not None
     assert np.median(frfs.input_coherence[0, 1, on]) < 0.2
+
+
+def test_multiple_coherence_is_shown_beside_the_partial_one() -> None:
+    force = np.random.default_rng(3).standard_normal((2, 20_000))
+    frfs = estimate_driven_frfs([_record(force, _responded(force, 0.05))])
+    assert frfs.multiple_coherence is not None
+    lines = (frfs.frequency_hz > 0) & (frfs.frequency_hz <= 60.0)
+    packed = packed_frfs(frfs, 60.0)
+    shown = np.frombuffer(zlib.decompress(base64.b64decode(packed["multiple"])), np.uint8) / 250
+    rows = frfs.multiple_coherence[[o for o, _, _ in packed["pairs"]]][:, lines]
+    np.testing.assert_allclose(shown.reshape(rows.shape), rows, atol=0.003)
+    axes = frf_sheet(frfs, None, [(1, 0)]).axes[2]
+    assert [t.get_text() for t in axes.get_legend().get_texts()] == ["partial", "multiple"]
+    partial, multiple = (np.asarray(line.get_ydata()) for line in axes.get_lines()[:2])
+    assert np.all(multiple >= partial - 1e-9)  # all forces explain what one does, and more
+    alone = estimate_driven_frfs([_record(force[:1], _responded(force[:1], 0.05))])
+    assert packed_frfs(alone, 60.0)["multiple"] is None
+    assert frf_sheet(alone, None, [(1, 0)]).axes[2].get_legend() is None
+
+
+def test_coherence_of_several_multisines_is_bridged_where_there_is_no_force() -> None:
+    random, period = np.random.default_rng(8), 1024
+    lines, records = np.arange(21, 221, 2), []
+    for k in range(4):
+        spectrum = np.zeros((2, period // 2 + 1), complex)
+        spectrum[:, lines] = np.exp(2j * np.pi * random.uniform(size=(2, len(lines))))
+        one = np.fft.irfft(spectrum, period)
+        response = np.stack([one[0] + 0.5 * one[1], one[1]])
+        response += 1e-3 * np.std(response) * random.standard_normal(response.shape)
+        records.append(_record(np.tile(one, 4), np.tile(response, 4), f"r{k}", period=period))
+    frfs = estimate_driven_frfs(records)
+    assert frfs.multiple_coherence is not None
+    assert frfs.multiple_coherence[:, lines[0] : lines[-1] + 1].min() > 0.99
 
 
 def test_forces_that_are_one_signal_are_refused_and_correlated_ones_named() -> None:

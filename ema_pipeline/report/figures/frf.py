@@ -43,6 +43,8 @@ def accelerance_unit(frfs: FrfSet) -> str:
 def frf_sheet(frfs: FrfSet, modal: ModalModel | None, picks: Sequence[tuple[int, int]]) -> Figure:
     """Magnitude, phase and coherence of up to two FRFs, with the modal model's synthesis over them.
 
+    Of several forces at once both coherences are drawn: the partial one of the FRF's force, and the multiple one.
+
     Parameters
     ----------
     frfs : FrfSet
@@ -89,7 +91,10 @@ def frf_sheet(frfs: FrfSet, modal: ModalModel | None, picks: Sequence[tuple[int,
         middle.set_yticks([-180, -90, 0, 90, 180])
         bottom.set_ylim(-0.04, 1.06)
         if np.isfinite(frfs.coherence[o, i, shown]).any():
-            _curve(bottom, f[shown], frfs.coherence[o, i, shown], "#333333", "-")
+            _curve(bottom, f[shown], frfs.coherence[o, i, shown], "#333333", "-", "partial")
+            if frfs.multiple_coherence is not None:
+                _curve(bottom, f[shown], frfs.multiple_coherence[o, shown], MODEL, "--", "multiple")
+                bottom.legend(loc="lower left", ncols=2, handlelength=2.4, borderpad=0.3)
         else:
             note(bottom, "one hit: no coherence" if hits <= 1 else "no coherence")
         frequency_axis(top, low, high, log, label=False)

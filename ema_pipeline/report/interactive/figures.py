@@ -38,9 +38,12 @@ from ema_pipeline.report.interactive.theme import (
 
 
 def frf_viewer(log_x: bool = False) -> Any:
-    """Magnitude (two scales, one shown), phase and coherence of one FRF: measured with its band, and two models."""
+    """Magnitude (two scales, one shown), phase and coherence of one FRF: measured with its band, and two models.
+
+    Of several forces at once the multiple coherence is dashed beside the partial one.
+    """
     x_type = "log" if log_x else "linear"
-    measured = source("frf.measured", "f", "magnitude", "phase", "coherence", "low", "high")
+    measured = source("frf.measured", "f", "magnitude", "phase", "coherence", "multiple", "low", "high")
     models = [(source(f"frf.{k}", "f", "magnitude", "phase"), k) for k in ("before", "after")]
     levels = {name: source(f"frf.{name}", "f", "level", "floor") for name in LEVELS}
     modes = source("frf.modes", "f", "text")
@@ -80,6 +83,7 @@ def frf_viewer(log_x: bool = False) -> Any:
         "frequency, Hz", "coherence, 1", 140, x_axis_type=x_type, x_range=x_range, y_range=(0, 1.05),
         name="frf.coherence",
     )  # fmt: skip
+    coherence.line("f", "multiple", source=measured, color=ACCENT, line_width=1.2, line_dash="dashed")
     coherence.line("f", "coherence", source=measured, color=INK, line_width=1.2).glyph.tags = [INK_TAG]
     for one in (phase, coherence):
         one.vspan("f", source=modes, line_color=INK, line_dash="dotted", line_alpha=0.55)

@@ -37,7 +37,8 @@ def packed_frfs(frfs: FrfSet, high_hz: float, points: int | None = POINTS) -> di
     -------
     dict
         ``pairs`` are (output, input, hits) of the FRFs, one row each in the arrays ``magnitude``, ``phase``,
-        ``coherence`` and ``sigma``, which are base64 of deflated bytes.
+        ``coherence``, ``sigma`` and ``multiple``, which are base64 of deflated bytes; ``multiple``, the multiple
+        coherence, is None but for several forces at once.
     """
     lines = (frfs.frequency_hz > 0) & (frfs.frequency_hz <= high_hz)
     all_pairs = [(int(o), int(i)) for o, i in np.argwhere(frfs.hits > 0)]
@@ -69,10 +70,17 @@ def packed_frfs(frfs: FrfSet, high_hz: float, points: int | None = POINTS) -> di
         "phase": _packed(_differences(_steps(np.angle(h), (-np.pi, np.pi), 65535))),
         "coherence": _packed(_bytes(coherence)),
         "sigma": _packed(sigma.astype(np.uint8)),
+        "multiple": _multiple(frfs, kept, lines),
         "decades": DECADES,
         "sigma_decades": SIGMA_DECADES,
         "levels": _levels(frfs, kept, lines),
     }  # fmt: skip
+
+
+def _multiple(frfs: FrfSet, kept: list[tuple[int, int]], lines: NDArray[np.bool_]) -> str | None:
+    """Multiple coherence of the responses of the kept FRFs; None for one force at a time."""
+    multiple = frfs.multiple_coherence
+    return None if multiple is None else _packed(_bytes(np.stack([multiple[o, lines] for o, _ in kept])))
 
 
 def _average(frfs: FrfSet) -> str:

@@ -21,22 +21,23 @@ var EmaNumbers = (function () {
   function unpacked(configuration) {
     var packed = configuration.frfs;
     if (!frfs[configuration.name]) {
-      frfs[configuration.name] = Promise.all(["magnitude", "phase", "coherence", "sigma"].map(function (key) { return inflate(packed[key]); })).then(function (raw) {
+      frfs[configuration.name] = Promise.all(["magnitude", "phase", "coherence", "sigma", "multiple"].map(function (key) { return packed[key] && inflate(packed[key]); })).then(function (raw) {
         var levels = Object.keys(packed.levels || {});
         return Promise.all(levels.map(function (key) { return inflate(packed.levels[key]); })).then(function (more) {
         var f = new Float64Array(packed.lines), level = {};
         levels.forEach(function (key, k) { level[key] = words16(more[k], packed.lines); });
         for (var k = 0; k < packed.lines; k++) { f[k] = packed.start + k * packed.step; }
-        return { f: f, magnitude: words16(raw[0], packed.lines), phase: words16(raw[1], packed.lines), coherence: raw[2], sigma: raw[3], level: level };
+        return { f: f, magnitude: words16(raw[0], packed.lines), phase: words16(raw[1], packed.lines), coherence: raw[2], sigma: raw[3], multiple: raw[4], level: level };
         });
       });
     }
     return frfs[configuration.name];
   }
+  function coherence(step) { return step === 255 ? NaN : step / 250; }
   /* One FRF with its band of two standard deviations, where that is wanted. */
   function row(all, packed, k, banded) {
     var n = packed.lines, low = packed.decades[0], span = packed.decades[1] - low;
-    var out = { f: all.f, magnitude: new Float64Array(n), phase: new Float64Array(n), coherence: new Float64Array(n), low: new Float64Array(n), high: new Float64Array(n) };
+    var out = { f: all.f, magnitude: new Float64Array(n), phase: new Float64Array(n), coherence: new Float64Array(n), multiple: new Float64Array(n), low: new Float64Array(n), high: new Float64Array(n) };
     var last = 0;
     for (var i = 0; i < n; i++) {
       var at = k * n + i, size = Math.pow(10, low + span * all.magnitude[at] / 65534), phase = 360 * all.phase[at] / 65535 - 180;
@@ -44,7 +45,8 @@ var EmaNumbers = (function () {
       out.magnitude[i] = size;
       out.phase[i] = i && Math.abs(phase - last) > 180 ? NaN : phase;
       last = phase;
-      out.coherence[i] = all.coherence[at] === 255 ? NaN : all.coherence[at] / 250;
+      out.coherence[i] = coherence(all.coherence[at]);
+      out.multiple[i] = all.multiple ? coherence(all.multiple[at]) : NaN;
       out.low[i] = size * Math.max(1 - 2 * share, 0.02);
       out.high[i] = size * (1 + 2 * share);
     }

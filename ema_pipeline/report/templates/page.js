@@ -129,7 +129,7 @@ var EmaPage = (function () {
     options(byId("frf-input"), inputs.map(function (i) { return c.frfs.inputs[i]; }), inputs.indexOf(chosen.input));
     var note = byId("frf-note"), hits = c.frfs.pairs.filter(function (p) { return p[0] === chosen.output && p[1] === chosen.input; })[0][2];
     var some = c.frfs.pairs.length < c.frfs.total ? "; " + c.frfs.pairs.length + " of " + c.frfs.total + " FRFs are kept in this page" : "";
-    note.textContent = c.name + ": " + c.frfs.outputs[chosen.output] + " ← " + c.frfs.inputs[chosen.input] + ", " + (hits === 1 ? "one " + c.frfs.average + ": no coherence, no scatter" : "mean of " + hits + " " + c.frfs.average + "s") + some + rest(c) + said(c.frfs.levels);
+    note.textContent = c.name + ": " + c.frfs.outputs[chosen.output] + " ← " + c.frfs.inputs[chosen.input] + ", " + (hits === 1 ? "one " + c.frfs.average + ": no coherence, no scatter" : "mean of " + hits + " " + c.frfs.average + "s") + some + rest(c) + said(c.frfs.levels) + coherences(c.frfs);
     refill(["frf"]);
   }
   /* Where the measurement goes on beyond the modes, which the figure begins with. */
@@ -138,6 +138,7 @@ var EmaPage = (function () {
     return c.shown_to < 0.99 * last ? "; shown up to " + Number(c.shown_to.toPrecision(3)) + " Hz, measured up to " + Number(last.toPrecision(4)) + " Hz: the tools beside it zoom and pan" : "";
   }
   function said(levels) { return levels ? ". Shaded: noise, 1σ of the mean; hatched: nonlinear distortion, 1σ of one realisation; triangles and squares: distortion at odd and even lines that carry no force." : ""; }
+  function coherences(packed) { return packed.multiple ? ". Coherence: solid, the partial one of this force without what the others explain; dashed, the multiple one of all forces together." : ""; }
   function empty(names) { var out = {}; names.forEach(function (n) { out[n] = []; }); return out; }
   function shortModel(k) { return data.model.models[k] || "model"; }
 
