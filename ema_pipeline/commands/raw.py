@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ema_pipeline.commands.options import EffectFiles, Json, Overrides, Quiet, Raw
 from ema_pipeline.commands.screen import program, show, show_json
+
+if TYPE_CHECKING:
+    from ema_pipeline.simulate.campaign import SimulatedCampaign
 
 
 def check(raw: Raw, set_: Overrides = None, json: Json = False) -> None:
@@ -57,7 +61,12 @@ def simulate(
     ] = None,
     effect: Annotated[
         list[str] | None,
-        typer.Option("--effect", "-e", metavar="ID@PLACE:NAME=VALUE", help="Hidden effect and its size."),
+        typer.Option(
+            "--effect",
+            "-e",
+            metavar="ID@PLACE:NAME=VALUE",
+            help="Hidden effect and its size; left out, one that shows clearly.",
+        ),
     ] = None,
     effect_file: EffectFiles = None,
     value: Annotated[
@@ -102,3 +111,22 @@ def simulate(
     if not quiet:
         where = ", ".join(made.configurations)
         show(f"Wrote {made.records} records ({where}) to {out}; the truth is in {out / 'truth.json'}")
+        for line in _assumed_sizes(made):
+            show(line)
+
+
+def _assumed_sizes(made: SimulatedCampaign) -> Iterator[str]:
+    """A line on every effect whose size, or part of it, was left out."""
+    from ema_pipeline.effects.base import effect_of
+
+    for label in dict.fromkeys(map(effect_of, made.assumed)):
+        own = {name: name.removeprefix(f"{label}.") for name in made.values if effect_of(name) == label}
+        sizes = [
+            f"{own[name]} = {made.values[name]:.4g} {'' if unit == '1' else unit}".rstrip()
+            for name, unit in made.assumed.items()
+            if name in own
+        ]
+        yield (
+            f"{label} has {' and '.join(sizes)} by default; "
+            f"to choose: --effect {label}:{','.join(f'{name}=VALUE' for name in own.values())}"
+        )

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from ema_pipeline.dof import Dof
-from ema_pipeline.effects.library import Library
+from ema_pipeline.effects.base import effect_of
+from ema_pipeline.effects.library import Library, parse_sized
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.mechanics.assembly import Assembly
 from ema_pipeline.rigs import load_rig, model_modes, rig_names
@@ -49,12 +50,15 @@ class SimulatedCampaign:
         True values of all parameters, the effects' among them.
     records : int
         Number of record files.
+    assumed : dict of str to str
+        Parameters of effects that were not given and have the library's value, which shows clearly; with their units.
     """
 
     folder: Path
     configurations: tuple[str, ...]
     values: dict[str, float]
     records: int
+    assumed: dict[str, str]
 
 
 def simulate_campaign(
@@ -137,7 +141,15 @@ def simulate_campaign(
         truth["imperfections"] = _drawn(made, tests, options)
     (out / TRUTH_FILE).write_text(json.dumps(truth, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     records = sum(len(c["records"]) for c in written.values())
-    return SimulatedCampaign(out, tuple(chosen), true, records)
+    return SimulatedCampaign(out, tuple(chosen), true, records, _assumed(made.rig, effects, values or {}))
+
+
+def _assumed(rig: Rig, effects: Sequence[str], values: Mapping[str, float]) -> dict[str, str]:
+    given = set(values)
+    for label, sizes in map(parse_sized, effects):
+        effect, _, place = (text.strip() for text in label.partition("@"))
+        given |= {f"{effect}@{place}.{name}" for name in sizes}
+    return {name: p.unit for name, p in rig.parameters.items() if effect_of(name) and name not in given}
 
 
 def true_values(

@@ -636,6 +636,31 @@ def test_settings_of_a_simulated_test_are_those_that_were_given(
     assert "unknown key 'sensors'" in err
 
 
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (
+            ("-e", "mass@storey1"),
+            "mass@storey1 has mass = 0.05 kg by default; to choose: --effect mass@storey1:mass=VALUE",
+        ),
+        (
+            ("-e", "out_of_tolerance@storey1_stiffness"),
+            "out_of_tolerance@storey1_stiffness has relative_change = 0.3 by default; "
+            "to choose: --effect out_of_tolerance@storey1_stiffness:relative_change=VALUE",
+        ),
+        (("-e", " mass @ storey1:mass=0.02"), ""),
+        (("-e", "mass@storey1", "--value", "mass@storey1.mass=0.02"), ""),
+    ],
+)
+def test_sizes_of_effects_that_were_not_given_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], given: tuple[str, ...], said: str
+) -> None:
+    short = ("--rig", "frame", "--set", "hits=1", "--set", "duration_s=0.2")
+    code, out, err = ema(capsys, "simulate", tmp_path / "raw", *short, *given)
+    assert code == 0, err
+    assert out.replace("\n", " ").partition("truth.json ")[2].strip() == said
+
+
 def test_an_effect_is_found_again_however_it_was_typed(
     results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
