@@ -24,7 +24,7 @@ from ema_pipeline.frf.channels import ChannelQuality
 from ema_pipeline.frf.parts import gain_ratios, joined
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.campaign import read_campaign
-from ema_pipeline.merge import merge
+from ema_pipeline.merge import Part, merge
 from ema_pipeline.run.measured import measured_frfs, measured_modes
 from ema_pipeline.run.opening import existing_run
 from ema_pipeline.simulate import simulate_campaign
@@ -245,6 +245,19 @@ def test_what_descriptions_tell_is_refused_before_modes_are_identified(
     code, _, err = ema(capsys, "merge", hard, tips / "soft", "--out", out)
     assert code == 1
     assert "exists already" in err
+
+
+def test_a_common_point_whose_hits_were_all_left_out_connects_nothing(
+    tips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def identified(part: Any, *_: object) -> Part:
+        own = (Dof.parse(f"{part.name}.x"),)
+        frfs = dataclasses.replace(_frfs(0.01, (1, 500), 1), outputs=own, inputs=own)
+        return Part(part.name, part.raw, part.test, frfs, None)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("ema_pipeline.merge._identified", identified)
+    with pytest.raises(EmaError, match="hard: strikes no point"):
+        merge([tips / "soft", tips / "hard"], tmp_path / "both")
 
 
 def test_hammers_that_contradict_each_other_are_refused(
