@@ -11,7 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ema_pipeline.modal.drift.local import FOLLOWED, LARGEST_STEP, filled, linear_fit, shared_poles
+from ema_pipeline.modal.drift.local import (
+    FOLLOWED,
+    LARGEST_STEP,
+    SharedPoles,
+    filled,
+    linear_fit,
+    shared_poles,
+)
 from ema_pipeline.modal.drift.windows import PeakWindow
 
 Complex = NDArray[np.complex128]
@@ -36,8 +43,11 @@ APART = (-3.0, -1.5, -0.7, 0.7, 1.5, 3.0)
 PAIR = 0.25
 """Share of what one mode leaves, with a frequency of its own in each hit, that two leave at most."""
 
+FOLLOWED_PAIRS = 3
+"""Pairs of modes that are tried in single hits, those first that explain all hits together best."""
+
 TWIN = 0.1
-"""Distance in decay rates below which two poles are one."""
+"""Distance of two frequencies, in decay rates, up to which two poles are one."""
 
 
 @dataclass(frozen=True)
@@ -105,33 +115,49 @@ def follow_peak(
     one_point : bool
         True where all hits struck one point: they excite two modes under a peak alike, as if they were one.
     """
-    one = _followed(window, np.array([window.pole]), frf, omega, rest_s)
+    known, data = filled(frf)
+
+    def shared(start: Complex) -> SharedPoles | None:
+        return shared_poles(window, start, data, known, omega, rest_s, FOLLOWED)
+
+    alone = shared(np.array([window.pole]))
+    one = None if alone is None else _followed(window, alone, data, known, omega, rest_s)
     if one_point or (one is not None and one[0].second_shape <= PURE):
         return None if one is None else one[0]
-    first = window.pole if one is None else complex(one[0].poles[0])
+    first = window.pole if alone is None else complex(alone.poles[0])
+    pairs = [shared(first + np.array([0.0, -1j * apart * first.real])) for apart in APART]
     best, least = (None, np.inf) if one is None else (one[0], PAIR * one[1])
-    for apart in APART:
-        two = _followed(window, first + np.array([0.0, -1j * apart * first.real]), frf, omega, rest_s)
-        if two is not None and two[1] < least:
-            best, least = two
+    for pair in _distinct([p for p in pairs if p is not None])[:FOLLOWED_PAIRS]:
+        two, left = _followed(window, pair, data, known, omega, rest_s)
+        if left < least:
+            best, least = two, left
     return best
 
 
+def _distinct(pairs: list[SharedPoles]) -> list[SharedPoles]:
+    """Pairs of poles that differ from each other, and the two of each, best first."""
+    found: list[SharedPoles] = []
+    for pair in sorted(pairs, key=lambda p: -p.explained):
+        near = TWIN * -float(pair.poles.real.max())
+        known = [np.abs(np.sort(pair.poles.imag) - np.sort(p.poles.imag)).max() < near for p in found]
+        if np.ptp(pair.poles.imag) > near and not any(known):
+            found.append(pair)
+    return found
+
+
 def _followed(
-    window: PeakWindow, start: Complex, frf: Complex, omega: Real, rest_s: float
-) -> tuple[FollowedPeak, float] | None:
-    """The peak if so many modes make it, and the power that they leave; None where they do not explain it."""
-    known, data = filled(frf)
-    shared = shared_poles(window, start, data, known, omega, rest_s, FOLLOWED)
-    if shared is None:
-        return None
-    poles, noise = shared
-    if len(poles) > 1 and abs(poles[1] - poles[0]) < TWIN * -float(poles.real.max()):
-        return None
-    weight = np.where(known, 1.0 / noise, 0.0)
-    hits = [_one_hit(window, poles, d, w, omega, rest_s) for d, w in zip(data, weight, strict=True)]
+    window: PeakWindow,
+    shared: SharedPoles,
+    data: Complex,
+    known: NDArray[np.bool_],
+    omega: Real,
+    rest_s: float,
+) -> tuple[FollowedPeak, float]:
+    """The peak if these modes make it, and the power that they leave."""
+    weight = np.where(known, 1.0 / shared.noise, 0.0)
+    hits = [_one_hit(window, shared.poles, d, w, omega, rest_s) for d, w in zip(data, weight, strict=True)]
     peak = FollowedPeak(
-        poles,
+        shared.poles,
         np.array([h.moved for h in hits]),
         np.array([h.std for h in hits]),
         np.array([h.residues for h in hits]),

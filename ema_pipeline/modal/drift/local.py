@@ -88,6 +88,25 @@ class PeakResidues:
 
 
 @dataclass(frozen=True)
+class SharedPoles:
+    """Poles that fit all hits best.
+
+    Attributes
+    ----------
+    poles : complex ndarray, (n_modes,)
+        rad/s.
+    noise : ndarray, (n_outputs,)
+        Power that they leave, over the largest.
+    explained : float
+        Share of what a straight background leaves that they explain.
+    """
+
+    poles: Complex
+    noise: Real
+    explained: float
+
+
+@dataclass(frozen=True)
 class LinearFit:
     """Fit of some FRFs at given poles.
 
@@ -165,7 +184,7 @@ def plain_pole(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> 
     """
     known, data = filled(frf)
     shared = shared_poles(window, np.array([window.pole]), data, known, omega, rest_s, EXPLAINED)
-    return None if shared is None else complex(shared[0][0])
+    return None if shared is None else complex(shared.poles[0])
 
 
 def peak_residues(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) -> PeakResidues | None:
@@ -184,7 +203,7 @@ def peak_residues(window: PeakWindow, frf: Complex, omega: Real, rest_s: float) 
     shared = shared_poles(window, np.array([window.pole]), data, known, omega, rest_s, FOLLOWED)
     if shared is None:
         return None
-    fit = linear_fit(shared[0], window.neighbours, data.reshape(-1, len(omega)), omega, rest_s)
+    fit = linear_fit(shared.poles, window.neighbours, data.reshape(-1, len(omega)), omega, rest_s)
     if fit is None or len(omega) <= fit.free:
         return None
     power = np.sum(np.abs(fit.left) ** 2, axis=-1) / (len(omega) - fit.free) * _serial(fit.left)
@@ -234,8 +253,8 @@ def shared_poles(
     omega: Real,
     rest_s: float,
     least: float,
-) -> tuple[Complex, Real] | None:
-    """Poles that fit all hits best, and the noise power of every output; None where they explain less than `least`.
+) -> SharedPoles | None:
+    """Poles that fit all hits best; None where they explain less than `least`.
 
     Parameters
     ----------
@@ -262,8 +281,10 @@ def shared_poles(
         inside = (omega[0] < poles.imag) & (poles.imag < omega[-1])
         if not np.all(inside & (poles.real < 0) & (-poles.real < MAX_DAMPING * np.abs(poles))):
             return None
-    rings_on = np.exp(float(poles.real.max()) * rest_s) > RINGS_ON
-    return None if rings_on or _explained(poles, window, data, omega, rest_s) < least else (poles, noise)
+    if np.exp(float(poles.real.max()) * rest_s) > RINGS_ON:
+        return None
+    explained = _explained(poles, window, data, omega, rest_s)
+    return None if explained < least else SharedPoles(poles, noise, explained)
 
 
 def linear_fit(
