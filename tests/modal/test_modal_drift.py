@@ -17,7 +17,7 @@ from ema_pipeline.ingest.records import HitSamples
 from ema_pipeline.modal.assurance import mac
 from ema_pipeline.modal.combine_estimates import NamedEstimate, pool
 from ema_pipeline.modal.drift.align import _movements, _warps
-from ema_pipeline.modal.drift.follow import FollowedPeak, follow_peak
+from ema_pipeline.modal.drift.follow import PURE, FollowedPeak, follow_peak
 from ema_pipeline.modal.drift.local import change_in_decay
 from ema_pipeline.modal.drift.shifts import movement
 from ema_pipeline.modal.drift.windows import HitKey, PeakWindow
@@ -407,3 +407,45 @@ def test_drift_is_told_from_pairs_of_close_modes_that_points_show_in_other_ratio
     assert np.std(off) < 4e-5  # what is common is the mean drift, which is in the intervals
     for mode, shape in zip(found.modal.modes, system.shapes, strict=True):
         assert 1 - mac(mode.shape, shape).item() < 3e-5
+
+
+def _peak_of_hits(records: np.ndarray, rate: float, centre: float, reach: float) -> FollowedPeak | None:
+    """The peak that decays, (n_hits, n_outputs, n), make about a frequency."""
+    n = records.shape[-1]
+    lines = slice(round((centre - reach) * n / rate), round((centre + reach) * n / rate))
+    frf = np.fft.rfft(records)[..., lines] / rate
+    omega = 2 * np.pi * np.arange(n // 2 + 1)[lines] * rate / n
+    start = complex(-1.0, 2 * np.pi * centre)
+    window = PeakWindow(lines, start, np.zeros(0, complex), np.arange(records.shape[1]))
+    return follow_peak(window, frf, omega, n / rate, one_point=False)
+
+
+def test_two_modes_under_a_peak_are_told_to_move_as_their_frequencies_do() -> None:
+    rate, n, rng = 512.0, 4096, np.random.default_rng(2)
+    time, drift = np.arange(n) / rate, np.array([1e-3, 1e-3, -5e-4, -5e-4, 0.0, -1e-3])
+    ratio = np.array([1.0, 1.0, 0.1, 0.1, -0.6, -0.6])  # of the second mode, as three points excite it
+    records = np.empty((6, 3, n))
+    for h, (moved, second) in enumerate(zip(drift, ratio, strict=True)):
+        one = np.exp(-1.2 * time) * np.sin(2 * np.pi * 60.0 * (1 + moved) * time)
+        two = np.exp(-1.0 * time) * np.sin(2 * np.pi * 60.3 * (1 + moved) * time)
+        records[h] = np.outer([1.0, 0.5, -0.8], one) + second * np.outer([0.3, -1.0, -0.6], two)
+    peak = _peak_of_hits(records + 1e-3 * rng.standard_normal(records.shape), rate, 60.1, 3.0)
+    assert peak is not None
+    assert not peak.single
+    assert np.sort(peak.poles.imag) / (2 * np.pi) == pytest.approx([60.0, 60.3], rel=1e-3)
+    assert peak.share.sum(axis=1) == pytest.approx(np.ones(6))
+    moved = peak.moved.imag + peak.share @ (peak.poles.imag / (2 * np.pi) / [60.0, 60.3] - 1)
+    assert moved == pytest.approx(drift, abs=5e-5)
+
+
+def test_a_frequency_that_moves_within_the_decay_is_one_mode_on_all_points() -> None:
+    """Its peak is leaned over: two poles follow it better than one, but all hits show them in one ratio."""
+    rate, n, rng = 512.0, 4096, np.random.default_rng(2)
+    time = np.arange(n) / rate
+    phase = 2 * np.pi * (60.0 * time + 1.0 * (1 - np.exp(-2.4 * time)) / 2.4)
+    records = np.outer([1.0, 0.5, 0.7, -0.9], np.exp(-1.2 * time) * np.sin(phase))[:, None]
+    records = records * np.array([1.0, -0.4, 0.7])[:, None]
+    peak = _peak_of_hits(records + 4e-2 * rng.standard_normal(records.shape), rate, 60.0, 3.0)
+    assert peak is not None
+    assert peak.second_shape > PURE
+    assert len(peak.poles) == 1

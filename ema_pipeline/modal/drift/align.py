@@ -237,7 +237,7 @@ def _movements(
                     pole=pole,
                     hits=float(power.sum() ** 2 / max(float(np.sum(power**2)), 1e-300)),
                     spread=np.array([decay, own_spread * pole.imag]),
-                    single=len(peak.poles) == 1 if len(points) == 1 else peak.single,
+                    single=len(points) == 1 or peak.single,
                     proven=len(points) > 1 and peak.single,
                     shift=np.where(peak.shown, moved.common + own[-1], np.nan),
                     common=moved.common,

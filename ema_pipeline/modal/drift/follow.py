@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ema_pipeline.modal.assurance import mac
 from ema_pipeline.modal.drift.local import (
     FOLLOWED,
     LARGEST_STEP,
@@ -45,6 +46,10 @@ PAIR = 0.25
 
 FOLLOWED_PAIRS = 3
 """Pairs of modes that are tried in single hits, those first that explain all hits together best."""
+
+ALIKE = 0.9
+"""Assurance criterion of the residues of two poles, over hits and sensors, from which they are those of one mode whose
+frequency moves within its decay."""
 
 TWIN = 0.1
 """Distance of two frequencies, in decay rates, up to which two poles are one."""
@@ -98,6 +103,11 @@ class FollowedPeak:
         values = np.linalg.svd(scaled, compute_uv=False)
         return float(values[1] / values[0])
 
+    @property
+    def shapes_alike(self) -> float:
+        """Assurance criterion of the residues of the first and the last pole, over hits and sensors."""
+        return float(mac(self.residues[:, :, 0].ravel(), self.residues[:, :, -1].ravel()).item())
+
 
 def follow_peak(
     window: PeakWindow, frf: Complex, omega: Real, rest_s: float, *, one_point: bool
@@ -129,7 +139,7 @@ def follow_peak(
     best, least = (None, np.inf) if one is None else (one[0], PAIR * one[1])
     for pair in _distinct([p for p in pairs if p is not None])[:FOLLOWED_PAIRS]:
         two, left = _followed(window, pair, data, known, omega, rest_s)
-        if left < least:
+        if left < least and two.shapes_alike < ALIKE:
             best, least = two, left
     return best
 
