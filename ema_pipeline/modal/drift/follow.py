@@ -48,8 +48,8 @@ FOLLOWED_PAIRS = 3
 """Pairs of modes that are tried in single hits, those first that explain all hits together best."""
 
 ALIKE = 0.9
-"""Assurance criterion of the residues of two poles, over hits and sensors, from which they are those of one mode whose
-frequency moves within its decay."""
+"""Modal assurance criterion over sensors from which two poles in place of one are one mode, whose frequency moves
+within its decay, where residues show but one."""
 
 TWIN = 0.1
 """Distance of two frequencies, in decay rates, up to which two poles are one."""
@@ -105,8 +105,9 @@ class FollowedPeak:
 
     @property
     def shapes_alike(self) -> float:
-        """Assurance criterion of the residues of the first and the last pole, over hits and sensors."""
-        return float(mac(self.residues[:, :, 0].ravel(), self.residues[:, :, -1].ravel()).item())
+        """Modal assurance criterion of the first and the last pole, by the shape over sensors that most hits show."""
+        first, last = (np.linalg.svd(self.residues[:, :, m], full_matrices=False)[2][0] for m in (0, -1))
+        return float(mac(first, last).item())
 
 
 def follow_peak(
@@ -139,7 +140,7 @@ def follow_peak(
     best, least = (None, np.inf) if one is None else (one[0], PAIR * one[1])
     for pair in _distinct([p for p in pairs if p is not None])[:FOLLOWED_PAIRS]:
         two, left = _followed(window, pair, data, known, omega, rest_s)
-        if left < least and two.shapes_alike < ALIKE:
+        if left < least and not (one is not None and one[0].single and two.shapes_alike > ALIKE):
             best, least = two, left
     return best
 
