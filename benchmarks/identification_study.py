@@ -394,6 +394,9 @@ def moving_pairs_case(seed: int) -> tuple[TrueSystem, Hits, list[int], list[int]
     return system, hits, dofs_out, dofs_in
 
 
+MOVING = {"moving": moving_case, "moving-pairs": moving_pairs_case}
+
+
 def roving_case(seed: int) -> tuple[TrueSystem, Hits, list[int], list[int]]:
     """A hammer that strikes 20 to 50 points once each, three sensors; frequencies drift together and each by itself.
 
@@ -554,17 +557,7 @@ def main() -> None:
     )
     parser.add_argument(
         "study",
-        choices=[
-            "random",
-            "pairs",
-            "noise",
-            "coverage",
-            "window",
-            "ringing",
-            "moving",
-            "moving-pairs",
-            "roving",
-        ],
+        choices=["random", "pairs", "noise", "coverage", "window", "ringing", *MOVING, "roving"],
     )
     parser.add_argument("--cases", type=int, default=50)
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
@@ -582,9 +575,8 @@ def main() -> None:
         noise_study(args.cases, args.first, settings)
     elif args.study == "window":
         window_study(args.cases, args.first, settings, args.verbose)
-    elif args.study in ("moving", "moving-pairs"):
-        case = moving_case if args.study == "moving" else moving_pairs_case
-        hits_study(case, range(args.first, args.first + args.cases), settings, args.verbose)
+    elif args.study in MOVING:
+        hits_study(MOVING[args.study], range(args.first, args.first + args.cases), settings, args.verbose)
     elif args.study == "roving":
         for start, words in (
             (0, "hits that do not depend on each other"),
@@ -594,8 +586,8 @@ def main() -> None:
             seeds = range(args.first + start, args.first + args.cases, 2)
             hits_study(roving_case, seeds, settings, args.verbose)
     else:
-        coverage = ringing_case if args.study == "ringing" else coverage_case
-        coverage_study(coverage, range(args.first, args.first + args.cases), settings)
+        case = ringing_case if args.study == "ringing" else coverage_case
+        coverage_study(case, range(args.first, args.first + args.cases), settings)
 
 
 if __name__ == "__main__":

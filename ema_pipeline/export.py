@@ -114,18 +114,19 @@ def export_results(out: Path, to: Path | None = None, effect_files: Iterable[str
         raise EmaError(f"{out}: {kind.words} have neither FRFs nor modes to export; see summary.json")
     measured = measured_frfs(run)
     folder, names = to or out / "export", run.info.configurations
-    ends = {name: (".uff", "_shapes.csv", "_frfs.csv")[: 3 if name in measured else 2] for name in names}
-    files = [folder / f"{name}{end}" for name in names for end in ends[name]]
+    ends = {name: (".uff", "_shapes.csv", *(["_frfs.csv"] if name in measured else [])) for name in names}
+    files = {name: [folder / f"{name}{end}" for end in ends[name]] for name in names}
+    written = [path for paths in files.values() for path in paths]
     if to is not None:
-        refuse_existing(files)
+        refuse_existing(written)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise EmaError(f"{folder}: cannot be written ({error.strerror}); name another folder") from None
     for name in names:
-        modal = modes_of_structure(run, name)
-        write_uff(folder / f"{name}.uff", measured.get(name), modal)
-        write_table(folder / f"{name}_shapes.csv", shapes_table(modal, name))
-        if name in measured:
-            write_frf_csv(folder / f"{name}_frfs.csv", measured[name])
-    return files
+        modal, (uff, shapes, *frfs) = modes_of_structure(run, name), files[name]
+        write_uff(uff, measured.get(name), modal)
+        write_table(shapes, shapes_table(modal, name))
+        for path in frfs:
+            write_frf_csv(path, measured[name])
+    return written

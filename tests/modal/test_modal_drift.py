@@ -63,7 +63,10 @@ def _peak(pole: complex, poles: np.ndarray, std: np.ndarray, residues: np.ndarra
     """One mode: its poles in the hits, their σ in rad/s, and residues, (n_hits, n_outputs)."""
     size = pole.imag
     share = np.ones((len(poles), 1))
-    return FollowedPeak(np.array([pole]), (poles - pole) / size, std / size, residues[:, :, None], share)
+    left = np.zeros(len(poles))
+    return FollowedPeak(
+        np.array([pole]), (poles - pole) / size, std / size, residues[:, :, None], share, left
+    )
 
 
 def source(records: list) -> Callable[[], Iterator[HitSamples]]:
@@ -338,8 +341,7 @@ def test_one_hit_tells_what_a_frequency_does_within_its_decay(change_hz: float) 
     lines = slice(round((f - 3) * n / rate), round((f + 3) * n / rate))
     frf = np.fft.rfft(records)[:, lines] / rate
     omega = 2 * np.pi * np.arange(n // 2 + 1)[lines] * rate / n
-    window = PeakWindow(lines, 0j, np.zeros(0, complex), np.arange(3))
-    window = replace(window, pole=complex(-sigma, 2 * np.pi * f))
+    window = PeakWindow(lines, complex(-sigma, 2 * np.pi * f), np.zeros(0, complex), np.arange(3))
     peak = follow_peak(window, frf[None], omega, n / rate, one_point=True)
     assert peak is not None
     found = change_in_decay(window, frf, complex(peak.of_hits[0, 0]), omega, n / rate)
@@ -439,7 +441,7 @@ def test_two_modes_under_a_peak_are_told_to_move_as_their_frequencies_do() -> No
 
 
 def test_a_frequency_that_moves_within_the_decay_is_one_mode_on_all_points() -> None:
-    """Its peak is leaned over: two poles follow it better than one, but all hits show them in one ratio."""
+    """Two poles follow its peak better than one, but they have one shape at the sensors."""
     rate, n, rng = 512.0, 4096, np.random.default_rng(2)
     time = np.arange(n) / rate
     phase = 2 * np.pi * (60.0 * time + 1.0 * (1 - np.exp(-2.4 * time)) / 2.4)

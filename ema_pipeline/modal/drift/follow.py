@@ -71,6 +71,8 @@ class FollowedPeak:
         0 where a channel was left out.
     share : ndarray, (n_hits, n_modes)
         How much an error of the frequency of each mode counts in `moved`; sums to 1 over modes.
+    left : ndarray, (n_hits,)
+        Power that the modes leave of the lines.
     """
 
     poles: Complex
@@ -78,6 +80,7 @@ class FollowedPeak:
     std: Real
     residues: Complex
     share: Real
+    left: Real
 
     @property
     def shown(self) -> NDArray[np.bool_]:
@@ -133,15 +136,15 @@ def follow_peak(
 
     alone = shared(np.array([window.pole]))
     one = None if alone is None else _followed(window, alone, data, known, omega, rest_s)
-    if one_point or (one is not None and one[0].second_shape <= PURE):
-        return None if one is None else one[0]
+    if one_point or (one is not None and one.second_shape <= PURE):
+        return one
     first = window.pole if alone is None else complex(alone.poles[0])
     pairs = [shared(first + np.array([0.0, -1j * apart * first.real])) for apart in APART]
-    best, least = (None, np.inf) if one is None else (one[0], PAIR * one[1])
+    best, least = one, np.inf if one is None else PAIR * one.left.sum()
     for pair in _distinct([p for p in pairs if p is not None])[:FOLLOWED_PAIRS]:
-        two, left = _followed(window, pair, data, known, omega, rest_s)
-        if left < least and not (one is not None and one[0].single and two.shapes_alike > ALIKE):
-            best, least = two, left
+        two = _followed(window, pair, data, known, omega, rest_s)
+        if two.left.sum() < least and not (one is not None and one.single and two.shapes_alike > ALIKE):
+            best, least = two, two.left.sum()
     return best
 
 
@@ -163,40 +166,21 @@ def _followed(
     known: NDArray[np.bool_],
     omega: Real,
     rest_s: float,
-) -> tuple[FollowedPeak, float]:
-    """The peak if these modes make it, and the power that they leave."""
+) -> FollowedPeak:
+    """The peak if these modes make it."""
     weight = np.where(known, 1.0 / shared.noise, 0.0)
     hits = [_one_hit(window, shared.poles, d, w, omega, rest_s) for d, w in zip(data, weight, strict=True)]
-    peak = FollowedPeak(
-        shared.poles,
-        np.array([h.moved for h in hits]),
-        np.array([h.std for h in hits]),
-        np.array([h.residues for h in hits]),
-        np.array([h.share for h in hits]),
-    )
-    return peak, sum(h.left for h in hits)
-
-
-@dataclass(frozen=True)
-class _OneHit:
-    """A peak in one hit; see `FollowedPeak`. `left` is the power that the modes leave."""
-
-    moved: complex
-    std: float
-    residues: Complex
-    share: Real
-    left: float
+    return FollowedPeak(shared.poles, *(np.array(of_hits) for of_hits in zip(*hits, strict=True)))
 
 
 def _one_hit(
     window: PeakWindow, poles: Complex, data: Complex, weight: Real, omega: Real, rest_s: float
-) -> _OneHit:
-    """The peak in one hit: all poles move by one factor."""
+) -> tuple[complex, float, Complex, Real, float]:
+    """The peak in one hit, all that `FollowedPeak` holds of it: all poles move by one factor."""
     fit = linear_fit(poles, window.neighbours, data, omega, rest_s)
     assert fit is not None  # the shared poles were fitted on as many lines
-    lost = _OneHit(
-        0j, np.inf, np.zeros_like(fit.residues), np.full(len(poles), 1 / len(poles)), _power(fit.left)
-    )
+    equal = np.full(len(poles), 1 / len(poles))
+    lost = 0j, np.inf, np.zeros_like(fit.residues), equal, _power(fit.left)
     width = float(np.min(-poles.real / poles.imag))
     moved = 0j
     for _ in range(OWN_STEPS):
@@ -218,9 +202,8 @@ def _one_hit(
     dof = max(outputs * (len(omega) - fit.free) - 1, 1)
     spread = float(np.sum(weight[:, None] * np.abs(fit.left) ** 2)) / dof
     residues = np.where(weight[:, None] > 0, fit.residues, 0.0)
-    return _OneHit(
-        moved, float(np.sqrt(0.5 * spread / information)), residues, parts / information, _power(fit.left)
-    )
+    std = float(np.sqrt(0.5 * spread / information))
+    return moved, std, residues, parts / information, _power(fit.left)
 
 
 def _power(left: Complex) -> float:
