@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.assurance import mpc
+from ema_pipeline.modal.band_end import seen_band
 from ema_pipeline.modal.bands import SubBand, between, indicator, split
 from ema_pipeline.modal.compress import Window
 from ema_pipeline.modal.data import FEW_AT_ONCE, FitData, analysis_band, arrange
@@ -92,6 +93,10 @@ def _identify(
     band = analysis_band(frfs, settings)
     data = arrange(frfs, band)
     window, level = _first_noise(data, _averaged_lines(frfs, data.transposed))
+    seen = seen_band(frfs, band, level)
+    if seen != band:
+        data = arrange(frfs, seen)
+        window, level = _first_noise(data, _averaged_lines(frfs, data.transposed))
     bands = split(data.omega, indicator(data, level))
     iterations = POLISH_ITERATIONS if settings.polish else 0
 
@@ -166,6 +171,12 @@ def _model(
 ) -> ModalModel:
     data = window.data
     estimate = Estimate(modes.poles, modes.participation)
+    fitted = _synthesis(window, modes)
+    # of lines and modes beyond the band, nothing is said
+    lines = int(np.count_nonzero(data.omega <= 2 * np.pi * band[1]))
+    end = float(data.omega[lines]) if lines < len(data.omega) else np.inf
+    modes = modes.take(between(modes.poles, 0.0, end))
+    charts = [chart.take(between(chart.pole, 0.0, end)) for chart in charts]
     anchored = modes.held & np.isin(modes.poles, peaks.poles)
     at_peak = modes.held & np.isin(modes.poles, plain.poles)
     # the fit of all hits is a second estimate: as where estimates are pooled, half the way to it is in the interval
@@ -218,8 +229,8 @@ def _model(
         scaled=not note,
         scaling_note=note,
         references=references,
-        frequency_hz=data.omega / (2 * np.pi),
-        synthesis=_synthesis(window, modes),
+        frequency_hz=data.omega[:lines] / (2 * np.pi),
+        synthesis=fitted[..., :lines],
         outputs=frfs.outputs,
         inputs=frfs.inputs,
         chart=chart,

@@ -31,6 +31,8 @@ from ema_pipeline.ingest.load import load_records
 from ema_pipeline.ingest.records import cut_hit
 from ema_pipeline.modal import segment, sub_bands
 from ema_pipeline.modal.all_rows import backgrounds
+from ema_pipeline.modal.assurance import mac
+from ema_pipeline.modal.band_end import seen_band
 from ema_pipeline.modal.data import FitData, arrange
 from ema_pipeline.modal.fit import Estimate
 from ema_pipeline.modal.identify import identify
@@ -482,6 +484,39 @@ def test_velocity_and_displacement_frfs_give_the_same_modes() -> None:
 def test_modes_outside_the_chosen_band_are_not_reported() -> None:
     model = identify(hammer_test(FIVE, list(range(8)), [0, 3]), ModalSettings(low_hz=60, high_hz=250))
     assert frequencies(model) == pytest.approx([81.0, 120.0, 190.0], rel=2e-4)
+
+
+AT_THE_END = TrueSystem(
+    np.array([290.0, 388.0, 399.0, 404.0]),
+    np.array([0.008, 0.007, 0.013, 0.014]),
+    np.random.default_rng(43).standard_normal((4, 8)),
+)
+
+
+def test_modes_that_the_end_of_the_band_cuts_neither_get_lost_nor_into_the_shapes_of_others() -> None:
+    frfs = hammer_test(AT_THE_END, list(range(8)), [0, 3], f_max=500.0)
+    model = identify(frfs, ModalSettings(high_hz=400))
+    assert frequencies(model) == pytest.approx(AT_THE_END.frequency_hz[:3], rel=1e-4)
+    shapes = np.array([m.shape for m in model.modes])
+    assert np.diag(mac(shapes, AT_THE_END.shapes[:3])) == pytest.approx(1.0, abs=1e-4)
+    assert model.frequency_hz[-1] == 400
+    assert model.synthesis.shape[-1] == len(model.frequency_hz)
+    chart = model.chart
+    assert np.all(chart.frequency_hz[chart.selected >= 0] < 402)
+    assert not model.left_out
+
+
+def test_the_fit_sees_lines_beyond_the_band_only_where_a_peak_stands_at_its_end_and_a_hammer_went_on() -> (
+    None
+):
+    frfs = hammer_test(AT_THE_END, list(range(8)), [0, 3], f_max=500.0)
+    level = np.full((8, 2), 1e-4)
+    low, high = seen_band(frfs, (5.0, 400.0), level)
+    assert low == 5.0
+    assert 410 < high <= 440
+    assert seen_band(frfs, (5.0, 340.0), level) == (5.0, 340.0)
+    assert seen_band(replace(frfs, excitation="random"), (5.0, 400.0), level) == (5.0, 400.0)
+    assert seen_band(frfs, (5.0, 400.0), 1e9 * level) == (5.0, 400.0)
 
 
 def test_a_band_without_lines_is_refused_with_a_remedy() -> None:
