@@ -20,8 +20,6 @@ _LEAST_LIMIT = 1.3
 """The same of many, whose σ are themselves known to some tenths only: of 400 models of simulated rigs that lacked
 nothing one had an error above it, of 103 that lacked too little to be named ten."""
 _ONCE_IN = 1e-3
-_FEW = 20
-"""Data that what is calculated to first order only counts as."""
 
 
 def error_limit(count: int, most: float = ERROR_LIMIT) -> float:
@@ -132,22 +130,16 @@ class Posterior:
 
     @property
     def telling(self) -> tuple[float, int]:
-        """Error and number of the data that tell whether the model lacks something: of those apart, or else of all.
-
-        What is calculated to first order only leaves an error of its own: it tells no more than few data.
-        """
+        """Error and number of the data that tell whether the model lacks something: of those apart, or else of all."""
         apart, count = self.residuals.apart, self.residuals.count
-        if apart is None:
+        if apart is None or apart.rough:
             return self.error, count
-        return (
-            (self.error, min(count, _FEW))
-            if apart.rough
-            else (self.error_apart, apart.values - apart.projected)
-        )
+        return self.error_apart, apart.values - apart.projected
 
     def error_limit(self, most: float = ERROR_LIMIT) -> float:
-        """Error of all data up to which the model explains them, see `error_limit`; beside data apart the largest."""
-        return error_limit(self.residuals.count, most) if self.residuals.apart is None else most
+        """Error of all data up to which the model explains them; where those apart tell more, the largest."""
+        apart = self.residuals.apart
+        return error_limit(self.residuals.count, most) if apart is None or apart.rough else most
 
     def fails(self, most: float = ERROR_LIMIT) -> bool:
         """True where the model does not explain the data, or those that count on their own as well."""

@@ -164,9 +164,11 @@ def test_what_counts_on_its_own_as_well_is_not_hidden_by_many_other_data() -> No
     assert both.telling == (both.error_apart, 4)
     rough = replace(whole, apart=Apart(values=5, projected=1, unknowns=1, rough=True))
     last = Posterior(unknowns, np.array([1.0, 3.0]), {}, rough)
-    assert (last.error_apart, last.telling, last.fails()) == (0.0, (last.error, 20), False)
+    assert (last.error_apart, last.telling, last.fails()) == (0.0, (last.error, 100), False)
     # beside data that tell on their own, all together may be calculated to first order only
-    assert (one.error_limit(), both.error_limit()) == (1.3, 1.5)
+    assert (one.error_limit(), both.error_limit(), last.error_limit()) == (1.3, 1.5, 1.3)
+    tight = replace(rough, values=np.where(values < 1, 1.25, values))
+    assert Posterior(unknowns, np.array([1.0, 3.0]), {}, tight).fails()
 
 
 def test_ninety_per_cent_intervals_hold_nine_times_in_ten() -> None:
