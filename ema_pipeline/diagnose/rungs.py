@@ -29,8 +29,8 @@ from ema_pipeline.observations.fitting import (
 from ema_pipeline.processes import spread
 
 _CALCULATED_STD, _RUBBED_STD = 0.3, 0.6
-"""1 σ, over a size that the motion in single hits tells, of what their calculation has wrong of it, and over a force,
-which is friction. In a study ten others lay within 1.64 σ so, and friction was half of the truth as often as not."""
+"""1 σ, over a size that the motion in single hits tells, of what their calculation has wrong of it, and over a force and
+its velocity, of friction. In a study ten others lay within 1.64 σ so, friction was half of the truth as often as not."""
 
 
 def rungs_of(observations: Observations, fits: Sequence[Fit], processes: int | None = 1) -> tuple[Rung, ...]:
@@ -84,7 +84,7 @@ def _stated(
     nonlinear = {e.label for e in model.effects if observations.linearised and not e.effect.linear}
 
     def stated(size: EffectSize) -> EffectSize:
-        wrong = (_RUBBED_STD if size.unit == "N" else _CALCULATED_STD) * size.value
+        wrong = (_RUBBED_STD if size.unit in ("N", "m/s") else _CALCULATED_STD) * size.value
         return replace(size, std=float(np.hypot(size.std, wrong)))
 
     return {name: stated(size) if effect_of(name) in nonlinear else size for name, size in sizes.items()}

@@ -42,7 +42,7 @@ def test_gains_count_from_the_first_rung() -> None:
 def test_a_size_that_single_hits_tell_is_no_better_known_than_it_is_calculated(
     linearised: bool, std: float
 ) -> None:
-    """Of -5 N/m a calculation that is off by 30 % has 1.5 N/m wrong, of friction of 5 N 3 N."""
+    """Of -5 N/m a calculation that is off by 30 % has 1.5 N/m wrong, of friction of 5 N 3 N; its velocity goes with it."""
     effects = [
         SimpleNamespace(label="cubic@x", effect=SimpleNamespace(linear=False)),
         SimpleNamespace(label="spring@x", effect=SimpleNamespace(linear=True)),
@@ -50,6 +50,7 @@ def test_a_size_that_single_hits_tell_is_no_better_known_than_it_is_calculated(
     ]
     sizes = {name: EffectSize(-5.0, 2.0, "N/m") for name in ("cubic@x.s", "spring@x.s", "mass")}
     sizes["friction@x.s"] = EffectSize(5.0, 2.0, "N")
+    sizes["friction@x.v"] = EffectSize(5.0, 2.0, "m/s")
     observations: Any = SimpleNamespace(linearised=linearised)
     model: Any = SimpleNamespace(effects=effects)
     found = rungs._stated(observations, model, sizes)
@@ -59,6 +60,7 @@ def test_a_size_that_single_hits_tell_is_no_better_known_than_it_is_calculated(
             "spring@x.s": 2.0,
             "mass": 2.0,
             "friction@x.s": np.hypot(2.0, 3.0) if linearised else 2.0,
+            "friction@x.v": np.hypot(2.0, 3.0) if linearised else 2.0,
         }
     )
     assert found["cubic@x.s"].value == -5.0
