@@ -29,8 +29,9 @@ from ema_pipeline.observations.fitting import (
 from ema_pipeline.processes import spread
 
 _CALCULATED_STD, _RUBBED_STD = 0.3, 0.6
-"""1 σ, over a size that the motion in single hits tells, of what their calculation has wrong of it, and over a force and
-its velocity, of friction. In a study ten others lay within 1.64 σ so, friction was half of the truth as often as not."""
+"""1 σ, over a size that the motion in single hits tells, of what their calculation has wrong of it, and over a force
+and its velocity, of friction: in a study ten others lay within 1.64 σ so, friction was half of the truth in half of
+the tests."""
 
 
 def rungs_of(observations: Observations, fits: Sequence[Fit], processes: int | None = 1) -> tuple[Rung, ...]:

@@ -41,7 +41,7 @@ class FrfSet:
     quantities : tuple of str
         Per output: ``"acceleration"``, ``"velocity"`` or ``"displacement"``.
     hits : ndarray of int, (n_outputs, n_inputs)
-        Number of hits averaged; 0 where not measured.
+        Number of hits averaged, see `averaged`; 0 where not measured.
     estimator : str
         ``"H1"``, ``"H2"`` or ``"Hv"``.
     record_s : float
@@ -113,6 +113,13 @@ class FrfSet:
     def rest_s(self) -> float:
         """Time from the mean hit to the end of the record, s."""
         return max(self.record_s - float(np.nanmean(self.delay_s)), 0.5 * self.record_s)
+
+    @property
+    def averaged(self) -> str:
+        """What `hits` counts: hits of a hammer, blocks of a continuous record, or periods of a multisine."""
+        if not self.excitation:
+            return "hit"
+        return "block" if self.noise_variance is None else "period"
 
     def accelerance(self, lines: slice = ALL_LINES) -> NDArray[np.complex128]:
         """All FRFs as acceleration over force, (m/s²)/N, shape (n_outputs, n_inputs, n_lines)."""

@@ -35,7 +35,7 @@ def set_up_table(results: RunResults, c: ConfigurationResults) -> Table:
             ("record", f"{plain(f.record_s, 4)} s, lines every {plain(step, 3)} Hz"),
             (
                 "estimator",
-                f"{f.estimator}, {_from_to(counts.min(), counts.max(), 'average' if f.excitation else 'hit')} per FRF"
+                f"{f.estimator}, {_from_to(counts.min(), counts.max(), f.averaged)} per FRF"
                 if counts.size
                 else f.estimator,
             ),

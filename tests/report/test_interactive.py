@@ -19,7 +19,7 @@ from ema_pipeline.mechanics.frf import receptance
 from ema_pipeline.mechanics.partial_fractions import partial_fractions
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.modal.types import LeftOut, StabilisationChart
-from ema_pipeline.report.figures.frf import frf_overview
+from ema_pipeline.report.figures.frf import frf_overview, frf_sheet
 from ema_pipeline.report.figures.modes import stabilisation_chart
 from ema_pipeline.report.html import report_html, script_json
 from ema_pipeline.report.interactive.data import measured_data, model_data, shown_up_to
@@ -75,6 +75,26 @@ def test_packed_frfs_are_the_measured_ones_to_a_tenth_of_a_per_cent(run: RunResu
     expected = np.stack([frfs.accelerance()[o, i, 1 : lines + 1] for o, i, _ in packed["pairs"]])
     assert np.max(np.abs(size * turn / expected - 1)) < 1e-3
     assert len(packed["pairs"]) == packed["total"] == int((frfs.hits > 0).sum())
+
+
+@pytest.mark.parametrize(
+    ("excitation", "noise", "word"),
+    [("", False, "hit"), ("random", False, "block"), ("multisine", True, "period")],
+)
+def test_what_was_averaged_has_its_name_on_the_page_and_on_paper(
+    run: RunResults, excitation: str, noise: bool, word: str
+) -> None:
+    known = run.configurations[0].frfs
+    assert known is not None
+    frfs = replace(
+        known,
+        excitation=excitation,
+        hits=np.full_like(known.hits, 3),
+        noise_variance=known.variance if noise else None,
+    )
+    assert packed_frfs(frfs, 1500.0, None)["average"] == word
+    sheet = frf_sheet(frfs, None, [(0, 0)])
+    assert sheet.axes[0].get_legend().get_texts()[0].get_text() == f"measured, mean of 3 {word}s"
 
 
 def test_of_more_frfs_than_fit_the_driving_points_are_kept(run: RunResults) -> None:
@@ -168,6 +188,7 @@ def test_axis_begins_with_the_modes_and_the_legend_has_what_the_chart_has(
     browser, run: RunResults, tmp_path: Path
 ) -> None:
     low = few_modes(run, 200.0)
+    low = replace(low, configurations=(replace(low.configurations[0], system=None),))
     page = tmp_path / "report.html"
     page.write_text(report_html(low), encoding="utf-8")
     tab = browser.new_page()
@@ -184,10 +205,12 @@ def test_axis_begins_with_the_modes_and_the_legend_has_what_the_chart_has(
     assert tab.evaluate(f"{axis}.end") == pytest.approx(2 * highest, rel=1e-3)
     assert "measured up to" in tab.locator("#frf-note").inner_text()
     entries = (
-        f"Array.from({find.format('stab.x')}._all_models.values()).filter(m => m.type === 'LegendItem' && m.visible)"
+        "Array.from({}._all_models.values()).filter(m => m.type === 'LegendItem' && m.visible)"
         ".map(m => m.label.value)"
     )
-    assert set(tab.evaluate(entries)) == {"mode indicator (log)", "stands for a mode"}
+    of_chart, of_frf = (entries.format(find.format(axis)) for axis in ("stab.x", "frf.x"))
+    assert set(tab.evaluate(of_chart)) == {"mode indicator (log)", "stands for a mode"}
+    assert set(tab.evaluate(of_frf)) == {"measured ± 2σ", "measured"}  # there is no model without a rig
     tab.close()
 
 

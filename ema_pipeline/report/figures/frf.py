@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ema_pipeline.frf.overview import cmif
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.types import ModalModel
+from ema_pipeline.number_text import counted
 from ema_pipeline.report.shown_band import places
 from ema_pipeline.report.style import (
     LINES,
@@ -71,7 +72,8 @@ def frf_sheet(frfs: FrfSet, modal: ModalModel | None, picks: Sequence[tuple[int,
         top, middle, bottom = (figure.add_subplot(grid[r, column]) for r in range(3))
         h = accelerance[o, i]
         hits = int(frfs.hits[o, i])
-        label = f"measured, mean of {hits} hits" if hits > 1 else "measured, one hit"
+        average = f"mean of {counted(hits, frfs.averaged)}" if hits > 1 else f"one {frfs.averaged}"
+        label = f"measured, {average}"
         _curve(top, f[shown], np.abs(h[shown]), MEASURED, "-", label)
         _curve(middle, f[shown], phase_deg(h[shown]), MEASURED, "-")
         if modal is not None:

@@ -62,7 +62,7 @@ def packed_frfs(frfs: FrfSet, high_hz: float, points: int | None = POINTS) -> di
         "step": float(frfs.frequency_hz[1] - frfs.frequency_hz[0]) if frfs.frequency_hz.size > 1 else 1.0,
         "lines": int(lines.sum()),
         "total": len(all_pairs),
-        "average": _average(frfs),
+        "average": frfs.averaged,
         "outputs": [d.point for d in frfs.outputs],
         "inputs": [d.point for d in frfs.inputs],
         "pairs": [[o, i, int(frfs.hits[o, i])] for o, i in kept],
@@ -81,13 +81,6 @@ def _multiple(frfs: FrfSet, kept: list[tuple[int, int]], lines: NDArray[np.bool_
     """Multiple coherence of the responses of the kept FRFs; None for one force at a time."""
     multiple = frfs.multiple_coherence
     return None if multiple is None else _packed(_bytes(np.stack([multiple[o, lines] for o, _ in kept])))
-
-
-def _average(frfs: FrfSet) -> str:
-    """What was averaged."""
-    if not frfs.excitation:
-        return "hit"
-    return "block" if frfs.noise_variance is None else "period"
 
 
 LEVELS = ("noise", "distortion", "odd", "even")

@@ -149,6 +149,9 @@ var EmaPage = (function () {
       if (m.name === name) { m.setv({ visible: there }); }
     });
   }
+  function calculated(k) {
+    return Object.keys(data.model.frfs).some(function (name) { var m = data.model.frfs[name][k]; return m && (m.own || m.alike); });
+  }
   /* Names of the models that are compared; a curve that is not there has no entry. */
   function legend(figure) {
     documents[figure]._all_models.forEach(function (m) {
@@ -156,7 +159,7 @@ var EmaPage = (function () {
       m.renderers.forEach(function (r) {
         var key = r.name && r.name.split(".")[1];
         if (key === "before" || key === "after") {
-          var there = key === "before" || chosen.after !== chosen.before;
+          var there = (key === "before" || chosen.after !== chosen.before) && (figure !== "frf" || calculated(chosen[key]));
           m.setv({ label: { value: shortModel(chosen[key]) }, visible: there });
           r.setv({ visible: there });
         }
