@@ -42,7 +42,7 @@ def test_gains_count_from_the_first_rung() -> None:
 def test_a_size_that_single_hits_tell_is_no_better_known_than_it_is_calculated(
     linearised: bool, std: float
 ) -> None:
-    """Of -5 N/m a calculation that is off by 30 % has 1.5 N/m wrong, of friction of 5 N 3 N; its velocity goes with it."""
+    """Of -5 N/m a calculation that is off by 30 % has 1.5 N/m wrong, of friction of 5 N 3 N; so has its velocity."""
     effects = [
         SimpleNamespace(label="cubic@x", effect=SimpleNamespace(linear=False)),
         SimpleNamespace(label="spring@x", effect=SimpleNamespace(linear=True)),
