@@ -21,7 +21,7 @@ from ema_pipeline.files import cannot_write, read_bounded
 from ema_pipeline.frf.estimate import estimate_frfs
 from ema_pipeline.frf.parts import Recorded, check_recorded_alike, gain_ratios
 from ema_pipeline.frf.types import FrfSet
-from ema_pipeline.ingest.campaign import read_campaign
+from ema_pipeline.ingest.campaign import Campaign, read_campaign
 from ema_pipeline.ingest.description import DESCRIPTION_FILE, RIG_FILE, TestDescription
 from ema_pipeline.ingest.load import load_records
 from ema_pipeline.job import run_raw
@@ -53,6 +53,7 @@ class _Described:
     name: str
     raw: Path
     test: TestDescription
+    rig_file: Path | None
     run: Run | None
 
     @property
@@ -79,6 +80,7 @@ class Part:
     name : str
     raw : Path
     test : TestDescription
+    rig_file : Path or None
     frfs : FrfSet
     modes : MeasuredModes
     """
@@ -86,6 +88,7 @@ class Part:
     name: str
     raw: Path
     test: TestDescription
+    rig_file: Path | None
     frfs: FrfSet
     modes: MeasuredModes
 
@@ -200,7 +203,8 @@ def _described(sources: Sequence[Path]) -> list[_Described]:
         run: Run | None = existing_run(source) if (source / RESULTS_FILE).is_file() else None
         raw = source if run is None else Path(run.info.raw)
         name = check_name(raw.resolve().name, f"{raw}: name of the folder")
-        found.append(_Described(name, raw, _single_test(raw), run))
+        campaign = _of_one_test(raw)
+        found.append(_Described(name, raw, campaign.tests[0], campaign.rig_file, run))
     first = found[0].test
     for k, part in enumerate(found):
         if any(other.name == part.name for other in found[:k]):
@@ -212,7 +216,7 @@ def _described(sources: Sequence[Path]) -> list[_Described]:
                 f"{part.test.file}: is of configuration '{part.test.configuration or ''}', {first.file} of "
                 f"'{first.configuration or ''}'; only tests of one configuration can be merged"
             )
-    _check_one_rig([part.test for part in found])
+    _check_one_rig([part.test for part in found], [p.rig_file for p in found if p.rig_file is not None])
     _check_connected({part.raw: part.points for part in found})
     check_recorded_alike({part.name: part.recorded for part in found})
     # sample rates may stand in the record files only
@@ -229,17 +233,18 @@ def _identified(part: _Described, out: Path, show: ShowStage | None) -> Part:
         run, _ = run_raw(part.raw, None, out, None, [_MEASURING], show)
     ((_, frfs),) = measured_frfs(run).items()
     ((_, modes),) = measured_modes(run).items()
-    return Part(part.name, part.raw, part.test, frfs, modes)
+    return Part(part.name, part.raw, part.test, part.rig_file, frfs, modes)
 
 
-def _single_test(raw: Path) -> TestDescription:
-    tests = read_campaign(raw).tests
+def _of_one_test(raw: Path) -> Campaign:
+    campaign = read_campaign(raw)
+    tests = campaign.tests
     if len(tests) > 1:
         what = "is merged already" if tests[0].part else "is a campaign of several configurations"
         raise EmaError(f"{raw}: {what}; give the folders of single tests")
     if tests[0].kind != "hammer":
         raise EmaError(f"{tests[0].file}: is of kind '{tests[0].kind}'; only hammer tests can be merged")
-    return tests[0]
+    return campaign
 
 
 def _points(struck: Iterable[Dof], measured: Iterable[Dof]) -> set[str]:
@@ -301,15 +306,14 @@ def _frfs_of(run: Run, configuration: str, part: str) -> FrfSet:
     return estimate_frfs(hits, run.settings.frf)
 
 
-def _check_one_rig(tests: Sequence[TestDescription]) -> None:
-    """One rig for all parts, by its name and by the rig file beside the description."""
+def _check_one_rig(tests: Sequence[TestDescription], files: Sequence[Path]) -> None:
+    """One rig for all parts, by its name and by the rig files."""
     named = [t for t in tests if t.rig is not None]
     for test in named[1:]:
         if test.rig != named[0].rig:
             raise EmaError(
                 f"{test.file}: names rig '{test.rig}', {named[0].file} names '{named[0].rig}'; one test has one rig"
             )
-    files = [t.folder / RIG_FILE for t in tests if (t.folder / RIG_FILE).is_file()]
     for file in files[1:]:
         if read_bounded(file, LARGEST_BYTES) != read_bounded(files[0], LARGEST_BYTES):
             raise EmaError(
@@ -330,12 +334,14 @@ def _copy(part: Part, folder: Path) -> None:
     try:
         folder.mkdir(parents=True)
         files = [record.file for record in test.records]
-        rigs = {RIG_FILE, Path(test.rig or RIG_FILE).name}
-        files += [name for name in sorted(rigs) if (test.folder / name).is_file()]
+        if test.rig is not None and (test.folder / Path(test.rig).name).is_file():
+            files.append(Path(test.rig).name)
         for name in dict.fromkeys(files):
             target = folder / name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(test.folder / name, target)
+        if part.rig_file is not None:
+            shutil.copy2(part.rig_file, folder / RIG_FILE)
         text = test.file.read_text(encoding="utf-8-sig")
         (folder / DESCRIPTION_FILE).write_text(_with_part(text, part), encoding="utf-8")
     except OSError as error:

@@ -236,6 +236,10 @@ def test_what_descriptions_tell_is_refused_before_modes_are_identified(
     rig = other("rig")
     rig.joinpath("rig.toml").write_text('name = "another"', encoding="utf-8")
     _refused(capsys, out, "rig.toml differ", "copy the right one", hard, rig)
+    within = other("above/test")
+    within.joinpath("rig.toml").unlink()
+    within.parent.joinpath("rig.toml").write_text('name = "another"', encoding="utf-8")
+    _refused(capsys, out, "above/rig.toml differ", "copy the right one", hard, within.parent)
     named = [
         other(name, ("sample_rate_hz =", f'rig = "{name}"\nsample_rate_hz ='))
         for name in ("gearbox", "isolator")
