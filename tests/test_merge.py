@@ -257,7 +257,7 @@ def test_a_common_point_whose_hits_were_all_left_out_connects_nothing(
     def identified(part: Any, *_: object) -> Part:
         own = (Dof.parse(f"{part.name}.x"),)
         frfs = dataclasses.replace(_frfs(0.01, (1, 500), 1), outputs=own, inputs=own)
-        return Part(part.name, part.raw, part.test, frfs, None)  # type: ignore[arg-type]
+        return Part(part.name, part.raw, part.test, None, frfs, None)  # type: ignore[arg-type]
 
     monkeypatch.setattr("ema_pipeline.merge._identified", identified)
     with pytest.raises(EmaError, match="hard: strikes no point"):

@@ -116,7 +116,7 @@ def shape_agreement(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """MAC of every measured with every model shape, and with the span of the model mode's group.
 
-    Both (n_measured, n_model); NaN where no shapes were measured.
+    Both (n_measured, n_model); NaN where no shapes were measured. None agrees with one that no sensor reads.
     """
     size = (len(measured), len(shapes))
     if measured.shapes is None or not measured.dofs:
@@ -133,7 +133,7 @@ def shape_agreement(
         else:
             share = np.array([subspace_mac(measured.shapes[r], shapes[members]) for r in compared])
         grouped[np.ix_(compared, members)] = share.reshape(-1, 1)
-    return single, grouped
+    return single, np.where(np.isnan(single) & np.isfinite(single).any(axis=1, keepdims=True), 0.0, grouped)
 
 
 def _shares_inside(shapes: NDArray[np.complex128], span: NDArray[np.complex128]) -> NDArray[np.float64]:

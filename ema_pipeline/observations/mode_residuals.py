@@ -179,7 +179,9 @@ class Comparison:
         return Alone.of(self.data, np.flatnonzero(match < 0), self.scatters, self.defaults)
 
     def _unseen(self, solution: EigenSolution, to: NDArray[np.int64], hidden: NDArray[np.int64]) -> float:
-        return unseen(self.data, solution.frequency_hz, np.concatenate([to, hidden[hidden >= 0]]))
+        along = self.sensing.along
+        read = along @ solution.shapes[: along.shape[1]]
+        return unseen(self.data, solution.frequency_hz, np.concatenate([to, hidden[hidden >= 0]]), read)
 
     def _partners(
         self, solution: EigenSolution, match: NDArray[np.int64]

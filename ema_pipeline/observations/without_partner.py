@@ -23,6 +23,9 @@ UNEXPLAINED_PRODUCT = 5.0
 24 of them, two that passed were third and second harmonics."""
 UNSEEN = 3.0
 """Cost of a model mode in the band that was not measured: it may lie on a node of every sensor or hit point."""
+_READ = 0.01
+"""Least motion at some sensor, over the largest one of a mode there, from which a mode would have been measured.
+Sensors along y alone read nothing of modes along x."""
 
 _SCATTERS = (FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, DAMPING_SCATTER)
 _KEPT = 64
@@ -78,13 +81,32 @@ class Alone:
         return known[key]
 
 
-def unseen(data: ModeData, frequency_hz: NDArray[np.float64], accounted: NDArray[np.int64]) -> float:
-    """Cost of model modes well inside the band, without those that are paired, or hidden in one that is."""
+def unseen(
+    data: ModeData,
+    frequency_hz: NDArray[np.float64],
+    accounted: NDArray[np.int64],
+    read: NDArray[np.float64],
+) -> float:
+    """Cost of model modes well inside the band, without those that are paired, or hidden in one that is.
+
+    Parameters
+    ----------
+    data : ModeData
+    frequency_hz : ndarray, (n,)
+        Of the model's modes.
+    accounted : ndarray of int, (k,)
+        Those that are paired or hidden.
+    read : ndarray, (s, n)
+        What the sensors read of mass-normalised shapes along their own directions; s may be 0.
+    """
     if not data.complete:
         return 0.0
     low, high = data.band_hz
     inside = (frequency_hz > 1.05 * low) & (frequency_hz < 0.95 * high)
     inside[accounted] = False
+    if len(read):
+        size = np.abs(read)
+        inside &= np.any(size > _READ * np.max(size, axis=1, keepdims=True), axis=0)
     return UNSEEN * int(np.count_nonzero(inside))
 
 

@@ -347,6 +347,25 @@ def test_of_two_members_of_a_group_the_one_with_the_better_plain_mac_is_taken() 
         assert assign(distance, grouped, single, PairingSettings()) == {0: better}
 
 
+def test_a_measured_mode_goes_to_one_that_its_sensors_read_however_near_another_lies() -> None:
+    """Two bodies in a plane with sensors along y alone: modes along x have nearly the same frequencies."""
+    dofs = (Dof("a", "y"), Dof("b", "y"))
+    shapes = np.array([[1.0, 0.9], [0.8, -1.0]])
+    measured = MeasuredModes(
+        "test", np.array([45.2, 96.2]), np.full(2, 0.01), np.full(2, 0.01), np.full(2, 1e-4),
+        shapes.astype(complex), np.full((2, 2), 0.01), dofs, band_hz=(5.0, 200.0),
+    )  # fmt: skip
+    along_x = np.zeros((2, 2))
+    model = np.vstack([along_x, shapes + 0.05]).astype(complex)
+    single, grouped = shape_agreement(measured, model, np.arange(4))
+    assert np.all(np.isnan(single[:, :2]))
+    assert np.all(grouped[:, :2] == 0.0)
+    distance = np.abs(np.log(measured.frequency_hz[:, None] / np.array([45.2, 96.2, 45.3, 96.3])))
+    assert assign(distance, grouped, single, PairingSettings()) == {0: 2, 1: 3}
+    unknown = replace(measured, shapes=None, shape_std=None)
+    assert np.all(np.isnan(shape_agreement(unknown, model, np.arange(4))[1]))
+
+
 def test_why_a_mode_stays_unpaired_is_said_with_its_numbers() -> None:
     rig = load_rig("frame")
     model_hz, _ = normal_modes(rig.system("default"))

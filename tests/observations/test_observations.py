@@ -45,6 +45,7 @@ from ema_pipeline.observations.without_partner import (
     UNEXPLAINED_PRODUCT,
     UNSEEN,
     Alone,
+    unseen,
 )
 from ema_pipeline.rigs import load_rig
 from ema_pipeline.rigs.base import ParametricRig
@@ -130,6 +131,20 @@ def test_a_mode_that_may_share_the_frequency_of_one_known_better_needs_the_shape
     found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
     assert [r.measured for r in problem.rows(found)] == [0, 1, 2, 3, 4]
     assert (found.penalty, found.unexplained) == (UNEXPLAINED_DOUBLE, 0)
+
+
+def test_a_mode_that_no_sensor_reads_need_not_be_measured() -> None:
+    """Half of the modes of bodies in a plane go along x; with sensors along y alone they are not missed."""
+    data: Any = SimpleNamespace(complete=True, band_hz=(10.0, 1000.0))
+    hz, read = (
+        np.array([50.0, 51.0, 120.0, 125.0]),
+        np.array([[0.0, 1.0, 1e-9, 0.7], [0.0, 1e-3, 2e-9, 0.002]]),
+    )
+    paired = np.array([1])
+    assert unseen(data, hz, paired, read) == UNSEEN
+    assert unseen(data, hz, paired, np.zeros((0, 4))) == 3 * UNSEEN  # without shapes all are
+    weak = read + np.array([[0.02], [0.0]])  # a sensor reads something of all
+    assert unseen(data, hz, paired, weak) == 3 * UNSEEN
 
 
 def test_a_size_gives_a_mode_without_a_partner_one_of_its_frequency_and_shape() -> None:
