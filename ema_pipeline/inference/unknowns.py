@@ -26,6 +26,8 @@ class Unknowns:
         Name of the scatter (a hyper-parameter) that multiplies `std`; empty where `std` stands alone.
     lower, upper : ndarray, (n,)
         Bounds; infinite where there is none.
+    sizes : frozenset of str
+        Names of those that are sizes of effects.
     """
 
     names: tuple[str, ...]
@@ -33,6 +35,7 @@ class Unknowns:
     scatter: tuple[str, ...]
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
+    sizes: frozenset[str] = frozenset()
 
     def __len__(self) -> int:
         return len(self.names)
@@ -81,6 +84,7 @@ class Unknowns:
             tuple(self.scatter[i] for i in kept),
             self.lower[kept],
             self.upper[kept],
+            self.sizes,
         )
 
     def clipped(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -96,4 +100,5 @@ def joined(*parts: Unknowns) -> Unknowns:
         scatter=tuple(s for p in parts for s in p.scatter),
         lower=np.concatenate([p.lower for p in parts]),
         upper=np.concatenate([p.upper for p in parts]),
+        sizes=frozenset().union(*(p.sizes for p in parts)),
     )

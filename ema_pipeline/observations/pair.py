@@ -196,6 +196,7 @@ class PairProblem(EffectProblem):
             scatter=(*b.scatter, *(a.scatter[i] for i in own)),
             lower=np.concatenate([b.lower, a.lower[own]]),
             upper=np.concatenate([b.upper, a.upper[own]]),
+            sizes=b.sizes | a.sizes,
         )
 
     @property

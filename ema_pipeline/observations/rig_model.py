@@ -87,6 +87,12 @@ class RigModel:
         damping = self.rig.parameters.get(DAMPING)
         loose = damping is not None and damping.value > 0 and (damping.free or damping.tolerance > 0)
         bounds = [s.bounds for s in self.sizes.values()]
+        sizes = Unknowns.plain(
+            tuple(self.sizes),
+            1.0,
+            lower=np.array([b[0] for b in bounds]),
+            upper=np.array([b[1] for b in bounds]),
+        )
         return joined(
             self.dependence.unknowns,
             Unknowns.plain((DAMPING,), damping.tolerance or LOG_STD) if loose and damping else _NOTHING,
@@ -99,12 +105,7 @@ class RigModel:
                 self.dependence.geometric,
                 [self.rig.parameters[g].tolerance for g in self.dependence.geometric],
             ),
-            Unknowns.plain(
-                tuple(self.sizes),
-                1.0,
-                lower=np.array([b[0] for b in bounds]),
-                upper=np.array([b[1] for b in bounds]),
-            ),
+            replace(sizes, sizes=frozenset(sizes.names)),
         )
 
     @cached_property

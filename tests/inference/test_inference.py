@@ -146,6 +146,19 @@ def test_many_data_are_explained_with_a_smaller_error_than_few() -> None:
     assert error_limit(35, 3.0) == pytest.approx(2 * error_limit(35))
 
 
+def test_that_an_effect_is_large_is_no_misfit() -> None:
+    residuals = Residuals(np.full(10, 0.5), np.zeros((10, 2)))
+
+    def error(size: float, sizes: frozenset[str]) -> float:
+        unknowns = replace(Unknowns.plain(("part", "size"), 1.0), sizes=sizes)
+        return Posterior(unknowns, np.array([1.0, size]), {}, residuals).error
+
+    for size in (-7.0, -1.5, 1.0, 7.0):
+        counted = min(abs(size), 2.0)
+        assert error(size, frozenset(("size",))) == pytest.approx(np.sqrt((2.5 + 1.0 + counted**2) / 10))
+        assert error(size, frozenset()) == pytest.approx(np.sqrt((2.5 + 1.0 + size**2) / 10))
+
+
 def test_what_counts_on_its_own_as_well_is_not_hidden_by_many_other_data() -> None:
     values = np.concatenate([[2.0, 2.0, 6.0, 6.0, 0.0], np.full(95, 0.5)])
     block = np.array([-1, -1, 0, 0, 0] + [-1] * 95)
