@@ -217,6 +217,7 @@ def read_modes(file: str | Path, rig: str | Path) -> Modes:
     EmaError
         Whatever is wrong with the table, in one line.
     """
+    expect("rig", rig, (str, Path), "the name of a rig or the path of a rig file")
     work = Work.new(describe_modes(path("file", file), str(rig), None, overrides(None)))
     work.run("modal")
     return modes_of(work)

@@ -155,6 +155,7 @@ def load_rig(name_or_path: str | Path) -> Rig:
     Traceback (most recent call last):
     ema_pipeline.errors.EmaError: no rig 'planetery' (did you mean 'planetary'?); or give a rig file ending in .toml
     """
+    expect("name_or_path", name_or_path, (str, Path), "the name of a rig or the path of a rig file")
     rig = checked_rig(str(name_or_path))
     assert isinstance(rig, ParametricRig)  # all that files and shipped rigs make
     return _as_rig(rig)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -47,7 +48,7 @@ def merge(
         show(_table(merged))
         for line in _lines(merged):
             show(line)
-        show(f"Next: {program()} run {out}")
+        show(f"Next: {program()} run {shlex.quote(str(out))}")
 
 
 def _table(merged: Merged) -> Screen:

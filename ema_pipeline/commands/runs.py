@@ -249,7 +249,7 @@ def view(
 
         go_on_with(f"run {shlex.quote(str(out))}")
         serve_hits(out, point or (), hits, poll, port, ready)
-        show(f"Next: {program()} run {out}")
+        show(f"Next: {program()} run {shlex.quote(str(out))}")
         return
     from ema_pipeline.report.commands import naming
     from ema_pipeline.store import Store

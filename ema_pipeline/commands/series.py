@@ -106,7 +106,7 @@ def _show_run(done: SeriesRun, tests: DataFrame) -> None:
     for row in rows_of(tests[tests["state"] != "ok"].head(10)):
         show(f"  {row.test}: {row.reason}")
     show(f"Table: {done.folder / 'series.db'}, {done.folder / 'tests.csv'}")
-    show(f"Next: {program()} series report {done.folder}")
+    show(f"Next: {program()} series report {shlex.quote(str(done.folder))}")
 
 
 @contextmanager

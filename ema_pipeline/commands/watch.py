@@ -65,7 +65,7 @@ def watch(
         missing = session.missing()
         if missing:
             show(f"Listed in test.toml, but missing: {', '.join(missing)}; remove them before the run.")
-        show(f"Next: {program()} run {folder}")
+        show(f"Next: {program()} run {shlex.quote(str(folder))}")
 
 
 def _show_verdict(told: Told, json: bool) -> None:

@@ -206,6 +206,8 @@ def test_a_rig_built_in_python_is_fitted_like_one_from_a_file(lines: SimpleNames
         (lambda _: ema.read(None), "raw: give a path, not None"),
         (lambda x: ema.run(x.raw, out=5), "out: give a path, not 5"),
         (lambda _: ema.open(None), "out: give a path, not None"),
+        (lambda _: ema.load_rig(None), "name_or_path: give the name of a rig or the path"),
+        (lambda x: ema.read_modes("modes.csv", x.rig), "rig: give the name of a rig or the path of a rig file, not"),
         (lambda _: ema.identify(None), "frfs: give FRFs, as test.frfs.. gives them, not None"),
         (lambda x: ema.fit(None, x.modes), "rig: give a rig, .* not None"),
         (lambda x: ema.fit(x.rig, x.frfs), "modes: give modes, as ema.identify.frfs. gives them, not Frfs"),
