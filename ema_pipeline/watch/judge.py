@@ -80,10 +80,13 @@ def judge_record(
     """
     record = load_record(test, entry)
     hits = hits_of_test([record])
-    good = [_in_memory(record, h) for h in hits if h.accepted]
+    every = [_in_memory(record, h) for h in hits if h.accepted]
+    copied = {_copied(h, before) for h in every} - {""}
+    good = [h for h in every if not _copied(h, before)]
     faults = [
         v.message for h in hits for v in h.verdicts if not v.passes and v.consequence != "warn" and v.message
     ]
+    faults += [f"holds the same force as {file}, bit for bit: a copy, and no blow" for file in sorted(copied)]
     remarks = [
         v.message for h in hits for v in h.verdicts if not v.passes and v.consequence == "warn" and v.message
     ]
@@ -98,6 +101,11 @@ def judge_record(
     once = tuple(dict.fromkeys(faults)), tuple(dict.fromkeys(remarks))
     judged = JudgedRecord(entry.file, record.impact, hits, len(good), *once, coherence)
     return judged, good
+
+
+def _copied(hit: HitSamples, before: Sequence[HitSamples]) -> str:
+    """File of the earlier hit that this one is a copy of; empty for none."""
+    return next((b.hit.file for b in before if np.array_equal(b.force, hit.force)), "")
 
 
 def _in_memory(record: Record, hit: Hit) -> HitSamples:

@@ -126,6 +126,25 @@ def test_points_are_asked_for_in_turn(source: Path, tmp_path: Path) -> None:
     assert session.done
 
 
+def test_a_copy_of_a_hit_is_no_hit(source: Path, tmp_path: Path) -> None:
+    """A hit that was saved twice is struck again; the file itself may be judged as often as it changes."""
+    folder = _channels(source, tmp_path / "live")
+    session = Session(folder, ("m1.x",), wanted=2)
+    first, second = sorted(source.glob("m1*.csv"))[:2]
+
+    def take(file: Path, name: str) -> Told:
+        shutil.copy(file, folder / name)
+        return session.take(Arrival(folder / name, time.time()))
+
+    assert take(first, "m1_x_1.csv").good
+    copy = take(first, "m1_x_2.csv")
+    assert not copy.good
+    assert "holds the same force as m1_x_1.csv" in copy.text
+    assert "strike m1.x again" in copy.text
+    assert take(first, "m1_x_1.csv").good
+    assert "all points are done" in take(second, "m1_x_3.csv").text
+
+
 def test_a_reversed_channel_is_told(source: Path, tmp_path: Path) -> None:
     """One sensor changes its sign from one hit to the next."""
     import pandas as pd
