@@ -80,13 +80,13 @@ def judge_record(
     """
     record = load_record(test, entry)
     hits = hits_of_test([record])
-    every = [_in_memory(record, h) for h in hits if h.accepted]
-    copied = {_copied(h, before) for h in every} - {""}
-    good = [h for h in every if not _copied(h, before)]
+    accepted = [_in_memory(record, h) for h in hits if h.accepted]
+    copied = [_copied(h, before) for h in accepted]
+    good = [h for h, file in zip(accepted, copied, strict=True) if not file]
     faults = [
         v.message for h in hits for v in h.verdicts if not v.passes and v.consequence != "warn" and v.message
     ]
-    faults += [f"holds the same force as {file}, bit for bit: a copy, and no blow" for file in sorted(copied)]
+    faults += [f"holds the same force as {file}, bit for bit: a copy, and no blow" for file in copied if file]
     remarks = [
         v.message for h in hits for v in h.verdicts if not v.passes and v.consequence == "warn" and v.message
     ]
