@@ -38,6 +38,12 @@ NOISE_RISES = 6.0
 FEWEST_LINES = 10
 """Lines around a pole that tell the noise of the response there."""
 
+BROAD = 0.2
+"""Damping ratio from which a pole mends any misfit."""
+
+BROAD_STD = 0.05
+"""Relative standard deviation up to which the damping of such a pole must be known."""
+
 UNSEEN = 0.1
 """Share of model orders below which no order can be said to show a pole."""
 
@@ -74,8 +80,7 @@ def unearned(
     suspects = np.flatnonzero(zeta > HEAVY)
     if not len(suspects):
         return out
-    # one weight per FRF: weights over lines take the peaks away where a fit leaves a share of them
-    weight = np.broadcast_to(np.median(weight, axis=-1, keepdims=True), weight.shape)
+    weight = _of_frfs(weight)
     power = np.sum(weight * np.abs(data.frf) ** 2, axis=(0, 1))
     suspects = np.array(
         [r for r in suspects if not has_peak(data.omega, power, estimate.poles[r])], dtype=int
@@ -93,6 +98,26 @@ def unearned(
         ranks = one_shape(data, weight, estimate)
         out[doubtful] = ranks[doubtful] < ONE_SHAPE
     return out
+
+
+def too_broad(
+    data: FitData, weight: Real, estimate: Estimate, explained: NDArray[np.bool_], std: Real
+) -> NDArray[np.bool_]:
+    """Very heavily damped poles that are no modes, (n_modes,).
+
+    One is a mode where nothing but the scatter between hits is left over, its damping is known well, by the relative
+    `std` (n_modes,), and it has one shape wherever it is excited. The other parameters are those of `unearned`.
+    """
+    broad = -estimate.poles.real > BROAD * np.abs(estimate.poles)
+    out = broad & ~(explained & (std < BROAD_STD))
+    if np.any(broad & ~out) and data.measured.shape[1] > 1:
+        out |= broad & (one_shape(data, _of_frfs(weight), estimate) < ONE_SHAPE)
+    return np.asarray(out)
+
+
+def _of_frfs(weight: Real) -> Real:
+    """One weight per FRF: weights over lines take the peaks away where a fit leaves a share of them."""
+    return np.broadcast_to(np.median(weight, axis=-1, keepdims=True), weight.shape)
 
 
 def has_peak(omega: Real, power: Real, pole: complex) -> bool:

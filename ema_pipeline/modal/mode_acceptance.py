@@ -18,7 +18,7 @@ from ema_pipeline.modal.assurance import mac, mpc
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, LinearSolution, newton_step, synthesis
 from ema_pipeline.modal.fit_covariance import evidence
-from ema_pipeline.modal.heavily_damped import UNSEEN, has_peak, unearned
+from ema_pipeline.modal.heavily_damped import UNSEEN, has_peak, too_broad, unearned
 from ema_pipeline.modal.missed import left_over
 from ema_pipeline.modal.noise import Noise
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
@@ -146,6 +146,10 @@ def credible(
     explained = np.zeros(len(out), dtype=bool)
     if hits is not None:
         explained = misfit(data, hits, estimate, solution) < EXPLAINED
+    weight, std = fit.noise.weight(data.measured), decay_std(estimate, solution)
+    out = too_broad(data, weight, estimate, explained, std)
+    if out.any():
+        return out
     out = _doubles(data, estimate, solution, explained)
     if out.any():
         return out
@@ -159,12 +163,10 @@ def credible(
     # any mix of two modes at one pole is a shape of that pole, complex ones too
     random = _incoherent(solution) & ~twin
     support = np.where(random, 0.0, support)
-    std = decay_std(estimate, solution)
     told = (share > UNSEEN) | ((std < MAX_UNSEEN_DAMPING_STD) & ~random)
     support = np.where(explained & told, np.maximum(support, 1.0), support)
     # where the polish finds no place for a mode, it is one only if most orders and the FRFs show it plainly
     support = np.where(fit.held, np.minimum(plain, share / SURE_VOTES), support)
-    weight = fit.noise.weight(data.measured)
     support = np.where(unearned(data, weight, estimate, solution, share, explained), 0.0, support)
     support = np.where(peaks.owners(estimate), np.maximum(support, 1.0), support)
     out = _next(np.minimum(_strength_over_noise(data, fit, std), support))

@@ -29,7 +29,7 @@ Real = NDArray[np.float64]
 ROUGH = 4
 """Iterations of the polish while there is still something to drop."""
 
-MAX_DAMPING_RATIO = 0.2
+MAX_DAMPING_RATIO = 0.5
 """A pole with more is no mode."""
 
 

@@ -302,6 +302,21 @@ def test_poles_with_much_damping_are_backgrounds_unless_they_make_a_peak() -> No
     assert backgrounds(data, Estimate(poles, np.ones((3, 1)))).tolist() == [False, False, True]
 
 
+def test_a_mode_that_a_strong_damper_damps_is_found_and_does_not_bend_those_around_it() -> None:
+    system = TrueSystem(
+        np.array([40.0, 79.0, 109.0, 118.0, 150.0]),
+        np.array([0.009, 0.017, 0.26, 0.017, 0.017]),
+        np.random.default_rng(4).standard_normal((5, 6)),
+    )
+    model = identify(hammer_test(system, list(range(6)), [0, 3], f_max=250.0, noise=2e-3), ModalSettings())
+    stds = np.array([(m.frequency_std_hz, m.damping_std) for m in model.modes])
+    assert np.all(np.abs(frequencies(model) - system.frequency_hz) < 3.5 * stds[:, 0])
+    assert np.all(np.abs(dampings(model) - system.damping_ratio) < 3.5 * stds[:, 1])
+    assert np.all(stds[:, 1] < 0.02 * system.damping_ratio)
+    shapes = np.array([m.shape for m in model.modes])
+    assert np.diag(mac(shapes, system.shapes)) == pytest.approx(np.ones(5), abs=2e-3)
+
+
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_modes_that_ring_on_are_right_whatever_the_sensors_measure(quantity: str) -> None:
     """Hardly any noise; a third of the first mode and of one below the band is left at the end of the record."""
