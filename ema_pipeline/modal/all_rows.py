@@ -19,7 +19,7 @@ from ema_pipeline.modal.fit import Estimate, Step, best_shapes, newton_step, sol
 from ema_pipeline.modal.heavily_damped import has_peak
 from ema_pipeline.modal.mode_acceptance import PLAIN_DAMPING
 from ema_pipeline.modal.polish import descend
-from ema_pipeline.modal.segment import SegmentFit, impossible, measured_noise, put_back
+from ema_pipeline.modal.segment import SegmentFit, gone_astray, measured_noise, put_back
 from ema_pipeline.threads import in_order
 
 Real = NDArray[np.float64]
@@ -82,7 +82,7 @@ def placed(
     while True:
         estimate = descend(start, sums, lambda _, found: found.step, iterations, held, ENOUGH)[0]
         far = np.abs(estimate.poles - start.poles) > FARTHEST * -start.poles.real
-        lost = (far | (impossible(window.data, estimate) & ~impossible(window.data, start))) & ~held
+        lost = (far | gone_astray(window.data, start, estimate)) & ~held
         if not lost.any():
             return estimate, held
         start, held = put_back(estimate, start, lost), held | lost

@@ -14,6 +14,7 @@ from ema_pipeline.modal.assurance import mpc
 from ema_pipeline.modal.data import FitData
 from ema_pipeline.modal.fit import Estimate, LinearSolution, solve_linear
 from ema_pipeline.modal.maxima import prominent_peaks
+from ema_pipeline.modal.segment import broad
 
 Real = NDArray[np.float64]
 
@@ -37,9 +38,6 @@ NOISE_RISES = 6.0
 
 FEWEST_LINES = 10
 """Lines around a pole that tell the noise of the response there."""
-
-BROAD = 0.2
-"""Damping ratio from which a pole mends any misfit."""
 
 BROAD_STD = 0.05
 """Relative standard deviation up to which the damping of such a pole must be known."""
@@ -108,10 +106,10 @@ def too_broad(
     One is a mode where nothing but the scatter between hits is left over, its damping is known well, by the relative
     `std` (n_modes,), and it has one shape wherever it is excited. The other parameters are those of `unearned`.
     """
-    broad = -estimate.poles.real > BROAD * np.abs(estimate.poles)
-    out = broad & ~(explained & (std < BROAD_STD))
-    if np.any(broad & ~out) and data.measured.shape[1] > 1:
-        out |= broad & (one_shape(data, _of_frfs(weight), estimate) < ONE_SHAPE)
+    suspect = broad(estimate)
+    out = suspect & ~(explained & (std < BROAD_STD))
+    if np.any(suspect & ~out) and data.measured.shape[1] > 1:
+        out |= suspect & (one_shape(data, _of_frfs(weight), estimate) < ONE_SHAPE)
     return np.asarray(out)
 
 

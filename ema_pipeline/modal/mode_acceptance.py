@@ -116,12 +116,15 @@ ECHO_MAC = 0.6
 """Product of the MACs at rows and references above which a nearby pole is an echo."""
 
 
-def significant(data: FitData, fit: SegmentFit) -> NDArray[np.bool_]:
-    """Candidates to drop from a first guess: impossible ones, else those that noise alone could make."""
-    out = impossible(data, fit.estimate)
-    if out.any():
-        return out
-    return _next(_strength_over_noise(data, fit, decay_std(fit.estimate, fit.solution)))
+def significant(data: FitData, fit: SegmentFit, any_broad: bool = True) -> NDArray[np.bool_]:
+    """Candidates to drop from a first guess: impossible ones, else those that noise alone could make.
+
+    Where `any_broad` is False, the polish has made all very heavily damped ones.
+    """
+    std = decay_std(fit.estimate, fit.solution)
+    weight, told = fit.noise.weight(data.measured), np.full(len(std), any_broad)
+    out = impossible(data, fit.estimate) | too_broad(data, weight, fit.estimate, told, std)
+    return out if out.any() else _next(_strength_over_noise(data, fit, std))
 
 
 def credible(
@@ -140,14 +143,12 @@ def credible(
         Peaks of which single hits show that one mode is there.
     """
     estimate, solution = fit.estimate, fit.solution
-    out = impossible(data, estimate) | peaks.echoes(estimate)
-    if out.any():
-        return out
-    explained = np.zeros(len(out), dtype=bool)
+    explained = np.zeros(len(estimate.poles), dtype=bool)
     if hits is not None:
         explained = misfit(data, hits, estimate, solution) < EXPLAINED
     weight, std = fit.noise.weight(data.measured), decay_std(estimate, solution)
-    out = too_broad(data, weight, estimate, explained, std)
+    out = impossible(data, estimate) | peaks.echoes(estimate)
+    out |= too_broad(data, weight, estimate, explained, std)
     if out.any():
         return out
     out = _doubles(data, estimate, solution, explained)

@@ -32,6 +32,9 @@ ROUGH = 4
 MAX_DAMPING_RATIO = 0.5
 """A pole with more is no mode."""
 
+BROAD = 0.2
+"""Damping ratio from which a pole mends any misfit."""
+
 
 @dataclass(frozen=True)
 class SegmentFit:
@@ -112,7 +115,7 @@ def fit_segment(
             before = Estimate(np.where(strayed, places, before.poles), before.participation)
             estimate, held = put_back(estimate, before, strayed), held | strayed
             continue
-        lost = impossible(data, estimate) & ~impossible(data, before)
+        lost = gone_astray(data, before, estimate)
         if evident is not None and lost.any():
             back = put_back(estimate, before, lost)
             lost &= evident(data, back, solve_linear(data, weight, back))
@@ -139,6 +142,17 @@ def impossible(data: FitData, estimate: Estimate) -> NDArray[np.bool_]:
     zeta = -poles.real / np.abs(poles)
     outside = (poles.imag < data.omega[0]) | (poles.imag > data.omega[-1])
     return np.asarray((poles.real >= 0) | (zeta > MAX_DAMPING_RATIO) | outside)
+
+
+def broad(estimate: Estimate) -> NDArray[np.bool_]:
+    """Poles with so much damping that they mend any misfit."""
+    return np.asarray(-estimate.poles.real > BROAD * np.abs(estimate.poles))
+
+
+def gone_astray(data: FitData, before: Estimate, estimate: Estimate) -> NDArray[np.bool_]:
+    """Poles that the polish has driven to where no mode can be, or no more than a background."""
+    lost = impossible(data, estimate) | (broad(estimate) & ~broad(before))
+    return np.asarray(lost & ~impossible(data, before))
 
 
 def put_back(estimate: Estimate, before: Estimate, lost: NDArray[np.bool_]) -> Estimate:

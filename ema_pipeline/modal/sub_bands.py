@@ -34,7 +34,7 @@ from ema_pipeline.modal.noise import NoiseLaw
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks, at_peak
 from ema_pipeline.modal.pole_tracks import link, votes
 from ema_pipeline.modal.poles import PoleSet
-from ema_pipeline.modal.segment import SegmentFit, fit_segment
+from ema_pipeline.modal.segment import SegmentFit, broad, fit_segment
 from ema_pipeline.processes import release_memory
 from ema_pipeline.threads import in_order
 
@@ -114,7 +114,8 @@ def first_guess(window: Window, bands: tuple[SubBand, ...], modes: Estimate, ite
         few = compress(window.lines(part.first, part.stop))
         release_memory()
         near = modes.take(between(modes.poles, few.data.omega[0], few.data.omega[-1]))
-        fit = fit_segment(few.data, few.hits, few.noise, near, significant, min(iterations, FIRST_ITERATIONS))
+        judge = partial(significant, any_broad=bool(np.any(broad(near))))
+        fit = fit_segment(few.data, few.hits, few.noise, near, judge, min(iterations, FIRST_ITERATIONS))
         found = _stitched(found, fit.estimate.take(between(fit.estimate.poles, part.low, part.high)))
     return found
 
