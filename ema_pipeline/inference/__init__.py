@@ -6,6 +6,7 @@ everything else that a user sees is read from the `Posterior`.
 
 from ema_pipeline.inference.bounded import Bounded, beyond, reach
 from ema_pipeline.inference.factor import lower_factor, solve_lower
+from ema_pipeline.inference.marginal import averaged_over_others
 from ema_pipeline.inference.maximise import anneal, descend
 from ema_pipeline.inference.posterior import ERROR_LIMIT, Posterior, error_limit
 from ema_pipeline.inference.problem import Apart, Problem, Residuals, same_matching
@@ -24,6 +25,7 @@ __all__ = [
     "Scatter",
     "Unknowns",
     "anneal",
+    "averaged_over_others",
     "beyond",
     "descend",
     "error_limit",

@@ -20,7 +20,7 @@ _LEAST_LIMIT = 1.3
 """The same of many, whose σ are themselves known to some tenths only: of 400 models of simulated rigs that lacked
 nothing one had an error above it, of 103 that lacked too little to be named ten."""
 _ONCE_IN = 1e-3
-_LARGE = 2.0
+LARGE = 2.0
 """Prior σ that sizes of effects count in an error at most: that an effect is large is no misfit. Of twelve data, a
 damper that explained all had left an error of 1.4."""
 
@@ -57,6 +57,8 @@ class Posterior:
         At `x`, with derivatives.
     scatter_cost : float
         -log prior density of learned scatters relative to that of the defaults.
+    widths : ndarray, (n,), optional
+        Factors on standard deviations that are known better than from the curvature at the maximum.
 
     References
     ----------
@@ -68,6 +70,7 @@ class Posterior:
     scatters: Mapping[str, float]
     residuals: Residuals
     scatter_cost: float = 0.0
+    widths: NDArray[np.float64] | None = None
 
     @cached_property
     def prior_std(self) -> NDArray[np.float64]:
@@ -79,7 +82,8 @@ class Posterior:
         """-log posterior up to a constant."""
         return self.residuals.cost + 0.5 * float(np.sum((self.x / self.prior_std) ** 2))
 
-    def _information(self) -> NDArray[np.float64]:
+    @property
+    def information(self) -> NDArray[np.float64]:
         """Posterior precision in units of the prior's, (n, n); not kept: a diagnosis holds hundreds of posteriors."""
         whitened = self.residuals.weighted[1] * self.prior_std
         return np.asarray(np.eye(len(self.x)) + whitened.T @ whitened)
@@ -87,8 +91,9 @@ class Posterior:
     @cached_property
     def covariance(self) -> NDArray[np.float64]:
         """Posterior covariance, (n, n)."""
-        inverse = np.linalg.inv(self._information())
-        return np.asarray(self.prior_std[:, None] * inverse * self.prior_std)
+        inverse = np.linalg.inv(self.information)
+        std = self.prior_std if self.widths is None else self.prior_std * self.widths
+        return np.asarray(std[:, None] * inverse * std)
 
     @cached_property
     def std(self) -> NDArray[np.float64]:
@@ -105,7 +110,7 @@ class Posterior:
         """The same for these scatters, whatever they cost."""
         if not np.isfinite(self.cost):
             return -np.inf
-        half_log_det = float(np.sum(np.log(np.diag(lower_factor(self._information())))))
+        half_log_det = float(np.sum(np.log(np.diag(lower_factor(self.information)))))
         return -self.cost - half_log_det
 
     @property
@@ -121,7 +126,7 @@ class Posterior:
         """Of some residuals, with the priors of the first unknowns."""
         away = self.x / self.prior_std
         sizes = [self.unknowns.index[name] for name in self.unknowns.sizes if name in self.unknowns.index]
-        away[sizes] = np.clip(away[sizes], -_LARGE, _LARGE)
+        away[sizes] = np.clip(away[sizes], -LARGE, LARGE)
         squares = residuals.squares + 2 * residuals.penalty + float(np.sum(away[:unknowns] ** 2))
         return float(np.sqrt(squares / max(residuals.count, 1)))
 

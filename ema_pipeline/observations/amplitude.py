@@ -79,6 +79,7 @@ class AmplitudeObservations(Observations):
     """
 
     linearised = True
+    slow = True
 
     def __init__(
         self,

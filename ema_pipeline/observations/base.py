@@ -90,11 +90,14 @@ class Observations(Protocol):
         True where effects that depend on the amplitude are known to first order, whose rest looks like another.
     level_dependent : bool
         True where modes are seen to move with the force of the hits, which no linear model does.
+    slow : bool
+        True where models are marched through time, or through many hits.
     """
 
     scatters: Mapping[str, Scatter]
     linearised: bool = False
     level_dependent: bool = False
+    slow: bool = False
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> EffectProblem:
         """The problem of fitting the rig with `effects`, whose sizes have these prior 1 σ, to the data."""

@@ -17,6 +17,7 @@ from ema_pipeline.inference import (
     Posterior,
     Unknowns,
     anneal,
+    averaged_over_others,
     beyond,
     descend,
     learn,
@@ -261,9 +262,16 @@ def at_scatters(observations: Observations, fit: Fit, scatters: Mapping[str, flo
 
 
 def averaged(observations: Observations, fit: Fit) -> Fit:
-    """The fit at scatters that hold how well they are known, for sizes whose intervals are true."""
+    """The fit at scatters that hold how well they are known, for sizes whose intervals are true; these averaged over
+    everything else.
+    """
     wide = at_scatters(observations, fit, widened(fit.posterior, observations.scatters))
-    return within_scatter(observations, wide)
+    wide = within_scatter(observations, wide)
+    if observations.slow:
+        return wide
+    problem = fit.model.problem(observations)
+    bounded = Bounded(problem, part_reach(observations, wide.posterior))
+    return replace(wide, posterior=averaged_over_others(bounded, wide.posterior, problem.sizes))
 
 
 def part_reach(observations: Observations, found: Posterior, furthest: float = FURTHEST) -> dict[str, float]:

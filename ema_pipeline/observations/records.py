@@ -87,6 +87,8 @@ class RecordObservations(Observations):
         Without records to fit, and for a rig that lacks a measured DOF.
     """
 
+    slow = True
+
     def __init__(
         self,
         rig: Rig,
