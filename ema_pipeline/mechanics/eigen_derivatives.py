@@ -167,7 +167,7 @@ class ModeDerivatives:
         log_frequency, weight, reduced = _undamped(matrices, solution, modes, between)
         ratio = _damping(matrices, solution, modes, log_frequency, weight)
         log_frequency, ratio, weight, reduced = _with_ratios(
-            matrices, modes, log_frequency, ratio, weight, reduced
+            matrices, solution, modes, log_frequency, ratio, weight, reduced
         )
         shapes = (solution.shapes @ weight).transpose(1, 2, 0)
         return cls(log_frequency.T, ratio.T, shapes, np.ascontiguousarray(reduced.T), between)
@@ -196,7 +196,7 @@ class ModeDerivatives:
                 phi @ damped.lag(phi.T @ matrices.skew_by_shape[j] @ phi, solution.eigenvalues)[:, modes]
             )
         log_frequency, ratio, shapes, reduced = _with_ratios(
-            matrices, modes, log_frequency, ratio, shapes, reduced
+            matrices, solution, modes, log_frequency, ratio, shapes, reduced
         )
         if len(turned):
             alone = _numbered_pairs(np.full(len(omega), -1))
@@ -241,6 +241,7 @@ def _undamped(
 
 def _with_ratios(
     matrices: Matrices,
+    solution: EigenSolution,
     modes: NDArray[np.int64],
     log_frequency: NDArray[np.float64],
     ratio: NDArray[np.float64],
@@ -258,6 +259,9 @@ def _with_ratios(
         return np.concatenate([array[:at], new, array[at:]])
 
     own = logs[:, modes] * matrices.damping_ratio[modes]
+    if matrices.own_damping is not None and matrices.own_log is not None:
+        by_dampers = np.diag(matrices.own_damping) / (2 * np.sqrt(solution.eigenvalues))
+        own += matrices.own_log[:, modes] * by_dampers[modes]
     return inserted(log_frequency, 0.0), inserted(ratio, own), inserted(shapes, 0.0), inserted(reduced, 0.0)
 
 

@@ -62,6 +62,15 @@ class Terms:
             sum((p.skew for p in parts[1:]), parts[0].skew),
         )
 
+    def damping_scaled(self, factor: NDArray[np.float64]) -> Terms:
+        """What is added to the damping matrix where `factor` F, (n, n), makes F C Fᵀ of it."""
+        on, rows = self.by_kind.get(DAMPING_MATRIX, (np.zeros(0, int), np.zeros((0, len(self.dofs)))))
+        signed = np.concatenate([self.coefficient[on], -self.coefficient[on]])
+        matrix, log = np.full(len(signed), DAMPING_MATRIX), np.concatenate([self.log[on]] * 2)
+        return Terms(
+            self.dofs, np.concatenate([rows @ factor.T, rows]), signed, matrix, log, np.zeros_like(self.skew)
+        )
+
     def scaled(self, logs: NDArray[np.float64]) -> NDArray[np.float64]:
         """Coefficients at these unknown logarithms, (t,)."""
         return np.asarray(self.coefficient * np.exp(self.log @ logs))
@@ -102,6 +111,11 @@ class Matrices:
     by_shape : ndarray, (k, 4, n, n)
         Derivatives by effects' unknowns and geometric ones.
     skew_by_shape : ndarray, (k, n, n)
+    own_damping : ndarray, (n, n), optional
+        Part of the damping matrix, in coordinates of the undamped modes, that goes with their own damping ratios.
+    own_log : ndarray, (u, n), optional
+        Derivatives of the logarithm of its diagonal by the unknowns of `damping_log`; row r and column r go with the
+        root.
     """
 
     terms: Terms
@@ -112,6 +126,8 @@ class Matrices:
     damping_log: NDArray[np.float64]
     by_shape: NDArray[np.float64]
     skew_by_shape: NDArray[np.float64]
+    own_damping: NDArray[np.float64] | None = None
+    own_log: NDArray[np.float64] | None = None
 
 
 def assemble_terms(

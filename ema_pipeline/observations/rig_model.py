@@ -22,6 +22,7 @@ from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, solved
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.mechanics.terms import (
     DAMPING_MATRIX,
+    MASS,
     STIFFNESS,
     STRUCTURAL,
     Matrices,
@@ -172,13 +173,37 @@ class RigModel:
         eigenvalues: NDArray[np.float64],
         shapes: NDArray[np.float64],
     ) -> Matrices:
-        """The matrices with the damping ratios of the undamped modes that have one of their own."""
+        """The matrices with the damping ratios of the undamped modes that have one of their own.
+
+        What dampers of the rig add goes with them: row and column r of their matrix between undamped modes with the
+        root of the factor of mode r, which leaves it positive. The derivatives take undamped shapes for fixed in this.
+        """
         at, slopes = int(self.has_ratio), matrices.damping_log.copy()
         for name, own in self.own_damping.items():
             if name == configuration:
                 slopes[at : at + len(own.names)] = own.slopes(eigenvalues, shapes)
             at += len(own.names)
-        return replace(matrices, damping_ratio=self._ratios(x, slopes), damping_log=slopes)
+        matrices = replace(matrices, damping_ratio=self._ratios(x, slopes), damping_log=slopes)
+        rig = self._without_effects(configuration, x) if self.effects else matrices.terms
+        if DAMPING_MATRIX not in rig.by_kind or rig.dofs != matrices.terms.dofs:
+            return matrices
+        own_log, logs = slopes.copy(), x[: self._logs]
+        own_log[: int(self.has_ratio)] = 0.0
+        root = np.exp(0.5 * (x[self._logs : self._logs + len(slopes)] @ own_log))
+        moved = matrices.dense[MASS] @ shapes
+        added = rig.damping_scaled((moved * root) @ shapes.T)
+        on, rows = rig.by_kind[DAMPING_MATRIX]
+        along = (rows @ shapes) * root
+        dense = matrices.dense.copy()
+        dense[DAMPING_MATRIX] += added.dense(added.scaled(logs))[DAMPING_MATRIX]
+        return replace(
+            matrices,
+            terms=Terms.joined([matrices.terms, added]),
+            coefficient=np.concatenate([matrices.coefficient, added.scaled(logs)]),
+            dense=dense,
+            own_damping=along.T @ (rig.scaled(logs)[on, None] * along),
+            own_log=own_log,
+        )
 
     def _ratios(self, x: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Damping ratios of the undamped modes by the derivatives of their logarithms, (n,)."""
@@ -299,14 +324,18 @@ class RigModel:
         shares = np.zeros(len(solution.eigenvalues))
         if not self.effects:
             return shares
-        shape = x[self.shape_start :].copy()
-        shape[len(self.dependence.geometric) :] = 0.0  # of no effect: the same terms at all sizes
-        rig = self._assembled(configuration, shape, frozenset(range(len(self.effects))))
+        rig = self._without_effects(configuration, x)
         if len(rig.dofs) == len(shares):
             springs = rig.matrix == STIFFNESS
             own = rig.scaled(x[: self._logs])[springs] @ (rig.rows[springs] @ solution.shapes) ** 2
             shares = np.clip(1 - own / solution.eigenvalues, 0.0, 1.0)
         return shares
+
+    def _without_effects(self, configuration: str, x: NDArray[np.float64]) -> Terms:
+        """Elements of the rig alone, its geometry at `x`."""
+        shape = x[self.shape_start :].copy()
+        shape[len(self.dependence.geometric) :] = 0.0  # of no effect: the same terms at all sizes
+        return self._assembled(configuration, shape, frozenset(range(len(self.effects))))
 
     def couples(self, configuration: str) -> bool:
         """True where dampers, losses or gyroscopic effects couple the modes, with the effects at their start values."""

@@ -72,33 +72,38 @@ def with_modal_factors(
     -------
     Assembly
         Its modal damping ratio is replaced by one damper per mode along Mφ_r, whose coefficients make up
-        C = Σ c_r·Mφ_r·φ_rᵀM. The own dampers stay: c_r holds only what is to be added to, or taken off, their
-        share of the damping ratio.
+        C = Σ c_r·Mφ_r·φ_rᵀM. The own dampers stay: what is to be added to, or taken off, multiplies row and column r of
+        their matrix between the modes by the root of `factors[r]`, so that no motion gains energy.
     """
     system = assembly.system()
     values, shapes = eigen_solution(system)
     omega = np.sqrt(values)
-    by_dampers = _coefficients(assembly, dampers, shapes)
-    wanted = factors * (2 * omega * assembly.modal_damping_ratio + by_dampers) - by_dampers
+    by_dampers = _between_modes(assembly, dampers, shapes)
+    root = np.sqrt(factors)
+    changes, along = np.linalg.eigh(root[:, None] * by_dampers * root - by_dampers)
+    modal = 2 * omega * assembly.modal_damping_ratio * factors
     rows = system.mass @ shapes
-    elements = [
-        Damper(
-            f"damping of mode {r + 1}", dict(zip(system.dofs, map(float, rows[:, r]), strict=True)), float(c)
-        )
-        for r, c in enumerate(wanted)
-        if omega[r] > 0 and c != 0.0
-    ]
-    return dataclasses.replace(assembly.add(*elements), modal_damping_ratio=0.0)
+
+    def elements(name: str, coefficients: NDArray[np.float64], rows: NDArray[np.float64]) -> list[Damper]:
+        return [
+            Damper(f"{name} {r + 1}", dict(zip(system.dofs, map(float, row), strict=True)), float(c))
+            for r, (c, row) in enumerate(zip(coefficients, rows.T, strict=True))
+            if c != 0.0
+        ]
+
+    modes = elements("damping of mode", np.where(omega > 0, modal, 0.0), rows)
+    others = elements("change of dampers", changes, rows @ along)
+    return dataclasses.replace(assembly.add(*modes, *others), modal_damping_ratio=0.0)
 
 
-def _coefficients(
+def _between_modes(
     assembly: Assembly, dampers: Collection[str], shapes: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """φᵀCφ of the named dampers, (n_modes,), 1/s."""
-    total = np.zeros(shapes.shape[1])
+    """ΦᵀCΦ of the named dampers, (n_modes, n_modes), 1/s."""
+    total = np.zeros((shapes.shape[1], shapes.shape[1]))
     index = {dof: i for i, dof in enumerate(assembly.dofs)}
     for e in assembly.elements:
         if isinstance(e, Damper) and e.name in dampers:
             stretch = sum((v * shapes[index[dof]] for dof, v in e.row.items()), np.zeros(len(total)))
-            total += e.coefficient * stretch**2
+            total += e.coefficient * np.outer(stretch, stretch)
     return total
