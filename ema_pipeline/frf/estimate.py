@@ -14,9 +14,11 @@ from scipy.ndimage import uniform_filter1d
 from ema_pipeline.check_result import CheckResult
 from ema_pipeline.dof import Dof
 from ema_pipeline.errors import EmaError
+from ema_pipeline.frf.channel_faults import EXCHANGED, SENSITIVITY
 from ema_pipeline.frf.channels import ChannelQuality, merged
 from ema_pipeline.frf.checks import check_frfs
 from ema_pipeline.frf.parts import joined
+from ema_pipeline.frf.points import POINT, check_points
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.signs import HitLines, check_signs, strongest_lines
 from ema_pipeline.frf.types import FrfSet, unknown
@@ -118,13 +120,19 @@ def estimate_frfs(
     frfs = joined(parts)
     if not coherence:
         return frfs
-    signs = [v for name, part in parts.items() for v in _signs(totals[name], part)]
-    return replace(frfs, verdicts=(*signs, *check_frfs(frfs, settings)))
+    of_hits = [v for name, part in parts.items() for v in _of_single_hits(totals[name], part)]
+    rest = check_frfs(frfs, settings)
+    misplaced = any(v.check == POINT and not v.passes for v in of_hits)
+    if misplaced:  # reciprocity then tells of no sensor
+        rest = tuple(v for v in rest if v.check not in (SENSITIVITY, EXCHANGED))
+    return replace(frfs, verdicts=(*of_hits, *rest))
 
 
-def _signs(total: _Total, frfs: FrfSet) -> list[CheckResult]:
+def _of_single_hits(total: _Total, frfs: FrfSet) -> list[CheckResult]:
     low, high = np.searchsorted(frfs.frequency_hz, frfs.band_hz)
-    return check_signs(total.pairs, total.outputs, total.quantities, (int(low), int(high)))
+    band = int(low), int(high)
+    signs = check_signs(total.pairs, total.outputs, total.quantities, band)
+    return [*signs, *check_points(total.pairs, frfs, band)]
 
 
 @dataclass

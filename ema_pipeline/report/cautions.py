@@ -10,6 +10,7 @@ from enum import IntEnum
 from ema_pipeline.check_result import CheckResult
 from ema_pipeline.fit.types import ErrorSweep, FitResult, ParameterEstimate
 from ema_pipeline.frf.channel_faults import EXCHANGED, REVERSED, SENSITIVITY
+from ema_pipeline.frf.points import POINT
 from ema_pipeline.frf.signs import SIGN
 from ema_pipeline.modal.types import GROWS
 from ema_pipeline.number_text import below, format_value, plain
@@ -55,10 +56,33 @@ def cautions(results: RunResults, lightest: Weight = Weight.SWEEP) -> tuple[str,
 
 
 def suspicions(results: RunResults) -> tuple[str, ...]:
-    """Channels that cannot be right: their sensitivity, unit or sign contradicts the rest of the test.
+    """Hits and channels that cannot be right: their point, sign, sensitivity or unit contradicts the rest of the test.
 
-    What the model says of single channels goes before what two channels say of each other.
+    Hits go first, as they make channels look wrong; what the model says of single channels goes before what two of them
+    say of each other.
     """
+    of_channels = _suspected_channels(results)
+    return tuple(_sentence(text) for text in (*_suspected_hits(results), *of_channels))
+
+
+def suspect(results: RunResults) -> str:
+    """``"a hit"`` or ``"a sensor"``, what is suspected first; empty for nothing."""
+    if _suspected_hits(results):
+        return "a hit"
+    return "a sensor" if suspicions(results) else ""
+
+
+def _suspected_hits(results: RunResults) -> list[str]:
+    return [
+        _where(results, c) + v.message
+        for c in results.configurations
+        if c.frfs is not None
+        for v in c.frfs.verdicts
+        if not v.passes and v.check in (SIGN, POINT)
+    ]
+
+
+def _suspected_channels(results: RunResults) -> list[str]:
     found = [v.message for v in results.sensitivities]
     if not found:
         for c in results.configurations:
@@ -67,7 +91,7 @@ def suspicions(results: RunResults) -> tuple[str, ...]:
     for c in results.configurations:
         peaks = [v for h in c.hits for v in h.verdicts if v.check == "force peak" and not v.passes]
         found += [_where(results, c) + v.message for v in peaks[:1]]
-    return tuple(_sentence(text) for text in found)
+    return found
 
 
 def identified_words(p: ParameterEstimate, provisional: bool) -> str:
@@ -138,10 +162,8 @@ def _of_configuration(c: ConfigurationResults) -> Iterator[tuple[Weight, str]]:
             what = "force" if c.frfs.excitation else "hammer"
             yield Weight.SCALE, f"the {what} is not calibrated: FRFs and shapes have no absolute scale"
         for v in c.frfs.verdicts:
-            if not v.passes and not _of_sensor(v):
-                # Hits of opposite sign cancel each other: modes vanish that all of them show.
-                weight = Weight.SENSOR if v.check == SIGN else Weight.SCATTER
-                yield weight, v.message or f"{v.check} fails"
+            if not v.passes and not _of_sensor(v) and v.check not in (SIGN, POINT):
+                yield Weight.SCATTER, v.message or f"{v.check} fails"
         singles = int((c.frfs.hits == 1).sum())
         if singles:
             rests = "FRF rests" if singles == 1 else "FRFs rest"

@@ -19,7 +19,7 @@ from ema_pipeline.modal.chosen import EXCLUDED
 from ema_pipeline.modal.types import ModalModel
 from ema_pipeline.number_text import below, counted, format_percent, format_value, plain, signed
 from ema_pipeline.report import diagnosis
-from ema_pipeline.report.cautions import Weight, cautions, left_out, suspicions
+from ema_pipeline.report.cautions import Weight, cautions, left_out, suspect, suspicions
 from ema_pipeline.report.commands import naming, typed
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.results import ConfigurationResults, RunResults
@@ -111,8 +111,11 @@ def _fitting(blocks: Sequence[list[str]], room: int) -> list[list[str]]:
 def verdict_line(results: RunResults) -> str:
     """What is missing and how sure that is; without a model how many modes there are."""
     words = _verdict(results)
-    if suspicions(results) and results.fit is not None:
-        return f"A sensor is suspected, see below. If it reads right: {words[:1].lower()}{words[1:]}"
+    doubted = suspect(results)
+    if doubted and results.fit is not None:
+        return (
+            f"{doubted.capitalize()} is suspected, see below. If it is right: {words[:1].lower()}{words[1:]}"
+        )
     return words
 
 

@@ -9,7 +9,7 @@ from ema_pipeline.fit.types import FitResult, ParameterEstimate
 from ema_pipeline.inference import ERROR_LIMIT
 from ema_pipeline.number_text import counted, format_value, plain
 from ema_pipeline.report import diagnosis
-from ema_pipeline.report.cautions import cautions, identified_words, suspicions
+from ema_pipeline.report.cautions import cautions, identified_words, suspect, suspicions
 from ema_pipeline.report.commands import command
 from ema_pipeline.report.levels import has_to_say
 from ema_pipeline.report.name_text import words
@@ -28,9 +28,9 @@ _SAME_ERROR = 1.01
 def findings(results: RunResults) -> tuple[str, ...]:
     """What was measured and how well the model follows it, one sentence each."""
     lines: list[str] = []
-    if suspicions(results):
+    if doubted := suspect(results):
         lines.append(
-            "A sensor is suspected, see the cautions: all that follows is valid only if it reads right."
+            f"{doubted.capitalize()} is suspected, see the cautions: all that follows is valid only if it is right."
         )
     if results.diagnosis is not None:
         lines += [] if not results.diagnosis_is_old else [changed_words(results)]
@@ -90,7 +90,7 @@ def changed_words(results: RunResults) -> str:
 def commands_left(results: RunResults, out: str) -> tuple[str, ...]:
     """What to type next: what the diagnosis proposes, or after a change the diagnosis again, or the change back.
 
-    None without a diagnosis, and where a sensor is suspected: the test comes first.
+    None without a diagnosis, and where a hit or a sensor is suspected: the test comes first.
     """
     if results.diagnosis is None or suspicions(results):
         return ()

@@ -227,7 +227,7 @@ def diagnosis_screen(
     program : str
         The command ``ema`` as the user would type it.
     suspicions : sequence of str
-        Sensors that cannot be right; they come first.
+        Hits and sensors that cannot be right; they come first.
     effect_files : sequence of str
         Files with the user's own effects, as the user would type them.
     added : sequence of str
