@@ -82,6 +82,8 @@ def _profile(
 
 def _log_density(at: Posterior, i: int) -> float:
     """Of one unknown where the others are at their best, these allowed for by their precision."""
+    if not np.isfinite(at.cost):
+        return -np.inf
     others = np.arange(len(at.x)) != i
     half_log_det = float(np.sum(np.log(np.diag(lower_factor(at.information[np.ix_(others, others)])))))
     beyond = 0.0

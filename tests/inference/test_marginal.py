@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -105,6 +106,25 @@ def test_an_unknown_at_its_bound_stays_there() -> None:
     told = averaged_over_others(problem, fitted(problem), ["c"])
     assert 0.0 <= told.x[0] < 0.02
     assert np.all(np.isfinite(told.std))
+
+
+def test_values_that_no_model_can_have_count_nothing() -> None:
+    problem = dampers(0.4, 1.0, np.zeros(3), std=100.0)
+
+    @dataclass(frozen=True)
+    class Ended(Dampers):
+        """With more damping the model has no modes."""
+
+        def residuals(self, x: Array, scatters: Mapping[str, float], **more: Any) -> Residuals:
+            if x[0] > 1.02:
+                return Residuals(np.full(3, np.inf), np.zeros((3, 5)))
+            return super().residuals(x, scatters, **more)
+
+    ended = Ended(problem.unknowns, problem.share, problem.measured)
+    found = fitted(problem)
+    told = averaged_over_others(ended, found, ["c"])
+    assert told.x[0] < averaged_over_others(problem, found, ["c"]).x[0]
+    assert told.x[0] + 0.1 * told.std[0] < 1.02
 
 
 def test_of_a_linear_problem_nothing_changes() -> None:
