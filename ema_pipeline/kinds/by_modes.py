@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from ema_pipeline.check_result import CheckResult
 from ema_pipeline.effects.library import depends_on_level
 from ema_pipeline.effects.rig import rig_with_effects
 from ema_pipeline.errors import EmaError
@@ -16,6 +17,10 @@ from ema_pipeline.run.types import Progress, Run
 if TYPE_CHECKING:
     from ema_pipeline.diagnose.types import Diagnosis, Ladder
     from ema_pipeline.rigs.types import Rig
+
+
+_MOST_ALIKE = 3
+"""Failures of one check that are all told."""
 
 
 def judge(run: Run) -> Judge | None:
@@ -68,9 +73,20 @@ def _failed_checks(run: Run) -> tuple[str, ...]:
     found = []
     for name in run.info.configurations:
         frfs = run.store.find("frf", name, "frfs", FrfSet)
-        verdicts = () if frfs is None else frfs.verdicts
-        found += [f"{name}: {v.message}" for v in verdicts if not v.passes and v.message]
+        failed: dict[str, list[CheckResult]] = {}
+        for v in () if frfs is None else frfs.verdicts:
+            if not v.passes and v.message:
+                failed.setdefault(v.check, []).append(v)
+        found += [f"{name}: {text}" for alike in failed.values() for text in _told(alike)]
     return tuple(found)
+
+
+def _told(failed: Sequence[CheckResult]) -> list[str]:
+    """Messages of one check that fails; of many the worst one."""
+    if len(failed) <= _MOST_ALIKE:
+        return [v.message for v in failed]
+    worst = max(failed, key=lambda v: abs(v.value - v.limit))
+    return [f"{worst.message} (the worst of {len(failed)})"]
 
 
 def _compared_with(run: Run, rig: Rig, labels: Sequence[str], unknowns: Mapping[str, float]) -> Results:

@@ -10,6 +10,7 @@ from ema_pipeline.diagnose.sentences import probability_text
 from ema_pipeline.diagnose.types import UNKNOWN, Diagnosis, Rung
 from ema_pipeline.number_text import plain
 from ema_pipeline.report import diagnosis
+from ema_pipeline.report.cautions import suspect, suspicions
 from ema_pipeline.report.effect_places import EffectPlaces, effect_places
 from ema_pipeline.report.results import RunResults
 from ema_pipeline.report.shapes import drawing_for
@@ -19,6 +20,8 @@ _WORTH_A_WORD = 0.01
 """Probability of an effect that is not in the library from which it is told."""
 _OTHERS = 3
 """Less likely explanations that are named."""
+_MOST_SUSPECTED = 3
+"""Hits and sensors that are named; the cautions have them all."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,10 @@ class PageTop:
     ----------
     heading, summary : str
         The verdict and one or two sentences on it; of the modes alone where there is no model.
+    doubt : str
+        That a hit or a sensor is suspected, with which all that follows stands or falls; empty where none is.
+    suspected : tuple of str
+        Which ones, and what to look up.
     tiles : tuple of Tile
     reasons : tuple of str
         Why the named effects are suspected.
@@ -53,6 +60,8 @@ class PageTop:
 
     heading: str
     summary: str
+    doubt: str = ""
+    suspected: tuple[str, ...] = ()
     tiles: tuple[Tile, ...] = ()
     reasons: tuple[str, ...] = ()
     against: tuple[str, ...] = ()
@@ -63,12 +72,17 @@ class PageTop:
 
 def page_top(results: RunResults) -> PageTop:
     """The top of the page for these results."""
-    found = results.diagnosis
-    if found is None:
-        return PageTop(_heading_without_diagnosis(results), "", _tiles(results))
-    known = PageTop(
-        "", "", _tiles(results), commands=commands_left(results, results.folder), drawing=_drawing(results)
+    found, doubted = results.diagnosis, suspect(results)
+    plain_top = PageTop(
+        _heading_without_diagnosis(results),
+        "",
+        f"{doubted.capitalize()} is suspected: what follows is valid only if it is right." if doubted else "",
+        suspicions(results)[:_MOST_SUSPECTED],
+        _tiles(results),
     )
+    if found is None:
+        return plain_top
+    known = replace(plain_top, commands=commands_left(results, results.folder), drawing=_drawing(results))
     if results.diagnosis_is_old:
         told = "The diagnosis below is older than this change; repeat it to see what is still missing."
         return replace(known, heading=_changed(results), summary=told)

@@ -21,6 +21,7 @@ from rich.console import Console
 from ema_pipeline.check_result import judged
 from ema_pipeline.correlate.types import ModeAlone
 from ema_pipeline.frf.overview import cmif, representative_frfs
+from ema_pipeline.frf.points import POINT
 from ema_pipeline.frf.signs import SIGN
 from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.number_text import format_percent, format_value, signed
@@ -28,9 +29,10 @@ from ema_pipeline.report import plots as report_plots
 from ema_pipeline.report import style, summary, summary_files, tables, terminal
 from ema_pipeline.report.html import bokeh_script, report_html, write_report
 from ema_pipeline.report.name_text import words
+from ema_pipeline.report.page_top import page_top
 from ema_pipeline.report.plots import figure_specs, write_plots
 from ema_pipeline.report.results import ConfigurationResults, RunResults
-from ema_pipeline.report.run_screen import RunScreen
+from ema_pipeline.report.run_screen import RunScreen, next_lines, verdict_line
 from ema_pipeline.report.shapes import missing_words, shape_pair
 from ema_pipeline.report.summary_files import finite
 from ema_pipeline.rigs import drawing_of
@@ -467,6 +469,25 @@ def test_hits_of_opposite_sign_which_make_modes_vanish_are_the_first_caution(run
     assert summary.cautions(replace(run, configurations=(odd, *run.configurations[1:])))[0].endswith(
         f"{told}."
     )
+
+
+def test_a_hit_of_another_point_heads_the_page_and_the_screen_and_comes_before_any_command(
+    run: RunResults,
+) -> None:
+    c = run.configurations[0]
+    assert c.frfs is not None
+    told = "1.csv#1 is listed under a.x, but like the hits on b.x: correct 'impact' in test.toml, or leave it out"
+    found = judged(POINT, 0.1, 0.5, False, "", "warn", told, channel="a.x")
+    odd = replace(c, frfs=replace(c.frfs, verdicts=(*c.frfs.verdicts, found)))
+    results = replace(run, configurations=(odd, *run.configurations[1:]), sensitivities=())
+    top = page_top(results)
+    assert top.doubt == "A hit is suspected: what follows is valid only if it is right."
+    assert top.suspected[0].endswith(f"{told}.")
+    assert not top.commands
+    assert summary.findings(results)[0].startswith("A hit is suspected")
+    assert verdict_line(results).startswith("A hit is suspected, see below. If it is right: ")
+    assert next_lines(results, "OUT", "ema")[0].startswith("correct test.toml, then ema run ")
+    assert not page_top(replace(run, sensitivities=())).doubt
 
 
 def test_cautions_of_one_kind_are_counted_rather_than_all_written_out(run: RunResults) -> None:
