@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ema_pipeline.dof import Dof
 from ema_pipeline.frf.channel_faults import EXCHANGED
 from ema_pipeline.frf.estimate import estimate_frfs
+from ema_pipeline.frf.points import POINT
 from ema_pipeline.frf.settings import FrfSettings
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.ingest.description import RecordDescription, TestDescription
@@ -57,6 +58,7 @@ def judge_record(
     test: TestDescription,
     entry: RecordDescription,
     before: Sequence[HitSamples],
+    elsewhere: Sequence[HitSamples] = (),
 ) -> tuple[JudgedRecord, list[HitSamples]]:
     """Judge one record.
 
@@ -66,6 +68,8 @@ def judge_record(
     entry : RecordDescription
     before : sequence of HitSamples
         Good hits of other records on the same point.
+    elsewhere : sequence of HitSamples
+        Good hits on other points.
 
     Returns
     -------
@@ -97,6 +101,7 @@ def judge_record(
         coherence = _coherence([*before, *good])
         low = [f"{name} {value:.2f}" for name, value in coherence.items() if value < LEAST_COHERENCE]
         if low:
+            remarks = _of_another_point([*before, *good], elsewhere) + remarks
             remarks.append(f"low coherence so far: {', '.join(low)}")
     once = tuple(dict.fromkeys(faults)), tuple(dict.fromkeys(remarks))
     judged = JudgedRecord(entry.file, record.impact, hits, len(good), *once, coherence)
@@ -138,6 +143,15 @@ def _coherence(hits: Sequence[HitSamples]) -> dict[str, float]:
         for d, v in zip(frfs.outputs, values, strict=True)
         if np.all(np.isfinite(v))
     }
+
+
+def _of_another_point(hits: Sequence[HitSamples], elsewhere: Sequence[HitSamples]) -> list[str]:
+    """Which hits on a point are like those on another one, see `check_points`."""
+    if not elsewhere:
+        return []
+    point = str(hits[0].hit.impact.point)
+    verdicts = _frfs([*hits, *elsewhere]).verdicts
+    return [v.message for v in verdicts if v.check == POINT and v.channel == point and not v.passes]
 
 
 def _reversed_channels(now: Sequence[HitSamples], before: Sequence[HitSamples]) -> list[str]:

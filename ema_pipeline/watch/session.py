@@ -108,7 +108,10 @@ class Session:
         try:
             entry = self._entry(arrival.path)
             before = self._samples(entry.impact)
-            record, samples = judge_record(self.test, entry, before)
+            elsewhere = [
+                h for n, hits in self._good.items() if self._impacts[n] != entry.impact for h in hits
+            ]
+            record, samples = judge_record(self.test, entry, before, elsewhere)
         except EmaError as error:
             return self._told(arrival, False, f"✗ {name}: {_short(str(error), arrival.path)}")
         self._good[name], self._impacts[name], self._judged[name] = samples, record.impact, record

@@ -145,6 +145,34 @@ def test_a_copy_of_a_hit_is_no_hit(source: Path, tmp_path: Path) -> None:
     assert "all points are done" in take(second, "m1_x_3.csv").text
 
 
+def test_a_blow_on_another_point_than_was_asked_for_is_told(source: Path, tmp_path: Path) -> None:
+    folder = _channels(source, tmp_path / "live")
+    session = Session(folder, ("m1.x", "m3.x"), wanted=3)
+    m1, m3 = (sorted(source.glob(f"{m}*.csv"))[:3] for m in ("m1", "m3"))
+
+    def take(file: Path, name: str) -> Told:
+        shutil.copy(file, folder / name)
+        return session.take(Arrival(folder / name, time.time()))
+
+    for k, file in enumerate(m1):
+        assert take(file, f"m1_x_{k}.csv").good
+    assert take(m3[0], "m3_x_0.csv").good
+    (folder / "other").mkdir()
+    wrong = take(_other_blow(m1[0], folder / "other" / "blow.csv"), "m3_x_1.csv")
+    assert "! m3_x_1.csv: " in wrong.text
+    assert "m3_x_1.csv#1 is listed under m3.x, but like the hits on m1.x" in wrong.text
+
+
+def _other_blow(file: Path, to: Path) -> Path:
+    """A blow on the same point a tenth harder, so that it is no copy."""
+    import pandas as pd
+
+    table = pd.read_csv(file)
+    table.iloc[:, 1:] *= 1.1
+    table.to_csv(to, index=False)
+    return to
+
+
 def test_a_reversed_channel_is_told(source: Path, tmp_path: Path) -> None:
     """One sensor changes its sign from one hit to the next."""
     import pandas as pd
