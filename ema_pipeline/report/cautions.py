@@ -61,15 +61,14 @@ def suspicions(results: RunResults) -> tuple[str, ...]:
     Hits go first, as they make channels look wrong; what the model says of single channels goes before what two of them
     say of each other.
     """
-    of_channels = _suspected_channels(results)
-    return tuple(_sentence(text) for text in (*_suspected_hits(results), *of_channels))
+    return tuple(map(_sentence, [*_suspected_hits(results), *_suspected_channels(results)]))
 
 
 def suspect(results: RunResults) -> str:
-    """``"a hit"`` or ``"a sensor"``, what is suspected first; empty for nothing."""
+    """``"A hit"`` or ``"A sensor"``, what is suspected first; empty for nothing."""
     if _suspected_hits(results):
-        return "a hit"
-    return "a sensor" if suspicions(results) else ""
+        return "A hit"
+    return "A sensor" if _suspected_channels(results) else ""
 
 
 def _suspected_hits(results: RunResults) -> list[str]:

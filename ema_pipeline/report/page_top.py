@@ -76,7 +76,7 @@ def page_top(results: RunResults) -> PageTop:
     plain_top = PageTop(
         _heading_without_diagnosis(results),
         "",
-        f"{doubted.capitalize()} is suspected: what follows is valid only if it is right." if doubted else "",
+        f"{doubted} is suspected: what follows is valid only if it is right." if doubted else "",
         suspicions(results)[:_MOST_SUSPECTED],
         _tiles(results),
     )

@@ -113,9 +113,7 @@ def verdict_line(results: RunResults) -> str:
     words = _verdict(results)
     doubted = suspect(results)
     if doubted and results.fit is not None:
-        return (
-            f"{doubted.capitalize()} is suspected, see below. If it is right: {words[:1].lower()}{words[1:]}"
-        )
+        return f"{doubted} is suspected, see below. If it is right: {words[:1].lower()}{words[1:]}"
     return words
 
 

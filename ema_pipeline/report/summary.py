@@ -30,7 +30,7 @@ def findings(results: RunResults) -> tuple[str, ...]:
     lines: list[str] = []
     if doubted := suspect(results):
         lines.append(
-            f"{doubted.capitalize()} is suspected, see the cautions: all that follows is valid only if it is right."
+            f"{doubted} is suspected, see the cautions: all that follows is valid only if it is right."
         )
     if results.diagnosis is not None:
         lines += [] if not results.diagnosis_is_old else [changed_words(results)]
