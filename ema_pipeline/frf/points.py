@@ -74,7 +74,7 @@ def _lines(
         lines = pairs[output, point]
         single, force = lines.frfs(band)
         single = single[[lines.hits.index(hit) for hit in hits]]
-        o, where = outputs.index(output), lines.lines[(lines.lines >= band[0]) & (lines.lines <= band[1])]
+        o, where = outputs.index(output), lines.lines[lines.inside(band)]
         level = np.max(np.abs(frfs.frf[o][:, where]), initial=0.0, where=frfs.hits[o][:, None] > 0)
         weight = np.sqrt(np.mean(force, axis=0)) / (level or 1.0)
         own.append(single * weight)

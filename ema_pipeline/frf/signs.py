@@ -56,9 +56,13 @@ class HitLines:
         self.cross.append(cross[self.lines])
         self.force.append(power[self.lines] / self.scale[-1])
 
+    def inside(self, band: tuple[int, int]) -> NDArray[np.bool_]:
+        """Mask of the lines in a band, (n_blocks,)."""
+        return np.asarray((self.lines >= band[0]) & (self.lines <= band[1]))
+
     def frfs(self, band: tuple[int, int]) -> tuple[NDArray[np.complex128], NDArray[np.float64]]:
         """FRF of every hit, (n_hits, n_lines), and force over its largest, at the lines in a band."""
-        inside = (self.lines >= band[0]) & (self.lines <= band[1])
+        inside = self.inside(band)
         force = np.array(self.force)[:, inside]
         cross = np.array(self.cross)[:, inside] / np.array(self.scale)[:, None]
         return np.divide(cross, force, out=np.zeros_like(cross), where=force > 0), force

@@ -29,7 +29,7 @@ def averaged_over_others(problem: Problem, found: Posterior, names: Iterable[str
 
     Where the precision of others depends on an unknown, its value at the joint maximum lies to one side of its mean:
     damping ratios that scatter in their logarithms tell the less of a damper the more it is said to damp, and the
-    largest density had dampers 5 to 15 % too small. Residuals and derivatives stay those of the maximum.
+    largest density had dampers 2 to 14 % too small. Residuals and derivatives stay those of the maximum.
 
     The prior of a size of an effect counts up to two of its σ as everywhere else, and with an even slope from there.
 

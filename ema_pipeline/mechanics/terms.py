@@ -64,7 +64,7 @@ class Terms:
 
     def damping_scaled(self, factor: NDArray[np.float64]) -> Terms:
         """What is added to the damping matrix where `factor` F, (n, n), makes F C Fᵀ of it."""
-        on, rows = self.by_kind.get(DAMPING_MATRIX, (np.zeros(0, int), np.zeros((0, len(self.dofs)))))
+        on, rows = self.by_kind[DAMPING_MATRIX]
         signed = np.concatenate([self.coefficient[on], -self.coefficient[on]])
         matrix, log = np.full(len(signed), DAMPING_MATRIX), np.concatenate([self.log[on]] * 2)
         return Terms(

@@ -22,7 +22,7 @@ from ema_pipeline.modal.heavily_damped import UNSEEN, has_peak, too_broad, unear
 from ema_pipeline.modal.missed import left_over
 from ema_pipeline.modal.noise import Noise
 from ema_pipeline.modal.peaks import NO_PEAKS, KnownPeaks
-from ema_pipeline.modal.segment import SegmentFit, impossible
+from ema_pipeline.modal.segment import SegmentFit, broad, impossible
 from ema_pipeline.modal.windowed import likeness
 
 Real = NDArray[np.float64]
@@ -121,9 +121,12 @@ def significant(data: FitData, fit: SegmentFit, any_broad: bool = True) -> NDArr
 
     Where `any_broad` is False, the polish has made all very heavily damped ones.
     """
+    out = impossible(data, fit.estimate)
+    if out.any() and not broad(fit.estimate).any():
+        return out
     std = decay_std(fit.estimate, fit.solution)
     weight, told = fit.noise.weight(data.measured), np.full(len(std), any_broad)
-    out = impossible(data, fit.estimate) | too_broad(data, weight, fit.estimate, told, std)
+    out |= too_broad(data, weight, fit.estimate, told, std)
     return out if out.any() else _next(_strength_over_noise(data, fit, std))
 
 
@@ -143,11 +146,13 @@ def credible(
         Peaks of which single hits show that one mode is there.
     """
     estimate, solution = fit.estimate, fit.solution
-    explained = np.zeros(len(estimate.poles), dtype=bool)
+    out = impossible(data, estimate) | peaks.echoes(estimate)
+    if out.any() and not broad(estimate).any():
+        return out
+    explained = np.zeros(len(out), dtype=bool)
     if hits is not None:
         explained = misfit(data, hits, estimate, solution) < EXPLAINED
     weight, std = fit.noise.weight(data.measured), decay_std(estimate, solution)
-    out = impossible(data, estimate) | peaks.echoes(estimate)
     out |= too_broad(data, weight, estimate, explained, std)
     if out.any():
         return out

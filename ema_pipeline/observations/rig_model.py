@@ -192,16 +192,17 @@ class RigModel:
         root = np.exp(0.5 * (x[self._logs : self._logs + len(slopes)] @ own_log))
         moved = matrices.dense[MASS] @ shapes
         added = rig.damping_scaled((moved * root) @ shapes.T)
+        coefficient = added.scaled(logs)
         on, rows = rig.by_kind[DAMPING_MATRIX]
         along = (rows @ shapes) * root
         dense = matrices.dense.copy()
-        dense[DAMPING_MATRIX] += added.dense(added.scaled(logs))[DAMPING_MATRIX]
+        dense[DAMPING_MATRIX] += added.dense(coefficient)[DAMPING_MATRIX]
         return replace(
             matrices,
             terms=Terms.joined([matrices.terms, added]),
-            coefficient=np.concatenate([matrices.coefficient, added.scaled(logs)]),
+            coefficient=np.concatenate([matrices.coefficient, coefficient]),
             dense=dense,
-            own_damping=along.T @ (rig.scaled(logs)[on, None] * along),
+            own_damping=along.T @ (coefficient[: len(on), None] * along),
             own_log=own_log,
         )
 
