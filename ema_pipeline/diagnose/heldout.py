@@ -159,7 +159,7 @@ def _whitened(found: Residuals) -> tuple[Residuals, float]:
     """Each value predicted from those before it, and half the log determinant of their covariance."""
     factor = lower_factor(np.eye(len(found.values)) + found.jacobian @ found.jacobian.T)
     values = solve_lower(factor, found.values)
-    whitened = Residuals(values, np.zeros((0, found.jacobian.shape[1])), block=found.block)
+    whitened = Residuals(values, found.jacobian[:0], block=found.block, beside=found.beside)
     return whitened, float(np.sum(np.log(np.diag(factor))))
 
 

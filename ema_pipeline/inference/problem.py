@@ -65,6 +65,9 @@ class Residuals:
         Measured mode that each value belongs to, numbered through all data; -1 for none.
     blurred : ndarray of bool, (m,), optional
         True for values of shapes that hold more than what they are compared with, by a mode without a partner.
+    beside : ndarray of bool, (m,), optional
+        True for values that may speak against a model and not for it: what they do not exceed makes no error smaller.
+        Their blocks have one value each that was spent.
     apart : Apart, optional
         The first values, where a model has to explain them on their own as well.
     matching : object
@@ -85,6 +88,7 @@ class Residuals:
     mixed: NDArray[np.bool_] | None = None
     mode: NDArray[np.int64] | None = None
     blurred: NDArray[np.bool_] | None = None
+    beside: NDArray[np.bool_] | None = None
     apart: Apart | None = None
 
     @property
@@ -142,12 +146,15 @@ class Residuals:
     def squares(self) -> float:
         """Sum of squares in which errors count."""
         alone = self.stated if self.block is None else self.stated[self.block < 0]
-        return float(alone @ alone) + float(np.sum(tails.deviance(*self.blocks)))
+        deviance, beside = tails.deviance(*self.blocks), self._blocks_of(self.beside)
+        exceeded = float(np.sum(deviance[beside] - (self.blocks[1][beside] - 1)))
+        return float(alone @ alone) + float(np.sum(deviance[~beside])) + max(exceeded, 0.0)
 
     @property
     def count(self) -> int:
-        """Number of data: of values that were not spent on factors of no interest."""
-        return len(self.values) - self.projected
+        """Number of data: of values that were not spent on factors of no interest, without those `beside`."""
+        beside = self._blocks_of(self.beside)
+        return len(self.values) - self.projected - int(np.sum(self.blocks[1][beside] - 1))
 
     def only_apart(self, apart: Apart) -> Residuals:
         """The values that count on their own as well, without derivatives."""
@@ -159,6 +166,7 @@ class Residuals:
             projected=apart.projected,
             relative=None if self.relative is None else self.relative[:count],
             block=None if self.block is None else self.block[:count],
+            beside=None if self.beside is None else self.beside[:count],
         )
 
     @property

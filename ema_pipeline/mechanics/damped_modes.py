@@ -124,12 +124,18 @@ class DampedModes:
         """True for modes whose shapes damping turns so far that derivatives have to follow them, (n,)."""
         return np.asarray(np.count_nonzero(np.abs(self.shares) > _TURNS, axis=0) > 1)
 
-    def lag(self, coupling: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Shares of the undamped modes that a small skew `coupling`, (n, n), adds to every shape, (n, n)."""
+    def lag(
+        self, damping: NDArray[np.float64], structural: NDArray[np.float64], values: NDArray[np.float64]
+    ) -> NDArray[np.complex128]:
+        """Shares of the undamped modes, of these ω², that a little damping or gyroscopic coupling and structural
+        damping between them, (n, n) each, add to every shape, (n, n).
+        """
         apart = self.poles[None, :] ** 2 + values[:, None]
         apart = apart + 2 * (self.damping_ratio * np.sqrt(values))[:, None] * self.poles[None, :]
         least = (_CLOSE * np.abs(self.poles[None, :]) ** 2) ** 2
-        return np.asarray(-coupling * self.poles[None, :] * np.conj(apart) / (np.abs(apart) ** 2 + least))
+        across = damping * self.poles[None, :] + 1j * structural
+        np.fill_diagonal(across, 0.0)
+        return np.asarray(-across * np.conj(apart) / (np.abs(apart) ** 2 + least))
 
     def derivatives(
         self,

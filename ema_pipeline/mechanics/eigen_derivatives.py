@@ -160,7 +160,7 @@ class ModeDerivatives:
         group = np.full(len(modes), -1) if group is None else group
         if solution.damped is not None:
             return cls._damped(matrices, solution, solution.damped, modes, group)
-        if np.any(matrices.skew_by_shape):  # of no size yet, but shapes lag behind with it
+        if len(_lags(matrices)):  # of no size yet, but shapes lag behind with it
             damped = DampedModes.uncoupled(solution.frequency_hz, solution.damping_ratio, solution.shapes)
             return cls._damped(matrices, solution, damped, modes, group)
         between = _numbered_pairs(group)
@@ -186,15 +186,15 @@ class ModeDerivatives:
         bare, weight, reduced = _undamped(matrices, solution, modes, between)
         log_frequency, ratio = damped.derivatives(matrices, modes, bare, weight, omega)
         turned = np.flatnonzero(damped.turned[modes])
-        skew = np.flatnonzero(np.any(matrices.skew_by_shape, axis=(1, 2)))
+        lags = _lags(matrices)
         shapes: NDArray[Any] = phi @ weight
-        if len(turned) or len(skew):
+        if len(turned) or len(lags):
             shapes = shapes.astype(complex)
         at = matrices.terms.log.shape[1]
-        for j in skew:
-            shapes[at + j] += (
-                phi @ damped.lag(phi.T @ matrices.skew_by_shape[j] @ phi, solution.eigenvalues)[:, modes]
-            )
+        for j in lags:
+            damping = phi.T @ (matrices.by_shape[j, DAMPING_MATRIX] + matrices.skew_by_shape[j]) @ phi
+            structural = phi.T @ matrices.by_shape[j, STRUCTURAL] @ phi
+            shapes[at + j] += phi @ damped.lag(damping, structural, solution.eigenvalues)[:, modes]
         log_frequency, ratio, shapes, reduced = _with_ratios(
             matrices, solution, modes, log_frequency, ratio, shapes, reduced
         )
@@ -208,6 +208,12 @@ class ModeDerivatives:
             shapes[:, :, turned] = own[2][:, :, order].transpose(2, 1, 0)
         shapes = shapes.transpose(1, 2, 0)
         return cls(log_frequency.T, ratio.T, shapes, np.ascontiguousarray(reduced.T), between)
+
+
+def _lags(matrices: Matrices) -> NDArray[np.int64]:
+    """Unknowns with which shapes lag behind, by their place among those of `by_shape`: of dampers, losses, whirl."""
+    damping = np.any(matrices.by_shape[:, [DAMPING_MATRIX, STRUCTURAL]], axis=(1, 2, 3))
+    return np.flatnonzero(damping | np.any(matrices.skew_by_shape, axis=(1, 2)))
 
 
 def _numbered_pairs(group: NDArray[np.int64]) -> NDArray[np.int64]:

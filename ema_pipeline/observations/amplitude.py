@@ -90,7 +90,9 @@ class AmplitudeObservations(Observations):
         rubbing: Mapping[str, frozenset[str]] | None = None,
         cut_off: bool = False,
     ) -> None:
-        self.modes, self.hits, self.of_modes, self.marched = modes, tuple(hits), of_modes, marched
+        # what depends on the amplitude lets shapes lag as well, and hits tell of it by their sizes in quadrature
+        self.modes = modes = modes.without_lag()
+        self.hits, self.of_modes, self.marched = tuple(hits), of_modes, marched
         self.rubbing, self.cut_off = dict(rubbing or {}), cut_off
         self.level_dependent = any(
             h.level_dependent and not modes.rig.assembly(h.configuration).nonlinear for h in hits

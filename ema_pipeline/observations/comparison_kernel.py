@@ -128,15 +128,15 @@ def turning_rows(places, seen, measured, weight, read, slopes, difference, slope
 
 @numba.njit(cache=True)
 def whiten(  # type: ignore[no-untyped-def]
-    difference, own, unit, blur, slope, noise, scatter, heat, values, jacobian, of_noise, of_scatter
+    difference, own, unit, least, blur, slope, noise, scatter, heat, values, jacobian, of_noise, of_scatter
 ):
     """Differences and derivatives over their σ; Σ ln(σ/σ₀), without what blurs.
 
     Parameters
     ----------
     difference, own, unit : ndarray, (k,)
-    blur : ndarray, (k,)
-        Empty where nothing does.
+    least, blur : ndarray, (k,)
+        Empty where there is none.
     slope : ndarray, (k, n)
         Without rows where no derivatives are wanted.
     noise, scatter : tuple of float
@@ -151,8 +151,9 @@ def whiten(  # type: ignore[no-untyped-def]
     total = 0.0
     for i in range(len(difference)):
         tested, added = (noise[0] * own[i]) ** 2, (scatter[0] * unit[i]) ** 2
-        variance = tested + added
-        total += 0.5 * np.log(variance / ((noise[1] * own[i]) ** 2 + (scatter[1] * unit[i]) ** 2))
+        always = least[i] * least[i] if len(least) else 0.0
+        variance = tested + added + always
+        total += 0.5 * np.log(variance / ((noise[1] * own[i]) ** 2 + (scatter[1] * unit[i]) ** 2 + always))
         if len(blur):
             variance += blur[i] * blur[i]
         known = 1.0 / (np.sqrt(variance) * heat)

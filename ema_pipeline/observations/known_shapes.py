@@ -30,8 +30,8 @@ class ShapeEntries:
         The modes, among those with a partner.
     mode, sensor : ndarray of int, (n_rows,)
         Measured mode and sensor of every entry.
-    own, unit : ndarray, (n_rows,)
-        1 σ of the test, and the unit of the scatter that adds to it.
+    own, least, unit : ndarray, (n_rows,)
+        1 σ of the test, see `Rows`, and the unit of the scatter that adds to it.
     blur : ndarray, (n_rows,), optional
         1 σ of what hidden modes add, where there are any.
     close : ndarray of bool, (n_rows,)
@@ -42,13 +42,14 @@ class ShapeEntries:
     mode: Integers
     sensor: Integers
     own: Real
+    least: Real
     unit: Real
     close: NDArray[np.bool_]
     blur: Real | None = None
 
     def twice(self) -> ShapeEntries:
         """With every entry once for its real part, then once for its imaginary one."""
-        parts = (self.mode, self.sensor, self.own, self.unit, self.close)
+        parts = (self.mode, self.sensor, self.own, self.least, self.unit, self.close)
         return ShapeEntries(self.places, *(np.concatenate([p, p]) for p in parts))
 
 
@@ -65,9 +66,9 @@ class KnownShapes:
     shapes, weight : ndarray, (k, s)
         Real shapes, and one over the variance of each entry; 0 where not measured.
     complex_shapes, complex_weight : ndarray, (k, s)
-        The same of shapes that are compared as complex ones.
-    real, whirling : ShapeEntries
-        Those that are compared as real ones, and as complex ones.
+        The same of shapes with their imaginary parts.
+    real, whirling, lagging : ShapeEntries
+        Those that are compared as real ones, as complex ones, and by their imaginary parts beside the real ones.
     members : tuple of ndarray of int, (g, c)
         Places, among `on`, of the modes of groups, by their number c.
     mixes : ndarray of int, (q,)
@@ -86,6 +87,7 @@ class KnownShapes:
     complex_weight: Real
     real: ShapeEntries
     whirling: ShapeEntries
+    lagging: ShapeEntries
     members: tuple[Integers, ...]
     mixes: Integers
     mixed: Integers
@@ -109,13 +111,15 @@ class KnownShapes:
         shapes, turning = data.known_shapes[on], data.complex_shapes[on]
         own, seen, whirls = data.compared_std[on], data.seen[on] > 0, data.whirling[on]
         unit, complex_unit = shape_unit(shapes), shape_unit(turning)
+        broad = data.broad_std[on, None]
         blur = np.where(blurred, _FITTED_AS_ONE_STD, 0.0)[:, None] + np.zeros(shapes.shape)
 
         def entries(places: Integers, unit: Real, blur: Real | None = None) -> ShapeEntries:
             mode, sensor = np.nonzero(seen[places])
             at, measured = (places[mode], sensor), on[places[mode]]
             hides = None if blur is None or not np.any(blur[at]) else blur[at]
-            return ShapeEntries(places, measured, sensor, own[at], unit[at], data.close[measured], hides)
+            least, close = data.broad_std[measured], data.close[measured]
+            return ShapeEntries(places, measured, sensor, own[at], least, unit[at], close, hides)
 
         place = np.full(len(data), -1)
         place[on] = np.arange(len(on))
@@ -125,11 +129,12 @@ class KnownShapes:
             on=on,
             seen=seen,
             shapes=shapes,
-            weight=seen / (own**2 + (scatter * unit) ** 2 + blur**2),
+            weight=seen / (own**2 + broad**2 + (scatter * unit) ** 2 + blur**2),
             complex_shapes=turning,
-            complex_weight=seen / (own**2 + (scatter * complex_unit) ** 2),
+            complex_weight=seen / (own**2 + broad**2 + (scatter * complex_unit) ** 2),
             real=entries(np.flatnonzero(~whirls), unit, blur),
             whirling=entries(np.flatnonzero(whirls), complex_unit).twice(),
+            lagging=entries(np.flatnonzero(data.lagging[on]), unit),
             members=in_groups(data.group[on]),
             mixes=mixes,
             mixed=place[pairs[mixes, 0]],

@@ -404,7 +404,7 @@ class ModeProblem(EffectProblem):
             count = int(np.sum(seen & whirl))
             real, imaginary = stated[at : at + 2 * count].reshape(2, count)
             shape[seen & whirl] = np.sqrt(0.5 * (real**2 + imaginary**2))
-            at += 2 * count
+            at += 2 * count + int(np.sum(data.seen[on] * data.lagging[on, None]))
             out += [
                 ModeRows(
                     data.configuration,

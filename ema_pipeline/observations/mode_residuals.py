@@ -16,7 +16,15 @@ from ema_pipeline.observations.comparison_kernel import scaled_rows, turning_row
 from ema_pipeline.observations.known_shapes import KnownShapes, ShapeEntries, in_groups
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_pairing import paired
-from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, Compared, Rows
+from ema_pipeline.observations.mode_rows import (
+    FREQUENCY,
+    FREQUENCY_NOISE,
+    QUADRATURE,
+    SHAPE,
+    SHAPE_NOISE,
+    Compared,
+    Rows,
+)
 from ema_pipeline.observations.parts import DAMPING_SCATTER
 from ema_pipeline.observations.rig_model import RigModel
 from ema_pipeline.observations.sensing import Sensing, SensorReadings
@@ -86,9 +94,9 @@ class _Predicted:
         What the sensors read, and what close modes hold of each other beside it; both up to one factor per mode.
     slope : Slopes, optional
         Derivatives of these.
-    whirling : complex ndarray, (k, s), optional
-        What the sensors read as it is, where some shapes are compared as complex ones.
-    whirling_slope : complex ndarray, (w, s, n), optional
+    whole : complex ndarray, (k, s), optional
+        What the sensors read as it is, where imaginary parts of some shapes are compared.
+    whirling_slope, lagging_slope : complex ndarray, (w, s, n), optional
         Derivatives of that of these.
     """
 
@@ -96,8 +104,9 @@ class _Predicted:
     shapes: NDArray[np.float64]
     turned: NDArray[np.float64]
     slope: Slopes | None = None
-    whirling: NDArray[np.complex128] | None = None
+    whole: NDArray[np.complex128] | None = None
     whirling_slope: NDArray[np.complex128] | None = None
+    lagging_slope: NDArray[np.complex128] | None = None
 
 
 class Comparison:
@@ -152,6 +161,8 @@ class Comparison:
         )
         if len(pairs.known.whirling.places):
             rows += (self._complex_shapes(pairs, shapes),)
+        if len(pairs.known.lagging.places):
+            rows += (self._imaginary_parts(pairs, shapes),)
         left = self._alone(pairs.match)
         return Compared(
             rows=rows,
@@ -160,10 +171,15 @@ class Comparison:
             penalty=left.penalty + self._unseen(solution, to, hidden),
             split=left.split,
             unexplained=left.unexplained,
-            projected=len(on) + int(np.count_nonzero(self.data.whirling[on] | (hidden >= 0)))
-            if self.data.shapes.shape[1]
-            else 0,
+            projected=self._projected(on, hidden),
         )
+
+    def _projected(self, on: NDArray[np.int64], hidden: NDArray[np.int64]) -> int:
+        """Number of values of shapes that are spent on factors, phases, and how much of hidden modes they hold."""
+        if not self.data.shapes.shape[1]:
+            return 0
+        twice = self.data.whirling[on] | (hidden >= 0)
+        return len(on) + int(np.count_nonzero(twice)) + int(np.count_nonzero(self.data.lagging[on]))
 
     def unpaired(self) -> float:
         """`Residuals.penalty` with new pairs; infinite where the model has no modes."""
@@ -300,10 +316,10 @@ class Comparison:
         log = np.log(np.maximum(solution.frequency_hz[to], 1e-6))
         shapes = np.ascontiguousarray(pairs.read[:, to].T)
         found = _Predicted(log, shapes, np.zeros(shapes.shape))
-        if len(pairs.known.whirling.places):
-            found.whirling = np.ascontiguousarray(self.readings.of(solution)[:, to].T, complex)
+        if len(pairs.known.whirling.places) or len(pairs.known.lagging.places):
+            found.whole = np.ascontiguousarray(self.readings.of(solution)[:, to].T, complex)
         if slopes is not None:
-            found.slope, found.whirling_slope = self._slopes(solution, pairs, slopes)
+            found.slope, found.whirling_slope, found.lagging_slope = self._slopes(solution, pairs, slopes)
         for members, group in pairs.groups:
             found.log_frequency[members] = group.log_frequency
             found.shapes[members], found.turned[members] = group.shapes, group.turned
@@ -313,14 +329,15 @@ class Comparison:
 
     def _slopes(
         self, solution: EigenSolution, pairs: _Pairs, slopes: ModeDerivatives
-    ) -> tuple[Slopes, NDArray[np.complex128]]:
-        """Derivatives of frequencies and real shapes, and of those that are compared as complex ones."""
-        to, whirling = pairs.to, pairs.known.whirling.places
+    ) -> tuple[Slopes, NDArray[np.complex128], NDArray[np.complex128]]:
+        """Derivatives of frequencies and real shapes, and of those whose imaginary parts are compared."""
+        to, known = pairs.to, pairs.known
         log = np.zeros((len(to), len(self.x)))
         log[:, : slopes.log_frequency.shape[1]] = slopes.log_frequency
         read = self.readings.slopes(slopes.shapes, solution, to)
         real = self.readings.real_slopes(read, solution, to)
-        return Slopes(log, real, np.zeros(real.shape)), read[whirling].astype(complex)
+        whirling, lagging = (read[e.places].astype(complex) for e in (known.whirling, known.lagging))
+        return Slopes(log, real, np.zeros(real.shape)), whirling, lagging
 
     def _shapes(self, pairs: _Pairs, shapes: _Predicted) -> Rows:
         """Shapes with the factor projected out that fits them best, and what coinciding modes add; none of whirling
@@ -359,14 +376,40 @@ class Comparison:
 
     def _complex_shapes(self, pairs: _Pairs, shapes: _Predicted) -> Rows:
         """Real and imaginary parts of whirling modes' shapes, a complex factor projected out."""
-        known, entries, by = pairs.known, pairs.known.whirling, shapes.whirling_slope
-        difference = np.empty(len(entries.mode))
+        entries, by = pairs.known.whirling, shapes.whirling_slope
+        return self._rows_of_shapes(
+            entries, *self._turned_to_fit(pairs, shapes.whole, entries.places, by), ""
+        )
+
+    def _imaginary_parts(self, pairs: _Pairs, shapes: _Predicted) -> Rows:
+        """Imaginary parts of shapes whose real parts are compared by themselves, a complex factor projected out."""
+        entries, by = pairs.known.lagging, shapes.lagging_slope
+        difference, slope = self._turned_to_fit(pairs, shapes.whole, entries.places, by)
+        half = len(entries.mode)
+        return Rows(
+            difference[half:], entries.own, entries.unit, QUADRATURE, 1 + 0.1 * (self.heat - 1), entries.mode,
+            entries.sensor, entries.close, None if slope is None else slope[half:], noise=SHAPE_NOISE,
+            least=entries.least,
+        )  # fmt: skip
+
+    def _turned_to_fit(
+        self,
+        pairs: _Pairs,
+        read: NDArray[np.complex128] | None,
+        places: NDArray[np.int64],
+        by: NDArray[np.complex128] | None,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+        """Differences of some shapes from what is read, times the complex factor that fits each best, and derivatives:
+        all real parts, then all imaginary ones.
+        """
+        known = pairs.known
+        difference = np.empty(2 * int(np.count_nonzero(known.seen[places])))
         slope = np.empty((0 if by is None else len(difference), len(self.x)))
         turning_rows(
-            entries.places, known.seen, known.complex_shapes, known.complex_weight, shapes.whirling,
+            places, known.seen, known.complex_shapes, known.complex_weight, read,
             _NO_SLOPE.astype(complex) if by is None else by, difference, slope,
         )  # fmt: skip
-        return self._rows_of_shapes(entries, difference, None if by is None else slope, "")
+        return difference, None if by is None else slope
 
     def _rows_of_shapes(
         self,
@@ -377,5 +420,5 @@ class Comparison:
     ) -> Rows:
         return Rows(
             difference, entries.own, entries.unit, SHAPE, 1 + 0.1 * (self.heat - 1), entries.mode, entries.sensor,
-            entries.close, slope, noise=noise, blur=entries.blur,
+            entries.close, slope, noise=noise, least=entries.least, blur=entries.blur,
         )  # fmt: skip

@@ -13,6 +13,7 @@ from ema_pipeline.observations.comparison_kernel import number_blocks, whiten
 
 FREQUENCY = "frequency_scatter"
 SHAPE = "shape_scatter"
+QUADRATURE = "quadrature_scatter"
 FREQUENCY_NOISE = "frequency_noise"
 SHAPE_NOISE = "shape_noise"
 
@@ -44,6 +45,7 @@ def stacked(parts: Sequence[Residuals], n: int) -> Residuals:
         mixed=_masks([p.mixed for p in parts], parts),
         mode=_numbered_through([p.mode for p in parts], parts, [_modes(p) for p in parts]),
         blurred=_masks([p.blurred for p in parts], parts),
+        beside=_masks([p.beside for p in parts], parts),
     )
 
 
@@ -113,6 +115,8 @@ class Rows:
         The model's values, of damping: ln ζ.
     noise : str
         Name of the factor on the test's own 1 σ where that is learned too.
+    least : ndarray, (k,), optional
+        1 σ of the test that adds to `own`, whatever the factor on that.
     blur : ndarray, (k,), optional
         1 σ of what the measurement holds beside what it is compared with. It makes a difference count less, and what is
         left costs what it would on average: it is no evidence for a model or against it.
@@ -131,6 +135,7 @@ class Rows:
     slope: NDArray[np.float64] | None = None
     model: NDArray[np.float64] | None = None
     noise: str = ""
+    least: NDArray[np.float64] | None = None
     blur: NDArray[np.float64] | None = None
     wider: float = 0.0
 
@@ -149,7 +154,7 @@ class Compared:
     Attributes
     ----------
     rows : tuple of Rows
-        Frequencies, damping ratios, shapes; complex ones, where there are any, apart.
+        Frequencies, damping ratios, shapes; apart, where there are any, complex ones and imaginary parts of others.
     match : ndarray of int, (m,)
         Model mode of every measured one, -1 for none.
     log_scale, penalty, split : float
@@ -182,14 +187,15 @@ def whitened(
     total = sum(len(r) for r, _, _ in rows)
     derivatives = all(r.slope is not None for r, _, _ in rows)
     values, block, mode = np.empty(total), np.full(total, -1), np.full(total, -1)
-    mixed, blurred = np.zeros(total, bool), np.zeros(total, bool)
+    mixed, blurred, beside = (np.zeros(total, bool) for _ in range(3))
     share: dict[str, NDArray[np.float64]] = {}
     jacobian = np.empty((total if derivatives else 0, n))
     log_scale, at, blocks = sum(c.log_scale for c in found), 0, 0
     for r, c, first in rows:
         here = slice(at, at + len(r))
         at = here.stop
-        mode[here] = r.mode + first
+        mode[here], beside[here] = r.mode + first, r.scatter == QUADRATURE
+        least = _NONE if r.least is None else r.least
         blur = _NONE
         log_scale += r.wider
         if r.blur is not None:
@@ -198,7 +204,7 @@ def whitened(
         slope = r.slope if derivatives and r.slope is not None else _NO_SLOPE
         of_noise, of_scatter = np.empty((2, len(slope)))
         log_scale += whiten(
-            r.difference, r.own, r.unit, blur, slope, (r.noise_at(scatters), r.noise_at(defaults)),
+            r.difference, r.own, r.unit, least, blur, slope, (r.noise_at(scatters), r.noise_at(defaults)),
             (scatters[r.scatter], defaults[r.scatter]), r.heat, values[here], jacobian[here], of_noise, of_scatter,
         )  # fmt: skip
         if r.sensor is not None:  # a shape may be wrong as a whole
@@ -225,4 +231,5 @@ def whitened(
         mixed=mixed,
         mode=mode,
         blurred=blurred,
+        beside=beside,
     )

@@ -16,7 +16,7 @@ from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_pairing import OwnDamping
 from ema_pipeline.observations.mode_problem import CALIBRATION, MIXING, ModeProblem
-from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE
+from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, QUADRATURE, SHAPE, SHAPE_NOISE
 from ema_pipeline.observations.parts import (
     DAMPING_SCATTER,
     MASS_SCATTER,
@@ -41,6 +41,8 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
         Scatter(DAMPING_SCATTER, "ln ζ from mode to mode", rig.modal_damping_scatter, 0.5, 0.5),
         Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 2.0, 0.2),
         Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03, 1.5, 0.03),
+        # What damping without a law makes complex: no model of single dampers is better.
+        Scatter(QUADRATURE, "imaginary parts of shapes", 0.01, 1.0, 0.02, 10.0, 0.05),
         # What hits have in common (drift, aim) is in their scatter, and no error of one mode against another.
         Scatter(FREQUENCY_NOISE, "stated uncertainty of frequencies", 1.0, 0.5, most=2.0),
         # Without a bound it falls to nothing where many modes agree, and those that the test hardly knows are outliers.
@@ -121,6 +123,14 @@ class ModeObservations(Observations):
             return self
         own = {d.configuration: OwnDamping(d, model.sensor_rows(d.configuration, d.dofs)) for d in self.data}
         return self._with(self.data, own)
+
+    def without_lag(self) -> ModeObservations:
+        """The same without imaginary parts of shapes that are compared as real ones, see `ModeData.lagging`."""
+        return (
+            self.with_data([d.without_lag() for d in self.data])
+            if any(d.lagging.any() for d in self.data)
+            else self
+        )
 
     def with_data(self, data: Sequence[ModeData]) -> ModeObservations:
         """The same rig and channels with other modes."""

@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from ema_pipeline.inference import tails
 from ema_pipeline.observations.mode_data import ModeData
-from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, shape_unit
+from ema_pipeline.observations.mode_rows import (
+    FREQUENCY,
+    FREQUENCY_NOISE,
+    QUADRATURE,
+    SHAPE,
+    SHAPE_NOISE,
+    shape_unit,
+)
 from ema_pipeline.observations.parts import DAMPING_SCATTER
 
 UNEXPLAINED = 18.0
@@ -27,7 +34,7 @@ _READ = 0.01
 """Least motion at some sensor, over the largest one of a mode there, from which a mode would have been measured.
 Sensors along y alone read nothing of modes along x."""
 
-_SCATTERS = (FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, DAMPING_SCATTER)
+_SCATTERS = (FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, QUADRATURE, DAMPING_SCATTER)
 _KEPT = 64
 """Costs that are kept."""
 
@@ -115,24 +122,32 @@ def _usual(
 ) -> float:
     """What modes would cost on average if they were explained."""
     seen, whirl = np.isfinite(d.shapes[alone]), d.whirling[alone]
-    real, both = seen & ~whirl[:, None], seen & whirl[:, None]
-    reach = shape_unit(d.complex_shapes[alone])
-    std = d.compared_std[alone]
+    real, both, lag = seen & ~whirl[:, None], seen & whirl[:, None], seen & d.lagging[alone, None]
+    reach = shape_unit(d.whole_shapes[alone])
+    std, broad = d.compared_std[alone], d.broad_std[alone, None] + np.zeros(seen.shape)
     damped = alone[np.isfinite(d.log_damping[alone])]
     parts = 1 + whirl  # real and imaginary
-    count = np.sum(seen, axis=1, dtype=float) * parts
-    total = -0.5 * float(np.sum(parts[np.any(seen, axis=1)])) + float(
-        np.sum(tails.cost(count, count) - 0.5 * count)
-    )
-    for own, unit, name, noise in (
-        (d.log_frequency_std[alone], 1.0, FREQUENCY, FREQUENCY_NOISE),
-        (d.log_damping_std[damped], 1.0, DAMPING_SCATTER, ""),
-        (std[real], reach[real], SHAPE, SHAPE_NOISE),
-        (np.tile(std[both], 2), np.tile(reach[both], 2), SHAPE, ""),
+    total = -0.5 * float(np.sum(parts[np.any(seen, axis=1)]) + np.sum(np.any(lag, axis=1)))
+    for count in (np.sum(seen, axis=1, dtype=float) * parts, np.sum(lag, axis=1, dtype=float)):
+        total += float(np.sum(tails.cost(count, count) - 0.5 * count))
+    of_shapes = std, broad, reach
+    for (own, least, unit), name, noise in (
+        (_alike(d.log_frequency_std[alone]), FREQUENCY, FREQUENCY_NOISE),
+        (_alike(d.log_damping_std[damped]), DAMPING_SCATTER, ""),
+        ([of[real] for of in of_shapes], SHAPE, SHAPE_NOISE),
+        ([of[lag] for of in of_shapes], QUADRATURE, SHAPE_NOISE),
+        ([np.tile(of[both], 2) for of in of_shapes], SHAPE, ""),
     ):
-        now, usual = ((at.get(noise, 1.0) * own) ** 2 + (at[name] * unit) ** 2 for at in (scatters, defaults))
+        now, usual = (
+            (at.get(noise, 1.0) * own) ** 2 + least**2 + (at[name] * unit) ** 2 for at in (scatters, defaults)
+        )
         total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
     return total
+
+
+def _alike(own: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """1 σ of a test that its factor scales as a whole, and to which a scatter adds as it is."""
+    return [own, np.zeros(len(own)), np.ones(len(own))]
 
 
 def _credited(
@@ -143,7 +158,9 @@ def _credited(
     Those that are hard to find a partner for are close ones, whose shapes are seldom as good.
     """
     now, usual = (
-        (at[SHAPE_NOISE] * d.compared_std[sure]) ** 2 + (at[SHAPE] * shape_unit(d.complex_shapes[sure])) ** 2
+        (at[SHAPE_NOISE] * d.compared_std[sure]) ** 2
+        + d.broad_std[sure, None] ** 2
+        + (at[SHAPE] * shape_unit(d.whole_shapes[sure])) ** 2
         for at in (scatters, defaults)
     )
     return float(np.sum(np.maximum(0.5 * np.log(usual / now), 0.0)[np.isfinite(d.shapes[sure])]))

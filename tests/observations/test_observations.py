@@ -614,7 +614,9 @@ def test_a_rig_that_is_as_drawn_has_residuals_of_nothing_but_noise() -> None:
     found = problem.residuals(np.zeros(len(problem.unknowns)), scatters)
     assert np.max(np.abs(found.values)) < 0.1
     assert found.penalty == 0.0
-    assert found.projected == 5
+    assert found.projected == 5 + np.sum(
+        observations.data[0].lagging
+    )  # factors, and phases of imaginary parts
 
 
 def test_shapes_are_compared_up_to_a_factor_and_a_phase() -> None:
@@ -653,7 +655,8 @@ def test_a_shape_is_left_with_the_least_of_all_factors() -> None:
     shapes = RigModel(chain()).sensor_rows("all", data.dofs) @ problem.solution("all", x).shapes
     for row in problem.rows(found):
         y, p = data.known_shapes[row.measured], shapes[:, row.model]
-        sigma = np.hypot(data.compared_std[row.measured], 0.2 * np.maximum(0.3, np.abs(y)))
+        own = np.hypot(data.compared_std[row.measured], data.broad_std[row.measured])
+        sigma = np.hypot(own, 0.2 * np.maximum(0.3, np.abs(y)))
         factor, (left, *_) = np.linalg.lstsq((p / sigma)[:, None], y / sigma, rcond=None)[:2]
         assert np.sum(((y - factor[0] * p) / sigma) ** 2) == pytest.approx(left)
         assert np.sum(row.shape**2) == pytest.approx(left, rel=1e-6), row.measured
@@ -724,8 +727,9 @@ def test_a_mode_without_a_partner_is_not_credited_with_how_well_the_shapes_of_ot
     without[4] = -1
     narrow = scatters | {SHAPE: 0.1 * scatters[SHAPE], SHAPE_NOISE: 1e-6}
     usual, now = (problem.residuals(x, s, matching=(without,)) for s in (scatters, narrow))
-    own, unit = observations.data[0].compared_std[4], np.maximum(0.3, np.abs(observations.data[0].shapes[4]))
-    widths = [np.hypot(s[SHAPE_NOISE] * own, s[SHAPE] * unit) for s in (scatters, narrow)]
+    (data,) = observations.data
+    own, unit, broad = data.compared_std[4], np.maximum(0.3, np.abs(data.shapes[4])), data.broad_std[4]
+    widths = [np.hypot(np.hypot(s[SHAPE_NOISE] * own, s[SHAPE] * unit), broad) for s in (scatters, narrow)]
     assert now.penalty - usual.penalty == pytest.approx(float(np.sum(np.log(widths[0] / widths[1]))))
     assert now.penalty - usual.penalty > 5 * np.log(9)
     wide = scatters | {SHAPE: 3.0 * scatters[SHAPE]}
@@ -777,7 +781,10 @@ def test_rows_of_the_residuals_stand_by_their_mode_and_sensor() -> None:
     assert not np.isnan(rows[2].damping)
     assert [bool(np.any(np.isnan(r.shape))) for r in rows] == [False, False, True, False, False]
     told = np.concatenate([[r.frequency, r.damping, *r.shape] for r in rows])
-    assert np.nansum(told**2) == pytest.approx(float(found.stated @ found.stated))
+    (data,) = observations.data
+    end = len(found.stated) - int(np.sum(data.seen[data.lagging]))  # then come imaginary parts
+    assert end < len(found.stated)
+    assert np.nansum(told**2) == pytest.approx(float(np.sum(found.stated[:end] ** 2)))
 
 
 def test_folds_hold_every_mode_out_once() -> None:
@@ -925,6 +932,90 @@ def test_a_plainly_complex_shape_is_compared_as_one_and_others_as_real_ones() ->
     assert data.only(np.array([False, True, True])).whirling.tolist() == [True, False]
 
 
+def chain_with_damper(coefficient: float) -> MeasuredModes:
+    """Poles and shapes of the chain with a damper at its first mass, all else damped in proportion to masses."""
+    system = chain().system("all")
+    damping = 2 * np.pi * system.mass
+    damping[0, 0] += coefficient
+    exact = complex_modes(replace(system, damping=damping, modal_damping_ratio=0.0))
+    shapes, f = exact.shapes.T, exact.frequency_hz
+    return MeasuredModes(
+        "all", f, 1e-5 * f, np.full(len(f), np.nan), np.full(len(f), np.nan), shapes,
+        1e-4 * np.max(np.abs(shapes), axis=1, keepdims=True) + np.zeros(shapes.shape),
+        tuple(Dof.parse(d) for d in system.dofs), band_hz=(1.0, 1.1 * float(np.max(f))),
+    )  # fmt: skip
+
+
+def test_imaginary_parts_of_shapes_tell_a_damper_without_damping_ratios() -> None:
+    rig = chain()
+    effect, label = parse_effect("damper@m1.z", rig), "damper@m1.z.coefficient"
+    observations = ModeObservations(rig, [prepare(chain_with_damper(20.0))])
+    (data,) = observations.data
+    assert not np.any(data.whirling)
+    assert np.count_nonzero(data.lagging) >= 3
+    scatters = {n: s.default for n, s in observations.scatters.items()} | {"quadrature_scatter": 1e-3}
+    sizes = []
+    for one in (observations, ModeObservations(rig, [data.without_lag()])):
+        problem = one.problem([effect], {})
+        found = descend(problem, scatters, problem.start({label: 5.0}), steps=40)
+        i = problem.unknowns.index[label]
+        sizes.append((problem.parameter_values(found.x)[label], float(found.std[i] / abs(found.x[i]))))
+        _derivatives_are_exact(problem, found.x, scatters)
+    assert sizes[0][0] == pytest.approx(20.0, rel=0.02)
+    assert sizes[0][1] < 0.1 * sizes[1][1]
+
+
+def test_close_modes_and_those_of_one_sensor_are_compared_by_real_shapes_alone() -> None:
+    measured = replace(chain_with_damper(20.0), damping_ratio=np.full(5, 0.01))
+    assert measured.shapes is not None
+    assert measured.shape_std is not None
+    data, without_second = prepare(measured), np.arange(5) != 1
+    assert np.all(data.lagging)
+    assert np.all(data.only(without_second).lagging)
+    near = np.array(measured.frequency_hz)
+    near[1] = 1.04 * near[0]
+    assert prepare(replace(measured, frequency_hz=near)).lagging.tolist() == [False, False, True, True, True]
+    one = replace(
+        measured, shapes=measured.shapes[:, :1], shape_std=measured.shape_std[:, :1], dofs=measured.dofs[:1]
+    )
+    assert not np.any(prepare(one).lagging)
+    real = prepare(replace(measured, shapes=measured.shapes.real.astype(complex)))
+    assert not np.any(real.lagging)
+
+
+def test_rows_of_a_second_configuration_stand_by_its_own_modes() -> None:
+    rig = planetary()
+    both = observed(rig, planetary_modes(rig, 2, GOOD))
+    assert all(np.any(d.lagging) for d in both.data)
+    problem = both.problem((), {})
+    scatters = {n: s.default for n, s in both.scatters.items()}
+    of_both = problem.rows(problem.residuals(problem.start(), scatters))
+    for data in both.data:
+        alone = both.with_data([data]).problem((), {})
+        of_one = alone.rows(alone.residuals(alone.start(), scatters))
+        mine = [r for r in of_both if r.configuration == data.configuration]
+        for a, b in zip(mine, of_one, strict=True):
+            assert (a.measured, a.model) == (b.measured, b.model)
+            np.testing.assert_allclose(a.shape, b.shape)
+
+
+def test_shapes_of_broad_resonances_are_known_no_better_than_a_fit_tells_them_apart() -> None:
+    """Whatever the factor on what single hits differ by is learned to be."""
+    measured = chain_modes(7, GOOD)["all"]
+    broad = measured.damping_ratio.copy()
+    broad[2] = 0.08
+    largest = []
+    for ratios in (measured.damping_ratio, broad):
+        observations = observed(chain(), {"all": replace(measured, damping_ratio=ratios)})
+        problem = observations.problem((), {})
+        scatters = {n: s.default for n, s in observations.scatters.items()} | {SHAPE: 1e-4, SHAPE_NOISE: 0.01}
+        rows = problem.rows(problem.residuals(problem.start(), scatters))
+        largest.append([r.shape_off for r in rows])
+    assert observations.data[0].broad_std[2] == pytest.approx(0.5 * 0.08**2)
+    assert largest[1][2] < 0.2 * largest[0][2]
+    assert np.delete(largest[1], 2) == pytest.approx(np.delete(largest[0], 2), rel=1e-6)
+
+
 def test_gyroscopic_coupling_explains_modes_that_whirl() -> None:
     """Poles and complex shapes of the true rig; the base model's shapes are real."""
     rig = planetary()
@@ -948,7 +1039,8 @@ def test_gyroscopic_coupling_explains_modes_that_whirl() -> None:
     at = with_it.start({"gyroscopic@carrier.coefficient": 80.0})
     true = with_it.residuals(at, scatters)
     assert np.max(np.abs(true.values)) < 0.05
-    assert true.projected == len(f) + np.sum(observations.data[0].whirling)  # two parts of complex factors
+    data = observations.data[0]
+    assert true.projected == len(f) + np.sum(data.whirling | data.lagging)  # two parts of complex factors
     assert base.residuals(base.start(), scatters).cost > true.cost + 100
     _derivatives_are_exact(with_it, at, scatters)
 
@@ -1005,7 +1097,9 @@ def test_damping_that_scatters_takes_the_rigs_own_dampers_along() -> None:
     configuration = rig.configurations[0]
     system = rig.system(configuration)
     values, phi = scipy.linalg.eigh(system.stiffness, system.mass)
-    factor = np.exp(0.6 * np.random.default_rng(5).standard_normal(len(values)))
+    # which shapes two modes of one frequency have is arbitrary: they are damped alike
+    number = np.unique(np.round(np.log(np.maximum(values, 1.0)), 6), return_inverse=True)[1]
+    factor = np.exp(0.6 * np.random.default_rng(5).standard_normal(len(values)))[number]
     own = phi.T @ system.damping @ phi + np.diag(
         2 * system.modal_damping_ratio * np.sqrt(np.maximum(values, 0.0))
     )

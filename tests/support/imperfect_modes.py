@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 import scipy.linalg
+import scipy.optimize
 from numpy.typing import NDArray
 
 from ema_pipeline.correlate.measured import MeasuredModes
@@ -91,12 +92,15 @@ def measure(
         added = [e for e in hidden.added if set(e.row) <= set(assembly.dofs)]  # type: ignore[union-attr]
         m, c, k = matrices(assembly.elements, assembly.dofs, factor)
         more = matrices(added, assembly.dofs, lambda e: 1.0)
-        values, phi = scipy.linalg.eigh(k + more[2], m + more[0])
+        m, c, k = m + more[0], c + more[1], k + more[2]
+        values, phi = scipy.linalg.eigh(k, m)
         f = np.sqrt(np.maximum(values, 0)) / (2 * np.pi)
         on = (f > band[0]) & (f < band[1])
-        f, phi = f[on], phi[:, on]
-        zeta = lab.damping_ratio * np.exp(lab.damping * rng.normal(size=len(f)))
-        zeta += np.einsum("ir,ij,jr->r", phi, c + more[1], phi) / (4 * np.pi * f)
+        zeta = np.full(len(f), lab.damping_ratio)
+        zeta[on] *= np.exp(lab.damping * rng.normal(size=int(on.sum())))
+        if np.any(c):
+            f, zeta, phi = _damped(m, c + m @ (phi * (4 * np.pi * f * zeta)) @ phi.T @ m, k, phi)
+        f, zeta, phi = f[on], zeta[on], phi[:, on]
         rows = []
         for name in names:
             if name not in gain:
@@ -118,6 +122,21 @@ def measure(
             band_hz=band,
         )
     return found
+
+
+def _damped(m: Array, c: Array, k: Array, phi: Array) -> tuple[Array, Array, NDArray[np.complex128]]:
+    """Natural frequencies, damping ratios and shapes from the first-order equations, in the order of undamped shapes.
+
+    Each in the phase of the undamped one that it is most like.
+    """
+    n = len(m)
+    first = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(m, k), -np.linalg.solve(m, c)]])
+    poles, vectors = scipy.linalg.eig(first)
+    up = np.argsort(np.where(poles.imag > 0, np.abs(poles), np.inf))[:n]
+    poles, shares = poles[up], phi.T @ m @ vectors[:n, up]
+    mode, column = scipy.optimize.linear_sum_assignment(-np.abs(shares) / np.linalg.norm(shares, axis=0))
+    poles, shares = poles[column], shares[:, column]
+    return np.abs(poles) / (2 * np.pi), -poles.real / np.abs(poles), phi @ (shares / shares[mode, mode])
 
 
 def _row(assembly: Assembly, name: str) -> Array:
