@@ -32,6 +32,8 @@ _TURNS = 0.001
 """Share of another mode in a shape from which derivatives follow the damped shape."""
 _CLOSE = 1e-4
 """Dynamic stiffness of another mode, over ω², below which the rotation of two shapes is no longer linear."""
+_OVERLAP = 6.0
+"""Half-widths within which modes are close."""
 _ITERATIONS = 4
 _OSCILLATES = 0.1
 """Share of a pole that is imaginary, below which a mode counts as one that does not oscillate."""
@@ -125,16 +127,26 @@ class DampedModes:
         return np.asarray(np.count_nonzero(np.abs(self.shares) > _TURNS, axis=0) > 1)
 
     def lag(
-        self, damping: NDArray[np.float64], structural: NDArray[np.float64], values: NDArray[np.float64]
+        self,
+        skew: NDArray[np.float64],
+        damping: NDArray[np.float64],
+        structural: NDArray[np.float64],
+        values: NDArray[np.float64],
     ) -> NDArray[np.complex128]:
-        """Shares of the undamped modes, of these ω², that a little damping or gyroscopic coupling and structural
-        damping between them, (n, n) each, add to every shape, (n, n).
+        """Shares of the undamped modes, of these ω², that a little coupling of them adds to every shape, (n, n).
+
+        By gyroscopic coupling, by damping and by structural damping between them, (n, n) each. Damping turns close
+        modes into each other, which is no linear function of it: it is left out.
         """
-        apart = self.poles[None, :] ** 2 + values[:, None]
-        apart = apart + 2 * (self.damping_ratio * np.sqrt(values))[:, None] * self.poles[None, :]
+        omega, ratio = np.sqrt(values), self.damping_ratio
+        apart = (
+            self.poles[None, :] ** 2 + values[:, None] + 2 * (ratio * omega)[:, None] * self.poles[None, :]
+        )
         least = (_CLOSE * np.abs(self.poles[None, :]) ** 2) ** 2
-        across = damping * self.poles[None, :] + 1j * structural
-        np.fill_diagonal(across, 0.0)
+        reach = _OVERLAP * np.maximum.outer(ratio * omega, ratio * omega)
+        far = np.abs(np.subtract.outer(omega, omega)) > reach
+        across = skew * self.poles[None, :]
+        across = across + np.where(far, damping * self.poles[None, :] + 1j * structural, 0.0)
         return np.asarray(-across * np.conj(apart) / (np.abs(apart) ** 2 + least))
 
     def derivatives(

@@ -160,16 +160,16 @@ class ModeDerivatives:
         group = np.full(len(modes), -1) if group is None else group
         if solution.damped is not None:
             return cls._damped(matrices, solution, solution.damped, modes, group)
-        if len(_lags(matrices)):  # of no size yet, but shapes lag behind with it
-            damped = DampedModes.uncoupled(solution.frequency_hz, solution.damping_ratio, solution.shapes)
-            return cls._damped(matrices, solution, damped, modes, group)
         between = _numbered_pairs(group)
         log_frequency, weight, reduced = _undamped(matrices, solution, modes, between)
         ratio = _damping(matrices, solution, modes, log_frequency, weight)
-        log_frequency, ratio, weight, reduced = _with_ratios(
-            matrices, solution, modes, log_frequency, ratio, weight, reduced
+        # of no size yet, shapes may lag behind with it
+        damped = DampedModes.uncoupled(solution.frequency_hz, solution.damping_ratio, solution.shapes)
+        shapes = _with_lag(solution.shapes @ weight, matrices, solution, damped, modes)
+        log_frequency, ratio, shapes, reduced = _with_ratios(
+            matrices, solution, modes, log_frequency, ratio, shapes, reduced
         )
-        shapes = (solution.shapes @ weight).transpose(1, 2, 0)
+        shapes = shapes.transpose(1, 2, 0)
         return cls(log_frequency.T, ratio.T, shapes, np.ascontiguousarray(reduced.T), between)
 
     @classmethod
@@ -186,22 +186,16 @@ class ModeDerivatives:
         bare, weight, reduced = _undamped(matrices, solution, modes, between)
         log_frequency, ratio = damped.derivatives(matrices, modes, bare, weight, omega)
         turned = np.flatnonzero(damped.turned[modes])
-        lags = _lags(matrices)
-        shapes: NDArray[Any] = phi @ weight
-        if len(turned) or len(lags):
+        shapes = _with_lag(phi @ weight, matrices, solution, damped, modes)
+        if len(turned):
             shapes = shapes.astype(complex)
-        at = matrices.terms.log.shape[1]
-        for j in lags:
-            damping = phi.T @ (matrices.by_shape[j, DAMPING_MATRIX] + matrices.skew_by_shape[j]) @ phi
-            structural = phi.T @ matrices.by_shape[j, STRUCTURAL] @ phi
-            shapes[at + j] += phi @ damped.lag(damping, structural, solution.eigenvalues)[:, modes]
         log_frequency, ratio, shapes, reduced = _with_ratios(
             matrices, solution, modes, log_frequency, ratio, shapes, reduced
         )
         if len(turned):
             alone = _numbered_pairs(np.full(len(omega), -1))
             bare, weight, _ = _undamped(matrices, solution, np.arange(len(omega)), alone)
-            count = len(weight)
+            count, at = len(weight), matrices.terms.log.shape[1]
             order = [*range(at), *range(count, count + len(matrices.damping_log)), *range(at, count)]
             own = damped.derivatives_of(modes[turned], matrices, phi, omega, bare, weight)
             log_frequency[:, turned], ratio[:, turned] = own[0][:, order].T, own[1][:, order].T
@@ -210,10 +204,23 @@ class ModeDerivatives:
         return cls(log_frequency.T, ratio.T, shapes, np.ascontiguousarray(reduced.T), between)
 
 
-def _lags(matrices: Matrices) -> NDArray[np.int64]:
-    """Unknowns with which shapes lag behind, by their place among those of `by_shape`: of dampers, losses, whirl."""
-    damping = np.any(matrices.by_shape[:, [DAMPING_MATRIX, STRUCTURAL]], axis=(1, 2, 3))
-    return np.flatnonzero(damping | np.any(matrices.skew_by_shape, axis=(1, 2)))
+def _with_lag(
+    shapes: NDArray[np.float64],
+    matrices: Matrices,
+    solution: EigenSolution,
+    damped: DampedModes,
+    modes: NDArray[np.int64],
+) -> NDArray[Any]:
+    """Derivatives of shapes, (n_unknowns, n, m), with what dampers, losses and gyroscopic effects let lag behind."""
+    kinds = matrices.by_shape[:, [DAMPING_MATRIX, STRUCTURAL]]
+    lag = np.flatnonzero(np.any(kinds, axis=(1, 2, 3)) | np.any(matrices.skew_by_shape, axis=(1, 2)))
+    if not len(lag):
+        return shapes
+    found, at, phi = shapes.astype(complex), matrices.terms.log.shape[1], solution.shapes
+    for j in lag:
+        skew, damping, structural = (phi.T @ of @ phi for of in (matrices.skew_by_shape[j], *kinds[j]))
+        found[at + j] += phi @ damped.lag(skew, damping, structural, solution.eigenvalues)[:, modes]
+    return found
 
 
 def _numbered_pairs(group: NDArray[np.int64]) -> NDArray[np.int64]:

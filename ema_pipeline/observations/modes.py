@@ -42,7 +42,7 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
         Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 2.0, 0.2),
         Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03, 1.5, 0.03),
         # What damping without a law makes complex: no model of single dampers is better.
-        Scatter(QUADRATURE, "imaginary parts of shapes", 0.01, 1.0, 0.02, 10.0, 0.05),
+        Scatter(QUADRATURE, "imaginary parts of shapes", 0.01, 1.0, 0.1, 20.0, 0.05),
         # What hits have in common (drift, aim) is in their scatter, and no error of one mode against another.
         Scatter(FREQUENCY_NOISE, "stated uncertainty of frequencies", 1.0, 0.5, most=2.0),
         # Without a bound it falls to nothing where many modes agree, and those that the test hardly knows are outliers.
