@@ -153,7 +153,7 @@ class ModeData:
         return np.asarray(self.known_shapes + 1j * np.where(compared, self.imaginary, 0.0), complex)
 
     @cached_property
-    def whole_shapes(self) -> NDArray[np.complex128]:
+    def compared_shapes(self) -> NDArray[np.complex128]:
         """Shapes that are compared up to one factor, (m, s): complex ones of `whirling` modes, real ones of others."""
         return np.where(self.whirling[:, None], self.complex_shapes, self.known_shapes)
 
@@ -170,7 +170,7 @@ class ModeData:
     @cached_property
     def squares(self) -> NDArray[np.float64]:
         """Sum of squares of every shape, (m,)."""
-        return np.asarray(np.sum(np.abs(self.whole_shapes) ** 2, axis=1))
+        return np.asarray(np.sum(np.abs(self.compared_shapes) ** 2, axis=1))
 
     @cached_property
     def double(self) -> NDArray[np.bool_]:

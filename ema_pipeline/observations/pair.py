@@ -90,6 +90,8 @@ class PairObservations(Observations):
         common: Sequence[str] = (),
         repeat: RepeatSettings | None = None,
     ) -> None:
+        # rows of both tests are taken kind by kind; imaginary parts of real shapes are asked of each test alone
+        a, b = a.without_lag(), b.without_lag()
         self.a, self.pairs, self.common = a, dict(pairs), frozenset(common)
         self.settings = repeat or RepeatSettings()
         self.repeat = self.settings.scatters()

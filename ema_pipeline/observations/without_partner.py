@@ -123,7 +123,7 @@ def _usual(
     """What modes would cost on average if they were explained."""
     seen, whirl = np.isfinite(d.shapes[alone]), d.whirling[alone]
     real, both, lag = seen & ~whirl[:, None], seen & whirl[:, None], seen & d.lagging[alone, None]
-    reach = shape_unit(d.whole_shapes[alone])
+    reach = shape_unit(d.compared_shapes[alone])
     std, broad = d.compared_std[alone], d.broad_std[alone, None] + np.zeros(seen.shape)
     damped = alone[np.isfinite(d.log_damping[alone])]
     parts = 1 + whirl  # real and imaginary
@@ -160,7 +160,7 @@ def _credited(
     now, usual = (
         (at[SHAPE_NOISE] * d.compared_std[sure]) ** 2
         + d.broad_std[sure, None] ** 2
-        + (at[SHAPE] * shape_unit(d.whole_shapes[sure])) ** 2
+        + (at[SHAPE] * shape_unit(d.compared_shapes[sure])) ** 2
         for at in (scatters, defaults)
     )
     return float(np.sum(np.maximum(0.5 * np.log(usual / now), 0.0)[np.isfinite(d.shapes[sure])]))
