@@ -146,15 +146,20 @@ class Residuals:
     def squares(self) -> float:
         """Sum of squares in which errors count."""
         alone = self.stated if self.block is None else self.stated[self.block < 0]
-        deviance, beside = tails.deviance(*self.blocks), self._blocks_of(self.beside)
-        exceeded = float(np.sum(deviance[beside] - (self.blocks[1][beside] - 1)))
+        deviance, (beside, count) = tails.deviance(*self.blocks), self._beside
+        exceeded = float(np.sum(deviance[beside])) - count
         return float(alone @ alone) + float(np.sum(deviance[~beside])) + max(exceeded, 0.0)
 
     @property
     def count(self) -> int:
         """Number of data: of values that were not spent on factors of no interest, without those `beside`."""
-        beside = self._blocks_of(self.beside)
-        return len(self.values) - self.projected - int(np.sum(self.blocks[1][beside] - 1))
+        return len(self.values) - self.projected - self._beside[1]
+
+    @cached_property
+    def _beside(self) -> tuple[NDArray[np.bool_], int]:
+        """Mask of the blocks that hold values `beside`, (n_blocks,), and the number of these that were not spent."""
+        blocks = self._blocks_of(self.beside)
+        return blocks, int(np.sum(self.blocks[1][blocks] - 1))
 
     def only_apart(self, apart: Apart) -> Residuals:
         """The values that count on their own as well, without derivatives."""

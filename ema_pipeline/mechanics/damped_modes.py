@@ -138,15 +138,12 @@ class DampedModes:
         By gyroscopic coupling, by damping and by structural damping between them, (n, n) each. Damping turns close
         modes into each other, which is no linear function of it: it is left out.
         """
-        omega, ratio = np.sqrt(values), self.damping_ratio
-        apart = (
-            self.poles[None, :] ** 2 + values[:, None] + 2 * (ratio * omega)[:, None] * self.poles[None, :]
-        )
-        least = (_CLOSE * np.abs(self.poles[None, :]) ** 2) ** 2
-        reach = _OVERLAP * np.maximum.outer(ratio * omega, ratio * omega)
-        far = np.abs(np.subtract.outer(omega, omega)) > reach
-        across = skew * self.poles[None, :]
-        across = across + np.where(far, damping * self.poles[None, :] + 1j * structural, 0.0)
+        omega, pole = np.sqrt(values), self.poles[None, :]
+        decay = self.damping_ratio * omega
+        apart = pole**2 + values[:, None] + 2 * decay[:, None] * pole
+        least = (_CLOSE * np.abs(pole) ** 2) ** 2
+        far = np.abs(np.subtract.outer(omega, omega)) > _OVERLAP * np.maximum.outer(decay, decay)
+        across = skew * pole + np.where(far, damping * pole + 1j * structural, 0.0)
         return np.asarray(-across * np.conj(apart) / (np.abs(apart) ** 2 + least))
 
     def derivatives(

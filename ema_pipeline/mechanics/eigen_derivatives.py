@@ -163,14 +163,13 @@ class ModeDerivatives:
         between = _numbered_pairs(group)
         log_frequency, weight, reduced = _undamped(matrices, solution, modes, between)
         ratio = _damping(matrices, solution, modes, log_frequency, weight)
-        # of no size yet, shapes may lag behind with it
-        damped = DampedModes.uncoupled(solution.frequency_hz, solution.damping_ratio, solution.shapes)
-        shapes = _with_lag(solution.shapes @ weight, matrices, solution, damped, modes)
+        shapes = _with_lag(solution.shapes @ weight, matrices, solution, modes)
         log_frequency, ratio, shapes, reduced = _with_ratios(
             matrices, solution, modes, log_frequency, ratio, shapes, reduced
         )
-        shapes = shapes.transpose(1, 2, 0)
-        return cls(log_frequency.T, ratio.T, shapes, np.ascontiguousarray(reduced.T), between)
+        return cls(
+            log_frequency.T, ratio.T, shapes.transpose(1, 2, 0), np.ascontiguousarray(reduced.T), between
+        )
 
     @classmethod
     def _damped(
@@ -186,9 +185,9 @@ class ModeDerivatives:
         bare, weight, reduced = _undamped(matrices, solution, modes, between)
         log_frequency, ratio = damped.derivatives(matrices, modes, bare, weight, omega)
         turned = np.flatnonzero(damped.turned[modes])
-        shapes = _with_lag(phi @ weight, matrices, solution, damped, modes)
+        shapes = _with_lag(phi @ weight, matrices, solution, modes)
         if len(turned):
-            shapes = shapes.astype(complex)
+            shapes = np.asarray(shapes, complex)
         log_frequency, ratio, shapes, reduced = _with_ratios(
             matrices, solution, modes, log_frequency, ratio, shapes, reduced
         )
@@ -208,14 +207,19 @@ def _with_lag(
     shapes: NDArray[np.float64],
     matrices: Matrices,
     solution: EigenSolution,
-    damped: DampedModes,
     modes: NDArray[np.int64],
 ) -> NDArray[Any]:
-    """Derivatives of shapes, (n_unknowns, n, m), with what dampers, losses and gyroscopic effects let lag behind."""
+    """Derivatives of shapes, (n_unknowns, n, m), with what dampers, losses and gyroscopic effects let lag behind.
+
+    Of no size yet they couple nothing, and shapes lag behind with them all the same.
+    """
     kinds = matrices.by_shape[:, [DAMPING_MATRIX, STRUCTURAL]]
     lag = np.flatnonzero(np.any(kinds, axis=(1, 2, 3)) | np.any(matrices.skew_by_shape, axis=(1, 2)))
     if not len(lag):
         return shapes
+    damped = solution.damped or DampedModes.uncoupled(
+        solution.frequency_hz, solution.damping_ratio, solution.shapes
+    )
     found, at, phi = shapes.astype(complex), matrices.terms.log.shape[1], solution.shapes
     for j in lag:
         skew, damping, structural = (phi.T @ of @ phi for of in (matrices.skew_by_shape[j], *kinds[j]))

@@ -397,14 +397,14 @@ class ModeProblem(EffectProblem):
             damping[damped] = stated[at : at + int(np.sum(damped))]
             at += int(np.sum(damped))
             seen, whirl = np.isfinite(data.shapes[on]), data.whirling[on, None]
-            shape = np.full(seen.shape, np.nan)
+            shape, after = np.full(seen.shape, np.nan), at + data.shape_rows(on)
             count = int(np.sum(seen & ~whirl))
             shape[seen & ~whirl] = stated[at : at + count]
             at += count
             count = int(np.sum(seen & whirl))
             real, imaginary = stated[at : at + 2 * count].reshape(2, count)
             shape[seen & whirl] = np.sqrt(0.5 * (real**2 + imaginary**2))
-            at += 2 * count + int(np.sum(data.seen[on] * data.lagging[on, None]))
+            at = after
             out += [
                 ModeRows(
                     data.configuration,

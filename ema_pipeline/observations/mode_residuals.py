@@ -377,25 +377,20 @@ class Comparison:
     def _complex_shapes(self, pairs: _Pairs, shapes: _Predicted) -> Rows:
         """Real and imaginary parts of whirling modes' shapes, a complex factor projected out."""
         entries, by = pairs.known.whirling, shapes.whirling_slope
-        return self._rows_of_shapes(
-            entries, *self._turned_to_fit(pairs, shapes.whole, entries.places, by), ""
-        )
+        return self._rows_of_shapes(entries, *self._turned_to_fit(pairs, shapes, entries.places, by), "")
 
     def _imaginary_parts(self, pairs: _Pairs, shapes: _Predicted) -> Rows:
         """Imaginary parts of shapes whose real parts are compared by themselves, a complex factor projected out."""
         entries, by = pairs.known.lagging, shapes.lagging_slope
-        difference, slope = self._turned_to_fit(pairs, shapes.whole, entries.places, by)
+        difference, slope = self._turned_to_fit(pairs, shapes, entries.places, by)
         half = len(entries.mode)
-        return Rows(
-            difference[half:], entries.own, entries.unit, QUADRATURE, 1 + 0.1 * (self.heat - 1), entries.mode,
-            entries.sensor, entries.close, None if slope is None else slope[half:], noise=SHAPE_NOISE,
-            least=entries.least,
-        )  # fmt: skip
+        slope = None if slope is None else slope[half:]
+        return self._rows_of_shapes(entries, difference[half:], slope, SHAPE_NOISE, QUADRATURE)
 
     def _turned_to_fit(
         self,
         pairs: _Pairs,
-        read: NDArray[np.complex128] | None,
+        shapes: _Predicted,
         places: NDArray[np.int64],
         by: NDArray[np.complex128] | None,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
@@ -406,7 +401,7 @@ class Comparison:
         difference = np.empty(2 * int(np.count_nonzero(known.seen[places])))
         slope = np.empty((0 if by is None else len(difference), len(self.x)))
         turning_rows(
-            places, known.seen, known.complex_shapes, known.complex_weight, read,
+            places, known.seen, known.complex_shapes, known.complex_weight, shapes.whole,
             _NO_SLOPE.astype(complex) if by is None else by, difference, slope,
         )  # fmt: skip
         return difference, None if by is None else slope
@@ -417,8 +412,9 @@ class Comparison:
         difference: NDArray[np.float64],
         slope: NDArray[np.float64] | None,
         noise: str,
+        scatter: str = SHAPE,
     ) -> Rows:
         return Rows(
-            difference, entries.own, entries.unit, SHAPE, 1 + 0.1 * (self.heat - 1), entries.mode, entries.sensor,
+            difference, entries.own, entries.unit, scatter, 1 + 0.1 * (self.heat - 1), entries.mode, entries.sensor,
             entries.close, slope, noise=noise, least=entries.least, blur=entries.blur,
         )  # fmt: skip

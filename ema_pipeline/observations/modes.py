@@ -126,11 +126,9 @@ class ModeObservations(Observations):
 
     def without_lag(self) -> ModeObservations:
         """The same without imaginary parts of shapes that are compared as real ones, see `ModeData.lagging`."""
-        return (
-            self.with_data([d.without_lag() for d in self.data])
-            if any(d.lagging.any() for d in self.data)
-            else self
-        )
+        if not any(d.lagging.any() for d in self.data):
+            return self
+        return self.with_data([d.without_lag() for d in self.data])
 
     def with_data(self, data: Sequence[ModeData]) -> ModeObservations:
         """The same rig and channels with other modes."""

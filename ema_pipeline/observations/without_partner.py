@@ -130,24 +130,19 @@ def _usual(
     total = -0.5 * float(np.sum(parts[np.any(seen, axis=1)]) + np.sum(np.any(lag, axis=1)))
     for count in (np.sum(seen, axis=1, dtype=float) * parts, np.sum(lag, axis=1, dtype=float)):
         total += float(np.sum(tails.cost(count, count) - 0.5 * count))
-    of_shapes = std, broad, reach
-    for (own, least, unit), name, noise in (
-        (_alike(d.log_frequency_std[alone]), FREQUENCY, FREQUENCY_NOISE),
-        (_alike(d.log_damping_std[damped]), DAMPING_SCATTER, ""),
-        ([of[real] for of in of_shapes], SHAPE, SHAPE_NOISE),
-        ([of[lag] for of in of_shapes], QUADRATURE, SHAPE_NOISE),
-        ([np.tile(of[both], 2) for of in of_shapes], SHAPE, ""),
+    none, one = np.zeros(1), np.ones(1)
+    for own, least, unit, name, noise in (
+        (d.log_frequency_std[alone], none, one, FREQUENCY, FREQUENCY_NOISE),
+        (d.log_damping_std[damped], none, one, DAMPING_SCATTER, ""),
+        (std[real], broad[real], reach[real], SHAPE, SHAPE_NOISE),
+        (std[lag], broad[lag], reach[lag], QUADRATURE, SHAPE_NOISE),
+        (np.tile(std[both], 2), np.tile(broad[both], 2), np.tile(reach[both], 2), SHAPE, ""),
     ):
         now, usual = (
             (at.get(noise, 1.0) * own) ** 2 + least**2 + (at[name] * unit) ** 2 for at in (scatters, defaults)
         )
         total += 0.5 * float(np.sum(np.log(now / usual) + 1.0))
     return total
-
-
-def _alike(own: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """1 σ of a test that its factor scales as a whole, and to which a scatter adds as it is."""
-    return [own, np.zeros(len(own)), np.ones(len(own))]
 
 
 def _credited(
