@@ -111,15 +111,16 @@ class KnownShapes:
         shapes, turning = data.known_shapes[on], data.complex_shapes[on]
         own, seen, whirls = data.compared_std[on], data.seen[on] > 0, data.whirling[on]
         unit, complex_unit = shape_unit(shapes), shape_unit(turning)
-        broad = data.broad_std[on, None]
+        broad = data.broad_std[on, None] + np.zeros(shapes.shape)
         blur = np.where(blurred, _FITTED_AS_ONE_STD, 0.0)[:, None] + np.zeros(shapes.shape)
 
-        def entries(places: Integers, unit: Real, blur: Real | None = None) -> ShapeEntries:
+        def entries(places: Integers, least: Real, unit: Real, blur: Real | None = None) -> ShapeEntries:
             mode, sensor = np.nonzero(seen[places])
             at, measured = (places[mode], sensor), on[places[mode]]
             hides = None if blur is None or not np.any(blur[at]) else blur[at]
-            least, close = data.broad_std[measured], data.close[measured]
-            return ShapeEntries(places, measured, sensor, own[at], least, unit[at], close, hides)
+            return ShapeEntries(
+                places, measured, sensor, own[at], least[at], unit[at], data.close[measured], hides
+            )
 
         place = np.full(len(data), -1)
         place[on] = np.arange(len(on))
@@ -132,9 +133,9 @@ class KnownShapes:
             weight=seen / (own**2 + broad**2 + (scatter * unit) ** 2 + blur**2),
             complex_shapes=turning,
             complex_weight=seen / (own**2 + broad**2 + (scatter * complex_unit) ** 2),
-            real=entries(np.flatnonzero(~whirls), unit, blur),
-            whirling=entries(np.flatnonzero(whirls), complex_unit).twice(),
-            lagging=entries(np.flatnonzero(data.lagging[on]), unit),
+            real=entries(np.flatnonzero(~whirls), broad, unit, blur),
+            whirling=entries(np.flatnonzero(whirls), broad, complex_unit).twice(),
+            lagging=entries(np.flatnonzero(data.lagging[on]), data.lag_std[on], data.lag_unit[on]),
             members=in_groups(data.group[on]),
             mixes=mixes,
             mixed=place[pairs[mixes, 0]],

@@ -15,6 +15,7 @@ from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.correlate.settings import AssumedSettings
 from ema_pipeline.dof import Dof
 from ema_pipeline.modal.assurance import mac
+from ema_pipeline.observations.mode_rows import shape_unit
 
 if TYPE_CHECKING:
     from ema_pipeline.observations.known_shapes import KnownShapes
@@ -26,6 +27,12 @@ _BROAD, _BROAD_STD = 0.05, 0.5
 """Damping ratio from which a resonance is broad, and 1 σ of its shape, in the largest entry, over the square of that,
 which repeated hits do not show: a fit gives some of a broad flank to the neighbours that stand on it. Modes of 7 to 8 %
 were off by 0.1 to 0.2 %."""
+_USUAL_RATIO = 0.01
+"""Damping ratio of a mode whose own was not measured."""
+_PHASE_STD = 2e-3
+"""1 σ of imaginary parts, per entry, by what all hits have in common: channels whose phases agree within 0.1°."""
+_BEYOND = 1.5
+"""Frequency of what stands for all modes above the band, over its upper end."""
 _WHIRLS = 0.05
 """Share of its imaginary part in the sum of squares of a shape, from which it is compared as a complex one: MPC 0.8."""
 _DOUBLE = 0.9
@@ -289,6 +296,33 @@ class ModeData:
         """1 σ of shapes of broad resonances that adds to that of hits, (m,); 0 of others."""
         ratio = np.nan_to_num(np.exp(self.log_damping))
         return np.where(ratio > _BROAD, _BROAD_STD * ratio**2, 0.0)
+
+    @cached_property
+    def lag_std(self) -> NDArray[np.float64]:
+        """1 σ of imaginary parts of shapes that adds to that of hits, (m, s)."""
+        return np.hypot(self.broad_std[:, None], _PHASE_STD * shape_unit(self.known_shapes))
+
+    @cached_property
+    def lag_unit(self) -> NDArray[np.float64]:
+        """Imaginary parts of shapes where parts damp unevenly, per relative difference of their damping, (m, s).
+
+        Damping forces from mode to mode are then of the size of those of the modes themselves, times that difference,
+        and make mode r hold 2 √(ζᵣ ζₛ ωₛ/ωᵣ) / ((ωₛ/ωᵣ)² − 1) of mode s, 90° late (first order: Rayleigh, The Theory of
+        Sound, 1877, §102). All modes are taken to be equally large at the sensors; one stands for those above the band.
+        """
+        if self.whole is not None:
+            return np.asarray(self.whole.lag_unit[self.kept])
+        ratio = np.where(np.isfinite(self.log_damping), np.exp(self.log_damping), _USUAL_RATIO)[:, None]
+
+        def held(above: NDArray[np.float64], of: NDArray[np.float64]) -> NDArray[np.float64]:
+            apart = np.where(above == 1, np.inf, above**2 - 1)
+            return np.asarray(4 * ratio * of * above / apart**2)
+
+        size = np.sqrt(np.sum(self.known_shapes**2, axis=1, keepdims=True))
+        others = held(np.exp(self.log_frequency - self.log_frequency[:, None]), ratio.T)
+        beyond = held(_BEYOND * self.band_hz[1] / np.exp(self.log_frequency)[:, None], ratio)
+        of_others = others @ (self.known_shapes / np.maximum(size, 1e-300)) ** 2 * size**2
+        return np.asarray(np.sqrt(of_others + beyond * shape_unit(self.known_shapes) ** 2))
 
     def without_lag(self) -> ModeData:
         """The same with imaginary parts of `whirling` modes alone."""

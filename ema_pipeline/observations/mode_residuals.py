@@ -19,9 +19,9 @@ from ema_pipeline.observations.mode_pairing import paired
 from ema_pipeline.observations.mode_rows import (
     FREQUENCY,
     FREQUENCY_NOISE,
-    QUADRATURE,
     SHAPE,
     SHAPE_NOISE,
+    UNEVEN_DAMPING,
     Compared,
     Rows,
 )
@@ -385,7 +385,7 @@ class Comparison:
         difference, slope = self._turned_to_fit(pairs, shapes, entries.places, by)
         half = len(entries.mode)
         slope = None if slope is None else slope[half:]
-        return self._rows_of_shapes(entries, difference[half:], slope, SHAPE_NOISE, QUADRATURE)
+        return self._rows_of_shapes(entries, difference[half:], slope, SHAPE_NOISE, UNEVEN_DAMPING)
 
     def _turned_to_fit(
         self,

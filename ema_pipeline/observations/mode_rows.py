@@ -13,7 +13,7 @@ from ema_pipeline.observations.comparison_kernel import number_blocks, whiten
 
 FREQUENCY = "frequency_scatter"
 SHAPE = "shape_scatter"
-QUADRATURE = "quadrature_scatter"
+UNEVEN_DAMPING = "uneven_damping"
 FREQUENCY_NOISE = "frequency_noise"
 SHAPE_NOISE = "shape_noise"
 
@@ -194,7 +194,7 @@ def whitened(
     for r, c, first in rows:
         here = slice(at, at + len(r))
         at = here.stop
-        mode[here], beside[here] = r.mode + first, r.scatter == QUADRATURE
+        mode[here], beside[here] = r.mode + first, r.scatter == UNEVEN_DAMPING
         least = _NONE if r.least is None else r.least
         blur = _NONE
         log_scale += r.wider

@@ -16,7 +16,7 @@ from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_pairing import OwnDamping
 from ema_pipeline.observations.mode_problem import CALIBRATION, MIXING, ModeProblem
-from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, QUADRATURE, SHAPE, SHAPE_NOISE
+from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, UNEVEN_DAMPING
 from ema_pipeline.observations.parts import (
     DAMPING_SCATTER,
     MASS_SCATTER,
@@ -41,8 +41,8 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
         Scatter(DAMPING_SCATTER, "ln ζ from mode to mode", rig.modal_damping_scatter, 0.5, 0.5),
         Scatter(FREQUENCY, "frequency", 3e-4, 0.7, 1e-3, 2.0, 0.2),
         Scatter(SHAPE, "shapes", 0.015, 0.5, 0.03, 1.5, 0.03),
-        # Joints that damp unevenly make shapes complex by a per cent: less than that tells of no damper.
-        Scatter(QUADRATURE, "imaginary parts of shapes", 0.01, 1.0, 0.1, 20.0, 1.0),
+        # Joints whose damping differs by a factor of two show 0.1 to 0.3 of it: less than that tells of no damper.
+        Scatter(UNEVEN_DAMPING, "damping from part to part", 0.2, 0.5, 1.0, 5.0, 1.0),
         # What hits have in common (drift, aim) is in their scatter, and no error of one mode against another.
         Scatter(FREQUENCY_NOISE, "stated uncertainty of frequencies", 1.0, 0.5, most=2.0),
         # Without a bound it falls to nothing where many modes agree, and those that the test hardly knows are outliers.

@@ -13,9 +13,9 @@ from ema_pipeline.observations.mode_data import ModeData
 from ema_pipeline.observations.mode_rows import (
     FREQUENCY,
     FREQUENCY_NOISE,
-    QUADRATURE,
     SHAPE,
     SHAPE_NOISE,
+    UNEVEN_DAMPING,
     shape_unit,
 )
 from ema_pipeline.observations.parts import DAMPING_SCATTER
@@ -34,7 +34,7 @@ _READ = 0.01
 """Least motion at some sensor, over the largest one of a mode there, from which a mode would have been measured.
 Sensors along y alone read nothing of modes along x."""
 
-_SCATTERS = (FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, QUADRATURE, DAMPING_SCATTER)
+_SCATTERS = (FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, UNEVEN_DAMPING, DAMPING_SCATTER)
 _KEPT = 64
 """Costs that are kept."""
 
@@ -135,7 +135,7 @@ def _usual(
         (d.log_frequency_std[alone], none, one, FREQUENCY, FREQUENCY_NOISE),
         (d.log_damping_std[damped], none, one, DAMPING_SCATTER, ""),
         (std[real], broad[real], reach[real], SHAPE, SHAPE_NOISE),
-        (std[lag], broad[lag], reach[lag], QUADRATURE, SHAPE_NOISE),
+        (std[lag], d.lag_std[alone][lag], d.lag_unit[alone][lag], UNEVEN_DAMPING, SHAPE_NOISE),
         (np.tile(std[both], 2), np.tile(broad[both], 2), np.tile(reach[both], 2), SHAPE, ""),
     ):
         now, usual = (

@@ -953,7 +953,7 @@ def test_imaginary_parts_of_shapes_tell_a_damper_without_damping_ratios() -> Non
     (data,) = observations.data
     assert not np.any(data.whirling)
     assert np.count_nonzero(data.lagging) >= 3
-    scatters = {n: s.default for n, s in observations.scatters.items()} | {"quadrature_scatter": 1e-3}
+    scatters = {n: s.default for n, s in observations.scatters.items()} | {"uneven_damping": 0.02}
     sizes = []
     for one in (observations, ModeObservations(rig, [data.without_lag()])):
         problem = one.problem([effect], {})
@@ -963,6 +963,24 @@ def test_imaginary_parts_of_shapes_tell_a_damper_without_damping_ratios() -> Non
         _derivatives_are_exact(problem, found.x, scatters)
     assert sizes[0][0] == pytest.approx(20.0, rel=0.02)
     assert sizes[0][1] < 0.1 * sizes[1][1]
+
+
+def test_uneven_damping_of_two_equal_masses_makes_shapes_lag_as_expected() -> None:
+    """Both modes hold as much of each other as the damping of half the structure says: a relative difference of 1."""
+    stiffness, coefficient = 1e4 * np.array([[2.0, -1.0], [-1.0, 2.0]]), 0.5
+    on_one = replace(
+        chain().system("all"), mass=np.eye(2), stiffness=stiffness, damping=np.diag([2 * coefficient, 0.0]),
+        structural=np.zeros((2, 2)), modal_damping_ratio=0.0, dofs=("m1.z", "m2.z"),
+    )  # fmt: skip
+    exact = complex_modes(on_one)
+    ratio = coefficient / (2 * 2 * np.pi * exact.frequency_hz)
+    measured = MeasuredModes(
+        "all", exact.frequency_hz, 1e-5 * exact.frequency_hz, ratio, 0.01 * ratio, exact.shapes.T,
+        np.full((2, 2), 1e-5), (Dof.parse("m1.z"), Dof.parse("m2.z")), band_hz=(1.0, 100.0),
+    )  # fmt: skip
+    data = prepare(measured)
+    assert data.imaginary is not None
+    np.testing.assert_allclose(np.abs(data.imaginary), data.lag_unit, rtol=0.05)
 
 
 def test_close_modes_and_those_of_one_sensor_are_compared_by_real_shapes_alone() -> None:
