@@ -31,7 +31,7 @@ class Named:
     sizes : dict of str to EffectSize
         By the short name of each size.
     advantage : float
-        Log prior density of this name's size against that of the effect that was fitted.
+        Log prior density of this name's size, and of its sign, against that which the fit took.
     """
 
     name: Name
@@ -115,13 +115,13 @@ def _rank(name: Name, positive: bool) -> tuple[int, str]:
 
 
 def _advantage(hypothesis: Hypothesis, name: Name, fit: Fit) -> float:
-    """Log prior density at the size found, against the fitted effect's; -inf where the name cannot have that size."""
+    """Log prior density at the size found, against that of the fit; -inf where the name cannot have that size."""
+    x, own = _unknown(hypothesis, fit), name.placed.effect.parameters[0]
+    usual = float(np.log(2 * (own.below if x < 0 else 1 - own.below)))
     if name.label == hypothesis.label:
-        return 0.0
+        return usual
     ratio = name.relative / hypothesis.representative.relative
-    x = _unknown(hypothesis, fit)
-    own = name.placed.effect.parameters[0]
     low, high = SizeMap.of(own, name.scales.get(own.name, own.scale)).bounds
     if not low <= x / ratio <= high:
         return float("-inf")
-    return 0.5 * x**2 - 0.5 * (x / ratio) ** 2 - float(np.log(ratio))
+    return usual + 0.5 * x**2 - 0.5 * (x / ratio) ** 2 - float(np.log(ratio))

@@ -28,6 +28,9 @@ class EffectParameter:
         Range in which the effect makes sense.
     description : str
         What the number means.
+    below : float
+        Prior probability that it is below `null`, where it can be: to be less of something is as usual as to be more,
+        but a mass that is missing is seldom one that was taken off.
     """
 
     name: str
@@ -38,6 +41,7 @@ class EffectParameter:
     minimum: float
     maximum: float
     description: str = ""
+    below: float = 0.5
 
 
 def _library_scales(assembly: Assembly, place: str) -> Mapping[str, float]:

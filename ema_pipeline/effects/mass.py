@@ -23,7 +23,7 @@ def _edit(assembly: Assembly, place: str, values: Mapping[str, float]) -> Assemb
 EFFECT = Effect(
     id="mass",
     title="mass at a DOF or a body, or an inerter between two",
-    parameters=(EffectParameter("mass", "kg", 0.0, 0.05, 0.1, -10.0, 1e3, "added mass"),),
+    parameters=(EffectParameter("mass", "kg", 0.0, 0.05, 0.1, -10.0, 1e3, "added mass", below=0.1),),
     find_places=bodies_and_lone_dofs,
     edit=_edit,
     signs="frequencies of modes that move it fall",

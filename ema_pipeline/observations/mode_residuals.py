@@ -255,7 +255,7 @@ class Comparison:
         damped = np.isfinite(d.log_damping[on])
         modes, of = on[damped], to[damped]
         # of modes whose damping is an unknown of its own, that unknown scatters, and not what is left
-        own = np.any(matrices.damping_log[int(self.model.has_ratio) :, of], axis=0)
+        own = np.any(matrices.damping_log[self.model.common_damping :, of], axis=0)
         model = np.log(solution.damping_ratio[of])
         test = np.hypot(d.log_damping_std[modes], own * _DAMPING_STD)
         lost = self._lost_in_effects(solution)[of]
@@ -263,7 +263,9 @@ class Comparison:
         slope = None
         if slopes is not None:
             slope = np.zeros((len(modes), len(self.x)))
-            by_model = slopes.damping_ratio[damped] / solution.damping_ratio[of, None]
+            modal = matrices.damping_ratio[of, None] * self.model.damping_power(self.x)
+            by_model = slopes.damping_ratio[damped] + modal * slopes.log_frequency[damped]
+            by_model /= solution.damping_ratio[of, None]
             slope[:, : by_model.shape[1]] = by_model
         return Rows(
             d.log_damping[modes] - model, np.hypot(test, lost),

@@ -70,6 +70,8 @@ class ModeObservations(Observations):
         Name of the test among several whose unknowns are shared: its drift is its own.
     own_damping : dict of str to OwnDamping, optional
         Undamped modes whose damping ratios are unknowns of their own, by configuration.
+    middle_hz : float
+        See `RigModel`; that of `data` where left out.
 
     Attributes
     ----------
@@ -87,9 +89,11 @@ class ModeObservations(Observations):
         sensors: tuple[str, ...] = (),
         test: str = "",
         own_damping: Mapping[str, OwnDamping] | None = None,
+        middle_hz: float = 0.0,
     ) -> None:
         self.rig, self.test, self.own_damping = rig, test, dict(own_damping or {})
         self.data = tuple(d for d in data if len(d))
+        self.middle_hz = middle_hz or _middle_hz(self.data)
         self.sensors = sensors or tuple(dict.fromkeys(d.point for one in data for d in one.dofs))
         self.channels = dict(channels or {})
         self.shared = shared or dependence(rig)
@@ -110,7 +114,8 @@ class ModeObservations(Observations):
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> ModeProblem:
         """See `Observations`."""
-        return ModeProblem(self, RigModel(self.rig, effects, scales, self.shared, self.own_damping))
+        model = RigModel(self.rig, effects, scales, self.shared, self.own_damping, self.middle_hz)
+        return ModeProblem(self, model)
 
     def suited(self, effects: Sequence[PlacedEffect]) -> ModeObservations:
         """See `Observations`: where damping couples modes, each has a damping ratio of its own.
@@ -136,7 +141,7 @@ class ModeObservations(Observations):
 
     def _with(self, data: Sequence[ModeData], own_damping: Mapping[str, OwnDamping]) -> ModeObservations:
         return ModeObservations(
-            self.rig, data, self.channels, self.shared, self.sensors, self.test, own_damping
+            self.rig, data, self.channels, self.shared, self.sensors, self.test, own_damping, self.middle_hz
         )
 
     def holding_out_explained(self, found: Residuals) -> ModeObservations:
@@ -169,3 +174,9 @@ class ModeObservations(Observations):
                 continue
             pairs.append((self.with_data(kept), self.with_data(out)))
         return pairs
+
+
+def _middle_hz(data: Sequence[ModeData]) -> float:
+    """Geometric mean of the frequencies whose damping was measured; 0 where there are fewer than two."""
+    log = np.concatenate([d.log_frequency[np.isfinite(d.log_damping)] for d in data] or [np.zeros(0)])
+    return float(np.exp(np.mean(log))) if len(log) > 1 else 0.0

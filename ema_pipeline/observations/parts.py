@@ -31,6 +31,7 @@ FREE_STD = (0.5, 2.5)
 """Least and largest prior 1 σ of the logarithm of a free parameter."""
 _UNBOUNDED_STD = 1.5
 DAMPING = "modal_damping_ratio"
+DAMPING_POWER = "damping_power"
 
 PartKey = tuple[type, str]
 """Kind of element and name of its part."""

@@ -31,7 +31,14 @@ from ema_pipeline.mechanics.terms import (
 )
 from ema_pipeline.observations.effect_terms import AddedTerms, EffectTerms, differences
 from ema_pipeline.observations.mode_pairing import OwnDamping
-from ema_pipeline.observations.parts import DAMPING, DAMPING_SCATTER, Dependence, dependence, part_key
+from ema_pipeline.observations.parts import (
+    DAMPING,
+    DAMPING_POWER,
+    DAMPING_SCATTER,
+    Dependence,
+    dependence,
+    part_key,
+)
 from ema_pipeline.observations.size_map import LOG_STD, SizeMap
 from ema_pipeline.rigs.types import Rig
 
@@ -39,13 +46,17 @@ T = TypeVar("T")
 
 _MOST_KNOWN = 2000
 """Effects of one rig, and models with them, of which terms are kept: those of some rankings."""
+_POWER_STD = 0.7
+"""1 σ of the power of the frequency that damping ratios follow: 1 where joints are viscous, −1 where the ground is."""
+_FURTHEST = 3.0
+"""Difference of ln f from the middle up to which they do: modes without stiffness have no ratio."""
 
 
 class RigModel:
     """A rig, with effects on top of it, as a function of unknowns.
 
-    The unknowns are, in this order: families, parts, the damping ratio of all modes and what those of single ones
-    differ from it by (logarithms), geometric parameters, and the effects' sizes.
+    The unknowns are, in this order: families, parts, the damping ratio of all modes, the power of the frequency that it
+    follows, and what those of single ones differ from it by (logarithms), geometric parameters, and the effects' sizes.
 
     Parameters
     ----------
@@ -58,6 +69,8 @@ class RigModel:
         Of the rig, where it is known already.
     own_damping : dict of str to OwnDamping, optional
         Undamped modes whose damping ratios are unknowns of their own, by configuration.
+    middle_hz : float
+        Frequency about which damping ratios follow a power of the frequency; 0 where all are the same.
     """
 
     def __init__(
@@ -67,8 +80,10 @@ class RigModel:
         scales: Mapping[str, float] | None = None,
         shared: Dependence | None = None,
         own_damping: Mapping[str, OwnDamping] | None = None,
+        middle_hz: float = 0.0,
     ) -> None:
         self.rig, self.effects, self.own_damping = rig, tuple(effects), dict(own_damping or {})
+        self.middle_hz = middle_hz
         self.dependence = shared or dependence(rig)
         given = scales or {}
         self.sizes = {
@@ -97,6 +112,7 @@ class RigModel:
         return joined(
             self.dependence.unknowns,
             Unknowns.plain((DAMPING,), damping.tolerance or LOG_STD) if loose and damping else _NOTHING,
+            Unknowns.plain((DAMPING_POWER,), _POWER_STD) if loose and self.middle_hz else _NOTHING,
             Unknowns.plain(
                 tuple(name for own in self.own_damping.values() for name in own.names),
                 1.0,
@@ -123,6 +139,16 @@ class RigModel:
     def has_ratio(self) -> bool:
         """True where the common damping ratio is an unknown."""
         return DAMPING in self.unknowns.index
+
+    @property
+    def common_damping(self) -> int:
+        """Number of unknowns of damping that all modes share."""
+        return int(self.has_ratio) + int(DAMPING_POWER in self.unknowns.index)
+
+    def damping_power(self, x: NDArray[np.float64]) -> float:
+        """Power of the frequency that modal damping ratios follow at `x`."""
+        at = self.unknowns.index.get(DAMPING_POWER)
+        return 0.0 if at is None else float(x[at])
 
     def start(self, sizes: Mapping[str, float] | None = None) -> NDArray[np.float64]:
         """Nominal values and the effects at `sizes` (their start values where left out), (n,)."""
@@ -158,12 +184,29 @@ class RigModel:
             matrices = self.matrices(configuration, x, derivatives)
             solution = known[3] if known is not None and known[0] == key else None
             undamped = solved(matrices.dense) if solution is None else (solution.eigenvalues, solution.shapes)
-            if undamped is not None and configuration in self.own_damping:
-                matrices = self._with_own_damping(configuration, x, matrices, *undamped)
+            if undamped is not None:
+                matrices = self._with_powers(x, matrices, undamped[0])
+                if configuration in self.own_damping:
+                    matrices = self._with_own_damping(configuration, x, matrices, *undamped)
             if solution is None and undamped is not None:
                 solution = EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio, undamped)
             known = self._modes[configuration] = key, derivatives, matrices, solution
         return known[2], known[3]
+
+    def _with_powers(
+        self, x: NDArray[np.float64], matrices: Matrices, eigenvalues: NDArray[np.float64]
+    ) -> Matrices:
+        """The matrices with modal damping ratios that follow a power of the frequency, where they do.
+
+        Viscous losses of joints grow with the frequency, those to the ground fall (Rayleigh), hysteretic ones do
+        neither. The derivatives take frequencies for fixed in this.
+        """
+        if self.common_damping < 2:
+            return matrices
+        slopes = matrices.damping_log.copy()
+        above = 0.5 * np.log(np.maximum(eigenvalues, 1e-300)) - np.log(2 * np.pi * self.middle_hz)
+        slopes[1] = np.clip(above, -_FURTHEST, _FURTHEST)
+        return replace(matrices, damping_ratio=self._ratios(x, slopes), damping_log=slopes)
 
     def _with_own_damping(
         self,
@@ -178,7 +221,7 @@ class RigModel:
         What dampers of the rig add goes with them: row and column r of their matrix between undamped modes with the
         root of the factor of mode r, which leaves it positive. The derivatives take undamped shapes for fixed in this.
         """
-        at, slopes = int(self.has_ratio), matrices.damping_log.copy()
+        at, slopes = self.common_damping, matrices.damping_log.copy()
         for name, own in self.own_damping.items():
             if name == configuration:
                 slopes[at : at + len(own.names)] = own.slopes(eigenvalues, shapes)
@@ -188,7 +231,7 @@ class RigModel:
         if DAMPING_MATRIX not in rig.by_kind or rig.dofs != matrices.terms.dofs:
             return matrices
         own_log, logs = slopes.copy(), x[: self._logs]
-        own_log[: int(self.has_ratio)] = 0.0
+        own_log[: self.common_damping] = 0.0
         root = np.exp(0.5 * (x[self._logs : self._logs + len(slopes)] @ own_log))
         moved = matrices.dense[MASS] @ shapes
         added = rig.damping_scaled((moved * root) @ shapes.T)

@@ -274,6 +274,17 @@ def test_a_name_is_said_where_its_prior_allows_the_size(unknown: float, said: st
         assert found.advantage == pytest.approx(density[0] - density[1])
 
 
+def test_a_mass_taken_off_is_less_usual_than_one_that_was_added() -> None:
+    """A spring is as often missing as it is too much."""
+    rig = chain()
+    nothing = ModeObservations(rig, [])
+    for label, odds in (("mass@m1", 9.0), ("spring@m1", 1.0)):
+        one = of_chain()[label]
+        added, off = (named(one, fitted_on_top(one, x, rig, nothing)) for x in (0.3, -0.3))
+        assert added.label == off.label
+        assert np.exp(added.advantage - off.advantage) == pytest.approx(odds)
+
+
 def test_sizes_follow_the_ratio_of_the_priors_alone() -> None:
     rig, one = planetary(), of_planetary()["shaft_torsion@sun"]
     halved = replace(one, names=tuple(replace(n, relative=0.5 * n.relative) for n in one.names))

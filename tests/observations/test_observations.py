@@ -1103,10 +1103,39 @@ def test_damping_ratios_that_differ_turn_the_shapes_of_coupled_modes() -> None:
     solution = problem.solution("with_ring", found.x)
     to = problem.paired(own.data[0], found.x).match
     told = [found.value(name) for name in own.own_damping["with_ring"].names]
-    common = found.value("modal_damping_ratio")
+    above = np.log(np.sqrt(solution.eigenvalues[to]) / (2 * np.pi * own.middle_hz))
+    common = found.value("modal_damping_ratio") + found.value("damping_power") * above
     assert np.array(told) + common == pytest.approx(np.log(factor)[to], abs=0.03)
     assert len(solution.frequency_hz) == len(factor)
     _derivatives_are_exact(problem, found.x, scatters)
+
+
+@pytest.mark.parametrize("effects", [(), ("damper@m1.z",)])
+def test_damping_that_grows_with_the_frequency_is_no_scatter(effects: tuple[str, ...]) -> None:
+    """As viscous joints make it. The common ratio is meant at the same frequency whatever modes are held out."""
+    rig = chain()
+    measured = chain_modes(4, GOOD)["all"]
+    f = measured.frequency_hz
+    assert measured.damping_ratio is not None
+    ratio = measured.damping_ratio * f / f[2]
+    observations = observed(rig, {"all": replace(measured, damping_ratio=ratio, damping_std=0.02 * ratio)})
+    scatters = {n: s.default for n, s in observations.scatters.items()} | {"damping_scatter": 0.2}
+    placed = [parse_effect(e, rig) for e in effects]
+    one = observations.suited(placed)
+    assert bool(one.own_damping) == bool(effects)
+    problem = one.problem(placed, {})
+    start = problem.start({f"{e}.coefficient": 10.0 for e in effects})
+    found = descend(problem, scatters, start, steps=40)
+    assert found.value("damping_power") == pytest.approx(1.0, abs=0.3)
+    start[problem.unknowns.index["damping_power"]] = 0.8
+    _derivatives_are_exact(problem, start, scatters)
+    assert all(kept.middle_hz == out.middle_hz == observations.middle_hz for kept, out in one.folds())
+    assert (
+        "damping_power"
+        not in ModeObservations(rig, [prepare(replace(measured, damping_ratio=np.full(len(f), np.nan)))])
+        .problem([], {})
+        .unknowns.index
+    )
 
 
 def test_damping_that_scatters_takes_the_rigs_own_dampers_along() -> None:
