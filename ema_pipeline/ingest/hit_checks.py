@@ -38,6 +38,9 @@ flat there all the same was clipped before the input, or the full scale is not t
 EXCEEDED = 2.0
 """A level that the same channel exceeds this many times in another hit is not where it clips."""
 
+_NO_BLOW = 10.0
+"""Second impact over the first beyond which there was no first one."""
+
 BAND_OVER_RATE = 1 / 2.56
 """Converters' anti-alias filters are flat up to the sample rate over 2.56."""
 
@@ -237,6 +240,10 @@ def _double_hit(force: NDArray[np.float64], pulse: Pulse, rate: float, settings:
     apart = abs(second.delay_s)
     span = f"{apart * 1e3:.1f} ms" if apart < 1 else f"{apart:.3g} s"
     fault = f"second impact of {second.ratio:.0%}, {span} {when} the peak"
+    if second.ratio > _NO_BLOW:
+        fault = (
+            "the force has no pulse where its peak should be: does the record begin or end within the blow?"
+        )
     return judged("double hit", second.ratio, settings.double_hit, passes, DOUBLE_HIT, "reject_hit", fault)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -127,13 +127,7 @@ def align_hits(
     guard = _guard(sample_rate_hz, settings)
     starts = [max(h.start, h.peak - guard) for h in hits]
     room = np.array([h.stop - start for h, start in zip(hits, starts, strict=True)])
-    longest: dict[tuple[str, str], int] = defaultdict(int)
-    for hit, length in zip(hits, room, strict=True):
-        key = hit.impact.point, hit.part
-        longest[key] = max(longest[key], int(length))
-    allowed = np.unique(room[room <= min(longest.values())])
-    best = max(allowed, key=lambda length: int(length) * int(np.sum(room >= length)))
-    length = _fast_length_below(int(best))
+    length = _common_length(hits, room)
     return tuple(
         _with_length(hit, start, int(space), length, sample_rate_hz)
         for hit, start, space in zip(hits, starts, room, strict=True)
@@ -141,7 +135,7 @@ def align_hits(
 
 
 def trim_hits(
-    hits: Sequence[Hit], records: Iterable[Record], settings: HitSettings | None = None
+    hits: Sequence[Hit], records: Sequence[Record], settings: HitSettings | None = None
 ) -> tuple[Hit, ...]:
     """Let the hits of a test start at their force pulse where responses have not decayed at the end.
 
@@ -151,13 +145,14 @@ def trim_hits(
     a delay before the blow that no longer holds, and the modal fit suffers; more so with delays that differ from
     hit to hit, as what is cut off then differs too. So all hits start equally long before their peak, and have
     one length. Decayed tests lose nothing by keeping their records whole, and then equal a plain computation;
-    so only tests with an accepted hit that fails the decay check are trimmed.
+    so only tests with an accepted hit that fails the decay check are trimmed. The length is found as in `align_hits`,
+    and a hit with less room is rejected: one at the end of its record spoils no test.
 
     Parameters
     ----------
     hits : sequence of Hit
         All hits of one configuration, checked.
-    records : iterable of Record
+    records : sequence of Record
         Their records.
     settings : HitSettings, optional
 
@@ -176,12 +171,26 @@ def trim_hits(
         if hit.file == record.file and hit.accepted
     )
     starts = [max(h.start, h.peak - lead) for h in hits]
-    kept = [h.stop - s for h, s in zip(hits, starts, strict=True) if h.accepted]
-    length = _fast_length_below(min(kept))
+    room = np.array([h.stop - s for h, s in zip(hits, starts, strict=True)])
+    accepted = [h.accepted for h in hits]
+    length = _common_length([h for h in hits if h.accepted], room[accepted])
     return tuple(
-        replace(hit, start=start, stop=min(start + length, hit.stop))
-        for hit, start in zip(hits, starts, strict=True)
+        _with_length(hit, start, int(space), length, records[0].sample_rate_hz)
+        if hit.accepted
+        else replace(hit, start=start, stop=min(start + length, hit.stop))
+        for hit, start, space in zip(hits, starts, room, strict=True)
     )
+
+
+def _common_length(hits: Sequence[Hit], room: NDArray[np.int64]) -> int:
+    """Length that keeps most time in all, while every impact point of every part of the test keeps a hit."""
+    longest: dict[tuple[str, str], int] = defaultdict(int)
+    for hit, length in zip(hits, room, strict=True):
+        key = hit.impact.point, hit.part
+        longest[key] = max(longest[key], int(length))
+    allowed = np.unique(room[room <= min(longest.values())])
+    best = max(allowed, key=lambda length: int(length) * int(np.sum(room >= length)))
+    return _fast_length_below(int(best))
 
 
 def _onset(force: NDArray[np.float64], peak: int) -> int:
