@@ -308,7 +308,8 @@ class ModeData:
 
         Damping forces from mode to mode are then of the size of those of the modes themselves, times that difference,
         and make mode r hold 2 √(ζᵣ ζₛ ωₛ/ωᵣ) / ((ωₛ/ωᵣ)² − 1) of mode s, 90° late (first order: Rayleigh, The Theory of
-        Sound, 1877, §102). All modes are taken to be equally large at the sensors; one stands for those above the band.
+        Sound, 1877, §102), or √(ωₛ/ωᵣ) times that where losses are hysteretic: the larger one is taken. All modes are
+        taken to be equally large at the sensors; one stands for those above the band.
         """
         if self.whole is not None:
             return np.asarray(self.whole.lag_unit[self.kept])
@@ -316,7 +317,7 @@ class ModeData:
 
         def held(above: NDArray[np.float64], of: NDArray[np.float64]) -> NDArray[np.float64]:
             apart = np.where(above == 1, np.inf, above**2 - 1)
-            return np.asarray(4 * ratio * of * above / apart**2)
+            return np.asarray(4 * ratio * of * above * np.maximum(above, 1.0) / apart**2)
 
         size = np.sqrt(np.sum(self.known_shapes**2, axis=1, keepdims=True))
         others = held(np.exp(self.log_frequency - self.log_frequency[:, None]), ratio.T)

@@ -965,22 +965,29 @@ def test_imaginary_parts_of_shapes_tell_a_damper_without_damping_ratios() -> Non
     assert sizes[0][1] < 0.1 * sizes[1][1]
 
 
-def test_uneven_damping_of_two_equal_masses_makes_shapes_lag_as_expected() -> None:
-    """Both modes hold as much of each other as the damping of half the structure says: a relative difference of 1."""
-    stiffness, coefficient = 1e4 * np.array([[2.0, -1.0], [-1.0, 2.0]]), 0.5
-    on_one = replace(
-        chain().system("all"), mass=np.eye(2), stiffness=stiffness, damping=np.diag([2 * coefficient, 0.0]),
-        structural=np.zeros((2, 2)), modal_damping_ratio=0.0, dofs=("m1.z", "m2.z"),
+@pytest.mark.parametrize("kind", ["damping", "structural"])
+def test_uneven_damping_of_two_equal_masses_makes_shapes_lag_as_expected(kind: str) -> None:
+    """Both modes hold as much of each other as the damping of half the structure says: a relative difference of 1.
+
+    Of the lower mode this is so for hysteretic losses, of the upper one for viscous ones; the other kind makes less.
+    """
+    stiffness, on_one = 1e4 * np.array([[2.0, -1.0], [-1.0, 2.0]]), np.diag([1.0, 0.0])
+    losses = {"damping": np.zeros((2, 2)), "structural": np.zeros((2, 2)), kind: on_one}
+    if kind == "structural":
+        losses[kind] = 200.0 * on_one
+    exact = complex_modes(
+        replace(chain().system("all"), mass=np.eye(2), stiffness=stiffness, dofs=("m1.z", "m2.z"),
+                modal_damping_ratio=0.0, **losses)
     )  # fmt: skip
-    exact = complex_modes(on_one)
-    ratio = coefficient / (2 * 2 * np.pi * exact.frequency_hz)
     measured = MeasuredModes(
-        "all", exact.frequency_hz, 1e-5 * exact.frequency_hz, ratio, 0.01 * ratio, exact.shapes.T,
-        np.full((2, 2), 1e-5), (Dof.parse("m1.z"), Dof.parse("m2.z")), band_hz=(1.0, 100.0),
+        "all", exact.frequency_hz, 1e-5 * exact.frequency_hz, exact.damping_ratio, 0.01 * exact.damping_ratio,
+        exact.shapes.T, np.full((2, 2), 1e-5), (Dof.parse("m1.z"), Dof.parse("m2.z")), band_hz=(1.0, 100.0),
     )  # fmt: skip
     data = prepare(measured)
     assert data.imaginary is not None
-    np.testing.assert_allclose(np.abs(data.imaginary), data.lag_unit, rtol=0.05)
+    less = 3**-0.25  # root of the ratio of both frequencies
+    part = [[less], [1.0]] if kind == "damping" else [[1.0], [less]]
+    np.testing.assert_allclose(np.abs(data.imaginary), data.lag_unit * part, rtol=0.05)
 
 
 def test_close_modes_and_those_of_one_sensor_are_compared_by_real_shapes_alone() -> None:
@@ -1167,7 +1174,9 @@ def test_damping_that_scatters_takes_the_rigs_own_dampers_along() -> None:
     problem = observations.problem([], {})
     found = descend(problem, scatters, problem.start(), steps=60)
     assert found.error < 0.85
-    _derivatives_are_exact(problem, found.x, scatters, [n for n in problem.unknowns.names if "damp" in n])
+    at = found.x.copy()  # how two modes turn whose poles coincide is bounded: a little apart it is exact
+    at[problem.unknowns.index[f"damping of measured mode 3 of {configuration}"]] += 0.1
+    _derivatives_are_exact(problem, at, scatters, [n for n in problem.unknowns.names if "damp" in n])
 
 
 def _derivatives_are_exact(
