@@ -23,6 +23,8 @@ MINIMUM_SAMPLES = 64
 """A shorter record holds no hit with a spectrum worth the name."""
 
 LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 1e-3, 1e9
+SLOWEST_UNSTATED_HZ = 64.0
+"""Sample rate up to which times of no stated unit may as well be milliseconds, of 64 kHz."""
 """From one sample in a quarter of an hour, slower than any structure, to the fastest converters."""
 
 LARGEST_VOLTAGE = 1000.0
@@ -251,6 +253,11 @@ def _sample_rate(test: TestDescription, raw: RawRecord, where: str) -> float:
         raise EmaError(
             f"{where}: its time stamps are too coarse to tell the sample rate ({found:.4g} Hz to within "
             f"{raw.rate_tolerance:.1%}); add sample_rate_hz to {test.file}"
+        )
+    if stated is None and found is not None and raw.seconds_assumed and found < SLOWEST_UNSTATED_HZ:
+        raise EmaError(
+            f"{where}: its time column, read as seconds, tells {found:.4g} Hz; write its unit in its name (time_ms) or "
+            f"add sample_rate_hz to {test.file}"
         )
     tolerance = max(RATE_TOLERANCE, raw.rate_tolerance)
     if stated is not None and found is not None and abs(found / stated - 1) > tolerance:

@@ -128,6 +128,24 @@ def test_records_that_do_not_decay_start_at_the_blow_and_decayed_ones_stay_whole
     assert trim_hits((whole,), [cut], HitSettings(trim="none")) == (whole,)
 
 
+def test_a_hit_at_the_end_of_its_record_spoils_no_test_that_rings_on() -> None:
+    usual = recording([0.03], [50.0], 0.13)
+    others = [replace(usual, file=f"{k}.csv") for k in range(3)]
+    hits = hits_of_test([*others, replace(recording([0.122], [50.0], 0.13), file="late.csv")])
+    assert [h.accepted for h in hits] == [True, True, True, False]
+    assert "to the next hit or the end, the test uses" in hits[-1].reason
+    assert hits[0].stop - hits[0].start > 0.09 * RATE
+
+
+def test_a_record_that_begins_within_the_blow_is_told_as_that() -> None:
+    rng = np.random.default_rng(0)
+    force = 0.02 * rng.standard_normal(4000)
+    force[:4] += [50.0, 30.0, -4.0, 2.0]
+    (hit,) = hits_of_test([record_of(force, 0.1 * rng.standard_normal((1, 4000)), 2560.0)])
+    assert not hit.accepted
+    assert "does the record begin or end within the blow?" in hit.reason
+
+
 def test_trimmed_hits_start_alike_and_keep_every_pulse_whole() -> None:
     """The soft tip's pulse of 16 ms begins long before its peak, the hard tip's of 1 ms shortly before."""
     pulses = [

@@ -219,6 +219,22 @@ def test_a_uff_label_counts_as_the_files_own_unit(tmp_path: Path) -> None:
     assert "hit.uff: channel 'hammer': the file is in 'V'" in message_of(folder)
 
 
+def test_times_of_no_stated_unit_that_may_be_milliseconds_are_refused(tmp_path: Path) -> None:
+    folder = make_test(tmp_path, DESCRIPTION.replace("sample_rate_hz = 2048", ""))
+    seconds = (folder / "hit1.csv").read_text("utf-8").splitlines()[1:]
+    rows = [f"{1e3 * float(r.partition(',')[0]):.9g},{r.partition(',')[2]}" for r in seconds]
+    names = ",".join(["{time}", *DATA])
+    for time, said in (
+        ("time", "read as seconds, tells 2.048 Hz; write its unit in its name"),
+        ("time_ms", ""),
+    ):
+        (folder / "hit1.csv").write_text("\n".join([names.format(time=time), *rows]) + "\n", "utf-8")
+        if said:
+            assert said in message_of(folder)
+        else:
+            assert load(folder).sample_rate_hz == pytest.approx(2048.0)
+
+
 def test_without_any_sample_rate_the_record_is_refused(tmp_path: Path) -> None:
     folder = make_test(tmp_path, DESCRIPTION.replace("sample_rate_hz = 2048", ""))
     write_csv(folder / "hit1.csv", DATA, with_time=False)

@@ -618,6 +618,15 @@ value = "loss"
         load_rig(write(tmp_path, text))
 
 
+def test_a_mass_that_is_listed_twice_is_taken_for_a_slip(tmp_path: Path) -> None:
+    mass = '[[masses]]\nat = "m.x"\nvalue = 1.0\n'
+    spring = '[[springs]]\nat = "m.x"\nvalue = 1e4\n'
+    with pytest.raises(EmaError, match="line 4: the same mass is listed twice"):
+        load_rig(write(tmp_path, mass + mass + spring))
+    named = load_rig(write(tmp_path, mass + 'name = "plate"\n' + mass + spring))
+    assert named.system("default").mass[0, 0] == 2.0
+
+
 def test_a_model_without_a_mode_that_vibrates_says_what_to_correct(tmp_path: Path) -> None:
     text = '[[masses]]\nat = "m.x"\nvalue = 1.0\n[[springs]]\nat = "m.x"\nvalue = 1e4\n'
     rig = load_rig(write(tmp_path, text + '[[dampers]]\nat = "m.x"\nvalue = 1e6\n'))

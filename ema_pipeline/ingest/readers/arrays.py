@@ -124,7 +124,7 @@ def assemble(
         numbers = values.astype(np.float64, copy=False)
         if values.ndim == 1 and is_time_name(array.name):
             scale = time_unit_scale(array.name, _text(array.attributes, _UNIT_KEYS))
-            rates.add(label, *rate_from_times(numbers * scale))
+            rates.add(label, *rate_from_times(numbers * (scale or 1.0)))
         elif values.ndim == 1:
             columns.append(_Column(array.path, numbers, array.attributes))
         elif values.ndim == 2:

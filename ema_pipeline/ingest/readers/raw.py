@@ -142,12 +142,15 @@ class RawRecord:
         What the reader had to decide, one plain sentence each.
     rate_tolerance : float
         Relative uncertainty of the sample rate where it comes from rounded times.
+    seconds_assumed : bool
+        True where it comes from times of no stated unit.
     """
 
     channels: dict[str, RawChannel]
     sample_rate_hz: float | None = None
     notes: tuple[str, ...] = ()
     rate_tolerance: float = 0.0
+    seconds_assumed: bool = False
 
     def in_memory(self) -> RawRecord:
         """The same with all samples read, for a file that will not stay."""

@@ -314,6 +314,7 @@ def _channels(table: NDArray[np.float64], preamble: Preamble) -> RawRecord:
     notes = list(preamble.notes)
     rate = preamble.sample_rate_hz
     times: NDArray[np.float64] | None = None
+    scale: float | None = 1.0
     channels: dict[str, RawChannel] = {}
     for i, (name, unit) in enumerate(zip(preamble.names, preamble.units, strict=True)):
         samples = np.ascontiguousarray(table[:, i])
@@ -323,7 +324,8 @@ def _channels(table: NDArray[np.float64], preamble: Preamble) -> RawRecord:
         elif ramp and (is_index_name(name) or (unit is None and _counts(samples))):
             notes.append(f"column '{name}' is a running number and is left out")
         elif times is None and (is_time_name(name) or (ramp and _could_be_time(unit))):
-            times = samples * time_unit_scale(name, unit)
+            scale = time_unit_scale(name, unit)
+            times = samples * (scale or 1.0)
         elif name in channels:
             raise EmaError(f"two columns have the name '{name}'; rename one in the file")
         else:
@@ -340,7 +342,7 @@ def _channels(table: NDArray[np.float64], preamble: Preamble) -> RawRecord:
             )
     if not channels:
         raise EmaError("holds no channel beside time; export one column per channel")
-    return RawRecord(channels, rate, tuple(notes), tolerance)
+    return RawRecord(channels, rate, tuple(notes), tolerance, scale is None)
 
 
 def _counts(samples: NDArray[np.float64]) -> bool:

@@ -52,13 +52,13 @@ def is_uniform_ramp(values: NDArray[np.float64]) -> bool:
     return bool(np.all(np.diff(values) > 0) and np.max(np.abs(values - line)) < 0.1 * step)
 
 
-def time_unit_scale(name: str, unit: str | None) -> float:
-    """Seconds per unit of a time column, from its unit or its name (``time_ms``); seconds where silent."""
+def time_unit_scale(name: str, unit: str | None) -> float | None:
+    """Seconds per unit of a time column, from its unit or its name (``time_ms``); None where silent."""
     for label in (unit, re.split(r"[ _-]", name.strip())[-1]):
         found = find_unit(label) if label else None
         if found is not None and found.quantity == "time":
             return found.scale
-    return 1.0
+    return None
 
 
 def rate_from_times(times: NDArray[np.float64]) -> tuple[float | None, float]:
