@@ -23,9 +23,10 @@ MINIMUM_SAMPLES = 64
 """A shorter record holds no hit with a spectrum worth the name."""
 
 LOWEST_RATE_HZ, HIGHEST_RATE_HZ = 1e-3, 1e9
+"""From one sample in a quarter of an hour, slower than any structure, to the fastest converters."""
+
 SLOWEST_UNSTATED_HZ = 64.0
 """Sample rate up to which times of no stated unit may as well be milliseconds, of 64 kHz."""
-"""From one sample in a quarter of an hour, slower than any structure, to the fastest converters."""
 
 LARGEST_VOLTAGE = 1000.0
 """V; inputs for vibration sensors take 10 V, the largest of measuring systems some hundred."""
