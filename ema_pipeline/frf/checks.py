@@ -195,13 +195,13 @@ def _driving_points(frfs: FrfSet, inside: slice, settings: FrfSettings) -> list[
         if crossed <= limit and not told & {one, other}:
             told |= {one, other}
             verdicts.append(_exchanged(frfs, one, other, max(wrong[one], wrong[other]), limit))
-    driver = "force" if frfs.excitation else "hammer"
+    driver, keys = ("force", "'dof'") if frfs.excitation else ("hammer", "'impact' and 'dof'")
     for o in sorted(set(own) - told):
         output = frfs.outputs[o]
         if wrong[o] > REVERSED:
             what = f"point the wrong way; sensor or {driver} is reversed, put '-' before its dof"
         else:
-            what = f"differ in sign; {driver} and sensor are not at one point"
+            what = f"differ in sign; {driver} and sensor are not at one point: look up {keys} in test.toml"
         fault, name = f"driving point {output}: resonances {what}", f"{output} over {output}"
         passes = wrong[o] <= limit
         verdicts.append(

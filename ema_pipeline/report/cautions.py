@@ -162,7 +162,8 @@ def _of_configuration(c: ConfigurationResults) -> Iterator[tuple[Weight, str]]:
             yield Weight.SCALE, f"the {what} is not calibrated: FRFs and shapes have no absolute scale"
         for v in c.frfs.verdicts:
             if not v.passes and not _of_sensor(v) and v.check not in (SIGN, POINT):
-                yield Weight.SCATTER, v.message or f"{v.check} fails"
+                weight = Weight.PAIR if v.check == "driving point" else Weight.SCATTER
+                yield weight, v.message or f"{v.check} fails"
         singles = int((c.frfs.hits == 1).sum())
         if singles:
             rests = "FRF rests" if singles == 1 else "FRFs rest"

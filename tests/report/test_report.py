@@ -27,6 +27,7 @@ from ema_pipeline.modal.circle.compare import average
 from ema_pipeline.number_text import format_percent, format_value, signed
 from ema_pipeline.report import plots as report_plots
 from ema_pipeline.report import style, summary, summary_files, tables, terminal
+from ema_pipeline.report.cautions import Weight
 from ema_pipeline.report.html import bokeh_script, report_html, write_report
 from ema_pipeline.report.name_text import words
 from ema_pipeline.report.page_top import page_top
@@ -488,6 +489,18 @@ def test_a_hit_of_another_point_heads_the_page_and_the_screen_and_comes_before_a
     assert verdict_line(results).startswith("A hit is suspected, see below. If it is right: ")
     assert next_lines(results, "OUT", "ema")[0].startswith("correct test.toml, then ema run ")
     assert not page_top(replace(run, sensitivities=())).doubt
+
+
+def test_a_driving_point_that_is_none_is_told_on_the_screen(run: RunResults) -> None:
+    """All hits of a point may be listed under another one, which no other hit contradicts."""
+    c = run.configurations[0]
+    assert c.frfs is not None
+    told = "driving point m3.x: resonances differ in sign; hammer and sensor are not at one point"
+    for check, shown in (("driving point", True), ("coherence", False)):
+        found = judged(check, 0.4, 0.2, False, "", "warn", told, channel="m3.x over m3.x")
+        odd = replace(c, frfs=replace(c.frfs, verdicts=(*c.frfs.verdicts, found)))
+        cautions = summary.cautions(replace(run, configurations=(odd,)), Weight.SCALE)
+        assert any(told in text for text in cautions) is shown
 
 
 def test_cautions_of_one_kind_are_counted_rather_than_all_written_out(run: RunResults) -> None:
