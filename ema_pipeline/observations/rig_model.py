@@ -185,30 +185,13 @@ class RigModel:
             solution = known[3] if known is not None and known[0] == key else None
             undamped = solved(matrices.dense) if solution is None else (solution.eigenvalues, solution.shapes)
             if undamped is not None:
-                matrices = self._with_powers(x, matrices, undamped[0])
-                if configuration in self.own_damping:
-                    matrices = self._with_own_damping(configuration, x, matrices, *undamped)
+                matrices = self._with_modal_damping(configuration, x, matrices, *undamped)
             if solution is None and undamped is not None:
                 solution = EigenSolution.of(matrices.dense, matrices.skew, matrices.damping_ratio, undamped)
             known = self._modes[configuration] = key, derivatives, matrices, solution
         return known[2], known[3]
 
-    def _with_powers(
-        self, x: NDArray[np.float64], matrices: Matrices, eigenvalues: NDArray[np.float64]
-    ) -> Matrices:
-        """The matrices with modal damping ratios that follow a power of the frequency, where they do.
-
-        Viscous losses of joints grow with the frequency, those to the ground fall (Rayleigh), hysteretic ones do
-        neither. The derivatives take frequencies for fixed in this.
-        """
-        if self.common_damping < 2:
-            return matrices
-        slopes = matrices.damping_log.copy()
-        above = 0.5 * np.log(np.maximum(eigenvalues, 1e-300)) - np.log(2 * np.pi * self.middle_hz)
-        slopes[1] = np.clip(above, -_FURTHEST, _FURTHEST)
-        return replace(matrices, damping_ratio=self._ratios(x, slopes), damping_log=slopes)
-
-    def _with_own_damping(
+    def _with_modal_damping(
         self,
         configuration: str,
         x: NDArray[np.float64],
@@ -216,23 +199,43 @@ class RigModel:
         eigenvalues: NDArray[np.float64],
         shapes: NDArray[np.float64],
     ) -> Matrices:
-        """The matrices with the damping ratios of the undamped modes that have one of their own.
+        """The matrices with damping ratios that differ from one undamped mode to the other, where they do.
 
-        What dampers of the rig add goes with them: row and column r of their matrix between undamped modes with the
-        root of the factor of mode r, which leaves it positive. The derivatives take undamped shapes for fixed in this.
+        Viscous losses of joints grow with the frequency, those to the ground fall (Rayleigh), hysteretic ones do
+        neither. The derivatives take undamped modes for fixed in this.
         """
-        at, slopes = self.common_damping, matrices.damping_log.copy()
+        has_own, slopes = configuration in self.own_damping, matrices.damping_log.copy()
+        if DAMPING_POWER in self.unknowns.index:
+            above = 0.5 * np.log(eigenvalues) - np.log(2 * np.pi * self.middle_hz)
+            slopes[1] = np.clip(above, -_FURTHEST, _FURTHEST)
+        elif not has_own:
+            return matrices
+        at = self.common_damping
         for name, own in self.own_damping.items():
             if name == configuration:
                 slopes[at : at + len(own.names)] = own.slopes(eigenvalues, shapes)
             at += len(own.names)
         matrices = replace(matrices, damping_ratio=self._ratios(x, slopes), damping_log=slopes)
+        return self._with_dampers_along(configuration, x, matrices, shapes) if has_own else matrices
+
+    def _with_dampers_along(
+        self,
+        configuration: str,
+        x: NDArray[np.float64],
+        matrices: Matrices,
+        shapes: NDArray[np.float64],
+    ) -> Matrices:
+        """The matrices with what dampers of the rig add, where modes have damping ratios of their own.
+
+        It goes with them: row and column r of the dampers' matrix between undamped modes with the root of the factor
+        of mode r, which leaves it positive.
+        """
         rig = self._without_effects(configuration, x) if self.effects else matrices.terms
         if DAMPING_MATRIX not in rig.by_kind or rig.dofs != matrices.terms.dofs:
             return matrices
-        own_log, logs = slopes.copy(), x[: self._logs]
+        own_log, logs = matrices.damping_log.copy(), x[: self._logs]
         own_log[: self.common_damping] = 0.0
-        root = np.exp(0.5 * (x[self._logs : self._logs + len(slopes)] @ own_log))
+        root = np.exp(0.5 * (x[self._logs : self._logs + len(own_log)] @ own_log))
         moved = matrices.dense[MASS] @ shapes
         added = rig.damping_scaled((moved * root) @ shapes.T)
         coefficient = added.scaled(logs)

@@ -150,10 +150,10 @@ def _check_names(file: ElementRigFile) -> None:
     for name, times in Counter(file.configurations).items():
         if times > 1:
             raise Mistake(("configurations",), f"configuration '{name}' is named twice; name it once")
-    known: set[str] = set()
     for i, mass in enumerate(file.masses):
         if not mass.name and mass in file.masses[:i]:
             raise Mistake(("masses", i), "the same mass is listed twice; take one out, or give both a name")
+    known: set[str] = set()
     for location, entry in file.entries():
         if entry.name in known:
             raise Mistake((*location, "name"), f"two elements are named '{entry.name}'; name them apart")

@@ -235,6 +235,16 @@ def test_times_of_no_stated_unit_that_may_be_milliseconds_are_refused(tmp_path: 
             assert load(folder).sample_rate_hz == pytest.approx(2048.0)
 
 
+def test_a_slow_rate_that_the_header_states_needs_no_unit_of_time(tmp_path: Path) -> None:
+    folder = make_test(tmp_path, DESCRIPTION.replace("sample_rate_hz = 2048", ""))
+    table = np.column_stack([np.arange(len(DATA["hammer"])) / 50, *DATA.values()])
+    rows = [",".join(["time", *DATA]), *(",".join(f"{v:.9g}" for v in row) for row in table)]
+    (folder / "hit1.csv").write_text("\n".join(["Sample rate: 50 Hz", *rows]) + "\n", "utf-8")
+    assert load(folder).sample_rate_hz == 50.0
+    (folder / "hit1.csv").write_text("\n".join(rows) + "\n", "utf-8")
+    assert "read as seconds, tells 50 Hz" in message_of(folder)
+
+
 def test_without_any_sample_rate_the_record_is_refused(tmp_path: Path) -> None:
     folder = make_test(tmp_path, DESCRIPTION.replace("sample_rate_hz = 2048", ""))
     write_csv(folder / "hit1.csv", DATA, with_time=False)

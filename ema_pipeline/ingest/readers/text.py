@@ -330,11 +330,11 @@ def _channels(table: NDArray[np.float64], preamble: Preamble) -> RawRecord:
             raise EmaError(f"two columns have the name '{name}'; rename one in the file")
         else:
             channels[name] = RawChannel(samples, unit)
-    tolerance = 0.0
+    tolerance, assumed = 0.0, False
     if times is not None:
         measured, rounding = rate_from_times(times)
         if rate is None:
-            rate, tolerance = measured, rounding
+            rate, tolerance, assumed = measured, rounding, scale is None
         elif measured is not None and abs(measured / rate - 1) > max(1e-3, rounding):
             raise EmaError(
                 f"contradicts itself: its header states {rate:.10g} Hz and its time column "
@@ -342,7 +342,7 @@ def _channels(table: NDArray[np.float64], preamble: Preamble) -> RawRecord:
             )
     if not channels:
         raise EmaError("holds no channel beside time; export one column per channel")
-    return RawRecord(channels, rate, tuple(notes), tolerance, scale is None)
+    return RawRecord(channels, rate, tuple(notes), tolerance, assumed)
 
 
 def _counts(samples: NDArray[np.float64]) -> bool:
