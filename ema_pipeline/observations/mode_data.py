@@ -47,6 +47,9 @@ _NEAR = 4.0
 """Half-widths within which modes are near: one that drifts from hit to hit has twins a little farther off than one."""
 _CLOSE = 3.0
 """Half-power bandwidths within which modes are close: further apart, one is below a sixth of its peak at another's."""
+_UNEVEN = 10.0
+"""Relative difference of the damping of parts that is seldom less, 0.1, over the usual share that identification mixes.
+"""
 _OVERLAP = 6.0
 """Half-widths within which one mode's shape may hold some of another's."""
 
@@ -248,7 +251,8 @@ class ModeData:
         """Modes whose shape identification may have mixed with that of another: mode, other one, and how much.
 
         What a fit mistakes of one resonance (drift, hits off their mark) goes to those that it overlaps: it falls with
-        their distance over the half-width.
+        their distance over the half-width. Parts that damp unevenly mix true shapes by √(ζᵣ ζₛ) |ζᵣ − ζₛ| /
+        (ln²(ωᵣ/ωₛ) + (ζᵣ − ζₛ)²), times their relative difference.
         """
         pairs = []
         width = np.nan_to_num(np.exp(self.log_damping))
@@ -258,7 +262,10 @@ class ModeData:
                 half = max(width[a], width[b])
                 apart = abs(self.log_frequency[a] - self.log_frequency[b]) / max(half, 1e-300)
                 if a != b and apart < _OVERLAP:
-                    pairs.append((int(a), int(b), float(1 / np.hypot(1.0, apart))))
+                    less = (width[a] + width[b] - half) / max(half, 1e-300)
+                    uneven = np.sqrt(less) * (1 - less) / (max(apart, 1.0) ** 2 + (1 - less) ** 2)
+                    share = np.hypot(1 / np.hypot(1.0, apart), _UNEVEN * uneven)
+                    pairs.append((int(a), int(b), float(share)))
         return tuple(pairs)
 
     @cached_property
