@@ -16,7 +16,7 @@ from ema_pipeline.observations.fitting import Fit, at_scatters, part_reach, with
 from ema_pipeline.observations.hit_residuals import LINEARISATION
 from ema_pipeline.observations.mode_problem import MIXING
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE
-from ema_pipeline.observations.parts import DAMPING_SCATTER
+from ema_pipeline.observations.parts import DAMPING_SCATTER, JOINT_DAMPING
 
 _OF_TESTS = (FREQUENCY, FREQUENCY_NOISE, SHAPE)
 """Scatters of what tests and models have wrong, and no parts. In 118 simulated tests of rigs without fault none was
@@ -192,8 +192,8 @@ def _squares_of_ratios(p: Posterior, usual: float) -> NDArray[np.float64]:
 
 
 def _squares_of_own_damping(p: Posterior, usual: float) -> NDArray[np.float64]:
-    """The same of modes whose damping is an unknown of its own."""
-    own = np.flatnonzero(p.unknowns.governed(DAMPING_SCATTER))
+    """The same of modes and joints whose damping is an unknown of its own."""
+    own = np.flatnonzero(p.unknowns.governed(DAMPING_SCATTER) | p.unknowns.governed(JOINT_DAMPING))
     if not len(own):
         return np.zeros(0)
     told = 1 - (p.std[own] / p.prior_std[own]) ** 2  # the share of it that the data tell

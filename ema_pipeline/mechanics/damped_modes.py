@@ -253,9 +253,9 @@ class DampedModes:
         turns = _product(turning.transpose(0, 2, 1), shared) + common[:, None] * _product(turning, share)
         force[:count] += pole * (log_frequency[:, :, None] * shared - turns)
         force[count:] = matrices.damping_log[:, :, None] * (pole * shared)
-        if matrices.own_damping is not None and matrices.own_log is not None:
-            by_mode, own = matrices.own_log[:, :, None], matrices.own_damping
-            force[count:] += 0.5 * pole * (by_mode * (own @ share) + own @ (by_mode * share))
+        for along, by_log in matrices.along_modal:
+            by_mode = by_log[:, :, None]
+            force[count:] += 0.5 * pole * (by_mode * (along @ share) + along @ (by_mode * share))
         _, damping, stiffness, structural = (shapes.T @ dense @ shapes for dense in matrices.dense)
         damping = damping + shapes.T @ matrices.skew @ shapes + np.diag(common)
         whole = pole[:, None, None] * damping + (stiffness + 1j * structural)

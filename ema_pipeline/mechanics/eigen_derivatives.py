@@ -276,9 +276,8 @@ def _with_ratios(
         return np.concatenate([array[:at], new, array[at:]])
 
     own = logs[:, modes] * matrices.damping_ratio[modes]
-    if matrices.own_damping is not None and matrices.own_log is not None:
-        by_dampers = np.diag(matrices.own_damping) / (2 * np.sqrt(solution.eigenvalues))
-        own += matrices.own_log[:, modes] * by_dampers[modes]
+    for along, by_log in matrices.along_modal:
+        own += by_log[:, modes] * (np.diag(along) / (2 * np.sqrt(solution.eigenvalues)))[modes]
     return inserted(log_frequency, 0.0), inserted(ratio, own), inserted(shapes, 0.0), inserted(reduced, 0.0)
 
 

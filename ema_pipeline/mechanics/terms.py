@@ -111,11 +111,10 @@ class Matrices:
     by_shape : ndarray, (k, 4, n, n)
         Derivatives by effects' unknowns and geometric ones.
     skew_by_shape : ndarray, (k, n, n)
-    own_damping : ndarray, (n, n), optional
-        Part of the damping matrix, in coordinates of the undamped modes, that goes with their own damping ratios.
-    own_log : ndarray, (u, n), optional
-        Derivatives of the logarithm of its diagonal by the unknowns of `damping_log`; row r and column r go with the
-        root.
+    along_modal : tuple of (ndarray, (n, n), ndarray, (u, n))
+        Parts of the damping matrix, in coordinates of the undamped modes, that go with the damping ratios of these, and
+        the derivatives of the logarithms of their diagonals by the unknowns of `damping_log`; row r and column r go
+        with the root.
     """
 
     terms: Terms
@@ -126,8 +125,7 @@ class Matrices:
     damping_log: NDArray[np.float64]
     by_shape: NDArray[np.float64]
     skew_by_shape: NDArray[np.float64]
-    own_damping: NDArray[np.float64] | None = None
-    own_log: NDArray[np.float64] | None = None
+    along_modal: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...] = ()
 
 
 def assemble_terms(

@@ -272,7 +272,7 @@ class HitResiduals:
 
     def _assembly(self, x: NDArray[np.float64]) -> Assembly:
         model = self.problem.model
-        return model.assembly(self.data.configuration, x[model.shape_start : self.problem.modes.offset])
+        return model.assembly(self.data.configuration, x[model.edit_start : self.problem.modes.offset])
 
     def _displacement(
         self, x: NDArray[np.float64], match: NDArray[np.int64], on: NDArray[np.int64]

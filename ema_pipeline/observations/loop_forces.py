@@ -110,7 +110,7 @@ class IsolatorForce:
     def elements(self, x: NDArray[np.float64]) -> list[Stretched]:
         """Elements along the isolator's stretch at the model's unknowns `x`."""
         logs = x[: len(self.model.dependence.unknowns)]
-        assembly = self.model.assembly(self.isolator.configuration, x[self.model.shape_start :])
+        assembly = self.model.assembly(self.isolator.configuration, x[self.model.edit_start :])
         return [
             (_times(e, self.exponents.get(part_key(e)), logs), factor)
             for e, factor in self.isolator.elements(assembly)
@@ -145,7 +145,7 @@ class ForceAtPoint:
             row = self._force.exponents.get(part_key(element))
             if row is not None:
                 slopes[:, : len(row)] += np.outer(column, row)
-        for i in range(model.shape_start, len(self._x)):
+        for i in range(model.edit_start, len(self._x)):
             slopes[:, i] = self._difference(i)
         return slopes
 

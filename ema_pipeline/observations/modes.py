@@ -19,6 +19,7 @@ from ema_pipeline.observations.mode_problem import CALIBRATION, MIXING, ModeProb
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, UNEVEN_DAMPING
 from ema_pipeline.observations.parts import (
     DAMPING_SCATTER,
+    JOINT_DAMPING,
     MASS_SCATTER,
     MASS_STD,
     PART_SCATTER,
@@ -50,6 +51,13 @@ def scatters_of(rig: Rig) -> dict[str, Scatter]:
         Scatter(MIXING, "shapes of close modes along each other", 0.01, 1.0, 0.03, 5.0),
     )
     return {s.name: s for s in known}
+
+
+_BESIDE_JOINTS = {
+    JOINT_DAMPING: Scatter(JOINT_DAMPING, "ln of damping from joint to joint", 0.3, 0.5, 1.0, 5.0, 0.05),
+    UNEVEN_DAMPING: Scatter(UNEVEN_DAMPING, "damping from part to part", 0.3, 0.5, 1.0, 5.0, 0.1),
+}
+"""Where every joint's damping is an unknown of its own: what uneven damping does beside that is little."""
 
 
 class ModeObservations(Observations):
@@ -97,7 +105,7 @@ class ModeObservations(Observations):
         self.sensors = sensors or tuple(dict.fromkeys(d.point for one in data for d in one.dofs))
         self.channels = dict(channels or {})
         self.shared = shared or dependence(rig)
-        self.scatters = scatters_of(rig)
+        self.scatters = scatters_of(rig) | (_BESIDE_JOINTS if self.own_damping else {})
         self.sensing: dict[tuple[str, int], tuple[ModeData, Sensing]] = {}
         self._has: dict[tuple[str, Dof], bool] = {}
 
@@ -118,10 +126,11 @@ class ModeObservations(Observations):
         return ModeProblem(self, model)
 
     def suited(self, effects: Sequence[PlacedEffect]) -> ModeObservations:
-        """See `Observations`: where damping couples modes, each has a damping ratio of its own.
+        """See `Observations`: where damping couples modes, each has a damping ratio of its own, and so has every joint.
 
-        How much the damping of single modes scatters then shows in the shapes of close ones, too. Where nothing couples
-        them it shows in their damping ratios alone, which need no unknowns for that.
+        How much the damping of single modes scatters then shows in the shapes of close ones, too, and that of joints in
+        the phases of all. Where nothing couples them it shows in their damping ratios alone, which need no unknowns for
+        that.
         """
         model = RigModel(self.rig, effects, {}, self.shared)
         if self.own_damping or not any(model.couples(d.configuration) for d in self.data):

@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ema_pipeline.inference import Unknowns, joined
-from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Mass, Spring
+from ema_pipeline.mechanics.assembly import Assembly, Damper, Element, Mass, Row, Spring
 from ema_pipeline.rigs.types import Parameter, Rig
 
 DAMPING_SCATTER = "damping_scatter"
+JOINT_DAMPING = "joint_damping"
 PART_SCATTER = "part_scatter"
 MASS_SCATTER = "mass_scatter"
 STIFFNESS_STD = 0.02
@@ -51,6 +52,8 @@ class Dependence:
         Parameters among the unknowns.
     geometric : tuple of str
         Uncertain parameters that no element's value is a power of: with them the elements are built anew.
+    joints : ndarray of int, (j,)
+        Positions of the unknowns of springs without a damper beside them: what such a part loses is not in the rig.
     known : dict
         What models of the rig have found of their effects, for others with the same ones.
     """
@@ -59,6 +62,7 @@ class Dependence:
     elements: Mapping[str, Mapping[PartKey, NDArray[np.float64]]]
     families: tuple[str, ...]
     geometric: tuple[str, ...]
+    joints: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     known: dict[object, Any] = field(default_factory=dict, compare=False, repr=False)
 
     @cached_property
@@ -124,8 +128,24 @@ def dependence(rig: Rig) -> Dependence:
         ),
     )
     return Dependence(
-        unknowns, _rows(nominal, exponents, families, tuple(parts), len(names)), families, tuple(geometric)
+        unknowns,
+        _rows(nominal, exponents, families, tuple(parts), len(names)),
+        families,
+        tuple(geometric),
+        np.array([len(families) + i for i, key in enumerate(parts) if key in _joints(nominal)], np.int64),
     )
+
+
+def _joints(nominal: Mapping[str, Assembly]) -> set[PartKey]:
+    """Springs without a damper beside them."""
+    elements = [e for assembly in nominal.values() for e in assembly.elements]
+    damped = {_line(e.row) for e in elements if isinstance(e, Damper) and e.coefficient}
+    return {part_key(e) for e in elements if isinstance(e, Spring) and _line(e.row) not in damped}
+
+
+def _line(row: Row) -> frozenset[frozenset[tuple[str, float]]]:
+    """What is the same for a row and for the opposite one."""
+    return frozenset(frozenset((d, sign * x) for d, x in row.items()) for sign in (1.0, -1.0))
 
 
 def prior_std(parameter: Parameter) -> float:

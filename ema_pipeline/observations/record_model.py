@@ -320,7 +320,7 @@ class RecordModel:
     def memories(self) -> tuple[tuple[str, int], ...]:
         """Name and number of every element that has a memory, among the nonlinear ones."""
         assembly = self.rig_model.assembly(
-            self.basis.configuration, self._inner(self.start())[self.rig_model.shape_start :]
+            self.basis.configuration, self._inner(self.start())[self.rig_model.edit_start :]
         )
         return tuple((e.name, j) for j, e in enumerate(assembly.nonlinear) if coded_law(e)[0] in WITH_MEMORY)
 
@@ -334,7 +334,7 @@ class RecordModel:
 
     def _coded(self, x: NDArray[np.float64]) -> CodedElements:
         """The nonlinear elements, which only some unknowns change; those of the last points are cached."""
-        shape = self._inner(x)[self.rig_model.shape_start :]
+        shape = self._inner(x)[self.rig_model.edit_start :]
         key = shape.tobytes()
         if key not in self._known:
             if len(self._known) > _MOST_KNOWN:
@@ -349,9 +349,9 @@ class RecordModel:
         matrices = rig.matrices(self.basis.configuration, inner)
         change = matrix_derivatives(matrices)
         tangents = np.zeros((len(change), len(here.kinds)))
-        logs = len(change) - (self.offset - rig.shape_start)
-        columns = np.r_[0:logs, rig.shape_start : self.offset]
-        for k, i in enumerate(range(rig.shape_start, self.offset), start=logs):
+        logs = len(change) - (self.offset - rig.edit_start)
+        columns = np.r_[0:logs, rig.edit_start : self.offset]
+        for k, i in enumerate(range(rig.edit_start, self.offset), start=logs):
             low, high, step = self._ends(x, i)
             found.numbers[..., i] = (high.numbers - low.numbers) / step
             tangents[k] = (high.tangent - low.tangent) / step

@@ -35,6 +35,7 @@ from ema_pipeline.observations.parts import (
     DAMPING,
     DAMPING_POWER,
     DAMPING_SCATTER,
+    JOINT_DAMPING,
     Dependence,
     dependence,
     part_key,
@@ -48,6 +49,9 @@ _MOST_KNOWN = 2000
 """Effects of one rig, and models with them, of which terms are kept: those of some rankings."""
 _POWER_STD = 0.7
 """1 σ of the power of the frequency that damping ratios follow: 1 where joints are viscous, −1 where the ground is."""
+_NEAR = 0.5
+"""Half-widths within which joints turn two modes into each other so fast that no fit could follow: they are taken to
+damp both alike. What the shape of one holds of the other is an unknown of its own."""
 _FURTHEST = 3.0
 """Difference of ln f from the middle up to which they do: modes without stiffness have no ratio."""
 
@@ -56,7 +60,8 @@ class RigModel:
     """A rig, with effects on top of it, as a function of unknowns.
 
     The unknowns are, in this order: families, parts, the damping ratio of all modes, the power of the frequency that it
-    follows, and what those of single ones differ from it by (logarithms), geometric parameters, and the effects' sizes.
+    follows, what those of single ones and the losses of single joints differ from it by (logarithms), geometric
+    parameters, and the effects' sizes.
 
     Parameters
     ----------
@@ -68,7 +73,8 @@ class RigModel:
     shared : Dependence, optional
         Of the rig, where it is known already.
     own_damping : dict of str to OwnDamping, optional
-        Undamped modes whose damping ratios are unknowns of their own, by configuration.
+        Undamped modes whose damping ratios are unknowns of their own, by configuration; with them so are the losses of
+        joints.
     middle_hz : float
         Frequency about which damping ratios follow a power of the frequency; 0 where all are the same.
     """
@@ -85,6 +91,7 @@ class RigModel:
         self.rig, self.effects, self.own_damping = rig, tuple(effects), dict(own_damping or {})
         self.middle_hz = middle_hz
         self.dependence = shared or dependence(rig)
+        self._joints = self.dependence.joints if self.own_damping else self.dependence.joints[:0]
         given = scales or {}
         self.sizes = {
             one.parameter_name(p.name): SizeMap.of(p, given.get(one.parameter_name(p.name), p.scale))
@@ -119,6 +126,11 @@ class RigModel:
                 DAMPING_SCATTER,
             ),
             Unknowns.plain(
+                tuple(f"damping of {self.dependence.unknowns.names[i]}" for i in self._joints),
+                1.0,
+                JOINT_DAMPING,
+            ),
+            Unknowns.plain(
                 self.dependence.geometric,
                 [self.rig.parameters[g].tolerance for g in self.dependence.geometric],
             ),
@@ -133,6 +145,11 @@ class RigModel:
     @cached_property
     def shape_start(self) -> int:
         """Position of the first unknown by which matrices are differentiated as a whole."""
+        return self.edit_start - len(self._joints)
+
+    @cached_property
+    def edit_start(self) -> int:
+        """Position of the first unknown with which the elements change: geometry, then effects' sizes."""
         return len(self.unknowns) - len(self.dependence.geometric) - len(self.sizes)
 
     @property
@@ -216,7 +233,8 @@ class RigModel:
                 slopes[at : at + len(own.names)] = own.slopes(eigenvalues, shapes)
             at += len(own.names)
         matrices = replace(matrices, damping_ratio=self._ratios(x, slopes), damping_log=slopes)
-        return self._with_dampers_along(configuration, x, matrices, shapes) if has_own else matrices
+        matrices = self._with_dampers_along(configuration, x, matrices, shapes) if has_own else matrices
+        return self._with_joints(x, matrices, eigenvalues, shapes) if len(self._joints) else matrices
 
     def _with_dampers_along(
         self,
@@ -248,9 +266,40 @@ class RigModel:
             terms=Terms.joined([matrices.terms, added]),
             coefficient=np.concatenate([matrices.coefficient, coefficient]),
             dense=dense,
-            own_damping=along.T @ (coefficient[: len(on), None] * along),
-            own_log=own_log,
+            along_modal=(*matrices.along_modal, (along.T @ (coefficient[: len(on), None] * along), own_log)),
         )
+
+    def _with_joints(
+        self,
+        x: NDArray[np.float64],
+        matrices: Matrices,
+        eigenvalues: NDArray[np.float64],
+        shapes: NDArray[np.float64],
+    ) -> Matrices:
+        """The matrices with what joints lose more or less than the others.
+
+        The loss of a mode is that of the parts, each with its share of the strain energy (C. D. Johnson, D. A.
+        Kienholz, AIAA Journal 20 (1982) 1284-1290). What couples modes r and s is that at the geometric mean of both,
+        which leaves damping positive.
+        """
+        on = matrices.terms.matrix == STIFFNESS
+        stretch = (matrices.terms.rows[on] @ shapes) * np.sqrt(
+            2 * matrices.damping_ratio / np.sqrt(eigenvalues)
+        )
+        of_joint = matrices.coefficient[on, None] * matrices.terms.log[on][:, self._joints]
+        usual = np.einsum("tp,ta,tb->pab", of_joint, stretch, stretch, optimize=True)
+        near = _nearness(np.sqrt(eigenvalues), matrices.damping_ratio)
+        alike = np.diagonal(usual, axis1=1, axis2=2) @ (near / np.sum(near, axis=0))
+        usual *= 1 - near
+        usual += alike[:, None] * np.eye(len(near))
+        factor = np.exp(x[self.shape_start : self.edit_start])
+        added = np.tensordot(factor - 1, usual, 1)
+        moved, dense, by_shape = matrices.dense[MASS] @ shapes, matrices.dense.copy(), matrices.by_shape
+        dense[DAMPING_MATRIX] += moved @ added @ moved.T
+        if len(by_shape):
+            by_shape[: len(factor), DAMPING_MATRIX] = moved @ (factor[:, None, None] * usual) @ moved.T
+        along = (*matrices.along_modal, (added, matrices.damping_log))
+        return replace(matrices, dense=dense, along_modal=along)
 
     def _ratios(self, x: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Damping ratios of the undamped modes by the derivatives of their logarithms, (n,)."""
@@ -260,13 +309,16 @@ class RigModel:
 
     def matrices(self, configuration: str, x: NDArray[np.float64], derivatives: bool = True) -> Matrices:
         """Matrices of a configuration at `x`, and their derivatives by effects and geometry."""
-        logs, shape = x[: self._logs], x[self.shape_start :]
+        logs, shape = x[: self._logs], x[self.edit_start :]
         terms = self.terms(configuration, shape)
         slopes = np.zeros((self.shape_start - self._logs, len(terms.dofs)))
         slopes[: int(self.has_ratio)] = 1.0
         coefficient = terms.scaled(logs)
         dense = terms.dense(coefficient)
         by_shape, skew = self._by_shape(configuration, terms, logs, shape if derivatives else shape[:0])
+        if derivatives and len(self._joints):
+            none = np.zeros((len(self._joints), *by_shape.shape[1:]))
+            by_shape, skew = np.concatenate([none, by_shape]), np.concatenate([none[:, 0], skew])
         ratios = self._ratios(x, slopes)
         return Matrices(terms, coefficient, dense, terms.skew, ratios, slopes, by_shape, skew)
 
@@ -380,7 +432,7 @@ class RigModel:
 
     def _without_effects(self, configuration: str, x: NDArray[np.float64]) -> Terms:
         """Elements of the rig alone, its geometry at `x`."""
-        shape = x[self.shape_start :].copy()
+        shape = x[self.edit_start :].copy()
         shape[len(self.dependence.geometric) :] = 0.0  # of no effect: the same terms at all sizes
         return self._assembled(configuration, shape, frozenset(range(len(self.effects))))
 
@@ -392,7 +444,7 @@ class RigModel:
     def system(self, configuration: str, x: NDArray[np.float64]) -> LinearSystem:
         """The linear system of a configuration at `x`, every part with its own deviation."""
         matrices = self.matrices(configuration, x, derivatives=False)
-        assembly = self.assembly(configuration, x[self.shape_start :])
+        assembly = self.assembly(configuration, x[self.edit_start :])
         mass, damping, stiffness, structural = matrices.dense
         return LinearSystem(
             dofs=matrices.terms.dofs,
@@ -414,6 +466,13 @@ class RigModel:
         return np.array([d.sign * _row(assembly.row(d.point), assembly.dofs) for d in dofs]).reshape(
             len(dofs), len(assembly.dofs)
         )
+
+
+def _nearness(omega: NDArray[np.float64], ratio: NDArray[np.float64]) -> NDArray[np.float64]:
+    """1 where two undamped modes coincide, 0 where they are far apart, (n, n)."""
+    half_width = np.maximum(ratio * omega, 1e-300)
+    apart = np.subtract.outer(omega, omega) / (_NEAR * np.maximum.outer(half_width, half_width))
+    return np.asarray(1 / (1 + apart**4))
 
 
 _NOTHING = Unknowns.plain((), 1.0)

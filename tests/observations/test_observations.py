@@ -30,6 +30,7 @@ from ema_pipeline.observations.mode_problem import MIXING, ModeProblem
 from ema_pipeline.observations.mode_rows import SHAPE, SHAPE_NOISE
 from ema_pipeline.observations.modes import ModeObservations
 from ema_pipeline.observations.parts import (
+    JOINT_DAMPING,
     MASS_SCATTER,
     MASS_STD,
     PART_SCATTER,
@@ -1097,8 +1098,9 @@ def test_damping_ratios_that_differ_turn_the_shapes_of_coupled_modes() -> None:
     assert observations.suited([]) is observations
     own = observations.suited([effect])
     assert own.suited([effect]) is own
-    scatters = {n: s.default for n, s in observations.scatters.items()}
-    scatters |= {"shape_scatter": 1e-3, MIXING: 1e-6}  # mixed shapes would explain turned ones as well
+    scatters = {n: s.default for n, s in own.scatters.items()}
+    # mixed shapes and uneven joints would explain turned ones as well
+    scatters |= {"shape_scatter": 1e-3, MIXING: 1e-6, JOINT_DAMPING: 1e-3}
     costs, sizes = [], []
     for data in (observations, own):
         problem = data.problem([effect], {})
@@ -1114,7 +1116,10 @@ def test_damping_ratios_that_differ_turn_the_shapes_of_coupled_modes() -> None:
     common = found.value("modal_damping_ratio") + found.value("damping_power") * above
     assert np.array(told) + common == pytest.approx(np.log(factor)[to], abs=0.03)
     assert len(solution.frequency_hz) == len(factor)
-    _derivatives_are_exact(problem, found.x, scatters)
+    # what joints turn of close modes is followed from where they have turned them a little
+    of_joints = problem.unknowns.governed(JOINT_DAMPING)
+    names = [n for n, one in zip(problem.unknowns.names, of_joints, strict=True) if not one]
+    _derivatives_are_exact(problem, found.x, scatters, names)
 
 
 @pytest.mark.parametrize("effects", [(), ("damper@m1.z",)])
@@ -1126,9 +1131,9 @@ def test_damping_that_grows_with_the_frequency_is_no_scatter(effects: tuple[str,
     assert measured.damping_ratio is not None
     ratio = measured.damping_ratio * f / f[2]
     observations = observed(rig, {"all": replace(measured, damping_ratio=ratio, damping_std=0.02 * ratio)})
-    scatters = {n: s.default for n, s in observations.scatters.items()} | {"damping_scatter": 0.2}
     placed = [parse_effect(e, rig) for e in effects]
     one = observations.suited(placed)
+    scatters = {n: s.default for n, s in one.scatters.items()} | {"damping_scatter": 0.2}
     assert bool(one.own_damping) == bool(effects)
     problem = one.problem(placed, {})
     start = problem.start({f"{e}.coefficient": 10.0 for e in effects})
@@ -1143,6 +1148,61 @@ def test_damping_that_grows_with_the_frequency_is_no_scatter(effects: tuple[str,
         .problem([], {})
         .unknowns.index
     )
+
+
+UNEVEN = np.log([2.2, 0.7, 1.3, 0.5, 1.0, 0.8])
+
+
+def uneven_chain(loss: str, coefficient: float) -> MeasuredModes:
+    """Exact complex modes of the chain whose springs lose some 1 % times `UNEVEN`, by dampers or by loss factors, with
+    a damper at its third mass.
+    """
+    rig = chain()
+    system = rig.system("all")
+    springs = [e for e in rig.assembly("all").elements if isinstance(e, Spring)]
+    losses = {"damping": np.zeros_like(system.stiffness), "structural": np.zeros_like(system.stiffness)}
+    for spring, log in zip(springs, UNEVEN, strict=True):
+        row = np.array([spring.row.get(d, 0.0) for d in system.dofs])
+        losses[loss] += np.exp(log) * 0.02 * spring.stiffness * np.outer(row, row)
+    if loss == "damping":
+        losses[loss] /= np.sqrt(scipy.linalg.eigvalsh(system.stiffness, system.mass)[2])
+    losses["damping"][2, 2] += coefficient
+    exact = complex_modes(replace(system, modal_damping_ratio=0.0, **losses))
+    f, shapes = exact.frequency_hz, exact.shapes.T
+    return MeasuredModes(
+        "all", f, 1e-5 * f, exact.damping_ratio, 0.01 * exact.damping_ratio, shapes,
+        1e-4 * np.max(np.abs(shapes), axis=1, keepdims=True) + np.zeros(shapes.shape),
+        tuple(Dof.parse(d) for d in system.dofs), band_hz=(1.0, 1.1 * float(np.max(f))),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("loss", ["damping", "structural"])
+def test_what_every_joint_loses_is_told_from_phases_and_ratios(loss: str) -> None:
+    """Though the model knows of one ratio only, of viscous joints and hysteretic ones; and no damper is claimed for
+    them, nor one that there is missed.
+    """
+    rig, label = chain(), "damper@m3.coefficient"
+    damper = Model((parse_effect("damper@m3", rig),))
+    for coefficient in (0.0, 40.0):
+        observations = ModeObservations(rig, [prepare(uneven_chain(loss, coefficient))]).suited(
+            damper.effects
+        )
+        nothing, more = (learned(observations, fit_base(observations, m)) for m in (Model(), damper))
+        gain, fit = more.log_evidence - nothing.log_evidence, more if coefficient else nothing
+        assert gain > 10 if coefficient else gain < 0
+        found, problem = fit.posterior, fit.model.problem(observations)
+        if coefficient:
+            size = problem.parameter_values(found.x)[label]
+            std = size * found.std[found.unknowns.index[label]] / found.x[found.unknowns.index[label]]
+            assert size == pytest.approx(coefficient, abs=2.5 * std)
+            assert std < 0.2 * coefficient
+        at = np.flatnonzero(found.unknowns.governed(JOINT_DAMPING))
+        assert len(at) == len(UNEVEN)
+        off = found.x[at] - UNEVEN
+        off -= np.mean(off)  # what all have in common is the damping of the rig
+        assert np.all(np.abs(off) < np.minimum(3 * found.std[at], 0.15))
+        assert found.scatters[JOINT_DAMPING] == pytest.approx(np.std(UNEVEN), rel=0.5)
+        _derivatives_are_exact(problem, found.x, found.scatters)
 
 
 def test_damping_that_scatters_takes_the_rigs_own_dampers_along() -> None:
