@@ -257,7 +257,7 @@ def _sample_rate(test: TestDescription, raw: RawRecord, where: str) -> float:
         )
     if stated is None and found is not None and raw.seconds_assumed and found < SLOWEST_UNSTATED_HZ:
         raise EmaError(
-            f"{where}: its time column, read as seconds, tells {found:.4g} Hz; write its unit in its name (time_ms) or "
+            f"{where}: its times, read as seconds, tell {found:.4g} Hz; write their unit in their name (time_ms) or "
             f"add sample_rate_hz to {test.file}"
         )
     tolerance = max(RATE_TOLERANCE, raw.rate_tolerance)

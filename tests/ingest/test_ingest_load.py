@@ -225,7 +225,7 @@ def test_times_of_no_stated_unit_that_may_be_milliseconds_are_refused(tmp_path: 
     rows = [f"{1e3 * float(r.partition(',')[0]):.9g},{r.partition(',')[2]}" for r in seconds]
     names = ",".join(["{time}", *DATA])
     for time, said in (
-        ("time", "read as seconds, tells 2.048 Hz; write its unit in its name"),
+        ("time", "read as seconds, tell 2.048 Hz; write their unit in their name"),
         ("time_ms", ""),
     ):
         (folder / "hit1.csv").write_text("\n".join([names.format(time=time), *rows]) + "\n", "utf-8")
@@ -242,7 +242,7 @@ def test_a_slow_rate_that_the_header_states_needs_no_unit_of_time(tmp_path: Path
     (folder / "hit1.csv").write_text("\n".join(["Sample rate: 50 Hz", *rows]) + "\n", "utf-8")
     assert load(folder).sample_rate_hz == 50.0
     (folder / "hit1.csv").write_text("\n".join(rows) + "\n", "utf-8")
-    assert "read as seconds, tells 50 Hz" in message_of(folder)
+    assert "read as seconds, tell 50 Hz" in message_of(folder)
 
 
 def test_without_any_sample_rate_the_record_is_refused(tmp_path: Path) -> None:

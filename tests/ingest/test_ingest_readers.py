@@ -384,6 +384,25 @@ def test_mat_5_struct_with_a_time_vector(tmp_path: Path) -> None:
     check(path, rtol=0)
 
 
+@pytest.mark.parametrize(
+    ("beside", "assumed"),
+    [({"t": 1e3}, True), ({"t_ms": 1e3}, False), ({"t": 1.0, "fs": None}, False), ({"fs": None}, False)],
+)
+def test_times_of_no_stated_unit_are_marked_as_read_as_seconds(
+    tmp_path: Path, beside: dict[str, float | None], assumed: bool
+) -> None:
+    """Not where the file states its sample rate as well."""
+    stated = {n: RATE if unit is None else unit * np.arange(SAMPLES) / RATE for n, unit in beside.items()}
+    scipy.io.savemat(tmp_path / "hit.mat", {**DATA, **stated})
+    with h5py.File(tmp_path / "hit.h5", "w") as file:
+        for name, values in {**DATA, **stated}.items():
+            file[name] = values
+    for name in ("hit.h5", "hit.mat"):
+        raw = read_raw(tmp_path / name)
+        assert raw.seconds_assumed == assumed
+        assert raw.sample_rate_hz == pytest.approx(RATE / 1e3 if assumed else RATE)
+
+
 def test_mat_5_matrix_columns_are_numbered(tmp_path: Path) -> None:
     path = tmp_path / "hit.mat"
     scipy.io.savemat(path, {"acc": np.column_stack(list(DATA.values())), "dt": 1 / RATE})

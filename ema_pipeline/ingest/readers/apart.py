@@ -122,7 +122,8 @@ class _Helper:
             samples = self._samples(size) if stored is None else StoredSamples(file, stored, size)
             channels[channel["name"]] = RawChannel(samples, channel["unit"], channel["dof"])
         rate = answer["sample_rate_hz"]
-        return RawRecord(channels, rate, tuple(answer["notes"]), answer["rate_tolerance"])
+        notes, assumed = tuple(answer["notes"]), bool(answer["seconds_assumed"])
+        return RawRecord(channels, rate, notes, answer["rate_tolerance"], assumed)
 
     def _samples(self, size: int) -> NDArray[np.float64]:
         answers = cast(BufferedReader, self._process.stdout)

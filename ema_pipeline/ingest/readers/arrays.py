@@ -124,7 +124,7 @@ def assemble(
         numbers = values.astype(np.float64, copy=False)
         if values.ndim == 1 and is_time_name(array.name):
             scale = time_unit_scale(array.name, _text(array.attributes, _UNIT_KEYS))
-            rates.add(label, *rate_from_times(numbers * (scale or 1.0)))
+            rates.add(label, *rate_from_times(numbers * (scale or 1.0)), assumed=scale is None)
         elif values.ndim == 1:
             columns.append(_Column(array.path, numbers, array.attributes))
         elif values.ndim == 2:
@@ -135,7 +135,7 @@ def assemble(
     limits.check_channels(len(columns))
     columns = _without_housekeeping(columns, notes)
     columns, axis_rate = _one_axis(columns, rates.value, notes)
-    rates.add("axis columns", axis_rate)
+    rates.add("axis columns", axis_rate, assumed=True)
     unit_names = _listed(unit_names, columns)
     names = _listed(column_names, columns) or _shortest_unique([c.path for c in columns])
     channels = {
@@ -148,7 +148,7 @@ def assemble(
     }
     if len(channels) < len(columns):
         raise EmaError("two channels have the same name; rename one in the file")
-    return RawRecord(channels, rates.value, tuple(notes), rates.tolerance)
+    return RawRecord(channels, rates.value, tuple(notes), rates.tolerance, rates.assumed)
 
 
 class _Rates:
@@ -157,6 +157,7 @@ class _Rates:
     def __init__(self) -> None:
         self.value: float | None = None
         self.tolerance = 0.0
+        self.assumed = False
         self._source = ""
 
     def read(self, label: str, attributes: Mapping[str, Any]) -> None:
@@ -177,7 +178,7 @@ class _Rates:
                 )
             self.add(label, value if plain in _RATE_KEYS else whole_rate(value, 1e-9))
 
-    def add(self, label: str, rate: float | None, tolerance: float = 0.0) -> None:
+    def add(self, label: str, rate: float | None, tolerance: float = 0.0, *, assumed: bool = False) -> None:
         if rate is None:
             return
         if self.value is not None and abs(rate / self.value - 1) > max(1e-4, tolerance, self.tolerance):
@@ -185,6 +186,7 @@ class _Rates:
                 f"contradicts itself: sample rate {self.value:.10g} Hz ({self._source}) "
                 f"and {rate:.10g} Hz ({label}); correct the file"
             )
+        self.assumed = assumed and (self.value is None or self.assumed)
         if self.value is None or tolerance < self.tolerance:
             self.value, self.tolerance, self._source = rate, tolerance, label
 

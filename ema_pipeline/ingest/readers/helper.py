@@ -117,6 +117,7 @@ def _described(record: RawRecord) -> dict[str, Any]:
         "sample_rate_hz": record.sample_rate_hz,
         "notes": record.notes,
         "rate_tolerance": record.rate_tolerance,
+        "seconds_assumed": record.seconds_assumed,
     }
 
 
