@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ema_pipeline.errors import EmaError
+from ema_pipeline.ingest.description import DESCRIPTION_FILE
 from ema_pipeline.store import RESULTS_FILE
 
 SERIES_FILE, CHANGES_FILE = "series.db", "changes.json"
@@ -18,7 +19,7 @@ ANSWERS = {
 
 
 def check_answer_folder(folder: Path, own: str) -> None:
-    """Refuse a folder that holds an answer of another kind, whose report and tables would be replaced.
+    """Refuse a folder that holds an answer of another kind, whose report and tables would be replaced, or raw data.
 
     Parameters
     ----------
@@ -33,6 +34,8 @@ def check_answer_folder(folder: Path, own: str) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise EmaError(f"{folder}: is no folder; name another with --out")
+    if (folder / DESCRIPTION_FILE).is_file() and not (folder / own).is_file():
+        raise EmaError(f"{folder}: holds raw data, and results may replace files there; name another with --out")
     for name, words in ANSWERS.items():
         if name != own and (folder / name).is_file():
             raise EmaError(f"{folder}: holds {words}, whose report would be lost; name another with --out")

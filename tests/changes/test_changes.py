@@ -355,7 +355,14 @@ def test_the_answer_does_not_take_the_place_of_a_tests_own_report(
 ) -> None:
     before = _results(root, "before")
     (tmp_path / "note.txt").write_text("mine", encoding="utf-8")
-    for out, why in ((before, "holds the results of a test"), (tmp_path / "note.txt", "is no folder")):
+    raw = tmp_path / "raw"
+    raw.mkdir()
+    (raw / "test.toml").touch()
+    for out, why in (
+        (before, "holds the results of a test"),
+        (raw, "holds raw data"),
+        (tmp_path / "note.txt", "is no folder"),
+    ):
         code, _, err = ema(capsys, "changes", before, before, "--rig", "none", "--out", out)
         assert code == 1
         assert why in err
