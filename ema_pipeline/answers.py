@@ -35,7 +35,9 @@ def check_answer_folder(folder: Path, own: str) -> None:
     if folder.exists() and not folder.is_dir():
         raise EmaError(f"{folder}: is no folder; name another with --out")
     if (folder / DESCRIPTION_FILE).is_file() and not (folder / own).is_file():
-        raise EmaError(f"{folder}: holds raw data, and results may replace files there; name another with --out")
+        raise EmaError(
+            f"{folder}: holds raw data, and results may replace files there; name another with --out"
+        )
     for name, words in ANSWERS.items():
         if name != own and (folder / name).is_file():
             raise EmaError(f"{folder}: holds {words}, whose report would be lost; name another with --out")

@@ -135,8 +135,8 @@ class DampedModes:
     ) -> NDArray[np.complex128]:
         """Shares of the undamped modes, of these ω², that a little coupling of them adds to every shape, (n, n).
 
-        By gyroscopic coupling, by damping and by structural damping between them, (n, n) each. Damping turns close
-        modes into each other, which is no linear function of it: it is left out.
+        By gyroscopic coupling, by damping and by structural damping between them, (n, n) each, or (k, n, n) for k such
+        answers. Damping turns close modes into each other, which is no linear function of it: it is left out.
         """
         omega, pole = np.sqrt(values), self.poles[None, :]
         decay = self.damping_ratio * omega
@@ -182,9 +182,9 @@ class DampedModes:
         for kind, (on, rows) in terms.by_kind.items():
             square = matrices.coefficient[on, None] * (rows @ shape) ** 2
             change[: terms.log.shape[1]] += power[kind] * (terms.log[on].T @ square)
-        for k, kinds in enumerate(matrices.by_shape):
-            for kind, factor in power.items():
-                change[terms.log.shape[1] + k] += factor * np.sum(shape * (kinds[kind] @ shape), axis=0)
+        for k, kind in np.argwhere(matrices.shaped):
+            pushed = matrices.by_shape[k, kind] @ shape
+            change[terms.log.shape[1] + k] += power[kind] * np.sum(shape * pushed, axis=0)
         change += pole * common * log_frequency
         apart = every[:, None] - common[None, :]
         change -= 2 * pole * np.einsum("jsr,sr->jr", turning, self.shares[:, modes] * apart)
@@ -244,10 +244,10 @@ class DampedModes:
             pushed = power[kind] * matrices.coefficient[on, None] * (rows @ shape)
             along = (terms.log[on][:, :, None] * (rows @ shapes)[:, None, :]).reshape(len(on), logs * n)
             force[:logs] += _product(along.T, pushed).reshape(logs, n, len(modes))
-        for j, kinds in enumerate(matrices.by_shape):
-            total = pole * (matrices.skew_by_shape[j] @ shape)
-            total += sum(factor * (kinds[kind] @ shape) for kind, factor in power.items())
-            force[logs + j] = shapes.T @ total
+        for j, kind in np.argwhere(matrices.shaped):
+            force[logs + j] += shapes.T @ (power[kind] * (matrices.by_shape[j, kind] @ shape))
+        for j in np.flatnonzero(np.any(matrices.skew_by_shape, axis=(1, 2))):
+            force[logs + j] += shapes.T @ (pole * (matrices.skew_by_shape[j] @ shape))
         # The damping of undamped modes goes with their frequencies and turns with their shapes.
         shared = common[:, None] * share
         turns = _product(turning.transpose(0, 2, 1), shared) + common[:, None] * _product(turning, share)

@@ -213,17 +213,19 @@ def _with_lag(
 
     Of no size yet they couple nothing, and shapes lag behind with them all the same.
     """
-    kinds = matrices.by_shape[:, [DAMPING_MATRIX, STRUCTURAL]]
-    lag = np.flatnonzero(np.any(kinds, axis=(1, 2, 3)) | np.any(matrices.skew_by_shape, axis=(1, 2)))
+    losses = [DAMPING_MATRIX, STRUCTURAL]
+    lag = np.flatnonzero(
+        np.any(matrices.shaped[:, losses], axis=1) | np.any(matrices.skew_by_shape, axis=(1, 2))
+    )
     if not len(lag):
         return shapes
     damped = solution.damped or DampedModes.uncoupled(
         solution.frequency_hz, solution.damping_ratio, solution.shapes
     )
     found, at, phi = shapes.astype(complex), matrices.terms.log.shape[1], solution.shapes
-    for j in lag:
-        skew, damping, structural = (phi.T @ of @ phi for of in (matrices.skew_by_shape[j], *kinds[j]))
-        found[at + j] += phi @ damped.lag(skew, damping, structural, solution.eigenvalues)[:, modes]
+    by_loss = (matrices.skew_by_shape[lag], *(matrices.by_shape[lag, kind] for kind in losses))
+    skew, damping, structural = (phi.T @ of @ phi for of in by_loss)
+    found[at + lag] += phi @ damped.lag(skew, damping, structural, solution.eigenvalues)[:, :, modes]
     return found
 
 

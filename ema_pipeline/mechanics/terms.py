@@ -127,6 +127,11 @@ class Matrices:
     skew_by_shape: NDArray[np.float64]
     along_modal: tuple[tuple[NDArray[np.float64], NDArray[np.float64]], ...] = ()
 
+    @cached_property
+    def shaped(self) -> NDArray[np.bool_]:
+        """Which kinds of matrices the unknowns of `by_shape` change, (k, 4)."""
+        return np.asarray(np.any(self.by_shape, axis=(2, 3)))
+
 
 def assemble_terms(
     assembly: Assembly,
