@@ -46,7 +46,8 @@ class FirstOrderModel(RigModel):
         configurations: Sequence[str],
         x: NDArray[np.float64],
     ) -> None:
-        super().__init__(model.rig, model.effects, None, model.dependence, model.own_damping, model.middle_hz)
+        damping = model.own_damping, model.middle_hz, model.joints
+        super().__init__(model.rig, model.effects, None, model.dependence, *damping)
         self._model = model
         self._further: dict[str, list[NDArray[np.float64]]] = {c: [] for c in configurations}
         together = []

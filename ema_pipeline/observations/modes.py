@@ -80,6 +80,8 @@ class ModeObservations(Observations):
         Undamped modes whose damping ratios are unknowns of their own, by configuration.
     middle_hz : float
         See `RigModel`; that of `data` where left out.
+    joints : bool
+        See `RigModel`.
 
     Attributes
     ----------
@@ -98,14 +100,15 @@ class ModeObservations(Observations):
         test: str = "",
         own_damping: Mapping[str, OwnDamping] | None = None,
         middle_hz: float = 0.0,
+        joints: bool = False,
     ) -> None:
-        self.rig, self.test, self.own_damping = rig, test, dict(own_damping or {})
+        self.rig, self.test, self.own_damping, self.joints = rig, test, dict(own_damping or {}), joints
         self.data = tuple(d for d in data if len(d))
         self.middle_hz = middle_hz or _middle_hz(self.data)
         self.sensors = sensors or tuple(dict.fromkeys(d.point for one in data for d in one.dofs))
         self.channels = dict(channels or {})
         self.shared = shared or dependence(rig)
-        self.scatters = scatters_of(rig) | (_BESIDE_JOINTS if self.own_damping else {})
+        self.scatters = scatters_of(rig) | (_BESIDE_JOINTS if joints else {})
         self.sensing: dict[tuple[str, int], tuple[ModeData, Sensing]] = {}
         self._has: dict[tuple[str, Dof], bool] = {}
 
@@ -122,21 +125,25 @@ class ModeObservations(Observations):
 
     def problem(self, effects: Sequence[PlacedEffect], scales: Mapping[str, float]) -> ModeProblem:
         """See `Observations`."""
-        model = RigModel(self.rig, effects, scales, self.shared, self.own_damping, self.middle_hz)
-        return ModeProblem(self, model)
+        damping = self.own_damping, self.middle_hz, self.joints
+        return ModeProblem(self, RigModel(self.rig, effects, scales, self.shared, *damping))
 
     def suited(self, effects: Sequence[PlacedEffect]) -> ModeObservations:
-        """See `Observations`: where damping couples modes, each has a damping ratio of its own, and so has every joint.
+        """See `Observations`: where damping or gyroscopic effects couple modes, each has a damping ratio of its own.
 
-        How much the damping of single modes scatters then shows in the shapes of close ones, too, and that of joints in
-        the phases of all. Where nothing couples them it shows in their damping ratios alone, which need no unknowns for
-        that.
+        How much the damping of single modes scatters then shows in the shapes of close ones, too. Where nothing couples
+        them it shows in their damping ratios alone, which need no unknowns for that. Beside dampers, every joint has a
+        loss of its own as well: both show in phases.
         """
         model = RigModel(self.rig, effects, {}, self.shared)
-        if self.own_damping or not any(model.couples(d.configuration) for d in self.data):
+        coupled = [model.couples(d.configuration) for d in self.data]
+        joints = self.joints or any(by_dampers for by_dampers, _ in coupled)
+        if not any(map(any, coupled)) or (self.own_damping and joints == self.joints):
             return self
-        own = {d.configuration: OwnDamping(d, model.sensor_rows(d.configuration, d.dofs)) for d in self.data}
-        return self._with(self.data, own)
+        own = self.own_damping or {
+            d.configuration: OwnDamping(d, model.sensor_rows(d.configuration, d.dofs)) for d in self.data
+        }
+        return self._with(self.data, own, joints)
 
     def without_lag(self) -> ModeObservations:
         """The same without imaginary parts of shapes that are compared as real ones, see `ModeData.lagging`."""
@@ -146,12 +153,13 @@ class ModeObservations(Observations):
 
     def with_data(self, data: Sequence[ModeData]) -> ModeObservations:
         """The same rig and channels with other modes."""
-        return self._with(data, self.own_damping)
+        return self._with(data, self.own_damping, self.joints)
 
-    def _with(self, data: Sequence[ModeData], own_damping: Mapping[str, OwnDamping]) -> ModeObservations:
-        return ModeObservations(
-            self.rig, data, self.channels, self.shared, self.sensors, self.test, own_damping, self.middle_hz
-        )
+    def _with(
+        self, data: Sequence[ModeData], own_damping: Mapping[str, OwnDamping], joints: bool
+    ) -> ModeObservations:
+        known, damping = (self.channels, self.shared, self.sensors, self.test), (own_damping, self.middle_hz)
+        return ModeObservations(self.rig, data, *known, *damping, joints)
 
     def holding_out_explained(self, found: Residuals) -> ModeObservations:
         """See `Observations`."""

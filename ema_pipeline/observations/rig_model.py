@@ -73,10 +73,11 @@ class RigModel:
     shared : Dependence, optional
         Of the rig, where it is known already.
     own_damping : dict of str to OwnDamping, optional
-        Undamped modes whose damping ratios are unknowns of their own, by configuration; with them so are the losses of
-        joints.
+        Undamped modes whose damping ratios are unknowns of their own, by configuration.
     middle_hz : float
         Frequency about which damping ratios follow a power of the frequency; 0 where all are the same.
+    joints : bool
+        True where the losses of single joints are unknowns, too; beside `own_damping`.
     """
 
     def __init__(
@@ -87,11 +88,12 @@ class RigModel:
         shared: Dependence | None = None,
         own_damping: Mapping[str, OwnDamping] | None = None,
         middle_hz: float = 0.0,
+        joints: bool = False,
     ) -> None:
         self.rig, self.effects, self.own_damping = rig, tuple(effects), dict(own_damping or {})
-        self.middle_hz = middle_hz
+        self.middle_hz, self.joints = middle_hz, joints
         self.dependence = shared or dependence(rig)
-        self._joints = self.dependence.joints if self.own_damping else self.dependence.joints[:0]
+        self._joints = self.dependence.joints if joints else self.dependence.joints[:0]
         given = scales or {}
         self.sizes = {
             one.parameter_name(p.name): SizeMap.of(p, given.get(one.parameter_name(p.name), p.scale))
@@ -436,10 +438,10 @@ class RigModel:
         shape[len(self.dependence.geometric) :] = 0.0  # of no effect: the same terms at all sizes
         return self._assembled(configuration, shape, frozenset(range(len(self.effects))))
 
-    def couples(self, configuration: str) -> bool:
-        """True where dampers, losses or gyroscopic effects couple the modes, with the effects at their start values."""
+    def couples(self, configuration: str) -> tuple[bool, bool]:
+        """Whether dampers or losses, and whether gyroscopic effects couple the modes, at the effects' start values."""
         m = self.matrices(configuration, self.start(), derivatives=False)
-        return bool(np.any(m.dense[[DAMPING_MATRIX, STRUCTURAL]]) or np.any(m.skew))
+        return bool(np.any(m.dense[[DAMPING_MATRIX, STRUCTURAL]])), bool(np.any(m.skew))
 
     def system(self, configuration: str, x: NDArray[np.float64]) -> LinearSystem:
         """The linear system of a configuration at `x`, every part with its own deviation."""

@@ -1099,7 +1099,7 @@ def test_damping_ratios_that_differ_turn_the_shapes_of_coupled_modes() -> None:
     own = observations.suited([effect])
     assert own.suited([effect]) is own
     scatters = {n: s.default for n, s in own.scatters.items()}
-    # mixed shapes and uneven joints would explain turned ones as well
+    # mixed shapes and, beside dampers, uneven joints would explain turned ones as well
     scatters |= {"shape_scatter": 1e-3, MIXING: 1e-6, JOINT_DAMPING: 1e-3}
     costs, sizes = [], []
     for data in (observations, own):
