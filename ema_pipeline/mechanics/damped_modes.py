@@ -135,8 +135,8 @@ class DampedModes:
     ) -> NDArray[np.complex128]:
         """Shares of the undamped modes, of these ω², that a little coupling of them adds to every shape, (n, n).
 
-        By gyroscopic coupling, by damping and by structural damping between them, (n, n) each, or (k, n, n) for k such
-        answers. Damping turns close modes into each other, which is no linear function of it: it is left out.
+        By gyroscopic coupling, by damping and by structural damping between them, (n, n) each, or (k, n, n) of k
+        unknowns. Damping turns close modes into each other, which is no linear function of it: it is left out.
         """
         omega, pole = np.sqrt(values), self.poles[None, :]
         decay = self.damping_ratio * omega

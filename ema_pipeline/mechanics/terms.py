@@ -109,7 +109,7 @@ class Matrices:
     damping_log : ndarray, (u, n)
         Derivatives of its logarithm by the unknowns that it depends on.
     by_shape : ndarray, (k, 4, n, n)
-        Derivatives by effects' unknowns and geometric ones.
+        Derivatives by unknowns that change whole matrices: losses of joints, geometry and effects' sizes.
     skew_by_shape : ndarray, (k, n, n)
     along_modal : tuple of (ndarray, (n, n), ndarray, (u, n))
         Parts of the damping matrix, in coordinates of the undamped modes, that go with the damping ratios of these, and

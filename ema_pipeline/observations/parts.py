@@ -118,6 +118,7 @@ def dependence(rig: Rig) -> Dependence:
     parts = _parts(rig, nominal, exponents)
     families = tuple(exponents)
     names = (*families, *(f"{key[1]} ({key[0].__name__.lower()})" for key in parts))
+    joints = _joints(nominal)
     unknowns = joined(
         Unknowns.plain(
             families, [prior_std(rig.parameters[f]) for f in families], "", *_bounds(rig, families)
@@ -132,7 +133,7 @@ def dependence(rig: Rig) -> Dependence:
         _rows(nominal, exponents, families, tuple(parts), len(names)),
         families,
         tuple(geometric),
-        np.array([len(families) + i for i, key in enumerate(parts) if key in _joints(nominal)], np.int64),
+        np.array([len(families) + i for i, key in enumerate(parts) if key in joints], np.int64),
     )
 
 

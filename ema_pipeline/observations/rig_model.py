@@ -472,7 +472,7 @@ class RigModel:
 
 def _nearness(omega: NDArray[np.float64], ratio: NDArray[np.float64]) -> NDArray[np.float64]:
     """1 where two undamped modes coincide, 0 where they are far apart, (n, n)."""
-    half_width = np.maximum(ratio * omega, 1e-300)
+    half_width = np.maximum(ratio, 1e-9) * omega
     apart = np.subtract.outer(omega, omega) / (_NEAR * np.maximum.outer(half_width, half_width))
     return np.asarray(1 / (1 + apart**4))
 
