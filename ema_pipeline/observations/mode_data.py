@@ -262,7 +262,7 @@ class ModeData:
                 half = max(width[a], width[b])
                 apart = abs(self.log_frequency[a] - self.log_frequency[b]) / max(half, 1e-300)
                 if a != b and apart < _OVERLAP:
-                    less = (width[a] + width[b] - half) / max(half, 1e-300)
+                    less = min(width[a], width[b]) / max(half, 1e-300)
                     uneven = np.sqrt(less) * (1 - less) / (max(apart, 1.0) ** 2 + (1 - less) ** 2)
                     share = np.hypot(1 / np.hypot(1.0, apart), _UNEVEN * uneven)
                     pairs.append((int(a), int(b), float(share)))

@@ -135,10 +135,12 @@ class ModeObservations(Observations):
         them it shows in their damping ratios alone, which need no unknowns for that. Beside dampers, every joint has a
         loss of its own as well: both show in phases.
         """
+        if self.joints:
+            return self
         model = RigModel(self.rig, effects, {}, self.shared)
         coupled = [model.couples(d.configuration) for d in self.data]
-        joints = self.joints or any(by_dampers for by_dampers, _ in coupled)
-        if not any(map(any, coupled)) or (self.own_damping and joints == self.joints):
+        joints = any(by_dampers for by_dampers, _ in coupled)
+        if not joints and (self.own_damping or not any(skew for _, skew in coupled)):
             return self
         own = self.own_damping or {
             d.configuration: OwnDamping(d, model.sensor_rows(d.configuration, d.dofs)) for d in self.data

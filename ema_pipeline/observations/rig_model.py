@@ -19,10 +19,10 @@ from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Assembly, Row
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, solved
+from ema_pipeline.mechanics.modal_losses import with_dampers_along, with_joint_losses
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.mechanics.terms import (
     DAMPING_MATRIX,
-    MASS,
     STIFFNESS,
     STRUCTURAL,
     Matrices,
@@ -49,9 +49,6 @@ _MOST_KNOWN = 2000
 """Effects of one rig, and models with them, of which terms are kept: those of some rankings."""
 _POWER_STD = 0.7
 """1 σ of the power of the frequency that damping ratios follow: 1 where joints are viscous, −1 where the ground is."""
-_NEAR = 0.5
-"""Half-widths within which joints turn two modes into each other so fast that no fit could follow: they are taken to
-damp both alike. What the shape of one holds of the other is an unknown of its own."""
 _FURTHEST = 3.0
 """Difference of ln f from the middle up to which they do: modes without stiffness have no ratio."""
 
@@ -235,73 +232,14 @@ class RigModel:
                 slopes[at : at + len(own.names)] = own.slopes(eigenvalues, shapes)
             at += len(own.names)
         matrices = replace(matrices, damping_ratio=self._ratios(x, slopes), damping_log=slopes)
-        matrices = self._with_dampers_along(configuration, x, matrices, shapes) if has_own else matrices
-        return self._with_joints(x, matrices, eigenvalues, shapes) if len(self._joints) else matrices
-
-    def _with_dampers_along(
-        self,
-        configuration: str,
-        x: NDArray[np.float64],
-        matrices: Matrices,
-        shapes: NDArray[np.float64],
-    ) -> Matrices:
-        """The matrices with what dampers of the rig add, where modes have damping ratios of their own.
-
-        It goes with them: row and column r of the dampers' matrix between undamped modes with the root of the factor
-        of mode r, which leaves it positive.
-        """
-        rig = self._without_effects(configuration, x) if self.effects else matrices.terms
-        if DAMPING_MATRIX not in rig.by_kind or rig.dofs != matrices.terms.dofs:
-            return matrices
-        own_log, logs = matrices.damping_log.copy(), x[: self._logs]
-        own_log[: self.common_damping] = 0.0
-        root = np.exp(0.5 * (x[self._logs : self._logs + len(own_log)] @ own_log))
-        moved = matrices.dense[MASS] @ shapes
-        added = rig.damping_scaled((moved * root) @ shapes.T)
-        coefficient = added.scaled(logs)
-        on, rows = rig.by_kind[DAMPING_MATRIX]
-        along = (rows @ shapes) * root
-        dense = matrices.dense.copy()
-        dense[DAMPING_MATRIX] += added.dense(coefficient)[DAMPING_MATRIX]
-        return replace(
-            matrices,
-            terms=Terms.joined([matrices.terms, added]),
-            coefficient=np.concatenate([matrices.coefficient, coefficient]),
-            dense=dense,
-            along_modal=(*matrices.along_modal, (along.T @ (coefficient[: len(on), None] * along), own_log)),
-        )
-
-    def _with_joints(
-        self,
-        x: NDArray[np.float64],
-        matrices: Matrices,
-        eigenvalues: NDArray[np.float64],
-        shapes: NDArray[np.float64],
-    ) -> Matrices:
-        """The matrices with what joints lose more or less than the others.
-
-        The loss of a mode is that of the parts, each with its share of the strain energy (C. D. Johnson, D. A.
-        Kienholz, AIAA Journal 20 (1982) 1284-1290). What couples modes r and s is that at the geometric mean of both,
-        which leaves damping positive.
-        """
-        on = matrices.terms.matrix == STIFFNESS
-        stretch = (matrices.terms.rows[on] @ shapes) * np.sqrt(
-            2 * matrices.damping_ratio / np.sqrt(eigenvalues)
-        )
-        of_joint = matrices.coefficient[on, None] * matrices.terms.log[on][:, self._joints]
-        usual = np.einsum("tp,ta,tb->pab", of_joint, stretch, stretch, optimize=True)
-        near = _nearness(np.sqrt(eigenvalues), matrices.damping_ratio)
-        alike = np.diagonal(usual, axis1=1, axis2=2) @ (near / np.sum(near, axis=0))
-        usual *= 1 - near
-        usual += alike[:, None] * np.eye(len(near))
-        factor = np.exp(x[self.shape_start : self.edit_start])
-        added = np.tensordot(factor - 1, usual, 1)
-        moved, dense, by_shape = matrices.dense[MASS] @ shapes, matrices.dense.copy(), matrices.by_shape
-        dense[DAMPING_MATRIX] += moved @ added @ moved.T
-        if len(by_shape):
-            by_shape[: len(factor), DAMPING_MATRIX] = moved @ (factor[:, None, None] * usual) @ moved.T
-        along = (*matrices.along_modal, (added, matrices.damping_log))
-        return replace(matrices, dense=dense, along_modal=along)
+        if has_own:
+            rig = self._without_effects(configuration, x) if self.effects else matrices.terms
+            logs, damping = x[: self._logs], x[self._logs : self.shape_start]
+            matrices = with_dampers_along(matrices, rig, shapes, logs, damping, self.common_damping)
+        if len(self._joints):
+            lost = x[self.shape_start : self.edit_start]
+            matrices = with_joint_losses(matrices, eigenvalues, shapes, self._joints, lost)
+        return matrices
 
     def _ratios(self, x: NDArray[np.float64], slopes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Damping ratios of the undamped modes by the derivatives of their logarithms, (n,)."""
@@ -468,13 +406,6 @@ class RigModel:
         return np.array([d.sign * _row(assembly.row(d.point), assembly.dofs) for d in dofs]).reshape(
             len(dofs), len(assembly.dofs)
         )
-
-
-def _nearness(omega: NDArray[np.float64], ratio: NDArray[np.float64]) -> NDArray[np.float64]:
-    """1 where two undamped modes coincide, 0 where they are far apart, (n, n)."""
-    half_width = np.maximum(ratio, 1e-9) * omega
-    apart = np.subtract.outer(omega, omega) / (_NEAR * np.maximum.outer(half_width, half_width))
-    return np.asarray(1 / (1 + apart**4))
 
 
 _NOTHING = Unknowns.plain((), 1.0)

@@ -236,9 +236,8 @@ def test_damping_that_scatters_too_much_is_told_whether_it_is_what_is_left_or_an
     told = [outlying_damping(o, fit) for o, fit in zip((observations, suited), fits, strict=True)]
     assert [one is not None for one in told] == [outlying, outlying]
     if outlying:
-        assert (
-            1.0 < told[1].scatter < told[0].scatter
-        )  # some of it may be that of joints, of which there are more
+        # some of it may be that of joints, of which there are more
+        assert 1.0 < told[1].scatter < told[0].scatter
 
 
 def test_a_model_that_only_a_larger_scatter_than_usual_explains_fails() -> None:
