@@ -51,6 +51,8 @@ _GRID_HEAT = 30.0
 _SIZES = (-15.0, -8.0, -4.0, -2.0, -1.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 15.0)
 """The same for effects of one size where measured modes have no partner: a size that gives them one may be far out, or
 small where it lifts a mode from 0 Hz."""
+_HARDLY = 0.003
+"""That of a size which changes hardly any frequency."""
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _UNHEATED: Schedule = ((1.0, 6), (1.0, 14))
 """Where starts are given. Heated, the data weigh less than the prior, which takes the first size to nothing, where the
@@ -137,8 +139,11 @@ def tried_sizes(
         sizes = [*_SIZES, *problem.tuned(begin, unknowns.names[at])]
         sizes = [size for size in sizes if unknowns.clipped(at_size(size))[at] == size]
         fewer = [s for s in sizes if problem.unpaired(at_size(s), scatters, _GRID_HEAT) < without.penalty]
-        least, size = min(((compared(s).cost, s) for s in fewer), default=(np.inf, 0.0))
-        return Tried(size, without.cost - least)
+        if not fewer:
+            return Tried(0.0, -np.inf)
+        least, size = min((compared(s).cost, s) for s in fewer)
+        # what turns coinciding modes of nominal parts into each other does so at any size: no size is the worse for it
+        return Tried(size, max(without.cost, compared(_HARDLY).cost) - least)
 
     found = zip(asked, spread(best, asked, processes), strict=True)
     return {h.label: tried for h, tried in found if tried.gain > 0}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +22,10 @@ _STEEP = 3.5
 """Standard deviations within which a density that falls to nothing is looked at in finer steps, in σ, `_FINE`."""
 _FINE = 0.5
 _FEWEST = 4
+_LOWER = 2.0
+"""Fall of the cost on the way to another value from which a fit was not at its maximum."""
+_MOST_AGAIN = 3
+_AGAIN_STEPS = 30
 
 
 def averaged_over_others(problem: Problem, found: Posterior, names: Iterable[str]) -> Posterior:
@@ -32,6 +36,9 @@ def averaged_over_others(problem: Problem, found: Posterior, names: Iterable[str
     largest density had dampers 2 to 14 % too small. Residuals and derivatives stay those of the maximum.
 
     The prior of a size of an effect counts up to two of its σ as everywhere else, and with an even slope from there.
+
+    Where another value of one leads to a far larger density, the fit had stopped before its maximum (at a point where
+    modes change places, say): it is begun again from there.
 
     Parameters
     ----------
@@ -45,9 +52,16 @@ def averaged_over_others(problem: Problem, found: Posterior, names: Iterable[str
     L. Tierney, J. B. Kadane, Accurate approximations for posterior moments and marginal densities, J. Am. Stat. Assoc.
     81 (1986) 82-86.
     """
+    return _averaged(problem, found, [found.unknowns.index[name] for name in names], _MOST_AGAIN)
+
+
+def _averaged(problem: Problem, found: Posterior, places: Sequence[int], again: int) -> Posterior:
     x, widths = found.x.copy(), np.ones(len(found.x))
-    for i in (found.unknowns.index[name] for name in names):
-        at, log_density = _profile(problem, found, i)
+    for i in places:
+        at, log_density, highest = _profile(problem, found, i)
+        if again and highest.cost < found.cost - _LOWER:
+            further = descend(problem, found.scatters, highest.x, steps=_AGAIN_STEPS)
+            return _averaged(problem, further, places, again - 1)
         if len(at) >= _FEWEST:
             weight = np.exp(log_density - np.max(log_density))
             mean = float(weight @ at / np.sum(weight))
@@ -58,10 +72,10 @@ def averaged_over_others(problem: Problem, found: Posterior, names: Iterable[str
 
 def _profile(
     problem: Problem, found: Posterior, i: int, spacing: float = 1.0
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places about the maximum, in σ, and the logarithms of one unknown's density there, to a constant."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], Posterior]:
+    """Places about the maximum, in σ, the logarithms of one unknown's density there, and the best fit."""
     step, along = spacing * found.std[i], spacing * found.covariance[:, i] / found.std[i]
-    told, ends = {0: _log_density(found, i)}, []
+    told, ends, best = {0: _log_density(found, i)}, [], found
     for side in (-1, 1):
         x = found.x
         for k in side * np.arange(1, round(_FURTHEST / spacing) + 1):
@@ -70,14 +84,14 @@ def _profile(
                 break
             there = descend(held, found.scatters, held.unknowns.clipped(x + side * along), steps=_STEPS)
             told[int(k)] = _log_density(there, i)
-            x = there.x
+            x, best = there.x, min(best, there, key=lambda p: p.cost)
             if not told[int(k)] > max(told.values()) - _LOW:
                 ends.append(abs(k * spacing))
                 break
     if spacing > _FINE and min(ends, default=_STEEP) < _STEEP:
         return _profile(problem, found, i, _FINE)
     places = [k for k in sorted(told) if np.isfinite(told[k])]
-    return spacing * np.array(places, float), np.array([told[k] for k in places])
+    return spacing * np.array(places, float), np.array([told[k] for k in places]), best
 
 
 def _log_density(at: Posterior, i: int) -> float:

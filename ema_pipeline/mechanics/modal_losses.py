@@ -22,6 +22,30 @@ _NEAR = 0.5
 damp both alike. What the shape of one holds of the other is an unknown of its own."""
 
 
+_CROSSING = 0.1
+"""The same of modes that cross: those of other damping change places within less than that."""
+
+
+def slopes_of_own(
+    eigenvalues: NDArray[np.float64], ratio: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """Derivatives of the logarithms of damping ratios by those of the lowest modes, which are unknowns, (count, n).
+
+    Modes are known by their order. Where two coincide, which one is which is not known, so that both have the mean of
+    the two: damping is continuous there.
+
+    Parameters
+    ----------
+    eigenvalues : ndarray, (n,)
+        ω², (rad/s)², in ascending order.
+    ratio : ndarray, (n,)
+        Damping ratios without what is a mode's own.
+    count : int
+    """
+    near = _nearness(np.sqrt(eigenvalues), ratio, _CROSSING)
+    return np.asarray((near / np.sum(near, axis=0))[:count])
+
+
 def with_dampers_along(
     matrices: Matrices,
     rig: Terms,
@@ -95,7 +119,7 @@ def with_joint_losses(
     stretch = (matrices.terms.rows[on] @ shapes) * np.sqrt(2 * ratio / omega)
     of_joint = matrices.coefficient[on, None] * matrices.terms.log[on][:, joints]
     usual = np.einsum("tp,ta,tb->pab", of_joint, stretch, stretch, optimize=True)
-    near = _nearness(omega, ratio)
+    near = _nearness(omega, ratio, _NEAR)
     alike = np.diagonal(usual, axis1=1, axis2=2) @ (near / np.sum(near, axis=0))
     usual *= 1 - near
     usual += alike[:, None] * np.eye(len(near))
@@ -109,8 +133,8 @@ def with_joint_losses(
     return replace(matrices, dense=dense, by_shape=by_shape, along_modal=along)
 
 
-def _nearness(omega: NDArray[np.float64], ratio: NDArray[np.float64]) -> NDArray[np.float64]:
-    """1 where two undamped modes coincide, 0 where they are far apart, (n, n)."""
+def _nearness(omega: NDArray[np.float64], ratio: NDArray[np.float64], within: float) -> NDArray[np.float64]:
+    """1 where two undamped modes coincide, 0 where they are more than some half-widths apart, (n, n)."""
     half_width = np.maximum(ratio, 1e-9) * omega
-    apart = np.subtract.outer(omega, omega) / (_NEAR * np.maximum.outer(half_width, half_width))
+    apart = np.subtract.outer(omega, omega) / (within * np.maximum.outer(half_width, half_width))
     return np.asarray(1 / (1 + apart**4))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import scipy.optimize
 from numpy.typing import NDArray
@@ -63,61 +61,3 @@ def turned(read: NDArray[np.float64] | NDArray[np.complex128]) -> NDArray[np.flo
     if not np.iscomplexobj(read):
         return np.asarray(read, float)
     return np.asarray(np.real(read * np.exp(-0.5j * np.angle(np.sum(read**2, axis=0)))), float)
-
-
-def _with_rest(to: NDArray[np.int64], data: ModeData, frequency_hz: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Pairs, and what is left of measured and undamped modes by frequency alone.
-
-    Damping turns undamped modes of nearly one frequency into each other, so that some resemble none that was measured.
-    """
-    alone = np.flatnonzero(to < 0)
-    if not len(alone):
-        return to
-    free = np.setdiff1d(np.arange(len(frequency_hz)), to)
-    log = np.log(np.maximum(frequency_hz[free], 1e-6))
-    apart = np.abs(log[None] - data.log_frequency[alone, None])
-    which, rest = scipy.optimize.linear_sum_assignment(apart)
-    near = apart[which, rest] < _FREQUENCY_REACH
-    found = to.copy()
-    found[alone[which[near]]] = free[rest[near]]
-    return found
-
-
-@dataclass(frozen=True)
-class OwnDamping:
-    """Undamped modes of a configuration whose damping ratios are unknowns of their own.
-
-    They are known by the measured modes that they resemble: numbers of modes change where frequencies cross.
-
-    Attributes
-    ----------
-    data : ModeData
-    along : ndarray, (s, n)
-        Rows of the motion along the sensors.
-    """
-
-    data: ModeData
-    along: NDArray[np.float64]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the unknowns, one for every measured mode."""
-        return tuple(
-            f"damping of measured mode {r + 1} of {self.data.configuration}" for r in range(len(self.data))
-        )
-
-    def slopes(self, eigenvalues: NDArray[np.float64], shapes: NDArray[np.float64]) -> NDArray[np.float64]:
-        """1 for the undamped mode that each unknown is of, 0 elsewhere, (m, n).
-
-        Parameters
-        ----------
-        eigenvalues : ndarray, (n,)
-        shapes : ndarray, (n_dofs, n)
-        """
-        read = self.along @ shapes[: self.along.shape[1]]
-        hz = np.sqrt(eigenvalues) / (2 * np.pi)
-        to = _with_rest(paired(self.data, hz, read), self.data, hz)
-        found = np.zeros((len(to), shapes.shape[1]))
-        on = np.flatnonzero(to >= 0)
-        found[on, to[on]] = 1.0
-        return found

@@ -255,9 +255,9 @@ class Comparison:
         damped = np.isfinite(d.log_damping[on])
         modes, of = on[damped], to[damped]
         # of modes whose damping is an unknown of its own, that unknown scatters, and not what is left
-        own = np.any(matrices.damping_log[self.model.common_damping :, of], axis=0)
+        own = np.sum(matrices.damping_log[self.model.common_damping :, of] ** 2, axis=0)
         model = np.log(solution.damping_ratio[of])
-        test = np.hypot(d.log_damping_std[modes], own * _DAMPING_STD)
+        test = np.hypot(d.log_damping_std[modes], (own > 0) * _DAMPING_STD)
         lost = self._lost_in_effects(solution)[of]
         usual = np.hypot(test, self.defaults[DAMPING_SCATTER])
         slope = None
@@ -269,7 +269,7 @@ class Comparison:
             slope[:, : by_model.shape[1]] = by_model
         return Rows(
             d.log_damping[modes] - model, np.hypot(test, lost),
-            np.where(own, 0.0, 1.0), DAMPING_SCATTER, 1.0, modes, slope=slope, model=model,
+            np.sqrt(np.maximum(1 - own, 0.0)), DAMPING_SCATTER, 1.0, modes, slope=slope, model=model,
             wider=float(np.sum(np.log(np.hypot(usual, lost) / usual))),
         )  # fmt: skip
 

@@ -14,7 +14,6 @@ from ema_pipeline.inference import Residuals, Scatter
 from ema_pipeline.ingest.defaults import CALIBRATION_STD
 from ema_pipeline.observations.base import Observations
 from ema_pipeline.observations.mode_data import ModeData
-from ema_pipeline.observations.mode_pairing import OwnDamping
 from ema_pipeline.observations.mode_problem import CALIBRATION, MIXING, ModeProblem
 from ema_pipeline.observations.mode_rows import FREQUENCY, FREQUENCY_NOISE, SHAPE, SHAPE_NOISE, UNEVEN_DAMPING
 from ema_pipeline.observations.parts import (
@@ -60,6 +59,10 @@ _BESIDE_JOINTS = {
 """Where every joint's damping is an unknown of its own: what uneven damping does beside that is little."""
 
 
+_ABOVE = 1.3
+"""Frequency, over the highest measured one, up to which modes may be near the band."""
+
+
 class ModeObservations(Observations):
     """Measured modes of a rig's configurations.
 
@@ -76,8 +79,8 @@ class ModeObservations(Observations):
         DOFs whose calibration is unknown; those of `data` where left out.
     test : str
         Name of the test among several whose unknowns are shared: its drift is its own.
-    own_damping : dict of str to OwnDamping, optional
-        Undamped modes whose damping ratios are unknowns of their own, by configuration.
+    own_damping : dict of str to int, optional
+        How many undamped modes have a damping ratio that is an unknown of its own, see `RigModel`.
     middle_hz : float
         See `RigModel`; that of `data` where left out.
     joints : bool
@@ -98,7 +101,7 @@ class ModeObservations(Observations):
         shared: Dependence | None = None,
         sensors: tuple[str, ...] = (),
         test: str = "",
-        own_damping: Mapping[str, OwnDamping] | None = None,
+        own_damping: Mapping[str, int] | None = None,
         middle_hz: float = 0.0,
         joints: bool = False,
     ) -> None:
@@ -142,10 +145,14 @@ class ModeObservations(Observations):
         joints = any(by_dampers for by_dampers, _ in coupled)
         if not joints and (self.own_damping or not any(skew for _, skew in coupled)):
             return self
-        own = self.own_damping or {
-            d.configuration: OwnDamping(d, model.sensor_rows(d.configuration, d.dofs)) for d in self.data
-        }
+        own = self.own_damping or {d.configuration: self._modes_near(d) for d in self.data}
         return self._with(self.data, own, joints)
+
+    def _modes_near(self, data: ModeData) -> int:
+        """Number of undamped modes of the rig that may be in the band or near it: nominal values may be far off."""
+        top = float(np.exp(np.max(data.log_frequency)))
+        rig = RigModel(self.rig, (), {}, self.shared)
+        return rig.count_below(data.configuration, _ABOVE * top, 2 * len(data))
 
     def without_lag(self) -> ModeObservations:
         """The same without imaginary parts of shapes that are compared as real ones, see `ModeData.lagging`."""
@@ -158,7 +165,7 @@ class ModeObservations(Observations):
         return self._with(data, self.own_damping, self.joints)
 
     def _with(
-        self, data: Sequence[ModeData], own_damping: Mapping[str, OwnDamping], joints: bool
+        self, data: Sequence[ModeData], own_damping: Mapping[str, int], joints: bool
     ) -> ModeObservations:
         known, damping = (self.channels, self.shared, self.sensors, self.test), (own_damping, self.middle_hz)
         return ModeObservations(self.rig, data, *known, *damping, joints)

@@ -19,7 +19,7 @@ from ema_pipeline.effects.base import PlacedEffect
 from ema_pipeline.inference import Unknowns, joined
 from ema_pipeline.mechanics.assembly import Assembly, Row
 from ema_pipeline.mechanics.eigen_derivatives import EigenSolution, solved
-from ema_pipeline.mechanics.modal_losses import with_dampers_along, with_joint_losses
+from ema_pipeline.mechanics.modal_losses import slopes_of_own, with_dampers_along, with_joint_losses
 from ema_pipeline.mechanics.system import LinearSystem
 from ema_pipeline.mechanics.terms import (
     DAMPING_MATRIX,
@@ -30,7 +30,6 @@ from ema_pipeline.mechanics.terms import (
     assemble_terms,
 )
 from ema_pipeline.observations.effect_terms import AddedTerms, EffectTerms, differences
-from ema_pipeline.observations.mode_pairing import OwnDamping
 from ema_pipeline.observations.parts import (
     DAMPING,
     DAMPING_POWER,
@@ -69,8 +68,8 @@ class RigModel:
         Prior 1 σ of effects' sizes by ``id@place.name``; the library's where left out.
     shared : Dependence, optional
         Of the rig, where it is known already.
-    own_damping : dict of str to OwnDamping, optional
-        Undamped modes whose damping ratios are unknowns of their own, by configuration.
+    own_damping : dict of str to int, optional
+        How many undamped modes, the lowest, have a damping ratio that is an unknown of its own, by configuration.
     middle_hz : float
         Frequency about which damping ratios follow a power of the frequency; 0 where all are the same.
     joints : bool
@@ -83,7 +82,7 @@ class RigModel:
         effects: Sequence[PlacedEffect] = (),
         scales: Mapping[str, float] | None = None,
         shared: Dependence | None = None,
-        own_damping: Mapping[str, OwnDamping] | None = None,
+        own_damping: Mapping[str, int] | None = None,
         middle_hz: float = 0.0,
         joints: bool = False,
     ) -> None:
@@ -120,7 +119,11 @@ class RigModel:
             Unknowns.plain((DAMPING,), damping.tolerance or LOG_STD) if loose and damping else _NOTHING,
             Unknowns.plain((DAMPING_POWER,), _POWER_STD) if loose and self.middle_hz else _NOTHING,
             Unknowns.plain(
-                tuple(name for own in self.own_damping.values() for name in own.names),
+                tuple(
+                    f"damping of undamped mode {k + 1} of {configuration}"
+                    for configuration, count in self.own_damping.items()
+                    for k in range(count)
+                ),
                 1.0,
                 DAMPING_SCATTER,
             ),
@@ -227,10 +230,11 @@ class RigModel:
         elif not has_own:
             return matrices
         at = self.common_damping
-        for name, own in self.own_damping.items():
+        for name, count in self.own_damping.items():
             if name == configuration:
-                slopes[at : at + len(own.names)] = own.slopes(eigenvalues, shapes)
-            at += len(own.names)
+                own = slopes_of_own(eigenvalues, matrices.damping_ratio, count)
+                slopes[at : at + len(own)] = own
+            at += count
         matrices = replace(matrices, damping_ratio=self._ratios(x, slopes), damping_log=slopes)
         if has_own:
             rig = self._without_effects(configuration, x) if self.effects else matrices.terms
@@ -380,6 +384,13 @@ class RigModel:
         """Whether dampers or losses, and whether gyroscopic effects couple the modes, at the effects' start values."""
         m = self.matrices(configuration, self.start(), derivatives=False)
         return bool(np.any(m.dense[[DAMPING_MATRIX, STRUCTURAL]])), bool(np.any(m.skew))
+
+    def count_below(self, configuration: str, frequency_hz: float, least: int) -> int:
+        """Number of undamped modes below a frequency at the effects' start values; `least` of them, where there are."""
+        dense = self.matrices(configuration, self.start(), derivatives=False).dense
+        found = solved(dense)
+        below = 0 if found is None else int(np.sum(found[0] < (2 * np.pi * frequency_hz) ** 2))
+        return min(max(below, least), dense.shape[-1])
 
     def system(self, configuration: str, x: NDArray[np.float64]) -> LinearSystem:
         """The linear system of a configuration at `x`, every part with its own deviation."""

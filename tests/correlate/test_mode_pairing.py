@@ -9,7 +9,7 @@ from frequencies import from_frequencies
 from ema_pipeline.correlate.measured import MeasuredModes
 from ema_pipeline.dof import Dof
 from ema_pipeline.observations.mode_data import ModeData, prepare
-from ema_pipeline.observations.mode_pairing import OwnDamping, paired, turned
+from ema_pipeline.observations.mode_pairing import paired, turned
 
 UP, BENT = np.array([1.0, 0.5, 1.0]), np.array([1.0, 0.4, -1.0])
 """Two shapes that have nothing in common but 2 % (MAC)."""
@@ -109,29 +109,3 @@ def test_complex_shapes_are_turned_to_real_ones() -> None:
     for found, real in zip(turned(shapes).T, (UP, BENT), strict=True):
         assert found * np.sign(found[0]) == pytest.approx(real)
     assert turned(np.column_stack([UP, -BENT])).tolist() == np.column_stack([UP, -BENT]).tolist()
-
-
-def test_damping_of_their_own_goes_to_the_undamped_modes_that_resemble_the_measured_ones() -> None:
-    """Two of three measured modes have a partner; the model counts its modes in another order."""
-    data = with_shapes([100.0, 104.0, 500.0], [UP, BENT, UP])
-    own = OwnDamping(data, np.eye(3))
-    assert own.names == tuple(f"damping of measured mode {k} of test" for k in (1, 2, 3))
-    shapes = np.zeros((5, 4))  # two coordinates of the model's beyond those that sensors read
-    shapes[:3] = np.column_stack([BENT, [0.0, 1.0, 0.0], UP, BENT])
-    shapes[3:] = 7.0
-    eigenvalues = (2 * np.pi * np.array([104.5, 250.0, 99.5, 900.0])) ** 2
-    expected = np.zeros((3, 4))
-    expected[0, 2] = expected[1, 0] = 1.0
-    assert own.slopes(eigenvalues, shapes).tolist() == expected.tolist()
-
-
-def test_an_undamped_mode_that_resembles_none_has_the_damping_of_the_measured_one_that_is_left() -> None:
-    """Damping turned two of one frequency into each other: one measured shape is like neither. Far ones have none."""
-    between = np.array([0.0, 0.0, 1.0])
-    data = with_shapes([100.0, 104.0, 500.0], [UP, between, UP])
-    shapes = np.column_stack([UP, BENT, [0.0, 1.0, 0.0]])
-    eigenvalues = (2 * np.pi * np.array([99.5, 900.0, 108.0])) ** 2
-    assert paired(data, np.array([99.5, 900.0, 108.0]), shapes).tolist() == [0, -1, -1]
-    expected = np.zeros((3, 3))
-    expected[0, 0] = expected[1, 2] = 1.0
-    assert OwnDamping(data, np.eye(3)).slopes(eigenvalues, shapes).tolist() == expected.tolist()

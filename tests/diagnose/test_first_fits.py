@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -202,6 +203,25 @@ def test_sizes_far_out_and_small_ones_are_tried_where_modes_have_no_partner() ->
         "beyond its range": 8.0,
     }
     assert found["far"].gain == pytest.approx(PENALTY + 0.5 * (7.0**2 - 1.0) / 30.0**2)
+
+
+def test_what_turns_coinciding_modes_at_any_size_is_told_by_the_larger_ones() -> None:
+    """As a gyroscopic effect turns the double modes of nominal parts: the smallest size costs as much as a true one."""
+    base = with_model("base", Parabola(("part",), ()), [0.4])
+    names = ("part", "a.s1")
+
+    class Turning(Parabola):
+        def residuals(self, x: np.ndarray, scatters: Any, **more: Any) -> Any:
+            found = super().residuals(x, scatters, **more)
+            return replace(found, log_scale=found.log_scale + (100.0 if x[1] else 0.0))
+
+    problem = Turning(names, names[1:], np.array([0.0, 7.0]), 3.0)
+    problem.unknowns = Unknowns(names, np.ones(2), ("part", ""), np.full(2, -20.0), np.full(2, 9.0))
+    model = with_model("a", problem, [0.0, 0.0]).model
+    data: Any = SimpleNamespace(scatters={})
+    found = tried_sizes(data, base, {"a": model}, [hypothesis("a")], 1)
+    assert found["a"].unknown == 8.0
+    assert found["a"].gain == pytest.approx(PENALTY + 0.5 * ((7.0 - 0.003) ** 2 - 1.0) / 30.0**2)
 
 
 def test_sizes_that_give_modes_a_partner_are_tried_as_well(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -127,6 +127,27 @@ def test_values_that_no_model_can_have_count_nothing() -> None:
     assert told.x[0] + 0.1 * told.std[0] < 1.02
 
 
+def test_a_fit_that_stopped_on_the_wrong_side_of_a_step_is_begun_again() -> None:
+    """Beyond a step the density is far larger: what is known is what is known from there."""
+
+    @dataclass(frozen=True)
+    class Step:
+        unknowns: Unknowns
+
+        def residuals(self, x: Array, scatters: object, **_: object) -> Residuals:
+            jacobian = np.array([[-5.0, -5.0], [-2.0, 2.0]])
+            values = np.array([5.0 * (1.0 - x[0] - x[1]), 2.0 * (x[1] - x[0])])
+            return Residuals(values, jacobian, penalty=0.0 if x[0] < 0.3 else 20.0)
+
+    problem = Step(Unknowns.plain(("a", "b"), 5.0))
+    stopped = descend(problem, {}, np.array([0.6, 0.6]), steps=60)
+    assert stopped.x == pytest.approx([0.5, 0.5], abs=0.01)
+    told = averaged_over_others(problem, stopped, ["a"])
+    assert told.cost < stopped.cost - 10
+    assert told.x[0] < 0.3
+    assert told.x[0] + told.std[0] > 0.2
+
+
 def test_of_a_linear_problem_nothing_changes() -> None:
     @dataclass(frozen=True)
     class Linear:

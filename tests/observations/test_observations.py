@@ -1111,7 +1111,7 @@ def test_damping_ratios_that_differ_turn_the_shapes_of_coupled_modes() -> None:
     assert abs(sizes[1] - 30.0) < 0.5
     solution = problem.solution("with_ring", found.x)
     to = problem.paired(own.data[0], found.x).match
-    told = [found.value(name) for name in own.own_damping["with_ring"].names]
+    told = [found.value(f"damping of undamped mode {k + 1} of with_ring") for k in to]
     above = np.log(np.sqrt(solution.eigenvalues[to]) / (2 * np.pi * own.middle_hz))
     common = found.value("modal_damping_ratio") + found.value("damping_power") * above
     assert np.array(told) + common == pytest.approx(np.log(factor)[to], abs=0.03)
@@ -1235,7 +1235,7 @@ def test_damping_that_scatters_takes_the_rigs_own_dampers_along() -> None:
     found = descend(problem, scatters, problem.start(), steps=60)
     assert found.error < 0.85
     at = found.x.copy()  # how two modes turn whose poles coincide is bounded: a little apart it is exact
-    at[problem.unknowns.index[f"damping of measured mode 3 of {configuration}"]] += 0.1
+    at[problem.unknowns.index[f"damping of undamped mode 3 of {configuration}"]] += 0.1
     _derivatives_are_exact(problem, at, scatters, [n for n in problem.unknowns.names if "damp" in n])
 
 
