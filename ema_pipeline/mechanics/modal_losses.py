@@ -17,13 +17,9 @@ from numpy.typing import NDArray
 
 from ema_pipeline.mechanics.terms import DAMPING_MATRIX, MASS, STIFFNESS, Matrices, Terms
 
-_NEAR = 0.5
-"""Half-widths within which joints turn two modes into each other so fast that no fit could follow: they are taken to
-damp both alike. What the shape of one holds of the other is an unknown of its own."""
-
-
-_CROSSING = 0.1
-"""The same of modes that cross: those of other damping change places within less than that."""
+_NEAR = 0.1
+"""Half-widths within which two modes count as coinciding. Next to nothing turns them into each other, so that no fit
+could follow what is lost in one and not in the other: they are taken to damp alike."""
 
 
 def slopes_of_own(
@@ -42,7 +38,7 @@ def slopes_of_own(
         Damping ratios without what is a mode's own.
     count : int
     """
-    near = _nearness(np.sqrt(eigenvalues), ratio, _CROSSING)
+    near = _nearness(np.sqrt(eigenvalues), ratio)
     return np.asarray((near / np.sum(near, axis=0))[:count])
 
 
@@ -119,7 +115,7 @@ def with_joint_losses(
     stretch = (matrices.terms.rows[on] @ shapes) * np.sqrt(2 * ratio / omega)
     of_joint = matrices.coefficient[on, None] * matrices.terms.log[on][:, joints]
     usual = np.einsum("tp,ta,tb->pab", of_joint, stretch, stretch, optimize=True)
-    near = _nearness(omega, ratio, _NEAR)
+    near = _nearness(omega, ratio)
     alike = np.diagonal(usual, axis1=1, axis2=2) @ (near / np.sum(near, axis=0))
     usual *= 1 - near
     usual += alike[:, None] * np.eye(len(near))
@@ -133,8 +129,8 @@ def with_joint_losses(
     return replace(matrices, dense=dense, by_shape=by_shape, along_modal=along)
 
 
-def _nearness(omega: NDArray[np.float64], ratio: NDArray[np.float64], within: float) -> NDArray[np.float64]:
-    """1 where two undamped modes coincide, 0 where they are more than some half-widths apart, (n, n)."""
+def _nearness(omega: NDArray[np.float64], ratio: NDArray[np.float64]) -> NDArray[np.float64]:
+    """1 where two undamped modes coincide, 0 where they are far apart, (n, n)."""
     half_width = np.maximum(ratio, 1e-9) * omega
-    apart = np.subtract.outer(omega, omega) / (within * np.maximum.outer(half_width, half_width))
+    apart = np.subtract.outer(omega, omega) / (_NEAR * np.maximum.outer(half_width, half_width))
     return np.asarray(1 / (1 + apart**4))
