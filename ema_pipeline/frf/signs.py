@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ema_pipeline.check_result import CheckResult, judged
 from ema_pipeline.dof import Dof
-from ema_pipeline.frf.checks import NODE_LEVEL, OBLIQUE_LEVEL
+from ema_pipeline.frf.checks import NODE_LEVEL, OBLIQUE_LEVEL, STRONG_LEVEL
 
 SIGN = "sign"
 
@@ -114,7 +114,10 @@ def check_signs(
         mine = level[output, source]
         at_sensor = max(x for (o, _), x in level.items() if o == output)
         of_blow = max(x for (o, i), x in level.items() if i == source and quantities[o] == quantities[output])
-        if mine <= NODE_LEVEL * at_sensor or mine <= OBLIQUE_LEVEL * of_blow or mine == 0:
+        # what an oblique blow makes along the sensor goes with what a blow along the sensor would make
+        across = outputs[output].direction != Dof.parse(source).direction
+        oblique = STRONG_LEVEL * max(of_blow, at_sensor) if across else OBLIQUE_LEVEL * of_blow
+        if mine <= max(NODE_LEVEL * at_sensor, oblique) or mine == 0:
             continue
         verdicts.append(_signs(f"{outputs[output]} over {source}", pairs[output, source].hits, frfs, force))
     return verdicts

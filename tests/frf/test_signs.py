@@ -66,6 +66,24 @@ def test_a_response_across_the_blow_may_change_its_sign() -> None:
     assert "p1.z over p0.z" not in signs([hit(1, (1.0, 0.02)), hit(2, (1.0, -0.02))])
 
 
+def test_a_sensor_across_the_blow_reads_more_of_an_oblique_one_than_a_sensor_along_it() -> None:
+    """More than a fifth of the largest response may change its sign with the aim; along the blow it may not."""
+    hits = [hit(1, (1.0, 0.25)), hit(2, (1.0, -0.25))]
+    assert not signs(hits)["p1.z over p0.z"].passes
+
+    def turned(one: HitSamples) -> HitSamples:
+        return replace(
+            one,
+            channels=tuple(
+                replace(c, dof=replace(c.dof, direction="x")) if c.name == "a1" else c for c in one.channels
+            ),
+        )
+
+    assert "p1.x over p0.z" not in signs(list(map(turned, hits)))
+    reversed_hits = [turned(hit(1, (1.0, 0.6))), turned(hit(2, (1.0, -0.6)))]
+    assert not signs(reversed_hits)["p1.x over p0.z"].passes
+
+
 def test_noise_has_no_sign() -> None:
     pairs = [
         signs([hit(k, (1.0, 0.0), noise=0.3), hit(k + 1, (1.0, 0.0), noise=0.3)]) for k in range(1, 60, 2)
