@@ -48,11 +48,10 @@ _GRID_STARTS = 5
 gained 480, was reached from the third only."""
 _GRID_HEAT = 30.0
 """Factor on the uncertainties there: two neighbours of the grid differ by a third in the frequency of an added mode."""
-_SIZES = (-15.0, -8.0, -4.0, -2.0, -1.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 15.0)
+_SMALLEST = 0.003
+_SIZES = (-15.0, -8.0, -4.0, -2.0, -1.0, _SMALLEST, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0, 8.0, 15.0)
 """The same for effects of one size where measured modes have no partner: a size that gives them one may be far out, or
 small where it lifts a mode from 0 Hz."""
-_HARDLY = 0.003
-"""That of a size which changes hardly any frequency."""
 _FROM_GRID: Schedule = ((5.0, 6), (1.0, 14))
 _UNHEATED: Schedule = ((1.0, 6), (1.0, 14))
 """Where starts are given. Heated, the data weigh less than the prior, which takes the first size to nothing, where the
@@ -143,7 +142,7 @@ def tried_sizes(
             return Tried(0.0, -np.inf)
         least, size = min((compared(s).cost, s) for s in fewer)
         # what turns coinciding modes of nominal parts into each other does so at any size: no size is the worse for it
-        return Tried(size, max(without.cost, compared(_HARDLY).cost) - least)
+        return Tried(size, max(without.cost, compared(_SMALLEST).cost) - least)
 
     found = zip(asked, spread(best, asked, processes), strict=True)
     return {h.label: tried for h, tried in found if tried.gain > 0}
