@@ -65,6 +65,11 @@ def watch(
         missing = session.missing()
         if missing:
             show(f"Listed in test.toml, but missing: {', '.join(missing)}; remove them before the run.")
+        left = [
+            f"{p.point} ({p.good} of {p.wanted} good hits)" for p in session.states() if p.good < p.wanted
+        ]
+        if left:
+            show(f"Still to strike: {', '.join(left)}.")
         show(f"Next: {program()} run {shlex.quote(str(folder))}")
 
 

@@ -146,6 +146,8 @@ def _settings(data: dict[str, Any], overrides: Iterable[str], where: str) -> Pip
         table[last] = toml_value(value.strip())
         where = f"{where} with --set {change}"
     settings = parse(PipelineSettings, data, where)
+    if not settings.stages:
+        raise EmaError(f"{where}: stages = []: name one or more of {', '.join(STAGES)}")
     for stage in settings.stages:
         if stage not in STAGES:
             raise EmaError(f"{where}: unknown stage '{stage}'{did_you_mean(stage, STAGES)}")

@@ -243,6 +243,9 @@ def test_the_command_judges_what_is_there(
     assert told[1]["coherence"].keys() == {"m1.x", "m2.x", "m3.x"}
     code, said, _ = ema(capsys, "watch", folder, "--idle", "1", "--hits", "2", "--sound")
     assert "m1.x is done" in said
+    assert "Still to strike" not in said
+    _, said, _ = ema(capsys, "watch", folder, "--idle", "1", "--point", "m1.x", "--point", "m4.x")
+    assert "Still to strike: m1.x (2 of 3 good hits), m4.x (0 of 3 good hits)." in said
     assert ema(capsys, "run", folder, "--out", tmp_path / "out", "-q")[0] == 0
 
 
