@@ -58,9 +58,9 @@ def averaged_over_others(problem: Problem, found: Posterior, names: Iterable[str
 def _averaged(problem: Problem, found: Posterior, places: Sequence[int], again: int) -> Posterior:
     x, widths = found.x.copy(), np.ones(len(found.x))
     for i in places:
-        at, log_density, highest = _profile(problem, found, i)
-        if again and highest.cost < found.cost - _LOWER:
-            further = descend(problem, found.scatters, highest.x, steps=_AGAIN_STEPS)
+        at, log_density, best = _profile(problem, found, i)
+        if again and best.cost < found.cost - _LOWER:
+            further = descend(problem, found.scatters, best.x, steps=_AGAIN_STEPS)
             return _averaged(problem, further, places, again - 1)
         if len(at) >= _FEWEST:
             weight = np.exp(log_density - np.max(log_density))

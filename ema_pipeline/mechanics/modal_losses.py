@@ -38,8 +38,7 @@ def slopes_of_own(
         Damping ratios without what is a mode's own.
     count : int
     """
-    near = _nearness(np.sqrt(eigenvalues), ratio)
-    return np.asarray((near / np.sum(near, axis=0))[:count])
+    return _shares(_nearness(np.sqrt(eigenvalues), ratio))[:count]
 
 
 def with_dampers_along(
@@ -116,7 +115,7 @@ def with_joint_losses(
     of_joint = matrices.coefficient[on, None] * matrices.terms.log[on][:, joints]
     usual = np.einsum("tp,ta,tb->pab", of_joint, stretch, stretch, optimize=True)
     near = _nearness(omega, ratio)
-    alike = np.diagonal(usual, axis1=1, axis2=2) @ (near / np.sum(near, axis=0))
+    alike = np.diagonal(usual, axis1=1, axis2=2) @ _shares(near)
     usual *= 1 - near
     usual += alike[:, None] * np.eye(len(near))
     factor = np.exp(log_factor)
@@ -134,3 +133,8 @@ def _nearness(omega: NDArray[np.float64], ratio: NDArray[np.float64]) -> NDArray
     half_width = np.maximum(ratio, 1e-9) * omega
     apart = np.subtract.outer(omega, omega) / (_NEAR * np.maximum.outer(half_width, half_width))
     return np.asarray(1 / (1 + apart**4))
+
+
+def _shares(near: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares of all modes in the mean of those that coincide with each one, a column that adds up to 1, (n, n)."""
+    return np.asarray(near / np.sum(near, axis=0))

@@ -57,8 +57,6 @@ _BESIDE_JOINTS = {
     UNEVEN_DAMPING: Scatter(UNEVEN_DAMPING, "damping from part to part", 0.3, 0.5, 1.0, 5.0, 0.1),
 }
 """Where every joint's damping is an unknown of its own: what uneven damping does beside that is little."""
-
-
 _ABOVE = 1.3
 """Frequency, over the highest measured one, up to which modes may be near the band."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,12 @@ def hit(number: int, sizes: tuple[float, ...] = (1.0, 1.0), noise: float = 1e-3)
         for s, x in zip(sizes, full, strict=True)
     ]
     return hit_of(force, np.array(rows), file=f"hit{number}.csv")
+
+
+def described(one: HitSamples, channel: str, **dof: Any) -> HitSamples:
+    """The same hit with another DOF of a channel."""
+    channels = tuple(replace(c, dof=replace(c.dof, **dof)) if c.name == channel else c for c in one.channels)
+    return replace(one, channels=channels)
 
 
 def signs(hits: list[HitSamples]) -> dict[str, CheckResult]:
@@ -58,8 +65,7 @@ def test_a_hammer_reversed_in_one_hit_reverses_all_channels() -> None:
 
 def test_signs_that_the_description_states_are_no_fault() -> None:
     turned = hit(2, (-1.0, 1.0))
-    stated = tuple(replace(c, dof=replace(c.dof, sign=-1)) if c.name == "a0" else c for c in turned.channels)
-    assert all(v.passes for v in signs([hit(1), replace(turned, channels=stated)]).values())
+    assert all(v.passes for v in signs([hit(1), described(turned, "a0", sign=-1)]).values())
 
 
 def test_a_response_across_the_blow_may_change_its_sign() -> None:
@@ -70,18 +76,9 @@ def test_a_sensor_across_the_blow_reads_more_of_an_oblique_one_than_a_sensor_alo
     """More than a fifth of the largest response may change its sign with the aim; along the blow it may not."""
     hits = [hit(1, (1.0, 0.25)), hit(2, (1.0, -0.25))]
     assert not signs(hits)["p1.z over p0.z"].passes
-
-    def turned(one: HitSamples) -> HitSamples:
-        return replace(
-            one,
-            channels=tuple(
-                replace(c, dof=replace(c.dof, direction="x")) if c.name == "a1" else c for c in one.channels
-            ),
-        )
-
-    assert "p1.x over p0.z" not in signs(list(map(turned, hits)))
-    reversed_hits = [turned(hit(1, (1.0, 0.6))), turned(hit(2, (1.0, -0.6)))]
-    assert not signs(reversed_hits)["p1.x over p0.z"].passes
+    assert "p1.x over p0.z" not in signs([described(h, "a1", direction="x") for h in hits])
+    hits = [hit(1, (1.0, 0.6)), hit(2, (1.0, -0.6))]
+    assert not signs([described(h, "a1", direction="x") for h in hits])["p1.x over p0.z"].passes
 
 
 def test_noise_has_no_sign() -> None:
