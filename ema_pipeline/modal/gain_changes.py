@@ -1,4 +1,5 @@
-"""Sensors whose gain differs between points of impact: a loose mount, another range, a sensor that warms up.
+"""Sensors whose gain differs between points of impact: a loose mount, another range, a sensor that warms up, or
+one that was mounted the other way.
 
 The residues of one mode over points of impact and sensors are the product of two shapes, a matrix of rank one. A sensor
 whose gain is another one while one point is struck changes one entry of it, by the same factor in every mode. A fit of
@@ -19,6 +20,7 @@ from ema_pipeline.dof import Dof
 from ema_pipeline.frf.types import FrfSet
 from ema_pipeline.modal.low_rank import first_right, low_rank, tangent
 from ema_pipeline.modal.plain_residues import FALSE_ALARM, FEWEST_PEAKS, PlainResidues
+from ema_pipeline.modal.reversals import signs_of
 
 Complex = NDArray[np.complex128]
 Real = NDArray[np.float64]
@@ -72,8 +74,9 @@ class GainChanges:
     ----------
     outputs, inputs : tuple of Dof
     factors : ndarray, (n_outputs, n_inputs)
-        1 where nothing differs. Which of two gains is the right one cannot be known: few factors stand against the
-        majority; where most differ, each sensor and each point of impact has a geometric mean of 1.
+        1 where nothing differs, negative where the sensor was reversed. Which of two gains is the right one cannot be
+        known: few factors stand against the majority; where most differ, each sensor and each point of impact has a
+        geometric mean of 1.
     std : float
         Largest standard deviation of the logarithm of a factor, from the scatter of what the peaks tell.
     """
@@ -91,20 +94,24 @@ class GainChanges:
     @property
     def note(self) -> str:
         """What was found, and the remedy."""
-        size = np.abs(np.log(self.factors))
+        size = np.where(self.factors < 0, np.inf, np.abs(np.log(np.abs(self.factors))))
         differ = np.argwhere(size > 0)
         largest = sorted(differ.tolist(), key=lambda cell: -float(size[tuple(cell)]))
         named = "; ".join(self._words(*cell) for cell in largest[:MOST_NAMED])
         more = f"; and {len(differ) - MOST_NAMED} more" if len(differ) > MOST_NAMED else ""
+        known = f" (± {100 * self.std:.1g} %)" if self.std else ""
         return (
-            f"gains of sensors changed between hits, alike in all modes: {named}{more} (± {100 * self.std:.1g} %). "
+            f"gains of sensors changed between hits, alike in all modes: {named}{more}{known}. "
             "FRFs were corrected; check how these sensors are mounted, and whether their range was changed"
         )
 
     def _words(self, output: int, point: int) -> str:
         factor = self.factors[output, point]
-        way = "more" if factor > 1 else "less"
-        return f"{self.outputs[output]} reads {100 * abs(factor - 1):.2g} % {way} in hits on {self.inputs[point]}"
+        size = abs(factor)
+        told = ["is reversed"] if factor < 0 else []
+        if size != 1:
+            told.append(f"reads {100 * abs(size - 1):.2g} % {'more' if size > 1 else 'less'}")
+        return f"{self.outputs[output]} {' and '.join(told)} in hits on {self.inputs[point]}"
 
 
 @dataclass(frozen=True)
@@ -160,9 +167,11 @@ def gain_changes(frfs: FrfSet, found: Sequence[PlainResidues]) -> GainChanges | 
     """
     if min(frfs.hits.shape) < 2 or frfs.hits.size > MOST_CELLS or len(found) < FEWEST_PEAKS:
         return None
-    peaks = [_Peak(p.residues, p.variance, first_right(p.residues, 1)) for p in found]
+    signs = signs_of(found)
+    upright = [(p.residues * signs, p.variance) for p in found]
+    peaks = [_Peak(residues, variance, first_right(residues, 1)) for residues, variance in upright]
     cells, logarithms, covariance = _selected(*_weighed(peaks))
-    if not cells:
+    if not cells and np.all(signs > 0):
         return None
     n_outputs, n_inputs = frfs.hits.shape
     full = np.zeros((n_inputs * n_outputs, len(cells)))
@@ -171,8 +180,8 @@ def gain_changes(frfs: FrfSet, found: Sequence[PlainResidues]) -> GainChanges | 
         centred = [np.eye(n) - 1 / n for n in (n_inputs, n_outputs)]
         full = np.kron(*centred) @ full
     std = np.sqrt(np.max(np.sum((full @ covariance) * full, axis=1)))
-    factors = np.exp(full @ logarithms).reshape(n_inputs, n_outputs).T
-    return GainChanges(frfs.outputs, frfs.inputs, factors, float(std))
+    factors = signs * np.exp(full @ logarithms).reshape(n_inputs, n_outputs)
+    return GainChanges(frfs.outputs, frfs.inputs, factors.T, float(std))
 
 
 def _weighed(peaks: list[_Peak]) -> tuple[list[_Peak], Real]:

@@ -151,3 +151,23 @@ def test_weights_of_zero_leave_entries_out() -> None:
     spoilt[1, 2], weight[1, 2] = 1e3, 0.0
     left, right = low_rank(spoilt, weight, np.ones((1, 5), dtype=complex), 200)
     assert left @ right == pytest.approx(true, abs=1e-6)
+
+
+@pytest.mark.parametrize("places", [[(1, 2)], [(1, 2), (3, 0)]])
+@pytest.mark.parametrize("factor", [-1.0, -0.9])
+def test_a_sensor_that_was_reversed_while_a_point_was_struck_is_told(
+    places: list[tuple[int, int]], factor: float
+) -> None:
+    gains = constant()
+    for place in places:
+        gains[place] = factor
+    changes = found(hits_of(gains))
+    assert changes is not None
+    assert np.argwhere(changes.factors < 0).tolist() == [list(place) for place in places]
+    for place in places:
+        assert abs(np.log(changes.factors[place] / factor)) <= 3 * changes.std
+    told = "is reversed in" if factor == -1 else "is reversed and reads 10 % less in"
+    assert f"{changes.outputs[1]} {told} hits on" in changes.note
+
+    modes = identified(hits_of(gains)).modal
+    assert [round(m.frequency_hz) for m in modes.modes] == [41, 83, 131, 190]
