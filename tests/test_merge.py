@@ -117,6 +117,7 @@ def merged(tips: Path) -> dict[str, Any]:
     return json.loads(done.stdout)  # type: ignore[no-any-return]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("merged")
 def test_two_tips_are_as_good_as_each_on_its_own_band(
     tips: Path, run_of: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -159,6 +160,7 @@ def test_what_merge_says(tips: Path, merged: dict[str, Any], capsys: pytest.Capt
     assert "hard/m1_x_60N_1.h5" in files
 
 
+@pytest.mark.slow
 def test_roving_sensors_make_whole_shapes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Three sensors at a time, one hammer: shapes over all bodies as the chain's matrices have them."""
     for name, sensors, seed in (

@@ -63,6 +63,7 @@ def test_two_tests_share_rig_and_sensors(root: Path) -> None:
     assert records[0]["records"][0]["aim_deg"] != records[1]["records"][0]["aim_deg"]
 
 
+@pytest.mark.slow
 def test_an_added_mass_is_found_with_its_size(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """By the command, and back again by the function behind it: what B has, A has not."""
     from ema_pipeline.changes.two_tests import changes_content, compare_runs

@@ -185,6 +185,7 @@ def test_an_effect_is_added_under_a_changed_setting_and_removed_and_the_ladder_s
     assert f"{effect}.stiffness" not in summary["fit"]["parameters"]
 
 
+@pytest.mark.slow
 def test_a_diagnosis_of_a_model_is_dropped_with_an_effect_that_it_had(
     results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

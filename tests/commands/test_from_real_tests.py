@@ -148,6 +148,7 @@ def test_init_does_not_invent_a_sample_rate(tmp_path: Path, capsys: pytest.Captu
     assert "sample_rate_hz =    # CHECK" in text
 
 
+@pytest.mark.slow
 def test_a_table_of_modes_rounded_coarser_than_its_deviations_is_noticed_and_nobody_is_told_to_hit_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

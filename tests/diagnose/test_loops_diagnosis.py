@@ -179,6 +179,7 @@ def test_cycles_that_differ_make_the_loop_less_certain() -> None:
     assert shared.force_std_n == pytest.approx(uneasy.force_std_n * np.sqrt(uneasy.cycles), rel=0.3)
 
 
+@pytest.mark.slow
 def test_friction_device_shows_hysteresis_and_the_report_says_what_is_missing(test_data: Path) -> None:
     test = read_campaign(test_data / "realdata" / "friction_device_loops").tests[0]
     chosen = (

@@ -76,6 +76,7 @@ def test_fitted_parameters_are_shown_of_the_model_in_use_and_of_no_other(
     assert "has not been fitted yet" in command(capsys, "fit", out)[1]
 
 
+@pytest.mark.slow
 def test_without_a_rig_the_modes_are_the_linear_model_and_a_linear_one_is_adequate(tmp_path: Path) -> None:
     raw = write_oscillator(tmp_path / "raw", lambda x, v: 0.0, samples=(1536, 1024))
     found = _run(raw, tmp_path / "out")
@@ -257,6 +258,7 @@ def test_bouc_wen(test_data: Path, tmp_path: Path) -> None:
     assert loop["energy_per_cycle_j"] > 5 * loop["energy_per_cycle_std_j"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("all_cores")
 def test_the_python_interface_reads_identifies_and_diagnoses(tmp_path: Path) -> None:
     test = ema.read(write_oscillator(tmp_path / "raw", lambda x, v: 3e9 * x**3, samples=(1024, 512)))

@@ -67,6 +67,7 @@ def test_a_mode_that_moves_is_found_and_no_other_is_blamed(moving: tuple[LevelSt
     assert mode.frequency_hz[2] - mode.frequency_hz[0] == pytest.approx(expected, rel=0.25)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("processors", [1, 2])
 def test_levels_are_the_same_in_one_process_and_in_several(
     moving: tuple[LevelStudy, ModalModel], monkeypatch: pytest.MonkeyPatch, processors: int
@@ -81,6 +82,7 @@ def test_levels_are_the_same_in_one_process_and_in_several(
         assert [m.pole for m in a.modal.modes] == [m.pole for m in b.modal.modes]
 
 
+@pytest.mark.slow
 def test_levels_of_many_frfs_are_identified_one_after_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ema_pipeline.levels.study.cores", lambda: 2)
     monkeypatch.setattr("ema_pipeline.levels.study.MOST_SIDE_BY_SIDE", 0)
@@ -174,6 +176,7 @@ def test_displacement_after_a_hit_is_that_of_the_impulse() -> None:
         assert found.amplitude_m[hardest, r] == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.slow
 def test_the_trend_test_keeps_its_false_alarm_rate_with_few_hits_and_an_unsteady_hand() -> None:
     rng = np.random.default_rng(7)
     for points, levels, hits, jitter in ((1, 3, 2, 0.0), (3, 3, 2, 1.0), (2, 2, 2, 0.0)):
@@ -194,6 +197,7 @@ def test_the_trend_test_keeps_its_false_alarm_rate_with_few_hits_and_an_unsteady
         assert wrong <= 9  # 3 expected at most; 10 by chance once in 700
 
 
+@pytest.mark.slow
 def test_a_sheet_that_scatters_by_itself_shows_no_trend() -> None:
     """A mode that oblique hits alone excite at one point: 1.5 of scatter there, hardly any elsewhere."""
     rng = np.random.default_rng(17)
@@ -304,6 +308,7 @@ def test_holm_adjusts_as_in_the_textbook() -> None:
     assert adjusted == pytest.approx([0.03, np.nan, 0.06, 0.06, 0.02], nan_ok=True)
 
 
+@pytest.mark.slow
 def test_the_carriers_cubic_spring_shows_at_the_carriers_mode_most_clearly(test_data: Path) -> None:
     test = read_campaign(test_data / "blind" / "p6-three-levels").tests[0]
     records = [r for r in load_records(test) if str(r.impact) in ("carrier.x", "planet1.x")]

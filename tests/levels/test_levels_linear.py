@@ -63,6 +63,7 @@ def test_a_stiffening_structure_is_that_of_its_softest_hits(
     assert study.modes[1].frequency_hz[2] - study.modes[1].frequency_hz[0] == pytest.approx(1.3, rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_structure_that_rubs_is_that_of_its_hardest_hits() -> None:
     study, _, _ = studied(replace(CASE, mode=1, damping_shift=-0.5), 2)
     assert study.linear_level == 2
@@ -132,6 +133,7 @@ def test_a_pole_that_grows_with_the_force_is_no_mode_though_nothing_else_moves()
     assert "the FRFs change with it" in study.summary
 
 
+@pytest.mark.slow
 def test_a_pole_that_fades_with_the_force_speaks_for_the_hardest_hits() -> None:
     study, _, _ = studied(replace(CASE, mode=2, growth=-0.5), 4)
     assert study.level_dependent

@@ -62,6 +62,7 @@ def frequencies(model: ModalModel) -> list[float]:
     return [m.frequency_hz for m in model.modes]
 
 
+@pytest.mark.slow
 def test_all_published_modes_of_the_aircraft_are_found_from_single_hits_and_no_others(
     test_data: Path, tmp_path: Path
 ) -> None:
@@ -72,11 +73,12 @@ def test_all_published_modes_of_the_aircraft_are_found_from_single_hits_and_no_o
     assert not model.scaled  # the sensors sit at points that were not hit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [
         pytest.param("", id="default"),
-        pytest.param("[modal.identify]\nmax_order = 80\n", id="order 80", marks=pytest.mark.slow),
+        pytest.param("[modal.identify]\nmax_order = 80\n", id="order 80"),
     ],
 )
 def test_a_mode_that_softens_by_its_own_width_is_kept_and_intervals_hold_what_the_peak_shows(

@@ -351,12 +351,13 @@ def test_a_scale_of_amplitudes_that_is_hardly_known_does_not_take_a_size_to_noth
     [
         ("bearing_cubic@hub", {"stiffness": 1e11}, 0.01, 1e-9),
         ("dry_friction@hub", {"force": 0.3, "velocity": 0.02}, 0.01, 1e-9),
-        (
+        pytest.param(
             "hysteresis@hub",
             {"stiffness": 4e4, "force": 2.0, "shape": 0.3, "exponent": 1.5},
             0.1,
-            1e-5,
-        ),  # by interpolation in a table
+            1e-5,  # by interpolation in a table
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_derivatives_by_sizes_are_those_of_small_differences(

@@ -59,7 +59,8 @@ def calculated_in_full(observations: AmplitudeObservations, fit: Fit) -> Amplitu
     return both[0]
 
 
-@pytest.mark.parametrize("force", [0.02, pytest.param(0.1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("force", [0.02, 0.1])
 def test_friction_calculated_in_full_has_its_true_size(force: float) -> None:
     observations, fit = linearised(force)
     value, std = size(fit, observations)

@@ -66,6 +66,7 @@ def test_effect_of_the_page_on_effects_runs(
     assert capsys.readouterr().out == "400000.0\n"
 
 
+@pytest.mark.slow
 def test_effect_of_the_page_is_diagnosed_and_laddered_by_its_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

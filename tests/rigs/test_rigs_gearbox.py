@@ -159,6 +159,7 @@ def test_isolator_is_one_mass_on_its_spring_and_takes_its_effects() -> None:
     assert soft.frequency_hz == pytest.approx(np.sqrt((9.702e4 + 133.25 * 631.42) / 2.0) / (2 * np.pi))
 
 
+@pytest.mark.slow
 def test_a_crack_of_a_gearbox_and_a_damper_beside_it_are_found_from_raw_hits(
     tmp_path: Path,
 ) -> None:

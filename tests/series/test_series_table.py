@@ -291,6 +291,7 @@ def test_page_of_a_series_without_results(tmp_path: Path, capsys: pytest.Capture
     assert "no test has modes" in err
 
 
+@pytest.mark.slow
 def test_learned_limits_take_the_place_of_nothing_else(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

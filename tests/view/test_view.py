@@ -224,6 +224,7 @@ def test_click_on_the_effect_and_the_error_falls_in_every_tab(browser, page: Pag
     context.close()
 
 
+@pytest.mark.slow
 def test_refit_that_is_cancelled_leaves_the_folder_as_it_was(browser, page: Page, out: Path) -> None:
     from playwright.sync_api import expect
 
@@ -240,6 +241,7 @@ def test_refit_that_is_cancelled_leaves_the_folder_as_it_was(browser, page: Page
     context.close()
 
 
+@pytest.mark.slow
 def test_mode_is_excluded_and_one_included_and_the_commands_repeat_it(
     browser, page: Page, out: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
