@@ -36,6 +36,7 @@ def test_every_path_of_the_page_on_architecture_exists() -> None:
     assert not [path for path in named if not (ROOT / "ema_pipeline" / path).exists()]
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs_jupyter")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]

@@ -794,7 +794,7 @@ def test_init_takes_the_struck_node_and_direction_from_universal_files(
     ("stage", "stages"),
     [
         ("ingest", 'stages=["ingest", "hits", "frf", "modal"]'),
-        ("modal", 'stages=["ingest", "hits", "frf", "modal", "ladder"]'),
+        pytest.param("modal", 'stages=["ingest", "hits", "frf", "modal", "ladder"]', marks=pytest.mark.slow),
     ],
     ids=["ingest", "modal"],
 )

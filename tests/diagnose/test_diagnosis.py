@@ -99,7 +99,7 @@ def test_a_healthy_chain_whose_parts_and_sensors_scatter_is_adequate(seed: int) 
             marks=pytest.mark.slow,
         ),
         pytest.param(added(Mass, 0.8, {"m4.z": 1.0}), "mass@m4", 0.8, 3, marks=pytest.mark.slow),
-        (added(Damper, 120.0, {"m3.z": 1.0}), "damper@m3", 120.0, 4),
+        pytest.param(added(Damper, 120.0, {"m3.z": 1.0}), "damper@m3", 120.0, 4, marks=pytest.mark.slow),
     ],
 )
 def test_what_is_hidden_in_a_chain_is_named_with_its_size(
@@ -204,6 +204,7 @@ def test_an_effect_that_the_library_lacks_is_unknown_and_its_place_is_told() -> 
     assert "force levels" in found.next_measurement
 
 
+@pytest.mark.slow
 def test_a_mass_that_only_one_part_far_off_can_follow_is_unknown_to_a_library_without_masses() -> None:
     only = {k: v for k, v in GENERIC.items() if k == "damper"}
     found = of_chain(3, added(Mass, 0.5, {"m4.z": 1.0}), library=only)
@@ -358,7 +359,8 @@ def test_what_is_known_already_is_not_looked_for_again() -> None:
 # --- verdicts, groups and held-out data ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [3, 5])
 def test_a_spring_to_ground_of_a_free_rig_is_named_though_the_mode_that_it_holds_has_little_damping(
     seed: int,
 ) -> None:

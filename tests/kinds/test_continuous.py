@@ -223,6 +223,7 @@ def test_signals_in_steps_of_a_converter_are_not_clipped(steps: int) -> None:
     assert _piled_up(np.clip(sine, -np.inf, 0.6 * steps))
 
 
+@pytest.mark.slow
 def test_a_model_of_modes_that_grows_without_bound_says_what_to_look_at(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

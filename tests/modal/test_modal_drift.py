@@ -151,7 +151,7 @@ def test_peaks_that_different_points_show_are_brought_together_by_the_trend() ->
 
 
 @pytest.mark.parametrize("trend", [1.0, 0.0], ids=["trend", "hits"])
-@pytest.mark.parametrize("n_points", [1, 3])
+@pytest.mark.parametrize("n_points", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_nine_of_ten_intervals_hold_whatever_the_drift(trend: float, n_points: int) -> None:
     rng = np.random.default_rng(12)
     inside, widths = [], []

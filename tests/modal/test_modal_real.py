@@ -124,7 +124,7 @@ def test_three_modes_of_a_frame_and_no_others(test_data: Path, tmp_path: Path) -
     assert frequencies(model) == pytest.approx([2.17, 6.89, 13.263], rel=8e-3)
 
 
-@pytest.fixture(scope="module", params=[pytest.param("i2", marks=pytest.mark.slow), "i3"])
+@pytest.fixture(scope="module", params=["i2", "i3"])
 def imperfect(
     request: pytest.FixtureRequest, test_data: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Store, str]:
@@ -138,6 +138,7 @@ def imperfect(
     return Store(out), done.output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("configuration", "count"), [("no_ring", 10), ("with_ring", 14)])
 def test_drift_from_hit_to_hit_makes_no_twins(
     imperfect: tuple[Store, str], configuration: str, count: int
@@ -149,6 +150,7 @@ def test_drift_from_hit_to_hit_makes_no_twins(
         assert 2e-4 < mode.frequency_std_hz / mode.frequency_hz < 3e-3
 
 
+@pytest.mark.slow
 def test_imperfect_planetary_rigs_raise_no_suspicion_of_a_sensor(imperfect: tuple[Store, str]) -> None:
     screen = imperfect[1]
     assert "damping, %" in screen

@@ -24,6 +24,7 @@ def _modes(folder: Path) -> ema.Modes:
     return ema.identify(ema.read(folder).frfs())
 
 
+@pytest.mark.slow
 def test_repeated_modes_of_two_shakers_are_found_as_with_a_hammer(tmp_path: Path) -> None:
     rig, random = study.pairs(), np.random.default_rng(0)
     study.write_shakers(tmp_path / "shakers", rig, random)

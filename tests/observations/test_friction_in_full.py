@@ -77,6 +77,7 @@ def test_friction_calculated_in_full_has_its_true_size(force: float) -> None:
     assert np.array_equal(shared.posterior.x, again.posterior.x)
 
 
+@pytest.mark.slow
 def test_only_friction_is_calculated_in_full_and_once() -> None:
     observations, fit = linearised(0.1)
     cubic = parse_effect("cubic_spring@hub.x", RIG, library=shipped_effects())

@@ -85,6 +85,7 @@ def test_sizes_that_teeth_change_are_those_of_simulated_hits() -> None:
     assert abs(other[0] - 1) > 2 * abs(slope - 1)
 
 
+@pytest.mark.slow
 def test_sizes_that_a_quadratic_spring_changes_are_those_of_simulated_hits() -> None:
     (data,) = simulated("quadratic").hits
     values, shapes, displacement = modes_of(data)

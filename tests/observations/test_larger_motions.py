@@ -28,11 +28,16 @@ HUB = {"hub.x": 1.0}
 @pytest.mark.parametrize(
     ("element", "smaller"),
     [
-        (PolynomialSpring("c", HUB, 1e6, 3e10), PolynomialSpring("c", HUB, LARGER * 1e6, LARGER**2 * 3e10)),
+        pytest.param(
+            PolynomialSpring("c", HUB, 1e6, 3e10),
+            PolynomialSpring("c", HUB, LARGER * 1e6, LARGER**2 * 3e10),
+            marks=pytest.mark.slow,
+        ),
         (DryFriction("f", HUB, 0.3, 0.01), DryFriction("f", HUB, 0.3 / LARGER, 0.01 / LARGER)),
-        (
+        pytest.param(
             PartingSpring("p", HUB, 2e5, preload=2e-4, gap=5e-4),
             PartingSpring("p", HUB, 2e5, preload=2e-4 / LARGER, gap=5e-4 / LARGER),
+            marks=pytest.mark.slow,
         ),
     ],
 )
