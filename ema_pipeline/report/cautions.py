@@ -117,6 +117,8 @@ def _of_sensor(v: CheckResult) -> bool:
 def _all(results: RunResults) -> Iterator[tuple[Weight, str]]:
     for text in suspicions(results):
         yield Weight.SENSOR, text
+    if results.missing_files:
+        yield Weight.LEFT_OUT, _lost(results)
     if results.not_diagnosed:
         yield Weight.MISFIT, f"Nothing was diagnosed: {results.not_diagnosed}"
     if results.fit is not None:
@@ -127,6 +129,16 @@ def _all(results: RunResults) -> Iterator[tuple[Weight, str]]:
     for c in results.configurations:
         for weight, text in _of_configuration(c):
             yield weight, _where(results, c) + text
+
+
+def _lost(results: RunResults) -> str:
+    """Files of results that were left behind or deleted, and how they are made anew."""
+    first, *more = results.missing_files
+    also = f" and {len(more)} more" if more else ""
+    return (
+        f"{first}{also} {'are' if more else 'is'} not in the folder, and what rests on that is left out below: "
+        f"copy folder {results.folder} as a whole, or make it anew with ema run"
+    )
 
 
 def _of_fit(fit: FitResult, error: float, provisional: bool) -> Iterator[tuple[Weight, str]]:

@@ -130,6 +130,8 @@ class RunResults:
         Of a test of force-displacement loops.
     sensitivities : tuple of CheckResult
         Channels whose scale or sign the model contradicts, see `fit.channel_faults`.
+    missing_files : tuple of str
+        Files of results in the folder that are no longer there.
     effect_files : tuple of str
         Files with the user's own effects that were named in this call, as a user would type them. No command that is
         shown names another one, since results may come from a stranger.
@@ -157,6 +159,7 @@ class RunResults:
     not_diagnosed: str = ""
     hysteresis: tuple[HysteresisLoop, ...] = ()
     loops: LoopResults | None = None
+    missing_files: tuple[str, ...] = ()
     effect_files: tuple[str, ...] = ()
 
     @property

@@ -28,7 +28,7 @@ from ema_pipeline.run.measured import level_study, modes_key
 from ema_pipeline.run.models import diagnosed_choices, diagnosis_is_of_other_data
 from ema_pipeline.run.records import count_driven
 from ema_pipeline.run.types import Run
-from ema_pipeline.store import ALL
+from ema_pipeline.store import ALL, PARTS_FOLDER
 
 
 def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
@@ -98,6 +98,9 @@ def load_results(run: Run, *, synthesis: bool = True) -> RunResults:
         choices=run.info.choices,
         diagnosed_choices=diagnosed_choices(run),
         folder=str(run.store.folder),
+        missing_files=tuple(
+            f"{PARTS_FOLDER}/{part.name}" for part in run.store.parts() if not part.is_file()
+        ),
         effect_files=tuple(map(_typed, filter(run.named_files.__contains__, run.settings.effect_files))),
         provenance=provenance(run),
         settings={

@@ -137,6 +137,20 @@ def test_report_for_print_has_eight_pages_at_most_and_the_test_sheet(
         assert item in sheet
 
 
+def test_a_report_without_the_large_results_says_that_they_are_gone(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(results, out)
+    monkeypatch.setattr("ema_pipeline.store.LARGE_BYTES", 0)
+    assert ema(capsys, "frf", out, "--set", "frf.estimator=H2")[0] == 0
+    (part,) = (out / "stages").iterdir()
+    part.unlink()
+    assert ema(capsys, "report", out)[0] == 0
+    warnings = json.loads((out / "summary.json").read_text(encoding="utf-8"))["warnings"]
+    assert any(w.startswith(f"stages/{part.name} is not in the folder") for w in warnings)
+
+
 def test_stages_run_alone_on_a_results_folder_without_the_raw_data(
     results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -503,6 +503,14 @@ def test_a_driving_point_that_is_none_is_told_on_the_screen(run: RunResults) -> 
         assert any(told in text for text in cautions) is shown
 
 
+def test_files_of_results_that_are_gone_are_told() -> None:
+    """Copied without its folder `stages`, a run has no FRFs, and its report no figures of them."""
+    gone = RunResults("x", folder="results/x", missing_files=("stages/frf.a.1.h5", "stages/modal.a.2.h5"))
+    (told,) = summary.cautions(gone)
+    assert told.startswith("stages/frf.a.1.h5 and 1 more are not in the folder")
+    assert "copy folder results/x as a whole, or make it anew with ema run" in told
+
+
 def test_cautions_of_one_kind_are_counted_rather_than_all_written_out(run: RunResults) -> None:
     c = run.configurations[0]
     assert c.modal is not None
