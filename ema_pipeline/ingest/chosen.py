@@ -41,4 +41,6 @@ def require_good_hits(hits: tuple[Hit, ...], configuration: str) -> None:
     for hit in hits:
         if hit.impact.point not in good:
             reasons = "; ".join(f"{h.file}: {h.reason}" for h in hits if h.impact.point == hit.impact.point)
-            raise EmaError(f"{configuration}: no good hit on {hit.impact.point} ({reasons}); strike it again")
+            raise EmaError(
+                f"{configuration}: no good hit on {hit.impact.point} ({reasons}); strike it again, or correct test.toml"
+            )

@@ -35,6 +35,9 @@ FAR_BELOW_SCALE = 0.25
 """No input clips below this share of its full scale: a sensor's own supply ends at half the usual input range. What is
 flat there all the same was clipped before the input, or the full scale is not the one stated."""
 
+BEYOND_SCALE = 1.1
+"""No input reads more than this share of its full scale, with what some leave above it: it is not the one stated."""
+
 EXCEEDED = 2.0
 """A level that the same channel exceeds this many times in another hit is not where it clips."""
 
@@ -261,6 +264,8 @@ def _overload(
     passes = share < settings.overload
     at = int(np.argmax(np.abs(samples)))
     fault = f"overload on {name}: {share:.1%} of full scale {(at - peak) / rate:+.4g} s from the blow"
+    if share > BEYOND_SCALE:
+        fault = f"{name} reaches {share:.0%} of its full scale, which no input can: correct it in test.toml"
     return judged("overload", share, settings.overload, passes, OVERLOAD, consequence, fault, channel=name)
 
 
