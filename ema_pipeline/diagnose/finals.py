@@ -31,6 +31,9 @@ FINALISTS = 5
 """Hypotheses for which the scatters are learned, if they gain anything at wide ones."""
 _AT_LEAST = 3
 """The same whatever they gain."""
+_TIED, _MOST = 3.0, 12
+"""Log evidence behind the best within which others may be as good at learned scatters, and how many are finalists then:
+in a gear train of which one mode was lifted from 0 Hz, eleven springs lay within 2.7."""
 PROMISING = 1.0
 """Log evidence that is something: a third of what a claim needs."""
 _FURTHER = 3
@@ -54,8 +57,10 @@ def spread_fits(
 
 def leading(order: Sequence[tuple[Hypothesis, Fit]], base: Fit) -> list[tuple[Hypothesis, Fit]]:
     """What is a finalist by its fit at wide scatters, best first."""
-    gaining = (pair for pair in order[_AT_LEAST:FINALISTS] if pair[1].log_evidence > base.log_evidence)
-    return [*order[:_AT_LEAST], *gaining]
+    gaining = [pair for pair in order[_AT_LEAST:FINALISTS] if pair[1].log_evidence > base.log_evidence]
+    least = max(base.log_evidence + PROMISING, *(fit.log_evidence - _TIED for _, fit in order[:1]), -np.inf)
+    tied = [pair for pair in order[FINALISTS:_MOST] if pair[1].log_evidence > least]
+    return [*order[:_AT_LEAST], *gaining, *tied]
 
 
 def promising_fits(
@@ -180,14 +185,10 @@ def _learned_each(
 
     def job(one: tuple[Fit, bool]) -> Posterior:
         fit, past_barriers = one
-        return _learned(observations, past_barriers, fit)
+        return learned(observations, fit, past_barriers).posterior
 
     learned_ones = spread(job, asked, processes, _WORTH)
     return [Fit(fit.model, p) for (fit, _), p in zip(asked, learned_ones, strict=True)]
-
-
-def _learned(observations: Observations, past_barriers: bool, fit: Fit) -> Posterior:
-    return learned(observations, fit, past_barriers).posterior
 
 
 def _crossed(observations: Observations, sources: Sequence[Fit], fit: Fit) -> Posterior:

@@ -68,7 +68,6 @@ def rung_at(observations: Observations, fit: Fit, scatters: Mapping[str, float])
         error=fit.posterior.error,
         heldout_error=held.error,
         chi2=float(fit.posterior.residuals.values @ fit.posterior.residuals.values),
-        objective=2 * fit.posterior.cost,
         parameters=_stated(
             observations, fit.model, parameter_sizes(problem, averaged(observations, fit).posterior)
         ),

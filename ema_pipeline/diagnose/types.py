@@ -109,8 +109,6 @@ class Rung:
     error, heldout_error : float
     chi2 : float
         Sum of squares of everything compared, priors included.
-    objective : float
-        -2 log posterior.
     parameters : dict of str to EffectSize
         All fitted parameters, those of the effects named ``id@place.name``.
     log_evidence : float
@@ -125,7 +123,6 @@ class Rung:
     error: float
     heldout_error: float
     chi2: float
-    objective: float
     parameters: dict[str, EffectSize]
     log_evidence: float
     unexplained: int

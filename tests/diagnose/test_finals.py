@@ -29,16 +29,16 @@ def test_finalists_are_learned_and_compared_with_the_learned_base(monkeypatch: p
     crossed: list[str] = []
     among: set[tuple[str, ...]] = set()
 
-    def learn(observations: object, past_barriers: bool, one: Any) -> Any:
+    def learn(observations: object, one: Any, past_barriers: bool) -> Any:
         learned.append((one.model.name, past_barriers))
-        return SimpleNamespace(log_evidence=one.log_evidence + (30.0 if one.model.name == "b" else 3.0))
+        return fit(one.model.name, one.log_evidence + (30.0 if one.model.name == "b" else 3.0))
 
     def cross(observations: object, sources: Any, one: Any) -> Any:
         crossed.append(one.model.name)
         among.add(tuple(s.model.name for s in sources))
         return SimpleNamespace(log_evidence=one.log_evidence + (1.0 if one.model.name == "base" else 0.0))
 
-    monkeypatch.setattr(finals, "_learned", learn)
+    monkeypatch.setattr(finals, "learned", learn)
     monkeypatch.setattr(finals, "_crossed", cross)
     found = found_of(a=215.0, b=205.0, c=16.0, d=15.0, e=14.0, f=5.0, g=-45.0)
     promising = [(hypothesis("g"), fit("g", 20.0))]
@@ -54,15 +54,16 @@ def test_finalists_are_learned_and_compared_with_the_learned_base(monkeypatch: p
     assert gains["g"] == (9.0, True)
     assert gains["e"] == (14.0 + 3.0 - 14.0, True)
     assert gains["f"] == (-5.0, False)
-    close = list(found_of(a=13.0, b=12.8, c=12.6, d=12.4, e=12.0, f=11.5).values())
-    told = finals_of(NO_DATA, fit("base", 10.0), close, [], 1, (), True)
+    behind = list(found_of(a=15.0, b=12.8, c=12.6, d=12.4, e=12.0, f=11.5).values())
+    told = finals_of(NO_DATA, fit("base", 10.0), behind, [], 1, (), True)
     last = told.ranked[-1]  # at wide scatters ahead of nothing by 1.5, no finalist by 1
     assert (last.hypothesis.label, last.gain) == ("f", told.ranked[-2].gain) == ("f", 1.0)
+    assert not last.final
     assert finals_of(NO_DATA, fit("base", 10.0), [], [], 1, (), True).ranked == ()
 
 
 def test_scatters_are_learned_of_three_and_of_what_gains_something(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finals, "_learned", lambda o, past_barriers, one: one.posterior)
+    monkeypatch.setattr(finals, "learned", lambda o, one, past_barriers: one)
     monkeypatch.setattr(finals, "_crossed", lambda o, sources, one: one.posterior)
     for evidence, expected in ((10.0, "abc"), (8.05, "abcd")):
         order = list(found_of(a=9.0, b=8.5, c=8.2, d=8.1, e=8.0).values())
@@ -70,18 +71,31 @@ def test_scatters_are_learned_of_three_and_of_what_gains_something(monkeypatch: 
         assert [r.hypothesis.label for r in told.ranked if r.final] == list(expected)
 
 
+def test_what_may_be_as_good_as_the_best_is_a_finalist_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Springs between a sun and each of four planets that are alike: a group without some of them misleads."""
+    monkeypatch.setattr(finals, "learned", lambda o, one, past_barriers: one)
+    monkeypatch.setattr(finals, "_crossed", lambda o, sources, one: one.posterior)
+    order = list(found_of(a=14.0, b=13.9, c=13.8, d=13.7, e=13.6, f=13.5, g=11.1, h=10.9).values())
+    for base, expected in ((5.0, "abcdefg"), (12.6, "abcde"), (0.0, "abcdefg")):
+        told = finals_of(NO_DATA, fit("base", base), order, [], 1, (), True)
+        assert "".join(r.hypothesis.label for r in told.ranked if r.final) == expected
+    many = list(found_of(**{f"x{k:02}": 14.0 for k in range(15)}).values())
+    told = finals_of(NO_DATA, fit("base", 5.0), many, [], 1, (), True)
+    assert sum(r.final for r in told.ranked) == 12
+
+
 def test_beside_a_base_model_that_explains_the_data_nothing_is_led_past_its_barriers_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     learned: list[tuple[str, bool]] = []
 
-    def learn(observations: object, past_barriers: bool, one: Any) -> Any:
+    def learn(observations: object, one: Any, past_barriers: bool) -> Any:
         learned.append((one.model.name, past_barriers))
-        return SimpleNamespace(log_evidence=one.log_evidence + 100.0)
+        return fit(one.model.name, one.log_evidence + 100.0)
 
-    monkeypatch.setattr(finals, "_learned", learn)
+    monkeypatch.setattr(finals, "learned", learn)
     monkeypatch.setattr(finals, "_crossed", lambda o, sources, one: one.posterior)
-    order = list(found_of(a=12.0, b=11.9, c=11.8, d=11.7, e=11.6, f=11.5).values())
+    order = list(found_of(a=12.0, b=11.9, c=11.8, d=11.7, e=11.6, f=10.9).values())
     known = [fit("settled", 111.0), fit("narrow", 110.0)]
     told = finals_of(NO_DATA, fit("base", 10.0), order, [], 1, known, False)
     assert learned == [(name, False) for name in "abcde"]

@@ -463,7 +463,7 @@ def test_prior_probabilities_add_up_to_one_and_generic_effects_weigh_less(found:
 
 
 def test_gains_of_a_ladder_count_from_its_first_rung() -> None:
-    rungs = [Rung((), 1.0, 1.0, 1.0, 1.0, {}, log_evidence=e, unexplained=0) for e in (-40.0, -25.0, -26.5)]
+    rungs = [Rung((), 1.0, 1.0, 1.0, {}, log_evidence=e, unexplained=0) for e in (-40.0, -25.0, -26.5)]
     assert [r.log_evidence for r in with_gains(rungs)] == [0.0, 15.0, 13.5]
 
 

@@ -347,8 +347,7 @@ def told_apart(monkeypatch: pytest.MonkeyPatch, behind: float, separations: dict
         for one in labels
     )
     rungs = tuple(
-        Rung(given, 1.0, 1.0, 1.0, 1.0, {"b@x.s": sizes["s"]}, 0.0, 0)
-        for given in ((), ("w@x",), ("w@x", "b@x"))
+        Rung(given, 1.0, 1.0, 1.0, {"b@x.s": sizes["s"]}, 0.0, 0) for given in ((), ("w@x",), ("w@x", "b@x"))
     )
     group = ((*labels,), ("w@x", "v@x"))
     ladder = Ladder(rungs, 0.0, 0.0, 0.0, "")

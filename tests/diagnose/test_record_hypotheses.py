@@ -102,7 +102,7 @@ def rung(log_evidence: float, effects: tuple[str, ...] = (), error: float = 1.0,
     parameters = {
         n.replace("_at_", "@").replace("__", "."): EffectSize(v, 0.1, "N") for n, v in sizes.items()
     }
-    return Rung(effects, error, 2.0, 1.0, 1.0, parameters, log_evidence, 0, unknowns={"a": 1.0, "b": 2.0})
+    return Rung(effects, error, 2.0, 1.0, parameters, log_evidence, 0, unknowns={"a": 1.0, "b": 2.0})
 
 
 def ladder(*rungs: Rung, note: str = "") -> Ladder:

@@ -31,7 +31,7 @@ NO_DATA: Any = object()
 
 
 def rung(log_evidence: float) -> Rung:
-    return Rung((), 1.0, 1.0, 1.0, 1.0, {}, log_evidence, 0)
+    return Rung((), 1.0, 1.0, 1.0, {}, log_evidence, 0)
 
 
 def test_gains_count_from_the_first_rung() -> None:
@@ -118,7 +118,6 @@ def test_a_rung_of_the_true_model_has_its_fits_numbers(monkeypatch: pytest.Monke
     at = rungs.at_scatters(data, fit, scatters)
     assert found.log_evidence == pytest.approx(at.log_evidence)
     assert found.chi2 == pytest.approx(float(np.sum(at.posterior.residuals.values**2)))
-    assert found.objective == pytest.approx(2 * at.posterior.cost)
     assert (found.error, found.heldout_error) == (pytest.approx(at.posterior.error), 1.25)
     assert (found.effects, found.unexplained) == ((), 0)
     assert found.unknowns["stiffness"] == pytest.approx(at.unknowns["stiffness"])

@@ -76,7 +76,7 @@ def rung(effects: tuple[str, ...], error: float, held: float, left: int) -> Rung
     sizes = {"sun_bearing_stiffness": size(2e6, 1e5, "N/m")} | {
         f"{e}.fraction": size(0.34, 0.0102) for e in effects if not e.startswith("out_of_tolerance")
     }
-    return Rung(effects, error, held, 100.0, 90.0, sizes, 55.0 if effects else 0.0, left)
+    return Rung(effects, error, held, 100.0, sizes, 55.0 if effects else 0.0, left)
 
 
 def found(verdict: VerdictWord) -> Diagnosis:
