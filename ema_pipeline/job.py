@@ -13,12 +13,12 @@ from ema_pipeline.diagnose.types import Diagnosis
 from ema_pipeline.errors import EmaError, did_you_mean
 from ema_pipeline.keys import Keys
 from ema_pipeline.kinds import require_judge, stages_of
-from ema_pipeline.pipeline import ShowStage, run_stages
+from ema_pipeline.pipeline import ShowStage, out_of_date, run_stages
 from ema_pipeline.run.opening import existing_run, load_info, new_run, stored_settings, with_effect_files
 from ema_pipeline.run.rollback import everything_taken_back, settings_taken_back
 from ema_pipeline.run.settings import override
 from ema_pipeline.run.types import Run, RunInfo
-from ema_pipeline.store import ALL, RESULTS_FILE, Store
+from ema_pipeline.store import ALL, RESULTS_FILE, CannotWriteError, Store
 
 DescribeSource = Callable[[Path, str | None, str | None, Iterable[str]], RunInfo]
 """Checks what a run starts from; takes source, rig, pipeline and overrides."""
@@ -89,14 +89,27 @@ def run_on(
 ) -> tuple[Run, list[str]]:
     """Run single stages on a results folder; settings changed by `overrides` stay changed there unless a stage fails.
 
+    A folder that cannot be written to is taken as it is where all is up to date.
+
     Raises
     ------
     EmaError
         Whatever is wrong with the folder or the settings, in one line.
     """
-    effect_files = tuple(effect_files)
+    effect_files, stages, overrides = tuple(effect_files), tuple(stages), tuple(overrides)
     store = Store.existing(folder)
-    with store.lock():
+    with contextlib.ExitStack() as locked:
+        try:
+            locked.enter_context(store.lock())
+        except CannotWriteError:
+            run = existing_run(folder, effect_files)
+            changed = ["settings"] if overrides else out_of_date(run, stages)
+            if changed:
+                raise EmaError(
+                    f"{folder}: cannot be written to, and {changed[0]} would change there; "
+                    "copy the folder to where you can write"
+                ) from None
+            return run, []
         info = existing_run(folder, effect_files).info
         settings = override(stored_settings(store, info), overrides, folder)
         info = dataclasses.replace(info, pipeline=settings.model_dump_json())

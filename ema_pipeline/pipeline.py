@@ -45,6 +45,18 @@ def run_stages(run: Run, names: Iterable[str], show: ShowStage | None = None) ->
     return computed
 
 
+def out_of_date(run: Run, names: Iterable[str]) -> list[str]:
+    """What `run_stages` would compute."""
+    names = tuple(names)
+    keys, there = Keys(run, names), stages_of(run)
+    return [
+        _label(stage, configuration)
+        for stage in (stage_module(name) for name in names if name in there)
+        for configuration in configurations_of(stage, run)
+        if not _up_to_date(stage, run, configuration, keys(stage.NAME, configuration))
+    ]
+
+
 def _in_turn(stages: list[Stage], run: Run, keys: Keys, show: ShowStage | None) -> list[str]:
     """Run the stages that are out of date one after the other."""
     computed = []

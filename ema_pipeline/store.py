@@ -51,6 +51,10 @@ _FORMAT = 1
 _LIBRARY = ("v110", "v110")
 
 
+class CannotWriteError(EmaError):
+    """A results folder cannot be written to: its results can still be read."""
+
+
 @dataclass(frozen=True)
 class Provenance:
     """How a stage's result came about.
@@ -120,8 +124,8 @@ class Store:
         except Timeout:
             raise EmaError(f"{self.folder}: {_holder(path)} is writing there; wait for it to end") from None
         except OSError as error:
-            raise EmaError(
-                f"{self.folder}: cannot write results there ({reason(error)}); choose another with --out"
+            raise CannotWriteError(
+                f"{self.folder}: cannot write results there ({reason(error)}); copy it, or choose another with --out"
             ) from None
         with held, workers_die_with_us():
             if (

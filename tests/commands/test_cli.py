@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -149,6 +150,26 @@ def test_a_report_without_the_large_results_says_that_they_are_gone(
     assert ema(capsys, "report", out)[0] == 0
     warnings = json.loads((out / "summary.json").read_text(encoding="utf-8"))["warnings"]
     assert any(w.startswith(f"stages/{part.name} is not in the folder") for w in warnings)
+
+
+def test_a_folder_that_cannot_be_written_to_is_read_where_nothing_has_changed(
+    results: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = ema(capsys, "compare", results)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr("ema_pipeline.store.FileLock.acquire", refuse)
+    assert ema(capsys, "compare", results) == told
+    code, _, err = ema(capsys, "frf", results, "--set", "frf.estimator=H2")
+    assert code == 1
+    assert err.endswith(
+        "cannot be written to, and settings would change there; copy the folder to where you can write\n"
+    )
+    code, _, err = ema(capsys, "add", results, "spring@sun.x")
+    assert code == 1
+    assert "cannot write results there (Read-only file system)" in err
 
 
 def test_stages_run_alone_on_a_results_folder_without_the_raw_data(
