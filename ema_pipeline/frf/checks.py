@@ -225,8 +225,11 @@ def _taken_out(frfs: FrfSet, output: int, source: int, inside: slice) -> float:
 def _exchanged(frfs: FrfSet, one: int, other: int, wrong: float, limit: float) -> CheckResult:
     points = f"{frfs.outputs[one]} and {frfs.outputs[other]}"
     sensors = channels_words([_sensor(frfs, one), _sensor(frfs, other)])
+    # exchanged sensors and exchanged points of impact give the same FRFs at these points
+    blows, key = ("forces", "dof") if frfs.excitation else ("hits", "impact")
     fault = (
-        f"{sensors} are exchanged: each shows the driving point of the other ({points}); exchange their dof"
+        f"{sensors} or the {blows} on {points} are exchanged: each sensor shows the driving point of the other; "
+        f"exchange the dof of these channels or the {key} of these {blows}, whichever is wrong"
     )
     return judged(EXCHANGED, wrong, limit, False, DRIVING_POINT, "warn", fault, channel=points)
 

@@ -39,7 +39,7 @@ def signs_of(found: Sequence[PlainResidues]) -> Real:
     needed = np.log(signs.size / FALSE_ALARM)
     likelihood = _log_likelihood(found, signs)
     for _ in range(signs.size // 2):
-        worst = np.argsort(_likeness(found, signs), axis=None)[:TRIED]
+        worst = np.argsort(_agreement(found, signs), axis=None)[:TRIED]
         trials = [np.where(np.arange(signs.size) == k, -1.0, 1.0).reshape(signs.shape) * signs for k in worst]
         after = [_log_likelihood(found, trial) for trial in trials]
         best = int(np.argmax(after))
@@ -49,7 +49,7 @@ def signs_of(found: Sequence[PlainResidues]) -> Real:
     return signs
 
 
-def _likeness(found: Sequence[PlainResidues], signs: Real) -> Real:
+def _agreement(found: Sequence[PlainResidues], signs: Real) -> Real:
     """Mean over the peaks that see an entry of how its rectangles agree, -1 to 1; 1 where too few do."""
     total, seen = np.zeros_like(signs), np.zeros_like(signs)
     for peak in found:

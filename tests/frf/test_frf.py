@@ -524,7 +524,9 @@ def test_exchanged_sensors_are_named_once_and_neither_is_called_reversed() -> No
     assert not [v for v in found if v.check == "driving point"]
     (told,) = (v for v in found if v.check == EXCHANGED)
     assert not told.passes
-    assert "exchange their dof" in told.message
+    assert (
+        "exchange the dof of these channels or the impact of these hits, whichever is wrong" in told.message
+    )
     assert "reversed" not in " ".join(v.message for v in found)
     for right in (rows, two_way_hits(1.0, -1.0)):
         assert EXCHANGED not in {v.check for v in estimate_frfs(right).verdicts}
