@@ -316,6 +316,7 @@ def test_a_table_of_modes_takes_the_place_of_raw_data(
     assert (out / "report.html").exists()
 
 
+@pytest.mark.slow
 def test_hysteresis_tests_run_through_the_same_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -489,6 +489,7 @@ def test_the_number_of_processes_does_not_change_a_digit() -> None:
     assert repr(one.ladder) == repr(two.ladder)
 
 
+@pytest.mark.slow
 def test_effects_that_cannot_be_pickled_are_fitted_in_other_processes_too() -> None:
     own = replace(GENERIC["spring"], id="my_spring", find_places=lambda a: a.bodies, generic=False)
     found = of_chain(
@@ -514,6 +515,7 @@ def test_a_ladder_of_given_effects_is_measured_at_one_yardstick() -> None:
 # --- data that are hard to work with ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_hopeless_data_give_a_verdict_and_no_error() -> None:
     rig = chain()
     measured = chain_modes(16)["all"]

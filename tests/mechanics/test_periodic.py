@@ -43,6 +43,7 @@ LAWS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_it_is_what_the_motion_settles_to(law: Nonlinear) -> None:
     system, force = _system(law), _force()

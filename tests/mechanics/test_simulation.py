@@ -122,6 +122,7 @@ def test_hysteresis_is_that_of_the_normalised_law_where_both_hold() -> None:
     assert np.corrcoef(slow[0, 20:], a[0][20:, 0])[0, 1] > 0.999
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_motion() -> None:
     def assembly(p: np.ndarray) -> Assembly:
         return _chain(

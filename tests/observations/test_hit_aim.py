@@ -53,6 +53,7 @@ def all_heard(data: HitData) -> HitData:
     return known
 
 
+@pytest.mark.slow
 def test_the_motion_of_simulated_hits_is_that_of_blows_as_they_were_aimed(data: HitData) -> None:
     """Read from raw hits along one direction: whatever is found across is an error."""
     nominal, across = rows_of(data)

@@ -75,6 +75,7 @@ def agreement(data: HitData, size: np.ndarray) -> tuple[float, float]:
     return float(told @ read / (told @ told)), float(told @ read / np.sqrt((told @ told) * (read @ read)))
 
 
+@pytest.mark.slow
 def test_sizes_that_teeth_change_are_those_of_simulated_hits() -> None:
     """From raw hits through FRFs and modes: no equivalent stiffness tells them."""
     (data,) = simulated("teeth").hits

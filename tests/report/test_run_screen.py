@@ -30,6 +30,7 @@ def crack(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
 
 
+@pytest.mark.slow
 def test_a_run_is_told_in_fifteen_lines_with_one_story_through_add_and_remove(
     crack: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
